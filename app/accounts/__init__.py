@@ -1,0 +1,1 @@
+"""People: users, memberships and roles, sign-in sessions, API tokens."""

@@ -1,0 +1,1 @@
+"""After the visit: what the tested controllers did against cDBS."""

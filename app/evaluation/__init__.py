@@ -1,0 +1,1 @@
+"""Phase III, evaluate: estimates of every policy and their ranking."""

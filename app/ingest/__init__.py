@@ -1,0 +1,1 @@
+"""Phase I, collect: uploads, decoding and the sessions that come out."""

@@ -1,0 +1,58 @@
+"""Tables of uploads: what arrived, from whom, and what was made of it."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, Index, String, func
+from sqlalchemy.orm import Mapped, mapped_column, relationship
+
+from app.platform.database import Base
+
+
+class Upload(Base):
+    """One call of the upload route, with the fields its sender stated."""
+
+    __tablename__ = "upload"
+    __table_args__ = (CheckConstraint("status in ('received', 'decoded', 'failed')", name="status"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    visit_id: Mapped[int | None] = mapped_column(ForeignKey("visit.id"), index=True)
+    status: Mapped[str] = mapped_column(String(20), server_default="received")
+    stated: Mapped[dict[str, Any]]
+    report: Mapped[list[Any]]
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+    files: Mapped[list[UploadFile]] = relationship(back_populates="upload", order_by="UploadFile.id")
+
+
+class UploadFile(Base):
+    """One file of an upload. The original's hash makes uploads idempotent; what is kept is the file without identity."""
+
+    __tablename__ = "upload_file"
+    __table_args__ = (
+        CheckConstraint("status in ('received', 'decoded', 'failed')", name="status"),
+        # one participant's file counts once; a file that could not be used may be tried again
+        Index(
+            "uq_upload_file_participant_original",
+            "participant_id",
+            "original_sha256",
+            unique=True,
+            postgresql_where="status = 'decoded'",
+        ),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    upload_id: Mapped[int] = mapped_column(ForeignKey("upload.id"), index=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    name: Mapped[str] = mapped_column(String(255))
+    kind: Mapped[str] = mapped_column(String(40), server_default="unknown")
+    size: Mapped[int] = mapped_column(BigInteger)
+    original_sha256: Mapped[str] = mapped_column(String(64), index=True)
+    stored_sha256: Mapped[str | None] = mapped_column(ForeignKey("stored_file.sha256"))
+    redactor_version: Mapped[int | None]
+    status: Mapped[str] = mapped_column(String(20), server_default="received")
+    report: Mapped[dict[str, Any]]
+    upload: Mapped[Upload] = relationship(back_populates="files")

@@ -1,0 +1,1 @@
+"""Phase II, learn: buffer snapshots, policies, training and distillation."""

@@ -1,0 +1,1 @@
+"""Pages that join phases; the only room that may import all of them."""

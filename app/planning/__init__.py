@@ -1,0 +1,1 @@
+"""Phase IV, plan: visit plans, approval, the printed sheet."""

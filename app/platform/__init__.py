@@ -1,0 +1,1 @@
+"""Database, files, jobs, security, audit and charts: what every phase stands on."""

@@ -1,0 +1,129 @@
+"""The database: engine, session per request, base class of all tables, and who is acting (for the audit trail)."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from fastapi import Depends
+from sqlalchemy import DateTime, Engine, MetaData, create_engine, event, text
+from sqlalchemy.dialects.postgresql import JSONB
+from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
+
+from app.platform.embedded_postgres import EmbeddedPostgres
+from app.settings import Settings, get_settings
+
+NAMING = {
+    "ix": "ix_%(column_0_N_label)s",
+    "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+    "ck": "ck_%(table_name)s_%(constraint_name)s",
+    "fk": "fk_%(table_name)s_%(column_0_N_name)s_%(referred_table_name)s",
+    "pk": "pk_%(table_name)s",
+}
+
+
+class Base(DeclarativeBase):
+    """Base of every table; times are UTC with time zone, dictionaries are JSONB."""
+
+    metadata = MetaData(naming_convention=NAMING)
+    type_annotation_map = {datetime: DateTime(timezone=True), dict[str, Any]: JSONB, list[Any]: JSONB}
+
+
+def now() -> datetime:
+    """The present, UTC."""
+    return datetime.now(UTC)
+
+
+_lock = threading.Lock()
+_engines: dict[str, Engine] = {}
+_embedded: dict[str, EmbeddedPostgres] = {}
+
+
+def database_url(settings: Settings | None = None) -> str:
+    """The SQLAlchemy URL; starts the embedded PostgreSQL when the settings name none."""
+    settings = settings or get_settings()
+    if settings.database_url:
+        scheme, _, rest = settings.database_url.partition("://")
+        if scheme not in {"postgres", "postgresql", "postgresql+psycopg"}:
+            raise RuntimeError(f"BETALOOP_DATABASE_URL must start with postgresql://, not {scheme}://: betaloop runs on PostgreSQL alone")
+        return f"postgresql+psycopg://{rest}"
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    key = str(settings.data_dir.resolve())
+    with _lock:
+        if key not in _embedded:
+            server = EmbeddedPostgres(settings.data_dir / "postgres")
+            server.start()
+            _embedded[key] = server
+        return _embedded[key].url("betaloop")
+
+
+def get_engine() -> Engine:
+    """The engine of this process."""
+    url = database_url()
+    with _lock:
+        if url not in _engines:
+            _engines[url] = create_engine(url, pool_pre_ping=True, pool_size=10, max_overflow=20)
+        return _engines[url]
+
+
+def new_session() -> Session:
+    """A session outside a request (commands, workers); the caller commits and closes."""
+    return sessionmaker(get_engine(), expire_on_commit=False)()
+
+
+@contextmanager
+def transaction(actor: str = "system") -> Iterator[Session]:
+    """A session that commits at the end and rolls back on an error; `actor` stands in the audit trail."""
+    with new_session() as db:
+        set_actor(db, actor)
+        yield db
+        db.commit()
+
+
+def get_db() -> Iterator[Session]:
+    """The session of one request; the endpoint commits, an error rolls back."""
+    with new_session() as db:
+        yield db
+
+
+Db = Annotated[Session, Depends(get_db)]
+
+
+def set_actor(db: Session, label: str, user_id: int | None = None, request_id: str | None = None, reason: str | None = None) -> None:
+    """Say who writes from now on in this session; the audit triggers read it from the transaction."""
+    db.info["actor"] = {"label": label, "user_id": user_id, "request_id": request_id, "reason": reason}
+    if db.in_transaction():
+        _announce(db)
+
+
+def set_reason(db: Session, reason: str | None) -> None:
+    """Why the following changes of this session are made (kept in the audit trail)."""
+    actor = db.info.get("actor", {"label": "system"})
+    set_actor(db, actor["label"], actor.get("user_id"), actor.get("request_id"), reason)
+
+
+def _announce(db: Session) -> None:
+    actor = db.info.get("actor")
+    if not actor:
+        return
+    db.execute(
+        text(
+            "select set_config('betaloop.actor', :label, true), set_config('betaloop.user_id', :user_id, true),"
+            " set_config('betaloop.request_id', :request_id, true), set_config('betaloop.reason', :reason, true)"
+        ),
+        {
+            "label": actor["label"],
+            "user_id": str(actor.get("user_id") or ""),
+            "request_id": actor.get("request_id") or "",
+            "reason": actor.get("reason") or "",
+        },
+    )
+
+
+@event.listens_for(Session, "after_begin")
+def _after_begin(db: Session, _transaction: Any, _connection: Any) -> None:
+    if db.info.get("actor"):
+        _announce(db)

@@ -1,0 +1,1 @@
+"""Background jobs: durable workflows, compute steps in child processes, live progress, cancel."""

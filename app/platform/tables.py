@@ -1,0 +1,26 @@
+"""Names of the modules that define tables; the migration environment and the test database load them all through here.
+
+A list of names and not of imports: the platform lies below the phases and may not import them.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+TABLE_MODULES = (
+    "app.platform.audit",
+    "app.platform.files",
+    "app.platform.jobs.models",
+    "app.accounts.models",
+    "app.study.models",
+    "app.ingest.models",
+    "app.learning.models",
+    "app.evaluation.models",
+    "app.planning.models",
+)
+
+
+def load_tables() -> None:
+    """Import every module with tables, so that the metadata are complete and foreign keys resolve."""
+    for name in TABLE_MODULES:
+        import_module(name)

@@ -1,0 +1,1 @@
+"""The study itself: participants, settings, visits, sessions, recordings, traces and QoCs."""

@@ -1,0 +1,297 @@
+"""Tables of the study. A recording is not a session: recordings belong to a device and a clock, `SessionSegment` links the two."""
+
+from __future__ import annotations
+
+from datetime import date, datetime
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import CheckConstraint, ForeignKey, Index, LargeBinary, SmallInteger, String, Text, UniqueConstraint, func
+from sqlalchemy.orm import Mapped, mapped_column, relationship
+
+from app.platform.database import Base
+
+
+class Controller(StrEnum):
+    """What drove the stimulation of a session."""
+
+    CDBS = "cdbs"
+    RL = "rl"
+    DISTILLED = "distilled"
+    NO_DBS = "no_dbs"
+    RANDOM = "random"
+    OTHER = "other"
+
+
+class Hemisphere(StrEnum):
+    """Side of the brain."""
+
+    LEFT = "left"
+    RIGHT = "right"
+
+
+HEMISPHERE_CHECK = "hemisphere in ('left', 'right')"
+
+
+class Study(Base):
+    """A trial under one protocol."""
+
+    __tablename__ = "study"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    code: Mapped[str] = mapped_column(String(40), unique=True)
+    name: Mapped[str] = mapped_column(String(200))
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+
+
+class Site(Base):
+    """A clinic that takes part in a study."""
+
+    __tablename__ = "site"
+    __table_args__ = (UniqueConstraint("study_id", "code"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    study_id: Mapped[int] = mapped_column(ForeignKey("study.id"))
+    code: Mapped[str] = mapped_column(String(40))
+    name: Mapped[str] = mapped_column(String(200))
+    study: Mapped[Study] = relationship()
+
+
+class Participant(Base):
+    """A person in the study, known by code only."""
+
+    __tablename__ = "participant"
+    __table_args__ = (CheckConstraint("status in ('active', 'completed', 'withdrawn')", name="status"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    site_id: Mapped[int] = mapped_column(ForeignKey("site.id"), index=True)
+    code: Mapped[str] = mapped_column(String(40), unique=True)
+    status: Mapped[str] = mapped_column(String(20), server_default="active")
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    site: Mapped[Site] = relationship()
+    settings: Mapped[list[SettingsVersion]] = relationship(back_populates="participant", order_by="SettingsVersion.version")
+    visits: Mapped[list[Visit]] = relationship(back_populates="participant", order_by="Visit.number")
+
+    @property
+    def current_settings(self) -> SettingsVersion:
+        """The newest settings version; a participant always has one."""
+        return self.settings[-1]
+
+
+class SettingsVersion(Base):
+    """MDP and signal settings of a participant. Never changed, only followed by a newer version."""
+
+    __tablename__ = "settings_version"
+    __table_args__ = (
+        UniqueConstraint("participant_id", "version"),
+        CheckConstraint("c1 >= 0 and c2 >= 0 and c3 >= 0 and c4 >= 0", name="weights"),
+        CheckConstraint('"window" >= 1 and period_s > 0', name="window"),
+        CheckConstraint("gamma >= 0 and gamma < 1", name="gamma"),
+        CheckConstraint("lower_bound >= 0 and lower_bound < 1", name="lower_bound"),
+        CheckConstraint("r_a >= r_b", name="rewards"),
+        CheckConstraint("cdbs_amplitude_ma > 0", name="cdbs_amplitude"),
+        CheckConstraint("beta_low_hz > 0 and beta_low_hz < beta_high_hz", name="beta_band"),
+        CheckConstraint("min_valid_fraction > 0 and min_valid_fraction <= 1", name="min_valid"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    version: Mapped[int]
+    xi_beta: Mapped[float | None]
+    beta_unit: Mapped[str | None] = mapped_column(String(40))
+    beta_source: Mapped[str | None] = mapped_column(String(40))
+    window: Mapped[int]
+    period_s: Mapped[float]
+    r_a: Mapped[float]
+    r_b: Mapped[float]
+    c1: Mapped[float]
+    c2: Mapped[float]
+    c3: Mapped[float]
+    c4: Mapped[float]
+    gamma: Mapped[float]
+    lower_bound: Mapped[float]
+    tremor_as_fraction: Mapped[bool]
+    cdbs_amplitude_ma: Mapped[float | None]
+    beta_low_hz: Mapped[float]
+    beta_high_hz: Mapped[float]
+    min_valid_fraction: Mapped[float]
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+    reason: Mapped[str | None] = mapped_column(Text)
+    participant: Mapped[Participant] = relationship(back_populates="settings")
+
+
+class CdbsAmplitude(Base):
+    """The clinician's cDBS amplitude in force at a visit, per hemisphere and program; fractions are derived from it."""
+
+    __tablename__ = "cdbs_amplitude"
+    __table_args__ = (
+        UniqueConstraint("visit_id", "hemisphere", "program"),
+        CheckConstraint("amplitude_ma > 0", name="amplitude"),
+        CheckConstraint("program between 0 and 3", name="program"),
+        CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    visit_id: Mapped[int] = mapped_column(ForeignKey("visit.id"), index=True)
+    hemisphere: Mapped[Hemisphere] = mapped_column(String(5))
+    program: Mapped[int] = mapped_column(SmallInteger)
+    amplitude_ma: Mapped[float]
+
+
+class Device(Base):
+    """An implant or another source of recordings, under a keyed pseudonym."""
+
+    __tablename__ = "device"
+    __table_args__ = (UniqueConstraint("participant_id", "pseudonym"), CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"))
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    pseudonym: Mapped[str] = mapped_column(String(64))
+    kind: Mapped[str] = mapped_column(String(40))
+    hemisphere: Mapped[Hemisphere | None] = mapped_column(String(5))
+
+
+class Visit(Base):
+    """A day in the clinic."""
+
+    __tablename__ = "visit"
+    __table_args__ = (UniqueConstraint("participant_id", "number"), CheckConstraint("number >= 1", name="number"))
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    number: Mapped[int]
+    date: Mapped[date | None]
+    note: Mapped[str] = mapped_column(Text, server_default="")
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    participant: Mapped[Participant] = relationship(back_populates="visits")
+    sessions: Mapped[list[StudySession]] = relationship(back_populates="visit", order_by="StudySession.ordinal")
+    cdbs_amplitudes: Mapped[list[CdbsAmplitude]] = relationship()
+
+
+class StudySession(Base):
+    """One controller at work for 5-20 minutes. Which one it was is asked of `app.study.blinding.arm` alone, hence the underscores."""
+
+    __tablename__ = "session"
+    __table_args__ = (
+        UniqueConstraint("visit_id", "ordinal"),
+        CheckConstraint("controller in ('cdbs', 'rl', 'distilled', 'no_dbs', 'random', 'other')", name="controller"),
+        CheckConstraint("status in ('proposed', 'confirmed')", name="status"),
+        CheckConstraint("duration_s >= 0", name="duration"),
+        CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"),
+        CheckConstraint("excluded_reason is null or excluded_reason <> ''", name="excluded_reason"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    visit_id: Mapped[int] = mapped_column(ForeignKey("visit.id"), index=True)
+    ordinal: Mapped[int]
+    _controller: Mapped[Controller] = mapped_column("controller", String(20))
+    _policy_id: Mapped[int | None] = mapped_column("policy_id", ForeignKey("policy.id"), index=True)
+    hemisphere: Mapped[Hemisphere | None] = mapped_column(String(5))
+    status: Mapped[str] = mapped_column(String(20), server_default="confirmed")
+    started_at: Mapped[datetime | None]
+    duration_s: Mapped[float]
+    control_stream: Mapped[str] = mapped_column(String(40), server_default="beta")
+    control_channel: Mapped[str | None] = mapped_column(String(80))
+    excluded_reason: Mapped[str | None] = mapped_column(Text)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    visit: Mapped[Visit] = relationship(back_populates="sessions")
+    segments: Mapped[list[SessionSegment]] = relationship(back_populates="session", order_by="SessionSegment.start_s")
+    qocs: Mapped[list[QocRevision]] = relationship(back_populates="session", order_by="QocRevision.revision")
+
+    @property
+    def qoc(self) -> QocRevision | None:
+        """The newest revision of the session's QoCs."""
+        return self.qocs[-1] if self.qocs else None
+
+
+class Recording(Base):
+    """A stretch of data of one device under one clock; may span a whole visit and hold several sessions."""
+
+    __tablename__ = "recording"
+    __table_args__ = (
+        UniqueConstraint("participant_id", "fingerprint"),
+        CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"),
+        CheckConstraint("clock in ('device', 'pc', 'table')", name="clock"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    device_id: Mapped[int] = mapped_column(ForeignKey("device.id"), index=True)
+    upload_file_id: Mapped[int | None] = mapped_column(ForeignKey("upload_file.id"), index=True)
+    fingerprint: Mapped[str] = mapped_column(String(64))
+    hemisphere: Mapped[Hemisphere | None] = mapped_column(String(5))
+    clock: Mapped[str] = mapped_column(String(10))
+    started_at: Mapped[datetime | None]
+    duration_s: Mapped[float]
+    details: Mapped[dict[str, Any]]
+    device: Mapped[Device] = relationship()
+    traces: Mapped[list[Trace]] = relationship(back_populates="recording", order_by="Trace.stream")
+
+
+class SessionSegment(Base):
+    """The part of a recording that belongs to a session, in seconds of the recording's clock."""
+
+    __tablename__ = "session_segment"
+    __table_args__ = (CheckConstraint("stop_s > start_s", name="order"), Index("ix_session_segment_recording", "recording_id"))
+
+    session_id: Mapped[int] = mapped_column(ForeignKey("session.id", ondelete="CASCADE"), primary_key=True)
+    recording_id: Mapped[int] = mapped_column(ForeignKey("recording.id"), primary_key=True)
+    start_s: Mapped[float] = mapped_column(primary_key=True)
+    stop_s: Mapped[float]
+    is_control: Mapped[bool] = mapped_column(server_default="true")
+    session: Mapped[StudySession] = relationship(back_populates="segments")
+    recording: Mapped[Recording] = relationship()
+
+
+class Trace(Base):
+    """A 2 s trace of a recording: beta amplitude, amplitude in mA, band power. Row i ends at `first_end_s + i dt_s`.
+
+    `values_f32` is little-endian float32, `valid_bits` numpy.packbits of the valid mask; both have `n` entries.
+    """
+
+    __tablename__ = "trace"
+    __table_args__ = (
+        UniqueConstraint("recording_id", "decode_version", "stream", "channel"),
+        CheckConstraint("n >= 0 and dt_s > 0 and octet_length(values_f32) = 4 * n", name="length"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    recording_id: Mapped[int] = mapped_column(ForeignKey("recording.id", ondelete="CASCADE"))
+    decode_version: Mapped[int]
+    stream: Mapped[str] = mapped_column(String(40))
+    channel: Mapped[str] = mapped_column(String(80), server_default="")
+    unit: Mapped[str] = mapped_column(String(40))
+    source: Mapped[str] = mapped_column(String(40))
+    dt_s: Mapped[float]
+    first_end_s: Mapped[float]
+    n: Mapped[int]
+    values_f32: Mapped[bytes] = mapped_column(LargeBinary)
+    valid_bits: Mapped[bytes] = mapped_column(LargeBinary)
+    details: Mapped[dict[str, Any]] = mapped_column(server_default="{}")
+    recording: Mapped[Recording] = relationship(back_populates="traces")
+
+
+class QocRevision(Base):
+    """End-of-session QoCs of a session; a correction is a new revision."""
+
+    __tablename__ = "qoc"
+    __table_args__ = (
+        UniqueConstraint("session_id", "revision"),
+        CheckConstraint("rating between 1 and 10", name="rating"),
+        CheckConstraint("tremor_percent between 0 and 100", name="tremor"),
+        CheckConstraint("grasp_hz >= 0 and grasp_hz < 20", name="grasp"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    session_id: Mapped[int] = mapped_column(ForeignKey("session.id", ondelete="CASCADE"), index=True)
+    revision: Mapped[int]
+    grasp_hz: Mapped[float | None]
+    rating: Mapped[int | None] = mapped_column(SmallInteger)
+    tremor_percent: Mapped[float | None]
+    entered_by: Mapped[str] = mapped_column(String(254))
+    reason: Mapped[str | None] = mapped_column(Text)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    session: Mapped[StudySession] = relationship(back_populates="qocs")
+
+

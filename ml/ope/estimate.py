@@ -1,0 +1,91 @@
+"""What every off-policy estimator takes and gives. Source of the quantity: Gao et al. 2023, eq:ope_total_return."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from ml.progress import Report, silent
+from ml.rl.policy import Policy
+from ml.trajectories import ReplayBuffer
+
+LEVEL = 0.90
+"""Coverage of the intervals that estimators report."""
+
+OUTCOMES = ("r_end", "grasp_hz", "rating", "tremor_percent")
+"""End-of-session outcomes, in the order of every array that holds them."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One method's estimate of one policy's expected return E[r_end + sum over t < H of gamma^t r_t], not normalised.
+
+    Attributes:
+        method: `dlsm`, `linear`, `pdis`, `wis`, ...
+        value: the estimate; finite.
+        low, high: interval of `level`.
+        level: coverage aimed at.
+        standard_error: of `value`.
+        step_return: the part of `value` from the steps.
+        end_reward: the part from r_end; None where no session of the buffer has an r_end (then `value` lacks it and a flag says so).
+        predicted: what the method predicts besides: `energy` (mean a^2), `mean_amplitude`, `mean_beta` (participant's unit), `grasp_hz`,
+            `rating`, `tremor_percent`; a key is absent where the method cannot say.
+        supported: False when the data cannot speak about this policy.
+        flags: the reasons and warnings, in words.
+        n: sessions or roll-outs behind the value.
+        details: everything else, JSON-able; `draws` (aligned over the policies of one method) feeds the probability of being best.
+    """
+
+    method: str
+    value: float
+    low: float
+    high: float
+    level: float
+    standard_error: float
+    step_return: float
+    end_reward: float | None
+    predicted: dict[str, float]
+    supported: bool
+    flags: tuple[str, ...]
+    n: int
+    details: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("value", "low", "high", "standard_error", "step_return"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{self.method}: {name} of an estimate must be finite, not {getattr(self, name)}")
+
+    def to_json(self) -> dict[str, Any]:
+        """Every field, JSON-able."""
+        return asdict(self) | {"flags": list(self.flags)}
+
+
+class Fitted(Protocol):
+    """An estimator that has seen the data."""
+
+    def evaluate(
+        self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent
+    ) -> dict[str, Estimate]:
+        """Estimate of every policy, by its name; the horizon H defaults to the buffer's median session length."""
+
+
+class Estimator(Protocol):
+    """A method of off-policy evaluation."""
+
+    @property
+    def method(self) -> str:
+        """Key of the method, such as `dlsm`."""
+
+    def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> Fitted:
+        """Learn from the buffer; with a `checkpoint_dir` an interrupted fit goes on where it stopped."""
+
+
+def checked_horizon(buffer: ReplayBuffer, horizon_steps: int | None) -> int:
+    """H, defaulting to the median session length. Raises ValueError when it is not a positive number of steps."""
+    horizon = buffer.median_steps() if horizon_steps is None else horizon_steps
+    if horizon < 1:
+        raise ValueError(f"the horizon must be at least 1 step, not {horizon}")
+    return horizon

@@ -1,0 +1,16 @@
+"""How long computations say where they are; every fit, training and roll-out takes a `Report`."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class Report(Protocol):
+    """Called now and then with the finished share and a few named numbers (losses, estimates)."""
+
+    def __call__(self, fraction: float, message: str = "", **numbers: float) -> None:
+        """`fraction` in [0, 1]; `message` a short phrase for a person; `numbers` become points of learning curves."""
+
+
+def silent(fraction: float, message: str = "", **numbers: float) -> None:
+    """A report that goes nowhere."""

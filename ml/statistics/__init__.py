@@ -1,0 +1,1 @@
+"""Statistics of sessions: rank-sum tests between controllers and bootstraps that keep sessions whole."""

@@ -1,0 +1,120 @@
+"""Bootstraps whose unit is the session, so that steps of one session never count as independent.
+
+Source: Efron and Tibshirani, An Introduction to the Bootstrap, chapters 13 (percentile) and 14 (BCa).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A two-sided interval and what it was made from.
+
+    Attributes:
+        low, high: ends, in the unit of the statistic.
+        level: coverage aimed at, such as 0.90.
+        standard_error: standard deviation of the bootstrap draws.
+        method: `percentile` or `bca`.
+    """
+
+    low: float
+    high: float
+    level: float
+    standard_error: float
+    method: str
+
+
+def resamples(n: int, draws: int, seed: int) -> Indices:
+    """Session indices drawn with replacement, shape [draws, n]; the same seed gives the same resamples for every policy.
+
+    Raises:
+        ValueError: no session or no draw.
+    """
+    if n < 1 or draws < 1:
+        raise ValueError(f"a bootstrap needs at least one session and one draw, not {n} and {draws}")
+    return np.random.default_rng(seed).integers(0, n, size=(draws, n))
+
+
+def session_bootstrap(
+    statistic: Callable[[Indices], float],
+    n: int,
+    *,
+    level: float = 0.90,
+    draws: int = 1000,
+    seed: int = 0,
+    method: Literal["percentile", "bca"] = "percentile",
+) -> Interval:
+    """Interval of a statistic of n sessions.
+
+    Args:
+        statistic: value for a list of session indices, shape [n] (or [n - 1] in the jackknife of BCa), repeats allowed.
+        n: number of sessions.
+        level: coverage, between 0 and 1.
+        draws: number of resamples.
+        seed: seed of the resamples.
+        method: `percentile`, or `bca` (bias-corrected and accelerated; needs at least 3 sessions).
+
+    Raises:
+        ValueError: a level outside (0, 1), or fewer than 3 sessions for BCa.
+    """
+    values = np.array([statistic(index) for index in resamples(n, draws, seed)])
+    if method == "percentile":
+        return percentile_interval(values, level)
+    if n < 3:
+        raise ValueError(f"a BCa interval needs at least 3 sessions, not {n}")
+    everything = np.arange(n)
+    jackknife = np.array([statistic(np.delete(everything, i)) for i in range(n)])
+    return bca_interval(values, statistic(everything), jackknife, level)
+
+
+def percentile_interval(values: NDArray[Any], level: float) -> Interval:
+    """Percentile interval of bootstrap draws, shape [draws]."""
+    _check_level(level)
+    tail = (1 - level) / 2
+    low, high = np.quantile(values, [tail, 1 - tail])
+    return Interval(float(low), float(high), level, _spread(values), "percentile")
+
+
+def bca_interval(values: NDArray[Any], estimate: float, jackknife: NDArray[Any], level: float) -> Interval:
+    """Bias-corrected and accelerated interval (Efron and Tibshirani, eq. 14.9-14.15).
+
+    Args:
+        values: bootstrap draws, shape [draws].
+        estimate: the statistic of the sessions as they are.
+        jackknife: the statistic with one session left out, shape [n].
+        level: coverage, between 0 and 1.
+    """
+    _check_level(level)
+    # Half of the ties count, so that a discrete statistic is not taken for a biased one.
+    share = (np.sum(values < estimate) + 0.5 * np.sum(values == estimate)) / values.size
+    share = float(np.clip(share, 0.5 / values.size, 1 - 0.5 / values.size))
+    bias = float(norm.ppf(share))
+    centred = jackknife.mean() - jackknife
+    spread = float(np.sum(centred**2) ** 1.5)
+    acceleration = float(np.sum(centred**3) / (6 * spread)) if spread > 0 else 0.0
+    ends = []
+    for tail in ((1 - level) / 2, (1 + level) / 2):
+        z = bias + float(norm.ppf(tail))
+        ends.append(float(norm.cdf(bias + z / (1 - acceleration * z))))
+    low, high = np.quantile(values, ends)
+    return Interval(float(low), float(high), level, _spread(values), "bca")
+
+
+def _spread(values: NDArray[Any]) -> float:
+    return float(np.std(values, ddof=1)) if values.size > 1 else 0.0
+
+
+def _check_level(level: float) -> None:
+    if not 0 < level < 1:
+        raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")

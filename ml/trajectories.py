@@ -1,0 +1,246 @@
+"""Sessions as trajectories of the MDP, and the replay buffer made of them.
+
+Alignment, everywhere in betaloop: step k = 0, 1, ... is the row t_s = period (k + 1). It holds a_k, the amplitude in force over
+(period k, period (k + 1)], and the beta amplitude of that same window. The state s_k is the W beta amplitudes *before* that row,
+oldest first; r_k uses the row itself. Source: Gao et al. 2023, section 4.1.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from ml.mdp import AMPLITUDE_TOLERANCE, MdpSettings, end_reward, step_reward
+from ml.qoc import Qoc
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class SessionTrajectory:
+    """One session: W beta amplitudes before it, then T steps.
+
+    Attributes:
+        session_id: the session's number in the study store.
+        visit: number of the visit.
+        controller: `cdbs`, `rl`, `distilled`, `no_dbs`, `random` or `other`.
+        policy_id: the policy that ran, where one did.
+        lead_beta: beta amplitudes before step 0, shape [W], oldest first; NaN where none is valid.
+        beta: beta amplitude of each step's row, shape [T]; NaN where invalid.
+        amplitude: amplitude fraction a_k, shape [T]; NaN where unknown. May exceed 1: such a step is not usable.
+        qoc: end-of-session QoCs.
+        random_lower_bound: B in force for a random session, so that its density 1 / (1 - B) on [B, 1] is known; else None.
+
+    Raises:
+        ValueError: arrays of unequal length, or a session without a step.
+    """
+
+    session_id: int
+    visit: int
+    controller: str
+    lead_beta: Floats
+    beta: Floats
+    amplitude: Floats
+    qoc: Qoc = field(default_factory=Qoc)
+    policy_id: int | None = None
+    random_lower_bound: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.beta.shape != self.amplitude.shape or self.beta.ndim != 1:
+            raise ValueError(f"session {self.session_id}: {self.beta.shape} beta rows against {self.amplitude.shape} amplitudes")
+        if self.beta.size == 0:
+            raise ValueError(f"session {self.session_id} has no step")
+
+    @property
+    def steps(self) -> int:
+        """T, number of steps."""
+        return int(self.beta.size)
+
+    @property
+    def padded_beta(self) -> Floats:
+        """Lead and session in one array, shape [W + T]; s_k is `padded_beta[k : k + W]`."""
+        return np.concatenate([self.lead_beta, self.beta])
+
+    def states(self) -> Floats:
+        """s_0 ... s_T, shape [T + 1, W], oldest beta first; NaN where a window holds an invalid beta."""
+        return sliding_window_view(self.padded_beta, self.lead_beta.size)
+
+    def usable(self) -> Mask:
+        """Steps that may enter a buffer, shape [T]: state, next beta and amplitude are known and 0 <= a <= 1."""
+        windows_ok = ~np.isnan(sliding_window_view(self.padded_beta, self.lead_beta.size + 1)).any(axis=1)
+        amplitude_ok = (self.amplitude >= -AMPLITUDE_TOLERANCE) & (self.amplitude <= 1 + AMPLITUDE_TOLERANCE)
+        return windows_ok & amplitude_ok
+
+    def rewards(self, settings: MdpSettings) -> Floats:
+        """r_k, shape [T]; NaN where beta or amplitude is unknown."""
+        return step_reward(settings, self.beta, self.amplitude)
+
+    def end_reward(self, settings: MdpSettings) -> float | None:
+        """r_end, or None where a QoC it needs is missing."""
+        return end_reward(settings, self.qoc)
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """Usable steps of a buffer in one table; row order is session, then step.
+
+    Attributes:
+        states: s_k, [N, W]. actions: a_k, [N], within [0, 1]. rewards: r_k, [N]. next_states: s_{k+1}, [N, W].
+        session: index into `ReplayBuffer.sessions`, [N]. step: k, [N].
+    """
+
+    states: Floats
+    actions: Floats
+    rewards: Floats
+    next_states: Floats
+    session: NDArray[np.int64]
+    step: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ReplayBuffer:
+    """All sessions of one participant that a learner or an estimator may see, in one unit of beta from one source.
+
+    Attributes:
+        settings: MDP constants.
+        sessions: trajectories, ordered by visit and session id.
+        beta_unit: unit of every beta amplitude in it (`mV`, `uV`, `device units`, ...).
+        beta_source: where beta comes from (`time_domain`, `device_power`, `percept_lfp`, `table`).
+    """
+
+    settings: MdpSettings
+    sessions: tuple[SessionTrajectory, ...]
+    beta_unit: str
+    beta_source: str
+
+    def __post_init__(self) -> None:
+        if not self.sessions:
+            raise ValueError("a replay buffer needs at least one session")
+        for session in self.sessions:
+            if session.lead_beta.size != self.settings.window:
+                raise ValueError(
+                    f"session {session.session_id} has {session.lead_beta.size} beta amplitudes before its first step; "
+                    f"the window is {self.settings.window}"
+                )
+
+    def transitions(self) -> Transitions:
+        """All usable steps. Raises ValueError when there is none."""
+        states, actions, rewards, next_states, index, step = [], [], [], [], [], []
+        for i, session in enumerate(self.sessions):
+            k = np.flatnonzero(session.usable())
+            windows = session.states()
+            states.append(windows[k])
+            next_states.append(windows[k + 1])
+            actions.append(np.clip(session.amplitude[k], 0.0, 1.0))
+            rewards.append(session.rewards(self.settings)[k])
+            index.append(np.full(k.size, i))
+            step.append(k)
+        if sum(part.size for part in step) == 0:
+            raise ValueError("no usable step in the buffer: every step lacks a valid beta window or an amplitude within 0-1")
+        return Transitions(
+            np.concatenate(states),
+            np.concatenate(actions),
+            np.concatenate(rewards),
+            np.concatenate(next_states),
+            np.concatenate(index),
+            np.concatenate(step),
+        )
+
+    def beta_scale(self) -> tuple[float, float]:
+        """Mean and standard deviation of all valid beta amplitudes, for normalising network inputs."""
+        values = np.concatenate([s.padded_beta for s in self.sessions])
+        values = values[~np.isnan(values)]
+        std = float(values.std())
+        return float(values.mean()), std if std > 0 else 1.0
+
+    def median_steps(self) -> int:
+        """Median session length in steps: the default horizon H of returns."""
+        return int(np.median([s.steps for s in self.sessions]))
+
+
+_SCHEMA_VERSION = 1
+
+
+def to_parquet(buffer: ReplayBuffer) -> bytes:
+    """The buffer as Parquet bytes: one row per beta amplitude (step < 0: the window before the session), constants in the metadata.
+
+    The bytes depend on the buffer alone (and the pyarrow version), so that their SHA-256 names it.
+    """
+    columns: dict[str, list[NDArray[Any]]] = {"session_id": [], "step": [], "beta": [], "amplitude": []}
+    for s in buffer.sessions:
+        lead = s.lead_beta.size
+        columns["session_id"].append(np.full(lead + s.steps, s.session_id, dtype=np.int64))
+        columns["step"].append(np.arange(-lead, s.steps, dtype=np.int32))
+        columns["beta"].append(s.padded_beta)
+        columns["amplitude"].append(np.concatenate([np.full(lead, np.nan), s.amplitude]))
+    meta = {
+        "schema_version": _SCHEMA_VERSION,
+        "settings": buffer.settings.to_json(),
+        "beta_unit": buffer.beta_unit,
+        "beta_source": buffer.beta_source,
+        "sessions": [_session_meta(s) for s in buffer.sessions],
+    }
+    table = pa.table({name: np.concatenate(parts) for name, parts in columns.items()})
+    table = table.replace_schema_metadata({"betaloop": json.dumps(meta, sort_keys=True)})
+    sink = io.BytesIO()
+    pq.write_table(table, sink, compression="zstd")
+    return sink.getvalue()
+
+
+def from_parquet(content: bytes) -> ReplayBuffer:
+    """The inverse of `to_parquet`. Raises ValueError when the bytes are not such a buffer."""
+    table = pq.read_table(io.BytesIO(content))
+    raw = (table.schema.metadata or {}).get(b"betaloop")
+    if raw is None:
+        raise ValueError("this Parquet file is not a betaloop buffer snapshot: its metadata lack the key 'betaloop'")
+    meta = json.loads(raw)
+    if meta["schema_version"] != _SCHEMA_VERSION:
+        raise ValueError(f"buffer snapshot of schema version {meta['schema_version']}; this betaloop reads {_SCHEMA_VERSION}")
+    ids = table["session_id"].to_numpy()
+    step = table["step"].to_numpy()
+    beta = table["beta"].to_numpy()
+    amplitude = table["amplitude"].to_numpy()
+    sessions = []
+    for m in meta["sessions"]:
+        own = ids == m["session_id"]
+        lead, body = own & (step < 0), own & (step >= 0)
+        sessions.append(
+            SessionTrajectory(
+                session_id=m["session_id"],
+                visit=m["visit"],
+                controller=m["controller"],
+                policy_id=m["policy_id"],
+                lead_beta=beta[lead],
+                beta=beta[body],
+                amplitude=amplitude[body],
+                qoc=Qoc(**m["qoc"]),
+                random_lower_bound=m["random_lower_bound"],
+            )
+        )
+    return ReplayBuffer(MdpSettings(**meta["settings"]), tuple(sessions), meta["beta_unit"], meta["beta_source"])
+
+
+def content_hash(content: bytes) -> str:
+    """SHA-256 of stored bytes, in hex."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
+    return {
+        "session_id": s.session_id,
+        "visit": s.visit,
+        "controller": s.controller,
+        "policy_id": s.policy_id,
+        "random_lower_bound": s.random_lower_bound,
+        "qoc": {"grasp_hz": s.qoc.grasp_hz, "rating": s.qoc.rating, "tremor_percent": s.qoc.tremor_percent},
+    }
