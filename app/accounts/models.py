@@ -1,4 +1,4 @@
-"""Tables of people and access."""
+"""Tables of people and access: studies and their sites are the scopes in which a member has a role."""
 
 from __future__ import annotations
 
@@ -18,6 +18,30 @@ class Role(StrEnum):
     CLINICIAN = "clinician"
     ENGINEER = "engineer"
     ADMIN = "admin"
+
+
+class Study(Base):
+    """A trial under one protocol."""
+
+    __tablename__ = "study"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    code: Mapped[str] = mapped_column(String(40), unique=True)
+    name: Mapped[str] = mapped_column(String(200))
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+
+
+class Site(Base):
+    """A clinic that takes part in a study."""
+
+    __tablename__ = "site"
+    __table_args__ = (UniqueConstraint("study_id", "code"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    study_id: Mapped[int] = mapped_column(ForeignKey("study.id"))
+    code: Mapped[str] = mapped_column(String(40))
+    name: Mapped[str] = mapped_column(String(200))
+    study: Mapped[Study] = relationship()
 
 
 class User(Base):

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from fastapi import Depends
-from sqlalchemy import DateTime, Engine, MetaData, create_engine, event, text
+from sqlalchemy import Connection, DateTime, Engine, MetaData, create_engine, event, text
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 
@@ -96,7 +96,7 @@ def set_actor(db: Session, label: str, user_id: int | None = None, request_id: s
     """Say who writes from now on in this session; the audit triggers read it from the transaction."""
     db.info["actor"] = {"label": label, "user_id": user_id, "request_id": request_id, "reason": reason}
     if db.in_transaction():
-        _announce(db)
+        _announce(db, db.connection())
 
 
 def set_reason(db: Session, reason: str | None) -> None:
@@ -105,11 +105,9 @@ def set_reason(db: Session, reason: str | None) -> None:
     set_actor(db, actor["label"], actor.get("user_id"), actor.get("request_id"), reason)
 
 
-def _announce(db: Session) -> None:
-    actor = db.info.get("actor")
-    if not actor:
-        return
-    db.execute(
+def _announce(db: Session, connection: Connection) -> None:
+    actor = db.info["actor"]
+    connection.execute(
         text(
             "select set_config('betaloop.actor', :label, true), set_config('betaloop.user_id', :user_id, true),"
             " set_config('betaloop.request_id', :request_id, true), set_config('betaloop.reason', :reason, true)"
@@ -124,6 +122,6 @@ def _announce(db: Session) -> None:
 
 
 @event.listens_for(Session, "after_begin")
-def _after_begin(db: Session, _transaction: Any, _connection: Any) -> None:
+def _after_begin(db: Session, _transaction: Any, connection: Connection) -> None:
     if db.info.get("actor"):
-        _announce(db)
+        _announce(db, connection)

@@ -9,6 +9,7 @@ from typing import Any
 from sqlalchemy import CheckConstraint, ForeignKey, Index, LargeBinary, SmallInteger, String, Text, UniqueConstraint, func
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
+from app.accounts.models import Site
 from app.platform.database import Base
 
 
@@ -31,30 +32,6 @@ class Hemisphere(StrEnum):
 
 
 HEMISPHERE_CHECK = "hemisphere in ('left', 'right')"
-
-
-class Study(Base):
-    """A trial under one protocol."""
-
-    __tablename__ = "study"
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    code: Mapped[str] = mapped_column(String(40), unique=True)
-    name: Mapped[str] = mapped_column(String(200))
-    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
-
-
-class Site(Base):
-    """A clinic that takes part in a study."""
-
-    __tablename__ = "site"
-    __table_args__ = (UniqueConstraint("study_id", "code"),)
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    study_id: Mapped[int] = mapped_column(ForeignKey("study.id"))
-    code: Mapped[str] = mapped_column(String(40))
-    name: Mapped[str] = mapped_column(String(200))
-    study: Mapped[Study] = relationship()
 
 
 class Participant(Base):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,7 @@ class MlpPolicy(nn.Module):
         self.window = window
         self.hidden = tuple(hidden)
         sizes = [window, *hidden, 1]
-        self.layers = nn.ModuleList(nn.Linear(i, o) for i, o in zip(sizes, sizes[1:], strict=False))
+        self.layers = nn.ModuleList(nn.Linear(i, o) for i, o in pairwise(sizes))
         self.register_buffer("mean", torch.tensor([mean], dtype=torch.float32))
         self.register_buffer("std", torch.tensor([std], dtype=torch.float32))
         initialise(self.layers, torch.Generator().manual_seed(seed))
@@ -185,7 +186,7 @@ class Critic(nn.Module):
         if len(hidden) < 2:
             raise ValueError(f"the critic needs two hidden layers or more (the action joins at the second), not {tuple(hidden)}")
         sizes = [window, *hidden, 1]
-        self.layers = nn.ModuleList(nn.Linear(i + (k == 1), o) for k, (i, o) in enumerate(zip(sizes, sizes[1:], strict=False)))
+        self.layers = nn.ModuleList(nn.Linear(i + (k == 1), o) for k, (i, o) in enumerate(pairwise(sizes)))
         initialise(self.layers, torch.Generator().manual_seed(seed))
 
     def forward(self, scores: Any, actions: Any) -> Any:

@@ -60,7 +60,8 @@ class OnnxPolicy:
 
         Raises:
             ValueError: states of another shape.
-            PolicyOutputError: an output that is not finite or lies outside [0, 1] by more than `RANGE_TOLERANCE`; less is rounding and is clipped.
+            PolicyOutputError: an output that is not finite or lies outside [0, 1] by more than `RANGE_TOLERANCE`; less is rounding and
+                is clipped.
         """
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != self.window:
@@ -87,7 +88,9 @@ class OnnxPolicy:
     def _run_block(self, rows: NDArray[Any]) -> NDArray[np.float64]:
         (output,) = self._session.run(None, {self._input: rows})
         if output.shape != (len(rows), 1):
-            raise PolicyOutputError(f"the policy answered with shape {list(output.shape)} for {len(rows)} windows; it must be [{len(rows)}, 1]")
+            raise PolicyOutputError(
+                f"the policy answered with shape {list(output.shape)} for {len(rows)} windows; it must be [{len(rows)}, 1]"
+            )
         return np.asarray(output[:, 0], dtype=np.float64)
 
     def _check_answers(self, probe: NDArray[Any] | None) -> None:
@@ -107,7 +110,8 @@ class OnnxPolicy:
             raise PolicyFileError("the policy answers differently to the same beta window: it must be deterministic")
         if abs(float(alone[0] - first[0])) > RANGE_TOLERANCE:
             raise PolicyFileError(
-                "the policy's answer to a beta window depends on the other windows of the batch; export it in evaluation mode (batch normalisation)"
+                "the policy's answer to a beta window depends on the other windows of the batch; "
+                "export it in evaluation mode (batch normalisation)"
             )
 
 
@@ -165,7 +169,8 @@ def _read_interface(graph: Any, window: int | None) -> tuple[str, type[Any], int
     inputs = [value for value in graph.input if value.name not in weights]
     if len(inputs) != 1 or len(graph.output) != 1:
         raise PolicyFileError(
-            f"a policy has one input (beta windows) and one output (amplitude fractions); this file has {len(inputs)} and {len(graph.output)}"
+            "a policy has one input (beta windows) and one output (amplitude fractions); "
+            f"this file has {len(inputs)} and {len(graph.output)}"
         )
     dtypes = []
     for role, value in (("input", inputs[0]), ("output", graph.output[0])):
@@ -184,7 +189,9 @@ def _read_interface(graph: Any, window: int | None) -> tuple[str, type[Any], int
     if graph.output[0].type.tensor_type.HasField("shape"):
         _, columns = _dimensions("output", graph.output[0], "[N, 1]")
         if columns not in (None, 1):
-            raise PolicyFileError(f"the output '{graph.output[0].name}' has {columns} columns; a policy answers with one fraction per window, [N, 1]")
+            raise PolicyFileError(
+                f"the output '{graph.output[0].name}' has {columns} columns; a policy answers with one fraction per window, [N, 1]"
+            )
     return inputs[0].name, dtypes[0], batch, width
 
 

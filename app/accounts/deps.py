@@ -1,0 +1,38 @@
+"""FastAPI dependencies: who calls. API routes take a bearer token or the browser's cookie; pages take the cookie."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Depends, Request
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from app.accounts import service
+from app.accounts.policy import Caller
+from app.platform.database import Db, set_actor
+from app.platform.errors import Unauthorized
+
+COOKIE = "betaloop_session"
+
+_bearer = HTTPBearer(auto_error=False, description="API token from `betaloop token create`.")
+
+
+def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> Caller:
+    """The caller of a request; its name goes into the audit trail of everything the request writes.
+
+    Raises:
+        Unauthorized: neither a live token nor a live browser session.
+    """
+    caller = None
+    if bearer is not None:
+        caller = service.caller_of_token(db, bearer.credentials)
+    elif cookie := request.cookies.get(COOKIE):
+        caller = service.caller_of_cookie(db, cookie)
+    if caller is None:
+        raise Unauthorized("This needs a bearer token or a browser session.", "Make a token with `betaloop token create EMAIL --name NAME`, or sign in.")
+    set_actor(db, caller.label, caller.user_id, getattr(request.state, "request_id", None))
+    request.state.caller = caller
+    return caller
+
+
+CurrentCaller = Annotated[Caller, Depends(get_caller)]

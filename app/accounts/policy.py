@@ -1,0 +1,81 @@
+"""Who may do what: one table of permissions, one function that asks it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from app.accounts.models import Role
+from app.platform.errors import Forbidden, NotFound
+
+READ = "read"
+WRITE_STUDY = "study:write"  # participants, visits, sessions, QoCs
+WRITE_SETTINGS = "settings:write"
+UPLOAD = "upload"
+RUN_JOBS = "jobs:run"
+WRITE_POLICIES = "policies:write"
+DRAFT_PLAN = "plan:draft"
+APPROVE_PLAN = "plan:approve"
+READ_AUDIT = "audit:read"
+MANAGE_ACCOUNTS = "accounts:write"
+
+_VIEWER = frozenset({READ})
+_CLINICIAN = _VIEWER | {WRITE_STUDY, WRITE_SETTINGS, UPLOAD, RUN_JOBS, DRAFT_PLAN, APPROVE_PLAN, READ_AUDIT}
+_ENGINEER = _VIEWER | {WRITE_STUDY, WRITE_SETTINGS, UPLOAD, RUN_JOBS, WRITE_POLICIES, DRAFT_PLAN, READ_AUDIT}
+PERMISSIONS: dict[Role, frozenset[str]] = {
+    Role.VIEWER: _VIEWER,
+    Role.CLINICIAN: _CLINICIAN,
+    Role.ENGINEER: _ENGINEER,
+    Role.ADMIN: _CLINICIAN | _ENGINEER | {MANAGE_ACCOUNTS},
+}
+
+
+@dataclass(frozen=True)
+class Grant:
+    """A role in a study, at one site of it or (site_id None) at all."""
+
+    study_id: int
+    site_id: int | None
+    role: Role
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Whoever acts: a signed-in user, a token's owner, or the system itself.
+
+    `may` and `require` take the site that the row belongs to; rows the caller may not even read look as if they did not exist.
+    """
+
+    label: str
+    user_id: int | None
+    grants: tuple[Grant, ...]
+    is_system: bool = False
+
+    def may(self, permission: str, study_id: int | None = None, site_id: int | None = None) -> bool:
+        """Whether some grant that covers the site holds the permission; without a study: whether any grant does."""
+        if self.is_system:
+            return True
+        return any(
+            permission in PERMISSIONS[g.role]
+            and (study_id is None or g.study_id == study_id)
+            and (site_id is None or g.site_id is None or g.site_id == site_id)
+            for g in self.grants
+        )
+
+    def require(self, permission: str, study_id: int | None = None, site_id: int | None = None) -> None:
+        """Raises NotFound for what the caller may not see, Forbidden for what it may see but not do."""
+        if self.may(permission, study_id, site_id):
+            return
+        if study_id is not None and not self.may(READ, study_id, site_id):
+            raise NotFound("There is no such record, or you have no access to it.")
+        raise Forbidden(
+            f"Your role does not include '{permission}'.", "Ask an administrator of the study for a role that does."
+        )
+
+    @property
+    def role(self) -> Role | None:
+        """The strongest role, for display."""
+        order = list(Role)
+        return max((g.role for g in self.grants), key=order.index, default=None)
+
+
+SYSTEM = Caller(label="system", user_id=None, grants=(), is_system=True)

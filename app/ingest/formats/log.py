@@ -1,0 +1,148 @@
+"""What a decoder hands over: recordings with their 2 s traces and events, and one report per file.
+
+Everything here is plain data. Times are seconds in the recording's own clock unless a name says otherwise; where that clock starts is
+`RecordingLog.started_at` (UTC), when the file tells it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+DECODE_VERSION = 1
+"""Raised whenever a decoder would give other numbers for the same bytes; traces are stored per version."""
+
+TraceSource = Literal["time_domain", "device_power", "percept_lfp", "device_log", "table"]
+Clock = Literal["device", "pc", "table"]
+Hemisphere = Literal["left", "right"]
+
+
+class UndecodableFile(Exception):
+    """A file of which nothing can be used: what is wrong, where, and how to mend it, in the user's words."""
+
+    def __init__(self, what: str, where: str, mend: str) -> None:
+        super().__init__(f"{what} ({where}). {mend}")
+        self.what = what
+        self.where = where
+        self.mend = mend
+
+    def __reduce__(self) -> tuple[type[UndecodableFile], tuple[str, str, str]]:
+        return type(self), (self.what, self.where, self.mend)
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Why a file, or a part of it, could not be used."""
+
+    what: str
+    where: str
+    mend: str
+
+
+@dataclass(frozen=True, slots=True)
+class FileReport:
+    """What became of one file of an upload. Every list holds sentences for the person who uploaded it."""
+
+    name: str
+    understood: list[str] = field(default_factory=list)
+    repaired: list[str] = field(default_factory=list)
+    ignored: list[str] = field(default_factory=list)
+    flagged: list[str] = field(default_factory=list)
+    removed: list[str] = field(default_factory=list)
+    problem: Problem | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TraceLog:
+    """One stream on the recording's common grid.
+
+    Row i covers (t_end_first_s + (i - 1) * dt_s, t_end_first_s + i * dt_s]. `values` has shape [n], float32, NaN where `valid` (bool, [n])
+    is false. `details` says how the values were made (band edges, gain, settings); the same keys for the same source.
+    """
+
+    stream: str
+    channel: str
+    unit: str
+    source: TraceSource
+    dt_s: float
+    t_end_first_s: float
+    values: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 1 or self.values.shape != self.valid.shape:
+            raise ValueError(f"values {self.values.shape} and valid {self.valid.shape} of {self.stream} must be the same [n]")
+
+    @property
+    def t_end_s(self) -> NDArray[np.float64]:
+        """End of every row, shape [n], s."""
+        return self.t_end_first_s + self.dt_s * np.arange(self.values.size, dtype=np.float64)
+
+    def same_as(self, other: TraceLog) -> bool:
+        """Equal in every field, NaN counted equal to NaN."""
+        named = ("stream", "channel", "unit", "source", "dt_s", "t_end_first_s", "details")
+        return (
+            all(getattr(self, name) == getattr(other, name) for name in named)
+            and np.array_equal(self.valid, other.valid)
+            and np.array_equal(self.values, other.values, equal_nan=True)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class EventLog:
+    """Something that happened at one time: a stimulation step, an operator's label, a change of settings."""
+
+    t_s: float
+    kind: str
+    label: str
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingLog:
+    """One recording of one device in one clock.
+
+    `device_key` is opaque and may still be a serial number: decode redacted bytes, or replace it, before anything is stored.
+    `fingerprint` is a SHA-256 over the decoded content without the device's name, so the same recording in another archive has the same.
+    """
+
+    kind: str
+    device_key: str | None
+    hemisphere: Hemisphere | None
+    clock: Clock
+    started_at: datetime | None
+    duration_s: float
+    traces: tuple[TraceLog, ...]
+    events: tuple[EventLog, ...]
+    limits: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    quality: Mapping[str, Any]
+    fingerprint: str
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedFile:
+    """Everything one uploaded file gave."""
+
+    recordings: tuple[RecordingLog, ...]
+    reports: tuple[FileReport, ...]
+
+
+SessionLog = DecodedFile
+
+
+def fingerprint(kind: str, parts: Iterable[str | bytes | NDArray[Any]]) -> str:
+    """SHA-256 (hex) over the kind and the parts in order; every part is length-prefixed so that no two lists of parts collide."""
+    digest = hashlib.sha256()
+    for part in (kind, *parts):
+        raw = part.encode() if isinstance(part, str) else part if isinstance(part, bytes) else np.ascontiguousarray(part).tobytes()
+        digest.update(len(raw).to_bytes(8, "little"))
+        digest.update(raw)
+    return digest.hexdigest()

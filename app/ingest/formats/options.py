@@ -1,0 +1,46 @@
+"""How to decode, and how much a file may ask of the machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class ArchiveLimits:
+    """Bounds checked against an archive's directory before anything is unpacked, and again while reading."""
+
+    total_bytes: int = 2 * 1024**3
+    member_bytes: int = 1024**3
+    ratio: float = 200.0
+    ratio_applies_above_bytes: int = 20 * 1024**2
+    members: int = 2_000
+
+
+@dataclass(frozen=True, slots=True)
+class DecodeOptions:
+    """Choices that change the decoded numbers; they belong to the participant's settings and are stored with the traces.
+
+    Attributes:
+        period_s: length of one step, s.
+        beta_low_hz, beta_high_hz: edges of the beta band, Hz.
+        min_valid_fraction: share of a window's samples that must be there for the window to be valid, 0..1.
+        table_beta_unit: unit of `beta` in a table whose header states none.
+        max_table_rows: rows a table may have.
+        archive: bounds for archives.
+    """
+
+    period_s: float = 2.0
+    beta_low_hz: float = 13.0
+    beta_high_hz: float = 35.0
+    min_valid_fraction: float = 0.7
+    table_beta_unit: str = "unstated"
+    max_table_rows: int = 500_000
+    archive: ArchiveLimits = field(default_factory=ArchiveLimits)
+
+    def __post_init__(self) -> None:
+        if not self.period_s > 0:
+            raise ValueError(f"period_s must be positive, not {self.period_s}")
+        if not 0 < self.beta_low_hz < self.beta_high_hz:
+            raise ValueError(f"beta band must rise from above 0 Hz, not {self.beta_low_hz} to {self.beta_high_hz} Hz")
+        if not 0 < self.min_valid_fraction <= 1:
+            raise ValueError(f"min_valid_fraction must lie in (0, 1], not {self.min_valid_fraction}")

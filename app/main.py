@@ -1,0 +1,100 @@
+"""The web service: routers of every phase, static files, health and metrics."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import plotly
+from fastapi import APIRouter, FastAPI, Response
+from fastapi.openapi.utils import get_openapi
+from fastapi.staticfiles import StaticFiles
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+from sqlalchemy import text
+
+from app import __version__
+from app.platform import web
+from app.platform.database import Db
+from app.platform.tables import load_tables
+from app.platform.templates import STATIC
+
+API_MODULES = (
+    "app.study.api",
+    "app.ingest.api",
+    "app.learning.api",
+    "app.evaluation.api",
+    "app.analysis.api",
+    "app.planning.api",
+)
+PAGE_MODULES = (
+    "app.accounts.pages",
+    "app.study.pages",
+    "app.ingest.pages",
+    "app.learning.pages",
+    "app.evaluation.pages",
+    "app.analysis.pages",
+    "app.planning.pages",
+    "app.pages.overview",
+    "app.pages.participant",
+)
+
+
+class _Static(StaticFiles):
+    """Static files whose URLs carry a hash: browsers keep them for ever."""
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        response = super().file_response(*args, **kwargs)
+        response.headers["Cache-Control"] = "public, max-age=31536000, immutable"
+        return response
+
+
+def create_app() -> FastAPI:
+    """Build the service. The database is reached at the first request, not here."""
+    load_tables()
+    app = FastAPI(title="betaloop", version=__version__, openapi_url="/api/v1/openapi.json", docs_url=None, redoc_url=None)
+    web.install(app)
+    api = APIRouter(prefix="/api/v1")
+    for name in API_MODULES:
+        api.include_router(import_module(name).router)
+    app.include_router(api)
+    for name in PAGE_MODULES:
+        app.include_router(import_module(name).router, include_in_schema=False)
+    app.include_router(_service_routes())
+    app.mount("/static/plotly", _Static(packages=[(plotly.__name__, "package_data")]))
+    app.mount("/static", _Static(directory=STATIC))
+    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    return app
+
+
+def _service_routes() -> APIRouter:
+    router = APIRouter()
+
+    @router.get("/healthz", tags=["service"])
+    def healthz(db: Db) -> dict[str, str]:
+        """Whether the service and its database answer; no token needed."""
+        db.execute(text("select 1"))
+        return {"status": "ok", "version": __version__}
+
+    @router.get("/metrics", include_in_schema=False)
+    def metrics() -> Response:
+        """Prometheus metrics."""
+        return Response(generate_latest(), media_type=CONTENT_TYPE_LATEST)
+
+    return router
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """The OpenAPI document; problems are application/problem+json, and FastAPI's own validation schema is left out."""
+    if app.openapi_schema:
+        return app.openapi_schema
+    document = get_openapi(title=app.title, version=app.version, routes=app.routes, description="REST interface of a betaloop study.")
+    for path in document["paths"].values():
+        for operation in path.values():
+            for status, response in operation.get("responses", {}).items():
+                if int(status) >= 400:
+                    schema = {"$ref": "#/components/schemas/Problem"}
+                    response["content"] = {"application/problem+json": {"schema": schema}}
+    for unused in ("HTTPValidationError", "ValidationError"):
+        document.get("components", {}).get("schemas", {}).pop(unused, None)
+    app.openapi_schema = document
+    return document

@@ -1,0 +1,78 @@
+"""Errors in the user's words: raised where the rule is, turned into problem+json (RFC 9457) or a page in one place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class BetaloopError(Exception):
+    """Something a user can understand and mend.
+
+    Args:
+        detail: what is wrong, and where.
+        mend: what to do about it.
+        extra: further members of the problem document.
+    """
+
+    status = 400
+    title = "The request cannot be carried out"
+
+    def __init__(self, detail: str, mend: str = "", **extra: Any) -> None:
+        super().__init__(f"{detail} {mend}".strip())
+        self.detail, self.mend, self.extra = detail, mend, extra
+
+    def problem(self, instance: str) -> dict[str, Any]:
+        """The problem document."""
+        body: dict[str, Any] = {"type": "about:blank", "title": self.title, "status": self.status, "detail": self.detail, "instance": instance}
+        if self.mend:
+            body["mend"] = self.mend
+        return body | self.extra
+
+
+class NotFound(BetaloopError):
+    """No such thing, or not for this user."""
+
+    status = 404
+    title = "Not found"
+
+
+class Invalid(BetaloopError):
+    """The input breaks a rule."""
+
+    status = 422
+    title = "The input cannot be used"
+
+
+class Conflict(BetaloopError):
+    """The present state does not allow it."""
+
+    status = 409
+    title = "Not possible in the present state"
+
+
+class Unauthorized(BetaloopError):
+    """Nobody is signed in."""
+
+    status = 401
+    title = "Sign in first"
+
+
+class Forbidden(BetaloopError):
+    """Signed in, but not allowed."""
+
+    status = 403
+    title = "Not allowed"
+
+
+class TooLarge(BetaloopError):
+    """More bytes than the installation accepts."""
+
+    status = 413
+    title = "The file is too large"
+
+
+class TooMany(BetaloopError):
+    """Too many attempts."""
+
+    status = 429
+    title = "Too many attempts"

@@ -1,0 +1,66 @@
+"""Shared API types: strict numbers and booleans (`"3"` is no integer), paged lists, problem documents."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Generic, TypeVar
+
+from fastapi import Depends, Query
+from pydantic import BaseModel, ConfigDict, Field, Strict
+
+Item = TypeVar("Item")
+
+Int = Annotated[int, Strict(), Field(ge=-(2**31), le=2**31 - 1)]
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+Bool = Annotated[bool, Strict()]
+RowId = Annotated[int, Field(ge=1, le=2**31 - 1)]
+Text = Annotated[str, Field(pattern=r"^[^\x00]*$")]
+"""Text without the zero character, which PostgreSQL cannot hold."""
+
+
+class Model(BaseModel):
+    """Base of every API type: unknown members are refused, attributes of rows are read."""
+
+    model_config = ConfigDict(extra="forbid", from_attributes=True)
+
+
+class Page(BaseModel, Generic[Item]):
+    """One page of a list."""
+
+    items: list[Item]
+    total: int
+    limit: int
+    offset: int
+
+
+class Paging(BaseModel):
+    """Which page."""
+
+    limit: int
+    offset: int
+
+
+def _paging(
+    limit: Annotated[int, Query(ge=1, le=500, description="Items per page.")] = 50,
+    offset: Annotated[int, Query(ge=0, le=2**31 - 1, description="Items to skip.")] = 0,
+) -> Paging:
+    return Paging(limit=limit, offset=offset)
+
+
+PagingQuery = Annotated[Paging, Depends(_paging)]
+
+
+class Problem(BaseModel):
+    """RFC 9457 problem document."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str
+    instance: str
+    mend: str | None = None
+    errors: list[dict[str, Any]] | None = None
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI entries for the problems that a route may answer with."""
+    return {s: {"model": Problem, "content": {"application/problem+json": {}}} for s in statuses}

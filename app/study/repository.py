@@ -1,0 +1,147 @@
+"""Every query of the study's tables, and the row scope: what a caller may not read does not exist for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import ColumnElement, Select, false, func, or_, select, true
+from sqlalchemy.orm import Session, joinedload, selectinload
+
+from app.accounts.models import Site
+from app.accounts.policy import Caller
+from app.platform.errors import NotFound
+from app.study.models import Participant, QocRevision, Recording, SessionSegment, SettingsVersion, StudySession, Trace, Visit
+
+
+def in_scope(caller: Caller) -> ColumnElement[bool]:
+    """Condition on `Site`: the sites that some grant of the caller covers."""
+    if caller.is_system:
+        return true()
+    conditions = [(Site.study_id == g.study_id) & (Site.id == g.site_id if g.site_id else true()) for g in caller.grants]
+    return or_(*conditions) if conditions else false()
+
+
+def participant_by_code(db: Session, code: str, caller: Caller) -> Participant:
+    """The participant of a code. Raises NotFound."""
+    row = db.scalar(
+        select(Participant)
+        .join(Participant.site)
+        .where(Participant.code == code, in_scope(caller))
+        .options(joinedload(Participant.site), selectinload(Participant.settings))
+    )
+    if row is None:
+        raise NotFound(f"There is no participant '{code}', or you have no access to it.")
+    return row
+
+
+def participants(db: Session, caller: Caller, limit: int, offset: int) -> tuple[Sequence[Participant], int]:
+    """A page of participants by code, and how many there are."""
+    query = select(Participant).join(Participant.site).where(in_scope(caller))
+    rows = db.scalars(
+        query.order_by(Participant.code)
+        .limit(limit)
+        .offset(offset)
+        .options(joinedload(Participant.site), selectinload(Participant.settings))
+    ).all()
+    return rows, count(db, query)
+
+
+def visits(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[Visit], int]:
+    """A page of a participant's visits by number."""
+    query = select(Visit).where(Visit.participant_id == participant_id)
+    rows = db.scalars(query.order_by(Visit.number).limit(limit).offset(offset).options(selectinload(Visit.cdbs_amplitudes))).all()
+    return rows, count(db, query)
+
+
+def visit(db: Session, visit_id: int, caller: Caller) -> Visit:
+    """A visit. Raises NotFound."""
+    row = db.scalar(
+        select(Visit)
+        .join(Visit.participant)
+        .join(Participant.site)
+        .where(Visit.id == visit_id, in_scope(caller))
+        .options(joinedload(Visit.participant).joinedload(Participant.site), selectinload(Visit.cdbs_amplitudes))
+    )
+    if row is None:
+        raise NotFound(f"There is no visit {visit_id}, or you have no access to it.")
+    return row
+
+
+def visit_by_number(db: Session, participant_id: int, number: int) -> Visit | None:
+    """A participant's visit of a number."""
+    return db.scalar(select(Visit).where(Visit.participant_id == participant_id, Visit.number == number))
+
+
+def session(db: Session, session_id: int, caller: Caller) -> StudySession:
+    """A session with its QoCs, segments and visit. Raises NotFound."""
+    row = db.scalar(_sessions().join(Participant.site).where(StudySession.id == session_id, in_scope(caller)))
+    if row is None:
+        raise NotFound(f"There is no session {session_id}, or you have no access to it.")
+    return row
+
+
+def sessions_of_visit(db: Session, visit_id: int, limit: int = 500, offset: int = 0) -> tuple[Sequence[StudySession], int]:
+    """A page of a visit's sessions in order."""
+    query = _sessions().where(StudySession.visit_id == visit_id)
+    rows = db.scalars(query.order_by(StudySession.ordinal).limit(limit).offset(offset)).all()
+    return rows, count(db, select(StudySession.id).where(StudySession.visit_id == visit_id))
+
+
+def sessions_of_participant(db: Session, participant_id: int) -> Sequence[StudySession]:
+    """All sessions of a participant by visit and order, with QoCs, segments and recordings."""
+    return db.scalars(
+        _sessions().where(Visit.participant_id == participant_id).order_by(Visit.number, StudySession.ordinal)
+    ).all()
+
+
+def next_ordinal(db: Session, visit_id: int) -> int:
+    """The next free place in a visit."""
+    return (db.scalar(select(func.max(StudySession.ordinal)).where(StudySession.visit_id == visit_id)) or 0) + 1
+
+
+def traces_of_recording(db: Session, recording_id: int) -> Sequence[Trace]:
+    """The traces of a recording in its newest decode version."""
+    newest = select(func.max(Trace.decode_version)).where(Trace.recording_id == recording_id).scalar_subquery()
+    return db.scalars(
+        select(Trace).where(Trace.recording_id == recording_id, Trace.decode_version == newest).order_by(Trace.stream, Trace.channel)
+    ).all()
+
+
+def recording_by_fingerprint(db: Session, participant_id: int, fingerprint: str) -> Recording | None:
+    """A participant's recording of a fingerprint."""
+    return db.scalar(select(Recording).where(Recording.participant_id == participant_id, Recording.fingerprint == fingerprint))
+
+
+def session_ids_of_recording(db: Session, recording_id: int) -> Sequence[int]:
+    """Sessions that a recording belongs to."""
+    return db.scalars(select(SessionSegment.session_id).where(SessionSegment.recording_id == recording_id).distinct()).all()
+
+
+def qoc_revision(db: Session, session_id: int) -> int:
+    """How many revisions a session's QoCs have."""
+    return db.scalar(select(func.count()).select_from(QocRevision).where(QocRevision.session_id == session_id)) or 0
+
+
+def settings_version(db: Session, settings_version_id: int) -> SettingsVersion:
+    """A settings version by its row number."""
+    return db.get_one(SettingsVersion, settings_version_id)
+
+
+def count(db: Session, query: Select[Any]) -> int:
+    """Rows of a query without its page."""
+    return db.scalar(select(func.count()).select_from(query.order_by(None).subquery())) or 0
+
+
+def _sessions() -> Select[tuple[StudySession]]:
+    return (
+        select(StudySession)
+        .join(StudySession.visit)
+        .join(Visit.participant)
+        .options(
+            joinedload(StudySession.visit).joinedload(Visit.participant).joinedload(Participant.site),
+            joinedload(StudySession.visit).selectinload(Visit.cdbs_amplitudes),
+            selectinload(StudySession.qocs),
+            selectinload(StudySession.segments).joinedload(SessionSegment.recording),
+        )
+    )

@@ -1,0 +1,201 @@
+"""Rules of the study; no HTTP, no SQL. The caller commits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sqlalchemy import select
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from app.accounts import policy as can
+from app.accounts.models import Site
+from app.accounts.policy import Caller
+from app.platform.database import set_reason
+from app.platform.errors import Conflict, Invalid, NotFound
+from app.study import blinding, repository
+from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision, SettingsVersion, StudySession, Visit
+from app.study.schemas import ParticipantIn, QocIn, SessionChange, SettingsIn, VisitIn
+from app.study.traces import StepTable, step_table
+from ml.mdp import MdpSettings
+from ml.qoc import Qoc
+
+MDP_FIELDS = (
+    "window", "period_s", "r_a", "r_b", "c1", "c2", "c3", "c4", "gamma", "lower_bound", "tremor_as_fraction",
+)  # fmt: skip
+
+
+def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
+    """Add a participant with its first settings version. Raises Conflict when the code is taken."""
+    site = _site(db, draft.site, caller)
+    caller.require(can.WRITE_STUDY, site.study_id, site.id)
+    participant = Participant(site_id=site.id, code=draft.code)
+    db.add(participant)
+    try:
+        db.flush()
+    except IntegrityError as error:
+        db.rollback()
+        raise Conflict(f"There is already a participant '{draft.code}'.", "Choose another code.") from error
+    _add_settings(db, participant, draft.settings.model_dump(), caller, reason=None)
+    return participant
+
+
+def change_settings(db: Session, participant: Participant, change: SettingsIn, reason: str | None, caller: Caller) -> SettingsVersion:
+    """Make a new settings version of what the change names; old results keep theirs. No change, no version."""
+    require(caller, can.WRITE_SETTINGS, participant)
+    current = participant.current_settings
+    values = {name: getattr(current, name) for name in SettingsIn.model_fields} | change.model_dump(exclude_unset=True)
+    if all(getattr(current, name) == value for name, value in values.items()):
+        return current
+    return _add_settings(db, participant, values, caller, reason)
+
+
+def mdp_settings(settings: SettingsVersion, suggestion: float | None = None) -> MdpSettings:
+    """The MDP of a settings version.
+
+    Raises:
+        Invalid: xi_beta is not set; names the suggestion from the data where there is one.
+    """
+    if settings.xi_beta is None:
+        hint = f" A suggestion from the data: {suggestion:.4g} {settings.beta_unit or ''}".rstrip() + "." if suggestion is not None else ""
+        raise Invalid(
+            f"Participant {settings.participant.code} has no beta threshold xi_beta yet; the paper gives no default.",
+            f"Set xi_beta in the participant's settings.{hint}",
+            suggested_xi_beta=suggestion,
+        )
+    return MdpSettings(xi_beta=settings.xi_beta, **{name: getattr(settings, name) for name in MDP_FIELDS})
+
+
+def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> float | None:
+    """A threshold from the data: midway between the median beta of cDBS sessions and that of no-DBS sessions, else the median of all."""
+    groups: dict[Controller, list[np.ndarray[Any, Any]]] = {}
+    for session in repository.sessions_of_participant(db, participant.id):
+        beta = step_table(db, session, participant.current_settings).beta
+        groups.setdefault(blinding.arm(session, caller).controller, []).append(beta[~np.isnan(beta)])
+    medians = {c: float(np.median(np.concatenate(b))) for c, b in groups.items() if sum(x.size for x in b)}
+    if Controller.CDBS in medians and Controller.NO_DBS in medians:
+        return (medians[Controller.CDBS] + medians[Controller.NO_DBS]) / 2
+    everything = [x for parts in groups.values() for x in parts if x.size]
+    return float(np.median(np.concatenate(everything))) if everything else None
+
+
+def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Caller) -> Visit:
+    """Add a visit. Raises Conflict when its number is taken."""
+    require(caller, can.WRITE_STUDY, participant)
+    if repository.visit_by_number(db, participant.id, draft.number):
+        raise Conflict(f"Participant {participant.code} already has a visit {draft.number}.", "Choose the next number.")
+    keys = [(a.hemisphere, a.program) for a in draft.cdbs_amplitudes]
+    if len(set(keys)) < len(keys):
+        raise Invalid("The same hemisphere and program stand twice in cdbs_amplitudes.", "Give each once.")
+    visit = Visit(participant_id=participant.id, number=draft.number, date=draft.date, note=draft.note)
+    visit.cdbs_amplitudes = [CdbsAmplitude(**a.model_dump()) for a in draft.cdbs_amplitudes]
+    db.add(visit)
+    db.flush()
+    return visit
+
+
+def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller) -> QocRevision:
+    """Enter or correct QoCs: a new revision that keeps what the call leaves out. Same values, no revision."""
+    require(caller, can.WRITE_STUDY, session.visit.participant)
+    known = session.qoc
+    merged = {name: getattr(known, name, None) for name in ("grasp_hz", "rating", "tremor_percent")}
+    merged |= values.model_dump(exclude_unset=True, exclude={"reason"})
+    if known is not None and all(getattr(known, name) == value for name, value in merged.items()):
+        return known
+    set_reason(db, values.reason)
+    # the newest revision is read again under a lock, so that two corrections at once become two revisions
+    db.execute(select(StudySession.id).where(StudySession.id == session.id).with_for_update())
+    revision = QocRevision(
+        session_id=session.id,
+        revision=repository.qoc_revision(db, session.id) + 1,
+        entered_by=caller.label,
+        reason=values.reason,
+        **merged,
+    )
+    db.add(revision)
+    db.flush()
+    db.expire(session, ["qocs"])
+    return revision
+
+
+def change_session(db: Session, session: StudySession, change: SessionChange, caller: Caller) -> StudySession:
+    """Correct a session; the audit trail keeps what stood before and why."""
+    require(caller, can.WRITE_STUDY, session.visit.participant)
+    given = change.model_dump(exclude_unset=True, exclude={"reason"})
+    set_reason(db, change.reason)
+    arm = blinding.arm(session, caller)
+    if "controller" in given or "policy_id" in given:
+        controller = given.pop("controller", None) or arm.controller
+        blinding.assign(session, controller, given.pop("policy_id", arm.policy_id))
+    for name, value in given.items():
+        if name == "excluded_reason":
+            value = (value or "").strip() or None
+        elif name == "control_stream" and value is None:
+            continue
+        setattr(session, name, value)
+    try:
+        db.flush()
+    except IntegrityError as error:
+        db.rollback()
+        raise Invalid("There is no such policy.", "Name one of the participant's policies.") from error
+    return session
+
+
+@dataclass(frozen=True)
+class SessionData:
+    """A session with its step table under the participant's present settings."""
+
+    session: StudySession
+    settings: SettingsVersion
+    table: StepTable
+
+
+def session_data(db: Session, session: StudySession) -> SessionData:
+    """Beta and amplitude of a session."""
+    settings = session.visit.participant.current_settings
+    return SessionData(session, settings, step_table(db, session, settings))
+
+
+def qoc_of(session: StudySession) -> Qoc:
+    """A session's QoCs as the science knows them."""
+    row = session.qoc
+    return Qoc() if row is None else Qoc(row.grasp_hz, row.rating, row.tremor_percent)
+
+
+def require(caller: Caller, permission: str, participant: Participant) -> None:
+    """Raises NotFound or Forbidden unless the caller holds the permission for this participant."""
+    caller.require(permission, participant.site.study_id, participant.site_id)
+
+
+def _add_settings(db: Session, participant: Participant, values: dict[str, Any], caller: Caller, reason: str | None) -> SettingsVersion:
+    try:
+        MdpSettings(xi_beta=values["xi_beta"] if values["xi_beta"] is not None else 0.0, **{n: values[n] for n in MDP_FIELDS})
+    except ValueError as error:
+        raise Invalid(f"{error}.", "Correct the settings.") from error
+    if values["beta_low_hz"] >= values["beta_high_hz"]:
+        raise Invalid(
+            f"The beta band {values['beta_low_hz']:g}-{values['beta_high_hz']:g} Hz is empty.", "Set beta_low_hz below beta_high_hz."
+        )
+    row = SettingsVersion(
+        participant_id=participant.id, version=len(participant.settings) + 1, created_by=caller.label, reason=reason, **values
+    )
+    set_reason(db, reason)
+    participant.settings.append(row)
+    try:
+        db.flush()
+    except IntegrityError as error:
+        db.rollback()
+        raise Conflict("Somebody else changed these settings at the same time.", "Load them again and repeat your change.") from error
+    return row
+
+
+def _site(db: Session, code: str | None, caller: Caller) -> Site:
+    query = select(Site).where(repository.in_scope(caller)).order_by(Site.id)
+    sites = db.scalars(query if code is None else query.where(Site.code == code)).all()
+    if len(sites) == 1:
+        return sites[0]
+    if not sites:
+        raise NotFound(f"There is no site '{code}', or you have no access to it.")
+    raise Invalid("There are several sites.", f"Name one: {', '.join(s.code for s in sites)}.")

@@ -1,0 +1,126 @@
+"""Traces in and out of the database, and the step table of a session: beta and amplitude on one 2 s grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy.orm import Session
+
+from app.platform.errors import Invalid
+from app.study import repository
+from app.study.models import SettingsVersion, StudySession, Trace
+from ml.mdp import AMPLITUDE_TOLERANCE
+
+AMPLITUDE_STREAM = "amplitude"
+
+
+@dataclass(frozen=True)
+class StepTable:
+    """Rows of one session on the control grid; row i ends `t_s[i]` seconds after the session's start (`t_s` <= 0: before it).
+
+    Attributes:
+        t_s: end of each row, seconds, multiples of the period, shape [n].
+        beta: beta amplitude, shape [n]; NaN where invalid.
+        amplitude_ma: milliamperes, shape [n]; NaN where unknown or where the source gave fractions and no cDBS amplitude is known.
+        fraction: amplitude fraction of the cDBS amplitude in force, shape [n]; NaN where unknown. May exceed 1.
+        beta_trace, amplitude_trace: the rows of `trace` that it was read from; None where the session has none.
+        cdbs_ma: the cDBS amplitude in force, mA, or None when nobody stated it.
+    """
+
+    t_s: NDArray[np.float64]
+    beta: NDArray[np.float64]
+    amplitude_ma: NDArray[np.float64]
+    fraction: NDArray[np.float64]
+    beta_trace: Trace | None
+    amplitude_trace: Trace | None
+    cdbs_ma: float | None
+
+    @property
+    def above_one(self) -> int:
+        """Steps of the session whose amplitude exceeds the cDBS amplitude: flagged, never clipped, kept out of buffers."""
+        return int(np.sum(self.fraction[self.t_s > 0] > 1 + AMPLITUDE_TOLERANCE))
+
+
+def pack(values: NDArray[np.floating], valid: NDArray[np.bool_]) -> tuple[bytes, bytes]:
+    """Columns `values_f32` and `valid_bits` of a trace."""
+    return values.astype("<f4").tobytes(), np.packbits(valid).tobytes()
+
+
+def unpack(trace: Trace) -> NDArray[np.float64]:
+    """Values of a trace, shape [n], NaN where invalid."""
+    values = np.frombuffer(trace.values_f32, dtype="<f4").astype(np.float64)
+    valid = np.unpackbits(np.frombuffer(trace.valid_bits, dtype=np.uint8), count=trace.n).astype(bool)
+    return np.where(valid, values, np.nan)
+
+
+def cdbs_amplitude_ma(session: StudySession, settings: SettingsVersion, program: int = 0) -> float | None:
+    """The cDBS amplitude in force for a session: the visit's row of its hemisphere and program, else the settings' shorthand."""
+    rows = [a for a in session.visit.cdbs_amplitudes if a.program == program and session.hemisphere in (None, a.hemisphere)]
+    if len(rows) == 1:
+        return rows[0].amplitude_ma
+    if len(rows) > 1:
+        raise Invalid(
+            f"Session {session.id} names no hemisphere, and visit {session.visit.number} has cDBS amplitudes for both.",
+            "Set the session's hemisphere.",
+        )
+    return settings.cdbs_amplitude_ma
+
+
+def step_table(db: Session, session: StudySession, settings: SettingsVersion) -> StepTable:
+    """Beta and amplitude of a session's control channel, with up to W rows before its start.
+
+    Raises:
+        Invalid: traces of one recording that do not share a grid, or two segments that claim the same rows.
+    """
+    cdbs = cdbs_amplitude_ma(session, settings)
+    period, lead = settings.period_s, settings.window
+    steps = int(np.floor(session.duration_s / period + 1e-6))
+    t_s = period * np.arange(-lead + 1, steps + 1, dtype=np.float64)
+    beta, amount = np.full(t_s.size, np.nan), np.full(t_s.size, np.nan)
+    beta_trace = amplitude_trace = None
+    for segment in session.segments:
+        if not segment.is_control:
+            continue
+        traces = repository.traces_of_recording(db, segment.recording_id)
+        found = _control_trace(session, traces)
+        driving = next((t for t in traces if t.stream == AMPLITUDE_STREAM), None)
+        origin = session_offset_s(session, segment.recording_id)
+        if found is not None:
+            _place(beta, t_s, found, origin, period)
+            beta_trace = found
+        if driving is not None:
+            _place(amount, t_s, driving, origin, period)
+            amplitude_trace = driving
+    if amplitude_trace is not None and amplitude_trace.unit == "fraction":
+        fraction, milliamperes = amount, amount * cdbs if cdbs else np.full(t_s.size, np.nan)
+    else:
+        milliamperes = amount
+        fraction = amount / cdbs if cdbs else np.full(t_s.size, np.nan)
+    return StepTable(t_s, beta, milliamperes, fraction, beta_trace, amplitude_trace, cdbs)
+
+
+def session_offset_s(session: StudySession, recording_id: int) -> float:
+    """Where the session's start lies in a recording's clock, seconds: the start of its first segment in that recording."""
+    return min(s.start_s for s in session.segments if s.recording_id == recording_id)
+
+
+def _control_trace(session: StudySession, traces: object) -> Trace | None:
+    candidates = [t for t in traces if t.stream == session.control_stream]  # type: ignore[attr-defined]
+    if session.control_channel is not None:
+        candidates = [t for t in candidates if t.channel == session.control_channel]
+    return candidates[0] if candidates else None
+
+
+def _place(into: NDArray[np.float64], t_s: NDArray[np.float64], trace: Trace, origin_s: float, period_s: float) -> None:
+    """Write a trace's rows onto the session's grid; a trace whose rows end off the grid is moved to the nearest grid row."""
+    if abs(trace.dt_s - period_s) > 1e-6:
+        raise Invalid(
+            f"Trace '{trace.stream}' has rows of {trace.dt_s:g} s, the participant's period is {period_s:g} s.",
+            "Set the participant's period_s to the device's, or decode the recording again.",
+        )
+    values = unpack(trace)
+    rows = np.rint((trace.first_end_s - origin_s + trace.dt_s * np.arange(trace.n) - t_s[0]) / period_s).astype(int)
+    inside = (rows >= 0) & (rows < t_s.size)
+    into[rows[inside]] = values[inside]

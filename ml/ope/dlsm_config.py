@@ -1,0 +1,84 @@
+"""Settings of a DLSM fit; the paper gives none of the sizes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+Objective = Literal["posterior", "free_running", "sum"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DlsmConfig:
+    """How a DLSM is built, trained and rolled out.
+
+    Attributes:
+        latent, hidden, heads: size of z, units of both LSTMs, hidden layers of the heads.
+        objective: `posterior` (Theorem 1), `free_running` (Algorithm 1 to the letter) or their `sum`.
+        state_terms: `window` reconstructs every beta of s_t (paper), `newest` only the one that s_{t-1} does not hold.
+        action_emission: heads of steps see a_{t-1} beside z_t, so that beta and reward answer to the action.
+        end_features: outcomes from z_T (`final`, paper) or from z_T and the mean of z (`pooled`).
+        start: roll-outs from `observed` s_0 through q(z_0 | s_0), or from the `prior` (paper).
+        kl_weight, end_weight: weights in the objective; 1 and 1 is the bound.
+        members: ensemble size, one seed each.
+        steps: gradient steps at most. batch: sessions per step. learning_rate: of Adam, falling to a tenth along a half cosine.
+        clip_norm: largest norm of the gradient. weight_decay: decoupled.
+        check_every: steps between held-out checks; `patience`: checks without improvement before stopping.
+        held_out: share of the sessions that a member does not learn from.
+        replay_draws: free runs per held-out session in a check.
+        rollouts: trajectories per policy and member. block: trajectories advanced together.
+        reward_source: step return from the learnt reward `head`, from the `known` reward on sampled beta, or whichever predicts
+            `held_out` sessions better.
+        decode_all_window: draw all W betas of s_t anew instead of shifting the window (paper; needs `window`).
+        seed: first seed.
+
+    Raises:
+        ValueError: a value outside its range; the message names it.
+    """
+
+    latent: int = 12
+    hidden: int = 48
+    heads: tuple[int, ...] = (48,)
+    objective: Objective = "sum"
+    state_terms: Literal["window", "newest"] = "newest"
+    action_emission: bool = True
+    end_features: Literal["final", "pooled"] = "pooled"
+    start: Literal["observed", "prior"] = "observed"
+    kl_weight: float = 1.0
+    end_weight: float = 1.0
+    members: int = 3
+    steps: int = 500
+    batch: int = 32
+    learning_rate: float = 3e-3
+    clip_norm: float = 1.0
+    weight_decay: float = 1e-3
+    check_every: int = 25
+    patience: int = 8
+    held_out: float = 0.2
+    replay_draws: int = 16
+    rollouts: int = 256
+    block: int = 256
+    reward_source: Literal["head", "known", "held_out"] = "held_out"
+    decode_all_window: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("latent", "hidden", "members", "steps", "batch", "check_every", "patience", "replay_draws", "rollouts", "block"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} of a DLSM must be at least 1, not {getattr(self, name)}")
+        for name in ("learning_rate", "clip_norm"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} of a DLSM must be above 0, not {getattr(self, name)}")
+        if not 0 < self.held_out < 1:
+            raise ValueError(f"held_out must be a share between 0 and 1, not {self.held_out}")
+        if self.decode_all_window and self.state_terms != "window":
+            raise ValueError("decode_all_window needs state_terms='window': a head of the newest beta cannot draw the others")
+
+    @classmethod
+    def demo(cls, seed: int = 0) -> DlsmConfig:
+        """Small and quick: about twenty sessions of 300 steps in well under a minute of one core."""
+        return cls(latent=8, hidden=24, heads=(24,), members=2, steps=150, learning_rate=6e-3, rollouts=128, patience=4, seed=seed)
+
+    def to_json(self) -> dict[str, Any]:
+        """All settings, by name."""
+        return asdict(self)

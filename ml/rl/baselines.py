@@ -1,0 +1,39 @@
+"""Controllers made from a buffer without learning, that a trained policy has to beat."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ml.rl.policy import ConstantPolicy, ProportionalPolicy
+from ml.trajectories import ReplayBuffer
+
+
+def behaviour_mean(buffer: ReplayBuffer) -> ConstantPolicy:
+    """The mean amplitude fraction of the buffer's usable steps, held constant: what the logged sessions spent, without their variation."""
+    return ConstantPolicy(float(buffer.transitions().actions.mean()))
+
+
+def proportional_from_buffer(
+    buffer: ReplayBuffer, low_quantile: float = 0.25, high_quantile: float = 0.9, floor: float = 0.0, newest: int = 1
+) -> ProportionalPolicy:
+    """Proportional control between two quantiles of the participant's own beta amplitudes.
+
+    Args:
+        buffer: sessions of the participant.
+        low_quantile: share of the beta amplitudes below the level at which the amplitude starts to rise from `floor`.
+        high_quantile: share below the level from which the amplitude is 1.
+        floor: lowest amplitude fraction.
+        newest: how many of the newest beta amplitudes are averaged.
+
+    Raises:
+        ValueError: quantiles out of order or outside [0, 1], or a beta trace without spread between them.
+    """
+    if not 0 <= low_quantile < high_quantile <= 1:
+        raise ValueError(f"the quantiles must rise within [0, 1], not {low_quantile} and {high_quantile}")
+    beta = np.concatenate([session.padded_beta for session in buffer.sessions])
+    low, high = (float(q) for q in np.nanquantile(beta, [low_quantile, high_quantile]))
+    if low >= high:
+        raise ValueError(
+            f"beta has no spread between its quantiles {low_quantile} and {high_quantile} (both {low:.4g}): nothing to be proportional to"
+        )
+    return ProportionalPolicy(low, high, floor, newest)

@@ -1,0 +1,145 @@
+"""Beta amplitude from local field potentials, and averages per step of streams with gaps. P_beta: Gao et al. 2023, section 3.
+
+Row i of every result covers (t0 + i * period, t0 + (i + 1) * period]. Gaps are never bridged: a stretch of samples without a gap is
+filtered by itself, and a row that holds too few samples is NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, sosfiltfilt
+
+FILTER_ORDER = 4
+MIN_CYCLES = 3.0
+"""A gap-free stretch shorter than this many cycles of the lower band edge says nothing about the band and is not counted."""
+
+EDGE_CYCLES = 2.0
+"""Length of the odd mirror image put before and after a stretch, in cycles of the lower edge."""
+
+
+@dataclass(frozen=True, slots=True)
+class BandRows:
+    """Band amplitude per row, all shape [rows].
+
+    Attributes:
+        rms: root mean square of the band-passed signal, unit of the samples; NaN where the row holds no usable sample.
+        power: its square.
+        covered: share of the row that usable samples cover, 0..1.
+    """
+
+    rms: NDArray[np.float64]
+    power: NDArray[np.float64]
+    covered: NDArray[np.float64]
+
+
+def band_pass(samples: NDArray[np.float64], rate_hz: float, low_hz: float, high_hz: float) -> NDArray[np.float64]:
+    """Zero-phase Butterworth band-pass of one gap-free stretch (forward and backward, so -6 dB at the edges).
+
+    Args:
+        samples: shape [n].
+        rate_hz: samples per second.
+        low_hz, high_hz: band edges, 0 < low < high < rate / 2.
+
+    Returns:
+        Shape [n], same unit.
+
+    Raises:
+        ValueError: a band outside (0, rate / 2).
+    """
+    if not 0 < low_hz < high_hz < rate_hz / 2:
+        raise ValueError(f"a band of {low_hz:g} to {high_hz:g} Hz does not fit below half of {rate_hz:g} Hz")
+    sections = butter(FILTER_ORDER, (low_hz, high_hz), btype="bandpass", fs=rate_hz, output="sos")
+    pad = min(samples.size - 1, round(EDGE_CYCLES * rate_hz / low_hz))
+    return np.asarray(sosfiltfilt(sections, samples, padlen=pad), dtype=np.float64)
+
+
+def band_rows(
+    stretches: Iterable[tuple[float, float, NDArray[np.float64]]], rows: int, period_s: float, low_hz: float, high_hz: float, t0_s: float = 0.0
+) -> BandRows:
+    """Band amplitude of a lossy signal per row.
+
+    Args:
+        stretches: gap-free pieces (time of the first sample in s, rate in Hz, samples [n]), in any order; rates may differ.
+        rows: number of rows.
+        period_s: length of a row, s.
+        low_hz, high_hz: band edges, Hz.
+        t0_s: where row 0 begins.
+
+    Raises:
+        ValueError: a band outside (0, rate / 2) of a stretch.
+    """
+    energy = np.zeros(rows)
+    seconds = np.zeros(rows)
+    for start_s, rate_hz, samples in stretches:
+        if samples.size < MIN_CYCLES * rate_hz / low_hz:
+            continue
+        filtered = band_pass(samples, rate_hz, low_hz, high_hz)
+        row = row_of(start_s + np.arange(samples.size) / rate_hz - t0_s, period_s)
+        inside = (row >= 0) & (row < rows)
+        energy += np.bincount(row[inside], weights=filtered[inside] ** 2 / rate_hz, minlength=rows)
+        seconds += np.bincount(row[inside], minlength=rows) / rate_hz
+    with np.errstate(invalid="ignore", divide="ignore"):
+        power = np.where(seconds > 0, energy / seconds, np.nan)
+    return BandRows(np.sqrt(power), power, np.minimum(seconds / period_s, 1.0))
+
+
+def row_of(t_s: NDArray[np.float64], period_s: float) -> NDArray[np.int64]:
+    """Row that holds each time; rows are open on the left and closed on the right, except that 0 belongs to row 0. Shape as t_s."""
+    row = np.ceil(t_s / period_s - 1e-9).astype(np.int64) - 1
+    return np.where((row == -1) & (t_s > -1e-9), 0, row)
+
+
+def row_means(
+    t_s: NDArray[np.float64], values: NDArray[np.float64], interval_s: NDArray[np.float64], rows: int, period_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean per row of values that come at intervals, such as the device's own band power.
+
+    Args:
+        t_s: time of each value, [n]; values with NaN are gaps.
+        values: [n].
+        interval_s: time each value stands for, [n].
+        rows: number of rows, the first beginning at 0.
+        period_s: length of a row, s.
+
+    Returns:
+        Means [rows], NaN without a value, and the share of each row covered, 0..1.
+    """
+    row = row_of(t_s, period_s)
+    use = np.isfinite(values) & (row >= 0) & (row < rows)
+    total = np.bincount(row[use], weights=values[use] * interval_s[use], minlength=rows)
+    seconds = np.bincount(row[use], weights=interval_s[use], minlength=rows)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(seconds > 0, total / seconds, np.nan), np.minimum(seconds / period_s, 1.0)
+
+
+def step_means(
+    t_s: NDArray[np.float64], values: NDArray[np.float64], end_s: float, rows: int, period_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Time-weighted mean per row of a value that holds from its time until the next, such as the stimulation amplitude.
+
+    Args:
+        t_s: when each value begins to hold, [n], not decreasing; may begin before 0.
+        values: [n]; NaN where unknown.
+        end_s: until when the last value holds, s.
+        rows: number of rows, the first beginning at 0.
+        period_s: length of a row, s.
+
+    Returns:
+        Means over the known part of each row [rows], NaN where nothing is known, and the known share of each row, 0..1.
+    """
+    if t_s.size == 0:
+        return np.full(rows, np.nan), np.zeros(rows)
+    edges = period_s * np.arange(rows + 1)
+    knots = np.append(t_s, max(end_s, float(t_s[-1])))
+    known = np.isfinite(values)
+    held = np.diff(knots)
+    integral = np.concatenate(([0.0], np.cumsum(np.where(known, values, 0.0) * held)))
+    seconds = np.concatenate(([0.0], np.cumsum(np.where(known, held, 0.0))))
+    area = np.diff(np.interp(edges, knots, integral))
+    span = np.diff(np.interp(edges, knots, seconds))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(span > 1e-9, area / span, np.nan), np.clip(span / period_s, 0.0, 1.0)

@@ -1,0 +1,128 @@
+"""Fixtures of the whole suite: a real PostgreSQL built by Alembic, a database per test, the service, its users, the recordings."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+from alembic import command
+from alembic.config import Config
+from fastapi.testclient import TestClient
+from sqlalchemy import create_engine
+from sqlalchemy.orm import Session
+
+import app.platform.database as database
+from app.platform.embedded_postgres import EmbeddedPostgres
+from app.settings import get_settings
+
+ROOT = Path(__file__).resolve().parents[1]
+PASSWORD = "correct horse battery"
+
+
+@pytest.fixture(scope="session")
+def recordings() -> Path:
+    """Folder of real device recordings; where it is absent the test is skipped."""
+    folder = Path(os.environ.get("BETALOOP_TEST_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip("no recordings here: set BETALOOP_TEST_DATA to their folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedPostgres]:
+    """A PostgreSQL of this test run with a migrated template database."""
+    server = EmbeddedPostgres(tmp_path_factory.mktemp("database") / "postgres")
+    server.start()
+    engine = create_engine(server.url("betaloop"))
+    with engine.begin() as connection:
+        config = Config(str(ROOT / "alembic.ini"))
+        config.set_main_option("script_location", str(ROOT / "migrations"))
+        config.attributes["connection"] = connection
+        command.upgrade(config, "head")
+    engine.dispose()
+    yield server
+    server.remove()
+
+
+_counter = iter(range(10**9))
+
+
+@pytest.fixture
+def fresh_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A database and data folder of the test's own, named in the environment too, so that child processes find them."""
+    name = f"test_{os.getpid()}_{next(_counter)}"
+    admin = f"host='{server._sockets}' user=postgres dbname=postgres"
+    with psycopg.connect(admin, autocommit=True) as connection:
+        connection.execute(f"create database {name} template betaloop")
+    url = server.url(name)
+    monkeypatch.setenv("BETALOOP_DATABASE_URL", url)
+    monkeypatch.setenv("BETALOOP_DATA_DIR", str(tmp_path / "data"))
+    get_settings.cache_clear()
+    yield url
+    for engine in database._engines.values():
+        engine.dispose()
+    database._engines.clear()
+    get_settings.cache_clear()
+    with psycopg.connect(admin, autocommit=True) as connection:
+        connection.execute(f"drop database {name} with (force)")
+    shutil.rmtree(tmp_path / "data", ignore_errors=True)
+
+
+@pytest.fixture
+def db(fresh_database: str) -> Iterator[Session]:
+    """A session on the test's database, acting as 'test'."""
+    with database.new_session() as session:
+        database.set_actor(session, "test")
+        yield session
+
+
+@pytest.fixture
+def make_token(fresh_database: str) -> Callable[[str], str]:
+    """Make a user of a role and return an API token."""
+    from app.accounts import service
+    from app.accounts.models import Role
+
+    def make(role: str) -> str:
+        with database.transaction("test") as db:
+            service.add_user(db, f"{role}@clinic.example", Role(role), PASSWORD)
+            return service.create_token(db, f"{role}@clinic.example", "tests")
+
+    return make
+
+
+@pytest.fixture
+def service_app(fresh_database: str):  # type: ignore[no-untyped-def]
+    """The web service on the test's database."""
+    from app.main import create_app
+
+    return create_app()
+
+
+@pytest.fixture
+def client(service_app, make_token: Callable[[str], str]) -> Iterator[TestClient]:  # type: ignore[no-untyped-def]
+    """A client that calls as an administrator."""
+    with TestClient(service_app, headers={"Authorization": f"Bearer {make_token('admin')}"}) as client:
+        yield client
+
+
+@pytest.fixture
+def client_as(service_app, make_token: Callable[[str], str]) -> Callable[[str], TestClient]:  # type: ignore[no-untyped-def]
+    """Clients by role: viewer, clinician, engineer, admin."""
+
+    def make(role: str) -> TestClient:
+        return TestClient(service_app, headers={"Authorization": f"Bearer {make_token(role)}"})
+
+    return make
+
+
+@pytest.fixture
+def enrolled(client: TestClient) -> str:
+    """Code of a participant with a cDBS amplitude and a threshold, and a visit 1."""
+    body = {"code": "P1", "settings": {"xi_beta": 1.0, "cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"}}
+    assert client.post("/api/v1/participants", json=body).status_code == 201
+    assert client.post("/api/v1/participants/P1/visits", json={"number": 1, "date": "2026-03-02"}).status_code == 201
+    return "P1"
