@@ -58,7 +58,12 @@ def band_pass(samples: NDArray[np.float64], rate_hz: float, low_hz: float, high_
 
 
 def band_rows(
-    stretches: Iterable[tuple[float, float, NDArray[np.float64]]], rows: int, period_s: float, low_hz: float, high_hz: float, t0_s: float = 0.0
+    stretches: Iterable[tuple[float, float, NDArray[np.float64]]],
+    rows: int,
+    period_s: float,
+    low_hz: float,
+    high_hz: float,
+    t0_s: float = 0.0,
 ) -> BandRows:
     """Band amplitude of a lossy signal per row.
 

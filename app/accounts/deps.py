@@ -29,7 +29,9 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
     elif cookie := request.cookies.get(COOKIE):
         caller = service.caller_of_cookie(db, cookie)
     if caller is None:
-        raise Unauthorized("This needs a bearer token or a browser session.", "Make a token with `betaloop token create EMAIL --name NAME`, or sign in.")
+        raise Unauthorized(
+            "This needs a bearer token or a browser session.", "Make one with `betaloop token create EMAIL --name NAME`, or sign in."
+        )
     set_actor(db, caller.label, caller.user_id, getattr(request.state, "request_id", None))
     request.state.caller = caller
     return caller

@@ -63,7 +63,10 @@ class Membership(Base):
     """A user's role in one study, at one site of it or (site null) at all."""
 
     __tablename__ = "membership"
-    __table_args__ = (UniqueConstraint("user_id", "study_id", "site_id", postgresql_nulls_not_distinct=True),)
+    __table_args__ = (
+        UniqueConstraint("user_id", "study_id", "site_id", postgresql_nulls_not_distinct=True),
+        CheckConstraint("role in ('viewer', 'clinician', 'engineer', 'admin')", name="role"),
+    )
 
     id: Mapped[int] = mapped_column(primary_key=True)
     user_id: Mapped[int] = mapped_column(ForeignKey("app_user.id", ondelete="CASCADE"), index=True)
@@ -71,8 +74,6 @@ class Membership(Base):
     site_id: Mapped[int | None] = mapped_column(ForeignKey("site.id"), index=True)
     role: Mapped[Role] = mapped_column(String(20))
     user: Mapped[User] = relationship(back_populates="memberships")
-
-    __table_args__ += (CheckConstraint("role in ('viewer', 'clinician', 'engineer', 'admin')", name="role"),)
 
 
 class SignIn(Base):

@@ -67,9 +67,7 @@ class Caller:
             return
         if study_id is not None and not self.may(READ, study_id, site_id):
             raise NotFound("There is no such record, or you have no access to it.")
-        raise Forbidden(
-            f"Your role does not include '{permission}'.", "Ask an administrator of the study for a role that does."
-        )
+        raise Forbidden(f"Your role does not include '{permission}'.", "Ask an administrator of the study for a role that does.")
 
     @property
     def role(self) -> Role | None:

@@ -53,7 +53,8 @@ def token_by_name(db: Session, user_id: int, name: str) -> ApiToken | None:
 
 def recent_failures(db: Session, email: str, within: timedelta) -> int:
     """Failed sign-ins of an address within a span."""
-    return db.scalar(select(func.count()).select_from(SignInAttempt).where(SignInAttempt.email == email, SignInAttempt.at > now() - within)) or 0
+    recent = (SignInAttempt.email == email) & (SignInAttempt.at > now() - within)
+    return db.scalar(select(func.count()).select_from(SignInAttempt).where(recent)) or 0
 
 
 def forget_failures(db: Session, email: str) -> None:

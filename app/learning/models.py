@@ -61,6 +61,8 @@ class Policy(Base):
         CheckConstraint("kind in ('trained', 'distilled', 'external', 'baseline')", name="kind"),
         CheckConstraint("(kind = 'distilled') = (teacher_id is not null)", name="teacher"),
         CheckConstraint("kind not in ('trained', 'distilled') or snapshot_id is not null", name="snapshot"),
+        # a compute step that is repeated after a crash finds its policy instead of making a second one
+        UniqueConstraint("job_id", "job_step"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
@@ -83,6 +85,3 @@ class Policy(Base):
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
     retired_reason: Mapped[str | None] = mapped_column(Text)
-
-    # a compute step that is repeated after a crash finds its policy instead of making a second one
-    __table_args__ += (UniqueConstraint("job_id", "job_step"),)

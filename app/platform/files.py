@@ -79,7 +79,7 @@ def read(sha256: str) -> bytes:
         raise MissingFile(f"File {sha256} is missing from {get_settings().files_dir}. Restore it from a backup of the data folder.")
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != sha256:
-        raise MissingFile(f"File {sha256} in {get_settings().files_dir} was damaged: its bytes have another hash. Restore it from a backup.")
+        raise MissingFile(f"File {sha256} in {get_settings().files_dir} is damaged: its bytes have another hash. Restore a backup.")
     return content
 
 

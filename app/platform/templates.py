@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import plotly
 from fastapi import Request
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
@@ -34,6 +35,11 @@ def render(request: Request, template: str, **values: Any) -> str:
 def static_url(name: str) -> str:
     """URL of a file under static/, with its hash, so that browsers may keep it for ever."""
     return f"/static/{name}?v={_hash(name, (STATIC / name).stat().st_mtime_ns)}"
+
+
+def plotly_url() -> str:
+    """URL of plotly.js, which comes from plotly's own package; charts.js loads it only where there is a chart."""
+    return f"/static/plotly/plotly.min.js?v={plotly.__version__}"
 
 
 @lru_cache(maxsize=256)
@@ -74,4 +80,4 @@ def when(value: datetime | date | None) -> str:
 
 
 _environment.filters.update(number=number, fixed=fixed, minutes=minutes, when=when)
-_environment.globals.update(static_url=static_url)
+_environment.globals.update(static_url=static_url, plotly_url=plotly_url)

@@ -16,6 +16,7 @@ from prometheus_client import Counter, Histogram
 from starlette.exceptions import HTTPException
 from starlette.middleware.base import RequestResponseEndpoint
 
+from app.platform.body_limit import BodyLimit
 from app.platform.errors import BetaloopError, Forbidden, Unauthorized
 from app.platform.templates import render
 
@@ -33,6 +34,7 @@ _seconds = Histogram("betaloop_request_seconds", "Time to answer by route.", ["r
 def install(app: FastAPI) -> None:
     """Add middleware and error handlers to the service."""
     app.middleware("http")(_around)
+    app.add_middleware(BodyLimit)
     app.add_exception_handler(BetaloopError, _known_error)
     app.add_exception_handler(RequestValidationError, _bad_input)
     app.add_exception_handler(HTTPException, _http_error)

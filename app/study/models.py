@@ -270,5 +270,3 @@ class QocRevision(Base):
     reason: Mapped[str | None] = mapped_column(Text)
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     session: Mapped[StudySession] = relationship(back_populates="qocs")
-
-

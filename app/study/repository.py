@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, Select, false, func, or_, select, true
+from sqlalchemy import ColumnElement, Select, column, false, func, or_, select, table, true
 from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.models import Site
@@ -90,9 +90,7 @@ def sessions_of_visit(db: Session, visit_id: int, limit: int = 500, offset: int 
 
 def sessions_of_participant(db: Session, participant_id: int) -> Sequence[StudySession]:
     """All sessions of a participant by visit and order, with QoCs, segments and recordings."""
-    return db.scalars(
-        _sessions().where(Visit.participant_id == participant_id).order_by(Visit.number, StudySession.ordinal)
-    ).all()
+    return db.scalars(_sessions().where(Visit.participant_id == participant_id).order_by(Visit.number, StudySession.ordinal)).all()
 
 
 def next_ordinal(db: Session, visit_id: int) -> int:
@@ -123,6 +121,19 @@ def qoc_revision(db: Session, session_id: int) -> int:
     return db.scalar(select(func.count()).select_from(QocRevision).where(QocRevision.session_id == session_id)) or 0
 
 
+def policy_id(db: Session, participant_id: int, name_or_id: str) -> int | None:
+    """Number of a participant's policy by name, or by number where no policy has that name.
+
+    Policies belong to a later phase; of their table only names are needed here.
+    """
+    policies = table("policy", column("id"), column("participant_id"), column("name"))
+    own = select(policies.c.id).where(policies.c.participant_id == participant_id)
+    found = db.scalar(own.where(policies.c.name == name_or_id))
+    if found is None and name_or_id.isdecimal() and len(name_or_id) < 10:
+        found = db.scalar(own.where(policies.c.id == int(name_or_id)))
+    return found
+
+
 def settings_version(db: Session, settings_version_id: int) -> SettingsVersion:
     """A settings version by its row number."""
     return db.get_one(SettingsVersion, settings_version_id)
@@ -133,7 +144,7 @@ def count(db: Session, query: Select[Any]) -> int:
     return db.scalar(select(func.count()).select_from(query.order_by(None).subquery())) or 0
 
 
-def _sessions() -> Select[tuple[StudySession]]:
+def _sessions() -> Select[StudySession]:
     return (
         select(StudySession)
         .join(StudySession.visit)

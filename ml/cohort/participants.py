@@ -157,7 +157,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=25.0,
         c3=25.0,
         c4=25.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.235, eta=0.42, a50=0.65, hill=2.0, s_act=0.20, c_med=0.15, s_k=0.22),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.64, a50=0.65, hill=2.0, s_act=0.25, c_med=0.15, s_k=0.30),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=2.0,
             tremor_theta=0.30,
@@ -173,7 +173,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.15, at_03=1.6, off=1.8),
+        reference=ReferenceBeta(cdbs=1.305, at_03=1.769, off=1.992),
     ),
     "P2": ParticipantModel(
         code="P2",
@@ -186,7 +186,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.265, eta=0.50, a50=0.70, hill=2.5, s_act=0.20, c_med=0.05, s_k=0.22),  # assumed
+        brain=BrainConstants(k0=0.29, eta=0.68, a50=0.70, hill=2.5, s_act=0.25, c_med=0.05, s_k=0.30),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=5.0,
             tremor_theta=0.62,
@@ -202,7 +202,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(), constant=0.15),  # selegiline and pramipexole (appendix); size assumed
-        reference=ReferenceBeta(cdbs=1.25, at_03=2.1, off=2.3),
+        reference=ReferenceBeta(cdbs=1.507, at_03=2.230, off=2.383),
     ),
     "P3": ParticipantModel(
         code="P3",
@@ -215,7 +215,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.260, eta=0.60, a50=0.60, hill=2.0, s_act=0.20, c_med=0.18, s_k=0.22),  # assumed
+        brain=BrainConstants(k0=0.30, eta=0.90, a50=0.60, hill=2.0, s_act=0.25, c_med=0.18, s_k=0.30),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=4.0,
             tremor_theta=0.55,
@@ -231,7 +231,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.15, at_03=1.7, off=2.1),
+        reference=ReferenceBeta(cdbs=1.383, at_03=1.805, off=2.158),
     ),
     "P4": ParticipantModel(
         code="P4",
@@ -244,7 +244,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.250, eta=0.45, a50=0.65, hill=2.0, s_act=0.20, c_med=0.12, s_k=0.22),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.70, a50=0.65, hill=2.0, s_act=0.25, c_med=0.12, s_k=0.30),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=3.5,
             tremor_theta=0.50,
@@ -260,6 +260,6 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(-2.0,), constant=0.0),  # appendix: one tablet at about 7 o'clock
-        reference=ReferenceBeta(cdbs=1.2, at_03=1.75, off=2.0),
+        reference=ReferenceBeta(cdbs=1.375, at_03=1.904, off=2.159),
     ),
 }

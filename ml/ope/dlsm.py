@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +36,21 @@ DRAWS = 200
 
 
 @dataclass(frozen=True)
+class _Data:
+    """A buffer as the members learn from it: tensors, standardisation, held-out groups of sessions, and its name with the settings."""
+
+    buffer: ReplayBuffer
+    batch: Batch
+    scale: Scale
+    folds: list[list[int]]
+    fingerprint: str
+
+
+@dataclass(frozen=True)
 class Dlsm:
     """The estimator; `fit` trains the ensemble."""
 
-    config: DlsmConfig = DlsmConfig()
+    config: DlsmConfig = field(default_factory=DlsmConfig)
     method: str = "dlsm"
 
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedDlsm:
@@ -48,22 +59,35 @@ class Dlsm:
         Raises:
             ValueError: fewer than four sessions, no usable step, or a checkpoint of another buffer or other settings.
         """
+        c = self.config
+        data = self._prepare(buffer)
+        members = tuple(self._train(data, k, _part(report, k, c.members), checkpoint_dir) for k in range(c.members))
+        return FittedDlsm(self.method, c, buffer, data.batch, data.scale, members)
+
+    def fit_member(self, buffer: ReplayBuffer, k: int, report: Report = silent, checkpoint_dir: Path | None = None) -> Member:
+        """Train member `k` alone, for ensembles whose members learn side by side: `fit` finds its checkpoint finished.
+
+        Raises:
+            ValueError: as `fit`, or no such member.
+        """
+        if not 0 <= k < self.config.members:
+            raise ValueError(f"this ensemble has members 0 to {self.config.members - 1}, not {k}")
+        return self._train(self._prepare(buffer), k, report, checkpoint_dir)
+
+    def _prepare(self, buffer: ReplayBuffer) -> _Data:
         n = len(buffer.sessions)
         if n < FEWEST_SESSIONS:
             raise ValueError(f"the DLSM needs at least {FEWEST_SESSIONS} sessions, of which it holds some out; the buffer has {n}")
         c = self.config
         scale = learn_scale(buffer)
-        batch = make_batch(buffer, scale)
-        fingerprint = hashlib.sha256(
-            (content_hash(to_parquet(buffer)) + json.dumps(c.to_json(), sort_keys=True)).encode()
-        ).hexdigest()
+        fingerprint = hashlib.sha256((content_hash(to_parquet(buffer)) + json.dumps(c.to_json(), sort_keys=True)).encode()).hexdigest()
         folds = session_folds(buffer.sessions, max(2, round(1 / c.held_out)), c.seed)
-        members = []
-        for k in range(c.members):
-            training = MemberTraining(buffer, batch, scale, folds[k % len(folds)], c, c.seed + k, fingerprint)
-            path = None if checkpoint_dir is None else checkpoint_dir / f"dlsm-member-{k}.pt"
-            members.append(training.run(path, _part(report, k, c.members)))
-        return FittedDlsm(self.method, c, buffer, batch, scale, tuple(members))
+        return _Data(buffer, make_batch(buffer, scale), scale, folds, fingerprint)
+
+    def _train(self, data: _Data, k: int, report: Report, checkpoint_dir: Path | None) -> Member:
+        c = self.config
+        training = MemberTraining(data.buffer, data.batch, data.scale, data.folds[k % len(data.folds)], c, c.seed + k, data.fingerprint)
+        return training.run(None if checkpoint_dir is None else checkpoint_dir / f"dlsm-member-{k}.pt", report)
 
 
 @dataclass(frozen=True)
@@ -90,14 +114,14 @@ class FittedDlsm:
         head, known = (sum(getattr(c, name) for c in self.checks) for name in ("error_head", "error_known"))
         return "head" if head < known else "known"
 
-    def evaluate(
-        self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent
-    ) -> dict[str, Estimate]:
+    def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
         """Roll every policy out in every member and join what they say."""
         horizon = checked_horizon(self.buffer, horizon_steps)
         if not policies:
             return {}
-        runs = [self._run(m, policies, horizon, k, prior=False, report=_part(report, k, len(self.members))) for k, m in enumerate(self.members)]
+        runs = [
+            self._run(m, policies, horizon, k, prior=False, report=_part(report, k, len(self.members))) for k, m in enumerate(self.members)
+        ]
         others = [self._run(m, policies, horizon, k, prior=True, report=silent) for k, m in enumerate(self.members)]
         main, second = (others, runs) if self.config.start == "prior" else (runs, others)
         support = AmplitudeSupport(self.buffer)

@@ -173,9 +173,7 @@ class _StochasticLstm(torch.autograd.Function):
             head[:, latent:].addcmul_(d_z, noise_slope[t])
             torch.addmm(d_carry[:, latent:], head, out_t, out=d_h)
             d_c.addcmul_(d_h, to_c[t])
-            torch.mul(
-                slope[:, : 3 * hidden].view(batch, 3, hidden), d_c.unsqueeze(1), out=act[:, : 3 * hidden].view(batch, 3, hidden)
-            )
+            torch.mul(slope[:, : 3 * hidden].view(batch, 3, hidden), d_c.unsqueeze(1), out=act[:, : 3 * hidden].view(batch, 3, hidden))
             torch.mul(slope[:, 3 * hidden :], d_h, out=act[:, 3 * hidden : 4 * hidden])
             act[:, 4 * hidden :] = head[:, :latent]
             torch.mm(act, joint_t, out=d_carry)
@@ -228,9 +226,7 @@ class _Lstm(torch.autograd.Function):
         for t in range(steps - 1, -1, -1):
             act, slope = d_acts[t], slopes[t]
             d_c.addcmul_(d_h, to_c[t])
-            torch.mul(
-                slope[:, : 3 * hidden].view(batch, 3, hidden), d_c.unsqueeze(1), out=act[:, : 3 * hidden].view(batch, 3, hidden)
-            )
+            torch.mul(slope[:, : 3 * hidden].view(batch, 3, hidden), d_c.unsqueeze(1), out=act[:, : 3 * hidden].view(batch, 3, hidden))
             torch.mul(slope[:, 3 * hidden :], d_h, out=act[:, 3 * hidden :])
             if t:
                 torch.addmm(grad_h[t - 1], act, back, out=d_h)

@@ -104,9 +104,7 @@ class MemberTraining:
     def check(self) -> None:
         """Score held-out sessions along free runs and remember the best weights."""
         steps_since = self.step - (self.course[-1][0] if self.course else 0)
-        scored = held_out(
-            self.networks, self.held_batch, self.held, self.scale, self.settings, self.config.replay_draws, seed=self.seed
-        )
+        scored = held_out(self.networks, self.held_batch, self.held, self.scale, self.settings, self.config.replay_draws, seed=self.seed)
         self.course.append((self.step, self.loss_sum / steps_since, scored.score))
         self.loss_sum = 0.0
         if math.isfinite(scored.score) and (self.best is None or scored.score < self.best.score):

@@ -66,9 +66,7 @@ class Estimate:
 class Fitted(Protocol):
     """An estimator that has seen the data."""
 
-    def evaluate(
-        self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent
-    ) -> dict[str, Estimate]:
+    def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
         """Estimate of every policy, by its name; the horizon H defaults to the buffer's median session length."""
 
 

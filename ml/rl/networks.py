@@ -56,7 +56,7 @@ class MlpPolicy(nn.Module):
         self.window = window
         self.hidden = tuple(hidden)
         sizes = [window, *hidden, 1]
-        self.layers = nn.ModuleList(nn.Linear(i, o) for i, o in pairwise(sizes))
+        self.layers = nn.ModuleList(nn.utils.skip_init(nn.Linear, i, o) for i, o in pairwise(sizes))
         self.register_buffer("mean", torch.tensor([mean], dtype=torch.float32))
         self.register_buffer("std", torch.tensor([std], dtype=torch.float32))
         initialise(self.layers, torch.Generator().manual_seed(seed))
@@ -170,7 +170,8 @@ class MlpPolicy(nn.Module):
 class Critic(nn.Module):
     """The state-action value function Q(s, a) on z-scored windows.
 
-    The action joins at the second hidden layer, beside the first layer's units, as in Lillicrap et al.
+    The action joins at the second hidden layer, beside the first layer's units, as in Lillicrap et al.; as 2a - 1, their range of actions,
+    which is also nearer to the z-scores that the other inputs are.
 
     Args:
         window: W.
@@ -186,13 +187,13 @@ class Critic(nn.Module):
         if len(hidden) < 2:
             raise ValueError(f"the critic needs two hidden layers or more (the action joins at the second), not {tuple(hidden)}")
         sizes = [window, *hidden, 1]
-        self.layers = nn.ModuleList(nn.Linear(i + (k == 1), o) for k, (i, o) in enumerate(pairwise(sizes)))
+        self.layers = nn.ModuleList(nn.utils.skip_init(nn.Linear, i + (k == 1), o) for k, (i, o) in enumerate(pairwise(sizes)))
         initialise(self.layers, torch.Generator().manual_seed(seed))
 
     def forward(self, scores: Any, actions: Any) -> Any:
         """Values [N, 1] of actions [N, 1] in z-scored windows [N, W], tensors of float32."""
         hidden = torch.relu(self.layers[0](scores))
-        hidden = torch.relu(self.layers[1](torch.cat([hidden, actions], dim=1)))
+        hidden = torch.relu(self.layers[1](torch.cat([hidden, 2.0 * actions - 1.0], dim=1)))
         for layer in self.layers[2:-1]:
             hidden = torch.relu(layer(hidden))
         return self.layers[-1](hidden)

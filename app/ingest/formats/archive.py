@@ -79,7 +79,9 @@ class ZipFiles:
     def _check(self, infos: list[zipfile.ZipInfo]) -> None:
         limits = self._limits
         if len(infos) > limits.members:
-            raise UndecodableFile(f"the archive holds {len(infos)} files, more than {limits.members}", "archive", "Upload one session folder.")
+            raise UndecodableFile(
+                f"the archive holds {len(infos)} files, more than {limits.members}", "archive", "Upload one session folder."
+            )
         if any(info.flag_bits & 0x1 for info in infos):
             raise UndecodableFile("the archive is encrypted", "archive", "Unpack it with its password and zip the folder without one.")
         total = sum(info.file_size for info in infos)

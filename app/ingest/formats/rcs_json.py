@@ -155,9 +155,7 @@ def _leave_stream(window: _Text) -> bool:
     for mark in "]}":
         if window.skip_space() == mark:
             window.at += 1
-    if window.skip_space() == "]":
-        return True
-    return False
+    return window.skip_space() == "]"
 
 
 def _read_list(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder, kind: str) -> Generator[tuple[Any, str], None, bool]:

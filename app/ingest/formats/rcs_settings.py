@@ -119,7 +119,9 @@ class Timeline(Generic[T]):
 def sensing_of(state: dict[str, Any]) -> Sensing:
     """Sensing as a merged settings state has it."""
     config = get(state, "SensingConfig")
-    rates = tuple(RATE_HZ.get(integer(get(config, "timeDomainChannels", k, "sampleRate")) or 0) if _has_rate(config, k) else None for k in range(4))
+    rates = tuple(
+        RATE_HZ.get(integer(get(config, "timeDomainChannels", k, "sampleRate")) or 0) if _has_rate(config, k) else None for k in range(4)
+    )
     interval = number(get(config, "fftConfig", "interval"))
     size = FFT_SIZE.get(integer(get(config, "fftConfig", "size")) or 0)
     rate = next((r for r in rates if r is not None), None)

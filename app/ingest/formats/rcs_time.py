@@ -122,7 +122,7 @@ def _acceptable(headers: PacketHeaders, gen: NDArray[np.float64], rejected: dict
 def _after_back_step(gen: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Packets after PacketGenTime fell by more than 500 ms: the next two, and up to the sixth while still earlier than before."""
     hit = np.zeros(gen.size, dtype=bool)
-    for i in np.flatnonzero(np.diff(gen) < -BACK_STEP_MS):
+    for i in np.flatnonzero(np.diff(gen) < -BACK_STEP_MS).tolist():
         hit[i + 1 : i + 3] = True
         for j in range(i + 3, min(i + 7, gen.size)):
             if not gen[j] < gen[i]:

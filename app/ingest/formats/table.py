@@ -141,7 +141,9 @@ def _lines(stream: io.TextIOWrapper) -> Iterator[str]:
     while line := stream.readline(MAX_LINE):
         number += 1
         if len(line) == MAX_LINE and not line.endswith("\n"):
-            raise UndecodableFile(f"a line of more than {MAX_LINE} characters", f"line {number}", "Save the table as CSV (UTF-8), one row per line.")
+            raise UndecodableFile(
+                f"a line of more than {MAX_LINE} characters", f"line {number}", "Save the table as CSV (UTF-8), one row per line."
+            )
         yield line
 
 
@@ -182,7 +184,9 @@ def _decimal_mark(rows: list[list[str]], delimiter: str, lines: list[int]) -> st
     comma = next((line for row, line in zip(rows, lines, strict=True) if any("," in cell for cell in row)), None)
     if comma is None:
         return "."
-    point = next((line for row, line in zip(rows, lines, strict=True) if any("." in cell and cell.strip()[:1] not in "=@" for cell in row)), None)
+    point = next(
+        (line for row, line in zip(rows, lines, strict=True) if any("." in cell and cell.strip()[:1] not in "=@" for cell in row)), None
+    )
     if point is not None and delimiter != ",":
         raise UndecodableFile(
             "decimal points and commas in one table", f"line {max(comma, point)}", "Use one decimal mark and no thousands separators."
@@ -195,7 +199,9 @@ def _number(cell: str, decimal: str, line: int, header: str) -> float:
         value = parse_number(cell, decimal)
     except NotANumber as error:
         where = f"line {line}, column {header.strip()}"
-        raise UndecodableFile(f"{shown(cell.strip())} is text, not a number", where, "Put a number there, or leave the cell empty.") from error
+        raise UndecodableFile(
+            f"{shown(cell.strip())} is text, not a number", where, "Put a number there, or leave the cell empty."
+        ) from error
     return math.nan if value is None else value
 
 
@@ -269,10 +275,14 @@ def _times(columns: Columns, options: DecodeOptions) -> NDArray[np.float64]:
         i = int(back[0]) + 1
         what = "appears twice" if t_s[i] == t_s[i - 1] else f"comes after {t_s[i - 1]:g} s"
         raise UndecodableFile(
-            f"times must increase: {t_s[i]:g} s {what}", f"line {columns.lines[i]}, column {header}", "Sort the rows by t_s; keep one row per time."
+            f"times must increase: {t_s[i]:g} s {what}",
+            f"line {columns.lines[i]}, column {header}",
+            "Sort the rows by t_s; keep one row per time.",
         )
     if not np.any(t_s > GRID_TOLERANCE * options.period_s):
-        raise UndecodableFile("no row with t_s > 0", f"column {header}", "Rows with t_s <= 0 are the window before the session; add the session.")
+        raise UndecodableFile(
+            "no row with t_s > 0", f"column {header}", "Rows with t_s <= 0 are the window before the session; add the session."
+        )
     return t_s
 
 
@@ -283,7 +293,9 @@ def _grid(t_s: NDArray[np.float64], columns: Columns, options: DecodeOptions) ->
     steps = np.rint(t_s / period)
     if steps[-1] - steps[0] >= options.max_table_rows:
         raise UndecodableFile(
-            f"the times span {t_s[-1] - t_s[0]:g} s, more than {options.max_table_rows} steps", f"column {header}", "Upload one session per table."
+            f"the times span {t_s[-1] - t_s[0]:g} s, more than {options.max_table_rows} steps",
+            f"column {header}",
+            "Upload one session per table.",
         )
     spacing = np.diff(t_s)
     uneven = np.flatnonzero((np.abs(spacing - period * np.rint(spacing / period)) > GRID_TOLERANCE * period) | (spacing < period / 2))
@@ -314,7 +326,9 @@ def _trace(
     if role != "beta" and np.any(given < 0):
         i = int(np.flatnonzero(given < 0)[0])
         raise UndecodableFile(
-            f"negative amplitude {given[i]:g}", f"line {columns.lines[i]}, column {header}", "Amplitudes are 0 or more; leave the cell empty if unknown."
+            f"negative amplitude {given[i]:g}",
+            f"line {columns.lines[i]}, column {header}",
+            "Amplitudes are 0 or more; leave the cell empty if unknown.",
         )
     if role == "amplitude_fraction" and (above := int(np.sum(given > 1))):
         report.flagged.append(f"{above} rows have an amplitude above the cDBS amplitude (fraction > 1); kept as they are")

@@ -3,8 +3,8 @@
 How to add a job kind
 ---------------------
 A kind has two parts. The *orchestration* runs in a worker and says which steps there are and in which order; the *compute functions* do
-the work, each call in a child process of its own (true cancel, memory returned, one crash harms nobody else). A room's `jobs.py` registers
-both at import, and its name stands in `registry.JOB_MODULES`::
+the work, each call in a child process of its own (true cancel, memory returned, one crash harms nobody else). A room registers kinds in its
+`jobs.py` and compute functions in its `compute.py`, by being imported; both names stand in `registry`::
 
     class TrainParams(BaseModel):                          # what POST .../jobs accepts besides `kind`; checked on submit
         policies: list[int]
@@ -43,8 +43,8 @@ Rules
 * Raise `JobError("what, where, how to mend it")` for errors that a person can mend; its text is shown as it is. Any other exception shows
   its last line and keeps the traceback in the step's log. A failed step raises `StepFailed` in the orchestration, which fails the job.
 * Do not catch `BaseException` in an orchestration: cancelling and stopping travel as such.
-* Put compute functions into a module that imports little (say `app/learning/compute.py`, imported by `jobs.py`): the child imports
-  only the module of its function.
+* Put compute functions into the room's `compute.py` (found by convention, see `registry.COMPUTE_MODULES`), not into `jobs.py`: the web service
+  imports every `jobs.py` to check params and must not load torch for it. The child imports only the module of its function.
 
 Everybody else
 --------------

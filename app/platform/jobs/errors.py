@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from app.platform.errors import BetaloopError
 
-class JobError(Exception):
+
+class JobError(BetaloopError):
     """An error in the user's words (what, where, how to mend it); its text is shown as it is."""
 
 
@@ -11,21 +13,16 @@ class StepFailed(JobError):
     """A step of a job failed; raised in the orchestration, with the step's message."""
 
     def __init__(self, key: str, message: str) -> None:
-        super().__init__(f"{key}: {message}")
+        super().__init__(f"Step {key} failed: {message}")
         self.key = key
         self.message = message
 
 
-class UnknownKind(JobError):
+class UnknownKind(BetaloopError):
     """No job kind or compute function has this name."""
 
-
-class JobEnded(JobError):
-    """The job has already ended, so that it can no longer be cancelled."""
-
-
-class JobNotFound(JobError):
-    """No job has this id."""
+    status = 422
+    title = "There is no such job kind"
 
 
 class JobCancelled(BaseException):
@@ -33,4 +30,4 @@ class JobCancelled(BaseException):
 
 
 class WorkerStopping(BaseException):
-    """The worker stops: unwinds the orchestration without recording anything, so that the job goes on in another worker."""
+    """The worker stops or lost the job: unwinds the orchestration, records nothing, and the job goes on in another worker."""

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,13 @@ JOB_MODULES = (
     "app.learning.jobs",
     "app.evaluation.jobs",
 )
-"""Modules that register kinds, as names: the platform lies below the phases and may not import them."""
+"""Modules that register kinds, as names: the platform lies below the phases and may not import them. The web service imports them too."""
+
+COMPUTE_MODULES = (
+    "app.learning.compute",
+    "app.evaluation.compute",
+)
+"""Modules with compute functions and their heavy imports, loaded by workers and children alone; a room may do without one."""
 
 Orchestration = Callable[["JobContext"], dict[str, Any]]
 Compute = Callable[[dict[str, Any], Path, "Report"], dict[str, Any]]
@@ -128,6 +135,7 @@ def compute_function(name: str) -> ComputeFunction:
     """
     if name not in _computes:
         load_kinds()
+        load_kinds(tuple(module for module in COMPUTE_MODULES if find_spec(module)))
     if name not in _computes:
         raise UnknownKind(f"There is no compute function {name!r}. Known ones: {', '.join(sorted(_computes)) or 'none'}.")
     return _computes[name]
@@ -141,4 +149,6 @@ def _check_name(name: str) -> None:
 def _refuse_second(what: str, name: str, known: Callable[..., Any] | None, new: Callable[..., Any]) -> None:
     # the same function imported twice (a reload, `python -m`) is no conflict
     if known is not None and (known.__module__, known.__qualname__) != (new.__module__, new.__qualname__):
-        raise ValueError(f"two functions register the {what} {name!r}: {known.__module__}.{known.__qualname__} and {new.__module__}.{new.__qualname__}")
+        raise ValueError(
+            f"two functions register the {what} {name!r}: {known.__module__}.{known.__qualname__} and {new.__module__}.{new.__qualname__}"
+        )

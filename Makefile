@@ -1,0 +1,50 @@
+# Everything runs in .venv; nothing needs to be installed before but Python 3.11 or newer.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+WORKERS ?= 2
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-slow check format lock bench clean
+
+help: ## List the targets.
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+install: $(STAMP) ## Create .venv with the pinned packages.
+
+$(STAMP): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "betaloop needs Python 3.11 or newer; name one with: make install PYTHON=python3.11")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $(STAMP)
+
+demo: install ## Start betaloop with a synthetic study at http://127.0.0.1:8000.
+	$(BIN)/betaloop demo
+
+test: install ## Run the test suite.
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow"
+
+test-slow: install ## Run learning curves and fault rounds (up to 40 minutes).
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow
+
+check: install ## Lint, types and the import contract.
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: install ## Format the code and mend what the linter can.
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+lock: ## Pin the installed packages in requirements.lock.
+	$(BIN)/python -m pip freeze --exclude-editable --exclude betaloop --all | grep -v -i '^pip==' | sed 's/^torch==\([0-9.]*\).*/torch==\1/' > requirements.lock
+
+bench: install ## Run every benchmark in its quick form.
+	@for script in benchmarks/*.py; do echo "== $$script"; OMP_NUM_THREADS=1 $(BIN)/python $$script --quick || exit 1; done
+
+clean: ## Remove the demo's data and everything made here (not the code).
+	rm -rf $(VENV) var build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,270 @@
+"""The console command `betaloop`. Exit code 0: done; 1: it could not be done, said in one line; 2: the call itself is wrong."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from datetime import datetime
+from getpass import getpass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from app.accounts import service as accounts
+from app.accounts.models import Role
+from app.accounts.policy import SYSTEM
+from app.platform import logs
+from app.platform.database import transaction
+from app.platform.errors import BetaloopError
+from app.platform.tables import load_tables
+from app.settings import get_settings
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="betaloop: the study system for closed-loop deep brain stimulation.")
+user_app = typer.Typer(no_args_is_help=True, help="Users.")
+token_app = typer.Typer(no_args_is_help=True, help="API tokens.")
+app.add_typer(user_app, name="user")
+app.add_typer(token_app, name="token")
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Code = Annotated[str, typer.Argument(help="Code of the participant, e.g. P1.")]
+ACTOR = "command line"
+
+
+def main() -> None:
+    """Entry point: runs a command and turns errors into one line and an exit code."""
+    load_tables()
+    try:
+        app(standalone_mode=True)
+    except BetaloopError as error:
+        _say(f"betaloop: {error}")
+        sys.exit(1)
+    except RuntimeError as error:
+        _say(f"betaloop: {error}")
+        sys.exit(1)
+
+
+@app.command(epilog="Example: betaloop serve --host 0.0.0.0 --port 8000")
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on.")] = None,
+) -> None:
+    """Serve the web pages and the REST interface. Jobs need a worker beside it (`betaloop worker`)."""
+    import uvicorn
+
+    from app.main import create_app
+    from app.platform.migrate import migrate as bring_up_to_date
+
+    logs.configure()
+    bring_up_to_date()
+    settings = get_settings()
+    uvicorn.run(
+        create_app(), host=host or settings.host, port=port or settings.port, log_level=settings.log_level.lower(), access_log=False,
+        timeout_graceful_shutdown=3,
+    )  # fmt: skip
+
+
+@app.command(epilog="Example: betaloop worker --slots 2")
+def worker(slots: Annotated[int | None, typer.Option(min=1, help="Compute steps side by side; BETALOOP_WORKER_SLOTS.")] = None) -> None:
+    """Run background jobs until told to stop; an interrupted job goes on where it was."""
+    from app.platform.jobs.worker import run_worker
+    from app.platform.migrate import migrate as bring_up_to_date
+
+    logs.configure()
+    bring_up_to_date()
+    stop = threading.Event()
+    _stop_on_signals(stop)
+    run_worker(slots or get_settings().worker_slots, stop)
+
+
+@app.command(epilog="Example: betaloop demo --port 8000")
+def demo(
+    host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on.")] = None,
+) -> None:
+    """Start everything with a small synthetic study: database, web, worker, uploads, and the first ranking."""
+    from app.demo import run_demo
+
+    settings = get_settings()
+    run_demo(host or settings.host, port or settings.port)
+
+
+@app.command(epilog="Example: betaloop migrate")
+def migrate() -> None:
+    """Bring the database to the newest schema."""
+    from app.platform.migrate import migrate as bring_up_to_date
+
+    bring_up_to_date()
+    print("The database is up to date.")  # noqa: T201
+
+
+@user_app.command("add", epilog="Example: betaloop user add ada@clinic.example --role clinician")
+def user_add(
+    email: Annotated[str, typer.Argument(help="E-mail address to sign in with.")],
+    role: Annotated[Role, typer.Option(help="viewer, clinician, engineer or admin.")],
+    study: Annotated[str | None, typer.Option(help="Code of the study, where there are several.")] = None,
+    password_file: Annotated[
+        Path | None, typer.Option(help="File with the password; asked for when left out ('-': standard input).")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Add a user with a role in a study."""
+    password = _password(password_file)
+    with transaction(ACTOR) as db:
+        user = accounts.add_user(db, email, role, password, study)
+        result = {"id": user.id, "email": user.email, "role": role.value}
+    _print(result, as_json, f"Added {result['email']} as {role.value}.")
+
+
+@token_app.command("create", epilog="Example: betaloop token create ada@clinic.example --name upload-tablet")
+def token_create(
+    email: Annotated[str, typer.Argument(help="E-mail address of the user.")],
+    name: Annotated[str, typer.Option(help="What will use the token.")],
+    as_json: AsJson = False,
+) -> None:
+    """Make an API token and print it; it is shown this once."""
+    with transaction(ACTOR) as db:
+        token = accounts.create_token(db, email, name)
+    _print({"email": email, "name": name, "token": token}, as_json, token)
+
+
+@app.command("import", epilog="Example: betaloop import session.zip --participant P1 --visit 2 --controller random")
+def import_(
+    path: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A zip of an RC+S session folder, or a table (CSV, Parquet).")],
+    participant: Annotated[str, typer.Option(help="Code of the participant.")],
+    visit: Annotated[int, typer.Option(min=1, help="Number of the visit.")],
+    controller: Annotated[str, typer.Option(help="cdbs, rl, distilled, no_dbs, random or other.")],
+    policy: Annotated[str | None, typer.Option(help="Name or number of the policy that ran.")] = None,
+    started_at: Annotated[datetime | None, typer.Option(help="Start of the session, UTC.")] = None,
+    beta_unit: Annotated[str | None, typer.Option(help="Unit of a table's beta; the participant's when left out.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Import the file of one session, as an upload does."""
+    from app.ingest import api, service
+    from app.study import repository as study
+    from app.study.models import Controller
+
+    if controller not in set(Controller):
+        raise typer.BadParameter(f"'{controller}' is none of {', '.join(Controller)}.", param_hint="--controller")
+    with transaction(ACTOR) as db, path.open("rb") as stream:
+        person = study.participant_by_code(db, participant, SYSTEM)
+        stated = service.state_session(db, person, visit, Controller(controller), policy, started_at)
+        outcome = service.receive(db, person, stated, [service.Incoming(path.name, stream)], SYSTEM, beta_unit)
+        if not outcome.usable:
+            raise api.unusable(outcome)
+        answer = api.upload_out(db, outcome, SYSTEM).model_dump(mode="json")
+    lines = [f"{r['name']}: {s}" for r in answer["report"] for key in ("understood", "repaired", "flagged", "removed") for s in r[key]]
+    _print(answer, as_json, "\n".join(lines))
+
+
+@app.command(epilog="Example: betaloop pipeline P1 --preset quick")
+def pipeline(
+    code: Code,
+    preset: Annotated[
+        str | None, typer.Option(help="Named settings of the pipeline: 'quick' for a first look, 'full' for a study.")
+    ] = None,
+    wait: Annotated[bool, typer.Option(help="Show progress until the job has ended.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Train, distil, evaluate and rank: the work between two visits. A worker must be running."""
+    from app.platform.jobs import service as jobs
+    from app.platform.jobs.watch import watch
+    from app.study import repository as study
+
+    params: dict[str, Any] = {} if preset is None else {"preset": preset}
+    with transaction(ACTOR) as db:
+        person = study.participant_by_code(db, code, SYSTEM)
+        job_id = jobs.submit(db, "pipeline", person.id, params, ACTOR).id
+    status = _follow(watch(job_id)) if wait else "queued"
+    _print({"id": job_id, "status": status}, as_json, f"Job {job_id}: {status}.")
+    if status in {"failed", "cancelled"}:
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: betaloop rank P1")
+def rank(code: Code, as_json: AsJson = False) -> None:
+    """Print the ranked policies of a participant."""
+    from app.evaluation import service as evaluation
+    from app.study import repository as study
+
+    with transaction(ACTOR) as db:
+        ranking = evaluation.current_ranking(db, study.participant_by_code(db, code, SYSTEM), SYSTEM)
+        body = evaluation.ranking_out(ranking).model_dump(mode="json")
+    if as_json:
+        _print(body, True, "")
+        return
+    console = Console()
+    title = f"{code}: estimated return over {body['horizon_steps']} steps (method {body['default_method']})"
+    table = Table(title=title, caption="STALE: " + body["stale_reason"] if body["stale"] else None)
+    for heading in ("rank", "policy", "return", "interval", "supported"):
+        table.add_column(heading)
+    for row in body["policies"]:
+        best = row["estimates"].get(body["default_method"])
+        shown = ("—", "—", "—") if best is None else _estimate_cells(best)
+        table.add_row(str(row["rank"] or "—"), row["name"], *shown)
+    console.print(table)
+
+
+@app.command("export", epilog="Example: betaloop export P1 --to p1.zip")
+def export_(
+    code: Code,
+    to: Annotated[Path | None, typer.Option(help="Zip to write; CODE.zip when left out.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write everything of a participant as a zip of tables (CSV) and settings (JSON)."""
+    from app.export import export_participant
+    from app.study import repository as study
+
+    target = to or Path(f"{code}.zip")
+    with transaction(ACTOR) as db:
+        content = export_participant(db, study.participant_by_code(db, code, SYSTEM), SYSTEM)
+    target.write_bytes(content)
+    _print({"path": str(target), "bytes": len(content)}, as_json, f"Wrote {target} ({len(content)} bytes).")
+
+
+def _estimate_cells(estimate: dict[str, Any]) -> tuple[str, str, str]:
+    interval = f"{estimate['low']:.2f} … {estimate['high']:.2f}"
+    return f"{estimate['value']:.2f}", interval, "yes" if estimate.get("supported", True) else "no"
+
+
+def _follow(states: Iterator[Any]) -> str:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    status = "queued"
+    with Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%"), TimeElapsedColumn()) as bars:
+        known: dict[str, Any] = {}
+        for state in states:
+            status = str(state.status)
+            for step in state.steps:
+                if step.key not in known:
+                    known[step.key] = bars.add_task(step.title, total=1.0)
+                bars.update(known[step.key], completed=step.progress)
+    return status
+
+
+def _password(path: Path | None) -> str:
+    if path is None:
+        if not sys.stdin.isatty():
+            raise typer.BadParameter("No terminal to ask for a password.", param_hint="--password-file")
+        return getpass("Password: ")
+    return (sys.stdin.readline() if str(path) == "-" else path.read_text()).rstrip("\r\n")
+
+
+def _stop_on_signals(stop: threading.Event) -> None:
+    import signal
+
+    handler: Callable[[int, Any], None] = lambda _number, _frame: stop.set()  # noqa: E731
+    signal.signal(signal.SIGTERM, handler)
+    signal.signal(signal.SIGINT, handler)
+
+
+def _print(result: dict[str, Any], as_json: bool, text: str) -> None:
+    print(json.dumps(result, default=str) if as_json else text)  # noqa: T201
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)  # noqa: T201

@@ -1,0 +1,179 @@
+"""Summit RC+S session folders, zipped or as a folder. Source: the format notes, part A.
+
+Any stream may be missing, empty or cut: what is there is decoded, and a report per file says what was and was not.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeVar
+
+from app.ingest.formats.archive import Files, FolderFiles, ZipFiles
+from app.ingest.formats.log import DecodedFile, FileReport, Problem, RecordingLog, UndecodableFile
+from app.ingest.formats.options import DecodeOptions
+from app.ingest.formats.rcs_json import JsonNotes, read_elements
+from app.ingest.formats.rcs_recording import Streams, build_recording
+from app.ingest.formats.rcs_settings import Settings, follow
+from app.ingest.formats.rcs_streams import read_adaptive, read_power, read_time_domain
+
+T = TypeVar("T")
+MAX_RECORDS = 200_000
+DEFAULT_INTERVAL_S = 0.1
+USED = ("DeviceSettings", "StimLog", "RawDataTD", "RawDataPower", "AdaptiveLog", "EventLog")
+UNUSED = {
+    "RawDataAccel": "accelerometer",
+    "RawDataFFT": "on-device spectra",
+    "TimeSync": "clock exchanges",
+    "ErrorLog": "device errors",
+    "DiagnosticsLog": "diagnostics",
+}
+KNOWN = {name.lower(): name for name in (*USED, *UNUSED)}
+KEY_OF = {"RawDataTD": "TimeDomainData", "RawDataPower": "PowerDomainData"}
+NEEDED_SETTINGS = ("RecordInfo", "UtcOffset", "GeneralData", "SensingConfig", "SenseState", "AdaptiveConfig", "DetectionConfig")
+
+
+@dataclass(slots=True)
+class SessionFiles:
+    """One device folder: the member of each known file, and the reports so far."""
+
+    members: dict[str, str]
+    label: str
+    reports: dict[str, FileReport] = field(default_factory=dict)
+
+    def report(self, stem: str) -> FileReport:
+        """The report of one of the folder's files; its name never shows the folder, which may hold a serial number."""
+        return self.reports.setdefault(stem, FileReport(f"{self.label}{stem}.json"))
+
+
+def decode_rcs(path: Path, options: DecodeOptions, name: str | None = None) -> DecodedFile:
+    """Decode a zip, or a folder, that holds one or more RC+S device folders.
+
+    Raises:
+        UndecodableFile: no zip, unsafe, or without any RC+S file.
+    """
+    if path.is_dir():
+        return decode_files(FolderFiles(path), options, name or "session folder")
+    with ZipFiles(path, options.archive) as files:
+        return decode_files(files, options, name or path.name)
+
+
+def decode_files(files: Files, options: DecodeOptions, name: str) -> DecodedFile:
+    """Decode every device folder among the files; see `decode_rcs`."""
+    whole = FileReport(name)
+    sessions = find_sessions(files, whole)
+    whole.ignored.extend(files.ignored)
+    if not sessions:
+        raise UndecodableFile(
+            "no RC+S session in here", name, "Zip the session's Device folder with its JSON files (DeviceSettings, StimLog, RawDataTD, …)."
+        )
+    recordings: list[RecordingLog] = []
+    reports = [whole]
+    for session in sessions:
+        recording = decode_session(session, files, options)
+        if any(recording.fingerprint == other.fingerprint for other in recordings):
+            whole.ignored.append(f"{session.label or 'session'}: the same recording stands in the archive twice; counted once")
+        else:
+            recordings.append(recording)
+        reports.extend(session.reports.values())
+    whole.understood.append(f"{len(recordings)} RC+S recording{'s' if len(recordings) != 1 else ''}")
+    return DecodedFile(tuple(recordings), tuple(reports))
+
+
+def find_sessions(files: Files, report: FileReport) -> list[SessionFiles]:
+    """Known files by folder; unknown files are counted in the report, without their names, which may identify a person."""
+    folders: dict[str, dict[str, str]] = defaultdict(dict)
+    unknown = 0
+    for name in files.names():
+        path = PurePosixPath(name)
+        stem = KNOWN.get(path.stem.lower()) if path.suffix.lower() == ".json" else None
+        if stem is None:
+            unknown += 1
+        else:
+            folders[str(path.parent)].setdefault(stem, name)
+    if unknown:
+        report.ignored.append(f"{unknown} file{'s' if unknown != 1 else ''} not of an RC+S session")
+    many = len(folders) > 1
+    return [SessionFiles(members, f"recording {i}: " if many else "") for i, (_, members) in enumerate(sorted(folders.items()), start=1)]
+
+
+def decode_session(session: SessionFiles, files: Files, options: DecodeOptions) -> RecordingLog:
+    """Decode one device folder; never raises for a defect of one file."""
+    infos: list[dict[str, Any]] = []
+    records = {stem: _records(session, files, stem, infos) for stem in ("DeviceSettings", "StimLog", "EventLog")}
+    settings = follow(records["DeviceSettings"], records["StimLog"])
+    interval_at = _interval_at(settings)
+    streams = Streams(
+        time_domain=_stream(session, files, "RawDataTD", infos, read_time_domain),
+        power=_stream(session, files, "RawDataPower", infos, lambda packets: read_power(packets, interval_at)),
+        adaptive=_stream(session, files, "AdaptiveLog", infos, lambda packets: read_adaptive(packets, interval_at)),
+        settings=settings,
+        notes=records["EventLog"],
+        infos=infos,
+    )
+    for stem, what in UNUSED.items():
+        if stem in session.members:
+            session.report(stem).ignored.append(f"{what}: not used by this version; kept with the upload")
+    missing = [stem for stem in USED if stem not in session.members]
+    if missing:
+        for stem in missing:
+            session.report(stem).flagged.append("not in the upload; the recording was decoded without it")
+    return build_recording(streams, session.report, options)
+
+
+def _interval_at(settings: Settings) -> Callable[[float], float]:
+    def interval_at(pc_ms: float) -> float:
+        state = settings.sensing.at(pc_ms if pc_ms == pc_ms else -1.0)
+        return state.fft_interval_s if state is not None and state.fft_interval_s else DEFAULT_INTERVAL_S
+
+    return interval_at
+
+
+def _elements(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]]) -> Iterator[Any]:
+    """Packets or records of one file; its report is complete when the iterator is exhausted."""
+    report = session.report(stem)
+    notes = JsonNotes()
+    try:
+        with files.open(session.members[stem]) as stream:
+            for element, _ in read_elements(stream, notes):
+                yield element
+    except UndecodableFile as error:
+        session.reports[stem] = FileReport(report.name, problem=Problem(error.what, report.name, error.mend))
+        return
+    infos.extend(notes.record_infos[:1])
+    report.repaired.extend(notes.defects)
+    wanted = KEY_OF.get(stem)
+    if notes.stream_key is not None and notes.stream_key != wanted:
+        report.flagged.append(f"holds {notes.stream_key}, not what its name says")
+    if notes.elements == 0:
+        report.flagged.append("holds no data")
+    else:
+        report.understood.append(f"{notes.elements} {'packets' if wanted else 'records'}")
+
+
+def _records(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]]) -> list[Any]:
+    """Records of a record file, reduced to the parts that are used."""
+    if stem not in session.members:
+        return []
+    out: list[Any] = []
+    for record in _elements(session, files, stem, infos):
+        if not isinstance(record, dict):
+            continue
+        if stem == "DeviceSettings":
+            record = {
+                k: v for k, v in record.items() if k in NEEDED_SETTINGS or k.startswith(("TherapyConfigGroup", "AmplitudeLimitsGroup"))
+            }
+        if len(out) == MAX_RECORDS:
+            session.report(stem).flagged.append(f"more than {MAX_RECORDS} records; the rest was left out")
+            break
+        out.append(record)
+    return out
+
+
+def _stream(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]], read: Callable[[Iterator[Any]], T]) -> T | None:
+    """A stream file read by `read`; None where the file is missing."""
+    if stem not in session.members:
+        return None
+    return read(_elements(session, files, stem, infos))

@@ -1,0 +1,202 @@
+"""From decoded recordings to rows: devices, recordings, traces, and the session that a person stated."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from app.accounts.policy import SYSTEM
+from app.ingest import repository
+from app.ingest.formats.log import DECODE_VERSION, RecordingLog, TraceLog
+from app.ingest.models import UploadFile
+from app.settings import get_settings
+from app.study import blinding
+from app.study import repository as study
+from app.study.models import Controller, Device, Participant, Recording, SessionSegment, StudySession, Trace, Visit
+from app.study.traces import pack
+
+CONTROL_STREAMS = ("beta", "band_power")
+"""Streams that can drive a controller, in the order of preference where the participant's source does not decide."""
+
+
+@dataclass(frozen=True)
+class StatedSession:
+    """What the sender says of the session that the files belong to."""
+
+    visit: Visit
+    controller: Controller
+    policy_id: int | None = None
+    started_at: datetime | None = None
+
+
+def store_recordings(
+    db: Session, participant: Participant, file: UploadFile, recordings: Sequence[RecordingLog], stated: StatedSession
+) -> tuple[list[int], bool, list[str]]:
+    """Store what a file gave and make its session.
+
+    The recordings of one file (the two implants of one participant) belong to one session. A recording that is known by its content,
+    from another file, keeps the sessions it has.
+
+    Returns:
+        Sessions that the file belongs to; whether all of its recordings were known; sentences for the report.
+    """
+    known_ids: list[int] = []
+    fresh: list[tuple[Recording, RecordingLog]] = []
+    for decoded in recordings:
+        known = study.recording_by_fingerprint(db, participant.id, decoded.fingerprint)
+        if known is not None:
+            known_ids.extend(study.session_ids_of_recording(db, known.id))
+        else:
+            fresh.append((_add_recording(db, participant, file, decoded), decoded))
+    notes = []
+    if known_ids:
+        notes.append(f"The same recording came before in another file; it stays session {', '.join(map(str, sorted(set(known_ids))))}.")
+        notes.extend(disagreements(db, known_ids, stated))
+    if not fresh:
+        return sorted(set(known_ids)), bool(recordings), notes
+    session = _add_session(db, participant, fresh, stated)
+    control = next(s.recording for s in session.segments if s.is_control)
+    notes.append(_session_sentence(session, control, stated))
+    return sorted({*known_ids, session.id}), False, notes
+
+
+def disagreements(db: Session, session_ids: Sequence[int], stated: StatedSession) -> list[str]:
+    """Sentences where known sessions are not what the sender now says of them."""
+    found = []
+    for session_id in dict.fromkeys(session_ids):
+        session = study.session(db, session_id, SYSTEM)
+        arm = blinding.arm(session, SYSTEM)
+        differs = []
+        if session.visit_id != stated.visit.id:
+            differs.append(f"it stands in visit {session.visit.number}, not {stated.visit.number}")
+        if arm.controller != stated.controller:
+            differs.append(f"its controller is {arm.controller}, not {stated.controller}")
+        if stated.policy_id is not None and arm.policy_id != stated.policy_id:
+            differs.append(f"its policy is {arm.policy_id or 'none'}, not {stated.policy_id}")
+        if differs:
+            found.append(f"Session {session_id} was not changed: {'; '.join(differs)}. Correct it on its page if it is wrong there.")
+    return found
+
+
+def pseudonym(device_key: str) -> str:
+    """A device's name in this installation: keyed, so that nobody can look a serial number up in a table."""
+    return hmac.new(get_settings().secret("pseudonyms"), device_key.encode(), hashlib.sha256).hexdigest()[:16]
+
+
+def _add_recording(db: Session, participant: Participant, file: UploadFile, decoded: RecordingLog) -> Recording:
+    recording = Recording(
+        participant_id=participant.id,
+        device_id=_device(db, participant, decoded).id,
+        upload_file_id=file.id,
+        fingerprint=decoded.fingerprint,
+        hemisphere=decoded.hemisphere,
+        clock=decoded.clock,
+        started_at=decoded.started_at,
+        duration_s=decoded.duration_s,
+        details=_json(
+            {
+                "kind": decoded.kind,
+                "events": [asdict(e) for e in decoded.events],
+                "limits": dict(decoded.limits),
+                "settings": dict(decoded.settings),
+                "quality": dict(decoded.quality),
+            }
+        ),
+    )
+    db.add(recording)
+    db.flush()
+    db.add_all(_trace(recording.id, t) for t in decoded.traces)
+    db.flush()
+    return recording
+
+
+def _device(db: Session, participant: Participant, decoded: RecordingLog) -> Device:
+    name = pseudonym(decoded.device_key) if decoded.device_key else decoded.kind
+    device = repository.device(db, participant.id, name)
+    if device is None:
+        device = Device(participant_id=participant.id, pseudonym=name, kind=decoded.kind, hemisphere=decoded.hemisphere)
+        db.add(device)
+        db.flush()
+    return device
+
+
+def _trace(recording_id: int, trace: TraceLog) -> Trace:
+    values, valid = pack(trace.values, trace.valid)
+    return Trace(
+        recording_id=recording_id,
+        decode_version=DECODE_VERSION,
+        stream=trace.stream,
+        channel=trace.channel,
+        unit=trace.unit,
+        source=trace.source,
+        dt_s=trace.dt_s,
+        first_end_s=trace.t_end_first_s,
+        n=trace.values.size,
+        values_f32=values,
+        valid_bits=valid,
+        details=_json(dict(trace.details)),
+    )
+
+
+def _add_session(
+    db: Session, participant: Participant, fresh: Sequence[tuple[Recording, RecordingLog]], stated: StatedSession
+) -> StudySession:
+    wanted_source = participant.current_settings.beta_source
+    choices = [(_control(log, wanted_source), recording, log) for recording, log in fresh]
+    control, recording, log = next((c for c in choices if c[0] is not None), choices[0])
+    started_at = stated.started_at or log.started_at
+    if started_at is not None and started_at.tzinfo is None:
+        started_at = started_at.replace(tzinfo=UTC)
+    session = StudySession(
+        visit_id=stated.visit.id,
+        ordinal=study.next_ordinal(db, stated.visit.id),
+        hemisphere=recording.hemisphere,
+        started_at=started_at,
+        duration_s=log.duration_s,
+        control_stream=control.stream if control else CONTROL_STREAMS[0],
+        control_channel=control.channel if control else None,
+    )
+    blinding.assign(session, stated.controller, stated.policy_id)
+    for other, other_log in fresh:
+        # a recording without data still says what was there; a segment needs a length
+        stop_s = max(other_log.duration_s, 1e-3)
+        session.segments.append(SessionSegment(recording=other, start_s=0.0, stop_s=stop_s, is_control=other is recording))
+    db.add(session)
+    db.flush()
+    return session
+
+
+def _control(decoded: RecordingLog, wanted_source: str | None) -> TraceLog | None:
+    """The trace that the controller is taken to have seen: of the participant's source where there is one, else the first stream's."""
+    candidates = [t for stream in CONTROL_STREAMS for t in decoded.traces if t.stream == stream and t.valid.any()]
+    return next((t for t in candidates if t.source == wanted_source), candidates[0] if candidates else None)
+
+
+def _session_sentence(session: StudySession, control: Recording, stated: StatedSession) -> str:
+    length = f"{session.duration_s / 60:.1f} min" if session.duration_s else "no data"
+    channel = f"controlled by {session.control_stream} {session.control_channel or ''}".strip()
+    return f"Session {session.id}: visit {stated.visit.number}, {stated.controller}, {length}, {channel} (recording {control.id})."
+
+
+def _json(value: Any) -> Any:
+    """Plain JSON: NaN and infinity, which PostgreSQL's JSONB refuses, become null; times become ISO text."""
+    if isinstance(value, dict):
+        return {str(k): _json(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_json(v) for v in value]
+    if isinstance(value, bool | int | str) or value is None:
+        return value
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if hasattr(value, "tolist"):
+        return _json(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value)

@@ -1,0 +1,120 @@
+"""Every query of snapshots and policies, and the row scope."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import func, or_, select
+from sqlalchemy.orm import Session, selectinload
+
+from app.accounts.models import Site
+from app.accounts.policy import Caller
+from app.learning.models import BufferSnapshot, Policy
+from app.platform.errors import NotFound
+from app.study.models import Participant
+from app.study.repository import count, in_scope
+
+
+def snapshot(db: Session, snapshot_id: int, caller: Caller) -> BufferSnapshot:
+    """A snapshot with its members. Raises NotFound."""
+    row = db.scalar(
+        select(BufferSnapshot)
+        .join(Participant, Participant.id == BufferSnapshot.participant_id)
+        .join(Site, Site.id == Participant.site_id)
+        .where(BufferSnapshot.id == snapshot_id, in_scope(caller))
+        .options(selectinload(BufferSnapshot.members))
+    )
+    if row is None:
+        raise NotFound(f"There is no buffer snapshot {snapshot_id}, or you have no access to it.")
+    return row
+
+
+def snapshot_by_pins(db: Session, participant_id: int, pins_sha256: str) -> BufferSnapshot | None:
+    """The participant's snapshot with these pins."""
+    return db.scalar(select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id, BufferSnapshot.pins_sha256 == pins_sha256))
+
+
+def snapshots(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[BufferSnapshot], int]:
+    """A page of a participant's snapshots, newest first."""
+    query = select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id)
+    rows = db.scalars(query.order_by(BufferSnapshot.id.desc()).limit(limit).offset(offset).options(selectinload(BufferSnapshot.members)))
+    return rows.all(), count(db, query)
+
+
+def newest_snapshot(db: Session, participant_id: int) -> BufferSnapshot | None:
+    """The snapshot that was taken last."""
+    return db.scalar(select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id).order_by(BufferSnapshot.id.desc()).limit(1))
+
+
+def policy(db: Session, policy_id: int, caller: Caller) -> Policy:
+    """A policy. Raises NotFound."""
+    row = db.scalar(
+        select(Policy)
+        .join(Participant, Participant.id == Policy.participant_id)
+        .join(Site, Site.id == Participant.site_id)
+        .where(Policy.id == policy_id, in_scope(caller))
+    )
+    if row is None:
+        raise NotFound(f"There is no policy {policy_id}, or you have no access to it.")
+    return row
+
+
+def policies(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[Policy], int]:
+    """A page of a participant's policies, newest first."""
+    query = select(Policy).where(Policy.participant_id == participant_id)
+    return db.scalars(query.order_by(Policy.id.desc()).limit(limit).offset(offset)).all(), count(db, query)
+
+
+def policies_named(db: Session, participant_id: int, ids: Sequence[int]) -> list[Policy]:
+    """The participant's policies of these ids, in that order, each once. Raises NotFound naming those that are not there."""
+    rows = {p.id: p for p in db.scalars(select(Policy).where(Policy.participant_id == participant_id, Policy.id.in_(ids)))}
+    missing = sorted(set(ids) - set(rows))
+    if missing:
+        raise NotFound(f"The participant has no policy {', '.join(map(str, missing))}.", "Name ids from the participant's list of policies.")
+    return [rows[i] for i in dict.fromkeys(ids)]
+
+
+def candidates(db: Session, participant_id: int) -> Sequence[Policy]:
+    """Policies that a ranking should hold: trained, distilled or made elsewhere, and not retired; oldest first."""
+    return db.scalars(
+        select(Policy)
+        .where(Policy.participant_id == participant_id, Policy.kind != "baseline", Policy.retired_reason.is_(None))
+        .order_by(Policy.id)
+    ).all()
+
+
+def policy_by_name(db: Session, participant_id: int, name: str) -> Policy | None:
+    """The participant's policy of a name."""
+    return db.scalar(select(Policy).where(Policy.participant_id == participant_id, Policy.name == name))
+
+
+def policy_of_step(db: Session, job_id: str, job_step: str) -> Policy | None:
+    """The policy that a step of a job made."""
+    return db.scalar(select(Policy).where(Policy.job_id == job_id, Policy.job_step == job_step))
+
+
+def baselines(db: Session, participant_id: int) -> Sequence[Policy]:
+    """The participant's baseline policies that are in use, oldest first."""
+    return db.scalars(
+        select(Policy)
+        .where(Policy.participant_id == participant_id, Policy.kind == "baseline", Policy.retired_reason.is_(None))
+        .order_by(Policy.id)
+    ).all()
+
+
+def trained_count(db: Session, participant_id: int) -> int:
+    """How many policies were trained for the participant; call under `lock_participant` to number the next."""
+    query = select(func.count()).select_from(Policy).where(Policy.participant_id == participant_id, Policy.kind == "trained")
+    return db.scalar(query) or 0
+
+
+def lock_participant(db: Session, participant_id: int) -> None:
+    """Let one transaction at a time name new policies of a participant."""
+    db.execute(select(Participant.id).where(Participant.id == participant_id).with_for_update())
+
+
+def names_in_use(db: Session, participant_id: int, prefix: str) -> set[str]:
+    """Names of the participant's policies that begin so."""
+    return set(
+        db.scalars(select(Policy.name).where(Policy.participant_id == participant_id, or_(Policy.name.startswith(prefix, autoescape=True))))
+    )

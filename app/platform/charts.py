@@ -1,0 +1,129 @@
+"""Charts of pages: a plain Plotly figure with its unit, its n and the table behind it. Drawn by static/charts.js, which switches off the cloud.
+
+Colours are tokens (`token:rl`, `token:rl/0.25`); the browser replaces them by the CSS variable `--c-rl` of the theme in use.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+CONTROLLERS = ("cdbs", "rl", "distilled", "no_dbs", "random", "other")
+"""Order in which controllers stand in every chart and table; cDBS is what the others are compared with."""
+
+SYMBOLS = {"cdbs": "circle", "rl": "diamond", "distilled": "square", "no_dbs": "x", "random": "triangle-up", "other": "star"}
+"""A shape beside each colour, so that colour is never the only carrier."""
+
+TEXT, MUTED, GRID, ACCENT, WARN, BAD = "token:text", "token:muted", "token:grid", "token:accent", "token:warn", "token:bad"
+
+Cell = str | float | int | None
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure for the `chart` macro.
+
+    Attributes:
+        id: HTML id, unique in its page.
+        title: a short noun phrase.
+        subtitle: units and n, e.g. "uV over 2 s · n = 300 steps".
+        figure: `{"data": [...], "layout": {...}}`, JSON only; `figure()` makes one.
+        columns, rows: the table behind the chart; a column names its unit.
+        height: of the plot, CSS pixels.
+        digits: significant digits of the table's numbers.
+    """
+
+    id: str
+    title: str
+    subtitle: str
+    figure: dict[str, Any]
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    height: int = 320
+    digits: int = field(default=4)
+
+
+def colour(controller: str, alpha: float | None = None) -> str:
+    """The colour token of a controller."""
+    name = controller if controller in CONTROLLERS else "other"
+    return f"token:{name}" + (f"/{alpha:g}" if alpha is not None else "")
+
+
+def marker(controller: str, size: float = 8, **more: Any) -> dict[str, Any]:
+    """Plotly marker of a controller: its colour and its shape."""
+    name = controller if controller in CONTROLLERS else "other"
+    return {"color": colour(name), "symbol": SYMBOLS[name], "size": size, **more}
+
+
+def figure(data: Sequence[Mapping[str, Any]], **layout: Any) -> dict[str, Any]:
+    """A Plotly figure in the house style; `layout` members override or add. NaN becomes null: a gap, never a zero."""
+    base: dict[str, Any] = {
+        "margin": {"l": 56, "r": 16, "t": 12, "b": 44},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "font": {"family": "system-ui, sans-serif", "size": 13, "color": TEXT},
+        "hovermode": "closest",
+        "hoverlabel": {"bgcolor": "token:surface", "bordercolor": GRID, "font": {"color": TEXT}},
+        "showlegend": len(data) > 1,
+        "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0},
+        "dragmode": "pan",
+    }
+    full = base | layout
+    for name in {"xaxis", "yaxis"} | {k for k in full if k.startswith(("xaxis", "yaxis"))}:
+        full[name] = _AXIS | full.get(name, {})
+    return {"data": [plain(dict(trace)) for trace in data], "layout": plain(full)}
+
+
+def axis(title: str, unit: str = "", **more: Any) -> dict[str, Any]:
+    """An axis with its unit in the title."""
+    return {"title": {"text": f"{title} ({unit})" if unit else title}, **more}
+
+
+def horizontal(
+    at: float, name: str, colour_token: str = WARN, dash: str = "dash", yref: str = "y"
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A labelled horizontal line over the whole width: its `shapes` and its `annotations` entry."""
+    line = {
+        "type": "line",
+        "xref": "paper",
+        "x0": 0,
+        "x1": 1,
+        "yref": yref,
+        "y0": at,
+        "y1": at,
+        "line": {"color": colour_token, "width": 1.5, "dash": dash},
+    }
+    label = {
+        "text": name, "xref": "paper", "x": 1, "xanchor": "right", "yref": yref, "y": at, "yanchor": "bottom", "showarrow": False,
+        "font": {"color": colour_token, "size": 12},
+    }  # fmt: skip
+    return line, label
+
+
+def plain(value: Any) -> Any:
+    """JSON-ready copy: arrays become lists, numpy numbers Python's, what is not finite null."""
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {k: plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+_AXIS: dict[str, Any] = {
+    "gridcolor": GRID,
+    "linecolor": GRID,
+    "zerolinecolor": GRID,
+    "automargin": True,
+    "tickfont": {"color": MUTED},
+    "ticks": "",
+}

@@ -1,0 +1,91 @@
+"""HTML forms as API types: pages and the API share one set of rules. A form sends text, the API's types are strict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import NoneType, UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+
+from fastapi import Depends, Request
+from pydantic import BaseModel, ValidationError
+from starlette.datastructures import FormData
+
+from app.platform.errors import Invalid
+
+M = TypeVar("M", bound=BaseModel)
+
+_TRUE, _FALSE = {"yes", "true", "on", "1"}, {"no", "false", "off", "0", ""}
+
+
+async def _form(request: Request) -> FormData:
+    return await request.form(max_files=0, max_fields=2000)
+
+
+FormValues = Annotated[FormData, Depends(_form)]
+"""The fields of a posted form (no files), e.g. `values.get("name", "")` and, for repeated ones, `values.getlist("policy")`."""
+
+
+def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] | None = None) -> M:
+    """Read a model from form text. An empty field is null; a field that the form does not have is left out.
+
+    Args:
+        model: the API type; only its fields are read.
+        values: field name to text.
+        labels: names as the page shows them, for the errors.
+
+    Raises:
+        Invalid: names each field that is wrong and why; the document's `errors` holds them too.
+    """
+    labels = labels or {}
+    errors: list[dict[str, str]] = []
+    data: dict[str, Any] = {}
+    for name, info in model.model_fields.items():
+        if name in values:
+            try:
+                data[name] = _value(str(values[name]), info.annotation, info.is_required())
+            except ValueError as error:
+                errors.append({"where": labels.get(name, name), "what": str(error)})
+    if not errors:
+        try:
+            return model.model_validate(data)
+        except ValidationError as error:
+            for e in error.errors():
+                name = ".".join(map(str, e["loc"]))
+                errors.append({"where": labels.get(name, name), "what": e["msg"]})
+    raise Invalid("Some fields cannot be used.", "Correct them and send the form again.", errors=errors)
+
+
+def _value(text: str, annotation: Any, required: bool) -> Any:
+    kinds = _kinds(annotation)
+    text = text.strip()
+    if bool in kinds:
+        if text.lower() not in _TRUE | _FALSE:
+            raise ValueError(f"'{text}' is neither yes nor no")
+        return text.lower() in _TRUE
+    if text == "":
+        if NoneType in kinds or required:
+            return None
+        if str in kinds:
+            return ""
+        raise ValueError("give a value")
+    if int in kinds:
+        try:
+            return int(text)
+        except ValueError:
+            raise ValueError(f"'{text}' is no whole number") from None
+    if float in kinds:
+        try:
+            return float(text.replace(",", ".") if text.count(",") == 1 and "." not in text else text)
+        except ValueError:
+            raise ValueError(f"'{text}' is no number") from None
+    return text
+
+
+def _kinds(annotation: Any) -> set[Any]:
+    """The plain types inside unions and `Annotated`."""
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        return _kinds(get_args(annotation)[0])
+    if origin in (Union, UnionType):
+        return {kind for part in get_args(annotation) for kind in _kinds(part)}
+    return {annotation}

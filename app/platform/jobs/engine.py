@@ -1,0 +1,258 @@
+"""The durable-workflow engine: the only module that knows DBOS (3.4 or later, below 4).
+
+Every job is one workflow `betaloop.job(job_id)` on one queue, in the schema `dbos` of our own PostgreSQL. DBOS keeps the queue, says which
+executor owns a workflow and replays it after a crash; what people see (status, steps, results) stands in our own tables. Three things the
+library leaves to us: noticing dead executors (`recover`), moving waiting jobs to a new protocol (`adopt_older_protocols`), and deleting what
+finished long ago (`delete_finished`).
+"""
+
+from __future__ import annotations
+
+import contextvars
+import json
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
+from typing import Any, cast
+
+from dbos import DBOS, DBOSClient, DBOSConfig, EnqueueOptions
+from dbos._serialization import Serializer
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+
+PROTOCOL = "1"
+"""Version of the job protocol: raise it when orchestrations change the order of their steps or the meaning of recorded results."""
+
+MAX_RECOVERIES = 3
+"""A job whose worker dies this many times after the first is given up: it is likely what kills them."""
+
+APPLICATION = "betaloop"
+SCHEMA = "dbos"
+QUEUE = "jobs"
+WORKFLOW = "betaloop.job"
+QUEUE_POLL_S = 0.5
+
+Body = Callable[[], dict[str, Any]]
+
+
+class JsonSerializer(Serializer):
+    """Arguments and results as readable JSON; an exception keeps its name and text. The default would be pickle, which can run code."""
+
+    def serialize(self, data: Any) -> str:
+        """Python to JSON; raises ValueError for NaN and TypeError for what JSON lacks."""
+        return json.dumps(data, default=_exception_to_json, allow_nan=False)
+
+    def deserialize(self, serialized_data: str) -> Any:
+        """JSON to Python."""
+        data = json.loads(serialized_data)
+        if isinstance(data, dict) and set(data) == {"__exception__", "text"}:
+            return RuntimeError(f"{data['__exception__']}: {data['text']}")
+        if isinstance(data, dict) and set(data) == {"args", "kwargs"}:
+            return {"args": tuple(data["args"]), "kwargs": data["kwargs"]}
+        return data
+
+    def name(self) -> str:
+        """The name that stands beside each stored value."""
+        return "betaloop_json"
+
+
+def _exception_to_json(value: Any) -> dict[str, str]:
+    if isinstance(value, BaseException):
+        return {"__exception__": type(value).__name__, "text": str(value)}
+    raise TypeError(f"{type(value).__name__} is not JSON")
+
+
+class CancelNoise(logging.Filter):
+    """Drops the tracebacks that DBOS logs whenever a workflow was cancelled: a cancelled job is no error."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """False for a record about a cancelled workflow."""
+        error = record.exc_info[1] if record.exc_info else None
+        names = {type(error).__name__, *(base.__name__ for base in type(error).__mro__)} if error else set()
+        return not any("Cancelled" in name for name in names) and "CancelledError" not in record.getMessage()
+
+
+def prepare(url: str) -> None:
+    """Create or upgrade the engine's schema; belongs to every run of the migrations."""
+    _quieten()
+    DBOS.migrate(url, schema=SCHEMA)
+
+
+def enqueue(db: Session, job_id: str, priority: int) -> None:
+    """Put a job on the queue within the caller's transaction: it exists when the caller commits, not before."""
+    # no app_version: a job runs on the newest protocol that any worker speaks
+    options: EnqueueOptions = {"workflow_name": WORKFLOW, "queue_name": QUEUE, "workflow_id": job_id, "priority": int(priority)}
+    # the insert must reach the rows that the session holds back, in order
+    db.flush()
+    client = _client(db.connection().engine.url.render_as_string(hide_password=False))
+    client.enqueue_in_transaction(db.connection(), options, job_id)
+
+
+_clients: dict[str, DBOSClient] = {}
+_clients_lock = threading.Lock()
+
+
+def _client(url: str) -> DBOSClient:
+    """A client that only writes and reads the queue; it never runs a workflow."""
+    with _clients_lock:
+        if url not in _clients:
+            _quieten()
+            _clients[url] = DBOSClient(
+                system_database_url=url,
+                dbos_system_schema=SCHEMA,
+                serializer=JsonSerializer(),
+                application_name=APPLICATION,
+                system_database_pool_size=2,
+                lazy=True,
+            )
+        return _clients[url]
+
+
+_runner: Callable[[str], None] | None = None
+
+
+@DBOS.workflow(name=WORKFLOW, max_recovery_attempts=MAX_RECOVERIES)
+def _job_workflow(job_id: str) -> dict[str, Any]:
+    if _runner is None:
+        raise RuntimeError("this process enqueues jobs and does not run them")
+    _runner(job_id)
+    return {}
+
+
+def launch(url: str, executor_id: str, jobs_at_once: int, runner: Callable[[str], None]) -> None:
+    """Make this process an executor: resume its own interrupted jobs and take jobs from the queue.
+
+    Args:
+        url: SQLAlchemy URL of the database.
+        executor_id: no other live process may have it, and a restarted worker should have it again.
+        jobs_at_once: jobs this worker takes from the queue at a time.
+        runner: runs one job; called in a thread of its own.
+    """
+    global _runner
+    _runner = runner
+    config: DBOSConfig = {
+        "name": APPLICATION,
+        "system_database_url": url,
+        "dbos_system_schema": SCHEMA,
+        "application_version": PROTOCOL,
+        "executor_id": executor_id,
+        "serializer": JsonSerializer(),
+        "log_level": "WARNING",
+        "console_log_level": "WARNING",
+        "run_migrations": False,
+        "enable_otlp": False,
+    }
+    DBOS(config=config)
+    _quieten()
+    DBOS.launch()
+    DBOS.register_queue(QUEUE, worker_concurrency=jobs_at_once, polling_interval_sec=QUEUE_POLL_S, on_conflict="always_update")
+
+
+def shutdown() -> None:
+    """Stop being an executor; jobs that are not finished stay ours until `release`."""
+    global _runner
+    DBOS.destroy()
+    _runner = None
+
+
+class Durability:
+    """Steps of the workflow that runs in this thread."""
+
+    def durable(self, name: str, body: Body) -> dict[str, Any]:
+        """Run `body` as a step: after a crash its recorded result is returned instead."""
+        return DBOS.run_step({"name": name}, body)
+
+    def durable_all(self, steps: Sequence[tuple[str, Body]]) -> list[dict[str, Any]]:
+        """Run bodies side by side, each a step; results in the order given.
+
+        A body that raises (cancel, stop) does not keep the others from ending; then the first such exception is raised.
+        """
+        # positions in the workflow are drawn here, in order, so that a replay finds the same ones whatever the threads do
+        reserved = [(name, body, DBOS.reserve_step()) for name, body in steps]
+        if not reserved:
+            return []
+        with ThreadPoolExecutor(max_workers=len(reserved), thread_name_prefix="fan-out") as pool:
+            futures = [pool.submit(contextvars.copy_context().run, step.run, {"name": name}, body) for name, body, step in reserved]
+        return [cast(dict[str, Any], future.result()) for future in futures]
+
+
+def recover(executor_ids: Sequence[str]) -> list[str]:
+    """Put the unfinished jobs of dead executors back on the queue; returns the ids of those that this call found.
+
+    Safe when several workers do it at once: the update asks for PENDING and the dead executor's id, so a job that somebody took meanwhile is
+    left alone. The public `resume_workflow` is not: it also revives cancelled jobs and resets the count of recoveries. Hence a private name,
+    held in this one place and by a contract test.
+    """
+    return [handle.get_workflow_id() for handle in DBOS._recover_pending_workflows(list(executor_ids))]
+
+
+def owners(db: Session) -> dict[str, str]:
+    """Executor of every job that is being run, by job id."""
+    rows = db.execute(
+        text("select workflow_uuid, executor_id from dbos.workflow_status where status = 'PENDING' and name = :name"), {"name": WORKFLOW}
+    )
+    return {row.workflow_uuid: row.executor_id for row in rows}
+
+
+def ended(db: Session, job_ids: Sequence[str]) -> dict[str, str]:
+    """Of these jobs, those that the engine will never run again, with its word for why ('GONE': it has no record of the job)."""
+    rows = db.execute(
+        text("select workflow_uuid, status from dbos.workflow_status where workflow_uuid = any(:ids)"), {"ids": list(job_ids)}
+    )
+    known = {row.workflow_uuid: row.status for row in rows}
+    return {i: known.get(i, "GONE") for i in job_ids if known.get(i) not in {"ENQUEUED", "DELAYED", "PENDING"}}
+
+
+def adopt_older_protocols(db: Session) -> int:
+    """Move unfinished jobs of other protocol versions to ours, at start-up; returns how many.
+
+    DBOS would leave them waiting for ever for a worker of their version. It also replays by position, which a new protocol may have changed:
+    its record of their steps is dropped, and finished steps are found by their keys in `job_step` instead.
+    """
+    rows = db.execute(
+        text(
+            "update dbos.workflow_status set application_version = :version where name = :name and status in ('ENQUEUED', 'DELAYED', 'PENDING')"
+            " and application_version is not null and application_version <> :version returning workflow_uuid"
+        ),
+        {"version": PROTOCOL, "name": WORKFLOW},
+    )
+    moved = [row.workflow_uuid for row in rows]
+    if moved:
+        db.execute(text("delete from dbos.operation_outputs where workflow_uuid = any(:ids)"), {"ids": moved})
+    return len(moved)
+
+
+def forgive_attempt(db: Session, executor_id: str) -> None:
+    """An orderly stop is no crash: take back the attempt that it will cost the jobs this executor still holds."""
+    db.execute(
+        text(
+            "update dbos.workflow_status set recovery_attempts = greatest(recovery_attempts - 1, 0)"
+            " where executor_id = :executor and status = 'PENDING' and name = :name"
+        ),
+        {"executor": executor_id, "name": WORKFLOW},
+    )
+
+
+def delete_finished(url: str, older_than: timedelta) -> int:
+    """Delete the engine's record of jobs that finished long ago (ours stays); returns how many."""
+    client = _client(url)
+    done = client.list_workflows(
+        status=["SUCCESS", "ERROR", "CANCELLED", "MAX_RECOVERY_ATTEMPTS_EXCEEDED"],
+        completed_before=(datetime.now(UTC) - older_than).isoformat(),
+        name=WORKFLOW,
+        limit=1000,
+        load_input=False,
+        load_output=False,
+    )
+    if done:
+        client.delete_workflows([workflow.workflow_id for workflow in done])
+    return len(done)
+
+
+def _quieten() -> None:
+    logger = logging.getLogger("dbos")
+    logger.setLevel(logging.WARNING)
+    if not any(isinstance(f, CancelNoise) for f in logger.filters):
+        logger.addFilter(CancelNoise())

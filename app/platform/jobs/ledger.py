@@ -1,0 +1,200 @@
+"""The record of one job while it runs: every change of job, steps and events goes through here.
+
+Each change locks the job's row first. So a cancel is seen by the very next change, and events get their numbers in the order in which they
+become visible: a reader that has seen event 7 never misses an event 6.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from sqlalchemy import func, select
+from sqlalchemy.dialects.postgresql import insert
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.orm import Session
+
+from app.platform.database import now, set_actor, transaction
+from app.platform.jobs import repository
+from app.platform.jobs.errors import JobCancelled
+from app.platform.jobs.models import Job, JobStatus, JobStep
+from app.platform.jobs.nursery import Heard
+
+log = logging.getLogger(__name__)
+
+Value = TypeVar("Value")
+_RETRY_S = (0.2, 5.0)
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """Writes about one job, in the name of the person who submitted it.
+
+    Args:
+        check: raises when this worker must leave the job alone.
+    """
+
+    job_id: str
+    created_by: str
+    worker: str
+    check: Callable[[], None]
+
+    def open(self) -> bool:
+        """Mark the job as running; False when it has ended already, so that there is nothing to do."""
+
+        def write() -> bool:
+            with self._locked(live_only=False) as (db, job):
+                if JobStatus(job.status).ended:
+                    return False
+                if job.status == JobStatus.QUEUED:
+                    job.status = JobStatus.RUNNING
+                    job.started_at = job.started_at or now()
+                    repository.add_event(db, job.id, "status", {"status": job.status})
+                job.updated_at = now()
+                return True
+
+        return self._persist(write)
+
+    def declare(self, key: str, title: str, weight: float) -> None:
+        """Make a step's row unless it is there."""
+
+        def write() -> None:
+            with self._locked() as (db, job):
+                position = select(func.coalesce(func.max(JobStep.position), -1) + 1).where(JobStep.job_id == job.id).scalar_subquery()
+                values = {"job_id": job.id, "key": key, "title": title, "weight": weight, "position": position}
+                db.execute(insert(JobStep).values(values).on_conflict_do_nothing(index_elements=["job_id", "key"]))
+
+        self._persist(write)
+
+    def begin(self, key: str) -> dict[str, Any] | None:
+        """Start a step, unless it has its result: that is returned."""
+
+        def write() -> dict[str, Any] | None:
+            with self._locked() as (db, job):
+                step = repository.step(db, job.id, key)
+                if step.status == JobStatus.SUCCEEDED:
+                    return step.result
+                step.status, step.message, step.progress = JobStatus.RUNNING, "", 0.0
+                step.attempts += 1
+                step.worker, step.started_at, step.finished_at = self.worker, now(), None
+                self._tell_step(db, job, step)
+                return None
+
+        return self._persist(write)
+
+    def hear(self, key: str, heard: Heard) -> None:
+        """Record what a step's process said."""
+
+        def write() -> None:
+            with self._locked() as (db, job):
+                step = repository.step(db, job.id, key)
+                if heard.progress is not None:
+                    step.progress = heard.progress
+                if heard.message is not None:
+                    step.message = heard.message
+                for text in heard.logs or ():
+                    repository.add_event(db, job.id, "log", {"text": text}, key)
+                if heard.points:
+                    repository.add_event(db, job.id, "points", {"points": heard.points}, key)
+                if heard.progress is not None or heard.message is not None:
+                    self._tell_progress(db, job, step)
+
+        self._persist(write)
+
+    def commit_step(self, key: str, fn: Callable[[Session], dict[str, Any]]) -> dict[str, Any]:
+        """Run `fn(db)` and mark the step as succeeded with its result, in one transaction; a step that has its result gives that."""
+
+        def write() -> dict[str, Any]:
+            with self._locked() as (db, job):
+                step = repository.step(db, job.id, key)
+                if step.status == JobStatus.SUCCEEDED and step.result is not None:
+                    return step.result
+                step.result = fn(db)
+                step.status, step.progress, step.finished_at = JobStatus.SUCCEEDED, 1.0, now()
+                self._tell_step(db, job, step)
+                return step.result
+
+        return self._persist(write)
+
+    def fail_step(self, key: str, message: str, trace: str) -> None:
+        """Mark a step as failed; the traceback goes to the job's log."""
+
+        def write() -> None:
+            with self._locked() as (db, job):
+                step = repository.step(db, job.id, key)
+                step.status, step.message, step.finished_at = JobStatus.FAILED, message, now()
+                if trace:
+                    repository.add_event(db, job.id, "log", {"text": trace}, key)
+                self._tell_step(db, job, step)
+
+        self._persist(write)
+
+    def say(self, text: str) -> None:
+        """Add a line to the job's log."""
+
+        def write() -> None:
+            with self._locked() as (db, job):
+                job.message = text
+                repository.add_event(db, job.id, "log", {"text": text})
+
+        self._persist(write)
+
+    def close(self, status: JobStatus, result: dict[str, Any] | None = None, error: str | None = None, trace: str = "") -> None:
+        """End the job; steps that did not end are cancelled."""
+
+        def write() -> None:
+            with self._locked(live_only=False) as (db, job):
+                if trace:
+                    repository.add_event(db, job.id, "log", {"text": trace})
+                repository.end_job(db, job, status, result=result, error=error)
+
+        self._persist(write)
+
+    @contextmanager
+    def _locked(self, live_only: bool = True) -> Iterator[tuple[Session, Job]]:
+        with transaction(self.created_by) as db:
+            set_actor(db, self.created_by, request_id=self.job_id)
+            job = repository.locked(db, self.job_id)
+            if live_only and (JobStatus(job.status).ended or job.cancel_requested_at is not None):
+                raise JobCancelled
+            yield db, job
+
+    def _persist(self, write: Callable[[], Value]) -> Value:
+        """Write, and when the database is away, wait for it: a restart of the database fails no job."""
+        pause, longest = _RETRY_S
+        while True:
+            self.check()
+            try:
+                return write()
+            except DBAPIError as error:
+                if not _worth_repeating(error):
+                    raise
+                log.warning("job %s: the database is away, trying again in %.1f s (%s)", self.job_id, pause, type(error.orig).__name__)
+                time.sleep(pause * random.uniform(0.5, 1.0))
+                pause = min(2 * pause, longest)
+
+    def _tell_step(self, db: Session, job: Job, step: JobStep) -> None:
+        data = {"status": step.status, "title": step.title, "message": step.message, "attempt": step.attempts}
+        repository.add_event(db, job.id, "step", data, step.key)
+        self._tell_progress(db, job, step)
+
+    def _tell_progress(self, db: Session, job: Job, step: JobStep) -> None:
+        db.flush()
+        # never backwards: a step that is resumed from its checkpoint starts to report from there
+        mean = select(func.sum(JobStep.weight * JobStep.progress) / func.sum(JobStep.weight)).where(JobStep.job_id == job.id)
+        job.progress = max(job.progress, min(1.0, db.scalar(mean) or 0.0))
+        job.updated_at = now()
+        job.message = f"{step.title}: {step.message}" if step.message else step.title
+        data = {"progress": step.progress, "job_progress": job.progress, "message": step.message}
+        repository.add_event(db, job.id, "progress", data, step.key)
+
+
+def _worth_repeating(error: DBAPIError) -> bool:
+    """The connection broke or the database restarts (class 08, 57P), or transactions got into each other's way (class 40)."""
+    state = getattr(error.orig, "sqlstate", None)
+    return error.connection_invalidated or state is None or state[:2] in {"08", "40"} or state[:3] == "57P"

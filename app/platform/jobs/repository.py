@@ -1,0 +1,148 @@
+"""Every query of the job tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import func, select, text, update
+from sqlalchemy.orm import Session, selectinload
+
+from app.platform.database import now
+from app.platform.errors import NotFound
+from app.platform.jobs.models import Job, JobEvent, JobStatus, JobStep, Worker
+
+LIVE = (JobStatus.QUEUED, JobStatus.RUNNING)
+
+
+def get(db: Session, job_id: str) -> Job:
+    """A job with its steps.
+
+    Raises:
+        NotFound: there is none.
+    """
+    job = db.scalar(select(Job).where(Job.id == job_id).options(selectinload(Job.steps)))
+    if job is None:
+        raise NotFound(f"There is no job {job_id}.")
+    return job
+
+
+def locked(db: Session, job_id: str) -> Job:
+    """A job's row as it stands now, locked against other changes.
+
+    Raises:
+        NotFound: there is none.
+    """
+    job = db.scalar(select(Job).where(Job.id == job_id).with_for_update(key_share=True), execution_options={"populate_existing": True})
+    if job is None:
+        raise NotFound(f"There is no job {job_id}.")
+    return job
+
+
+def find(
+    db: Session,
+    participant_id: int | None = None,
+    kind: str | None = None,
+    status: Sequence[JobStatus] = (),
+    limit: int = 50,
+    offset: int = 0,
+) -> tuple[list[Job], int]:
+    """Jobs, newest first, with their steps, and how many there are in all."""
+    query = select(Job)
+    if participant_id is not None:
+        query = query.where(Job.participant_id == participant_id)
+    if kind is not None:
+        query = query.where(Job.kind == kind)
+    if status:
+        query = query.where(Job.status.in_(status))
+    total = db.scalar(select(func.count()).select_from(query.subquery())) or 0
+    newest = query.order_by(Job.created_at.desc(), Job.id).limit(limit).offset(offset).options(selectinload(Job.steps))
+    return list(db.scalars(newest)), total
+
+
+def step(db: Session, job_id: str, key: str) -> JobStep:
+    """A step of a job; it must have been declared."""
+    return db.scalars(select(JobStep).where(JobStep.job_id == job_id, JobStep.key == key)).one()
+
+
+def add_event(db: Session, job_id: str, kind: str, data: dict[str, Any], step_key: str | None = None) -> None:
+    """Say something in a job's name; the job's row must be locked, so that events become visible in the order of their numbers."""
+    db.add(JobEvent(job_id=job_id, step_key=step_key, kind=kind, data=data))
+    db.flush()
+
+
+def events_after(db: Session, job_id: str, last_id: int, limit: int = 500) -> list[JobEvent]:
+    """Events of a job that came after one, oldest first."""
+    return list(db.scalars(select(JobEvent).where(JobEvent.job_id == job_id, JobEvent.id > last_id).order_by(JobEvent.id).limit(limit)))
+
+
+def end_job(db: Session, job: Job, status: JobStatus, result: dict[str, Any] | None = None, error: str | None = None) -> None:
+    """End a job, whose row must be locked; steps that did not end are cancelled. A job that has ended stays as it is."""
+    if JobStatus(job.status).ended:
+        return
+    job.status, job.result, job.error = status, result, error
+    job.finished_at = job.updated_at = now()
+    job.message = error or ""
+    if status == JobStatus.SUCCEEDED:
+        job.progress = 1.0
+    db.execute(
+        update(JobStep)
+        .where(JobStep.job_id == job.id, JobStep.status.in_(LIVE))
+        .values(status=JobStatus.CANCELLED, finished_at=job.finished_at)
+    )
+    add_event(db, job.id, "status", {"status": status, "error": error, "progress": job.progress})
+
+
+def live_ids(db: Session) -> list[str]:
+    """Jobs that have not ended."""
+    return list(db.scalars(select(Job.id).where(Job.status.in_(LIVE))))
+
+
+def cancel_requests(db: Session, job_ids: Sequence[str]) -> set[str]:
+    """Of these jobs, those that somebody wants cancelled or that have ended."""
+    wanted = select(Job.id).where(Job.id.in_(job_ids), Job.cancel_requested_at.is_not(None) | Job.status.not_in(LIVE))
+    return set(db.scalars(wanted))
+
+
+def ended_before(db: Session, job_ids: Sequence[str], days: float) -> set[str]:
+    """Of these ids, those of jobs that ended longer ago, or that are no jobs at all."""
+    keep = select(Job.id).where(
+        Job.id.in_(job_ids), (Job.finished_at.is_(None)) | (Job.finished_at > func.now() - func.make_interval(0, 0, 0, days))
+    )
+    return set(job_ids) - set(db.scalars(keep))
+
+
+def beat(db: Session, worker_id: str, host: str, pid: int) -> float:
+    """Sign of life of a worker; returns the seconds since its last one by the database's clock (0 for a new worker)."""
+    row = db.execute(
+        text(
+            "with old as (select seen_at from worker where id = :id)"
+            " insert into worker (id, host, pid, started_at, seen_at) values (:id, :host, :pid, clock_timestamp(), clock_timestamp())"
+            " on conflict (id) do update set host = :host, pid = :pid, seen_at = clock_timestamp(),"
+            " started_at = case when worker.pid = :pid then worker.started_at else clock_timestamp() end"
+            " returning coalesce(extract(epoch from clock_timestamp() - (select seen_at from old)), 0)"
+        ),
+        {"id": worker_id, "host": host, "pid": pid},
+    )
+    return float(row.scalar_one())
+
+
+def leave(db: Session, worker_id: str) -> None:
+    """Remove a worker that stops in order, so that others need not wait until it counts as dead."""
+    db.execute(text("delete from worker where id = :id"), {"id": worker_id})
+
+
+def live_workers(db: Session, stale_s: float) -> list[Worker]:
+    """Workers seen within the last `stale_s` seconds, by the database's clock."""
+    return list(
+        db.scalars(
+            select(Worker)
+            .where(Worker.seen_at > func.clock_timestamp() - func.make_interval(0, 0, 0, 0, 0, 0, stale_s))
+            .order_by(Worker.id)
+        )
+    )
+
+
+def forget_workers(db: Session, stale_s: float) -> None:
+    """Remove workers that have been silent for longer."""
+    db.execute(text("delete from worker where seen_at < clock_timestamp() - make_interval(secs => :stale)"), {"stale": stale_s})

@@ -1,0 +1,107 @@
+"""Submit, cancel and retry jobs. The caller commits."""
+
+from __future__ import annotations
+
+import hashlib
+import uuid
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from sqlalchemy.orm import Session
+
+from app import __version__
+from app.platform.database import now
+from app.platform.errors import Conflict, Invalid
+from app.platform.jobs import engine, registry, repository
+from app.platform.jobs.models import Job, JobEvent, JobStatus
+from app.platform.jobs.repository import events_after as events_after
+
+STALE_S = 60.0
+"""A worker that is silent for longer is taken for dead."""
+
+_ROOT = Path(__file__).resolve().parents[3]
+
+
+def submit(db: Session, kind: str, participant_id: int | None, params: dict[str, Any] | BaseModel, created_by: str) -> Job:
+    """Make a job and put it on the queue, both in the caller's transaction.
+
+    Args:
+        db: the session; the job exists when the caller commits.
+        kind: a registered name.
+        participant_id: whose data it works on.
+        params: checked by the kind's schema.
+        created_by: who asks for it; stands in the audit trail beside everything that the job writes.
+
+    Raises:
+        UnknownKind: there is no such kind.
+        Invalid: the params break the kind's schema; `errors` lists where.
+    """
+    wanted = registry.kind(kind)
+    raw = params.model_dump(mode="json") if isinstance(params, BaseModel) else params
+    try:
+        checked = wanted.params_schema.model_validate(raw).model_dump(mode="json")
+    except ValidationError as error:
+        errors = error.errors(include_url=False, include_context=False, include_input=False)
+        places = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'params'}: {e['msg']}" for e in errors)
+        raise Invalid(f"These params do not fit the job kind {kind!r}: {places}.", errors=errors) from error
+    job = Job(
+        id=str(uuid.uuid4()),
+        participant_id=participant_id,
+        kind=kind,
+        status=JobStatus.QUEUED,
+        progress=0.0,
+        message="",
+        params=checked,
+        code_version=code_version(),
+        created_by=created_by,
+    )
+    db.add(job)
+    db.flush()
+    repository.add_event(db, job.id, "status", {"status": JobStatus.QUEUED})
+    engine.enqueue(db, job.id, wanted.priority)
+    return job
+
+
+def cancel(db: Session, job: Job, by: str) -> Job:
+    """Cancel a job: at once when it waits, or when no worker lives that could run it; else its worker kills it within 2 s.
+
+    Raises:
+        Conflict: it has already ended.
+    """
+    job = repository.locked(db, job.id)
+    if JobStatus(job.status).ended:
+        raise Conflict(f"Job {job.id} has already {job.status}: there is nothing left to cancel.")
+    if job.cancel_requested_at is None:
+        job.cancel_requested_at, job.cancel_requested_by = now(), by
+        repository.add_event(db, job.id, "cancel", {"by": by})
+    if job.status == JobStatus.QUEUED or not repository.live_workers(db, STALE_S):
+        repository.end_job(db, job, JobStatus.CANCELLED)
+    return job
+
+
+def retry(db: Session, job: Job, by: str) -> Job:
+    """A new job of the same kind with the same params.
+
+    Raises:
+        Conflict: the job has not ended.
+    """
+    if not JobStatus(job.status).ended:
+        raise Conflict(f"Job {job.id} is still {job.status}.", "Wait for it or cancel it, then retry.")
+    return submit(db, job.kind, job.participant_id, job.params, by)
+
+
+def describe_event(event: JobEvent) -> dict[str, Any]:
+    """An event as the API and the event stream show it."""
+    return {"id": event.id, "kind": event.kind, "step": event.step_key, "at": event.at.isoformat(), "data": event.data}
+
+
+@lru_cache(maxsize=1)
+def code_version() -> str:
+    """Version and hash of the source that runs here: the same text means the same code, with git or without."""
+    digest = hashlib.sha256()
+    for package in ("app", "ml"):
+        for path in sorted((_ROOT / package).rglob("*.py")):
+            digest.update(path.relative_to(_ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return f"{__version__}+{digest.hexdigest()[:12]}"

@@ -1,0 +1,81 @@
+"""Server-sent events of one job."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator
+from typing import Any
+
+from fastapi.concurrency import run_in_threadpool
+
+from app.platform.database import new_session
+from app.platform.jobs import repository
+from app.platform.jobs.models import Job, JobStatus
+from app.platform.jobs.service import describe_event
+
+POLL_S = 0.5
+KEEP_ALIVE_S = 15.0
+_BATCH = 500
+
+
+async def job_events(job_id: str, last_event_id: str | None = None) -> AsyncIterator[str]:
+    """The events of a job as the lines of a `text/event-stream`, until it ends.
+
+    First comes an event `job` without an id: the state of the job and its steps. Then every event after `last_event_id` (the header
+    Last-Event-ID; anything but a number counts as none) under its kind: `status`, `step`, `progress`, `points`, `log`, `cancel`. Last comes
+    `end` with the final state; the browser must then close its EventSource, which would connect again otherwise.
+
+    Raises:
+        NotFound: there is no such job.
+    """
+    last_id = int(last_event_id) if last_event_id and last_event_id.isdecimal() else 0
+    state, _ = await run_in_threadpool(_read, job_id, None)
+    yield _message("job", state)
+    spoken = time.monotonic()
+    while True:
+        state, events = await run_in_threadpool(_read, job_id, last_id)
+        for event in events:
+            last_id = event["id"]
+            yield _message(event["kind"], event, last_id)
+            spoken = time.monotonic()
+        if len(events) == _BATCH:
+            continue
+        if JobStatus(state["status"]).ended:
+            yield _message("end", state)
+            return
+        if time.monotonic() - spoken >= KEEP_ALIVE_S:
+            yield ": keep-alive\n\n"
+            spoken = time.monotonic()
+        await asyncio.sleep(POLL_S)
+
+
+def describe(job: Job) -> dict[str, Any]:
+    """State of a job with its steps, as the event stream and the terminal show it."""
+    return {
+        "id": job.id,
+        "kind": job.kind,
+        "status": str(job.status),
+        "progress": job.progress,
+        "message": job.message,
+        "error": job.error,
+        "result": job.result,
+        "steps": [
+            {"key": s.key, "title": s.title, "status": str(s.status), "progress": s.progress, "message": s.message, "weight": s.weight}
+            for s in job.steps
+        ],
+    }
+
+
+def _read(job_id: str, last_id: int | None) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    with new_session() as db:
+        # the state before the events: once it says that the job has ended, the events that follow are the last
+        state = describe(repository.get(db, job_id))
+        events = [] if last_id is None else repository.events_after(db, job_id, last_id, _BATCH)
+        return state, [describe_event(event) for event in events]
+
+
+def _message(kind: str, data: dict[str, Any], event_id: int | None = None) -> str:
+    head = f"id: {event_id}\n" if event_id is not None else ""
+    return f"{head}event: {kind}\ndata: {json.dumps(data)}\n\n"

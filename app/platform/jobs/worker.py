@@ -1,0 +1,238 @@
+"""The worker: takes jobs from the queue, shows that it lives, and looks after the jobs of workers that do not."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import socket
+import threading
+import time
+from dataclasses import dataclass
+from datetime import timedelta
+
+from sqlalchemy import Connection, text
+from sqlalchemy.exc import DBAPIError
+
+from app.platform.database import database_url, get_engine, new_session, set_actor, transaction
+from app.platform.jobs import engine, repository
+from app.platform.jobs.models import JobStatus
+from app.platform.jobs.steps import JobRunner
+from app.platform.tables import load_tables
+from app.settings import get_settings
+
+log = logging.getLogger(__name__)
+
+CANCEL_POLL_S = 0.5
+KEEP_FINISHED = timedelta(days=14)
+"""How long the engine's rows and the working folders of finished jobs are kept."""
+_MOST_WORKERS = 1000
+_STOP_WAIT_S = 8.0
+_ACTOR = "worker"
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How often a worker does what, seconds; tests run faster."""
+
+    beat_s: float = 5.0
+    stale_s: float = 60.0
+    housekeeping_s: float = 3600.0
+
+
+class IdentityLost(RuntimeError):
+    """Another process took this worker's name while its connection was gone; it must not go on."""
+
+
+class Identity:
+    """A worker's name, `host-N` with the smallest free N: the same after a restart, and never two live workers at once.
+
+    An advisory lock in the database holds it, which ends with the connection, that is with the process, kill -9 included.
+    """
+
+    def __init__(self) -> None:
+        self._connection: Connection | None = None
+        self.id = ""
+
+    def claim(self) -> str:
+        """Take the first free name."""
+        host = socket.gethostname()
+        for number in range(_MOST_WORKERS):
+            if self._lock(f"{host}-{number}"):
+                return self.id
+        raise RuntimeError(f"there are {_MOST_WORKERS} workers on {host} already")
+
+    def keep(self) -> None:
+        """Take the name again if the connection was lost.
+
+        Raises:
+            IdentityLost: somebody else has it now.
+        """
+        try:
+            if self._connection is not None:
+                self._connection.execute(text("select 1"))
+                return
+        except DBAPIError:
+            self.release()
+        if not self._lock(self.id):
+            raise IdentityLost(f"another worker took the name {self.id} while the database was away")
+
+    def release(self) -> None:
+        """Give the name up."""
+        if self._connection is not None:
+            self._connection.invalidate()  # closes it, and with it the lock, instead of handing it back to the pool
+            self._connection.close()
+            self._connection = None
+
+    def _lock(self, name: str) -> bool:
+        connection = get_engine().connect().execution_options(isolation_level="AUTOCOMMIT")
+        if connection.scalar(text("select pg_try_advisory_lock(hashtextextended(:name, 0))"), {"name": f"betaloop worker {name}"}):
+            self._connection, self.id = connection, name
+            return True
+        connection.close()
+        return False
+
+
+class Watchman:
+    """The worker's own thread: signs of life, cancel requests, jobs of dead workers, old rows and folders."""
+
+    def __init__(self, identity: Identity, runner: JobRunner, pace: Pace) -> None:
+        self._identity, self._runner, self._pace = identity, runner, pace
+        self._host, self._pid = socket.gethostname(), os.getpid()
+        self._may_reap_at = 0.0
+        self._next_beat = self._next_housekeeping = 0.0
+
+    def look(self) -> None:
+        """One round; called every CANCEL_POLL_S.
+
+        Raises:
+            IdentityLost: the worker must stop.
+        """
+        try:
+            self._cancel()
+            if time.monotonic() >= self._next_beat:
+                self._next_beat = time.monotonic() + self._pace.beat_s
+                self.beat()
+                self._let_go()
+                self._reap()
+                self._end_given_up()
+            if time.monotonic() >= self._next_housekeeping:
+                self._next_housekeeping = time.monotonic() + self._pace.housekeeping_s
+                self._tidy()
+        except DBAPIError as error:
+            log.warning("the database is away: %s", type(error.orig).__name__)
+
+    def beat(self) -> None:
+        """Say that we live."""
+        self._identity.keep()
+        with transaction(_ACTOR) as db:
+            silent_s = repository.beat(db, self._identity.id, self._host, self._pid)
+        if silent_s > self._pace.stale_s:
+            # the machine slept: other workers of this machine did too, and need a moment to show that they live
+            self._may_reap_at = time.monotonic() + self._pace.stale_s
+
+    def _cancel(self) -> None:
+        if running := self._runner.running():
+            with new_session() as db:
+                for job_id in repository.cancel_requests(db, running):
+                    self._runner.cancel(job_id)
+
+    def _let_go(self) -> None:
+        """Drop jobs that another worker took over, because we were silent for too long."""
+        if running := self._runner.running():
+            with new_session() as db:
+                owners = engine.owners(db)
+            for job_id in running:
+                if owners.get(job_id, self._identity.id) != self._identity.id:
+                    log.warning("job %s was taken over by %s", job_id, owners[job_id])
+                    self._runner.abandon(job_id)
+
+    def _reap(self) -> None:
+        """Put the jobs of dead workers back on the queue."""
+        if time.monotonic() < self._may_reap_at:
+            return
+        with new_session() as db:
+            live = {worker.id for worker in repository.live_workers(db, self._pace.stale_s)}
+            dead = sorted(set(engine.owners(db).values()) - live)
+        if dead:
+            found = engine.recover(dead)
+            log.warning("recovered %d jobs of %s", len(found), ", ".join(dead))
+
+    def _end_given_up(self) -> None:
+        """Fail jobs that the engine will never run again."""
+        with new_session() as db:
+            # rows first: a job that is submitted in between is then not missed in the engine's table
+            given_up = engine.ended(db, repository.live_ids(db))
+        for job_id, reason in given_up.items():
+            if job_id in self._runner.running():
+                continue
+            with transaction(_ACTOR) as db:
+                set_actor(db, _ACTOR, request_id=job_id)
+                job = repository.locked(db, job_id)
+                if job.cancel_requested_at is not None:
+                    repository.end_job(db, job, JobStatus.CANCELLED)
+                else:
+                    repository.end_job(db, job, JobStatus.FAILED, error=_why_given_up(reason))
+
+    def _tidy(self) -> None:
+        engine.delete_finished(database_url(), KEEP_FINISHED)
+        with transaction(_ACTOR) as db:
+            repository.forget_workers(db, KEEP_FINISHED.total_seconds())
+            folders = {path.name: path for path in get_settings().jobs_dir.glob("*") if path.is_dir()}
+            old = repository.ended_before(db, list(folders), KEEP_FINISHED / timedelta(days=1))
+        for name in old:
+            shutil.rmtree(folders[name])
+
+
+def run_worker(slots: int, stop_event: threading.Event, pace: Pace | None = None) -> None:
+    """Work until `stop_event` is set; then kill the children and leave unfinished jobs to whoever comes next.
+
+    Args:
+        slots: compute steps to run side by side.
+        stop_event: set by the caller's signal handler.
+        pace: how often to do what.
+
+    Raises:
+        IdentityLost: another process took this worker's name; its jobs are left alone.
+    """
+    load_tables()
+    pace = pace or Pace()
+    identity = Identity()
+    worker_id = identity.claim()
+    runner = JobRunner(worker_id, slots)
+    watchman = Watchman(identity, runner, pace)
+    with transaction(_ACTOR) as db:
+        if moved := engine.adopt_older_protocols(db):
+            log.warning("moved %d waiting jobs to job protocol %s", moved, engine.PROTOCOL)
+    watchman.beat()  # before the first job, or others would take it for a dead worker's
+    engine.launch(database_url(), worker_id, slots, runner.run)
+    log.info("worker %s takes jobs, %d at a time", worker_id, slots)
+    try:
+        while not stop_event.wait(CANCEL_POLL_S):
+            watchman.look()
+    finally:
+        _stop(identity, runner)
+
+
+def _stop(identity: Identity, runner: JobRunner) -> None:
+    if not runner.stop(_STOP_WAIT_S):
+        log.warning("jobs %s did not let go in time; they are recovered later", ", ".join(runner.running()))
+    engine.shutdown()
+    try:
+        with transaction(_ACTOR) as db:
+            engine.forgive_attempt(db, identity.id)
+            repository.leave(db, identity.id)
+    except DBAPIError as error:
+        log.warning(
+            "the database is away, so that other workers learn only later that %s stopped: %s", identity.id, type(error.orig).__name__
+        )
+    identity.release()
+
+
+def _why_given_up(reason: str) -> str:
+    if reason == "MAX_RECOVERY_ATTEMPTS_EXCEEDED":
+        return (
+            f"The worker died {engine.MAX_RECOVERIES + 1} times while it ran this job, so the job was given up."
+            " Look at the worker's log and the machine's memory, then retry it."
+        )
+    return f"The job's place in the queue is gone ({reason.lower()}), as after a database restored from a backup. Retry the job."

@@ -1,0 +1,235 @@
+"""Importance sampling in log space: per trajectory, self-normalised, and per decision. Source: Precup, Sutton and Singh 2000.
+
+The density of the random controller is known, 1 / (1 - B) on [B, 1]. A deterministic target is given a Gaussian kernel truncated to
+[0, 1]; its bandwidth stands in every estimate. Weights at T = 300 rest on a session or two whatever is done: these are baselines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from ml.ope.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size
+from ml.ope.estimate import LEVEL, Estimate, checked_horizon
+from ml.progress import Report, silent
+from ml.rl.policy import Policy
+from ml.statistics.bootstrap import percentile_interval, resamples
+from ml.trajectories import ReplayBuffer, SessionTrajectory
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Weighting = Literal["is", "wis", "pdis"]
+
+LARGEST_LOG = 690.0
+"""exp of this is a finite float; ordinary importance sampling may ask for more."""
+
+
+def per_trajectory(log_ratio: Floats, mask: Mask, rewards: Floats, end: Floats, gamma: float) -> tuple[Floats, Floats]:
+    """Log weights of whole trajectories and their returns.
+
+    Args:
+        log_ratio: log pi(a_t | s_t) - log mu(a_t | s_t), [N, T]; may be -inf. mask: steps that count, [N, T].
+        rewards: r_t, [N, T]. end: r_end, [N], added undiscounted; NaN where it was not measured (the return is then NaN).
+        gamma: discount per step.
+
+    Returns:
+        Log weights [N] and returns [N]: discounted sums over the steps that count, rescaled to the whole horizon of T steps.
+    """
+    discount = gamma ** np.arange(rewards.shape[1])
+    counted = np.where(mask, discount, 0.0).sum(1)
+    step = np.where(mask, rewards * discount, 0.0).sum(1) * discount.sum() / np.maximum(counted, 1e-300)
+    return np.where(mask, log_ratio, 0.0).sum(1), step + end
+
+
+def ordinary(log_weights: Floats, returns: Floats) -> float:
+    """Mean of weight x return, [N]: unbiased, and of enormous variance over long horizons. Finite at any length."""
+    return float(_signed_exp(log_weights, returns).mean()) if returns.size else 0.0
+
+
+def weighted(log_weights: Floats, returns: Floats) -> float:
+    """Self-normalised mean of returns, [N]; the plain mean where every weight is zero."""
+    top = log_weights.max()
+    weights = np.exp(log_weights - top) if np.isfinite(top) else np.ones_like(log_weights)
+    return float(weights @ returns / weights.sum())
+
+
+def per_decision_terms(log_ratio: Floats, mask: Mask, rewards: Floats, gamma: float) -> Floats:
+    """Per-decision contributions of each session, [N]: sum over t of gamma^t (product of ratios up to t) r_t, finite at any length.
+
+    A step that does not count (unusable, or after a short session's end) takes the mean contribution of the sessions that have it.
+    """
+    cumulative = np.cumsum(np.where(mask, log_ratio, 0.0), axis=1)
+    discount = gamma ** np.arange(rewards.shape[1])
+    terms = _signed_exp(cumulative, np.where(mask, rewards, 0.0)) * discount
+    counted = mask.sum(0)
+    means = np.where(mask, terms, 0.0).sum(0) / np.maximum(counted, 1)
+    return np.asarray(np.where(mask, terms, means).sum(1), dtype=np.float64)
+
+
+def kernel_log_density(amplitude: Floats, centre: Floats, bandwidth: float) -> Floats:
+    """Log density at `amplitude` of a Gaussian around `centre` truncated to [0, 1], elementwise (broadcasting)."""
+    inside = norm.cdf((1 - centre) / bandwidth) - norm.cdf(-centre / bandwidth)
+    density = norm.logpdf((amplitude - centre) / bandwidth) - np.log(bandwidth) - np.log(inside)
+    return np.asarray(np.where((amplitude >= 0) & (amplitude <= 1), density, -np.inf), dtype=np.float64)
+
+
+def behaviour_log_density(session: SessionTrajectory, bandwidth: float) -> Floats:
+    """Log density of the logged amplitudes of a session, [T]; NaN where unusable.
+
+    Random sessions: uniform on [B, 1]. Others ran a near-deterministic controller: the kernel that smooths the target is put around what
+    it did, so that a target that acts alike has the ratio 1 and no ratio grows with the session.
+    """
+    usable = session.usable()
+    a = np.clip(session.amplitude, 0.0, 1.0)
+    result = np.full(session.steps, np.nan)
+    if not usable.any():
+        return result
+    if session.random_lower_bound is not None:
+        result[usable] = -np.log(1 - session.random_lower_bound)
+        return result
+    result[usable] = kernel_log_density(a[usable], a[usable], bandwidth)
+    return result
+
+
+@dataclass(frozen=True)
+class ImportanceSampling:
+    """The estimator; `method` is `is`, `wis` or `pdis`.
+
+    Attributes:
+        method: `is` per trajectory, `wis` per trajectory and self-normalised, `pdis` per decision.
+        bandwidth: of the kernel around pi(s), as a fraction of the cDBS amplitude.
+        only_random: use only sessions whose density is known.
+        draws: bootstrap resamples of sessions. seed: of the resamples.
+    """
+
+    method: Weighting = "pdis"
+    bandwidth: float = 0.1
+    only_random: bool = False
+    draws: int = 1000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.method not in ("is", "wis", "pdis"):
+            raise ValueError(f"importance sampling is one of is, wis and pdis, not {self.method}")
+        if not self.bandwidth > 0:
+            raise ValueError(f"the kernel's bandwidth must be above 0, not {self.bandwidth}")
+
+    def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedImportance:
+        """Collect the behaviour densities; takes seconds, so nothing is kept in `checkpoint_dir`.
+
+        Raises:
+            ValueError: no session is left to weigh.
+        """
+        kept = [s for s in buffer.sessions if s.usable().any() and not (self.only_random and s.random_lower_bound is None)]
+        if not kept:
+            raise ValueError("importance sampling has no session to weigh: none has a usable step with a behaviour density")
+        densities = [behaviour_log_density(s, self.bandwidth) for s in kept]
+        report(1.0, "densities of the logged amplitudes")
+        return FittedImportance(self, buffer, tuple(kept), tuple(densities))
+
+
+@dataclass(frozen=True)
+class FittedImportance:
+    """Sessions and the densities of their logged amplitudes."""
+
+    settings: ImportanceSampling
+    buffer: ReplayBuffer
+    sessions: tuple[SessionTrajectory, ...]
+    densities: tuple[Floats, ...]
+
+    def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
+        """Estimate of every policy; all share the resamples of sessions."""
+        horizon = checked_horizon(self.buffer, horizon_steps)
+        support = AmplitudeSupport(self.buffer)
+        estimates = {}
+        for k, (name, policy) in enumerate(policies.items()):
+            estimates[name] = self._estimate(policy, horizon, support)
+            report((k + 1) / len(policies), "weighing sessions")
+        return estimates
+
+    def log_ratios(self, policy: Policy, horizon: int) -> tuple[Floats, Mask, Floats]:
+        """Log ratios, the mask of usable steps, and rewards, [N, H] each."""
+        n = len(self.sessions)
+        log_ratio, rewards, mask = np.zeros((n, horizon)), np.zeros((n, horizon)), np.zeros((n, horizon), dtype=bool)
+        for i, (s, density) in enumerate(zip(self.sessions, self.densities, strict=True)):
+            k = np.flatnonzero(s.usable())
+            k = k[k < horizon]
+            if k.size:
+                target = policy.act(s.states()[k])
+                log_ratio[i, k] = kernel_log_density(np.clip(s.amplitude[k], 0, 1), target, self.settings.bandwidth) - density[k]
+                rewards[i, k] = s.rewards(self.buffer.settings)[k]
+                mask[i, k] = True
+        return log_ratio, mask, rewards
+
+    def _estimate(self, policy: Policy, horizon: int, support: AmplitudeSupport) -> Estimate:
+        config, gamma = self.settings, self.buffer.settings.gamma
+        log_ratio, mask, rewards = self.log_ratios(policy, horizon)
+        measured = [s.end_reward(self.buffer.settings) for s in self.sessions]
+        end = np.array([np.nan if v is None else v for v in measured], dtype=np.float64)
+        log_weights, step_returns = per_trajectory(log_ratio, mask, rewards, np.zeros(len(end)), gamma)
+        decisions = per_decision_terms(log_ratio, mask, rewards, gamma)
+        known = np.isfinite(end)
+
+        def value(index: NDArray[np.int64]) -> tuple[float, float]:
+            with_end = index[known[index]]
+            average = weighted if config.method == "wis" else ordinary
+            step = float(decisions[index].mean()) if config.method == "pdis" else average(log_weights[index], step_returns[index])
+            return step, average(log_weights[with_end], end[with_end]) if with_end.size else 0.0
+
+        step, end_value = value(np.arange(len(end)))
+        draws = np.array([sum(value(index)) for index in resamples(len(end), config.draws, config.seed)])
+        interval = percentile_interval(draws, LEVEL)
+        effective, largest = effective_sample_size(log_weights)
+        logged = support.of_policy(policy)
+        flags = list(logged.flags)
+        if effective < FEW_EFFECTIVE:
+            flags.append(f"not supported by the data: the weights rest on {effective:.1f} effective sessions of {len(end)}")
+        if not known.any():
+            flags.append("no session has an end-of-session reward: the estimate is the step return alone")
+        return Estimate(
+            method=config.method,
+            value=step + end_value,
+            low=interval.low,
+            high=interval.high,
+            level=LEVEL,
+            standard_error=interval.standard_error,
+            step_return=step,
+            end_reward=end_value if known.any() else None,
+            predicted={},
+            supported=logged.supported and effective >= FEW_EFFECTIVE,
+            flags=tuple(flags),
+            n=len(end),
+            details={
+                "horizon_steps": horizon,
+                "bandwidth": config.bandwidth,
+                "effective_sample_size": effective,
+                "largest_weight_share": largest,
+                "horizon_of_ten": _horizon_of_ten(log_ratio, mask),
+                "sessions_of_known_density": sum(s.random_lower_bound is not None for s in self.sessions),
+                "sessions_left_out": len(self.buffer.sessions) - len(self.sessions),
+                "coverage": logged.to_json(),
+                "draws": [float(d) for d in draws[:200]],
+            },
+        )
+
+
+def _signed_exp(log_weights: Floats, values: Floats) -> Floats:
+    """exp(log_weights) x values computed as one exponent, kept finite."""
+    with np.errstate(divide="ignore"):
+        logs = log_weights + np.log(np.abs(values))
+    return np.asarray(np.sign(values) * np.exp(np.minimum(logs, LARGEST_LOG)), dtype=np.float64)
+
+
+def _horizon_of_ten(log_ratio: Floats, mask: Mask) -> int:
+    """Steps until the effective sample size of the running weights first falls below ten."""
+    cumulative = np.cumsum(np.where(mask, log_ratio, 0.0), axis=1)
+    for t in range(cumulative.shape[1]):
+        if effective_sample_size(cumulative[:, t])[0] < FEW_EFFECTIVE:
+            return t
+    return int(cumulative.shape[1])

@@ -1,0 +1,98 @@
+// Small behaviours of every page: sorting, confirmation, single submission, refreshing. Pages work without all of them.
+
+// --- tables: click a heading to sort; numbers, dates and missing values sort as such
+const MISSING = new Set(["", "—"]);
+
+function sortValue(cell) {
+  const text = (cell?.dataset.value ?? cell?.textContent ?? "").trim();
+  if (MISSING.has(text)) return null;
+  const number = Number(text.replaceAll("\u202f", "").replace("\u2212", "-").replace(/\s*%$/, ""));
+  return Number.isNaN(number) ? text.toLowerCase() : number;
+}
+
+function compare(a, b) {
+  if (a === null || b === null) return a === b ? 0 : a === null ? 1 : -1; // missing values stay last
+  if (typeof a === "number" && typeof b === "number") return a - b;
+  return String(a).localeCompare(String(b), "en", { numeric: true });
+}
+
+function sortTable(heading) {
+  const table = heading.closest("table");
+  const column = [...heading.parentElement.children].indexOf(heading);
+  const ascending = heading.getAttribute("aria-sort") !== "ascending";
+  for (const other of heading.parentElement.children) other.removeAttribute("aria-sort");
+  heading.setAttribute("aria-sort", ascending ? "ascending" : "descending");
+  const rows = [...table.tBodies[0].rows].map((row) => [sortValue(row.cells[column]), row]);
+  rows.sort(([a], [b]) => (a === null || b === null || ascending ? compare(a, b) : compare(b, a)));
+  table.tBodies[0].append(...rows.map(([, row]) => row));
+}
+
+function makeSortable(root) {
+  for (const heading of root.querySelectorAll("table[data-sort] thead th")) {
+    if (heading.querySelector("button") || !heading.textContent.trim()) continue;
+    const button = document.createElement("button");
+    button.type = "button";
+    button.append(...heading.childNodes);
+    heading.append(button);
+    button.addEventListener("click", () => sortTable(heading));
+  }
+}
+
+// --- confirmation before what cannot be taken back
+async function confirmed(question) {
+  const dialog = document.getElementById("confirm");
+  dialog.querySelector("#confirm-text").textContent = question;
+  dialog.returnValue = "no";
+  dialog.showModal();
+  await new Promise((done) => dialog.addEventListener("close", done, { once: true }));
+  return dialog.returnValue === "yes";
+}
+
+document.addEventListener("click", async (event) => {
+  const button = event.target.closest("[data-confirm]");
+  if (!button || button.dataset.confirmed) return;
+  event.preventDefault();
+  if (!(await confirmed(button.dataset.confirm))) return;
+  button.dataset.confirmed = "yes";
+  button.click();
+  delete button.dataset.confirmed;
+});
+
+// --- a form is sent once
+document.addEventListener("submit", (event) => {
+  const form = event.target.closest("form[data-once]");
+  if (!form) return;
+  // after this turn, so that the pressed button's own name and value are still sent
+  setTimeout(() => { for (const button of form.querySelectorAll("button")) button.disabled = true; });
+});
+addEventListener("pageshow", (event) => {
+  // the back button brings the page back as it was left
+  if (event.persisted) for (const button of document.querySelectorAll("form[data-once] button")) button.disabled = false;
+});
+
+// --- parts of a page that fetch themselves again
+async function refresh(id) {
+  const old = document.getElementById(id);
+  if (!old || !old.dataset.refresh) return;
+  const seconds = Number(old.dataset.refresh);
+  if (!document.hidden) {
+    try {
+      const answer = await fetch(location.href, { headers: { Accept: "text/html" } });
+      if (answer.ok && !answer.redirected) {
+        const fresh = new DOMParser().parseFromString(await answer.text(), "text/html").getElementById(id);
+        if (fresh) { old.replaceWith(fresh); announce(fresh); }
+      }
+    } catch (error) {
+      console.info("refresh failed, trying again later", error);
+    }
+  }
+  setTimeout(() => refresh(id), seconds * 1000);
+}
+
+function announce(root) {
+  makeSortable(root);
+  root.dispatchEvent(new CustomEvent("betaloop:swap", { bubbles: true }));
+}
+
+makeSortable(document);
+for (const part of document.querySelectorAll("[data-refresh][id]")) setTimeout(() => refresh(part.id), Number(part.dataset.refresh) * 1000);

@@ -1,0 +1,80 @@
+// The one place that draws charts. Plotly comes from this service; its cloud button is off, no data leave the browser.
+const CONFIG = {
+  showSendToCloud: false, plotlyServerURL: "", displaylogo: false, responsive: true, scrollZoom: false,
+  modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "toggleSpikelines"], toImageButtonOptions: { format: "svg" },
+};
+
+let library = null;
+
+function plotly() {
+  library ??= new Promise((resolve, reject) => {
+    const script = document.createElement("script");
+    script.src = document.querySelector('meta[name="betaloop-plotly"]').content;
+    script.onload = () => resolve(window.Plotly);
+    script.onerror = () => reject(new Error("the chart library could not be loaded"));
+    document.head.append(script);
+  });
+  return library;
+}
+
+// "token:rl" and "token:rl/0.25" become the colour of --c-rl in the theme in use
+function colours() {
+  const probe = document.createElement("span");
+  probe.hidden = true;
+  document.body.append(probe);
+  const known = new Map();
+  const resolve = (token) => {
+    if (!known.has(token)) {
+      const [name, alpha] = token.slice("token:".length).split("/");
+      probe.style.color = `var(--c-${name})`;
+      const [r, g, b] = getComputedStyle(probe).color.match(/[\d.]+/g).map(Number);
+      known.set(token, alpha ? `rgba(${r}, ${g}, ${b}, ${alpha})` : `rgb(${r}, ${g}, ${b})`);
+    }
+    return known.get(token);
+  };
+  const walk = (value) => {
+    if (typeof value === "string") return value.startsWith("token:") ? resolve(value) : value;
+    if (Array.isArray(value)) return typeof value[0] === "number" ? value : value.map(walk);
+    if (value && typeof value === "object") return Object.fromEntries(Object.entries(value).map(([k, v]) => [k, walk(v)]));
+    return value;
+  };
+  return { walk, done: () => probe.remove() };
+}
+
+async function draw(figure) {
+  const plot = figure.querySelector(".plot");
+  const source = figure.querySelector('script[type="application/json"]');
+  try {
+    const Plotly = await plotly();
+    const theme = colours();
+    const { data, layout } = theme.walk(JSON.parse(source.textContent));
+    theme.done();
+    plot.querySelector(".loading")?.remove();
+    await Plotly.react(plot, data, layout, CONFIG);
+    figure.dataset.drawn = "yes";
+  } catch (error) {
+    plot.textContent = `This chart could not be drawn (${error.message}). Its numbers are in the table below.`;
+    figure.dataset.drawn = "failed";
+  }
+}
+
+// charts are drawn when they come near the window: a page with many stays quick
+const watcher = new IntersectionObserver((entries) => {
+  for (const entry of entries) if (entry.isIntersecting) { watcher.unobserve(entry.target); draw(entry.target); }
+}, { rootMargin: "400px" });
+
+function find(root) {
+  for (const figure of root.querySelectorAll("figure[data-chart]:not([data-drawn])")) {
+    figure.querySelector(".loading")?.replaceChildren("Drawing …");
+    watcher.observe(figure);
+  }
+}
+
+find(document);
+document.addEventListener("betaloop:swap", (event) => find(event.target));
+// a changed figure: replace the JSON in its script element, then dispatch this event on the <figure>
+document.addEventListener("betaloop:redraw", (event) => draw(event.target.closest("figure[data-chart]")));
+document.addEventListener("betaloop:theme", () => { for (const figure of document.querySelectorAll("figure[data-drawn=yes]")) draw(figure); });
+addEventListener("beforeprint", () => {
+  for (const figure of document.querySelectorAll("figure[data-drawn=yes] .plot")) window.Plotly.Plots.resize(figure);
+});
