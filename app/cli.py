@@ -153,7 +153,7 @@ def import_(
     with transaction(ACTOR) as db, path.open("rb") as stream:
         person = study.participant_by_code(db, participant, SYSTEM)
         stated = service.state_session(db, person, visit, Controller(controller), policy, started_at)
-        outcome = service.receive(db, person, stated, [service.Incoming(path.name, stream)], SYSTEM, beta_unit)
+        outcome = service.receive(db, person, stated, [service.Incoming(path.name, stream)], SYSTEM, service.BetaStated(beta_unit))
         if not outcome.usable:
             raise api.unusable(outcome)
         answer = api.upload_out(db, outcome, SYSTEM).model_dump(mode="json")

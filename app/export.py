@@ -36,7 +36,8 @@ _ESTIMATE_COLUMNS = (
 def export_participant(db: Session, participant: Participant, caller: Caller) -> bytes:
     """Everything the caller may know of a participant. The controller of a session comes through the blinding gate."""
     service.require(caller, can.READ, participant)
-    sessions, steps = [], []
+    sessions: list[tuple[Any, ...]] = []
+    steps: list[tuple[Any, ...]] = []
     for session in repository.sessions_of_participant(db, participant.id):
         arm, table, qoc = blinding.arm(session, caller), service.session_data(db, session).table, session.qoc
         beta = table.beta_trace

@@ -106,8 +106,10 @@ def not_enough(tested: Group, cdbs: Group) -> str:
     found = f"{tested.label} has {tested.n}, {cdbs.label} {cdbs.n}"
     if min(tested.n, cdbs.n) == 0:
         return f"needs at least 4 sessions with this metric on each side; {found}"
+    needed = sessions_needed(cdbs.n)
+    unequal = "" if needed == cdbs.n else f", or {needed} against {cdbs.n}"
     return (
-        f"needs at least 4 sessions on each side, or {sessions_needed(cdbs.n)} against {cdbs.n}; {found}. "
+        f"needs at least 4 sessions on each side{unequal}; {found}. "
         f"So few cannot give a two-sided p below {smallest_p(tested.n, cdbs.n):.2g}"
     )
 

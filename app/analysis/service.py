@@ -33,7 +33,7 @@ TITLES: dict[str, tuple[str, str]] = {
 """The paper's five metrics: title and unit; the unit of beta is the participant's."""
 
 LIMITS = (
-    "Sessions of one visit are not independent: they share the day, the medication and what the session before left behind. The test treats "
+    "Sessions of one visit are not independent: they share the day, the medication and what the session before left. The test treats "
     "them as independent, so that its p-values may be too small.",
     "A p of .05 or more does not show that two controllers do equally well; the difference and its interval say what the data leave open.",
     "Energy is the mean squared amplitude fraction of the session's steps, at the pulse width and rate of cDBS. Every session counts once, "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, File, Form, UploadFile
 from sqlalchemy.orm import Session
@@ -13,7 +13,7 @@ from app.accounts.policy import Caller
 from app.ingest import repository, service
 from app.ingest.models import UploadFile as UploadFileRow
 from app.ingest.schemas import FileReportOut, UploadedFileOut, UploadOut
-from app.ingest.service import Incoming, UploadOutcome
+from app.ingest.service import BetaStated, Incoming, UploadOutcome
 from app.platform.database import Db
 from app.platform.errors import Invalid
 from app.platform.schemas import RowId, problems
@@ -22,6 +22,9 @@ from app.study.api import session_out
 from app.study.models import Controller
 
 router = APIRouter(tags=["uploads"], responses=problems(401, 403, 404, 422))
+
+
+BetaSource = Literal["time_domain", "device_power", "percept_lfp", "table"]
 
 
 class UnusableUpload(Invalid):
@@ -41,12 +44,13 @@ def upload(
     policy: Annotated[str | None, Form(max_length=100, description="Name or number of the policy that ran.")] = None,
     started_at: Annotated[datetime | None, Form(description="Start of the session; without an offset: UTC.")] = None,
     beta_unit: Annotated[str | None, Form(max_length=40, description="Unit of a table's beta; the participant's when left out.")] = None,
+    beta_source: Annotated[BetaSource | None, Form(description="Where a table's beta comes from; the participant's when left out.")] = None,
 ) -> UploadOut:
     """Upload the files of one session. The answer comes after decoding; the same bytes again give the same sessions."""
     person = study.participant_by_code(db, participant, caller)
     stated = service.state_session(db, person, visit, controller, policy, started_at)
     incoming = [Incoming(f.filename or "file", f.file) for f in file]
-    outcome = service.receive(db, person, stated, incoming, caller, beta_unit)
+    outcome = service.receive(db, person, stated, incoming, caller, BetaStated(beta_unit, beta_source))
     if not outcome.usable:
         raise unusable(outcome)
     return upload_out(db, outcome, caller)

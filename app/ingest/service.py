@@ -10,15 +10,17 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 from sqlalchemy.orm import Session
 
 from app.accounts import policy as can
 from app.accounts.policy import Caller
 from app.ingest import formats, quarantine, repository, sessions
-from app.ingest.formats.log import FileReport, Problem, UndecodableFile
+from app.ingest.formats import FileKind
+from app.ingest.formats.log import DecodedFile, FileReport, Problem, TraceSource, UndecodableFile
 from app.ingest.formats.options import ArchiveLimits, DecodeOptions
+from app.ingest.formats.redact import REDACTOR_VERSION, Redaction, redact_rcs_zip
 from app.ingest.models import Upload, UploadFile
 from app.ingest.sessions import StatedSession
 from app.platform import files
@@ -28,7 +30,7 @@ from app.study import repository as study
 from app.study import service as study_service
 from app.study.models import Controller, Participant
 
-REDACTOR_VERSION = 1
+TABLES = ("csv", "parquet")
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,14 @@ class Incoming:
 
     name: str
     stream: BinaryIO
+
+
+@dataclass(frozen=True)
+class BetaStated:
+    """What the sender says of a table's beta column: unit and source (`time_domain`, `device_power`, `percept_lfp`, `table`)."""
+
+    unit: str | None = None
+    source: str | None = None
 
 
 @dataclass
@@ -53,6 +63,16 @@ class FileOutcome:
     def reports_for_sender(self) -> list[FileReport]:
         """The reports, naming the file as the sender does."""
         return [replace(r, name=self.name) if r.name == self.row.name else r for r in self.reports]
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A file as it was stored: what it is, the hash of the stored bytes, what was taken out, and why it cannot be decoded, if so."""
+
+    kind: str
+    stored_sha256: str
+    redaction: Redaction
+    problem: UndecodableFile | None
 
 
 @dataclass
@@ -101,9 +121,11 @@ def receive(
     stated: StatedSession,
     incoming: Sequence[Incoming],
     caller: Caller,
-    beta_unit: str | None = None,
+    beta: BetaStated | None = None,
 ) -> UploadOutcome:
     """Take an upload: keep every file, decode what can be decoded, make sessions.
+
+    `beta` says what the beta column of a table is; the participant's unit and source are taken, and said, where it is silent.
 
     Raises:
         TooLarge: a file exceeds the installation's limit; files before it are kept.
@@ -111,6 +133,7 @@ def receive(
     study_service.require(caller, can.UPLOAD, participant)
     if not incoming:
         raise Invalid("The upload holds no file.", "Choose at least one file.")
+    beta = beta or BetaStated()
     upload = Upload(
         participant_id=participant.id,
         visit_id=stated.visit.id,
@@ -121,20 +144,21 @@ def receive(
             "controller": stated.controller,
             "policy_id": stated.policy_id,
             "started_at": stated.started_at.isoformat() if stated.started_at else None,
-            "beta_unit": beta_unit,
+            "beta_unit": beta.unit,
+            "beta_source": beta.source,
         },
     )
     db.add(upload)
     db.flush()
-    options = decode_options(participant, beta_unit)
-    outcomes = [_receive_file(db, participant, upload, stated, one, options) for one in incoming]
+    options = decode_options(participant, beta)
+    outcomes = [_receive_file(db, participant, upload, stated, one, options, beta) for one in incoming]
     upload.report = [asdict(r) for o in outcomes for r in o.reports]
     upload.status = "decoded" if any(o.row.status == "decoded" for o in outcomes) else "failed"
     db.commit()
     return UploadOutcome(upload, participant, outcomes)
 
 
-def decode_options(participant: Participant, beta_unit: str | None = None) -> DecodeOptions:
+def decode_options(participant: Participant, beta: BetaStated) -> DecodeOptions:
     """The participant's choices for decoders."""
     settings = participant.current_settings
     return DecodeOptions(
@@ -142,13 +166,19 @@ def decode_options(participant: Participant, beta_unit: str | None = None) -> De
         beta_low_hz=settings.beta_low_hz,
         beta_high_hz=settings.beta_high_hz,
         min_valid_fraction=settings.min_valid_fraction,
-        table_beta_unit=beta_unit or settings.beta_unit or "unstated",
+        table_beta_unit=beta.unit or settings.beta_unit or "unstated",
         archive=ArchiveLimits(),
     )
 
 
 def _receive_file(
-    db: Session, participant: Participant, upload: Upload, stated: StatedSession, one: Incoming, options: DecodeOptions
+    db: Session,
+    participant: Participant,
+    upload: Upload,
+    stated: StatedSession,
+    one: Incoming,
+    options: DecodeOptions,
+    beta: BetaStated,
 ) -> FileOutcome:
     limit = get_settings().upload_limit_mb * 1024 * 1024
     name = Path(one.name.replace("\\", "/")).name[:255] or "file"
@@ -161,7 +191,7 @@ def _receive_file(
         ) from error
     try:
         known = _known(db, participant, stated, name, sha256)
-        return known or _keep_and_decode(db, participant, upload, stated, name, draft, sha256, size, options)
+        return known or _keep_and_decode(db, participant, upload, stated, name, draft, sha256, size, options, beta)
     finally:
         draft.unlink(missing_ok=True)
 
@@ -187,16 +217,18 @@ def _keep_and_decode(
     sha256: str,
     size: int,
     options: DecodeOptions,
+    beta: BetaStated,
 ) -> FileOutcome:
-    kind, stored, removed, problem = _keep(db, draft, name, options)
+    kept = _keep(db, draft, options)
+    problem = kept.problem
     row = UploadFile(
         upload_id=upload.id,
         participant_id=participant.id,
-        name=_harmless_name(name, kind),
-        kind=kind,
+        name=_harmless_name(name, kept.kind),
+        kind=kept.kind,
         size=size,
         original_sha256=sha256,
-        stored_sha256=stored,
+        stored_sha256=kept.stored_sha256,
         redactor_version=REDACTOR_VERSION,
         report={},
     )
@@ -210,7 +242,9 @@ def _keep_and_decode(
                 db.delete(row)
                 db.commit()
                 return known
-            decoded = formats.decode(files.path_of(stored), kind, options, name=row.name)
+            decoded = formats.decode(files.path_of(kept.stored_sha256), cast(FileKind, kept.kind), options, name=row.name)
+            if kept.kind in TABLES:
+                decoded = _name_beta(decoded, participant, beta)
             ids, duplicate, notes = sessions.store_recordings(db, participant, row, decoded.recordings, stated)
         except UndecodableFile as error:
             db.rollback()
@@ -218,32 +252,48 @@ def _keep_and_decode(
             problem = error
         else:
             reports = list(decoded.reports)
-            reports[0].removed.extend(removed)
+            reports[0].removed.extend(kept.redaction.removed)
+            reports[0].repaired.extend(kept.redaction.repaired)
+            reports[0].ignored.extend(kept.redaction.ignored)
+            reports[0].flagged.extend(f"not kept, because it could not be read: {u}" for u in kept.redaction.unreadable)
             reports[0].understood.extend(notes)
             row.status = "decoded"
             row.report = {"reports": [asdict(r) for r in reports]}
             db.commit()
             return FileOutcome(name, row, reports, duplicate=duplicate, session_ids=ids)
-    report = FileReport(name=row.name, removed=removed, problem=Problem(problem.what, problem.where, problem.mend))
+    report = FileReport(name=row.name, removed=kept.redaction.removed, problem=Problem(problem.what, problem.where, problem.mend))
     row.status = "failed"
     row.report = {"reports": [asdict(report)]}
     db.commit()
     return FileOutcome(name, row, [report])
 
 
-def _keep(db: Session, draft: Path, name: str, options: DecodeOptions) -> tuple[str, str, list[str], UndecodableFile | None]:
-    """Store a file without identity, or encrypted when it cannot be parsed: kind, hash of what is stored, what was removed, the problem."""
+def _keep(db: Session, draft: Path, options: DecodeOptions) -> Kept:
+    """Store a file without identity, or encrypted when it cannot be parsed."""
     try:
-        kind = formats.sniff(draft, name)
-        redacted, removed = formats.redact(draft, kind, _pseudonym_key(), options)
+        kind = formats.sniff(draft)
+        redaction = Redaction()
+        clean = draft
+        if kind == "rcs":
+            clean = files.draft_path()
+            redaction = redact_rcs_zip(draft, clean, get_settings().secret("pseudonyms"), options.archive)
     except UndecodableFile as error:
-        stored = files.store(db, quarantine.encrypt(draft), "application/octet-stream")
-        return "unreadable", stored.sha256, [], error
-    return kind, files.store(db, redacted, "application/octet-stream").sha256, removed, None
+        sealed = files.store(db, quarantine.encrypt(draft), "application/octet-stream")
+        return Kept("unreadable", sealed.sha256, Redaction(), error)
+    return Kept(kind, files.store(db, clean, "application/octet-stream").sha256, redaction, None)
 
 
-def _pseudonym_key() -> bytes:
-    return get_settings().secret("pseudonyms")
+def _name_beta(decoded: DecodedFile, participant: Participant, beta: BetaStated) -> DecodedFile:
+    """A table's beta under its source, with a sentence where the participant's unit and source were taken."""
+    settings = participant.current_settings
+    source = cast(TraceSource, beta.source or settings.beta_source or "table")
+    recordings = tuple(
+        replace(r, traces=tuple(replace(t, source=source) if t.stream == "beta" else t for t in r.traces)) for r in decoded.recordings
+    )
+    for trace in (t for r in recordings for t in r.traces if t.stream == "beta"):
+        whose = "as stated" if beta.unit and beta.source else "as the participant's settings say, where the upload does not"
+        decoded.reports[0].understood.append(f"beta is in '{trace.unit}' from '{source}', {whose}")
+    return replace(decoded, recordings=recordings)
 
 
 def _harmless_name(name: str, kind: str) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import hmac
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -15,6 +13,7 @@ from sqlalchemy.orm import Session
 from app.accounts.policy import SYSTEM
 from app.ingest import repository
 from app.ingest.formats.log import DECODE_VERSION, RecordingLog, TraceLog
+from app.ingest.formats.redact import pseudonym
 from app.ingest.models import UploadFile
 from app.settings import get_settings
 from app.study import blinding
@@ -85,11 +84,6 @@ def disagreements(db: Session, session_ids: Sequence[int], stated: StatedSession
     return found
 
 
-def pseudonym(device_key: str) -> str:
-    """A device's name in this installation: keyed, so that nobody can look a serial number up in a table."""
-    return hmac.new(get_settings().secret("pseudonyms"), device_key.encode(), hashlib.sha256).hexdigest()[:16]
-
-
 def _add_recording(db: Session, participant: Participant, file: UploadFile, decoded: RecordingLog) -> Recording:
     recording = Recording(
         participant_id=participant.id,
@@ -118,7 +112,7 @@ def _add_recording(db: Session, participant: Participant, file: UploadFile, deco
 
 
 def _device(db: Session, participant: Participant, decoded: RecordingLog) -> Device:
-    name = pseudonym(decoded.device_key) if decoded.device_key else decoded.kind
+    name = pseudonym(decoded.device_key, get_settings().secret("pseudonyms")) if decoded.device_key else decoded.kind
     device = repository.device(db, participant.id, name)
     if device is None:
         device = Device(participant_id=participant.id, pseudonym=name, kind=decoded.kind, hemisphere=decoded.hemisphere)
@@ -154,23 +148,36 @@ def _add_session(
     started_at = stated.started_at or log.started_at
     if started_at is not None and started_at.tzinfo is None:
         started_at = started_at.replace(tzinfo=UTC)
+    offset_s = _offset_s(log, started_at, participant.current_settings.period_s)
     session = StudySession(
         visit_id=stated.visit.id,
         ordinal=study.next_ordinal(db, stated.visit.id),
         hemisphere=recording.hemisphere,
         started_at=started_at,
-        duration_s=log.duration_s,
+        duration_s=log.duration_s - offset_s,
         control_stream=control.stream if control else CONTROL_STREAMS[0],
         control_channel=control.channel if control else None,
     )
     blinding.assign(session, stated.controller, stated.policy_id)
     for other, other_log in fresh:
+        start_s = _offset_s(other_log, started_at, participant.current_settings.period_s)
         # a recording without data still says what was there; a segment needs a length
-        stop_s = max(other_log.duration_s, 1e-3)
-        session.segments.append(SessionSegment(recording=other, start_s=0.0, stop_s=stop_s, is_control=other is recording))
+        stop_s = max(other_log.duration_s, start_s + 1e-3)
+        session.segments.append(SessionSegment(recording=other, start_s=start_s, stop_s=stop_s, is_control=other is recording))
     db.add(session)
     db.flush()
     return session
+
+
+def _offset_s(log: RecordingLog, started_at: datetime | None, period_s: float) -> float:
+    """Where a session that starts at `started_at` begins in a recording, seconds, on the recording's grid; what comes before is its lead.
+
+    A recording without a time of its own begins with the session, and so does one that does not reach to the stated start.
+    """
+    if started_at is None or log.started_at is None:
+        return 0.0
+    offset = round((started_at - log.started_at).total_seconds() / period_s) * period_s
+    return offset if 0 < offset < log.duration_s else 0.0
 
 
 def _control(decoded: RecordingLog, wanted_source: str | None) -> TraceLog | None:

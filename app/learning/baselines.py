@@ -5,8 +5,11 @@ They are ONNX files like any other policy, so that they are estimated, bundled a
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import onnx
+from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from sqlalchemy.orm import Session
 
@@ -26,7 +29,9 @@ CONSTANTS = (1.0, 0.85, 0.7, 0.55, 0.4)
 _OPSET, _IR_VERSION = 17, 8
 
 
-def ensure_baselines(db: Session, participant: Participant, snapshot: BufferSnapshot, buffer: ReplayBuffer, created_by: str) -> list[Policy]:
+def ensure_baselines(
+    db: Session, participant: Participant, snapshot: BufferSnapshot, buffer: ReplayBuffer, created_by: str
+) -> list[Policy]:
     """The participant's baseline policies, made where they are missing: constants once per window length, and proportional control
     between quantiles of the beta amplitudes (0.25 and 0.9), made once from the first snapshot in a unit and source of beta.
     """
@@ -43,11 +48,7 @@ def ensure_baselines(db: Session, participant: Participant, snapshot: BufferSnap
     if name not in made and proportional is not None:
         config = {"controller": "proportional", "low": proportional.low, "high": proportional.high, "window": window}
         made[name] = _add(db, participant, snapshot, name, "proportional", config, proportional_onnx(proportional, window), created_by)
-    return [
-        p
-        for p in made.values()
-        if p.config.get("window") == window and (p.algorithm == "constant" or p.name == name)
-    ]
+    return [p for p in made.values() if p.config.get("window") == window and (p.algorithm == "constant" or p.name == name)]
 
 
 def constant_onnx(amplitude: float, window: int) -> bytes:
@@ -57,7 +58,10 @@ def constant_onnx(amplitude: float, window: int) -> bytes:
         helper.make_node("Gather", ["shape", "first"], ["count"]),
         helper.make_node("Concat", ["count", "one"], ["answer_shape"], axis=0),
         helper.make_node(
-            "ConstantOfShape", ["answer_shape"], ["amplitude_fraction"], value=helper.make_tensor("value", TensorProto.FLOAT, [1], [amplitude])
+            "ConstantOfShape",
+            ["answer_shape"],
+            ["amplitude_fraction"],
+            value=helper.make_tensor("value", TensorProto.FLOAT, [1], [amplitude]),
         ),
     ]
     return _model(shape, {"first": np.array([0], dtype=np.int64), "one": np.array([1], dtype=np.int64)}, window)
@@ -88,7 +92,7 @@ def _proportional(buffer: ReplayBuffer) -> ProportionalPolicy | None:
         return None
 
 
-def _model(nodes: list[onnx.NodeProto], constants: dict[str, np.ndarray], window: int) -> bytes:  # type: ignore[type-arg]
+def _model(nodes: list[onnx.NodeProto], constants: dict[str, NDArray[Any]], window: int) -> bytes:
     graph = helper.make_graph(
         nodes,
         "policy",

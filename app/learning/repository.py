@@ -31,7 +31,9 @@ def snapshot(db: Session, snapshot_id: int, caller: Caller) -> BufferSnapshot:
 
 def snapshot_by_pins(db: Session, participant_id: int, pins_sha256: str) -> BufferSnapshot | None:
     """The participant's snapshot with these pins."""
-    return db.scalar(select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id, BufferSnapshot.pins_sha256 == pins_sha256))
+    return db.scalar(
+        select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id, BufferSnapshot.pins_sha256 == pins_sha256)
+    )
 
 
 def snapshots(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[BufferSnapshot], int]:
@@ -43,7 +45,9 @@ def snapshots(db: Session, participant_id: int, limit: int, offset: int) -> tupl
 
 def newest_snapshot(db: Session, participant_id: int) -> BufferSnapshot | None:
     """The snapshot that was taken last."""
-    return db.scalar(select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id).order_by(BufferSnapshot.id.desc()).limit(1))
+    return db.scalar(
+        select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id).order_by(BufferSnapshot.id.desc()).limit(1)
+    )
 
 
 def policy(db: Session, policy_id: int, caller: Caller) -> Policy:
@@ -70,7 +74,9 @@ def policies_named(db: Session, participant_id: int, ids: Sequence[int]) -> list
     rows = {p.id: p for p in db.scalars(select(Policy).where(Policy.participant_id == participant_id, Policy.id.in_(ids)))}
     missing = sorted(set(ids) - set(rows))
     if missing:
-        raise NotFound(f"The participant has no policy {', '.join(map(str, missing))}.", "Name ids from the participant's list of policies.")
+        raise NotFound(
+            f"The participant has no policy {', '.join(map(str, missing))}.", "Name ids from the participant's list of policies."
+        )
     return [rows[i] for i in dict.fromkeys(ids)]
 
 

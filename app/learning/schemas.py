@@ -35,7 +35,9 @@ class DistilParams(Model):
     policies: PolicyIds = Field(default_factory=list, description="Teachers; empty: every trained policy without a student.")
     sigma: Number | None = Field(None, ge=0, le=10, description="Noise of synthetic states, as a share of beta's standard deviation.")
     updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each student.")
-    hidden: list[Annotated[Int, Field(ge=1, le=1024)]] | None = Field(None, min_length=1, max_length=6, description="Student's hidden layers.")
+    hidden: list[Annotated[Int, Field(ge=1, le=1024)]] | None = Field(
+        None, min_length=1, max_length=6, description="Student's hidden layers."
+    )
     seed: Int = Field(0, ge=0, le=10**6)
 
 

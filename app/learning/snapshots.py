@@ -215,7 +215,9 @@ def _why_unusable(trajectory: SessionTrajectory, table: StepTable) -> str:
         return "no usable step: no valid beta amplitude"
     if table.above_one == trajectory.steps:
         return "no usable step: every amplitude exceeds the cDBS amplitude"
-    return f"no usable step: none of its {trajectory.steps} steps has a whole beta window before it and an amplitude within the cDBS amplitude"
+    return (
+        f"no usable step: none of its {trajectory.steps} steps has a whole beta window before it and an amplitude within the cDBS amplitude"
+    )
 
 
 def _signal(version: SettingsVersion, read: list[Member]) -> tuple[str | None, str | None, str]:

@@ -298,7 +298,8 @@ def run_sessions(
         simulation.close()
     amplitude = np.ascontiguousarray(amplitude[:, lead_steps:])
     outcomes = tuple(
-        measure(model, simulation.counters[i], amplitude[i], hidden["brady"][i], hidden["tremor"][i], hidden["overload"][i]) for i in range(n)
+        measure(model, simulation.counters[i], amplitude[i], hidden["brady"][i], hidden["tremor"][i], hidden["overload"][i])
+        for i in range(n)
     )
     return SessionBatch(
         participant=model,

@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import textwrap
 import zipfile
 from dataclasses import replace
 from typing import Any
@@ -174,7 +175,7 @@ def _unpack(content: bytes) -> dict[str, bytes]:
 
 
 def _sheet(manifest: BundleManifest, model: bytes) -> str:
-    """The one-page sheet, at most 80 characters wide."""
+    """The one-page sheet, 82 characters wide."""
     limits = manifest.limits()
     age = limits.period_s if limits.max_beta_age_s is None else limits.max_beta_age_s
     back = "at once" if limits.fallback_ramp_ma_per_s is None else f"at {limits.fallback_ramp_ma_per_s:g} mA/s"
@@ -190,7 +191,7 @@ def _sheet(manifest: BundleManifest, model: bytes) -> str:
         f"Participant       {manifest.participant}",
         f"Policy            {manifest.policy_name} (no. {manifest.policy_id})",
         f"Model SHA-256     {hashlib.sha256(model).hexdigest()}",
-        f"Trained on        {'snapshot ' + manifest.snapshot_sha256 if manifest.snapshot_sha256 else 'data outside this study'}",
+        f"Snapshot SHA-256  {manifest.snapshot_sha256 or 'none: trained outside this study'}",
         f"Made by           betaloop {manifest.code_version}",
         "",
         "SIGNAL",
@@ -212,4 +213,4 @@ def _sheet(manifest: BundleManifest, model: bytes) -> str:
         *approvals,
         "",
     ]
-    return "\n".join(lines)
+    return "\n".join(wrapped for line in lines for wrapped in textwrap.wrap(line, 82, subsequent_indent="    ") or [""])

@@ -59,7 +59,8 @@ class Scale:
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Scale:
         """The inverse of `to_json`."""
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**fields)
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def learn_scale(buffer: ReplayBuffer) -> Scale:
     log = bool(beta.min() > 0) and abs(_skewness(np.log(np.maximum(beta, 1e-300)))) < abs(_skewness(beta))
     shown = np.log(beta) if log else beta
     outcomes = outcome_table(buffer)
-    seen = np.isfinite(outcomes).any(axis=0)
+    seen = [bool(np.isfinite(outcomes[:, j]).any()) for j in range(len(OUTCOMES))]
     mean = np.array([outcomes[np.isfinite(outcomes[:, j]), j].mean() if seen[j] else 0.0 for j in range(len(OUTCOMES))])
     std = np.array([outcomes[np.isfinite(outcomes[:, j]), j].std() if seen[j] else 1.0 for j in range(len(OUTCOMES))])
     return Scale(
@@ -142,7 +143,7 @@ def learn_scale(buffer: ReplayBuffer) -> Scale:
         reward_std=_positive(float(rewards.std())),
         outcome_mean=tuple(float(v) for v in mean),
         outcome_std=tuple(_positive(float(v)) for v in std),
-        outcome_seen=tuple(bool(v) for v in seen),
+        outcome_seen=tuple(seen),
     )
 
 

@@ -51,7 +51,8 @@ class HeldOut:
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> HeldOut:
         """The inverse of `to_json`."""
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**fields)
 
 
 def held_out(

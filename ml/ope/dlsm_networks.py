@@ -240,7 +240,7 @@ class DlsmNetworks(nn.Module):
 
 @dataclass(frozen=True)
 class Replay:
-    """Free-running predictions: mean and log standard deviation of the newest beta and mean reward, [T, draws, B]; outcomes [draws, B, 4]."""
+    """Free runs: mean and log standard deviation of the newest beta and mean reward, [T, draws, B]; outcomes, [draws, B, 4]."""
 
     beta_mean: Tensor
     beta_log_std: Tensor

@@ -84,21 +84,39 @@ def lstm(gates: Tensor, w_h: Tensor) -> Tensor:
     return result
 
 
-def _cell(pre: Tensor, c_prev: Tensor, c: Tensor, tanh_c: Tensor, h: Tensor) -> None:
-    """One LSTM cell in place: `pre` [B, 4H] becomes the squashed gates; c, tanh c and h are written."""
-    hidden = c.shape[1]
-    pre[:, :hidden].tanh_()
-    pre[:, hidden:].sigmoid_()
-    torch.mul(pre[:, :hidden], pre[:, hidden : 2 * hidden], out=c)
-    c.addcmul_(pre[:, 2 * hidden : 3 * hidden], c_prev)
+def _views(acts: Tensor, hidden: int) -> list[tuple[Tensor, ...]]:
+    """Per step: views of g, of (i, f, o) together, of i, f and o. Made all at once: a slice costs as much as a small kernel."""
+    pieces = ((0, 1), (1, 4), (1, 2), (2, 3), (3, 4))
+    return list(zip(*(acts[:, :, a * hidden : b * hidden].unbind(0) for a, b in pieces), strict=True))
+
+
+def _cell(gates: tuple[Tensor, ...], c_prev: Tensor, c: Tensor, tanh_c: Tensor, h: Tensor) -> None:
+    """One LSTM cell in place: the gates [B, H] are squashed; c, tanh c and h are written."""
+    g, squashed, i, f, o = gates
+    g.tanh_()
+    squashed.sigmoid_()
+    torch.mul(g, i, out=c)
+    c.addcmul_(f, c_prev)
     torch.tanh(c, out=tanh_c)
-    torch.mul(pre[:, 3 * hidden :], tanh_c, out=h)
+    torch.mul(o, tanh_c, out=h)
+
+
+def _cell_backward(slope: tuple[Tensor, ...], out: tuple[Tensor, ...], d_h: Tensor, d_c: Tensor) -> None:
+    """Gradients of the gates before squashing, written to `out`, from those of h and c."""
+    torch.mul(slope[0], d_c, out=out[0])
+    torch.mul(slope[1], d_h, out=out[1])
+
+
+def _backward_views(tensor: Tensor, hidden: int) -> list[tuple[Tensor, ...]]:
+    """Per step: views of (g, i, f) as [3, B, H], so that one [B, H] factor broadcasts, and of o."""
+    first = tensor[:, :, : 3 * hidden].unflatten(2, (3, hidden)).transpose(1, 2)
+    return list(zip(first.unbind(0), tensor[:, :, 3 * hidden : 4 * hidden].unbind(0), strict=True))
 
 
 def _gate_slopes(acts: Tensor, c: Tensor, tanh_c: Tensor) -> tuple[Tensor, Tensor]:
     """For all steps at once: d(gate)/d(c_t) for g, i, f and d(gate o)/d(h_t), [T, B, 4H], and d(c_t)/d(h_t), [T, B, H]."""
     hidden = c.shape[2]
-    g, i, f, o = acts.split(hidden, dim=2)
+    g, i, _, o = acts.split(hidden, dim=2)
     slopes = torch.empty_like(acts)
     s_g, s_i, s_f, s_o = slopes.split(hidden, dim=2)
     torch.mul(g, g, out=s_g).neg_().add_(1.0).mul_(i)
@@ -113,7 +131,7 @@ def _gate_slopes(acts: Tensor, c: Tensor, tanh_c: Tensor) -> tuple[Tensor, Tenso
 
 
 class _StochasticLstm(torch.autograd.Function):
-    """`stochastic_lstm_loop` with hand-written derivatives: the loops hold only what is sequential, all weight gradients are one product."""
+    """`stochastic_lstm_loop` with hand-written derivatives: loops hold only what is sequential, weight gradients are one product."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -130,17 +148,30 @@ class _StochasticLstm(torch.autograd.Function):
         heads = eps.new_empty(steps, batch, 2 * latent)
         std = eps.new_empty(steps, batch, latent)
         c_prev = eps.new_zeros(batch, hidden)
-        rows = zip(acts, carry[:-1], carry[1:], c, tanh_c, heads, std, eps, strict=True)
-        for act, now, after, c_t, tanh_t, head, std_t, eps_t in rows:
+        rows = zip(
+            acts.unbind(0),
+            _views(acts, hidden),
+            acts[:, :, 4 * hidden :].unbind(0),
+            carry[:-1].unbind(0),
+            carry[1:, :, :latent].unbind(0),
+            carry[1:, :, latent:].unbind(0),
+            c.unbind(0),
+            tanh_c.unbind(0),
+            heads.unbind(0),
+            heads[:, :, :latent].unbind(0),
+            heads[:, :, latent:].unbind(0),
+            std.unbind(0),
+            eps.unbind(0),
+            strict=True,
+        )
+        for act, gate_views, skip_t, now, z, h, c_t, tanh_t, head, mean, raw, std_t, eps_t in rows:
             act.addmm_(now, joint)
-            h = after[:, latent:]
-            _cell(act[:, : 4 * hidden], c_prev, c_t, tanh_t, h)
+            _cell(gate_views, c_prev, c_t, tanh_t, h)
             torch.addmm(b_out, h, w_out, out=head)
-            mean = head[:, :latent]
-            mean.add_(act[:, 4 * hidden :])
-            squashed = head[:, latent:].sigmoid_()
-            torch.mul(squashed, high - low, out=std_t).add_(low).exp_()
-            torch.addcmul(mean, std_t, eps_t, out=after[:, :latent])
+            mean.add_(skip_t)
+            raw.sigmoid_()
+            torch.mul(raw, high - low, out=std_t).add_(low).exp_()
+            torch.addcmul(mean, std_t, eps_t, out=z)
             c_prev = c_t
         ctx.save_for_backward(carry, acts, c, tanh_c, heads, std, eps, joint, w_out)
         ctx.sizes = (latent, hidden)
@@ -154,30 +185,40 @@ class _StochasticLstm(torch.autograd.Function):
         latent, hidden = ctx.sizes
         grad_z, grad_mean, grad_log_std = grads
         low, high = LOG_STD_BOUNDS
-        steps, batch, _ = eps.shape
+        batch = eps.shape[1]
         squashed = heads[:, :, latent:]
         bound_slope = (squashed - squashed * squashed) * (high - low)
         noise_slope = std * eps * bound_slope
         d_head = torch.cat([grad_mean + grad_z, torch.addcmul(grad_log_std * bound_slope, grad_z, noise_slope)], dim=2)
         slopes, to_c = _gate_slopes(acts[:, :, : 4 * hidden], c, tanh_c)
-        forget = acts[:, :, 2 * hidden : 3 * hidden]
         d_acts = torch.empty_like(acts)
         joint_t, out_t = joint.t().contiguous(), w_out.t().contiguous()
         d_carry = eps.new_zeros(batch, latent + hidden)
+        d_z, d_h_next = d_carry[:, :latent], d_carry[:, latent:]
         d_c = eps.new_zeros(batch, hidden)
         d_h = eps.new_empty(batch, hidden)
-        for t in range(steps - 1, -1, -1):
-            head, act, slope = d_head[t], d_acts[t], slopes[t]
-            d_z = d_carry[:, :latent]
-            head[:, :latent].add_(d_z)
-            head[:, latent:].addcmul_(d_z, noise_slope[t])
-            torch.addmm(d_carry[:, latent:], head, out_t, out=d_h)
-            d_c.addcmul_(d_h, to_c[t])
-            torch.mul(slope[:, : 3 * hidden].view(batch, 3, hidden), d_c.unsqueeze(1), out=act[:, : 3 * hidden].view(batch, 3, hidden))
-            torch.mul(slope[:, 3 * hidden :], d_h, out=act[:, 3 * hidden : 4 * hidden])
-            act[:, 4 * hidden :] = head[:, :latent]
+        rows = zip(
+            d_head.unbind(0),
+            d_head[:, :, :latent].unbind(0),
+            d_head[:, :, latent:].unbind(0),
+            noise_slope.unbind(0),
+            d_acts.unbind(0),
+            _backward_views(d_acts, hidden),
+            d_acts[:, :, 4 * hidden :].unbind(0),
+            _backward_views(slopes, hidden),
+            to_c.unbind(0),
+            acts[:, :, 2 * hidden : 3 * hidden].unbind(0),
+            strict=True,
+        )
+        for head, d_mean, d_raw, noise, act, gates, skip, slope, to_c_t, forget in reversed(list(rows)):
+            d_mean.add_(d_z)
+            d_raw.addcmul_(d_z, noise)
+            torch.addmm(d_h_next, head, out_t, out=d_h)
+            d_c.addcmul_(d_h, to_c_t)
+            _cell_backward(slope, gates, d_h, d_c)
+            skip.copy_(d_mean)
             torch.mm(act, joint_t, out=d_carry)
-            d_c.mul_(forget[t])
+            d_c.mul_(forget)
         flat_acts, flat_head = d_acts.reshape(-1, 4 * hidden + latent), d_head.reshape(-1, 2 * latent)
         d_joint = carry[:-1].reshape(-1, latent + hidden).t() @ flat_acts
         d_out = carry[1:, :, latent:].reshape(-1, hidden).t() @ flat_head
@@ -205,9 +246,10 @@ class _Lstm(torch.autograd.Function):
         hs = gates.new_zeros(steps + 1, batch, hidden)
         c, tanh_c = gates.new_empty(steps, batch, hidden), gates.new_empty(steps, batch, hidden)
         c_prev = gates.new_zeros(batch, hidden)
-        for act, before, after, c_t, tanh_t in zip(acts, hs[:-1], hs[1:], c, tanh_c, strict=True):
+        rows = zip(acts.unbind(0), _views(acts, hidden), hs[:-1].unbind(0), hs[1:].unbind(0), c.unbind(0), tanh_c.unbind(0), strict=True)
+        for act, gate_views, before, after, c_t, tanh_t in rows:
             act.addmm_(before, w_h)
-            _cell(act, c_prev, c_t, tanh_t, after)
+            _cell(gate_views, c_prev, c_t, tanh_t, after)
             c_prev = c_t
         ctx.save_for_backward(acts, hs, c, tanh_c, w_h)
         return hs[1:].clone()
@@ -216,19 +258,25 @@ class _Lstm(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
         acts, hs, c, tanh_c, w_h = ctx.saved_tensors
         (grad_h,) = grads
-        steps, batch, hidden = c.shape
+        _, batch, hidden = c.shape
         slopes, to_c = _gate_slopes(acts, c, tanh_c)
-        forget = acts[:, :, 2 * hidden : 3 * hidden]
         d_acts = torch.empty_like(acts)
         back = w_h.t().contiguous()
         d_c = c.new_zeros(batch, hidden)
-        d_h = grad_h[-1].clone()
-        for t in range(steps - 1, -1, -1):
-            act, slope = d_acts[t], slopes[t]
-            d_c.addcmul_(d_h, to_c[t])
-            torch.mul(slope[:, : 3 * hidden].view(batch, 3, hidden), d_c.unsqueeze(1), out=act[:, : 3 * hidden].view(batch, 3, hidden))
-            torch.mul(slope[:, 3 * hidden :], d_h, out=act[:, 3 * hidden :])
-            if t:
-                torch.addmm(grad_h[t - 1], act, back, out=d_h)
-                d_c.mul_(forget[t])
+        d_h = grad_h.new_zeros(batch, hidden)
+        rows = zip(
+            grad_h.unbind(0),
+            d_acts.unbind(0),
+            _backward_views(d_acts, hidden),
+            _backward_views(slopes, hidden),
+            to_c.unbind(0),
+            acts[:, :, 2 * hidden : 3 * hidden].unbind(0),
+            strict=True,
+        )
+        for grad, act, gates, slope, to_c_t, forget in reversed(list(rows)):
+            d_h.add_(grad)
+            d_c.addcmul_(d_h, to_c_t)
+            _cell_backward(slope, gates, d_h, d_c)
+            torch.mm(act, back, out=d_h)
+            d_c.mul_(forget)
         return d_acts, hs[:-1].reshape(-1, hidden).t() @ d_acts.reshape(-1, 4 * hidden)

@@ -95,7 +95,7 @@ class MemberTraining:
             group["lr"] = rate
         loss = self.networks.loss(batch, self.networks.noise(*batch.size, self.noise))
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         torch.nn.utils.clip_grad_norm_(self.networks.parameters(), c.clip_norm, error_if_nonfinite=True)
         self.optimizer.step()
         self.loss_sum += float(loss.detach())

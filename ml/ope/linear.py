@@ -7,7 +7,7 @@ against it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +52,7 @@ class LinearConfig:
 class LinearModel:
     """The estimator."""
 
-    config: LinearConfig = LinearConfig()
+    config: LinearConfig = field(default_factory=LinearConfig)
     method: str = "linear"
 
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedLinear:

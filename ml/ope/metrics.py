@@ -80,7 +80,7 @@ def spearman(x: ArrayLike, y: ArrayLike) -> float | None:
 
 
 def spearman_p(x: ArrayLike, y: ArrayLike, *, draws: int = 20_000, seed: int = 0) -> float:
-    """Two-sided permutation p-value of Spearman's rho: exact up to 8 policies, else from random permutations (counting the observed one)."""
+    """Two-sided permutation p-value of Spearman's rho: exact up to 8 policies, else from random permutations and the observed order."""
     rx, ry = _centred_ranks(x), _centred_ranks(y)
     observed = abs(float(np.sum(rx * ry))) - 1e-9
     if rx.size <= EXACT_PERMUTATIONS_UP_TO:

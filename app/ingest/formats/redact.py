@@ -43,11 +43,12 @@ TEXTS = {
     "name": GAIN_TRIM,
 }
 PACKET_WORDS = frozenset(
-    (
-        "Header dataSize dataType dataTypeSequence globalSequence info systemTick timestamp seconds user1 user2 PacketGenTime "
-        "PacketRxUnixTime ChannelSamples Key Value DebugInfo EvokedMarker IncludedChannels SampleRate Units millivolts XSamples YSamples "
-        "ZSamples centiG Bands ExternalValuesMask FftSize IsPowerChannelOverrange ValidDataMask Channel FftOutput LatencyMilliseconds"
-    ).split()  # noqa: SIM905
+    re.findall(
+        r"\w+",
+        """Header dataSize dataType dataTypeSequence globalSequence info systemTick timestamp seconds user1 user2 PacketGenTime
+        PacketRxUnixTime ChannelSamples Key Value DebugInfo EvokedMarker IncludedChannels SampleRate Units millivolts XSamples YSamples
+        ZSamples centiG Bands ExternalValuesMask FftSize IsPowerChannelOverrange ValidDataMask Channel FftOutput LatencyMilliseconds""",
+    )
 )
 _QUOTED = re.compile(r'"([^"]*)"')
 

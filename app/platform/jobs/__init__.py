@@ -43,8 +43,8 @@ Rules
 * Raise `JobError("what, where, how to mend it")` for errors that a person can mend; its text is shown as it is. Any other exception shows
   its last line and keeps the traceback in the step's log. A failed step raises `StepFailed` in the orchestration, which fails the job.
 * Do not catch `BaseException` in an orchestration: cancelling and stopping travel as such.
-* Put compute functions into the room's `compute.py` (found by convention, see `registry.COMPUTE_MODULES`), not into `jobs.py`: the web service
-  imports every `jobs.py` to check params and must not load torch for it. The child imports only the module of its function.
+* Put compute functions into the room's `compute.py` (found by convention, see `registry.COMPUTE_MODULES`), not into `jobs.py`: the web
+  service imports every `jobs.py` to check params and must not load torch for it. The child imports only the module of its function.
 
 Everybody else
 --------------

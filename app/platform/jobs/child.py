@@ -1,7 +1,7 @@
 """The child process of one compute step: `python -m app.platform.jobs.child NAME WORKDIR`.
 
-It reads `params.json` from its folder, runs the function, and leaves `result.json` there by atomic rename. Progress goes as JSON lines to the
-file descriptor that BETALOOP_REPORT_FD names; what the function prints goes to `log.txt`. It dies with the worker that started it.
+It reads `params.json` from its folder, runs the function, and leaves `result.json` there by atomic rename. Progress goes as JSON lines to
+the file descriptor that BETALOOP_REPORT_FD names; what the function prints goes to `log.txt`. It dies with the worker that started it.
 """
 
 from __future__ import annotations
@@ -47,6 +47,13 @@ def stored_result(workdir: Path, sha256: str) -> dict[str, Any] | None:
     return result
 
 
+def too_much_memory(limit_mb: int) -> str:
+    """What the user reads when a step outgrew its limit."""
+    return (
+        f"The step needs more memory than its limit of {limit_mb} MiB. Make the job smaller or raise BETALOOP_JOB_MEMORY_MB for the worker."
+    )
+
+
 def main(arguments: list[str]) -> int:
     """Run one call; 0 when it gave a result, 1 when it failed (the reason stands in result.json), 2 for wrong arguments."""
     _die_with_parent()
@@ -84,7 +91,10 @@ def _run(name: str, call: dict[str, Any], workdir: Path) -> dict[str, Any]:
     result = function.run(call["params"], workdir, report)
     if not isinstance(result, dict):
         raise TypeError(f"compute function {name!r} must return a dict, not {type(result).__name__}")
-    json.dumps(result, allow_nan=False)
+    try:
+        json.dumps(result, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"compute function {name!r} must return JSON, without NaN, arrays or other objects ({error})") from error
     report.flush()
     return result
 
@@ -93,10 +103,7 @@ def _worded(error: Exception, memory_mb: int) -> str:
     """One line for the user."""
     text = str(error).strip()
     if isinstance(error, MemoryError) or "can't allocate memory" in text:
-        return (
-            f"The step needs more memory than its limit of {memory_mb} MiB."
-            " Make the job smaller or raise BETALOOP_JOB_MEMORY_MB for the worker."
-        )
+        return too_much_memory(memory_mb)
     if isinstance(error, BetaloopError):
         return text
     return f"{type(error).__name__}: {text.splitlines()[-1]}" if text else type(error).__name__

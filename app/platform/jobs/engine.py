@@ -1,9 +1,9 @@
 """The durable-workflow engine: the only module that knows DBOS (3.4 or later, below 4).
 
 Every job is one workflow `betaloop.job(job_id)` on one queue, in the schema `dbos` of our own PostgreSQL. DBOS keeps the queue, says which
-executor owns a workflow and replays it after a crash; what people see (status, steps, results) stands in our own tables. Three things the
-library leaves to us: noticing dead executors (`recover`), moving waiting jobs to a new protocol (`adopt_older_protocols`), and deleting what
-finished long ago (`delete_finished`).
+executor owns a workflow and replays it after a crash; what people see (status, steps, results) stands in our own tables. Three things
+the library leaves to us: noticing dead executors (`recover`), moving waiting jobs to a new protocol (`adopt_older_protocols`), and
+deleting what finished long ago (`delete_finished`).
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
-from typing import Any, cast
+from typing import Any
 
 from dbos import DBOS, DBOSClient, DBOSConfig, EnqueueOptions
+from dbos._dbos import StepReservation
 from dbos._serialization import Serializer
 from sqlalchemy import text
 from sqlalchemy.orm import Session
@@ -174,16 +175,21 @@ class Durability:
         if not reserved:
             return []
         with ThreadPoolExecutor(max_workers=len(reserved), thread_name_prefix="fan-out") as pool:
-            futures = [pool.submit(contextvars.copy_context().run, step.run, {"name": name}, body) for name, body, step in reserved]
-        return [cast(dict[str, Any], future.result()) for future in futures]
+            # every thread gets a copy of this one's context: it says which workflow the step belongs to
+            futures = [pool.submit(contextvars.copy_context().run, _reserved_step(step, name, body)) for name, body, step in reserved]
+        return [future.result() for future in futures]
+
+
+def _reserved_step(step: StepReservation, name: str, body: Body) -> Body:
+    return lambda: step.run({"name": name}, body)
 
 
 def recover(executor_ids: Sequence[str]) -> list[str]:
     """Put the unfinished jobs of dead executors back on the queue; returns the ids of those that this call found.
 
-    Safe when several workers do it at once: the update asks for PENDING and the dead executor's id, so a job that somebody took meanwhile is
-    left alone. The public `resume_workflow` is not: it also revives cancelled jobs and resets the count of recoveries. Hence a private name,
-    held in this one place and by a contract test.
+    Safe when several workers do it at once: the update asks for PENDING and the dead executor's id, so a job that somebody took meanwhile
+    is left alone. The public `resume_workflow` is not: it also revives cancelled jobs and resets the count of recoveries. Hence a private
+    name, held in this one place and by a contract test.
     """
     return [handle.get_workflow_id() for handle in DBOS._recover_pending_workflows(list(executor_ids))]
 
@@ -208,12 +214,13 @@ def ended(db: Session, job_ids: Sequence[str]) -> dict[str, str]:
 def adopt_older_protocols(db: Session) -> int:
     """Move unfinished jobs of other protocol versions to ours, at start-up; returns how many.
 
-    DBOS would leave them waiting for ever for a worker of their version. It also replays by position, which a new protocol may have changed:
-    its record of their steps is dropped, and finished steps are found by their keys in `job_step` instead.
+    DBOS would leave them waiting for ever for a worker of their version. It also replays by position, which a new protocol may have
+    changed: its record of their steps is dropped, and finished steps are found by their keys in `job_step` instead.
     """
     rows = db.execute(
         text(
-            "update dbos.workflow_status set application_version = :version where name = :name and status in ('ENQUEUED', 'DELAYED', 'PENDING')"
+            "update dbos.workflow_status set application_version = :version"
+            " where name = :name and status in ('ENQUEUED', 'DELAYED', 'PENDING')"
             " and application_version is not null and application_version <> :version returning workflow_uuid"
         ),
         {"version": PROTOCOL, "name": WORKFLOW},

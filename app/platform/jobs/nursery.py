@@ -20,7 +20,7 @@ from typing import Any
 
 import psutil
 
-from app.platform.jobs.child import params_hash, stored_result
+from app.platform.jobs.child import params_hash, stored_result, too_much_memory
 from app.platform.jobs.context import Outcome
 from app.platform.jobs.registry import ComputeFunction
 from app.platform.jobs.report import write_atomically
@@ -72,13 +72,15 @@ class Heard:
         return any(part is not None for part in (self.progress, self.message, self.points, self.logs))
 
 
+_Child = subprocess.Popen[bytes]
+_Order = tuple[Callable[[], _Child], Future[_Child]]
+
+
 class Nursery:
     """Starts every child from one thread, because the kernel's parent-death signal fires when the starting *thread* ends."""
 
     def __init__(self) -> None:
-        self._orders: queue.SimpleQueue[tuple[Callable[[], subprocess.Popen[bytes]], Future[subprocess.Popen[bytes]]] | None] = (
-            queue.SimpleQueue()
-        )
+        self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="nursery", daemon=True)
         self._thread.start()
 
@@ -114,7 +116,7 @@ class Nursery:
             outcome["log"] = log.read_bytes()[log_start:][-LOG_TAIL:].decode(errors="replace")
         return outcome
 
-    def _start(self, call: Call, log: Path) -> tuple[subprocess.Popen[bytes], int]:
+    def _start(self, call: Call, log: Path) -> tuple[_Child, int]:
         reader, writer = os.pipe()
         env = os.environ | _ONE_THREAD
         env |= {
@@ -125,12 +127,12 @@ class Nursery:
         command = [sys.executable, "-m", "app.platform.jobs.child", call.function.name, str(call.workdir.resolve())]
         with log.open("ab") as out:
 
-            def start() -> subprocess.Popen[bytes]:
+            def start() -> _Child:
                 return subprocess.Popen(
                     command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=env, pass_fds=(writer,), start_new_session=True
                 )
 
-            started: Future[subprocess.Popen[bytes]] = Future()
+            started: Future[_Child] = Future()
             self._orders.put((start, started))
             try:
                 return started.result(), reader
@@ -162,9 +164,7 @@ def _prepare(call: Call) -> None:
         result.unlink()  # of a failed attempt
 
 
-def _listen(
-    process: subprocess.Popen[bytes], pipe: int, memory_mb: int, hear: Callable[[Heard], None], check: Callable[[], None]
-) -> str | None:
+def _listen(process: _Child, pipe: int, memory_mb: int, hear: Callable[[Heard], None], check: Callable[[], None]) -> str | None:
     """Hear a child out; returns why it had to be killed, or None when it ended by itself."""
     heard, rest, open_ = Heard(), b"", True
     reported = measured = time.monotonic()
@@ -185,7 +185,7 @@ def _listen(
         if present - measured >= MEMORY_CHECK_S:
             measured = present
             if _resident_mb(process.pid) > memory_mb:
-                return f"The step needs more memory than its limit of {memory_mb} MiB. Make the job smaller or raise BETALOOP_JOB_MEMORY_MB for the worker."
+                return too_much_memory(memory_mb)
         if process.poll() is not None and not select.select([pipe], [], [], 0)[0]:
             break  # a grandchild may hold the pipe open
     if heard:
@@ -200,7 +200,7 @@ def _resident_mb(pid: int) -> float:
         return 0.0
 
 
-def _kill(process: subprocess.Popen[bytes]) -> None:
+def _kill(process: _Child) -> None:
     if process.poll() is None:
         try:
             os.killpg(process.pid, signal.SIGKILL)  # its own session: its children go too

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import timedelta
 from typing import Any
 
-from sqlalchemy import func, select, text, update
+from sqlalchemy import ColumnElement, Interval, delete, func, literal, select, text, update
 from sqlalchemy.orm import Session, selectinload
 
 from app.platform.database import now
@@ -106,9 +107,7 @@ def cancel_requests(db: Session, job_ids: Sequence[str]) -> set[str]:
 
 def ended_before(db: Session, job_ids: Sequence[str], days: float) -> set[str]:
     """Of these ids, those of jobs that ended longer ago, or that are no jobs at all."""
-    keep = select(Job.id).where(
-        Job.id.in_(job_ids), (Job.finished_at.is_(None)) | (Job.finished_at > func.now() - func.make_interval(0, 0, 0, days))
-    )
+    keep = select(Job.id).where(Job.id.in_(job_ids), (Job.finished_at.is_(None)) | (Job.finished_at > func.now() - _seconds(86400 * days)))
     return set(job_ids) - set(db.scalars(keep))
 
 
@@ -134,15 +133,13 @@ def leave(db: Session, worker_id: str) -> None:
 
 def live_workers(db: Session, stale_s: float) -> list[Worker]:
     """Workers seen within the last `stale_s` seconds, by the database's clock."""
-    return list(
-        db.scalars(
-            select(Worker)
-            .where(Worker.seen_at > func.clock_timestamp() - func.make_interval(0, 0, 0, 0, 0, 0, stale_s))
-            .order_by(Worker.id)
-        )
-    )
+    return list(db.scalars(select(Worker).where(Worker.seen_at > func.clock_timestamp() - _seconds(stale_s)).order_by(Worker.id)))
 
 
 def forget_workers(db: Session, stale_s: float) -> None:
     """Remove workers that have been silent for longer."""
-    db.execute(text("delete from worker where seen_at < clock_timestamp() - make_interval(secs => :stale)"), {"stale": stale_s})
+    db.execute(delete(Worker).where(Worker.seen_at < func.clock_timestamp() - _seconds(stale_s)))
+
+
+def _seconds(seconds: float) -> ColumnElement[timedelta]:
+    return literal(timedelta(seconds=seconds), Interval)

@@ -61,7 +61,7 @@ def test_without_a_future_ddpg_finds_the_amplitude_that_balances_threshold_and_p
     # The sessions' beta is 200 exp(0.1 n - a) with n standard normal: probability of reaching the threshold in closed form.
     reward = -norm.sf((np.log(settings.xi_beta / 200) + amplitudes) / 0.1) - settings.c1 * amplitudes
     best = amplitudes[reward.argmax()]
-    trained = train(buffer, DdpgConfig(actor_lr=1e-3, hidden=(32, 32), updates=2000, batch=128, seed=0))
+    trained = train(buffer, DdpgConfig(actor_lr=1e-3, hidden=(64, 64), updates=2000, batch=128, seed=0))
     chosen = trained.policy.act(buffer.transitions().states).mean()
     assert abs(chosen - best) < 0.07
     assert reward.max() - np.interp(chosen, amplitudes, reward) < 0.04
@@ -83,7 +83,7 @@ class Net:
         x, inputs, outputs = list(x), [], []
         for i, (rows, bias) in enumerate(zip(self.w, self.b, strict=True)):
             if i == self.join:
-                x = [*x, action]
+                x = [*x, 2 * action - 1]
             inputs.append(x)
             x = [sum(w * v for w, v in zip(row, x, strict=True)) + b for row, b in zip(rows, bias, strict=True)]
             outputs.append(x)
@@ -102,7 +102,7 @@ class Net:
             grad_b[i] = list(delta)
             delta = [sum(d * row[j] for d, row in zip(delta, self.w[i], strict=True)) for j in range(len(inputs[i]))]
             if i == self.join:
-                by_action = delta.pop()
+                by_action = 2 * delta.pop()
         return grad_w, grad_b, by_action
 
     def flat(self):

@@ -1,0 +1,193 @@
+"""HTML pages of accounts: sign in and out, one's own password and tokens, the users of a study."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.orm import Session
+
+from app.accounts import policy as can
+from app.accounts import repository, service
+from app.accounts.deps import COOKIE, CurrentCaller
+from app.accounts.models import Role, User
+from app.accounts.policy import Caller
+from app.platform.database import Db
+from app.platform.errors import BetaloopError, Invalid, NotFound
+from app.platform.forms import FormValues
+from app.platform.schemas import RowId
+from app.platform.templates import render
+from app.settings import get_settings
+
+router = APIRouter()
+
+
+@router.get("/sign-in")
+def sign_in_page(request: Request, db: Db, next: str = "/") -> Response:
+    """The sign-in form; who is signed in already goes on."""
+    token = request.cookies.get(COOKIE)
+    if token and service.caller_of_cookie(db, token):
+        return RedirectResponse(local_path(next), 303)
+    return HTMLResponse(render(request, "accounts/sign_in.html", problem=None, email="", next=local_path(next)))
+
+
+@router.post("/sign-in")
+def sign_in(request: Request, db: Db, values: FormValues) -> Response:
+    """Open a browser session."""
+    email, target = str(values.get("email", "")), local_path(str(values.get("next", "/")))
+    try:
+        token = service.sign_in(db, email, str(values.get("password", "")))
+    except BetaloopError as error:
+        db.commit()  # failures count
+        page = render(request, "accounts/sign_in.html", problem=error.problem(request.url.path), email=email, next=target)
+        return HTMLResponse(page, error.status)
+    db.commit()
+    settings, answer = get_settings(), RedirectResponse(target, 303)
+    answer.set_cookie(
+        COOKIE, token, max_age=3600 * settings.session_max_hours, httponly=True, samesite="lax", secure=settings.cookie_secure
+    )
+    return answer
+
+
+@router.post("/sign-out")
+def sign_out(request: Request, db: Db) -> Response:
+    """End the browser session, here and on the server."""
+    if token := request.cookies.get(COOKIE):
+        service.sign_out(db, token)
+        db.commit()
+    answer = RedirectResponse("/sign-in?done=out", 303)
+    answer.delete_cookie(COOKIE, httponly=True, samesite="lax", secure=get_settings().cookie_secure)
+    return answer
+
+
+@router.get("/account")
+def account(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """One's own access."""
+    return _account_page(request, db, caller)
+
+
+@router.post("/account/password")
+def change_password(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Change one's password; every browser session ends, also this one."""
+    try:
+        if values.get("password") != values.get("again"):
+            raise Invalid("The two new passwords differ.", "Type the same one twice.")
+        service.change_own_password(db, _own_id(caller), str(values.get("present", "")), str(values.get("password", "")))
+    except BetaloopError as error:
+        db.rollback()
+        return _account_page(request, db, caller, error)
+    db.commit()
+    return RedirectResponse("/sign-in?done=password", 303)
+
+
+@router.post("/account/tokens")
+def create_token(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Make an API token and show it this once."""
+    try:
+        token = service.create_token(db, caller.label, str(values.get("name", "")))
+    except BetaloopError as error:
+        db.rollback()
+        return _account_page(request, db, caller, error)
+    db.commit()
+    return _account_page(request, db, caller, token=token)
+
+
+@router.post("/account/tokens/{token_id}/revoke")
+def revoke_token(token_id: RowId, db: Db, caller: CurrentCaller) -> Response:
+    """End one of one's own tokens."""
+    service.revoke_token(db, _own_id(caller), token_id)
+    db.commit()
+    return RedirectResponse("/account?done=revoked", 303)
+
+
+@router.get("/accounts")
+def accounts(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """The users of the studies that the caller administers."""
+    caller.require(can.MANAGE_ACCOUNTS)
+    return _accounts_page(request, db, caller)
+
+
+@router.post("/accounts")
+def add_user(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Add a user to the study."""
+    fields = {name: str(values.get(name, "")) for name in ("email", "name", "role", "study")}
+    try:
+        caller.require(can.MANAGE_ACCOUNTS, service.study_id_of(db, fields["study"] or None))
+        if fields["role"] not in set(Role):
+            raise Invalid("Choose a role.", f"Known: {', '.join(Role)}.")
+        password = str(values.get("password", ""))
+        service.add_user(db, fields["email"], Role(fields["role"]), password, fields["study"] or None, fields["name"].strip()[:200])
+    except BetaloopError as error:
+        db.rollback()
+        return _accounts_page(request, db, caller, error, fields)
+    db.commit()
+    return RedirectResponse("/accounts?done=added", 303)
+
+
+@router.post("/accounts/{user_id}/password")
+def reset_password(request: Request, user_id: RowId, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Give a user a new password; the user's browser sessions end."""
+    user = _managed_user(db, caller, user_id)
+    try:
+        service.set_password(db, user, str(values.get("password", "")))
+    except BetaloopError as error:
+        db.rollback()
+        return _accounts_page(request, db, caller, error)
+    db.commit()
+    return RedirectResponse("/accounts?done=password", 303)
+
+
+@router.post("/accounts/{user_id}/active")
+def set_active(user_id: RowId, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Shut a user out, or let the user in again."""
+    active = values.get("active") == "yes"
+    service.set_active(db, _managed_user(db, caller, user_id), active, caller)
+    db.commit()
+    return RedirectResponse(f"/accounts?done={'opened' if active else 'closed'}", 303)
+
+
+def local_path(target: str) -> str:
+    """A path of this service, or `/`: nobody is sent to another site after signing in.
+
+    Browsers read a backslash as a slash and drop tabs and line ends, hence the strict look at every character.
+    """
+    ok = target.startswith("/") and not target.startswith("//") and "\\" not in target and all(" " < c < "\x7f" for c in target)
+    return target if ok else "/"
+
+
+def _own_id(caller: Caller) -> int:
+    if caller.user_id is None:
+        raise NotFound("The system itself has no account.")
+    return caller.user_id
+
+
+def _managed_user(db: Session, caller: Caller, user_id: int) -> User:
+    caller.require(can.MANAGE_ACCOUNTS)
+    user = db.get(User, user_id)
+    if user is None or not service.manages(caller, user):
+        raise NotFound("There is no such user, or you do not administer all of its studies.")
+    return user
+
+
+def _account_page(request: Request, db: Session, caller: Caller, error: BetaloopError | None = None, token: str = "") -> HTMLResponse:
+    user = db.get_one(User, _own_id(caller))
+    values = {"user": user, "tokens": repository.tokens_of(db, user.id), "token": token, "min_password": service.MIN_PASSWORD}
+    problem = error.problem(request.url.path) if error else None
+    return HTMLResponse(render(request, "accounts/account.html", problem=problem, **values), error.status if error else 200)
+
+
+def _accounts_page(
+    request: Request, db: Session, caller: Caller, error: BetaloopError | None = None, draft: dict[str, Any] | None = None
+) -> HTMLResponse:
+    page = render(
+        request,
+        "accounts/accounts.html",
+        users=[u for u in repository.users(db) if service.manages(caller, u)],
+        studies=[s for s in repository.studies(db) if caller.may(can.MANAGE_ACCOUNTS, s.id)],
+        roles=list(Role),
+        draft=draft or {"email": "", "name": "", "role": Role.CLINICIAN, "study": ""},
+        problem=error.problem(request.url.path) if error else None,
+        min_password=service.MIN_PASSWORD,
+    )
+    return HTMLResponse(page, error.status if error else 200)

@@ -1,0 +1,22 @@
+"""HTML pages of the analysis."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse
+
+from app.accounts.deps import CurrentCaller
+from app.analysis import service
+from app.analysis.charts import view
+from app.platform.database import Db
+from app.platform.templates import render
+from app.study.api import CurrentParticipant
+
+router = APIRouter()
+
+
+@router.get("/participants/{code}/analyses")
+def analyses(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """The five metrics by controller, with tests, tables and limits."""
+    analysis = view(service.five_metrics(db, participant, caller))
+    return HTMLResponse(render(request, "analysis/analyses.html", participant=participant, analysis=analysis))

@@ -1,0 +1,35 @@
+"""Every query of evaluations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import Select, select
+from sqlalchemy.orm import Session, selectinload
+
+from app.evaluation.models import Evaluation
+from app.learning.models import Policy
+
+
+def newest_evaluation(db: Session, participant_id: int) -> Evaluation | None:
+    """The participant's last evaluation with its estimates."""
+    return db.scalar(_evaluations().where(Evaluation.participant_id == participant_id).order_by(Evaluation.id.desc()).limit(1))
+
+
+def evaluation_of_job(db: Session, job_id: str) -> Evaluation | None:
+    """What a job evaluated."""
+    return db.scalar(_evaluations().where(Evaluation.job_id == job_id))
+
+
+def evaluation(db: Session, participant_id: int, evaluation_id: int) -> Evaluation | None:
+    """A participant's evaluation by its number."""
+    return db.scalar(_evaluations().where(Evaluation.participant_id == participant_id, Evaluation.id == evaluation_id))
+
+
+def policies_by_id(db: Session, ids: Sequence[int]) -> dict[int, Policy]:
+    """Policies by their number."""
+    return {p.id: p for p in db.scalars(select(Policy).where(Policy.id.in_(ids)))}
+
+
+def _evaluations() -> Select[tuple[Evaluation]]:
+    return select(Evaluation).options(selectinload(Evaluation.estimates))

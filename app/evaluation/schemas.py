@@ -1,0 +1,198 @@
+"""API types of evaluation and of jobs."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from app.learning.schemas import DistilParams, PolicyIds, Preset, TrainParams
+from app.platform.schemas import Int, Model, Number
+
+Method = Literal["dlsm", "linear", "wis", "pdis"]
+METHODS: tuple[Method, ...] = ("dlsm", "linear", "wis", "pdis")
+METHOD_NAMES = {
+    "dlsm": "DLSM",
+    "linear": "Linear model",
+    "wis": "Weighted importance sampling",
+    "pdis": "Per-decision importance sampling",
+}
+
+
+class EvaluateParams(Model):
+    """What `evaluate` takes."""
+
+    preset: Preset = Field("full", description="`full`: sizes for a study; `demo`: small and quick.")
+    policies: PolicyIds = Field(default_factory=list, description="Policies to rank; empty: every one that is not retired.")
+    methods: Annotated[list[Method], Field(min_length=1, max_length=8)] = Field(list(METHODS), description="Estimators to run.")
+    horizon_steps: Int | None = Field(None, ge=1, le=100_000, description="H; the snapshot's median session length where not given.")
+    seed: Int = Field(0, ge=0, le=10**6)
+
+
+class PipelineParams(Model):
+    """What `pipeline` takes: everything between two visits in one job."""
+
+    preset: Preset = Field("full", description="`full`: sizes for a study; `demo`: small and quick.")
+    policies: PolicyIds = Field(default_factory=list, description="Fine-tune from each of these; empty: train from scratch.")
+    count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch; the paper trains 6.")
+    updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each policy.")
+    actor_lr_low: Number | None = Field(None, gt=0, le=1, description="Lowest learning rate of the policies.")
+    actor_lr_high: Number | None = Field(None, gt=0, le=1, description="Highest; in between they are spread evenly in the logarithm.")
+    sigma: Number | None = Field(None, ge=0, le=10, description="Noise of the distillation's synthetic states, share of beta's standard deviation.")
+    distil_updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each student.")
+    methods: Annotated[list[Method], Field(min_length=1, max_length=8)] = Field(list(METHODS), description="Estimators to run.")
+    horizon_steps: Int | None = Field(None, ge=1, le=100_000, description="H; the snapshot's median session length where not given.")
+    seed: Int = Field(0, ge=0, le=10**6, description="Seed of everything in the job.")
+
+    def training(self) -> TrainParams:
+        """The training stage."""
+        names = ("preset", "policies", "count", "updates", "actor_lr_low", "actor_lr_high", "seed")
+        return TrainParams(**{name: getattr(self, name) for name in names})
+
+    def distillation(self) -> DistilParams:
+        """The distillation stage."""
+        return DistilParams(preset=self.preset, sigma=self.sigma, updates=self.distil_updates, seed=self.seed)
+
+    def evaluation(self) -> EvaluateParams:
+        """The evaluation stage: every policy that is not retired, the new ones among them."""
+        return EvaluateParams(preset=self.preset, methods=self.methods, horizon_steps=self.horizon_steps, seed=self.seed)
+
+
+class TrainJob(TrainParams):
+    """Train policies."""
+
+    kind: Literal["train"]
+
+
+class DistillJob(DistilParams):
+    """Distil policies."""
+
+    kind: Literal["distill"]
+
+
+class EvaluateJob(EvaluateParams):
+    """Estimate and rank policies."""
+
+    kind: Literal["evaluate"]
+
+
+class PipelineJob(PipelineParams):
+    """Snapshot, train, distil, estimate, rank."""
+
+    kind: Literal["pipeline"]
+
+
+JobIn = Annotated[TrainJob | DistillJob | EvaluateJob | PipelineJob, Field(discriminator="kind")]
+
+
+class JobStepOut(Model):
+    """One step of a job."""
+
+    key: str
+    title: str
+    status: str
+    progress: float
+    message: str
+    attempts: int
+    started_at: datetime | None
+    finished_at: datetime | None
+
+
+class JobOut(Model):
+    """A job."""
+
+    id: str
+    kind: str
+    participant: str | None
+    status: str
+    progress: float
+    message: str
+    params: dict[str, Any]
+    result: dict[str, Any] | None
+    error: str | None
+    code_version: str
+    created_at: datetime
+    created_by: str
+    started_at: datetime | None
+    finished_at: datetime | None
+    cancel_requested_at: datetime | None
+    steps: list[JobStepOut]
+
+
+class EstimateOut(Model):
+    """One method's estimate of E[r_end + sum over t < H of gamma^t r_t], unnormalised."""
+
+    value: float
+    low: float
+    high: float
+    level: float
+    standard_error: float | None
+    step_return: float | None
+    end_reward: float | None
+    supported: bool
+    flags: list[str]
+    predicted: dict[str, float]
+    n: int | None
+
+
+class TestedBefore(Model):
+    """What a policy did where it ran: actual returns with the H and gamma of the estimates."""
+
+    __test__ = False
+
+    sessions: int
+    sessions_with_return: int
+    mean_return: float | None
+    mean_step_return: float | None
+    mean_end_reward: float | None
+    energy: float | None
+
+
+class RankedPolicy(Model):
+    """A policy in the ranking."""
+
+    policy_id: int
+    name: str
+    kind: str
+    algorithm: str
+    teacher_id: int | None
+    rank: int | None = Field(description="1 is best; policies that the data do not support come last. Null for references.")
+    reference: str | None = Field(description="`cdbs`, `best_constant`, `constant` or `proportional`; null for candidates.")
+    supported: bool
+    probability_best: float | None
+    retired: bool
+    estimates: dict[str, EstimateOut]
+    predicted: dict[str, float] = Field(description="By the ranking's method: energy, mean_amplitude, mean_beta, grasp_hz, rating, tremor_percent.")
+    flags: list[str]
+    tested: TestedBefore | None
+
+
+class RankedSnapshot(Model):
+    """What the ranking rests on."""
+
+    id: int
+    created_at: datetime
+    sessions: int
+    steps: int
+    beta_unit: str
+    beta_source: str
+    settings_version: int
+
+
+class RankingOut(Model):
+    """Candidate policies from best to worst by the default method, and references beside them."""
+
+    participant: str
+    evaluation_id: int
+    created_at: datetime
+    default_method: str
+    methods: list[str]
+    failed_methods: dict[str, str] = Field(description="Methods that could not speak, and why.")
+    horizon_steps: int
+    gamma: float
+    snapshot: RankedSnapshot
+    stale: bool
+    stale_reasons: list[str]
+    policies: list[RankedPolicy]
+    references: list[RankedPolicy]

@@ -1,0 +1,185 @@
+"""Background work of learning: the kinds `train` and `distill`, and their stages for longer jobs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from app.accounts.policy import Caller
+from app.learning import compute as compute  # registers its functions
+from app.learning import repository, service, snapshots
+from app.learning.configs import distillation_config, training_configs
+from app.learning.models import BufferSnapshot, Policy
+from app.learning.schemas import DistilParams, TrainParams
+from app.platform.errors import Invalid
+from app.platform.jobs import JobContext, job_kind
+from app.study.models import Participant
+
+TRAIN_WEIGHT, DISTIL_WEIGHT, STORE_WEIGHT = 10.0, 2.0, 0.1
+Call = tuple[str, str, dict[str, Any]]
+
+
+def acting(job: JobContext) -> Caller:
+    """Whoever submitted the job; what it may do was checked then."""
+    return Caller(label=job.created_by, user_id=None, grants=(), is_system=True)
+
+
+def participant_of(db: Session, job: JobContext) -> Participant:
+    """The job's participant."""
+    if job.participant_id is None:
+        raise Invalid(f"A job of kind '{job.kind}' needs a participant.", "Start it from the participant's page.")
+    return db.get_one(Participant, job.participant_id)
+
+
+def take_snapshot(job: JobContext, db: Session) -> BufferSnapshot:
+    """The snapshot that everything in this job rests on."""
+    return snapshots.take_snapshot(db, participant_of(db, job), acting(job))
+
+
+def snapshot_facts(snapshot: BufferSnapshot) -> dict[str, Any]:
+    """What later steps need to know of a snapshot."""
+    return {"id": snapshot.id, "sha256": snapshot.file_sha256, "sessions": snapshot.sessions, "steps": snapshot.steps}
+
+
+def training_starts(db: Session, participant_id: int, params: TrainParams) -> list[dict[str, Any] | None]:
+    """Where each training starts: None from scratch, else the parent's id and its files.
+
+    Raises:
+        NotFound: no such policy. Invalid: a policy that cannot be trained further.
+    """
+    if not params.policies:
+        return [None] * params.count
+    starts: list[dict[str, Any] | None] = []
+    for policy in repository.policies_named(db, participant_id, params.policies):
+        if policy.kind not in ("trained", "distilled"):
+            raise Invalid(
+                f"Policy '{policy.name}' is {policy.kind}: only policies trained here can be trained further.", "Choose a trained policy."
+            )
+        known = {"checkpoint_sha256": policy.checkpoint_sha256} if policy.checkpoint_sha256 else {"onnx_sha256": policy.onnx_sha256}
+        starts.append({"policy_id": policy.id, **known})
+    return starts
+
+
+def training_calls(params: TrainParams, sha256: str, starts: Sequence[dict[str, Any] | None]) -> list[Call]:
+    """Compute steps of the training stage."""
+    calls: list[Call] = []
+    for k, (config, start) in enumerate(zip(training_configs(params), starts, strict=True)):
+        call: dict[str, Any] = {"snapshot_sha256": sha256, "config": config}
+        if start is not None:
+            call["initial"] = {name: value for name, value in start.items() if name.endswith("sha256")}
+        calls.append((f"train/{k}", "train", call))
+    return calls
+
+
+def declare_training(job: JobContext, params: TrainParams) -> None:
+    """Show the training stage from the start."""
+    for k, config in enumerate(training_configs(params)):
+        job.step(f"train/{k}", f"Train policy {k + 1} (learning rate {config['actor_lr']:g})", weight=TRAIN_WEIGHT)
+    job.step("store-policies", "Store the policies", weight=STORE_WEIGHT)
+
+
+def store_trained(
+    job: JobContext, snapshot_id: int, results: Sequence[dict[str, Any]], starts: Sequence[dict[str, Any] | None]
+) -> list[dict[str, Any]]:
+    """Store the training stage's policies; returns their ids, names and files."""
+
+    def store(db: Session) -> dict[str, Any]:
+        snapshot = db.get_one(BufferSnapshot, snapshot_id)
+        steps = [
+            (f"train/{k}", result, job.workdir(f"train/{k}"), start["policy_id"] if start else None)
+            for k, (result, start) in enumerate(zip(results, starts, strict=True))
+        ]
+        return {"policies": _facts(service.store_trained(db, job.id, job.created_by, snapshot, steps))}
+
+    stored: list[dict[str, Any]] = job.transact("store-policies", store)["policies"]
+    return stored
+
+
+def declare_distillation(job: JobContext, count: int) -> None:
+    """Show the distillation stage, where the number of teachers is known."""
+    for k in range(count):
+        job.step(f"distil/{k}", f"Distil policy {k + 1}", weight=DISTIL_WEIGHT)
+    job.step("store-students", "Store the small policies", weight=STORE_WEIGHT)
+
+
+def distil_all(job: JobContext, params: DistilParams, snapshot: dict[str, Any], teachers: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The distillation stage; returns ids, names and files of the students."""
+    calls: list[Call] = [
+        (
+            f"distil/{k}",
+            "distil",
+            {"snapshot_sha256": snapshot["sha256"], "teacher_sha256": teacher["sha256"], "config": distillation_config(params, k)},
+        )
+        for k, teacher in enumerate(teachers)
+    ]
+    results = job.compute_all(calls)
+
+    def store(db: Session) -> dict[str, Any]:
+        row = db.get_one(BufferSnapshot, snapshot["id"])
+        steps = [
+            (f"distil/{k}", result, job.workdir(f"distil/{k}"), teacher["id"])
+            for k, (result, teacher) in enumerate(zip(results, teachers, strict=True))
+        ]
+        return {"policies": _facts(service.store_students(db, job.id, job.created_by, row, steps))}
+
+    stored: list[dict[str, Any]] = job.transact("store-students", store)["policies"]
+    return stored
+
+
+@job_kind("train", title="Train policies", params_schema=TrainParams)
+def run_train(job: JobContext) -> dict[str, Any]:
+    """Train policies on a fresh snapshot."""
+    params = TrainParams.model_validate(job.params)
+    job.step("plan", "Take a buffer snapshot", weight=STORE_WEIGHT)
+    declare_training(job, params)
+
+    def plan(db: Session) -> dict[str, Any]:
+        snapshot = take_snapshot(job, db)
+        return {"snapshot": snapshot_facts(snapshot), "starts": training_starts(db, snapshot.participant_id, params)}
+
+    planned = job.transact("plan", plan)
+    results = job.compute_all(training_calls(params, planned["snapshot"]["sha256"], planned["starts"]))
+    policies = store_trained(job, planned["snapshot"]["id"], results, planned["starts"])
+    return {"snapshot_id": planned["snapshot"]["id"], "policy_ids": [p["id"] for p in policies]}
+
+
+@job_kind("distill", title="Distil policies", params_schema=DistilParams)
+def run_distil(job: JobContext) -> dict[str, Any]:
+    """Distil the named policies, or every trained one that has no student."""
+    params = DistilParams.model_validate(job.params)
+    job.step("plan", "Take a buffer snapshot", weight=STORE_WEIGHT)
+
+    def plan(db: Session) -> dict[str, Any]:
+        snapshot = take_snapshot(job, db)
+        return {"snapshot": snapshot_facts(snapshot), "teachers": _facts(teachers(db, snapshot.participant_id, params))}
+
+    planned = job.transact("plan", plan)
+    declare_distillation(job, len(planned["teachers"]))
+    students = distil_all(job, params, planned["snapshot"], planned["teachers"])
+    return {"snapshot_id": planned["snapshot"]["id"], "policy_ids": [p["id"] for p in students]}
+
+
+def teachers(db: Session, participant_id: int, params: DistilParams) -> list[Policy]:
+    """The policies to distil.
+
+    Raises:
+        NotFound: no such policy. Invalid: a baseline, or nothing to distil.
+    """
+    if params.policies:
+        chosen = repository.policies_named(db, participant_id, params.policies)
+        for policy in chosen:
+            if policy.kind == "baseline":
+                raise Invalid(f"Policy '{policy.name}' is a baseline: there is nothing to distil.", "Choose trained policies.")
+        return chosen
+    live = repository.candidates(db, participant_id)
+    taught = {p.teacher_id for p in live}
+    found = [p for p in live if p.kind == "trained" and p.id not in taught]
+    if not found:
+        raise Invalid("There is no trained policy without a student.", "Train policies first, or name the policies to distil.")
+    return found
+
+
+def _facts(policies: Sequence[Policy]) -> list[dict[str, Any]]:
+    return [{"id": p.id, "name": p.name, "sha256": p.onnx_sha256} for p in policies]

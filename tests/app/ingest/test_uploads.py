@@ -1,0 +1,236 @@
+"""Uploads over REST: alignment, idempotence, errors that lose nothing, identity that never arrives."""
+
+from __future__ import annotations
+
+import io
+import threading
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from fastapi.testclient import TestClient
+
+from app.ingest import quarantine
+from app.platform import files
+from app.settings import get_settings
+
+TABLE = b"""t_s,beta,amplitude_fraction
+-2,0.8,1
+0,0.9,1
+2,1.5,0.5
+4,1.2,0.6
+6,0.7,1.2
+"""
+
+
+def upload(client: TestClient, content: bytes, name: str = "session.csv", **fields: Any) -> Any:
+    """Post one file for P1, visit 1, a random session unless told otherwise."""
+    data = {"participant": "P1", "visit": "1", "controller": "random"} | {k: str(v) for k, v in fields.items()}
+    return client.post("/api/v1/uploads", data=data, files={"file": (name, content)})
+
+
+def test_a_table_becomes_a_confirmed_session_on_the_papers_grid(client: TestClient, enrolled: str) -> None:
+    answer = upload(client, TABLE)
+    assert answer.status_code == 201
+    body = answer.json()
+    assert set(body) >= {"id", "sha256", "duplicate", "sessions", "report"}
+    assert body["duplicate"] is False
+    (session,) = body["sessions"]
+    assert (session["controller"], session["visit"], session["status"], session["duration_s"]) == ("random", 1, "confirmed", 6)
+    trace = client.get(f"/api/v1/sessions/{session['id']}/trace").json()
+    rows = {t: (b, m, a) for t, b, m, a in zip(trace["t_s"], trace["beta"], trace["amplitude_ma"], trace["amplitude_fraction"], strict=True)}
+    assert trace["t_s"] == [2.0 * k for k in range(-9, 4)]
+    assert rows[-4] == (None, None, None)
+    assert rows[0][0] == pytest.approx(0.9)
+    assert rows[2] == pytest.approx((1.5, 1.5, 0.5))
+    assert rows[6] == pytest.approx((0.7, 3.6, 1.2))
+
+
+def test_a_fraction_above_one_is_stored_and_flagged_not_clipped(client: TestClient, enrolled: str) -> None:
+    body = upload(client, TABLE).json()
+    trace = client.get(f"/api/v1/sessions/{body['sessions'][0]['id']}/trace").json()
+    assert trace["steps_above_cdbs"] == 1
+    assert max(a for a in trace["amplitude_fraction"] if a is not None) == pytest.approx(1.2)
+    assert any("above" in sentence or "exceed" in sentence for report in body["report"] for sentence in report["flagged"])
+
+
+def test_parquet_gives_the_same_trace_as_csv(client: TestClient, enrolled: str) -> None:
+    sink = io.BytesIO()
+    columns = {"t_s": [-2.0, 0, 2, 4, 6], "beta": [0.8, 0.9, 1.5, 1.2, 0.7], "amplitude_fraction": [1, 1, 0.5, 0.6, 1.2]}
+    pq.write_table(pa.table(columns), sink)
+    first = upload(client, TABLE).json()
+    other = client.post("/api/v1/participants", json={"code": "P2", "settings": {"cdbs_amplitude_ma": 3.0}})
+    assert other.status_code == 201
+    client.post("/api/v1/participants/P2/visits", json={"number": 1})
+    second = upload(client, sink.getvalue(), "session.parquet", participant="P2").json()
+    traces = [client.get(f"/api/v1/sessions/{b['sessions'][0]['id']}/trace").json() for b in (first, second)]
+    assert traces[0]["beta"] == traces[1]["beta"]
+    assert traces[0]["amplitude_fraction"] == traces[1]["amplitude_fraction"]
+
+
+def test_the_same_bytes_again_change_nothing_and_say_so(client: TestClient, enrolled: str) -> None:
+    first = upload(client, TABLE).json()
+    again = upload(client, TABLE, name="copy.csv", controller="cdbs")
+    assert again.status_code == 201
+    body = again.json()
+    assert body["duplicate"] is True
+    assert [s["id"] for s in body["sessions"]] == [s["id"] for s in first["sessions"]]
+    assert body["sessions"][0]["controller"] == "random"
+    assert "was not changed" in body["report"][0]["flagged"][0]
+    visit = client.get("/api/v1/participants/P1/visits").json()["items"][0]["id"]
+    assert client.get(f"/api/v1/visits/{visit}/sessions").json()["total"] == 1
+
+
+def test_the_same_recording_in_another_file_is_the_same_session(client: TestClient, enrolled: str) -> None:
+    first = upload(client, TABLE).json()
+    other = upload(client, TABLE.replace(b",", b";"), name="semicolons.csv").json()
+    assert other["sha256"] != first["sha256"]
+    assert other["duplicate"] is True
+    assert other["sessions"][0]["id"] == first["sessions"][0]["id"]
+
+
+def test_two_uploads_at_once_of_one_file_make_one_session(service_app: Any, make_token: Any, client: TestClient, enrolled: str) -> None:
+    headers = dict(client.headers)
+    answers: list[Any] = []
+
+    def send() -> None:
+        answers.append(upload(TestClient(service_app, headers={"Authorization": headers["authorization"]}), TABLE))
+
+    threads = [threading.Thread(target=send) for _ in range(4)]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    assert {a.status_code for a in answers} == {201}
+    assert len({a.json()["sessions"][0]["id"] for a in answers}) == 1
+    assert sorted(a.json()["duplicate"] for a in answers) == [False, True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "named"),
+    [
+        (b"", "empty.csv", "empty"),
+        (b"time,level\n1,2\n", "columns.csv", "beta"),
+        (b"t_s,beta,amplitude_fraction\n2,abc,1\n", "text.csv", "line 2"),
+        (b"PK\x03\x04 not a zip", "broken.zip", "zip"),
+        (b"\x00\x01\x02\x03" * 100, "noise.bin", "format"),
+    ],
+)
+def test_a_file_of_no_use_is_kept_and_named(client: TestClient, enrolled: str, content: bytes, name: str, named: str) -> None:
+    answer = upload(client, content, name)
+    assert answer.status_code == 422
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem = answer.json()
+    assert problem["file"] == name
+    assert name in problem["detail"]
+    assert named in (problem["detail"] + problem["where"]).lower()
+    assert problem["mend"]
+    kept = client.get(f"/api/v1/uploads/{problem['upload_id']}").json()["files"][0]
+    assert kept["status"] == "failed"
+    assert files.path_of(kept["stored_sha256"]).exists()
+
+
+def test_what_cannot_be_parsed_is_kept_encrypted(client: TestClient, enrolled: str) -> None:
+    secret = b"\x00\x01 Jane Example, born 1950 " * 10
+    problem = upload(client, secret, "noise.bin").json()
+    kept = client.get(f"/api/v1/uploads/{problem['upload_id']}").json()["files"][0]["stored_sha256"]
+    assert b"Jane" not in files.read(kept)
+    assert b"".join(quarantine.decrypt(files.path_of(kept))) == secret
+
+
+def test_a_bad_file_loses_nothing_else_in_the_upload(client: TestClient, enrolled: str) -> None:
+    data = {"participant": "P1", "visit": "1", "controller": "random"}
+    answer = client.post("/api/v1/uploads", data=data, files=[("file", ("bad.csv", b"x,y\n1,2\n")), ("file", ("good.csv", TABLE))])
+    assert answer.status_code == 201
+    body = answer.json()
+    assert [f["status"] for f in body["files"]] == ["failed", "decoded"]
+    assert len(body["sessions"]) == 1
+    assert [r["name"] for r in body["report"] if r["problem"]] == ["bad.csv"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "status", "named"),
+    [
+        ({"participant": "P7"}, 404, "P7"),
+        ({"visit": 9}, 422, "visit 9"),
+        ({"visit": "one"}, 422, "visit"),
+        ({"controller": "warp"}, 422, "controller"),
+        ({"policy": "ghost"}, 422, "ghost"),
+    ],
+)
+def test_what_is_stated_must_exist(client: TestClient, enrolled: str, fields: dict[str, Any], status: int, named: str) -> None:
+    answer = upload(client, TABLE, **fields)
+    assert answer.status_code == status
+    assert named in answer.text
+
+
+def test_more_bytes_than_allowed_are_refused(client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(get_settings(), "upload_limit_mb", 1)
+    answer = upload(client, b"t_s,beta,amplitude_fraction\n" + b"0,1,1\n" * 600_000)
+    assert answer.status_code == 413
+    assert "1 MiB" in answer.json()["detail"]
+
+
+def test_a_viewer_may_not_upload(client: TestClient, client_as: Any, enrolled: str) -> None:
+    assert upload(client_as("viewer"), TABLE).status_code == 403
+
+
+def test_the_stimulation_sweep_becomes_a_session_with_its_steps(client: TestClient, enrolled: str, recordings: Path) -> None:
+    content = (recordings / "rcs" / "stim_sweep.zip").read_bytes()
+    answer = upload(client, content, "stim_sweep.zip", controller="other")
+    assert answer.status_code == 201
+    session = answer.json()["sessions"][0]
+    trace = client.get(f"/api/v1/sessions/{session['id']}/trace").json()
+    assert (trace["beta_unit"], trace["beta_source"]) == ("device units", "device_power")
+    assert session["duration_s"] == pytest.approx(444, abs=2)
+    amplitudes = [a for a in trace["amplitude_ma"] if a is not None]
+    assert (min(amplitudes), max(amplitudes)) == (0, pytest.approx(2.4))
+    by_amplitude = {
+        level: [b for b, a in zip(trace["beta"], trace["amplitude_ma"], strict=True) if b is not None and a == pytest.approx(level, abs=1e-4)]
+        for level in (0, 1.1, 2.4)
+    }
+    means = {level: sum(b) / len(b) for level, b in by_amplitude.items()}
+    assert means[0] > 2 * means[1.1] > means[2.4]
+
+
+def test_no_identity_of_a_device_file_is_stored_anywhere(client: TestClient, enrolled: str, recordings: Path) -> None:
+    archive = recordings / "rcs" / "stim_sweep.zip"
+    with zipfile.ZipFile(archive) as zipped:
+        serials = {part for name in zipped.namelist() for part in name.split("/") if part.startswith("Device") and "." not in part}
+    serials = {s.removeprefix("Device") for s in serials} - {""}
+    assert serials
+    assert upload(client, archive.read_bytes(), "npc.zip", controller="other").status_code == 201
+    for path in get_settings().files_dir.rglob("*"):
+        if path.is_file() and zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as zipped:
+                stored = b"".join(zipped.read(n) + n.encode() for n in zipped.namelist())
+            assert not any(s.encode() in stored for s in serials)
+
+
+def test_a_stated_start_inside_a_recording_leaves_what_came_before_as_the_lead(
+    client: TestClient, enrolled: str, recordings: Path
+) -> None:
+    content = (recordings / "rcs" / "stim_sweep.zip").read_bytes()
+    body = upload(client, content, "stim_sweep.zip", controller="other", started_at="2019-08-15T19:33:53.6Z").json()
+    session = body["sessions"][0]
+    assert session["duration_s"] == pytest.approx(443.5 - 40, abs=1)
+    trace = client.get(f"/api/v1/sessions/{session['id']}/trace").json()
+    lead = [b for t, b in zip(trace["t_s"], trace["beta"], strict=True) if t <= 0]
+    assert len(lead) == 10
+    assert None not in lead
+
+
+def test_the_participants_unit_and_source_are_taken_and_said(client: TestClient, enrolled: str) -> None:
+    body = upload(client, TABLE).json()
+    trace = client.get(f"/api/v1/sessions/{body['sessions'][0]['id']}/trace").json()
+    assert (trace["beta_unit"], trace["beta_source"]) == ("uV", "table")
+    assert any("'uV' from 'table', as the participant's settings say" in s for s in body["report"][0]["understood"])
+
+
+def test_a_stated_unit_and_source_win(client: TestClient, enrolled: str) -> None:
+    body = upload(client, TABLE, beta_unit="mV", beta_source="time_domain").json()
+    trace = client.get(f"/api/v1/sessions/{body['sessions'][0]['id']}/trace").json()
+    assert (trace["beta_unit"], trace["beta_source"]) == ("mV", "time_domain")

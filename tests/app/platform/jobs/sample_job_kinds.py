@@ -1,0 +1,119 @@
+"""Job kinds of the tests, imported by the tests, by workers in processes of their own, and by their children."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, Field
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+
+from app.platform.jobs import JobContext, JobError, Report, compute, job_kind, write_atomically
+from app.platform.jobs.worker import Pace, run_worker
+
+
+class CountParams(BaseModel):
+    """How many parts, how far each counts, how long each number takes."""
+
+    parts: int = Field(2, ge=1)
+    numbers: int = Field(3, ge=1)
+    pause_s: float = 0.0
+
+
+@compute("count")
+def count(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+    """Count slowly, with a checkpoint after every number."""
+    checkpoint = workdir / "checkpoint"
+    start = int(checkpoint.read_text()) if checkpoint.exists() else 0
+    for i in range(start, params["numbers"]):
+        time.sleep(params["pause_s"])
+        with (workdir / "counted").open("a") as counted:
+            counted.write(f"{i}\n")
+        write_atomically(checkpoint, str(i + 1).encode())
+        report.progress((i + 1) / params["numbers"], f"number {i + 1}")
+        report.point(i, square=i * i)
+    return {"part": params["part"], "counted": params["numbers"], "resumed_from": start, "pid": os.getpid()}
+
+
+@job_kind("count", title="Count", params_schema=CountParams)
+def run_count(job: JobContext) -> dict[str, Any]:
+    """Count in parts, then store one row per part."""
+    calls = [(f"count/{i}", "count", {**job.params, "part": i}) for i in range(job.params["parts"])]
+    for i, (key, _, _) in enumerate(calls):
+        job.step(key, f"Part {i}", weight=10)
+    job.step("store", "Store", weight=1)
+    results = job.compute_all(calls)
+    stored = job.transact("store", lambda db: _store(db, job.id, results))
+    return {"stored": stored["rows"], "resumed_from": [r["resumed_from"] for r in results]}
+
+
+def _store(db: Session, job_id: str, results: list[dict[str, Any]]) -> dict[str, Any]:
+    for result in results:
+        db.execute(text("insert into counted (job_id, part) values (:job, :part)"), {"job": job_id, "part": result["part"]})
+    return {"rows": len(results)}
+
+
+class FailParams(BaseModel):
+    """How to fail."""
+
+    how: str
+
+
+@compute("fail")
+def fail(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+    """Fail as asked."""
+    how = params["how"]
+    if how == "worded":
+        raise JobError("Participant P1 has no session.", "Upload one first.")
+    if how == "bug":
+        raise ZeroDivisionError("division by zero")
+    if how == "memory":
+        hoard = [bytearray(1 << 24)]
+        while True:
+            hoard.append(bytearray(b"x" * (1 << 24)))
+    if how == "torch":
+        import torch
+
+        return {"norm": float(torch.ones(1 << 30).norm())}
+    if how == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if how == "nan":
+        return {"value": float("nan")}
+    return {}
+
+
+@job_kind("fail", title="Fail", params_schema=FailParams)
+def run_fail(job: JobContext) -> dict[str, Any]:
+    """Fail in a child, in a transaction or in the orchestration."""
+    if job.params["how"] == "transaction":
+        return job.transact("store", _store_and_break)
+    if job.params["how"] == "orchestration":
+        raise KeyError("missing")
+    if job.params["how"] == "kills worker":
+        return job.transact("kill", _kill_worker)
+    return job.compute("fail", "fail", job.params)
+
+
+def _store_and_break(db: Session) -> dict[str, Any]:
+    db.execute(text("insert into counted (job_id, part) values ('broken', 1)"))
+    db.flush()
+    raise JobError("The buffer is empty.", "Upload a session.")
+
+
+def _kill_worker(db: Session) -> dict[str, Any]:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return {}
+
+
+def work(slots: int, beat_s: float, stale_s: float) -> None:
+    """A worker process, as the command line starts it."""
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    run_worker(slots, stop, Pace(beat_s=beat_s, stale_s=stale_s))
+    sys.exit(0)

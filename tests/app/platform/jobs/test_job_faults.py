@@ -1,0 +1,168 @@
+"""What jobs survive: kill -9 of workers and children, orderly stops, dead and sleeping workers, a restarted database."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import psutil
+import pytest
+from sqlalchemy import text
+
+from app.platform.database import new_session, transaction
+from app.platform.jobs import engine, repository, service
+
+
+def _gone(process: psutil.Process) -> bool:
+    try:
+        return process.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
+def _count_until(jobs, job_id, number):
+    jobs.wait(lambda: len(jobs.numbers(job_id, 0)) >= number and len(jobs.numbers(job_id, 1)) >= number)
+
+
+def test_a_killed_worker_takes_its_children_along_and_the_next_one_finishes_the_job(jobs, capsys):
+    worker = jobs.start_worker()
+    job_id = jobs.submit(parts=2, numbers=30, pause_s=0.1)
+    _count_until(jobs, job_id, 5)
+    children = jobs.children(worker)
+    assert len(children) == 2
+    worker.send_signal(signal.SIGKILL)
+    took = jobs.wait(lambda: all(_gone(c) for c in children), 2.0)
+    assert jobs.get(job_id).status == "running"
+
+    jobs.start_worker()
+    job = jobs.ended(job_id)
+    with capsys.disabled():
+        print(f"\n  children dead {took:.3f} s after kill -9 of their worker; parts resumed from {job.result['resumed_from']}")  # noqa: T201
+    assert job.status == "succeeded"
+    assert jobs.counted(job_id) == [0, 1]
+    assert min(job.result["resumed_from"]) >= 5
+    assert [s.attempts for s in job.steps] == [2, 2, 1]
+    for part in range(2):
+        # the number in flight may be counted again (a step is at least once), its result is not
+        assert sorted(set(jobs.numbers(job_id, part))) == list(range(30))
+        assert len(jobs.numbers(job_id, part)) <= 31
+
+
+def test_an_orderly_stop_kills_the_children_and_another_worker_takes_over_at_once(jobs):
+    first = jobs.start_worker()
+    job_id = jobs.submit(parts=2, numbers=40, pause_s=0.1)
+    _count_until(jobs, job_id, 3)
+    jobs.start_worker()  # stale after 60 s: it must not have to wait for that
+    with new_session() as db:
+        jobs.wait(lambda: len(repository.live_workers(db, 60.0)) == 2 or db.rollback())
+    children = jobs.children(first)
+    first.send_signal(signal.SIGTERM)
+    assert first.wait(10) == 0
+    assert all(_gone(c) for c in children)
+    job = jobs.ended(job_id, 20)
+    assert (job.status, jobs.counted(job_id)) == ("succeeded", [0, 1])
+    with new_session() as db:
+        assert db.scalar(text("select recovery_attempts from dbos.workflow_status where workflow_uuid = :id"), {"id": job_id}) == 1
+
+
+def test_a_live_worker_takes_the_jobs_of_one_that_fell_silent(jobs):
+    first = jobs.start_worker(stale_s=3.0)
+    job_id = jobs.submit(parts=2, numbers=40, pause_s=0.1)
+    _count_until(jobs, job_id, 3)
+    second = jobs.start_worker(stale_s=3.0)
+    with new_session() as db:
+        jobs.wait(lambda: len(repository.live_workers(db, 60.0)) == 2 or db.rollback())
+    first.send_signal(signal.SIGKILL)
+    job = jobs.ended(job_id, 30)
+    assert (job.status, jobs.counted(job_id)) == ("succeeded", [0, 1])
+    assert {s.worker for s in job.steps} == {f"{os.uname().nodename}-1"}
+    assert second.poll() is None
+
+
+@pytest.mark.slow
+def test_a_worker_that_was_frozen_drops_the_jobs_that_another_took_over(jobs):
+    first = jobs.start_worker(stale_s=2.0)
+    job_id = jobs.submit(parts=2, numbers=60, pause_s=0.1)
+    _count_until(jobs, job_id, 3)
+    frozen = [psutil.Process(first.pid), *jobs.children(first)]
+    second = jobs.start_worker(stale_s=2.0)
+    for process in frozen:
+        process.suspend()
+    jobs.wait(lambda: jobs.get(job_id).steps[0].attempts == 2, 20)
+    for process in frozen:
+        process.resume()
+    jobs.wait(lambda: all(_gone(c) for c in frozen[1:]), 10)
+    job = jobs.ended(job_id, 60)
+    assert (job.status, jobs.counted(job_id)) == ("succeeded", [0, 1])
+    assert (first.poll(), second.poll()) == (None, None)
+
+
+def test_two_workers_share_the_queue(jobs):
+    jobs.start_worker(slots=1)
+    jobs.start_worker(slots=1)
+    with new_session() as db:
+        jobs.wait(lambda: len(repository.live_workers(db, 60.0)) == 2 or db.rollback())
+    ids = [jobs.submit(parts=1, numbers=5, pause_s=0.2) for _ in range(4)]
+    workers = {jobs.ended(i).steps[0].worker for i in ids}
+    assert len(workers) == 2
+    assert all(jobs.counted(i) == [0] for i in ids)
+
+
+def test_a_job_that_nobody_runs_any_more_is_cancelled_at_once(jobs):
+    worker = jobs.start_worker()
+    job_id = jobs.submit(parts=1, numbers=1000, pause_s=0.1)
+    jobs.wait(lambda: jobs.numbers(job_id, 0))
+    worker.send_signal(signal.SIGTERM)
+    worker.wait(10)
+    with transaction("test") as db:
+        assert service.cancel(db, repository.get(db, job_id), "test").status == "cancelled"
+    counted = len(jobs.numbers(job_id, 0))
+    jobs.start_worker()
+    jobs.ended(jobs.submit(parts=1, numbers=1))
+    assert jobs.get(job_id).status == "cancelled"
+    assert len(jobs.numbers(job_id, 0)) == counted
+
+
+def test_jobs_of_an_older_protocol_are_moved_and_their_finished_steps_kept(jobs):
+    worker = jobs.start_worker()
+    job_id = jobs.submit(parts=2, numbers=20, pause_s=0.1)
+    _count_until(jobs, job_id, 3)
+    worker.send_signal(signal.SIGKILL)
+    worker.wait()
+    with transaction("test") as db:
+        db.execute(text("update dbos.workflow_status set application_version = '0' where workflow_uuid = :id"), {"id": job_id})
+    jobs.start_worker()
+    assert jobs.ended(job_id).status == "succeeded"
+    assert jobs.counted(job_id) == [0, 1]
+    with new_session() as db:
+        version = db.scalar(text("select application_version from dbos.workflow_status where workflow_uuid = :id"), {"id": job_id})
+    assert version == engine.PROTOCOL
+
+
+@pytest.mark.slow
+def test_a_job_that_kills_every_worker_is_given_up(jobs):
+    job_id = jobs.submit("fail", how="kills worker")
+    for _ in range(engine.MAX_RECOVERIES + 1):
+        worker = jobs.start_worker()
+        assert worker.wait(30) == -signal.SIGKILL
+    survivor = jobs.start_worker()
+    job = jobs.ended(job_id)
+    assert job.status == "failed"
+    assert "The worker died 4 times while it ran this job" in job.error
+    assert survivor.poll() is None
+
+
+@pytest.mark.slow
+def test_rounds_of_kill_nine_at_any_moment_lose_and_double_nothing(jobs):
+    job_ids = [jobs.submit(parts=3, numbers=10, pause_s=0.05) for _ in range(3)]
+    for wait_s in (2.5, 3.1, 3.7):
+        worker = jobs.start_worker()
+        try:
+            worker.wait(wait_s)
+        except Exception:
+            worker.send_signal(signal.SIGKILL)
+            worker.wait()
+    jobs.start_worker()
+    for job_id in job_ids:
+        job = jobs.ended(job_id, 60)
+        assert (job.status, job.error, jobs.counted(job_id)) == ("succeeded", None, [0, 1, 2])

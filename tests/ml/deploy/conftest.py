@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from ml.deploy.manifest import Approval, BundleManifest
+from ml.rl.networks import MlpPolicy
+
+
+@pytest.fixture(scope="session")
+def network() -> MlpPolicy:
+    """A student whose answers spread over the range."""
+    policy = MlpPolicy(10, (20, 10), mean=120.0, std=35.0, seed=3)
+    with torch.no_grad():
+        policy.layers[-1].weight.mul_(1000)
+    return policy
+
+
+@pytest.fixture(scope="session")
+def manifest() -> BundleManifest:
+    return BundleManifest(
+        participant="P-07",
+        policy_id=41,
+        policy_name="visit 3, seed 2, distilled",
+        window=10,
+        beta_unit="uV",
+        beta_source="time_domain",
+        normalisation_mean=120.0,
+        normalisation_std=35.0,
+        min_ma=0.5,
+        max_ma=3.2,
+        cdbs_ma=3.0,
+        ramp_ma_per_s=0.25,
+        snapshot_sha256="ab" * 32,
+        code_version="0.1.0",
+        approvals=(Approval(name="A. Clinician", role="clinician", approved_at="2026-03-01T09:00:00+00:00", statement="limits checked"),),
+    )
+
+
+@pytest.fixture(scope="session")
+def test_windows() -> np.ndarray:
+    return np.random.default_rng(0).normal(120.0, 40.0, (16, 10))

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy.stats import mannwhitneyu
+
+from ml.statistics.ranksum import non_inferiority, rank_sum, u_distribution
+
+
+@pytest.mark.parametrize(("n_x", "n_y"), [(1, 1), (2, 5), (4, 4), (5, 3)])
+def test_the_exact_distribution_is_that_of_counting_every_assignment_of_ranks(n_x, n_y):
+    counts = np.zeros(n_x * n_y + 1)
+    for ranks in combinations(range(1, n_x + n_y + 1), n_x):
+        counts[sum(ranks) - n_x * (n_x + 1) // 2] += 1
+    np.testing.assert_allclose(u_distribution(n_x, n_y), counts / counts.sum(), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("n_x", "n_y", "seed"), [(3, 4, 0), (8, 8, 1), (12, 7, 2), (30, 40, 3)])
+def test_without_ties_the_exact_p_value_is_scipys(n_x, n_y, seed):
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(0.4, 1, n_x), rng.normal(0, 1, n_y)
+    ours, theirs = rank_sum(x, y), mannwhitneyu(x, y, method="exact")
+    assert ours.method == "exact"
+    assert ours.u == theirs.statistic
+    assert ours.p_value == pytest.approx(theirs.pvalue, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_with_ties_the_normal_approximation_is_scipys(seed):
+    rng = np.random.default_rng(seed)
+    x, y = rng.integers(1, 11, 9), rng.integers(3, 11, 14)
+    ours, theirs = rank_sum(x, y), mannwhitneyu(x, y, method="asymptotic", use_continuity=True)
+    assert ours.method == "normal approximation"
+    assert ours.p_value == pytest.approx(theirs.pvalue, rel=1e-9)
+
+
+def test_large_groups_use_the_normal_approximation_and_say_so():
+    rng = np.random.default_rng(5)
+    x, y = rng.normal(size=60), rng.normal(size=60)
+    ours, theirs = rank_sum(x, y), mannwhitneyu(x, y, method="asymptotic")
+    assert ours.method == "normal approximation"
+    assert ours.p_value == pytest.approx(theirs.pvalue, rel=1e-9)
+
+
+def test_identical_ratings_on_both_sides_have_p_one():
+    assert rank_sum([7, 7, 7], [7, 7]).p_value == 1.0
+
+
+def test_the_shift_is_the_median_of_all_pairwise_differences():
+    result = rank_sum([1.0, 4.0, 9.0], [0.0, 2.5])
+    assert result.shift == np.median([1, -1.5, 4, 1.5, 9, 6.5])
+    assert result.superiority == pytest.approx(5 / 6)
+    assert (result.n_x, result.n_y, result.median_x, result.median_y) == (3, 2, 4.0, 1.25)
+
+
+def test_the_interval_of_the_shift_holds_exactly_the_shifts_that_the_test_does_not_reject():
+    rng = np.random.default_rng(6)
+    x, y = rng.normal(0.5, 1, 9), rng.normal(0, 1, 8)
+    result = rank_sum(x, y, level=0.9)
+    for shift in np.linspace(result.low - 1, result.high + 1, 301):
+        rejected = mannwhitneyu(x - shift, y, method="exact").pvalue <= 0.1
+        assert rejected == (not result.low < shift < result.high)
+
+
+def test_the_interval_of_the_shift_covers_the_true_shift_as_often_as_it_says():
+    rng = np.random.default_rng(7)
+    results = [rank_sum(rng.normal(1, 1, 7), rng.normal(0, 1, 9), level=0.9) for _ in range(600)]
+    assert 0.88 <= np.mean([r.low <= 1 <= r.high for r in results]) <= 0.96
+
+
+def test_a_controller_as_good_as_the_other_is_non_inferior_at_a_wide_margin_and_not_at_a_narrow_one():
+    rng = np.random.default_rng(8)
+    x, y = rng.normal(2.0, 0.2, 12), rng.normal(2.0, 0.2, 12)
+    assert non_inferiority(x, y, 0.5, higher_is_better=True).non_inferior
+    assert not non_inferiority(x, y, 0.01, higher_is_better=True).non_inferior
+    assert non_inferiority(x, y, 0.5, higher_is_better=True).p_value == pytest.approx(
+        mannwhitneyu(x + 0.5, y, alternative="greater", method="exact").pvalue
+    )
+
+
+def test_where_less_is_better_a_higher_group_is_not_non_inferior():
+    tremor_x, tremor_y = np.arange(30.0, 40.0), np.arange(5.0, 15.0) + 0.5
+    assert not non_inferiority(tremor_x, tremor_y, 5.0, higher_is_better=False).non_inferior
+    assert non_inferiority(tremor_y, tremor_x, 5.0, higher_is_better=False).non_inferior
+
+
+def test_an_empty_group_and_a_missing_measurement_are_refused_in_words():
+    with pytest.raises(ValueError, match="second group has no session"):
+        rank_sum([1.0], [])
+    with pytest.raises(ValueError, match="leave sessions without a measurement out"):
+        rank_sum([1.0, np.nan], [2.0])
+    with pytest.raises(ValueError, match="margin must be above 0"):
+        non_inferiority([1.0], [2.0], 0.0, higher_is_better=True)

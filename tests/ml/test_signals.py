@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ml.signals import band_pass, band_rows, row_means, row_of, step_means
+
+RATE = 500.0
+LOW, HIGH = 13.0, 35.0
+
+
+def sine(hz: float, seconds: float, amplitude: float = 1.0) -> np.ndarray:
+    return amplitude * np.sin(2 * np.pi * hz * np.arange(int(seconds * RATE)) / RATE)
+
+
+def test_a_sine_inside_the_band_has_an_rms_of_its_amplitude_over_root_two():
+    rows = band_rows([(1 / RATE, RATE, sine(22.0, 20.0, 3.0))], 10, 2.0, LOW, HIGH)
+    np.testing.assert_allclose(rows.rms, 3.0 / np.sqrt(2), rtol=0.01)
+    np.testing.assert_allclose(rows.power, 4.5, rtol=0.02)
+    np.testing.assert_allclose(rows.covered, 1.0)
+
+
+@pytest.mark.parametrize("hz", [1.0, 5.0, 70.0, 130.0])
+def test_a_sine_outside_the_band_leaves_less_than_two_per_cent(hz):
+    rows = band_rows([(1 / RATE, RATE, sine(hz, 20.0))], 10, 2.0, LOW, HIGH)
+    assert np.all(rows.rms[1:-1] < 0.02)
+
+
+def test_white_noise_gives_its_density_times_the_bandwidth():
+    noise = np.random.default_rng(4).normal(0.0, 2.0, int(400 * RATE))
+    rows = band_rows([(1 / RATE, RATE, noise)], 200, 2.0, LOW, HIGH)
+    density = 4.0 / (RATE / 2)
+    assert rows.power.mean() == pytest.approx(density * (HIGH - LOW), rel=0.03)
+
+
+@pytest.mark.parametrize("hz", [LOW, HIGH])
+def test_a_sine_at_an_edge_of_the_band_keeps_half_its_power(hz):
+    rows = band_rows([(1 / RATE, RATE, sine(hz, 20.0))], 10, 2.0, LOW, HIGH)
+    np.testing.assert_allclose(rows.power[1:-1], 0.25, rtol=0.02)
+
+
+def test_the_filter_shifts_nothing_in_time():
+    x = sine(22.0, 4.0)
+    y = band_pass(x, RATE, LOW, HIGH)
+    lags = np.arange(-10, 11)
+    assert lags[np.argmax([np.dot(x[500:1500], np.roll(y, lag)[500:1500]) for lag in lags])] == 0
+
+
+def test_gaps_take_coverage_but_not_amplitude():
+    x = sine(22.0, 4.0, 2.0)
+    kept = [(1 / RATE, RATE, x[:700]), (1 / RATE + 1200 / RATE, RATE, x[1200:])]
+    rows = band_rows(kept, 2, 2.0, LOW, HIGH)
+    np.testing.assert_allclose(rows.covered, [0.7, 0.8], atol=1e-9)
+    np.testing.assert_allclose(rows.rms, np.sqrt(2.0), rtol=0.03)
+
+
+def test_a_stretch_too_short_for_the_band_is_not_counted():
+    rows = band_rows([(1 / RATE, RATE, sine(22.0, 0.2))], 1, 2.0, LOW, HIGH)
+    assert rows.covered[0] == 0
+    assert np.isnan(rows.rms[0])
+
+
+def test_stretches_of_different_rates_may_share_a_row():
+    fast = np.sin(2 * np.pi * 22 * np.arange(1000) / 1000.0)
+    rows = band_rows([(1 / RATE, RATE, sine(22.0, 1.0)), (1.001, 1000.0, fast)], 1, 2.0, LOW, HIGH)
+    assert rows.covered[0] == pytest.approx(1.0)
+    assert rows.rms[0] == pytest.approx(1 / np.sqrt(2), rel=0.03)
+
+
+def test_a_band_beyond_half_the_rate_is_refused():
+    with pytest.raises(ValueError, match="does not fit"):
+        band_pass(np.zeros(100), 60.0, LOW, HIGH)
+
+
+def test_rows_are_closed_on_the_right_and_zero_belongs_to_the_first():
+    np.testing.assert_array_equal(row_of(np.array([-0.5, 0.0, 0.1, 2.0, 2.001, 4.0]), 2.0), [-1, 0, 0, 0, 1, 1])
+
+
+def test_row_means_of_packets_count_only_what_is_there():
+    t = np.array([0.5, 1.0, 1.5, 2.0, 2.5])
+    means, covered = row_means(t, np.array([1.0, 3.0, np.nan, 5.0, 7.0]), np.full(5, 0.5), 3, 2.0)
+    np.testing.assert_allclose(means, [3.0, 7.0, np.nan])
+    np.testing.assert_allclose(covered, [0.75, 0.25, 0.0])
+
+
+def test_a_step_inside_a_row_is_weighted_by_time():
+    means, known = step_means(np.array([-5.0, 0.5, 3.0]), np.array([1.0, 3.0, np.nan]), 4.0, 2, 2.0)
+    np.testing.assert_allclose(means, [(0.5 * 1 + 1.5 * 3) / 2, 3.0])
+    np.testing.assert_allclose(known, [1.0, 0.5])
+
+
+def test_no_steps_means_nothing_is_known():
+    means, known = step_means(np.array([]), np.array([]), 4.0, 2, 2.0)
+    assert np.isnan(means).all()
+    assert not known.any()
+
+
+@given(
+    steps=st.lists(st.tuples(st.floats(-3, 9), st.one_of(st.just(float("nan")), st.floats(0, 5))), min_size=1, max_size=6),
+    end=st.floats(9, 12),
+)
+def test_step_means_agree_with_a_fine_sum(steps, end):
+    steps = sorted(steps, key=lambda s: s[0])
+    t = np.array([s[0] for s in steps])
+    v = np.array([s[1] for s in steps])
+    means, known = step_means(t, v, end, 5, 2.0)
+    fine = np.arange(10_000) * 1e-3 + 5e-4
+    held = np.searchsorted(t, fine, side="right") - 1
+    at = np.where((held >= 0) & (fine < end), v[np.maximum(held, 0)], np.nan).reshape(5, 2000)
+    share = np.isfinite(at).mean(axis=1)
+    np.testing.assert_allclose(known, share, atol=5e-3)
+    some = share > 0.2
+    np.testing.assert_allclose(means[some], np.nanmean(at[some], axis=1) if some.any() else [], atol=0.1)
