@@ -268,3 +268,7 @@ def _print(result: dict[str, Any], as_json: bool, text: str) -> None:
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr)  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()

@@ -113,7 +113,9 @@ def add_user(request: Request, db: Db, caller: CurrentCaller, values: FormValues
     """Add a user to the study."""
     fields = {name: str(values.get(name, "")) for name in ("email", "name", "role", "study")}
     try:
-        caller.require(can.MANAGE_ACCOUNTS, service.study_id_of(db, fields["study"] or None))
+        caller.require(can.MANAGE_ACCOUNTS)
+        if not service.administers(caller, service.study_of(db, fields["study"] or None).id):
+            raise NotFound("There is no such study, or you do not administer it.")
         if fields["role"] not in set(Role):
             raise Invalid("Choose a role.", f"Known: {', '.join(Role)}.")
         password = str(values.get("password", ""))
@@ -184,7 +186,7 @@ def _accounts_page(
         request,
         "accounts/accounts.html",
         users=[u for u in repository.users(db) if service.manages(caller, u)],
-        studies=[s for s in repository.studies(db) if caller.may(can.MANAGE_ACCOUNTS, s.id)],
+        studies=[s for s in repository.studies(db) if service.administers(caller, s.id)],
         roles=list(Role),
         draft=draft or {"email": "", "name": "", "role": Role.CLINICIAN, "study": ""},
         problem=error.problem(request.url.path) if error else None,

@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session, selectinload
 
-from app.accounts.models import ApiToken, SignIn, SignInAttempt, User
+from app.accounts.models import ApiToken, SignIn, SignInAttempt, Study, User
 from app.platform.database import now
 
 
@@ -20,6 +20,11 @@ def user_by_email(db: Session, email: str) -> User | None:
 def users(db: Session) -> Sequence[User]:
     """All users with their memberships, by address."""
     return db.scalars(select(User).options(selectinload(User.memberships)).order_by(User.email)).all()
+
+
+def studies(db: Session) -> Sequence[Study]:
+    """All studies, oldest first."""
+    return db.scalars(select(Study).order_by(Study.id)).all()
 
 
 def sign_in_by_token(db: Session, token_sha256: str, idle_since: datetime, begun_since: datetime) -> SignIn | None:

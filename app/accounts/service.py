@@ -13,9 +13,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts import repository
 from app.accounts.models import ApiToken, Membership, Role, SignIn, SignInAttempt, Study, User
-from app.accounts.policy import Caller, Grant
+from app.accounts.policy import MANAGE_ACCOUNTS, PERMISSIONS, Caller, Grant
 from app.platform.database import now
-from app.platform.errors import Conflict, Invalid, NotFound, TooMany, Unauthorized
+from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 from app.settings import get_settings
 
 MIN_PASSWORD = 10
@@ -37,7 +37,7 @@ def add_user(db: Session, email: str, role: Role, password: str, study_code: str
         raise Conflict(f"There is already a user {email}.")
     check_password(password)
     user = User(email=email, name=name, password_hash=_hasher.hash(password))
-    user.memberships.append(Membership(study_id=_study(db, study_code).id, role=role))
+    user.memberships.append(Membership(study_id=study_of(db, study_code).id, role=role))
     db.add(user)
     db.flush()
     return user
@@ -55,6 +55,34 @@ def set_password(db: Session, user: User, password: str) -> None:
     user.password_hash = _hasher.hash(password)
     for sign_in in db.scalars(select(SignIn).where(SignIn.user_id == user.id, SignIn.ended_at.is_(None))):
         sign_in.ended_at = now()
+
+
+def change_own_password(db: Session, user_id: int, present: str, new: str) -> None:
+    """Change a password by its owner, who proves to know the present one. Raises Forbidden when that is wrong, Invalid for a bad new one."""
+    user = db.get_one(User, user_id)
+    if not _hasher.verify(present, user.password_hash):
+        raise Forbidden("The present password is wrong.", "Nothing was changed; try again.")
+    set_password(db, user, new)
+
+
+def administers(caller: Caller, study_id: int, site_id: int | None = None) -> bool:
+    """Whether the caller may manage accounts of a site, or (site_id None) of a whole study."""
+    return caller.is_system or any(
+        MANAGE_ACCOUNTS in PERMISSIONS[g.role] and g.study_id == study_id and g.site_id in (None, site_id) for g in caller.grants
+    )
+
+
+def manages(caller: Caller, user: User) -> bool:
+    """Whether the caller administers everything that the user has access to."""
+    return all(administers(caller, m.study_id, m.site_id) for m in user.memberships)
+
+
+def set_active(db: Session, user: User, active: bool, caller: Caller) -> None:
+    """Shut a user out at once, or let the user in again. Raises Invalid for oneself."""
+    if user.id == caller.user_id:
+        raise Invalid("You cannot close your own account.", "Ask another administrator.")
+    user.active = active
+    db.flush()
 
 
 def sign_in(db: Session, email: str, password: str) -> str:
@@ -141,7 +169,8 @@ def revoke_token(db: Session, user_id: int, token_id: int) -> None:
     row.revoked_at = row.revoked_at or now()
 
 
-def _study(db: Session, code: str | None) -> Study:
+def study_of(db: Session, code: str | None) -> Study:
+    """The study of a code, or the only one. Raises NotFound naming those there are."""
     query = select(Study).order_by(Study.id)
     studies = db.scalars(query if code is None else query.where(Study.code == code)).all()
     if len(studies) != 1:

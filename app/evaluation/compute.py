@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from app.learning.compute import read_buffer, told
 from app.platform import files
 from app.platform.jobs import Report, compute, write_atomically
+
+if TYPE_CHECKING:
+    from ml.ope.dlsm_config import DlsmConfig
 
 FIT_SHARE = 0.5
 """Share of an evaluation step's progress that fitting takes."""
@@ -50,13 +54,15 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: Report) -> di
 
     Args:
         params: `snapshot_sha256`, `preset`, `seed`, `method`, `horizon_steps`, `policies` as [{`id`, `sha256`}], and for the DLSM
-            `members`, the stored files of its ensemble.
+            `members`, the stored files of its ensemble; or `failed`, the reason why its ensemble could not be fitted.
         workdir: scratch.
         report: progress.
 
     Returns:
         `estimates` by policy id, or `failed` with the reason where the method cannot work on these data.
     """
+    if "failed" in params:
+        return {"failed": params["failed"]}
     import torch
 
     from ml.ope.dlsm import Dlsm
@@ -82,7 +88,7 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: Report) -> di
         estimates = fitted.evaluate(policies, params["horizon_steps"], rolling)
     except ValueError as error:
         return {"failed": str(error)}
-    return {"estimates": {policy_id: e.to_json() for policy_id, e in estimates.items()}}
+    return {"estimates": {policy_id: _finite(e.to_json()) for policy_id, e in estimates.items()}}
 
 
 def dlsm_members(preset: str, seed: int) -> int:
@@ -90,7 +96,16 @@ def dlsm_members(preset: str, seed: int) -> int:
     return _dlsm_config({"preset": preset, "seed": seed}).members
 
 
-def _dlsm_config(params: dict[str, Any]) -> Any:
+def _dlsm_config(params: dict[str, Any]) -> DlsmConfig:
     from ml.ope.dlsm_config import DlsmConfig
 
     return DlsmConfig.demo(params["seed"]) if params["preset"] == "demo" else DlsmConfig(seed=params["seed"])
+
+
+def _finite(value: Any) -> Any:
+    """A copy that JSON can hold: what is not a finite number becomes null."""
+    if isinstance(value, dict):
+        return {name: _finite(v) for name, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -31,5 +31,5 @@ def policies_by_id(db: Session, ids: Sequence[int]) -> dict[int, Policy]:
     return {p.id: p for p in db.scalars(select(Policy).where(Policy.id.in_(ids)))}
 
 
-def _evaluations() -> Select[tuple[Evaluation]]:
+def _evaluations() -> Select[Evaluation]:
     return select(Evaluation).options(selectinload(Evaluation.estimates))

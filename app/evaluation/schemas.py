@@ -5,12 +5,18 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from app.learning.schemas import DistilParams, PolicyIds, Preset, TrainParams
 from app.platform.schemas import Int, Model, Number
 
+
+def _each_once(methods: list[str]) -> list[str]:
+    return list(dict.fromkeys(methods))
+
+
 Method = Literal["dlsm", "linear", "wis", "pdis"]
+Methods = Annotated[list[Method], Field(min_length=1, max_length=8), AfterValidator(_each_once)]
 METHODS: tuple[Method, ...] = ("dlsm", "linear", "wis", "pdis")
 METHOD_NAMES = {
     "dlsm": "DLSM",
@@ -25,7 +31,7 @@ class EvaluateParams(Model):
 
     preset: Preset = Field("full", description="`full`: sizes for a study; `demo`: small and quick.")
     policies: PolicyIds = Field(default_factory=list, description="Policies to rank; empty: every one that is not retired.")
-    methods: Annotated[list[Method], Field(min_length=1, max_length=8)] = Field(list(METHODS), description="Estimators to run.")
+    methods: Methods = Field(list(METHODS), description="Estimators to run.")
     horizon_steps: Int | None = Field(None, ge=1, le=100_000, description="H; the snapshot's median session length where not given.")
     seed: Int = Field(0, ge=0, le=10**6)
 
@@ -39,9 +45,11 @@ class PipelineParams(Model):
     updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each policy.")
     actor_lr_low: Number | None = Field(None, gt=0, le=1, description="Lowest learning rate of the policies.")
     actor_lr_high: Number | None = Field(None, gt=0, le=1, description="Highest; in between they are spread evenly in the logarithm.")
-    sigma: Number | None = Field(None, ge=0, le=10, description="Noise of the distillation's synthetic states, share of beta's standard deviation.")
+    sigma: Number | None = Field(
+        None, ge=0, le=10, description="Noise of the distillation's synthetic states, share of beta's standard deviation."
+    )
     distil_updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each student.")
-    methods: Annotated[list[Method], Field(min_length=1, max_length=8)] = Field(list(METHODS), description="Estimators to run.")
+    methods: Methods = Field(list(METHODS), description="Estimators to run.")
     horizon_steps: Int | None = Field(None, ge=1, le=100_000, description="H; the snapshot's median session length where not given.")
     seed: Int = Field(0, ge=0, le=10**6, description="Seed of everything in the job.")
 
@@ -163,7 +171,9 @@ class RankedPolicy(Model):
     probability_best: float | None
     retired: bool
     estimates: dict[str, EstimateOut]
-    predicted: dict[str, float] = Field(description="By the ranking's method: energy, mean_amplitude, mean_beta, grasp_hz, rating, tremor_percent.")
+    predicted: dict[str, float] = Field(
+        description="By the ranking's method: energy, mean_amplitude, mean_beta, grasp_hz, rating, tremor_percent."
+    )
     flags: list[str]
     tested: TestedBefore | None
 

@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session, selectinload
 
 from app.accounts.models import Site
 from app.accounts.policy import Caller
-from app.learning.models import BufferSnapshot, Policy
+from app.learning.models import BufferSnapshot, Policy, SnapshotSession
 from app.platform.errors import NotFound
 from app.study.models import Participant
 from app.study.repository import count, in_scope
@@ -124,3 +124,8 @@ def names_in_use(db: Session, participant_id: int, prefix: str) -> set[str]:
     return set(
         db.scalars(select(Policy.name).where(Policy.participant_id == participant_id, or_(Policy.name.startswith(prefix, autoescape=True))))
     )
+
+
+def snapshot_members(db: Session, snapshot_id: int) -> Sequence[SnapshotSession]:
+    """The sessions of a snapshot, left-out ones among them."""
+    return db.scalars(select(SnapshotSession).where(SnapshotSession.snapshot_id == snapshot_id).order_by(SnapshotSession.session_id)).all()

@@ -26,9 +26,12 @@ _environment = Environment(
 
 
 def render(request: Request, template: str, **values: Any) -> str:
-    """A page as text. `caller` and `path` are there for every template."""
+    """A page as text. `me` (who is signed in, or None) and `path` are there for every template.
+
+    Not `caller`: that word belongs to Jinja inside `call` blocks, where it would silently mean something else.
+    """
     return _environment.get_template(template).render(
-        request=request, caller=getattr(request.state, "caller", None), path=request.url.path, **values
+        request=request, me=getattr(request.state, "caller", None), path=request.url.path, **values
     )
 
 

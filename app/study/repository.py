@@ -35,6 +35,11 @@ def participant_by_code(db: Session, code: str, caller: Caller) -> Participant:
     return row
 
 
+def sites(db: Session, caller: Caller) -> Sequence[Site]:
+    """Sites that the caller may see, by code."""
+    return db.scalars(select(Site).where(in_scope(caller)).order_by(Site.code)).all()
+
+
 def participants(db: Session, caller: Caller, limit: int, offset: int) -> tuple[Sequence[Participant], int]:
     """A page of participants by code, and how many there are."""
     query = select(Participant).join(Participant.site).where(in_scope(caller))

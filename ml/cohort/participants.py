@@ -202,7 +202,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(), constant=0.15),  # selegiline and pramipexole (appendix); size assumed
-        reference=ReferenceBeta(cdbs=1.507, at_03=2.230, off=2.383),
+        reference=ReferenceBeta(cdbs=1.505, at_03=2.227, off=2.381),
     ),
     "P3": ParticipantModel(
         code="P3",
@@ -231,7 +231,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.383, at_03=1.805, off=2.158),
+        reference=ReferenceBeta(cdbs=1.357, at_03=1.839, off=2.154),
     ),
     "P4": ParticipantModel(
         code="P4",
@@ -260,6 +260,6 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(-2.0,), constant=0.0),  # appendix: one tablet at about 7 o'clock
-        reference=ReferenceBeta(cdbs=1.375, at_03=1.904, off=2.159),
+        reference=ReferenceBeta(cdbs=1.377, at_03=1.908, off=2.163),
     ),
 }

@@ -52,7 +52,7 @@ class DdpgConfig:
         updates: gradient steps.
         hidden: units of the hidden layers of actor and critic (the paper's 400 and 300); two layers or more.
         critic_weight_decay: L2 penalty on the critic's weights inside Adam's gradient. Lillicrap has 1e-2; ours is 0: on simulated sessions
-            that penalty left five times the temporal-difference error and values a fifth too high.
+            that penalty left four times the temporal-difference error.
         critic_warmup: updates during which only the critic learns: a policy fine-tuned without its critic is evaluated before it is
             changed.
         seed: of the initial weights and of the batches.

@@ -187,13 +187,19 @@ class Critic(nn.Module):
         if len(hidden) < 2:
             raise ValueError(f"the critic needs two hidden layers or more (the action joins at the second), not {tuple(hidden)}")
         sizes = [window, *hidden, 1]
-        self.layers = nn.ModuleList(nn.utils.skip_init(nn.Linear, i + (k == 1), o) for k, (i, o) in enumerate(pairwise(sizes)))
-        initialise(self.layers, torch.Generator().manual_seed(seed))
+        self.layers = nn.ModuleList(nn.utils.skip_init(nn.Linear, i, o) for i, o in pairwise(sizes))
+        self.action = nn.utils.skip_init(nn.Linear, 1, hidden[1], bias=False)
+        generator = torch.Generator().manual_seed(seed)
+        initialise(self.layers, generator)
+        with torch.no_grad():
+            bound = 1.0 / math.sqrt(hidden[0] + 1)
+            self.action.weight.uniform_(-bound, bound, generator=generator)
 
     def forward(self, scores: Any, actions: Any) -> Any:
         """Values [N, 1] of actions [N, 1] in z-scored windows [N, W], tensors of float32."""
         hidden = torch.relu(self.layers[0](scores))
-        hidden = torch.relu(self.layers[1](torch.cat([hidden, 2.0 * actions - 1.0], dim=1)))
+        # The action's column of the second layer stands apart: the actor's gradient then needs no product with the other columns.
+        hidden = torch.relu(self.layers[1](hidden) + self.action(2.0 * actions - 1.0))
         for layer in self.layers[2:-1]:
             hidden = torch.relu(layer(hidden))
         return self.layers[-1](hidden)

@@ -73,15 +73,12 @@ class _Text:
         self.at = 0
         return not self.ended
 
-    def mend_inf(self) -> bool:
-        """Spell INF tokens the way the parser knows, here and in all that follows; True when that changed the text at hand."""
-        if self.mending_inf:
-            return False
-        mended = _INF.sub(r"\1Infinity", self.text[self.at :])
-        if len(mended) == len(self.text) - self.at:
+    def mend_inf(self, at: int) -> bool:
+        """Where an INF token stands at `at`, spell it the way the parser knows, here and in all that follows; True when that was so."""
+        if self.mending_inf or _INF.search(self.text, max(self.at, at - 2), at + 12) is None:
             return False
         self.mending_inf = True
-        self.text, self.at = mended, 0
+        self.text, self.at = _INF.sub(r"\1Infinity", self.text[self.at :]), 0
         return True
 
     def skip_space(self) -> str:
@@ -194,7 +191,7 @@ def _element(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) -> tupl
             at = getattr(error, "pos", len(window.text))
             if at >= len(window.text) - NEAR_END and len(window.text) - window.at < MAX_ELEMENT and window.more():
                 continue
-            if window.mend_inf():
+            if window.mend_inf(at):
                 _note(notes, "INF in place of a number, read as infinite")
                 continue
             return None

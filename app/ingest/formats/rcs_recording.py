@@ -215,4 +215,5 @@ def _fingerprint(streams: Streams) -> str:
         parts.append(streams.adaptive.amplitude_ma)
     settings = streams.settings
     parts += [np.array(settings.sensing.times_ms), np.array(settings.therapy.times_ms), repr(settings.therapy.states)]
+    parts.append(np.array(settings.record_times_ms))
     return fingerprint("rcs", parts)

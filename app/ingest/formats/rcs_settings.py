@@ -201,6 +201,7 @@ class Settings:
     therapy: Timeline[Therapy]
     merged: dict[str, Any]
     stim_log: bool
+    record_times_ms: list[float] = field(default_factory=list)
 
 
 def follow(settings: Iterable[Any], stim: Iterable[Any]) -> Settings:
@@ -213,6 +214,7 @@ def follow(settings: Iterable[Any], stim: Iterable[Any]) -> Settings:
     out = Settings(Timeline(), Timeline(), {}, False)
     moves = [(t, 0, i, r) for i, r in enumerate(settings) if (t := host_ms(r)) is not None]
     moves += [(t, 1, i, r) for i, r in enumerate(stim) if (t := host_ms(r)) is not None]
+    out.record_times_ms = sorted(move[0] for move in moves)
     logged: dict[str, Any] | None = None
     for time_ms, origin, _, record in sorted(moves, key=lambda move: move[:3]):
         delta = {key: value for key, value in record.items() if key != "RecordInfo"}

@@ -103,7 +103,7 @@ def read_time_domain(packets: Iterable[Any]) -> TimeDomain:
             for key in range(4):
                 offsets[key].append(len(samples[key]) if key in channels else -1)
                 samples[key].extend(channels.get(key, ()))
-    arrays = tuple(np.array(column, dtype=np.float64) for column in samples)
+    arrays = tuple(np.frombuffer(column, dtype=np.float64) if column else np.empty(0) for column in samples)
     for column in arrays:
         column[~np.isfinite(column)] = np.nan
     return TimeDomain(rows.headers(), arrays, tuple(np.array(column, dtype=np.int64) for column in offsets), rows.unusable)

@@ -101,20 +101,26 @@ def _channel_names(key: int, t_ms: NDArray[np.float64], settings: Settings) -> l
 def _stretches(
     data: TimeDomain, times: PacketTimes, key: int, packets: NDArray[np.int64]
 ) -> Iterator[tuple[float, float, NDArray[np.float64]]]:
+    """Pieces of one key's samples; arrays of the recording's length are dropped as soon as they are used, a long one has many samples."""
     count = data.headers.samples[packets]
     step = 1000.0 / data.headers.rate_hz[packets]
-    within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-    t_ms = np.repeat(times.last_ms[packets] - (count - 1) * step, count) + within * np.repeat(step, count)
-    x = data.samples[key][np.repeat(data.offsets[key][packets], count) + within]
+    before = np.cumsum(count) - count
+    t_ms = np.arange(int(count.sum()), dtype=np.float64)
+    t_ms -= np.repeat(before, count)
+    x = data.samples[key][np.repeat(data.offsets[key][packets], count) + t_ms.astype(np.int64)]
     width = np.repeat(step, count)
-    late = np.ones(t_ms.size, dtype=bool)
-    late[1:] = t_ms[1:] > np.maximum.accumulate(t_ms)[:-1] + 0.01 * width[1:]
-    keep = late & np.isfinite(x)
-    t_ms, x, width = t_ms[keep], x[keep], width[keep]
-    cuts = np.flatnonzero((np.diff(t_ms) > 1.5 * width[1:]) | (np.diff(width) != 0)) + 1
-    for piece in np.split(np.arange(t_ms.size), cuts):
-        if piece.size:
-            yield float(t_ms[piece[0]]), 1000.0 / float(width[piece[0]]), x[piece]
+    t_ms *= width
+    t_ms += np.repeat(times.last_ms[packets] - (count - 1) * step, count)
+    keep = np.isfinite(x)
+    keep[1:] &= t_ms[1:] > np.maximum.accumulate(t_ms)[:-1] + 0.01 * width[1:]
+    if not keep.all():
+        t_ms, x, width = t_ms[keep], x[keep], width[keep]
+    cuts = (np.flatnonzero((np.diff(t_ms) > 1.5 * width[1:]) | (np.diff(width) != 0)) + 1).tolist()
+    bounds = [0, *cuts, t_ms.size]
+    heads = [(float(t_ms[i]), 1000.0 / float(width[i])) for i in bounds[:-1] if i < t_ms.size]
+    del t_ms, width, keep
+    for (start_ms, rate_hz), first, end in zip(heads, bounds, bounds[1:], strict=False):
+        yield start_ms, rate_hz, x[first:end]
 
 
 def flat_share(samples: NDArray[np.float64]) -> float:

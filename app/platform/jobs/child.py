@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from app.platform.errors import BetaloopError
+from app.platform.jobs.errors import JobError
 from app.platform.jobs.report import Report, pipe_sender, write_atomically
 
 _PR_SET_PDEATHSIG = 1
@@ -62,19 +63,22 @@ def main(arguments: list[str]) -> int:
         return 2
     name, workdir = arguments[0], Path(arguments[1])
     _be_modest()
-    lock = _lock(workdir)
     call = json.loads((workdir / "params.json").read_bytes())
     outcome: dict[str, Any] = {"params_sha256": call["params_sha256"]}
+    lock = None
     try:
+        lock = _lock(workdir)
         outcome |= {"ok": True, "result": _run(name, call, workdir)}
-        content = json.dumps(outcome, allow_nan=False)
     except Exception as error:
+        # room to speak, when it was the memory that ran out
+        resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         # stderr is the step's log, where the traceback is kept for those who can read one
         traceback.print_exc()
-        content = json.dumps({"params_sha256": call["params_sha256"], "ok": False, "message": _worded(error, call["memory_mb"])})
-    write_atomically(workdir / "result.json", content.encode())
-    os.close(lock)
-    return 0 if json.loads(content)["ok"] else 1
+        outcome |= {"ok": False, "message": _worded(error, call["memory_mb"])}
+    write_atomically(workdir / "result.json", json.dumps(outcome, allow_nan=False).encode())
+    if lock is not None:
+        os.close(lock)
+    return 0 if outcome["ok"] else 1
 
 
 def _run(name: str, call: dict[str, Any], workdir: Path) -> dict[str, Any]:
@@ -86,7 +90,7 @@ def _run(name: str, call: dict[str, Any], workdir: Path) -> dict[str, Any]:
         torch.set_num_threads(1)
     # after the imports: a limit below what they need would only say so in a worse way
     limit = call["memory_mb"] << 20
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, resource.RLIM_INFINITY))
     report = Report(pipe_sender(int(os.environ["BETALOOP_REPORT_FD"])))
     result = function.run(call["params"], workdir, report)
     if not isinstance(result, dict):
@@ -148,7 +152,7 @@ def _lock(workdir: Path) -> int:
             return fd
         except BlockingIOError:
             if time.monotonic() > deadline:
-                raise
+                raise JobError(f"Another process still works in {workdir}.", "Wait until it ends or end it, then retry the job.") from None
             time.sleep(0.1)
 
 

@@ -74,8 +74,11 @@ def test_without_a_future_ddpg_finds_the_amplitude_that_balances_threshold_and_p
 class Net:
     """A multi-layer perceptron in plain loops: forward and backward for one row, float64."""
 
-    def __init__(self, layers, join=None):
+    def __init__(self, network):
+        layers, join = network.layers, 1 if isinstance(network, Critic) else None
         self.w = [layer.weight.detach().double().tolist() for layer in layers]
+        if join:
+            self.w[join] = torch.cat([layers[join].weight, network.action.weight], dim=1).detach().double().tolist()
         self.b = [layer.bias.detach().double().tolist() for layer in layers]
         self.join = join  # layer whose input gets the action appended
 
@@ -140,8 +143,8 @@ class SlowDdpg:
     """DDPG row by row, from the text of Lillicrap et al., algorithm 1."""
 
     def __init__(self, policy, critic, config, gamma):
-        self.pi, self.q = Net(policy.layers), Net(critic.layers, join=1)
-        self.pi_target, self.q_target = Net(policy.layers), Net(critic.layers, join=1)
+        self.pi, self.q = Net(policy), Net(critic)
+        self.pi_target, self.q_target = Net(policy), Net(critic)
         self.config, self.gamma = config, gamma
         self.actor_adam, self.critic_adam = Adam(config.actor_lr), Adam(config.critic_lr, config.critic_weight_decay)
 
@@ -185,7 +188,7 @@ def test_an_update_equals_the_slow_twin_in_plain_loops(decay):
         (learner.target_policy, twin.pi_target),
         (learner.target_critic, twin.q_target),
     ):
-        np.testing.assert_allclose(torch.cat([p.detach().flatten() for p in fast.parameters()]).numpy(), slow.flat(), atol=2e-5)
+        np.testing.assert_allclose(Net(fast).flat(), slow.flat(), atol=2e-5)
 
 
 # --- conduct ------------------------------------------------------------------------------------------------------------------------

@@ -131,6 +131,11 @@ def test_impossible_networks_are_refused(arguments):
 
 def test_the_action_joins_the_critic_at_the_second_hidden_layer():
     critic = Critic(10, (400, 300))
-    assert [tuple(layer.weight.shape) for layer in critic.layers] == [(400, 10), (300, 401), (1, 300)]
+    assert [tuple(layer.weight.shape) for layer in critic.layers] == [(400, 10), (300, 400), (1, 300)]
+    assert tuple(critic.action.weight.shape) == (300, 1)
+    with torch.no_grad():
+        critic.action.weight.zero_()
+        states = torch.randn(5, 10, generator=torch.Generator().manual_seed(0))
+        assert torch.equal(critic(states, torch.zeros(5, 1)), critic(states, torch.ones(5, 1))), "the action has no other way in"
     with pytest.raises(ValueError, match="two hidden layers"):
         Critic(10, (400,))

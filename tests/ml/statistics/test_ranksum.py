@@ -65,9 +65,9 @@ def test_the_interval_of_the_shift_holds_exactly_the_shifts_that_the_test_does_n
 
 
 def test_the_interval_of_the_shift_covers_the_true_shift_as_often_as_it_says():
-    rng = np.random.default_rng(7)
-    results = [rank_sum(rng.normal(1, 1, 7), rng.normal(0, 1, 9), level=0.9) for _ in range(600)]
-    assert 0.88 <= np.mean([r.low <= 1 <= r.high for r in results]) <= 0.96
+    rng = np.random.default_rng(1)
+    results = [rank_sum(rng.normal(1, 1, 7), rng.normal(0, 1, 9), level=0.9) for _ in range(1500)]
+    assert 0.89 <= np.mean([r.low <= 1 <= r.high for r in results]) <= 0.96
 
 
 def test_a_controller_as_good_as_the_other_is_non_inferior_at_a_wide_margin_and_not_at_a_narrow_one():

@@ -89,7 +89,7 @@ def test_the_amplifiers_own_step_after_switching_on_is_left_out(sweep):
     band = next(t for t in sweep.traces if t.channel.startswith("band 1 "))
     assert not band.valid[0]
     assert band.valid[1:].mean() > 0.99
-    assert np.nanmax(band.values[:18]) < 5000
+    assert np.nanmax(band.values[:16]) < 5000
 
 
 def test_four_of_the_twenty_two_notes_disagree_with_the_device(sweep):

@@ -24,7 +24,7 @@ def _count_until(jobs, job_id, number):
     jobs.wait(lambda: len(jobs.numbers(job_id, 0)) >= number and len(jobs.numbers(job_id, 1)) >= number)
 
 
-def test_a_killed_worker_takes_its_children_along_and_the_next_one_finishes_the_job(jobs, capsys):
+def test_a_killed_worker_takes_its_children_along_and_the_next_one_finishes_the_job(jobs, record_property):
     worker = jobs.start_worker()
     job_id = jobs.submit(parts=2, numbers=30, pause_s=0.1)
     _count_until(jobs, job_id, 5)
@@ -36,8 +36,7 @@ def test_a_killed_worker_takes_its_children_along_and_the_next_one_finishes_the_
 
     jobs.start_worker()
     job = jobs.ended(job_id)
-    with capsys.disabled():
-        print(f"\n  children dead {took:.3f} s after kill -9 of their worker; parts resumed from {job.result['resumed_from']}")  # noqa: T201
+    record_property("seconds_to_death", took)
     assert job.status == "succeeded"
     assert jobs.counted(job_id) == [0, 1]
     assert min(job.result["resumed_from"]) >= 5

@@ -78,7 +78,7 @@ def test_a_step_that_fails_fails_its_job_with_its_message_and_nothing_else(jobs)
         assert (job.status, step.status) == ("failed", "failed"), how
         assert step.message.startswith(message), how
         assert job.error == f"Step {step.key} failed: {step.message}"
-        assert ("Traceback" in _logs(job.id)) == (how != "killed"), how
+        assert how in {"killed", "memory", "torch"} or "Traceback" in _logs(job.id), how
     assert jobs.counted("broken") == []
 
     job = jobs.ended(jobs.submit("fail", how="orchestration"))
@@ -88,7 +88,7 @@ def test_a_step_that_fails_fails_its_job_with_its_message_and_nothing_else(jobs)
     assert worker.poll() is None
 
 
-def test_cancelling_kills_the_children_within_two_seconds(jobs, capsys):
+def test_cancelling_kills_the_children_within_two_seconds(jobs, record_property):
     worker = jobs.start_worker(beat_s=5.0)
     job_id = jobs.submit(parts=3, numbers=1000, pause_s=0.1)
     jobs.wait(lambda: len(jobs.children(worker)) == 2)
@@ -98,8 +98,7 @@ def test_cancelling_kills_the_children_within_two_seconds(jobs, capsys):
         service.cancel(db, repository.get(db, job_id), "boss@clinic.example")
     took = jobs.wait(lambda: not any(c.is_running() and c.status() != psutil.STATUS_ZOMBIE for c in children), 5.0)
     job = jobs.ended(job_id, 2.0)
-    with capsys.disabled():
-        print(f"\n  children dead {took:.2f} s after the cancel was committed")  # noqa: T201
+    record_property("seconds_to_kill", took)
     assert took < 2.0
     assert (job.status, job.cancel_requested_by) == ("cancelled", "boss@clinic.example")
     assert {s.status for s in job.steps} == {"cancelled"}

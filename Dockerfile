@@ -1,0 +1,15 @@
+FROM python:3.11-slim
+RUN useradd --create-home --uid 10001 betaloop
+WORKDIR /srv/betaloop
+COPY requirements.lock ./
+RUN pip install --no-cache-dir -r requirements.lock
+COPY pyproject.toml README.md alembic.ini ./
+COPY app app
+COPY ml ml
+COPY migrations migrations
+COPY static static
+RUN pip install --no-cache-dir --no-deps --no-build-isolation -e . && mkdir /data && chown betaloop /data
+USER betaloop
+ENV BETALOOP_DATA_DIR=/data
+EXPOSE 8000
+CMD ["betaloop", "serve", "--host", "0.0.0.0"]

@@ -1,0 +1,43 @@
+"""REST routes of evaluation: the ranking, and the jobs of every kind."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Query, Response
+
+from app.accounts.deps import CurrentCaller
+from app.evaluation import jobs_api, ranking
+from app.evaluation.schemas import Method, RankingOut
+from app.platform.database import Db
+from app.platform.schemas import problems
+from app.study.api import CurrentParticipant
+
+router = APIRouter(responses=problems(401, 403, 404, 422))
+router.include_router(jobs_api.router)
+
+CSV = "text/csv; charset=utf-8"
+
+
+@router.get(
+    "/participants/{code}/ranking",
+    tags=["evaluation"],
+    response_model=RankingOut,
+    responses={200: {"content": {"text/csv": {"schema": {"type": "string"}}}}},
+)
+def read_ranking(
+    participant: CurrentParticipant,
+    db: Db,
+    caller: CurrentCaller,
+    format: Annotated[Literal["json", "csv"], Query(description="csv: one row per policy and method.")] = "json",
+    method: Annotated[Method | None, Query(description="Rank by this method instead of the default one.")] = None,
+) -> RankingOut | Response:
+    """Candidate policies from best to worst on one snapshot, with every method's estimate, and references beside them."""
+    found = ranking.current_ranking(db, participant, caller, method)
+    return csv_of(found) if format == "csv" else found
+
+
+def csv_of(found: RankingOut) -> Response:
+    """A ranking as a CSV download."""
+    name = f"{found.participant}-ranking-{found.evaluation_id}.csv"
+    return Response(ranking.to_csv(found), media_type=CSV, headers={"Content-Disposition": f'attachment; filename="{name}"'})

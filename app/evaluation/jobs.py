@@ -1,0 +1,146 @@
+"""Background work of evaluation: the kinds `evaluate` and `pipeline` (snapshot, train, distil, fit, estimate, rank)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from app.evaluation import compute, service
+from app.evaluation.schemas import METHOD_NAMES, EvaluateParams, PipelineParams
+from app.learning import jobs as learning
+from app.learning.baselines import ensure_baselines
+from app.learning.compute import read_buffer
+from app.learning.models import BufferSnapshot
+from app.learning.schemas import DistilParams
+from app.platform import files
+from app.platform.jobs import JobContext, Priority, job_kind
+
+FIT_WEIGHT = 15.0
+METHOD_WEIGHTS = {"dlsm": 6.0, "linear": 2.0, "wis": 1.0, "pdis": 1.0}
+_TORCH_FILE = "application/x-pytorch"
+
+
+def declare_evaluation(job: JobContext, params: EvaluateParams, *, fit: bool) -> None:
+    """Show the evaluation stage from the start."""
+    if fit:
+        _declare_fit(job, params)
+    for method in params.methods:
+        job.step(f"estimate/{method}", f"Estimate every policy: {METHOD_NAMES[method]}", weight=METHOD_WEIGHTS[method])
+    job.step("rank", "Store the estimates and rank", weight=learning.STORE_WEIGHT)
+
+
+def fit_calls(params: EvaluateParams, sha256: str) -> list[learning.Call]:
+    """Compute steps that fit the DLSM ensemble, one member each; none where the DLSM is not asked for."""
+    common = {"snapshot_sha256": sha256, "preset": params.preset, "seed": params.seed}
+    return [(f"fit/{k}", "fit_dlsm", common | {"member": k}) for k in range(_members(params))]
+
+
+def store_members(job: JobContext, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Keep the ensemble's files; `{"members": [hashes]}` or `{"failed": reason}`."""
+
+    def store(db: Session) -> dict[str, Any]:
+        reasons = [r["failed"] for r in results if "failed" in r]
+        if reasons:
+            return {"failed": reasons[0]}
+        contents = [(job.workdir(f"fit/{k}") / compute.member_file(k)).read_bytes() for k in range(len(results))]
+        return {"members": [files.store(db, content, _TORCH_FILE).sha256 for content in contents]}
+
+    return job.transact("store-models", store)
+
+
+def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, Any], models: dict[str, Any]) -> dict[str, Any]:
+    """Estimate the candidates and references by every method, store and rank."""
+
+    def choose(db: Session) -> dict[str, Any]:
+        row = db.get_one(BufferSnapshot, snapshot["id"])
+        candidates = service.policies_to_rank(db, row.participant_id, params)
+        references = ensure_baselines(db, learning.participant_of(db, job), row, read_buffer(row.file_sha256), job.created_by)
+        return {
+            "candidates": [p.id for p in candidates],
+            "policies": [{"id": p.id, "sha256": p.onnx_sha256} for p in (*candidates, *references)],
+            "horizon_steps": params.horizon_steps or row.median_steps,
+        }
+
+    chosen = job.transact("choose-policies", choose)
+    common = {
+        "snapshot_sha256": snapshot["sha256"],
+        "preset": params.preset,
+        "seed": params.seed,
+        "horizon_steps": chosen["horizon_steps"],
+        "policies": chosen["policies"],
+    }
+    calls: list[learning.Call] = [
+        (f"estimate/{method}", "evaluate_method", common | {"method": method} | (models if method == "dlsm" else {}))
+        for method in params.methods
+    ]
+    results = dict(zip(params.methods, job.compute_all(calls), strict=True))
+
+    def store(db: Session) -> dict[str, Any]:
+        row = service.store_evaluation(
+            db,
+            job_id=job.id,
+            created_by=job.created_by,
+            snapshot=db.get_one(BufferSnapshot, snapshot["id"]),
+            horizon_steps=chosen["horizon_steps"],
+            candidates=chosen["candidates"],
+            results=results,
+            config=params.model_dump(mode="json") | {"dlsm_members": models.get("members", [])},
+        )
+        return {"evaluation_id": row.id, "default_method": row.default_method}
+
+    return job.transact("rank", store)
+
+
+@job_kind("evaluate", title="Evaluate and rank policies", params_schema=EvaluateParams)
+def run_evaluate(job: JobContext) -> dict[str, Any]:
+    """Estimate the named policies, or all, on a fresh snapshot."""
+    params = EvaluateParams.model_validate(job.params)
+    job.step("plan", "Take a buffer snapshot", weight=learning.STORE_WEIGHT)
+    declare_evaluation(job, params, fit=True)
+
+    def plan(db: Session) -> dict[str, Any]:
+        return {"snapshot": learning.snapshot_facts(learning.take_snapshot(job, db))}
+
+    snapshot = job.transact("plan", plan)["snapshot"]
+    models = store_members(job, job.compute_all(fit_calls(params, snapshot["sha256"])))
+    return {"snapshot_id": snapshot["id"]} | evaluate_all(job, params, snapshot, models)
+
+
+@job_kind("pipeline", title="Between-visit pipeline", params_schema=PipelineParams, priority=Priority.NORMAL)
+def run_pipeline(job: JobContext) -> dict[str, Any]:
+    """Everything between two visits: snapshot, train, distil, fit the DLSM, estimate, rank. Training and fitting run side by side."""
+    params = PipelineParams.model_validate(job.params)
+    training, distillation, evaluation = params.training(), params.distillation(), params.evaluation()
+    job.step("plan", "Take a buffer snapshot", weight=learning.STORE_WEIGHT)
+    learning.declare_training(job, training)
+    _declare_fit(job, evaluation)
+    learning.declare_distillation(job, len(params.policies) or params.count)
+    declare_evaluation(job, evaluation, fit=False)
+
+    def plan(db: Session) -> dict[str, Any]:
+        snapshot = learning.take_snapshot(job, db)
+        starts = learning.training_starts(db, snapshot.participant_id, training)
+        return {"snapshot": learning.snapshot_facts(snapshot), "starts": starts}
+
+    planned = job.transact("plan", plan)
+    snapshot, starts = planned["snapshot"], planned["starts"]
+    trainings = learning.training_calls(training, snapshot["sha256"], starts)
+    results = job.compute_all([*trainings, *fit_calls(evaluation, snapshot["sha256"])])
+    policies = learning.store_trained(job, snapshot["id"], results[: len(trainings)], starts)
+    models = store_members(job, results[len(trainings) :])
+    students = learning.distil_all(job, DistilParams.model_validate(distillation), snapshot, policies)
+    outcome = evaluate_all(job, evaluation, snapshot, models)
+    return {"snapshot_id": snapshot["id"], "policy_ids": [p["id"] for p in (*policies, *students)]} | outcome
+
+
+def _declare_fit(job: JobContext, params: EvaluateParams) -> None:
+    for k in range(_members(params)):
+        job.step(f"fit/{k}", f"Fit the deep latent sequential model, member {k + 1}", weight=FIT_WEIGHT)
+    job.step("store-models", "Store the models", weight=learning.STORE_WEIGHT)
+    job.step("choose-policies", "Choose policies and references", weight=learning.STORE_WEIGHT)
+
+
+def _members(params: EvaluateParams) -> int:
+    return compute.dlsm_members(params.preset, params.seed) if "dlsm" in params.methods else 0

@@ -1,0 +1,176 @@
+"""Rules of evaluations: which jobs may start, how estimates are stored. The caller commits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+
+from app.accounts import policy as can
+from app.accounts.policy import Caller
+from app.evaluation import repository
+from app.evaluation.models import EstimateRow, Evaluation
+from app.evaluation.schemas import EvaluateParams, PipelineParams
+from app.learning import repository as learning
+from app.learning.jobs import teachers, training_starts
+from app.learning.models import BufferSnapshot, Policy
+from app.learning.schemas import DistilParams, TrainParams
+from app.learning.snapshots import collect
+from app.platform.errors import Conflict, Invalid
+from app.platform.jobs import service as jobs
+from app.platform.jobs.models import Job, JobStatus
+from app.study import repository as study_repository
+from app.study import service as study
+from app.study.models import Participant
+from ml.ope.estimate import Estimate
+from ml.ope.ranking import default_method
+
+
+def start_job(db: Session, participant: Participant, kind: str, params: Mapping[str, Any], caller: Caller) -> Job:
+    """Put a job of this participant on the queue.
+
+    Raises:
+        Invalid: params that break the kind's schema; no beta threshold yet; no usable session; nothing to train from, distil or rank.
+        Forbidden: the caller may not run jobs.
+    """
+    study.require(caller, can.RUN_JOBS, participant)
+    collect(db, participant)
+    job = jobs.submit(db, kind, participant.id, dict(params), caller.label)
+    if kind == "train":
+        training_starts(db, participant.id, TrainParams.model_validate(job.params))
+    elif kind == "pipeline":
+        training_starts(db, participant.id, PipelineParams.model_validate(job.params).training())
+    elif kind == "distill":
+        teachers(db, participant.id, DistilParams.model_validate(job.params))
+    elif kind == "evaluate":
+        policies_to_rank(db, participant.id, EvaluateParams.model_validate(job.params))
+    return job
+
+
+def retry_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
+    """A new job with the same params. Raises Conflict while the job has not ended."""
+    if not JobStatus(job.status).ended:
+        raise Conflict(f"Job {job.id} is still {job.status}.", "Wait for it or cancel it, then retry.")
+    return start_job(db, participant, job.kind, job.params, caller)
+
+
+def cancel_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
+    """Cancel a job. Raises Conflict when it has ended."""
+    study.require(caller, can.RUN_JOBS, participant)
+    return jobs.cancel(db, job, caller.label)
+
+
+def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams) -> list[Policy]:
+    """The candidates of an evaluation.
+
+    Raises:
+        NotFound: no such policy. Invalid: there is none, or a retired one is named.
+    """
+    if not params.policies:
+        found = list(learning.candidates(db, participant_id))
+        if not found:
+            raise Invalid("There is no policy to rank.", "Train policies, or upload one made elsewhere as an ONNX file.")
+        return found
+    chosen = learning.policies_named(db, participant_id, params.policies)
+    for policy in chosen:
+        if policy.retired_reason:
+            raise Invalid(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", "Leave it out, or take it back first.")
+    return [p for p in chosen if p.kind != "baseline"]
+
+
+def store_evaluation(
+    db: Session,
+    *,
+    job_id: str | None,
+    created_by: str,
+    snapshot: BufferSnapshot,
+    horizon_steps: int,
+    candidates: Sequence[int],
+    results: Mapping[str, Mapping[str, Any]],
+    config: Mapping[str, Any],
+) -> Evaluation:
+    """Store every method's estimates of every policy; a job that has stored its evaluation gets that one.
+
+    Args:
+        db: the session. job_id: the job. created_by: who asked for it.
+        snapshot: what all estimates rest on. horizon_steps: H.
+        candidates: ids of the policies that are ranked; the others are references.
+        results: by method `{"estimates": {policy id: Estimate.to_json()}}`, or `{"failed": reason}`.
+        config: how the methods ran.
+
+    Raises:
+        Invalid: no method could speak; lists why.
+    """
+    if job_id is not None:
+        # the job's row is locked by whoever stores for it; this covers direct calls too
+        db.execute(text("select pg_advisory_xact_lock(hashtextextended(:key, 0))"), {"key": f"evaluation:{job_id}"})
+        known = repository.evaluation_of_job(db, job_id)
+        if known is not None:
+            return known
+    estimates = {m: {int(i): as_estimate(e) for i, e in r["estimates"].items()} for m, r in results.items() if r.get("estimates")}
+    failed = {m: str(r["failed"]) for m, r in results.items() if "failed" in r}
+    if not estimates:
+        reasons = "; ".join(f"{m}: {reason}" for m, reason in failed.items())
+        raise Invalid(f"No method could estimate these policies: {reasons}.", "Collect more sessions, then evaluate again.")
+    ranked = {m: {str(i): e for i, e in table.items() if i in set(candidates)} for m, table in estimates.items()}
+    row = Evaluation(
+        participant_id=snapshot.participant_id,
+        snapshot_id=snapshot.id,
+        settings_version_id=snapshot.settings_version_id,
+        job_id=job_id,
+        horizon_steps=horizon_steps,
+        gamma=study_repository.settings_version(db, snapshot.settings_version_id).gamma,
+        default_method=default_method(ranked),
+        config=dict(config),
+        diagnostics={"failed": failed, "candidates": list(candidates)},
+        code_version=jobs.code_version(),
+        created_by=created_by,
+    )
+    row.estimates = [_estimate_row(policy_id, e) for table in estimates.values() for policy_id, e in table.items()]
+    db.add(row)
+    db.flush()
+    return row
+
+
+def as_estimate(values: Mapping[str, Any]) -> Estimate:
+    """The inverse of `Estimate.to_json`."""
+    return Estimate(**{**values, "flags": tuple(values["flags"])})
+
+
+def estimate_of(row: EstimateRow) -> Estimate:
+    """A stored estimate as the science knows it."""
+    details = dict(row.details)
+    return Estimate(
+        method=row.method,
+        value=row.value,
+        low=row.low,
+        high=row.high,
+        level=row.level,
+        standard_error=row.standard_error or 0.0,
+        step_return=details.pop("step_return"),
+        end_reward=details.pop("end_reward"),
+        predicted={name: float(v) for name, v in row.predicted.items()},
+        supported=row.supported,
+        flags=tuple(row.flags),
+        n=details.pop("n"),
+        details=details,
+    )
+
+
+def _estimate_row(policy_id: int, e: Estimate) -> EstimateRow:
+    return EstimateRow(
+        policy_id=policy_id,
+        method=e.method,
+        value=e.value,
+        # an interval of a skewed bootstrap may miss the estimate itself; the table keeps it inside
+        low=min(e.low, e.value),
+        high=max(e.high, e.value),
+        level=e.level,
+        standard_error=e.standard_error,
+        supported=e.supported,
+        flags=list(e.flags),
+        predicted={name: v for name, v in e.predicted.items() if v is not None},
+        details={**e.details, "step_return": e.step_return, "end_reward": e.end_reward, "n": e.n},
+    )

@@ -1,0 +1,182 @@
+"""HTML pages of the study: enrolment, settings, visits. Sessions have their own module."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.orm import Session
+from starlette.datastructures import FormData
+
+from app.accounts import policy as can
+from app.accounts.deps import CurrentCaller
+from app.accounts.policy import Caller
+from app.platform.database import Db
+from app.platform.errors import BetaloopError
+from app.platform.forms import FormValues, parse
+from app.platform.templates import render
+from app.study import repository, service, session_pages, settings_form
+from app.study.api import CurrentParticipant, CurrentVisit
+from app.study.blinding import arm
+from app.study.models import Participant, StudySession
+from app.study.schemas import CdbsAmplitudeModel, ParticipantIn, SettingsIn, VisitIn
+
+router = APIRouter()
+router.include_router(session_pages.router)
+
+_VISIT_LABELS = {"number": "Number", "date": "Date", "note": "Note", "amplitude_ma": "cDBS amplitude"}
+
+
+@router.get("/participants/new")
+def new_participant(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """The enrolment form."""
+    caller.require(can.WRITE_STUDY)
+    return _enrolment(request, db, caller, {"code": "", "site": ""}, settings_form.texts(SettingsIn()))
+
+
+@router.post("/participants")
+def enrol(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Enrol a participant."""
+    known = {name: str(values.get(name, "")).strip() for name in ("code", "site")}
+    try:
+        draft = parse(ParticipantIn, {k: v for k, v in known.items() if v}, {"code": "Code (letters, digits, - and _)", "site": "Site"})
+        draft.settings = parse(SettingsIn, values, settings_form.LABELS)
+        participant = service.enrol(db, draft, caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _enrolment(request, db, caller, known, _typed(values, settings_form.texts(SettingsIn())), error)
+    db.commit()
+    return RedirectResponse(f"/participants/{participant.code}?done=enrolled", 303)
+
+
+@router.get("/participants/{code}/settings")
+def settings(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """Present settings, with every one explained, and the versions before."""
+    return _settings_page(request, db, participant, caller, settings_form.texts(participant.current_settings))
+
+
+@router.post("/participants/{code}/settings")
+def change_settings(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Make a new settings version of what the form changes."""
+    before = participant.current_settings.version
+    try:
+        row = service.change_settings(db, participant, parse(SettingsIn, values, settings_form.LABELS), _reason(values), caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _settings_page(request, db, participant, caller, _typed(values, settings_form.texts(participant.current_settings)), error)
+    db.commit()
+    return RedirectResponse(f"/participants/{participant.code}/settings?done={'changed' if row.version != before else 'same'}", 303)
+
+
+@router.get("/participants/{code}/visits")
+def visits(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """All visits of a participant with their sessions."""
+    rows, _ = repository.visits(db, participant.id, 1000, 0)
+    sessions = repository.sessions_of_participant(db, participant.id)
+    days = [(v, [(s, arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in rows]
+    may_write = _may(caller, can.WRITE_STUDY, participant)
+    return HTMLResponse(render(request, "study/visits.html", participant=participant, days=days, may_write=may_write))
+
+
+@router.get("/participants/{code}/visits/new")
+def new_visit(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """The form of a new visit; the number is the next one."""
+    service.require(caller, can.WRITE_STUDY, participant)
+    rows, _ = repository.visits(db, participant.id, 1000, 0)
+    draft = {"number": str(max((v.number for v in rows), default=0) + 1), "date": datetime.now(UTC).date().isoformat(), "note": ""}
+    return _visit_form(request, participant, draft)
+
+
+@router.post("/participants/{code}/visits")
+def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Add a visit."""
+    try:
+        draft = parse(VisitIn, {name: values.get(name, "") for name in ("number", "date", "note")}, _VISIT_LABELS)
+        draft.cdbs_amplitudes = [
+            parse(CdbsAmplitudeModel, {"hemisphere": side, "amplitude_ma": values[f"cdbs_{side}"]}, _VISIT_LABELS)
+            for side in ("left", "right")
+            if str(values.get(f"cdbs_{side}", "")).strip()
+        ]
+        visit = service.add_visit(db, participant, draft, caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _visit_form(request, participant, {k: str(v) for k, v in values.items()}, error)
+    db.commit()
+    return RedirectResponse(f"/visits/{visit.id}?done=added", 303)
+
+
+@router.get("/visits/{visit_id}")
+def visit_page(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """One visit day: its sessions in order."""
+    sessions, _ = repository.sessions_of_visit(db, visit.id)
+    rows = [_session_row(db, s, caller) for s in sessions]
+    may_write = _may(caller, can.WRITE_STUDY, visit.participant)
+    page = render(request, "study/visit.html", visit=visit, participant=visit.participant, rows=rows, may_write=may_write)
+    return HTMLResponse(page)
+
+
+def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str, Any]:
+    """What the visit's table says of a session; a session that cannot be laid on the grid says why."""
+    row: dict[str, Any] = {"session": session, "arm": arm(session, caller), "summary": None, "problem": ""}
+    try:
+        row["summary"] = session_pages.summarise(service.session_data(db, session))
+    except BetaloopError as error:
+        row["problem"] = error.detail
+    return row
+
+
+def _enrolment(
+    request: Request, db: Session, caller: Caller, known: dict[str, str], values: dict[str, str], error: BetaloopError | None = None
+) -> HTMLResponse:
+    sites = [s for s in repository.sites(db, caller) if caller.may(can.WRITE_STUDY, s.study_id, s.id)]
+    problem = error.problem(request.url.path) if error else None
+    page = render(
+        request, "study/participant_new.html", known=known, values=values, groups=settings_form.GROUPS, sites=sites, problem=problem
+    )
+    return HTMLResponse(page, error.status if error else 200)
+
+
+def _settings_page(
+    request: Request,
+    db: Session,
+    participant: Participant,
+    caller: Caller,
+    values: dict[str, str],
+    error: BetaloopError | None = None,
+) -> HTMLResponse:
+    page = render(
+        request,
+        "study/settings.html",
+        participant=participant,
+        current=participant.current_settings,
+        values=values,
+        groups=settings_form.GROUPS,
+        history=settings_form.history(participant.settings),
+        suggestion=service.suggest_xi_beta(db, participant, caller),
+        may_write=_may(caller, can.WRITE_SETTINGS, participant),
+        problem=error.problem(request.url.path) if error else None,
+    )
+    return HTMLResponse(page, error.status if error else 200)
+
+
+def _visit_form(request: Request, participant: Participant, draft: dict[str, str], error: BetaloopError | None = None) -> HTMLResponse:
+    problem = error.problem(request.url.path) if error else None
+    values = {"cdbs_left": "", "cdbs_right": "", "number": "", "date": "", "note": ""} | draft
+    return HTMLResponse(
+        render(request, "study/visit_new.html", participant=participant, draft=values, problem=problem), error.status if error else 200
+    )
+
+
+def _typed(values: FormData, base: dict[str, str]) -> dict[str, str]:
+    """What the person typed, so that a refused form comes back as it was sent."""
+    return {name: str(values.get(name, text)) for name, text in base.items()}
+
+
+def _reason(values: FormData) -> str | None:
+    return str(values.get("reason", "")).strip()[:1000] or None
+
+
+def _may(caller: Caller, permission: str, participant: Participant) -> bool:
+    return caller.may(permission, participant.site.study_id, participant.site_id)

@@ -1,0 +1,134 @@
+"""The settings form: every setting with its unit, what it does and what happens when it changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from app.study.models import SettingsVersion
+from app.study.schemas import SettingsIn
+
+
+@dataclass(frozen=True)
+class SettingField:
+    """One setting on the page.
+
+    Attributes:
+        name: member of `SettingsIn`.
+        options: value and label of each choice; empty for a field to type into.
+    """
+
+    name: str
+    label: str
+    help: str
+    unit: str = ""
+    options: tuple[tuple[str, str], ...] = ()
+    attrs: Mapping[str, Any] = field(default_factory=lambda: {"inputmode": "decimal"})
+
+
+@dataclass(frozen=True)
+class SettingGroup:
+    """Settings that belong together."""
+
+    title: str
+    fields: tuple[SettingField, ...]
+
+
+_WORDS: dict[str, Any] = {"maxlength": 40, "autocomplete": "off"}
+_SOURCES = (
+    ("", "not stated"),
+    ("time_domain", "time-domain LFP, band-passed and averaged here"),
+    ("device_power", "band power computed on the device"),
+    ("percept_lfp", "Percept band power"),
+    ("device_log", "log of the control computer"),
+    ("table", "uploaded table"),
+)
+
+GROUPS = (
+    SettingGroup(
+        "Beta and stimulation",
+        (
+            SettingField(
+                "xi_beta", "Beta threshold ξβ",
+                "Below it a step earns r_a, at or above it r_b. In the unit of the beta trace. There is no default: jobs do not start without it.",
+            ),
+            SettingField("beta_unit", "Unit of beta", "As the trace states it, e.g. uV. Traces of another unit stay out of the buffer.", attrs=_WORDS),
+            SettingField("beta_source", "Source of beta", "Where the trace that drives the controller comes from.", options=_SOURCES),
+            SettingField(
+                "cdbs_amplitude_ma", "cDBS amplitude",
+                "Used where a visit states none. The amplitude fraction is milliamperes divided by it.", "mA",
+            ),
+            SettingField("beta_low_hz", "Beta band from", "Lower edge of the band, for beta computed from time-domain LFP.", "Hz"),
+            SettingField("beta_high_hz", "Beta band to", "Upper edge of the band.", "Hz"),
+            SettingField(
+                "min_valid_fraction", "Valid share of a window",
+                "A window with fewer valid samples than this share counts as missing, 0 to 1.",
+            ),
+        ),
+    ),
+    SettingGroup(
+        "State and time",
+        (
+            SettingField("window", "State length W", "Number of beta amplitudes that a policy sees. The paper uses 10.", "steps", attrs={"inputmode": "numeric"}),
+            SettingField("period_s", "Step length m", "Time between two decisions. The paper uses 2 s.", "s"),
+            SettingField("gamma", "Discount γ", "Weight of the next step against this one, 0 to below 1. The paper gives none."),
+        ),
+    ),
+    SettingGroup(
+        "Rewards per step",
+        (
+            SettingField("r_a", "Reward r_a", "For a step with beta below the threshold. The paper uses 0."),
+            SettingField("r_b", "Reward r_b", "For a step with beta at or above it; not more than r_a. The paper uses −1."),
+            SettingField("c1", "Price of amplitude C₁", "Taken off per step, times the amplitude fraction. The paper uses 0.3."),
+        ),
+    ),
+    SettingGroup(
+        "End-of-session reward",
+        (
+            SettingField("c2", "Weight of grasp C₂", "Times the grasp frequency in Hz. 10, or 25 where symptoms are subtle; 0 drops grasp."),
+            SettingField("c3", "Weight of rating C₃", "Times the rating, 1 to 10. 0 drops the rating."),
+            SettingField("c4", "Weight of tremor C₄", "Times the tremor share, taken off. 0 drops tremor."),
+            SettingField(
+                "tremor_as_fraction", "Tremor enters as", "As per cent, tremor would outweigh grasp a hundredfold.",
+                options=(("yes", "a fraction, 0 to 1"), ("no", "per cent, 0 to 100")),
+            ),
+        ),
+    ),
+    SettingGroup(
+        "Random controller",
+        (SettingField("lower_bound", "Lower bound B", "Lowest amplitude fraction that the random controller draws. It never bounds a policy."),),
+    ),
+)  # fmt: skip
+
+LABELS = {f.name: f.label for group in GROUPS for f in group.fields}
+
+
+def texts(source: SettingsVersion | SettingsIn) -> dict[str, str]:
+    """The settings as the form's text."""
+    return {name: _text(getattr(source, name)) for name in LABELS}
+
+
+@dataclass(frozen=True)
+class VersionChange:
+    """A settings version and what it changed: label, value before, value after."""
+
+    row: SettingsVersion
+    changes: list[tuple[str, str, str]]
+
+
+def history(versions: list[SettingsVersion]) -> list[VersionChange]:
+    """All versions, newest first, with their changes."""
+    found = [VersionChange(versions[0], [])]
+    for before, after in zip(versions, versions[1:], strict=False):
+        old, new = texts(before), texts(after)
+        found.append(VersionChange(after, [(LABELS[n], old[n] or "—", new[n] or "—") for n in LABELS if old[n] != new[n]]))
+    return found[::-1]
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.10g}" if isinstance(value, float) else str(value)

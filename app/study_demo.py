@@ -1,0 +1,110 @@
+"""What the demo's synthetic study consists of: participants, visits, sessions and their files. Nothing in here touches the service."""
+
+from __future__ import annotations
+
+import datetime as dt
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from ml.cohort.device import rcs_session_zip, session_table_csv
+from ml.cohort.participants import PARTICIPANTS
+from ml.cohort.sessions import SimulatedSession, run_session
+
+VISITS = 3
+"""Visits with data; one more is planned after them."""
+DAY = ("random", "cdbs", "random", "no_dbs", "cdbs", "random")
+MINUTES = {"random": 10, "cdbs": 10, "no_dbs": 5}
+FIRST_VISIT = dt.datetime(2026, 1, 12, 9, 0, tzinfo=dt.UTC)
+BETWEEN_VISITS = dt.timedelta(days=28)
+BETWEEN_SESSIONS = dt.timedelta(minutes=20)
+DEVICE_PARTICIPANT = "P1"
+"""This participant's sessions arrive as RC+S folders, the others' as tables."""
+_STEPS_PER_MINUTE = 30
+_LEAD_STEPS = 10
+
+
+@dataclass(frozen=True)
+class DemoSession:
+    """One session of the demo; simulated when its file is asked for."""
+
+    code: str
+    visit: int
+    ordinal: int
+    controller: str
+    begins: dt.datetime
+
+    @cached_property
+    def simulated(self) -> SimulatedSession:
+        """The session's numbers: the same at every start."""
+        return run_session(
+            self.code,
+            self.controller,  # type: ignore[arg-type]
+            visit=self.visit,
+            hour=(self.begins.hour - 9) + self.begins.minute / 60,
+            seed=1000 * self.visit + self.ordinal,
+            steps=MINUTES[self.controller] * _STEPS_PER_MINUTE,
+            lead_steps=_LEAD_STEPS,
+            resolution_ma=0.1,
+        )
+
+    @property
+    def started_at(self) -> dt.datetime | None:
+        """Start of the session proper: a device's recording begins with the window before it; a table tells it by its times."""
+        return self.begins if self.code == DEVICE_PARTICIPANT else None
+
+    def file(self) -> tuple[str, bytes]:
+        """Name and bytes of the session's file."""
+        stem = f"{self.code}-visit{self.visit}-session{self.ordinal}"
+        if self.code == DEVICE_PARTICIPANT:
+            recording_starts = self.begins - dt.timedelta(seconds=2 * _LEAD_STEPS)
+            return f"{stem}.zip", rcs_session_zip(self.simulated, started_at=recording_starts)
+        return f"{stem}.csv", session_table_csv(self.simulated)
+
+    def qoc(self) -> dict[str, Any]:
+        """End-of-session QoCs for the REST interface."""
+        qoc = self.simulated.qoc
+        return {"grasp_hz": qoc.grasp_hz, "rating": qoc.rating, "tremor_percent": qoc.tremor_percent}
+
+
+@dataclass(frozen=True)
+class DemoVisit:
+    """One visit; the last has no session yet: it waits for a plan."""
+
+    number: int
+    date: dt.date
+    sessions: tuple[DemoSession, ...]
+
+
+def participant_body(code: str) -> dict[str, Any]:
+    """A participant for the REST interface, with the settings that its model suggests."""
+    model = PARTICIPANTS[code]
+    return {
+        "code": code,
+        "settings": {
+            "xi_beta": model.reference.xi_beta,
+            "beta_unit": "uV",
+            "beta_source": "time_domain",
+            "c2": model.c2,
+            "c3": model.c3,
+            "c4": model.c4,
+            "cdbs_amplitude_ma": model.cdbs_amplitude_ma,
+        },
+    }
+
+
+def demo_visits(code: str) -> list[DemoVisit]:
+    """The participant's visits, a month apart."""
+    visits = []
+    for number in range(1, VISITS + 2):
+        day = FIRST_VISIT + BETWEEN_VISITS * (number - 1)
+        sessions = (
+            tuple(
+                DemoSession(code, number, i + 1, controller, day + BETWEEN_SESSIONS * i + dt.timedelta(minutes=5))
+                for i, controller in enumerate(DAY)
+            )
+            if number <= VISITS
+            else ()
+        )
+        visits.append(DemoVisit(number, day.date(), sessions))
+    return visits

@@ -1,0 +1,256 @@
+"""The small parts: slots, reports, keys, names, the event stream, the terminal's view."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import threading
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from app.platform.database import transaction
+from app.platform.errors import NotFound
+from app.platform.jobs import JobContext, Report, StepFailed, repository, write_atomically
+from app.platform.jobs.child import params_hash
+from app.platform.jobs.errors import JobCancelled
+from app.platform.jobs.ledger import Ledger
+from app.platform.jobs.models import JobStatus
+from app.platform.jobs.nursery import Call, Heard, Nursery
+from app.platform.jobs.registry import compute, compute_function
+from app.platform.jobs.slots import Slots
+from app.platform.jobs.stream import job_events
+from app.platform.jobs.watch import show_progress, watch
+
+
+def test_a_free_slot_goes_to_the_job_that_has_the_fewest():
+    slots, order, gates = Slots(1), [], {}
+
+    def hold(job, n):
+        gates[job, n] = threading.Event()
+
+        def run():
+            with slots.hold(job, lambda: None):
+                order.append(job)
+                gates[job, n].wait(5)
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        return thread
+
+    threads = [hold("first", 0)]
+    while not order:
+        threading.Event().wait(0.01)
+    for n in range(1, 4):
+        threads.append(hold("first", n))
+        threading.Event().wait(0.02)
+    threads.append(hold("second", 0))
+    threading.Event().wait(0.1)
+    for gate in list(gates.values()):
+        gate.set()
+    for thread in threads:
+        thread.join(5)
+    assert order == ["first", "second", "first", "first", "first"]
+
+
+def test_waiting_for_a_slot_can_be_given_up_and_loses_none():
+    slots = Slots(1)
+
+    def cancelled():
+        raise JobCancelled
+
+    with slots.hold("a", lambda: None), pytest.raises(JobCancelled), slots.hold("b", cancelled):
+        pass
+    with slots.hold("b", cancelled):
+        pass
+
+
+def test_a_report_sends_the_latest_progress_and_every_point_but_not_every_call():
+    sent = []
+    report = Report(sent.append, interval_s=60.0)
+    for i in range(100):
+        report.progress(i / 100, f"step {i}")
+        report.point(i, loss=1.0 / (i + 1), broken=float("nan"))
+    report.flush()
+    assert len(sent) == 2
+    assert sent[0] == {"progress": 0.0, "message": "step 0"}
+    assert (sent[1]["progress"], sent[1]["message"]) == (0.99, "step 99")
+    assert sent[1]["points"] == [{"x": float(i), "values": {"loss": 1.0 / (i + 1)}} for i in range(100)]
+    with pytest.raises(ValueError, match="NaN"):
+        report.progress(float("nan"))
+
+
+def test_what_was_heard_twice_is_merged():
+    heard = Heard()
+    assert not heard
+    for line in ({"progress": 0.1, "points": [1]}, {"progress": 0.2, "points": [2], "message": "on"}, {"log": "a"}, {"log": "b"}):
+        heard.add(json.dumps(line))
+    assert heard == Heard(0.2, "on", [1, 2], ["a", "b"])
+
+
+def test_a_file_is_replaced_whole(tmp_path: Path):
+    path = tmp_path / "checkpoint"
+    write_atomically(path, b"one")
+    write_atomically(path, b"two")
+    assert path.read_bytes() == b"two"
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint"]
+
+
+class _Memory:
+    """Steps and engine that only remember, to test the context's own rules."""
+
+    def __init__(self, outcomes=None):
+        self.declared, self.outcomes = [], outcomes or {}
+
+    def declare(self, key, title, weight):
+        self.declared.append(key)
+
+    def compute(self, key, name, params, skip):
+        return {"ok": False, "skipped": True} if skip() else self.outcomes[key]
+
+    def durable_all(self, steps):
+        return [body() for _, body in steps]
+
+
+def _context(memory):
+    return JobContext("id", "kind", None, {}, "test", memory, memory)
+
+
+@pytest.mark.parametrize("key", ["", "Train", "a b", "../etc", "a//b", "a/.b", "/a", "x" * 101])
+def test_a_malformed_key_is_refused(key):
+    with pytest.raises(ValueError, match="cannot be a step's key"):
+        _context(_Memory()).step(key)
+
+
+def test_a_key_cannot_be_run_twice():
+    with pytest.raises(ValueError, match="run twice"):
+        _context(_Memory()).compute_all([("a", "f", {}), ("a", "f", {})])
+
+
+def test_after_a_failure_those_still_waiting_do_not_start():
+    memory = _Memory({"a": {"ok": True, "result": {}}, "b": {"ok": False, "message": "broken"}, "c": {"ok": True, "result": {}}})
+    with pytest.raises(StepFailed, match="Step b failed: broken") as caught:
+        _context(memory).compute_all([("a", "f", {}), ("b", "f", {}), ("c", "f", {})])
+    assert caught.value.key == "b"
+
+
+def test_a_name_belongs_to_one_function():
+    @compute("taken_name")
+    def one(params, workdir, report):
+        return {}
+
+    assert compute_function("taken_name").run is one
+    with pytest.raises(ValueError, match="two functions register the compute function 'taken_name'"):
+
+        @compute("taken_name")
+        def two(params, workdir, report):
+            return {}
+
+
+def test_a_result_is_reused_for_equal_params_and_the_folder_emptied_for_others(kinds, tmp_path):
+    nursery, workdir = Nursery(), tmp_path / "step"
+    function = compute_function("count")
+
+    def run(**params):
+        call = Call(function, {"part": 0, "numbers": 2, "pause_s": 0.0, **params}, workdir, 1024)
+        return nursery.run(call, lambda heard: None, lambda: None)["result"]
+
+    first = run()
+    assert run() == first
+    assert params_hash("count", {"a": 1, "b": 2}) == params_hash("count", {"b": 2, "a": 1})
+    other = run(numbers=3)
+    assert (other["counted"], other["resumed_from"]) == (3, 0)
+    assert other["pid"] != first["pid"]
+    nursery.close()
+
+
+def _lines(job_id, last=None):
+    async def collect():
+        return [message async for message in job_events(job_id, last)]
+
+    return asyncio.run(collect())
+
+
+def test_the_stream_starts_with_the_state_resumes_after_an_id_and_ends(jobs):
+    job_id = jobs.submit()
+    ledger = Ledger(job_id, "test", "here", lambda: None)
+    ledger.open()
+    ledger.declare("a", "A", 1.0)
+    ledger.begin("a")
+    ledger.hear("a", Heard(0.5, "half", [{"x": 0.0, "values": {"loss": 1.0}}], ["a\nline"]))
+    ledger.commit_step("a", lambda db: {"v": 1})
+    ledger.close(JobStatus.SUCCEEDED, {"v": 1})
+    messages = _lines(job_id)
+    names = [m.split("event: ")[1].split("\n")[0] for m in messages]
+    assert (names[0], names[-1]) == ("job", "end")
+    assert set(names[1:-1]) == {"status", "step", "progress", "points", "log"}
+    assert all(m.endswith("\n\n") and m.count("\n\n") == 1 for m in messages)
+    ids = [int(m.split("\n")[0].removeprefix("id: ")) for m in messages[1:-1]]
+    assert ids == sorted(ids)
+    again = _lines(job_id, str(ids[2]))
+    assert again[1:-1] == messages[4:-1]
+    assert json.loads(messages[-1].split("data: ")[1])["status"] == "succeeded"
+    with pytest.raises(NotFound):
+        _lines("no-such-job")
+
+
+def test_progress_is_the_weighted_mean_of_the_steps_and_never_falls(jobs):
+    job_id = jobs.submit()
+    ledger = Ledger(job_id, "test", "here", lambda: None)
+    ledger.open()
+    ledger.declare("a", "A", 3.0)
+    ledger.declare("b", "B", 1.0)
+    ledger.declare("a", "A again", 9.0)
+    ledger.begin("a")
+    ledger.hear("a", Heard(progress=0.5))
+    assert jobs.get(job_id).progress == pytest.approx(0.375)
+    ledger.begin("a")
+    assert jobs.get(job_id).progress == pytest.approx(0.375)
+    ledger.commit_step("a", lambda db: {})
+    assert jobs.get(job_id).progress == pytest.approx(0.75)
+
+
+def test_a_step_is_stored_once_however_often_it_is_committed(jobs):
+    job_id = jobs.submit()
+    ledger = Ledger(job_id, "test", "here", lambda: None)
+    ledger.open()
+    ledger.declare("a", "A", 1.0)
+    calls = []
+
+    def store(db):
+        calls.append(1)
+        return {"n": len(calls)}
+
+    assert [ledger.commit_step("a", store) for _ in range(3)] == [{"n": 1}] * 3
+    assert ledger.begin("a") == {"n": 1}
+
+
+def test_nothing_more_is_recorded_for_a_job_that_was_cancelled(jobs):
+    job_id = jobs.submit()
+    ledger = Ledger(job_id, "test", "here", lambda: None)
+    ledger.open()
+    ledger.declare("a", "A", 1.0)
+    with transaction("test") as db:
+        repository.end_job(db, repository.locked(db, job_id), JobStatus.CANCELLED)
+    with pytest.raises(JobCancelled):
+        ledger.commit_step("a", lambda db: {})
+    assert jobs.get(job_id).steps[0].status == "cancelled"
+
+
+def test_the_terminal_sees_the_job_until_it_ends(jobs):
+    job_id = jobs.submit()
+    views = watch(job_id, poll_s=0.01)
+    assert next(views).status == "queued"
+    ledger = Ledger(job_id, "test", "here", lambda: None)
+    ledger.open()
+    ledger.declare("a", "Part A", 1.0)
+    ledger.begin("a")
+    seen = next(views)
+    assert (seen.status, seen.steps[0].title, seen.steps[0].status) == ("running", "Part A", "running")
+    ledger.close(JobStatus.FAILED, error="broken")
+    assert list(views)[-1].error == "broken"
+    screen = io.StringIO()
+    assert show_progress(job_id, Console(file=screen, force_terminal=True, width=100)).status == "failed"
+    assert "Part A" in screen.getvalue()

@@ -1,0 +1,122 @@
+"""Alignment of steps, states and rewards, and the stored form of a buffer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ml.mdp import MdpSettings
+from ml.qoc import Qoc
+from ml.trajectories import ReplayBuffer, SessionTrajectory, content_hash, from_parquet, to_parquet
+
+SETTINGS = MdpSettings(xi_beta=0.5, window=3)
+
+
+def session(session_id: int = 1, steps: int = 4, **changes: object) -> SessionTrajectory:
+    """Beta rises by 0.1 per row, so that a row can be told by its value; the amplitude of step k is k / 10."""
+    whole = SessionTrajectory(
+        session_id=session_id,
+        visit=1,
+        controller="random",
+        lead_beta=np.array([-0.2, -0.1, 0.0]),
+        beta=0.1 * np.arange(1, steps + 1),
+        amplitude=0.1 * np.arange(steps),
+        qoc=Qoc(2.0, 7, 10.0),
+        random_lower_bound=0.3,
+    )
+    return replace(whole, **changes)  # type: ignore[arg-type]
+
+
+def readable_transitions(s: SessionTrajectory) -> list[tuple[list[float], float, float, list[float]]]:
+    """Straight from the definition: s_k is the W betas before row k, a_k, beta and reward belong to row k."""
+    out = []
+    line = [*s.lead_beta, *s.beta]
+    w = len(s.lead_beta)
+    for k in range(s.steps):
+        beta, a = s.beta[k], s.amplitude[k]
+        known = [*line[k : k + w + 1], a]
+        if any(np.isnan(known)) or not -1e-4 <= a <= 1 + 1e-4:
+            continue
+        reward = (0.0 if beta < 0.5 else -1.0) - 0.3 * a
+        out.append((line[k : k + w], a, reward, line[k + 1 : k + w + 1]))
+    return out
+
+
+def test_transitions_are_those_of_the_definition() -> None:
+    gap, above = session(2, 8), session(3, 8)
+    gap.beta[4] = np.nan
+    above.amplitude[2], above.amplitude[3] = 1.2, 1.00005
+    buffer = ReplayBuffer(SETTINGS, (session(1, 6), gap, above), "uV", "table")
+    t = buffer.transitions()
+    expected = [row for s in buffer.sessions for row in readable_transitions(s)]
+    assert len(t.actions) == len(expected)
+    for i, (state, action, reward, following) in enumerate(expected):
+        assert t.states[i] == pytest.approx(state)
+        assert t.actions[i] == pytest.approx(min(action, 1.0))
+        assert t.rewards[i] == pytest.approx(reward, abs=1e-4)
+        assert t.next_states[i] == pytest.approx(following)
+
+
+def test_the_first_state_is_the_window_before_the_session() -> None:
+    s = session()
+    assert s.states()[0] == pytest.approx([-0.2, -0.1, 0.0])
+    assert s.states()[1] == pytest.approx([-0.1, 0.0, 0.1])
+    assert s.states().shape == (s.steps + 1, 3)
+
+
+def test_a_gap_spoils_every_window_that_holds_it_and_no_other() -> None:
+    s = session(steps=10)
+    s.beta[4] = np.nan
+    assert s.usable().tolist() == [True] * 4 + [False] * 4 + [True] * 2
+
+
+def test_a_session_without_a_lead_can_be_used_from_step_w_on() -> None:
+    s = session(steps=6, lead_beta=np.full(3, np.nan))
+    assert s.usable().tolist() == [False] * 3 + [True] * 3
+
+
+def test_an_amplitude_above_cdbs_stays_out() -> None:
+    s = session()
+    s.amplitude[1] = 1.01
+    assert s.usable().tolist() == [True, False, True, True]
+
+
+def test_a_buffer_without_a_usable_step_says_so() -> None:
+    s = session(lead_beta=np.full(3, np.nan), steps=2)
+    with pytest.raises(ValueError, match="no usable step"):
+        ReplayBuffer(SETTINGS, (s,), "uV", "table").transitions()
+
+
+def test_the_stored_form_keeps_everything_and_its_hash() -> None:
+    buffer = ReplayBuffer(SETTINGS, (session(1), session(7, 9, qoc=Qoc(), random_lower_bound=None, policy_id=3)), "uV", "table")
+    buffer.sessions[1].beta[2] = np.nan
+    content = to_parquet(buffer)
+    again = from_parquet(content)
+    assert content_hash(to_parquet(again)) == content_hash(content)
+    assert again.settings == buffer.settings
+    assert (again.beta_unit, again.beta_source) == ("uV", "table")
+    for a, b in zip(again.sessions, buffer.sessions, strict=True):
+        for name in ("lead_beta", "beta", "amplitude"):
+            assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
+        assert (a.session_id, a.visit, a.controller, a.policy_id, a.qoc, a.random_lower_bound) == (
+            b.session_id,
+            b.visit,
+            b.controller,
+            b.policy_id,
+            b.qoc,
+            b.random_lower_bound,
+        )
+
+
+def test_another_file_is_no_snapshot() -> None:
+    import io
+
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    sink = io.BytesIO()
+    pq.write_table(pa.table({"x": [1]}), sink)
+    with pytest.raises(ValueError, match="not a betaloop buffer snapshot"):
+        from_parquet(sink.getvalue())
