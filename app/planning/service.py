@@ -19,7 +19,7 @@ from app.learning.models import Policy
 from app.planning import repository
 from app.planning.models import Plan, PlanItem
 from app.planning.schedule import Candidate, Rules, schedule
-from app.planning.schemas import PlanIn
+from app.planning.schemas import PlanIn, PlanOptions
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import service as study
@@ -84,13 +84,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
     participant = visit.participant
     study.require(caller, can.DRAFT_PLAN, participant)
     chosen = testable_policies(db, participant, draft.policy_ids)
-    rules = Rules(
-        session_minutes=draft.minutes_per_session,
-        washout_minutes=draft.washout_minutes,
-        total_minutes=draft.total_minutes,
-        no_dbs=draft.no_dbs,
-        random_sessions=draft.random_sessions,
-    )
+    rules = rules_of(draft)
     seed = secrets.randbelow(MAX_SEED) if draft.seed is None else draft.seed
     day = schedule([Candidate(p.id, controller_of(p)) for p in chosen], rules, seed)
     evaluation = _evaluation(db, participant, draft.evaluation_id)
@@ -142,6 +136,22 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, plan_id: int | None 
     return view
 
 
+def rules_of(options: PlanOptions) -> Rules:
+    """The rules of a visit day as the caller wants them."""
+    return Rules(
+        session_minutes=options.minutes_per_session,
+        washout_minutes=options.washout_minutes,
+        total_minutes=options.total_minutes,
+        no_dbs=options.no_dbs,
+        random_sessions=options.random_sessions,
+    )
+
+
+def today() -> date:
+    """The day on which it is decided whether a visit is past (UTC)."""
+    return now().date()
+
+
 def testable_policies(db: Session, participant: Participant, ids: Sequence[int]) -> list[Policy]:
     """The named policies of this participant, in that order.
 
@@ -173,7 +183,7 @@ def visit_for_draft(
     Raises:
         Invalid: the visit is not open: another participant's, past, or with sessions. Conflict: the number is taken.
     """
-    open_visits = repository.open_visits(db, participant.id, now().date())
+    open_visits = repository.open_visits(db, participant.id, today())
     if visit_id is not None:
         for visit in open_visits:
             if visit.id == visit_id:
@@ -260,6 +270,6 @@ def _warnings(
     held = repository.session_count(db, visit.id)
     if held:
         warnings.append(f"The visit already has {held} {'session' if held == 1 else 'sessions'}.")
-    if plan.status == "draft" and visit.date and visit.date < now().date():
+    if plan.status == "draft" and visit.date and visit.date < today():
         warnings.append(f"The visit's date, {visit.date.isoformat()}, is past.")
     return warnings

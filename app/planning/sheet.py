@@ -17,7 +17,7 @@ from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller
 
 STOP_RULES = (
-    "Stop the session and return to the clinical stimulation (cDBS) at once when the participant asks for it; on a fall or the risk of one; "
+    "Stop the session and return to the clinical stimulation (cDBS) at once when the participant asks for it; on a fall or its risk; "
     "on troublesome tremor, dyskinesia, dystonia, or change of speech, mood or sight; when sensing or the link to the device is lost; or "
     "when the amplitude leaves the clinician's limits. The study protocol's stop rules prevail over this sheet."
 )

@@ -1,0 +1,138 @@
+"""Passwords, lock-out, sessions and tokens."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+import pytest
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+
+from app.accounts import service
+from app.accounts.models import Role
+from app.accounts.policy import APPROVE_PLAN, MANAGE_ACCOUNTS, PERMISSIONS, READ, WRITE_STUDY, Caller, Grant
+from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
+
+EMAIL, PASSWORD = "ada@clinic.example", "correct horse battery"
+
+
+@pytest.fixture
+def ada(db: Session) -> str:
+    service.add_user(db, "Ada@Clinic.example", Role.CLINICIAN, PASSWORD)
+    db.commit()
+    return EMAIL
+
+
+def test_a_password_opens_a_session_whose_token_is_not_stored(db: Session, ada: str) -> None:
+    token = service.sign_in(db, "ADA@clinic.example ", PASSWORD)
+    db.commit()
+    caller = service.caller_of_cookie(db, token)
+    assert caller is not None
+    assert caller.label == ada
+    stored = db.execute(text("select token_sha256 from sign_in")).scalar_one()
+    assert token not in stored
+    assert PASSWORD not in db.execute(text("select password_hash from app_user")).scalar_one()
+
+
+def test_five_failures_lock_the_address_and_a_pause_unlocks_it(db: Session, ada: str) -> None:
+    for _ in range(service.FAILURES_ALLOWED):
+        with pytest.raises(Unauthorized):
+            service.sign_in(db, ada, "wrong password")
+        db.commit()
+    with pytest.raises(TooMany):
+        service.sign_in(db, ada, PASSWORD)
+    db.execute(text("update sign_in_attempt set at = at - interval '16 minutes'"))
+    db.commit()
+    assert service.sign_in(db, ada, PASSWORD)
+
+
+def test_unknown_address_and_wrong_password_sound_the_same(db: Session, ada: str) -> None:
+    messages = set()
+    for email in (ada, "nobody@clinic.example"):
+        with pytest.raises(Unauthorized) as caught:
+            service.sign_in(db, email, "wrong password")
+        messages.add(str(caught.value))
+    assert len(messages) == 1
+
+
+@pytest.mark.parametrize("column", ["last_seen_at", "created_at"])
+def test_a_session_ends_by_idling_and_by_age(db: Session, ada: str, column: str) -> None:
+    token = service.sign_in(db, ada, PASSWORD)
+    db.commit()
+    db.execute(text(f"update sign_in set {column} = {column} - cast(:age as interval)"), {"age": timedelta(hours=13)})
+    db.commit()
+    assert service.caller_of_cookie(db, token) is None
+
+
+def test_signing_out_ends_the_session(db: Session, ada: str) -> None:
+    token = service.sign_in(db, ada, PASSWORD)
+    service.sign_out(db, token)
+    db.commit()
+    assert service.caller_of_cookie(db, token) is None
+
+
+def test_a_new_password_ends_every_session(db: Session, ada: str) -> None:
+    token = service.sign_in(db, ada, PASSWORD)
+    db.commit()
+    from app.accounts import repository
+
+    user = repository.user_by_email(db, ada)
+    assert user is not None
+    service.set_password(db, user, "another long password")
+    db.commit()
+    assert service.caller_of_cookie(db, token) is None
+    with pytest.raises(Unauthorized):
+        service.sign_in(db, ada, PASSWORD)
+
+
+def test_a_token_works_until_it_is_revoked(db: Session, ada: str) -> None:
+    token = service.create_token(db, ada, "tablet")
+    db.commit()
+    caller = service.caller_of_token(db, token)
+    assert caller is not None
+    assert caller.user_id is not None
+    row = db.execute(text("select id from api_token")).scalar_one()
+    service.revoke_token(db, caller.user_id, row)
+    db.commit()
+    assert service.caller_of_token(db, token) is None
+
+
+def test_nobody_revokes_the_token_of_another(db: Session, ada: str) -> None:
+    service.create_token(db, ada, "tablet")
+    row = db.execute(text("select id from api_token")).scalar_one()
+    with pytest.raises(NotFound):
+        service.revoke_token(db, 10_000, row)
+
+
+def test_names_of_tokens_and_addresses_are_unique(db: Session, ada: str) -> None:
+    service.create_token(db, ada, "tablet")
+    with pytest.raises(Conflict):
+        service.create_token(db, ada, "tablet")
+    with pytest.raises(Conflict):
+        service.add_user(db, ada.upper(), Role.VIEWER, PASSWORD)
+
+
+@pytest.mark.parametrize(("email", "password"), [("no address", PASSWORD), ("a@b.example", "short")])
+def test_bad_accounts_are_refused(db: Session, email: str, password: str) -> None:
+    with pytest.raises(Invalid):
+        service.add_user(db, email, Role.VIEWER, password)
+
+
+def test_roles_include_what_they_should() -> None:
+    assert PERMISSIONS[Role.VIEWER] == {READ}
+    assert APPROVE_PLAN in PERMISSIONS[Role.CLINICIAN]
+    assert APPROVE_PLAN not in PERMISSIONS[Role.ENGINEER]
+    assert all(PERMISSIONS[r] <= PERMISSIONS[Role.ADMIN] for r in Role)
+    assert MANAGE_ACCOUNTS not in PERMISSIONS[Role.CLINICIAN] | PERMISSIONS[Role.ENGINEER]
+
+
+def test_a_grant_reaches_its_study_and_site_only() -> None:
+    caller = Caller("x", 1, (Grant(1, 10, Role.CLINICIAN), Grant(2, None, Role.VIEWER)))
+    caller.require(WRITE_STUDY, 1, 10)
+    caller.require(READ, 2, 99)
+    with pytest.raises(NotFound):
+        caller.require(WRITE_STUDY, 1, 11)
+    with pytest.raises(Forbidden):
+        caller.require(WRITE_STUDY, 2, 99)
+    with pytest.raises(NotFound):
+        caller.require(READ, 3)
