@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import datetime
 from getpass import getpass
 from pathlib import Path
@@ -172,15 +172,16 @@ def pipeline(
 ) -> None:
     """Train, distil, evaluate and rank: the work between two visits. A worker must be running."""
     from app.platform.jobs import service as jobs
-    from app.platform.jobs.watch import watch
+    from app.platform.jobs.models import JobStatus
+    from app.platform.jobs.watch import show_progress
     from app.study import repository as study
 
     params: dict[str, Any] = {} if preset is None else {"preset": preset}
     with transaction(ACTOR) as db:
         person = study.participant_by_code(db, code, SYSTEM)
         job_id = jobs.submit(db, "pipeline", person.id, params, ACTOR).id
-    status = _follow(watch(job_id)) if wait else "queued"
-    _print({"id": job_id, "status": status}, as_json, f"Job {job_id}: {status}.")
+    status = show_progress(job_id, Console(stderr=True)).status if wait else JobStatus.QUEUED
+    _print({"id": job_id, "status": status.value}, as_json, f"Job {job_id}: {status}.")
     if status in {"failed", "cancelled"}:
         raise typer.Exit(1)
 
@@ -188,12 +189,11 @@ def pipeline(
 @app.command(epilog="Example: betaloop rank P1")
 def rank(code: Code, as_json: AsJson = False) -> None:
     """Print the ranked policies of a participant."""
-    from app.evaluation import service as evaluation
+    from app.evaluation.ranking import current_ranking
     from app.study import repository as study
 
     with transaction(ACTOR) as db:
-        ranking = evaluation.current_ranking(db, study.participant_by_code(db, code, SYSTEM), SYSTEM)
-        body = evaluation.ranking_out(ranking).model_dump(mode="json")
+        body = current_ranking(db, study.participant_by_code(db, code, SYSTEM), SYSTEM).model_dump(mode="json")
     if as_json:
         _print(body, True, "")
         return
@@ -229,21 +229,6 @@ def export_(
 def _estimate_cells(estimate: dict[str, Any]) -> tuple[str, str, str]:
     interval = f"{estimate['low']:.2f} … {estimate['high']:.2f}"
     return f"{estimate['value']:.2f}", interval, "yes" if estimate.get("supported", True) else "no"
-
-
-def _follow(states: Iterator[Any]) -> str:
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    status = "queued"
-    with Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%"), TimeElapsedColumn()) as bars:
-        known: dict[str, Any] = {}
-        for state in states:
-            status = str(state.status)
-            for step in state.steps:
-                if step.key not in known:
-                    known[step.key] = bars.add_task(step.title, total=1.0)
-                bars.update(known[step.key], completed=step.progress)
-    return status
 
 
 def _password(path: Path | None) -> str:

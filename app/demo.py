@@ -95,9 +95,7 @@ def _children(logs: Path, host: str, port: int) -> Iterator[list[subprocess.Pope
     for name, arguments in commands.items():
         log = (logs / f"{name}.log").open("ab")
         # a session of its own: Ctrl-C reaches this process alone, which then stops the others in order
-        children.append(
-            subprocess.Popen([sys.executable, "-m", "app.cli", *arguments], stdout=log, stderr=log, start_new_session=True)
-        )
+        children.append(subprocess.Popen([sys.executable, "-m", "app.cli", *arguments], stdout=log, stderr=log, start_new_session=True))
         log.close()
     previous = signal.signal(signal.SIGTERM, _interrupt)
     try:

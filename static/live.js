@@ -1,24 +1,30 @@
-// Follows server-sent events of a job: <section data-live="/api/v1/jobs/ID/events">.
-//   progress {progress, message, step?}   fills [data-step="KEY"] (a `progress` macro with that key; the job's own has the key "job")
-//   status   {status, step?}              fills [data-status="KEY"]; when the job itself has ended, the page is loaded again
-//   log      {log}                        adds a line to [data-log]
-//   point    {step, points: [{x, values}]}  adds to the figure [data-curve="STEP"]
-const ENDED = new Set(["succeeded", "failed", "cancelled"]);
+// Follows the server-sent events of a job: <section data-live="/api/v1/jobs/ID/events">. An event is {id, kind, step, at, data}:
+//   progress {progress, job_progress, message}   fills [data-step="STEP"] and [data-step="job"] (`progress` macros with these keys)
+//   step, status {status}                        fills [data-status="STEP"] or, without a step, [data-status="job"]
+//   log      {text}                              adds a line to [data-log]
+//   points   {points: [{x, values}]}             adds to the figure [data-curve="STEP"]
+// The first event, `job`, and the last, `end`, hold the whole job: at the end the page is loaded again.
+const KINDS = ["status", "step", "progress", "points", "log"];
 
 function follow(section) {
   const source = new EventSource(section.dataset.live);
-  const handle = (kind) => (event) => {
-    const data = JSON.parse(event.data);
-    apply(section, { kind, ...data });
-    if (data.status && ENDED.has(data.status) && !stepOf(data)) { source.close(); location.reload(); }
-  };
-  for (const kind of ["progress", "status", "log", "point", "message"]) source.addEventListener(kind, handle(kind));
+  for (const kind of KINDS) source.addEventListener(kind, (event) => {
+    const { step, data } = JSON.parse(event.data);
+    apply(section, { ...data, step, log: data.text });
+    if (typeof data.job_progress === "number") apply(section, { progress: data.job_progress, message: data.message });
+  });
+  source.addEventListener("job", (event) => {
+    const job = JSON.parse(event.data);
+    apply(section, { progress: job.progress, message: job.message, status: job.status });
+    for (const step of job.steps) apply(section, { step: step.key, progress: step.progress, message: step.message, status: step.status });
+  });
+  source.addEventListener("end", () => { source.close(); location.reload(); });
   source.addEventListener("error", () => { section.dataset.connection = source.readyState === EventSource.CLOSED ? "closed" : "retrying"; });
   source.addEventListener("open", () => { section.dataset.connection = "open"; });
   addEventListener("pagehide", () => source.close(), { once: true });
 }
 
-const stepOf = (data) => data.step ?? data.step_key ?? null;
+const stepOf = (data) => data.step ?? null;
 const byKey = (section, attribute, key) => section.querySelectorAll(`[data-${attribute}="${CSS.escape(key)}"]`);
 
 function apply(section, data) {

@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session
 
 import app.platform.database as database
 from app.platform.embedded_postgres import EmbeddedPostgres
+from app.platform.jobs import engine as jobs_engine
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,6 +45,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedPostgre
         config.attributes["connection"] = connection
         command.upgrade(config, "head")
     engine.dispose()
+    jobs_engine.prepare(server.url("betaloop"))
     yield server
     server.remove()
 

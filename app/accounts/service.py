@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import repository
 from app.accounts.models import ApiToken, Membership, Role, SignIn, SignInAttempt, Study, User
-from app.accounts.policy import MANAGE_ACCOUNTS, PERMISSIONS, Caller, Grant
+from app.accounts.policy import MANAGE_ACCOUNTS, PERMISSIONS, READ_AUDIT, Caller, Grant
 from app.platform.database import now
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 from app.settings import get_settings
@@ -75,6 +75,12 @@ def administers(caller: Caller, study_id: int, site_id: int | None = None) -> bo
 def manages(caller: Caller, user: User) -> bool:
     """Whether the caller administers everything that the user has access to."""
     return all(administers(caller, m.study_id, m.site_id) for m in user.memberships)
+
+
+def reads_whole_audit(db: Session, caller: Caller) -> bool:
+    """Whether the caller may read the audit trail, whose rows belong to no study: a grant over every study, at all of its sites."""
+    whole = {g.study_id for g in caller.grants if READ_AUDIT in PERMISSIONS[g.role] and g.site_id is None}
+    return caller.is_system or all(study.id in whole for study in repository.studies(db))
 
 
 def set_active(db: Session, user: User, active: bool, caller: Caller) -> None:

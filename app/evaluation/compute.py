@@ -72,7 +72,7 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: Report) -> di
     torch.set_num_threads(1)
     buffer = read_buffer(params["snapshot_sha256"])
     method = params["method"]
-    estimator = Dlsm(_dlsm_config(params)) if method == "dlsm" else estimators(params["seed"], demo=params["preset"] == "demo")[method]
+    estimator = Dlsm(_dlsm_config(params)) if method == "dlsm" else estimators(params["seed"], demo=params["preset"] == "quick")[method]
     for k, sha256 in enumerate(params.get("members", [])):
         write_atomically(workdir / member_file(k), files.read(sha256))
     policies = {str(p["id"]): OnnxPolicy(files.read(p["sha256"]), buffer.settings.window) for p in params["policies"]}
@@ -99,7 +99,7 @@ def dlsm_members(preset: str, seed: int) -> int:
 def _dlsm_config(params: dict[str, Any]) -> DlsmConfig:
     from ml.ope.dlsm_config import DlsmConfig
 
-    return DlsmConfig.demo(params["seed"]) if params["preset"] == "demo" else DlsmConfig(seed=params["seed"])
+    return DlsmConfig.demo(params["seed"]) if params["preset"] == "quick" else DlsmConfig(seed=params["seed"])
 
 
 def _finite(value: Any) -> Any:

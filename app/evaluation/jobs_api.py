@@ -75,7 +75,7 @@ def read_job(found: CurrentJob) -> JobOut:
     responses={200: {"content": {"text/event-stream": {}}, "description": "Server-sent events until the job ends."}},
 )
 def follow_job(found: CurrentJob, db: Db, last_event_id: Annotated[str | None, Header(max_length=20)] = None) -> StreamingResponse:
-    """Follow a job: its state, then `status`, `step`, `progress`, `points` and `log` as they come, and `end`; goes on after Last-Event-ID."""
+    """Follow a job: its state, what happens (`status`, `step`, `progress`, `points`, `log`), `end`; goes on after Last-Event-ID."""
     job_id = found.job.id
     # the stream may last for hours and reads with sessions of its own: this one's connection goes back now
     db.close()

@@ -13,9 +13,9 @@ from app.accounts import policy as can
 from app.accounts.policy import Caller
 from app.evaluation import repository
 from app.evaluation.actual import Actual, actual, mean_of
+from app.evaluation.estimates import estimate_of
 from app.evaluation.models import Evaluation
 from app.evaluation.schemas import METHODS, EstimateOut, RankedPolicy, RankedSnapshot, RankingOut, TestedBefore
-from app.evaluation.service import estimate_of
 from app.learning import repository as learning
 from app.learning.models import BufferSnapshot, Policy, SnapshotSession
 from app.learning.snapshots import Collection, Member, collect
@@ -76,6 +76,7 @@ def current_ranking(db: Session, participant: Participant, caller: Caller, metho
         snapshot=_snapshot_out(db, evaluation.snapshot_id),
         stale=bool(reasons),
         stale_reasons=reasons,
+        stale_reason="; ".join(reasons) or None,
         policies=[r for r in rows if r.reference is None],
         references=[r for r in rows if r.reference is not None],
     )

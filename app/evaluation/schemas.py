@@ -29,7 +29,7 @@ METHOD_NAMES = {
 class EvaluateParams(Model):
     """What `evaluate` takes."""
 
-    preset: Preset = Field("full", description="`full`: sizes for a study; `demo`: small and quick.")
+    preset: Preset = Field("full", description="`full`: sizes for a study; `quick`: for a first look.")
     policies: PolicyIds = Field(default_factory=list, description="Policies to rank; empty: every one that is not retired.")
     methods: Methods = Field(list(METHODS), description="Estimators to run.")
     horizon_steps: Int | None = Field(None, ge=1, le=100_000, description="H; the snapshot's median session length where not given.")
@@ -39,7 +39,7 @@ class EvaluateParams(Model):
 class PipelineParams(Model):
     """What `pipeline` takes: everything between two visits in one job."""
 
-    preset: Preset = Field("full", description="`full`: sizes for a study; `demo`: small and quick.")
+    preset: Preset = Field("full", description="`full`: sizes for a study; `quick`: for a first look.")
     policies: PolicyIds = Field(default_factory=list, description="Fine-tune from each of these; empty: train from scratch.")
     count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch; the paper trains 6.")
     updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each policy.")
@@ -204,5 +204,6 @@ class RankingOut(Model):
     snapshot: RankedSnapshot
     stale: bool
     stale_reasons: list[str]
+    stale_reason: str | None = Field(description="All of them in one line.")
     policies: list[RankedPolicy]
     references: list[RankedPolicy]

@@ -11,7 +11,9 @@ from sqlalchemy.orm import Session
 from app.accounts import policy as can
 from app.accounts.policy import Caller
 from app.evaluation import repository
+from app.evaluation.estimates import as_estimate
 from app.evaluation.models import EstimateRow, Evaluation
+from app.evaluation.ranking import current_ranking as current_ranking
 from app.evaluation.schemas import EvaluateParams, PipelineParams
 from app.learning import repository as learning
 from app.learning.jobs import teachers, training_starts
@@ -132,31 +134,6 @@ def store_evaluation(
     db.add(row)
     db.flush()
     return row
-
-
-def as_estimate(values: Mapping[str, Any]) -> Estimate:
-    """The inverse of `Estimate.to_json`."""
-    return Estimate(**{**values, "flags": tuple(values["flags"])})
-
-
-def estimate_of(row: EstimateRow) -> Estimate:
-    """A stored estimate as the science knows it."""
-    details = dict(row.details)
-    return Estimate(
-        method=row.method,
-        value=row.value,
-        low=row.low,
-        high=row.high,
-        level=row.level,
-        standard_error=row.standard_error or 0.0,
-        step_return=details.pop("step_return"),
-        end_reward=details.pop("end_reward"),
-        predicted={name: float(v) for name, v in row.predicted.items()},
-        supported=row.supported,
-        flags=tuple(row.flags),
-        n=details.pop("n"),
-        details=details,
-    )
 
 
 def _estimate_row(policy_id: int, e: Estimate) -> EstimateRow:

@@ -19,7 +19,7 @@ from app.platform.errors import Invalid
 from app.platform.schemas import RowId, problems
 from app.study import repository as study
 from app.study.api import session_out
-from app.study.models import Controller
+from app.study.models import Controller, Hemisphere
 
 router = APIRouter(tags=["uploads"], responses=problems(401, 403, 404, 422))
 
@@ -43,12 +43,13 @@ def upload(
     controller: Annotated[Controller, Form(description="What drove the stimulation.")],
     policy: Annotated[str | None, Form(max_length=100, description="Name or number of the policy that ran.")] = None,
     started_at: Annotated[datetime | None, Form(description="Start of the session; without an offset: UTC.")] = None,
+    hemisphere: Annotated[Hemisphere | None, Form(description="Side of the controlled implant, where the file does not tell.")] = None,
     beta_unit: Annotated[str | None, Form(max_length=40, description="Unit of a table's beta; the participant's when left out.")] = None,
     beta_source: Annotated[BetaSource | None, Form(description="Where a table's beta comes from; the participant's when left out.")] = None,
 ) -> UploadOut:
     """Upload the files of one session. The answer comes after decoding; the same bytes again give the same sessions."""
     person = study.participant_by_code(db, participant, caller)
-    stated = service.state_session(db, person, visit, controller, policy, started_at)
+    stated = service.state_session(db, person, visit, controller, policy, started_at, hemisphere)
     incoming = [Incoming(f.filename or "file", f.file) for f in file]
     outcome = service.receive(db, person, stated, incoming, caller, BetaStated(beta_unit, beta_source))
     if not outcome.usable:

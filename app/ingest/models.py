@@ -29,7 +29,10 @@ class Upload(Base):
 
 
 class UploadFile(Base):
-    """One file of an upload. The original's hash makes uploads idempotent; what is kept is the file without identity."""
+    """One file of an upload. The original's hash makes uploads idempotent; what is kept is the file without identity.
+
+    What could not be parsed, whole or in part, could not be cleaned: the original is kept encrypted then, as `quarantine_sha256`.
+    """
 
     __tablename__ = "upload_file"
     __table_args__ = (
@@ -52,6 +55,7 @@ class UploadFile(Base):
     size: Mapped[int] = mapped_column(BigInteger)
     original_sha256: Mapped[str] = mapped_column(String(64), index=True)
     stored_sha256: Mapped[str | None] = mapped_column(ForeignKey("stored_file.sha256"))
+    quarantine_sha256: Mapped[str | None] = mapped_column(ForeignKey("stored_file.sha256"))
     redactor_version: Mapped[int | None]
     status: Mapped[str] = mapped_column(String(20), server_default="received")
     report: Mapped[dict[str, Any]]

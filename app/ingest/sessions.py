@@ -18,7 +18,7 @@ from app.ingest.models import UploadFile
 from app.settings import get_settings
 from app.study import blinding
 from app.study import repository as study
-from app.study.models import Controller, Device, Participant, Recording, SessionSegment, StudySession, Trace, Visit
+from app.study.models import Controller, Device, Hemisphere, Participant, Recording, SessionSegment, StudySession, Trace, Visit
 from app.study.traces import pack
 
 CONTROL_STREAMS = ("beta", "band_power")
@@ -33,6 +33,7 @@ class StatedSession:
     controller: Controller
     policy_id: int | None = None
     started_at: datetime | None = None
+    hemisphere: Hemisphere | None = None
 
 
 def store_recordings(
@@ -152,7 +153,7 @@ def _add_session(
     session = StudySession(
         visit_id=stated.visit.id,
         ordinal=study.next_ordinal(db, stated.visit.id),
-        hemisphere=recording.hemisphere,
+        hemisphere=stated.hemisphere or recording.hemisphere,
         started_at=started_at,
         duration_s=log.duration_s - offset_s,
         control_stream=control.stream if control else CONTROL_STREAMS[0],

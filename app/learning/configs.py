@@ -11,12 +11,12 @@ TRAINING: dict[str, dict[str, Any]] = {
     # from scratch as in the paper: learning rates from 1e-5 to 1e-3
     "full": {"updates": 10_000, "batch": 64, "low": 1e-5, "high": 1e-3, "critic_lr": 1e-3},
     # few updates reach nothing at the lowest of them
-    "demo": {"updates": 2_000, "batch": 64, "low": 1e-4, "high": 1e-3, "critic_lr": 1e-3},
+    "quick": {"updates": 2_000, "batch": 64, "low": 1e-4, "high": 1e-3, "critic_lr": 1e-3},
 }
 FINE_TUNING = {"low": 1e-7, "high": 1e-5}
 """The paper's learning rates when going on from a tested policy."""
 
-DISTILLATION: dict[str, dict[str, Any]] = {"full": {"updates": 5_000, "sigma": 0.3}, "demo": {"updates": 1_500, "sigma": 0.3}}
+DISTILLATION: dict[str, dict[str, Any]] = {"full": {"updates": 5_000, "sigma": 0.3}, "quick": {"updates": 1_500, "sigma": 0.3}}
 
 
 def training_configs(params: TrainParams) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from app.platform.schemas import Int, Model, Number, Text
 
-Preset = Literal["full", "demo"]
+Preset = Literal["full", "quick"]
 PolicyName = Annotated[str, Field(pattern=r"^[^\x00-\x1f]*\S[^\x00-\x1f]*$", max_length=100)]
 PolicyIds = Annotated[list[Annotated[Int, Field(ge=1)]], Field(max_length=50)]
 
@@ -17,7 +17,7 @@ PolicyIds = Annotated[list[Annotated[Int, Field(ge=1)]], Field(max_length=50)]
 class TrainParams(Model):
     """What `train` takes. What is left out comes from the preset."""
 
-    preset: Preset = Field("full", description="`full`: sizes for a study; `demo`: small and quick.")
+    preset: Preset = Field("full", description="`full`: sizes for a study; `quick`: for a first look.")
     policies: PolicyIds = Field(default_factory=list, description="Fine-tune from each of these; empty: train from scratch.")
     count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch; the paper trains 6.")
     updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each policy.")
@@ -31,7 +31,7 @@ class TrainParams(Model):
 class DistilParams(Model):
     """What `distill` takes."""
 
-    preset: Preset = Field("full", description="`full`: sizes for a study; `demo`: small and quick.")
+    preset: Preset = Field("full", description="`full`: sizes for a study; `quick`: for a first look.")
     policies: PolicyIds = Field(default_factory=list, description="Teachers; empty: every trained policy without a student.")
     sigma: Number | None = Field(None, ge=0, le=10, description="Noise of synthetic states, as a share of beta's standard deviation.")
     updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each student.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,11 +24,10 @@ from app.planning.service import PlanView, rules_of
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, NotFound
 from app.platform.forms import FormValues, parse
-from app.platform.schemas import PagingQuery
+from app.platform.schemas import Int, Model, PagingQuery
 from app.platform.templates import render
 from app.study.api import CurrentParticipant, CurrentVisit
 from app.study.models import Participant, Visit
-from app.study.schemas import VisitIn
 
 router = APIRouter()
 
@@ -37,14 +37,17 @@ LABELS = {
     "washout_minutes": "Washout",
     "random_sessions": "Random sessions",
     "visit_id": "Visit",
+    "visit_number": "Number of the new visit",
+    "visit_date": "Date of the new visit",
 }
 
 
-class VisitChoice(VisitIn):
-    """Which visit a draft is for; without an id and a number the first open visit or the next one."""
+class VisitChoice(Model):
+    """Which visit a draft is for; with neither id nor number the first open visit or a new one with the next number."""
 
-    number: int | None = Field(None, ge=1, le=10_000)  # type: ignore[assignment]
     visit_id: Id | None = None
+    visit_number: Int | None = Field(None, ge=1, le=10_000)
+    visit_date: dt.date | None = None
 
 
 @router.get("/visits/{visit_id}/plan")
@@ -82,28 +85,27 @@ def approve(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller
 def plans(request: Request, participant: CurrentParticipant, db: Db, paging: PagingQuery) -> HTMLResponse:
     """All plans of a participant, and the visits that may still be planned."""
     rows, total = repository.plans(db, participant.id, paging.limit, paging.offset)
-    today = service.today()
-    open_visits = repository.open_visits(db, participant.id, today)
-    return HTMLResponse(
-        render(
-            request, "planning/plans.html", participant=participant, rows=rows, total=total, paging=paging, open_visits=open_visits,
-            next_number=repository.next_visit_number(db, participant.id),
-        )  # fmt: skip
+    page = render(
+        request,
+        "planning/plans.html",
+        participant=participant,
+        rows=rows,
+        total=total,
+        paging=paging,
+        open_visits=repository.open_visits(db, participant.id, service.today()),
+        next_number=repository.next_visit_number(db, participant.id),
     )
+    return HTMLResponse(page)
 
 
 @router.post("/participants/{code}/plan/draft")
 def draft_from_ranking(participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Draft a visit from the policies ticked in the ranking; the visit is an open one or a new one."""
-    wanted = parse(VisitChoice, {_VISIT_FIELDS[k]: v for k, v in values.items() if k in _VISIT_FIELDS and v != "new"}, LABELS)
-    plan_in = _draft(values)
-    visit = service.visit_for_draft(db, participant, wanted.visit_id, wanted.number, wanted.date, caller)
+    wanted, plan_in = parse(VisitChoice, {k: "" if v == "new" else v for k, v in values.items()}, LABELS), _draft(values)
+    visit = service.visit_for_draft(db, participant, wanted.visit_id, wanted.visit_number, wanted.visit_date, caller)
     service.draft_plan(db, visit, plan_in, caller)
     db.commit()
     return RedirectResponse(f"/visits/{visit.id}/plan?done=drafted", 303)
-
-
-_VISIT_FIELDS = {"visit_id": "visit_id", "visit_number": "number", "visit_date": "date"}
 
 
 def _draft(values: FormData) -> PlanIn:
@@ -156,7 +158,8 @@ def _page(
 def _choices(db: Session, participant: Participant, ranking: RankingOut | None) -> list[dict[str, Any]]:
     """Policies that may be planned, best first; those that no ranking holds come last."""
     ranked = {p.policy_id: p for p in ranking.policies} if ranking else {}
-    policies = sorted(learning.candidates(db, participant.id), key=lambda p: (ranked[p.id].rank or 10**6 if p.id in ranked else 10**6, p.id))
+    places = {i: p.rank for i, p in ranked.items() if p.rank is not None}
+    policies = sorted(learning.candidates(db, participant.id), key=lambda p: (places.get(p.id, len(places) + 1), p.id))
     return [{"policy": p, "ranked": ranked.get(p.id)} for p in policies]
 
 

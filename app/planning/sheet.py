@@ -40,6 +40,7 @@ _SHADES = {
 }
 _INK, _MUTED, _LINE, _PLANNED = (20, 30, 38), (95, 108, 118), (150, 160, 168), (246, 248, 250)
 
+
 class _Sheet(FPDF):  # type: ignore[misc]
     """Pages with the plan's name above, provenance and page number below, and DRAFT across where it is one."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
+import structlog
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
@@ -14,7 +15,7 @@ from app.accounts import policy as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.policy import Caller
 from app.platform.database import Db
-from app.platform.errors import BetaloopError
+from app.platform.errors import BetaloopError, Invalid
 from app.platform.forms import FormValues, parse
 from app.platform.templates import render
 from app.study import repository, service, session_pages, settings_form
@@ -23,6 +24,7 @@ from app.study.blinding import arm
 from app.study.models import Participant, StudySession
 from app.study.schemas import CdbsAmplitudeModel, ParticipantIn, SettingsIn, VisitIn
 
+log = structlog.get_logger()
 router = APIRouter()
 router.include_router(session_pages.router)
 
@@ -154,11 +156,20 @@ def _settings_page(
         values=values,
         groups=settings_form.GROUPS,
         history=settings_form.history(participant.settings),
-        suggestion=service.suggest_xi_beta(db, participant, caller),
+        suggestion=_suggestion(db, participant, caller),
         may_write=_may(caller, can.WRITE_SETTINGS, participant),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)
+
+
+def _suggestion(db: Session, participant: Participant, caller: Caller) -> float | None:
+    try:
+        return service.suggest_xi_beta(db, participant, caller)
+    except Invalid as error:
+        # the session's own page says what is wrong with it; the settings must stay reachable, for they may be what mends it
+        log.info("no threshold suggested", participant=participant.code, reason=error.detail)
+        return None
 
 
 def _visit_form(request: Request, participant: Participant, draft: dict[str, str], error: BetaloopError | None = None) -> HTMLResponse:

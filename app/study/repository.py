@@ -139,6 +139,12 @@ def policy_id(db: Session, participant_id: int, name_or_id: str) -> int | None:
     return found
 
 
+def policy_name(db: Session, policy_id: int | None) -> str | None:
+    """Name of a policy, by its number."""
+    policies = table("policy", column("id"), column("name"))
+    return None if policy_id is None else db.scalar(select(policies.c.name).where(policies.c.id == policy_id))
+
+
 def settings_version(db: Session, settings_version_id: int) -> SettingsVersion:
     """A settings version by its row number."""
     return db.get_one(SettingsVersion, settings_version_id)

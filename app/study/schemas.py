@@ -29,9 +29,7 @@ class SettingsIn(Model):
     c3: Number = Field(10.0, ge=0, description="Weight of the rating, C3; 0 drops it.")
     c4: Number = Field(10.0, ge=0, description="Weight of tremor, C4; 0 drops it.")
     gamma: Number = Field(0.99, ge=0, lt=1, description="Discount per step.")
-    lower_bound: Number = Field(
-        0.3, ge=0, lt=1, description="B, lowest fraction of the random controller; never bounds a policy."
-    )
+    lower_bound: Number = Field(0.3, ge=0, lt=1, description="B, lowest fraction of the random controller; never bounds a policy.")
     tremor_as_fraction: Bool = Field(True, description="Tremor enters r_end as 0-1 instead of per cent.")
     cdbs_amplitude_ma: Number | None = Field(None, gt=0, le=25.5, description="cDBS amplitude where a visit states none, mA.")
     beta_low_hz: Number = Field(13.0, gt=0, description="Lower edge of the beta band, Hz.")
@@ -149,9 +147,7 @@ class SessionChange(Model):
     hemisphere: Hemisphere | None = None
     control_stream: Text | None = Field(None, max_length=40)
     control_channel: Text | None = Field(None, max_length=80)
-    excluded_reason: Text | None = Field(
-        None, max_length=1000, description="Keeps it out of buffers and analyses; null takes that back."
-    )
+    excluded_reason: Text | None = Field(None, max_length=1000, description="Keeps it out of buffers and analyses; null takes that back.")
     reason: Text | None = Field(None, max_length=1000)
 
 

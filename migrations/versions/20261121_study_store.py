@@ -446,11 +446,13 @@ def upgrade() -> None:
     sa.Column('size', sa.BigInteger(), nullable=False),
     sa.Column('original_sha256', sa.String(length=64), nullable=False),
     sa.Column('stored_sha256', sa.String(length=64), nullable=True),
+    sa.Column('quarantine_sha256', sa.String(length=64), nullable=True),
     sa.Column('redactor_version', sa.Integer(), nullable=True),
     sa.Column('status', sa.String(length=20), server_default='received', nullable=False),
     sa.Column('report', postgresql.JSONB(astext_type=sa.Text()), nullable=False),
     sa.CheckConstraint("status in ('received', 'decoded', 'failed')", name=op.f('ck_upload_file_status')),
     sa.ForeignKeyConstraint(['participant_id'], ['participant.id'], name=op.f('fk_upload_file_participant_id_participant')),
+    sa.ForeignKeyConstraint(['quarantine_sha256'], ['stored_file.sha256'], name=op.f('fk_upload_file_quarantine_sha256_stored_file')),
     sa.ForeignKeyConstraint(['stored_sha256'], ['stored_file.sha256'], name=op.f('fk_upload_file_stored_sha256_stored_file')),
     sa.ForeignKeyConstraint(['upload_id'], ['upload.id'], name=op.f('fk_upload_file_upload_id_upload')),
     sa.PrimaryKeyConstraint('id', name=op.f('pk_upload_file'))

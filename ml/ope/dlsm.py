@@ -75,18 +75,17 @@ class Dlsm:
         return self._train(self._prepare(buffer), k, report, checkpoint_dir)
 
     def _prepare(self, buffer: ReplayBuffer) -> _Data:
-        n = len(buffer.sessions)
+        n, c = len(buffer.sessions), self.config
         if n < FEWEST_SESSIONS:
             raise ValueError(f"the DLSM needs at least {FEWEST_SESSIONS} sessions, of which it holds some out; the buffer has {n}")
-        c = self.config
         scale = learn_scale(buffer)
-        fingerprint = hashlib.sha256((content_hash(to_parquet(buffer)) + json.dumps(c.to_json(), sort_keys=True)).encode()).hexdigest()
         folds = session_folds(buffer.sessions, max(2, round(1 / c.held_out)), c.seed)
-        return _Data(buffer, make_batch(buffer, scale), scale, folds, fingerprint)
+        named = content_hash(to_parquet(buffer)) + json.dumps(c.to_json(), sort_keys=True)
+        return _Data(buffer, make_batch(buffer, scale), scale, folds, hashlib.sha256(named.encode()).hexdigest())
 
     def _train(self, data: _Data, k: int, report: Report, checkpoint_dir: Path | None) -> Member:
-        c = self.config
-        training = MemberTraining(data.buffer, data.batch, data.scale, data.folds[k % len(data.folds)], c, c.seed + k, data.fingerprint)
+        held = data.folds[k % len(data.folds)]
+        training = MemberTraining(data.buffer, data.batch, data.scale, held, self.config, self.config.seed + k, data.fingerprint)
         return training.run(None if checkpoint_dir is None else checkpoint_dir / f"dlsm-member-{k}.pt", report)
 
 

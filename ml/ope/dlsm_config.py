@@ -37,8 +37,8 @@ class DlsmConfig:
     """
 
     latent: int = 12
-    hidden: int = 48
-    heads: tuple[int, ...] = (48,)
+    hidden: int = 32
+    heads: tuple[int, ...] = (32,)
     objective: Objective = "sum"
     state_terms: Literal["window", "newest"] = "newest"
     action_emission: bool = True
@@ -47,7 +47,7 @@ class DlsmConfig:
     kl_weight: float = 1.0
     end_weight: float = 1.0
     members: int = 3
-    steps: int = 500
+    steps: int = 400
     batch: int = 32
     learning_rate: float = 3e-3
     clip_norm: float = 1.0

@@ -38,6 +38,9 @@ from ml.rl.training import (
 )
 from ml.trajectories import ReplayBuffer, Transitions
 
+SATURATION_MARGIN = 0.01
+"""An amplitude fraction this near to 0 or 1 counts as saturated."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class DdpgConfig:
@@ -116,7 +119,8 @@ class TrainedPolicy:
         reward_scale: how the critic's rewards were scaled.
         curve: learning curves by name, arrays of one length: `update`; `critic_loss` (mean squared temporal-difference error since the last
             point, in squared reward units); `mean_q` (mean Q(s, pi(s)) over a probe of the buffer, in reward units: an unbounded climb is
-            over-estimation); `action_distance` (mean |pi(s) - a| to the logged actions of the probe).
+            over-estimation); `action_distance` (mean |pi(s) - a| to the logged actions of the probe); `saturated` (share of the probe's
+            states answered within 0.01 of 0 or 1: at 1 the tanh has no slope left, and the policy is cDBS or no-DBS by another name).
         config: the hyper-parameters, with the seed.
     """
 
@@ -192,15 +196,21 @@ class DdpgLearner:
         self._since_measure += 1
 
     def measure(self, probe: Batch) -> dict[str, float]:
-        """`critic_loss`, `mean_q` and `action_distance`, as `TrainedPolicy.curve` describes them."""
+        """The points of the learning curves, as `TrainedPolicy.curve` describes them."""
         with torch.no_grad():
             actions = self.policy.act_on_scores(probe.states)
             mean_q = float(self.critic(probe.states, actions).mean())
             distance = float((actions - probe.actions).abs().mean())
+            saturated = float(((actions - 0.5).abs() > 0.5 - SATURATION_MARGIN).double().mean())
         loss = float(self._loss_sum) / max(self._since_measure, 1)
         self._loss_sum.zero_()
         self._since_measure = 0
-        return {"critic_loss": loss / self.scale.factor**2, "mean_q": self.scale.value(mean_q), "action_distance": distance}
+        return {
+            "critic_loss": loss / self.scale.factor**2,
+            "mean_q": self.scale.value(mean_q),
+            "action_distance": distance,
+            "saturated": saturated,
+        }
 
     def state(self) -> dict[str, Any]:
         """Weights, targets, Adam's moments and the running loss."""

@@ -5,25 +5,20 @@ The row `t_s` covers (t_s - period, t_s]; rows with t_s <= 0 are the window befo
 
 from __future__ import annotations
 
-import csv
-import io
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from app.ingest.formats.delimited import read_delimited
 from app.ingest.formats.log import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
-from app.ingest.formats.numbers import NotANumber, column_name, parse_number, shown
+from app.ingest.formats.numbers import column_name, shown
 from app.ingest.formats.options import DecodeOptions
 
 GRID_TOLERANCE = 0.01
 """A time may lie this share of the period off the grid: clocks written with two decimals."""
-
-MAX_LINE = 1_000_000
-"""Characters a line may have: a longer one is no row of a table, and is not read into memory."""
 
 TIME_NAMES = ("t_s", "t", "time_s", "time", "seconds", "t_sec")
 BETA_NAMES = ("beta", "p_beta", "beta_amplitude", "beta_power")
@@ -96,113 +91,14 @@ def _role(key: str, unit: str | None) -> str | None:
 
 def read_csv(path: Path, options: DecodeOptions) -> Columns:
     """Cells of a text table; see `decode_csv`."""
-    notes: list[str] = []
-    with _open_text(path, notes) as stream:
-        source = _lines(stream)
-        first = next(source, "")
-        if first.lower().startswith("sep=") and len(first.strip()) == 5:
-            delimiter, offset, first = first.strip()[4], 1, next(source, "")
-        else:
-            delimiter, offset = _delimiter(first), 0
-        if not first.strip():
-            raise UndecodableFile("the file is empty", "line 1", f"Upload a table with the columns {NEEDED}.")
-        headers = next(csv.reader([first], delimiter=delimiter))
-        found, units, unused = match_columns(headers)
-        lines, rows = _cells(csv.reader(source, delimiter=delimiter), len(headers), list(found.values()), 1 + offset, options)
-    decimal = _decimal_mark(rows, delimiter, lines)
+    table = read_delimited(path, options.max_table_rows, NEEDED)
+    found, units, unused = match_columns(table.headers)
+    decimal = table.decimal_mark(list(found.values()))
     if decimal == ",":
-        notes.append("decimal comma read as decimal point")
-    values = {
-        role: np.array([_number(row[k], decimal, line, headers[index]) for row, line in zip(rows, lines, strict=True)], dtype=np.float64)
-        for k, (role, index) in enumerate(found.items())
-    }
-    names = {role: headers[index].strip() for role, index in found.items()}
-    return Columns(names, units, np.array(lines, dtype=np.int64), values, unused, notes)
-
-
-def _open_text(path: Path, notes: list[str]) -> io.TextIOWrapper:
-    with path.open("rb") as stream:
-        head = stream.read(4096)
-    if not head:
-        raise UndecodableFile("the file is empty", "line 1", f"Upload a table with the columns {NEEDED}.")
-    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
-        notes.append("text in UTF-16 read")
-        encoding = "utf-16"
-    elif b"\0" in head:
-        raise UndecodableFile("this is a binary file, not a table of text", "first bytes", "Save the table as CSV (UTF-8) or Parquet.")
-    else:
-        encoding = "utf-8-sig"
-    return io.TextIOWrapper(path.open("rb"), encoding=encoding, errors="replace", newline=None)
-
-
-def _lines(stream: io.TextIOWrapper) -> Iterator[str]:
-    """Lines of the text; raises on one too long to be a row."""
-    number = 0
-    while line := stream.readline(MAX_LINE):
-        number += 1
-        if len(line) == MAX_LINE and not line.endswith("\n"):
-            raise UndecodableFile(
-                f"a line of more than {MAX_LINE} characters", f"line {number}", "Save the table as CSV (UTF-8), one row per line."
-            )
-        yield line
-
-
-def _delimiter(header: str) -> str:
-    return max("\t;,", key=lambda mark: (header.count(mark), mark != ","))
-
-
-def _cells(
-    reader: Iterator[list[str]], width: int, wanted: list[int], offset: int, options: DecodeOptions
-) -> tuple[list[int], list[list[str]]]:
-    """Line numbers and the wanted cells of every row that is not blank."""
-    lines: list[int] = []
-    rows: list[list[str]] = []
-    number = offset
-    try:
-        for row in reader:
-            number = offset + reader.line_num  # type: ignore[attr-defined]
-            if not any(cell.strip() for cell in row):
-                continue
-            while len(row) > width and not row[-1].strip():
-                row.pop()
-            if len(row) != width:
-                mend = "Give every row one cell per column; with decimal commas separate the columns by semicolons."
-                raise UndecodableFile(f"{len(row)} cells where the header has {width}", f"line {number}", mend)
-            lines.append(number)
-            rows.append([row[i] for i in wanted])
-            if len(rows) > options.max_table_rows:
-                raise UndecodableFile(f"more than {options.max_table_rows} rows", f"line {number}", "Upload one session per table.")
-    except csv.Error as error:
-        raise UndecodableFile(f"not readable as a table: {error}", f"line {number + 1}", "Save the table as CSV (UTF-8).") from error
-    except UnicodeError as error:
-        raise UndecodableFile("text in an unknown encoding", f"after line {number}", "Save the table as CSV (UTF-8).") from error
-    return lines, rows
-
-
-def _decimal_mark(rows: list[list[str]], delimiter: str, lines: list[int]) -> str:
-    """The decimal mark used throughout; raises where both are."""
-    comma = next((line for row, line in zip(rows, lines, strict=True) if any("," in cell for cell in row)), None)
-    if comma is None:
-        return "."
-    point = next(
-        (line for row, line in zip(rows, lines, strict=True) if any("." in cell and cell.strip()[:1] not in "=@" for cell in row)), None
-    )
-    if point is not None and delimiter != ",":
-        raise UndecodableFile(
-            "decimal points and commas in one table", f"line {max(comma, point)}", "Use one decimal mark and no thousands separators."
-        )
-    return "." if point is not None else ","
-
-
-def _number(cell: str, decimal: str, line: int, header: str) -> float:
-    try:
-        value = parse_number(cell, decimal)
-    except NotANumber as error:
-        where = f"line {line}, column {header.strip()}"
-        raise UndecodableFile(
-            f"{shown(cell.strip())} is text, not a number", where, "Put a number there, or leave the cell empty."
-        ) from error
-    return math.nan if value is None else value
+        table.notes.append("decimal comma read as decimal point")
+    values = {role: table.numbers(index, decimal) for role, index in found.items()}
+    names = {role: table.headers[index].strip() for role, index in found.items()}
+    return Columns(names, units, np.array(table.lines, dtype=np.int64), values, unused, table.notes)
 
 
 def read_parquet(path: Path, options: DecodeOptions) -> Columns:

@@ -165,18 +165,7 @@ class Ledger:
             yield db, job
 
     def _persist(self, write: Callable[[], Value]) -> Value:
-        """Write, and when the database is away, wait for it: a restart of the database fails no job."""
-        pause, longest = _RETRY_S
-        while True:
-            self.check()
-            try:
-                return write()
-            except DBAPIError as error:
-                if not _worth_repeating(error):
-                    raise
-                log.warning("job %s: the database is away, trying again in %.1f s (%s)", self.job_id, pause, type(error.orig).__name__)
-                time.sleep(pause * random.uniform(0.5, 1.0))
-                pause = min(2 * pause, longest)
+        return persist(write, self.check)
 
     def _tell_step(self, db: Session, job: Job, step: JobStep) -> None:
         data = {"status": step.status, "title": step.title, "message": step.message, "attempt": step.attempts}
@@ -192,6 +181,26 @@ class Ledger:
         job.message = f"{step.title}: {step.message}" if step.message else step.title
         data = {"progress": step.progress, "job_progress": job.progress, "message": step.message}
         repository.add_event(db, job.id, "progress", data, step.key)
+
+
+def persist(action: Callable[[], Value], check: Callable[[], None]) -> Value:
+    """Do something with the database, and when it is away, wait for it: a restart of the database fails no job.
+
+    Args:
+        action: a whole transaction, which may be repeated.
+        check: called before every attempt; raises to give up.
+    """
+    pause, longest = _RETRY_S
+    while True:
+        check()
+        try:
+            return action()
+        except DBAPIError as error:
+            if not _worth_repeating(error):
+                raise
+            log.warning("the database is away, trying again in %.1f s (%s)", pause, type(error.orig).__name__)
+            time.sleep(pause * random.uniform(0.5, 1.0))
+            pause = min(2 * pause, longest)
 
 
 def _worth_repeating(error: DBAPIError) -> bool:

@@ -19,8 +19,8 @@ from app.platform.errors import BetaloopError
 from app.platform.jobs import engine, registry, repository
 from app.platform.jobs.context import JobContext, Outcome
 from app.platform.jobs.errors import JobCancelled, WorkerStopping
-from app.platform.jobs.ledger import Ledger
-from app.platform.jobs.models import JobStatus
+from app.platform.jobs.ledger import Ledger, persist
+from app.platform.jobs.models import Job, JobStatus
 from app.platform.jobs.nursery import Call, Nursery
 from app.platform.jobs.slots import Slots
 from app.settings import get_settings
@@ -149,9 +149,9 @@ class JobRunner:
         return done
 
     def _run(self, job_id: str, flags: Flags) -> None:
-        with new_session() as db:
-            job = repository.get(db, job_id)
-        ledger = Ledger(job_id, job.created_by, self._worker, _check_abandoned(flags))
+        check = _check_abandoned(flags)
+        job = persist(lambda: _job(job_id), check)
+        ledger = Ledger(job_id, job.created_by, self._worker, check)
         if not ledger.open():
             return
         steps = JobSteps(ledger, flags, self._nursery, self._slots)
@@ -177,6 +177,11 @@ def worded(error: Exception) -> str:
         return str(error)
     text = str(error.orig if isinstance(error, DBAPIError) else error).strip()
     return f"{type(error).__name__}: {text.splitlines()[0]}" if text else type(error).__name__
+
+
+def _job(job_id: str) -> Job:
+    with new_session() as db:
+        return repository.get(db, job_id)
 
 
 def _check_abandoned(flags: Flags) -> Callable[[], None]:

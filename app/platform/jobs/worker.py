@@ -118,7 +118,7 @@ class Watchman:
                 self._end_given_up()
             if time.monotonic() >= self._next_housekeeping:
                 self._next_housekeeping = time.monotonic() + self._pace.housekeeping_s
-                self._tidy()
+                self.tidy()
         except DBAPIError as error:
             log.warning("the database is away: %s", type(error.orig).__name__)
 
@@ -174,7 +174,8 @@ class Watchman:
                 else:
                     repository.end_job(db, job, JobStatus.FAILED, error=_why_given_up(reason))
 
-    def _tidy(self) -> None:
+    def tidy(self) -> None:
+        """Remove the engine's rows and the folders of jobs that ended long ago."""
         engine.delete_finished(database_url(), KEEP_FINISHED)
         with transaction(_ACTOR) as db:
             repository.forget_workers(db, KEEP_FINISHED.total_seconds())

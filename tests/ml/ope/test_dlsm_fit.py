@@ -64,6 +64,16 @@ def test_a_finished_fit_is_taken_from_its_checkpoints(small_buffer, tmp_path):
     assert first.evaluate(POLICIES, 20) == again.evaluate(POLICIES, 20)
 
 
+def test_members_trained_on_their_own_are_the_members_of_the_ensemble(small_buffer, tmp_path):
+    for k in (1, 0):
+        Dlsm(TINY).fit_member(small_buffer, k, checkpoint_dir=tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["dlsm-member-0.pt", "dlsm-member-1.pt"]
+    joined = Dlsm(TINY).fit(small_buffer, checkpoint_dir=tmp_path).evaluate(POLICIES, 20)
+    assert joined == Dlsm(TINY).fit(small_buffer).evaluate(POLICIES, 20)
+    with pytest.raises(ValueError, match="members 0 to 1, not 2"):
+        Dlsm(TINY).fit_member(small_buffer, 2)
+
+
 def test_a_checkpoint_of_another_buffer_is_refused(small_buffer, tmp_path):
     Dlsm(TINY).fit(small_buffer, checkpoint_dir=tmp_path)
     other = ReplayBuffer(small_buffer.settings, small_buffer.sessions[:-1], "uV", "table")
@@ -122,7 +132,7 @@ def test_gaps_in_beta_and_amplitude_do_not_stop_a_fit(small_buffer):
 
 
 def test_three_sessions_are_too_few_and_the_message_says_how_many_there_are(small_buffer):
-    with pytest.raises(ValueError, match="at least 4 sessions.*the buffer has 3"):
+    with pytest.raises(ValueError, match=r"at least 4 sessions.*the buffer has 3"):
         Dlsm(TINY).fit(ReplayBuffer(small_buffer.settings, small_buffer.sessions[:3], "uV", "table"))
 
 

@@ -198,7 +198,7 @@ def test_the_same_buffer_configuration_and_seed_give_the_same_weights_bit_for_bi
     one, two = train(buffer, SMALL), train(buffer, SMALL)
     assert one.policy.to_onnx() == two.policy.to_onnx()
     assert same(weights(one.critic), weights(two.critic))
-    assert one.curve.keys() == {"update", "critic_loss", "mean_q", "action_distance"}
+    assert one.curve.keys() == {"update", "critic_loss", "mean_q", "action_distance", "saturated"}
     for name in one.curve:
         np.testing.assert_array_equal(one.curve[name], two.curve[name])
 
@@ -255,6 +255,19 @@ def test_the_torch_threads_are_given_back(buffer):
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
+
+
+def test_the_curves_last_point_is_that_of_the_policy_that_comes_back(buffer):
+    pushed = MlpPolicy(10, (16, 12), mean=100.0, std=40.0)
+    with torch.no_grad():
+        pushed.layers[-1].weight.mul_(1000)
+    trained = train(buffer, DdpgConfig(hidden=(16, 12), updates=20), initial=pushed)
+    logged = buffer.transitions()
+    actions = trained.policy.act(logged.states)
+    assert trained.curve["action_distance"][-1] == pytest.approx(np.abs(actions - logged.actions).mean(), abs=1e-5)
+    saturated = np.mean((actions < 0.01) | (actions > 0.99))
+    assert 0 < saturated < 1
+    assert trained.curve["saturated"][-1] == pytest.approx(saturated, abs=0.01)
 
 
 def test_a_training_that_diverges_says_so(buffer):

@@ -64,7 +64,9 @@ class Rcs:
         return [{"RecordInfo": info(), "TimeDomainData": packets}]
 
     def settings(self, enabled: tuple[int, ...] = (0,), sense: int = 1) -> list[Any]:
-        programs = [{"isEnabled": 0 if p in enabled else 131, "amplitudeInMilliamps": 8.5, "pulseWidthInMicroseconds": 60} for p in range(4)]
+        programs = [
+            {"isEnabled": 0 if p in enabled else 131, "amplitudeInMilliamps": 8.5, "pulseWidthInMicroseconds": 60} for p in range(4)
+        ]
         channel = {"plusInput": 4, "minusInput": 1, "sampleRate": 1}
         off = {"plusInput": 8, "minusInput": 1, "sampleRate": 240}
         return [

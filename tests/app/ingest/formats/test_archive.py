@@ -17,7 +17,9 @@ def members(path, **limits):
 
 
 def test_paths_that_lead_out_are_ignored_and_said(pack):
-    names, ignored = members(pack({"../evil.json": "1", "/etc/passwd.json": "1", "C:\\x.json": "1", "a/../../b.json": "1", "ok/StimLog.json": "[]"}))
+    names, ignored = members(
+        pack({"../evil.json": "1", "/etc/passwd.json": "1", "C:\\x.json": "1", "a/../../b.json": "1", "ok/StimLog.json": "[]"})
+    )
     assert names == ["ok/StimLog.json"]
     assert len(ignored) == 4
 

@@ -90,7 +90,9 @@ def test_any_file_may_be_missing(rcs, pack, gone):
 
 
 @pytest.mark.parametrize("stem", ["DeviceSettings", "StimLog", "RawDataTD", "RawDataPower", "AdaptiveLog", "EventLog"])
-@pytest.mark.parametrize("content", ["", "no json", "[", '[{"RecordInfo":5}]', '[[[]]]', '[{"RecordInfo":{"HostUnixTime":"x"},"TherapyConfigGroup0":[1]}]'])
+@pytest.mark.parametrize(
+    "content", ["", "no json", "[", '[{"RecordInfo":5}]', "[[[]]]", '[{"RecordInfo":{"HostUnixTime":"x"},"TherapyConfigGroup0":[1]}]']
+)
 def test_nonsense_in_one_file_never_costs_the_others(rcs, pack, stem, content):
     recording = one(decode(pack(session(rcs, **{stem: content}))))
     if stem != "RawDataTD":
@@ -130,7 +132,9 @@ def test_the_same_recording_in_another_zip_has_the_same_fingerprint(rcs, pack):
 
 def test_notes_keep_their_label_and_lose_their_text(rcs, pack):
     notes = [
-        rcs.note(1.0, "Stop Stim Run. Stim amp: 0.8mA. Stim Rate: 130.2Hz. Pulse Width: 60μs. Group A. Mrs Lovelace was tired", swapped=True),
+        rcs.note(
+            1.0, "Stop Stim Run. Stim amp: 0.8mA. Stim Rate: 130.2Hz. Pulse Width: 60μs. Group A. Mrs Lovelace was tired", swapped=True
+        ),
         rcs.note(8.0, "Mrs Lovelace says 3.0 mA is fine"),
         rcs.note(9.0, "call 555 1234"),
     ]

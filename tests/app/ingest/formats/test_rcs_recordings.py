@@ -112,7 +112,7 @@ def test_with_the_interval_in_force_the_sweep_has_no_false_gaps(sweep):
 
 def test_device_power_is_the_detectors_input_in_every_packet(recordings):
     path = recordings / "rcs/embedded_adaptive.zip"
-    power, settings = stream(path, "RawDataPower", read_bands)
+    power, _ = stream(path, "RawDataPower", read_bands)
     log, _ = stream(path, "AdaptiveLog", lambda packets, settings: read_adaptive(packets, _interval_at(settings)))
     ours = dict(zip(zip(power.headers.seconds, power.headers.tick, strict=True), power.bands[:, 0], strict=True))
     theirs = dict(zip(zip(log.headers.seconds, log.headers.tick, strict=True), log.ld0_inputs[:, 0], strict=True))

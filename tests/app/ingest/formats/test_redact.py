@@ -12,7 +12,20 @@ from app.ingest.formats.redact import pseudonym, redact_rcs_zip
 
 KEY = b"a key of the clinic's own"
 REAL = ["stim_sweep", "embedded_adaptive", "montage_packet_loss", "empty_streams"]
-REAL_SECRETS = ["NPC700", "SUBJ", "RCS0", "NLD0", "NLF0", "NKW0", "R STN", "R GPi", "Dystonia", "opened his eyes", "[78,80,67", "[78, 80, 67"]
+REAL_SECRETS = [
+    "NPC700",
+    "SUBJ",
+    "RCS0",
+    "NLD0",
+    "NLF0",
+    "NKW0",
+    "R STN",
+    "R GPi",
+    "Dystonia",
+    "opened his eyes",
+    "[78,80,67",
+    "[78, 80, 67",
+]
 
 
 def unpacked(path):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from sqlalchemy import text
 
 from app.platform.database import transaction
 from app.platform.errors import NotFound
@@ -21,8 +22,11 @@ from app.platform.jobs.models import JobStatus
 from app.platform.jobs.nursery import Call, Heard, Nursery
 from app.platform.jobs.registry import compute, compute_function
 from app.platform.jobs.slots import Slots
+from app.platform.jobs.steps import JobRunner
 from app.platform.jobs.stream import job_events
 from app.platform.jobs.watch import show_progress, watch
+from app.platform.jobs.worker import Identity, IdentityLost, Pace, Watchman
+from app.settings import get_settings
 
 
 def test_a_free_slot_goes_to_the_job_that_has_the_fewest():
@@ -237,6 +241,47 @@ def test_nothing_more_is_recorded_for_a_job_that_was_cancelled(jobs):
     with pytest.raises(JobCancelled):
         ledger.commit_step("a", lambda db: {})
     assert jobs.get(job_id).steps[0].status == "cancelled"
+
+
+def test_a_worker_name_is_held_by_one_and_free_again_when_its_connection_ends(jobs):
+    first, second = Identity(), Identity()
+    assert (first.claim()[-2:], second.claim()[-2:]) == ("-0", "-1")
+    first.release()
+    third = Identity()
+    assert third.claim() == first.id
+    with pytest.raises(IdentityLost, match="another worker took the name"):
+        first.keep()
+    second.keep()
+    for identity in (second, third):
+        identity.release()
+
+
+def test_a_sign_of_life_tells_how_long_the_worker_was_silent(jobs):
+    with transaction("test") as db:
+        assert repository.beat(db, "w", "host", 1) == 0.0
+    with transaction("test") as db:
+        db.execute(text("update worker set seen_at = seen_at - interval '70 seconds'"))
+        assert repository.live_workers(db, 60.0) == []
+        assert repository.beat(db, "w", "host", 1) == pytest.approx(70, abs=5)
+        assert [w.id for w in repository.live_workers(db, 60.0)] == ["w"]
+        repository.leave(db, "w")
+        assert repository.live_workers(db, 60.0) == []
+
+
+def test_folders_of_jobs_that_ended_long_ago_are_removed_and_others_kept(jobs):
+    old, recent, running = jobs.submit(), jobs.submit(), jobs.submit()
+    with transaction("test") as db:
+        for job_id in (old, recent):
+            repository.end_job(db, repository.locked(db, job_id), JobStatus.CANCELLED)
+        db.execute(text("update job set finished_at = now() - interval '15 days' where id = :id"), {"id": old})
+    for job_id in (old, recent, running):
+        (get_settings().jobs_dir / job_id / "step").mkdir(parents=True)
+    identity, runner = Identity(), JobRunner("w", 1)
+    identity.claim()
+    Watchman(identity, runner, Pace()).tidy()
+    assert {p.name for p in get_settings().jobs_dir.iterdir()} == {recent, running}
+    runner.stop(1.0)
+    identity.release()
 
 
 def test_the_terminal_sees_the_job_until_it_ends(jobs):

@@ -1,0 +1,125 @@
+"""Charts of the ranking and of running jobs."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any
+
+from app.evaluation.schemas import METHOD_NAMES, RankedPolicy, RankingOut
+from app.platform.charts import MUTED, Chart, axis, figure
+from app.platform.jobs.models import Job, JobEvent
+
+METHOD_STYLES = {
+    "dlsm": {"color": "token:rl", "symbol": "diamond"},
+    "linear": {"color": "token:distilled", "symbol": "square"},
+    "wis": {"color": "token:random", "symbol": "triangle-up"},
+    "pdis": {"color": "token:other", "symbol": "x"},
+}
+PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")
+DASHES = ("solid", "dash", "dot")
+JOB_CURVES = {
+    "mean_q": ("Training: mean Q of each policy", "reward; an unbounded climb is over-estimation"),
+    "action_distance": ("Training: distance from the logged amplitudes", "mean absolute difference, fraction"),
+    "loss": ("Losses", "distillation: squared action error; DLSM: negative bound per session"),
+    "held_out_score": ("DLSM: score on held-out sessions", "lower is better"),
+}
+"""Learning curves by the name that the computations give them: title and unit."""
+
+
+def shown_references(ranking: RankingOut) -> list[RankedPolicy]:
+    """References for the page: cDBS, the best constant and proportional control; the API has every constant."""
+    return [p for p in ranking.references if p.reference != "constant"]
+
+
+def label(policy: RankedPolicy) -> str:
+    """A policy's name in the ranking's charts and tables."""
+    names = {"cdbs": "cDBS (reference)", "best_constant": f"best constant: {policy.name}", "proportional": "proportional (reference)"}
+    return names.get(policy.reference or "", policy.name)
+
+
+def forest(ranking: RankingOut) -> Chart:
+    """Estimate and interval of every policy, best on top; the ranking's method is shown, the others wait in the legend."""
+    shown = [*ranking.policies, *shown_references(ranking)]
+    data = []
+    for method in sorted(ranking.methods, key=lambda m: m != ranking.default_method):
+        have = [p for p in shown if method in p.estimates]
+        estimates = [p.estimates[method] for p in have]
+        style = METHOD_STYLES[method]
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": METHOD_NAMES[method],
+                "visible": True if method == ranking.default_method else "legendonly",
+                "x": [e.value for e in estimates],
+                "y": [label(p) for p in have],
+                "marker": {
+                    "size": 10,
+                    "color": style["color"],
+                    "symbol": [style["symbol"] + ("" if e.supported else "-open") for e in estimates],
+                },
+                "error_x": {
+                    "type": "data",
+                    "symmetric": False,
+                    "array": [e.high - e.value for e in estimates],
+                    "arrayminus": [e.value - e.low for e in estimates],
+                    "color": style["color"],
+                },
+                "hovertemplate": "%{y}: %{x:.2f}<extra>" + METHOD_NAMES[method] + "</extra>",
+            }
+        )
+    level = next((e.level for p in shown for e in p.estimates.values()), 0.9)
+    rows = [
+        [label(p), p.rank, METHOD_NAMES[m], e.value, e.low, e.high, "yes" if e.supported else "no"]
+        for p in shown
+        for m, e in p.estimates.items()
+    ]
+    return Chart(
+        id="forest",
+        title="Estimated return",
+        subtitle=f"E[r_end + discounted step rewards over {ranking.horizon_steps} steps], {100 * level:.0f} % intervals · "
+        f"n = {ranking.snapshot.sessions} sessions · open marks: not supported by the data",
+        figure=figure(
+            data,
+            xaxis=axis("Estimated return", "reward"),
+            yaxis=axis("", categoryorder="array", categoryarray=[label(p) for p in reversed(shown)]),
+            margin={"l": 150, "r": 16, "t": 12, "b": 44},
+        ),
+        columns=["Policy", "Rank", "Method", "Value (reward)", f"Low ({100 * level:.0f} %)", f"High ({100 * level:.0f} %)", "Supported"],
+        rows=rows,
+        height=110 + 30 * len(shown),
+    )
+
+
+def job_curves(job: Job, events: Sequence[JobEvent]) -> list[Chart]:
+    """The learning curves of a job's steps; of a step that was resumed, the last point of an x counts."""
+    curves: dict[str, dict[str, dict[float, float]]] = defaultdict(lambda: defaultdict(dict))
+    for event in events:
+        for point in event.data.get("points", []):
+            for name, value in point["values"].items():
+                curves[name][event.step_key or ""][point["x"]] = value
+    titles = {s.key: s.title for s in job.steps}
+    return [_curve_chart(name, curves[name], titles) for name in JOB_CURVES if name in curves]
+
+
+def _curve_chart(name: str, by_step: dict[str, dict[float, float]], titles: dict[str, str]) -> Chart:
+    title, unit = JOB_CURVES[name]
+    data: list[dict[str, Any]] = []
+    rows: list[list[Any]] = []
+    for k, (step, points) in enumerate(sorted(by_step.items())):
+        x = sorted(points)
+        line = {"color": PALETTE[k % len(PALETTE)], "dash": DASHES[k // len(PALETTE) % len(DASHES)], "width": 1.8}
+        data.append({"type": "scatter", "mode": "lines", "name": titles.get(step, step), "x": x, "y": [points[v] for v in x], "line": line})
+        rows += [[titles.get(step, step), v, points[v]] for v in x]
+    return Chart(
+        id=f"job-{name}",
+        title=title,
+        subtitle=f"{unit} · n = {len(rows)} points of {len(by_step)} steps",
+        figure=figure(
+            data, xaxis=axis("Update"), yaxis=axis(""), showlegend=True, legend={"orientation": "h", "y": -0.25, "font": {"color": MUTED}}
+        ),
+        columns=["Step", "Update", title],
+        rows=rows,
+        height=340,
+    )

@@ -1,0 +1,183 @@
+"""Charts of one session: beta against the threshold and the amplitude on one time axis, and the recording's other traces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.platform.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, figure, horizontal
+from app.study.models import Trace
+from app.study.service import SessionData
+from app.study.traces import unpack
+from ml.mdp import AMPLITUDE_TOLERANCE
+
+_DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
+_COLOURS = ("token:cdbs", "token:rl", "token:random", "token:distilled", "token:other", "token:no_dbs")
+
+
+@dataclass(frozen=True)
+class StimulationStep:
+    """A stretch of equal amplitude, in seconds of the session.
+
+    Attributes:
+        amplitude_ma, fraction: None where unknown.
+    """
+
+    start_s: float
+    stop_s: float
+    amplitude_ma: float | None
+    fraction: float | None
+
+    @property
+    def above_cdbs(self) -> bool:
+        """Whether it exceeds the cDBS amplitude."""
+        return self.fraction is not None and self.fraction > 1 + AMPLITUDE_TOLERANCE
+
+
+def stimulation_steps(data: SessionData) -> list[StimulationStep]:
+    """Runs of equal amplitude within the session; unknown stretches between known ones are steps without amplitude."""
+    table, period = data.table, data.settings.period_s
+    inside = table.t_s > 0
+    ends, values = table.t_s[inside], np.where(np.isnan(table.amplitude_ma), table.fraction, table.amplitude_ma)[inside]
+    if not np.any(~np.isnan(values)):
+        return []
+    # amplitudes are set in steps of 0.1 mA or coarser; float32 noise makes no new step
+    keys = np.where(np.isnan(values), -1.0, np.round(values, 4))
+    starts = np.flatnonzero(np.r_[True, np.diff(keys) != 0])
+    stops = np.r_[starts[1:], keys.size]
+    milliamperes, fraction = table.amplitude_ma[inside], table.fraction[inside]
+    return [
+        StimulationStep(float(ends[i] - period), float(ends[j - 1]), _known(milliamperes[i]), _known(fraction[i]))
+        for i, j in zip(starts, stops, strict=True)
+    ]
+
+
+def control_chart(data: SessionData) -> Chart:
+    """Beta with the threshold above, amplitude in mA and as a fraction below, one time axis; gaps stay gaps."""
+    table, settings = data.table, data.settings
+    minutes = table.t_s / 60
+    unit = table.beta_trace.unit if table.beta_trace else ""
+    known = int(np.sum(~np.isnan(table.beta[table.t_s > 0])))
+    traces: list[dict[str, Any]] = [
+        {
+            "type": "scatter", "mode": "lines+markers", "name": "Beta amplitude", "x": minutes, "y": table.beta, "connectgaps": False,
+            "line": {"color": ACCENT, "width": 1.5}, "marker": {"size": 3.5, "color": ACCENT}, "hovertemplate": f"%{{x:.2f}} min<br>%{{y:.4g}} {unit}<extra>beta</extra>",
+        },
+        *_amplitude_traces(data, minutes),
+    ]  # fmt: skip
+    layout: dict[str, Any] = {
+        "grid": {"rows": 2, "columns": 1},
+        "xaxis": axis("Time in session", "min", anchor="y2", zeroline=False),
+        "yaxis": axis("Beta", unit, domain=[0.47, 1.0], zeroline=False, rangemode="tozero"),
+        "yaxis2": axis("Amplitude", "mA" if _has(table.amplitude_ma) else "fraction", domain=[0.0, 0.38], rangemode="nonnegative", zeroline=False),
+        "shapes": [], "annotations": [], "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0},
+        "hovermode": "x unified", "margin": {"l": 62, "r": 62, "t": 30, "b": 44},
+    }  # fmt: skip
+    _mark_lead(layout, float(minutes[0]))
+    if settings.xi_beta is not None:
+        _add(layout, horizontal(settings.xi_beta, f"threshold {settings.xi_beta:.4g} {unit}".strip(), WARN))
+    if _has(table.amplitude_ma) and table.cdbs_ma:
+        _add(layout, horizontal(table.cdbs_ma, f"cDBS {table.cdbs_ma:.3g} mA", MUTED, "dot", "y2"))
+        top = 1.15 * max(table.cdbs_ma, float(np.nanmax(table.amplitude_ma)))
+        layout["yaxis2"] |= {"range": [0, top]}
+        layout["yaxis3"] = axis(
+            "of cDBS",
+            "%",
+            overlaying="y2",
+            side="right",
+            range=[0, 100 * top / table.cdbs_ma],
+            showgrid=False,
+            zeroline=False,
+            tickmode="auto",
+        )
+        traces.append({"type": "scatter", "x": [minutes[0]], "y": [None], "yaxis": "y3", "showlegend": False, "hoverinfo": "skip"})
+    subtitle = f"{unit or 'no unit'} over {settings.period_s:g} s · n = {known} of {int(np.sum(table.t_s > 0))} steps with beta"
+    columns = ("Step end (s)", f"Beta ({unit or '—'})", "Amplitude (mA)", "Fraction of cDBS")
+    rows: list[list[Cell]] = [
+        [float(t), _known(b), _known(a), _known(f)]
+        for t, b, a, f in zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, strict=True)
+    ]
+    return Chart("control", "Beta and amplitude", subtitle, figure(traces, **layout), columns, rows, height=470)
+
+
+def other_charts(traces: Sequence[Trace], origin_s: float, duration_s: float, skip: set[int]) -> list[Chart]:
+    """The recording's traces besides the two that the controller used, one chart per unit."""
+    charts = []
+    rest = [t for t in traces if t.id not in skip]
+    for number, unit in enumerate(sorted({t.unit for t in rest})):
+        group = [t for t in rest if t.unit == unit]
+        lines: list[dict[str, Any]] = []
+        rows: list[list[Cell]] = []
+        for i, trace in enumerate(group):
+            ends = trace.first_end_s - origin_s + trace.dt_s * np.arange(trace.n)
+            inside = ends <= duration_s + trace.dt_s / 2
+            values = unpack(trace)
+            name = f"{trace.stream} {trace.channel}".strip().replace("_", " ")
+            lines.append(
+                {
+                    "type": "scatter", "mode": "lines", "name": name, "x": ends[inside] / 60, "y": values[inside], "connectgaps": False,
+                    "line": {"color": _COLOURS[i % len(_COLOURS)], "dash": _DASHES[i // len(_COLOURS) % len(_DASHES)], "width": 1.5},
+                }
+            )  # fmt: skip
+            known = values[inside][~np.isnan(values[inside])]
+            spread: list[Cell] = [float(np.median(known)), float(known.min()), float(known.max())] if known.size else [None, None, None]
+            rows.append([name, int(known.size), int(inside.sum()), *spread, trace.source])
+        streams = ", ".join(sorted({t.stream.replace("_", " ") for t in group}))
+        title = streams[:1].upper() + streams[1:]
+        layout = {"xaxis": axis("Time in session", "min"), "yaxis": axis("", unit, zeroline=False), "showlegend": True}
+        columns = ("Trace", "Valid steps", "Steps", f"Median ({unit})", f"Minimum ({unit})", f"Maximum ({unit})", "Source")
+        n = sum(int(r[1]) for r in rows if isinstance(r[1], int))
+        charts.append(
+            Chart(
+                f"traces-{number}",
+                title,
+                f"{unit} · n = {n} windows in {len(group)} traces",
+                figure(lines, **layout),
+                columns,
+                rows,
+                height=300,
+            )
+        )
+    return charts
+
+
+def _amplitude_traces(data: SessionData, minutes: NDArray[np.float64]) -> list[dict[str, Any]]:
+    table = data.table
+    values = table.amplitude_ma if _has(table.amplitude_ma) else table.fraction
+    # a row holds the amplitude over the period that ends at its time, so the line steps first and then runs
+    base: dict[str, Any] = {"type": "scatter", "yaxis": "y2", "connectgaps": False, "line": {"shape": "vh", "color": TEXT, "width": 1.8}}
+    hover = "%{y:.3g}" + (" mA (%{customdata:.0%})" if _has(table.amplitude_ma) else "") + "<extra>amplitude</extra>"
+    traces = [
+        base | {"mode": "lines", "name": "Amplitude", "x": minutes, "y": values, "customdata": table.fraction, "hovertemplate": hover}
+    ]
+    above = table.fraction > 1 + AMPLITUDE_TOLERANCE
+    if np.any(above):
+        mark = {"symbol": "triangle-up", "size": 8, "color": BAD}
+        traces.append(
+            {"type": "scatter", "mode": "markers", "yaxis": "y2", "name": "above cDBS", "x": minutes[above], "y": values[above], "marker": mark, "hoverinfo": "skip"}
+        )  # fmt: skip
+    return traces
+
+
+def _mark_lead(layout: dict[str, Any], first: float) -> None:
+    """Shade the window before the session: the state s_0."""
+    layout["shapes"].append(
+        {"type": "rect", "xref": "x", "yref": "paper", "x0": first, "x1": 0, "y0": 0, "y1": 1, "fillcolor": GRID, "opacity": 0.35, "line": {"width": 0}, "layer": "below"}
+    )  # fmt: skip
+
+
+def _add(layout: dict[str, Any], line_and_label: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    layout["shapes"].append(line_and_label[0])
+    layout["annotations"].append(line_and_label[1])
+
+
+def _has(values: NDArray[np.float64]) -> bool:
+    return bool(np.any(~np.isnan(values)))
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)

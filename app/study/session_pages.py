@@ -1,0 +1,185 @@
+"""HTML page of a session: its traces, stimulation, data quality, QoCs and corrections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.orm import Session
+
+from app.accounts import policy as can
+from app.accounts.deps import CurrentCaller
+from app.accounts.policy import Caller
+from app.platform.database import Db
+from app.platform.errors import BetaloopError, Invalid
+from app.platform.forms import FormValues, parse
+from app.platform.templates import render
+from app.study import repository, service
+from app.study.api import CurrentSession
+from app.study.blinding import CONTROLLER_NAMES, arm
+from app.study.models import StudySession
+from app.study.schemas import QocIn, SessionChange
+from app.study.service import SessionData
+from app.study.session_charts import control_chart, other_charts, stimulation_steps
+from app.study.traces import session_offset_s
+from ml.energy import relative_energy
+
+router = APIRouter()
+
+_QOC_LABELS = {"grasp_hz": "Grasp frequency", "rating": "Rating", "tremor_percent": "Tremor", "reason": "Reason"}
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A session in a few numbers.
+
+    Attributes:
+        steps, beta_steps, amplitude_steps: of the session, and those with a valid beta and a known amplitude.
+        gaps, longest_gap_s: stretches without beta within the session.
+        median_beta: in `unit`; None without beta.
+        below_threshold: share of valid steps with beta below xi_beta; None without a threshold or beta.
+        mean_fraction, energy: of the steps with a known fraction; energy relative to cDBS; None without any.
+        above_cdbs: steps above 100 % of the cDBS amplitude.
+    """
+
+    steps: int
+    beta_steps: int
+    amplitude_steps: int
+    gaps: int
+    longest_gap_s: float
+    unit: str
+    median_beta: float | None
+    below_threshold: float | None
+    mean_fraction: float | None
+    energy: float | None
+    above_cdbs: int
+
+
+def summarise(data: SessionData) -> Summary:
+    """The numbers of a session's step table."""
+    table, settings = data.table, data.settings
+    inside = table.t_s > 0
+    beta, fraction = table.beta[inside], table.fraction[inside]
+    missing = np.isnan(beta)
+    edges = np.flatnonzero(np.diff(np.r_[False, missing, False].astype(int)))
+    lengths = edges[1::2] - edges[::2]
+    valid, known = beta[~missing], fraction[~np.isnan(fraction)]
+    return Summary(
+        steps=int(inside.sum()),
+        beta_steps=int(valid.size),
+        amplitude_steps=int(np.sum(~np.isnan(fraction) | ~np.isnan(table.amplitude_ma[inside]))),
+        gaps=int(lengths.size),
+        longest_gap_s=float(lengths.max(initial=0) * settings.period_s),
+        unit=table.beta_trace.unit if table.beta_trace else "",
+        median_beta=float(np.median(valid)) if valid.size else None,
+        below_threshold=float(np.mean(valid < settings.xi_beta)) if valid.size and settings.xi_beta is not None else None,
+        mean_fraction=float(known.mean()) if known.size else None,
+        energy=relative_energy(fraction) if known.size else None,
+        above_cdbs=table.above_one,
+    )
+
+
+@router.get("/sessions/{session_id}")
+def session_page(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """One session."""
+    return _page(request, db, session, caller)
+
+
+@router.post("/sessions/{session_id}/qoc")
+def record_qoc(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Enter or correct QoCs."""
+    try:
+        service.record_qoc(db, session, parse(QocIn, values, _QOC_LABELS), caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, db, session, caller, error, typed={k: str(v) for k, v in values.items()})
+    db.commit()
+    return RedirectResponse(f"/sessions/{session.id}?done=qoc", 303)
+
+
+@router.post("/sessions/{session_id}/exclusion")
+def exclude(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Keep a session out of buffers and analyses, or take it in again."""
+    include = values.get("include") == "yes"
+    why = str(values.get("excluded_reason", "")).strip()
+    try:
+        if not include and not why:
+            raise Invalid("An exclusion needs a reason.", "Say why the session shall not count.")
+        change = SessionChange(excluded_reason=None if include else why[:1000], reason="included again" if include else why[:1000])
+        service.change_session(db, session, change, caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, db, session, caller, error)
+    db.commit()
+    return RedirectResponse(f"/sessions/{session.id}?done={'included' if include else 'excluded'}", 303)
+
+
+@router.post("/sessions/{session_id}/correction")
+def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Correct what a session was: controller, policy, hemisphere, the trace that drove the controller."""
+    try:
+        fields: dict[str, Any] = {n: values.get(n, "") for n in ("controller", "hemisphere", "reason") if n in values}
+        policy = str(values.get("policy", "")).strip()
+        fields["policy_id"] = _policy_id(db, session, policy) if policy else ""
+        stream, _, channel = str(values.get("control", "")).partition("\t")
+        if stream:
+            fields |= {"control_stream": stream, "control_channel": channel}
+        service.change_session(db, session, parse(SessionChange, fields), caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, db, session, caller, error)
+    db.commit()
+    return RedirectResponse(f"/sessions/{session.id}?done=corrected", 303)
+
+
+def _policy_id(db: Session, session: StudySession, name: str) -> int:
+    found = repository.policy_id(db, session.visit.participant_id, name)
+    if found is None:
+        raise Invalid(f"Participant {session.visit.participant.code} has no policy '{name}'.", "Give the name or number of one.")
+    return found
+
+
+def _page(
+    request: Request,
+    db: Session,
+    session: StudySession,
+    caller: Caller,
+    error: BetaloopError | None = None,
+    typed: dict[str, str] | None = None,
+) -> HTMLResponse:
+    participant = session.visit.participant
+    recordings = list(dict.fromkeys(s.recording for s in session.segments))
+    traces = {r.id: repository.traces_of_recording(db, r.id) for r in recordings}
+    data, trouble = None, None
+    try:
+        data = service.session_data(db, session)
+    except BetaloopError as unreadable:
+        trouble = unreadable.problem(request.url.path)
+    used = {t.id for t in (data.table.beta_trace, data.table.amplitude_trace) if t} if data else set()
+    others = [c for r in recordings for c in other_charts(traces[r.id], session_offset_s(session, r.id), session.duration_s, used)]
+    known = {n: getattr(session.qoc, n, None) for n in ("grasp_hz", "rating", "tremor_percent")}
+    page = render(
+        request,
+        "study/session.html",
+        session=session,
+        visit=session.visit,
+        participant=participant,
+        arm=arm(session, caller),
+        policy_name=repository.policy_name(db, arm(session, caller).policy_id),
+        controllers=[(c.value, name) for c, name in CONTROLLER_NAMES.items()],
+        data=data,
+        trouble=trouble,
+        summary=summarise(data) if data else None,
+        control=control_chart(data) if data and (data.table.beta_trace or data.table.amplitude_trace) else None,
+        steps=stimulation_steps(data) if data else [],
+        others=others,
+        streams=[t for r in recordings for t in traces[r.id] if t.stream != "amplitude"],
+        recordings=recordings,
+        qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
+        may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
+        problem=error.problem(request.url.path) if error else None,
+    )
+    return HTMLResponse(page, error.status if error else 200)
