@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from ml.cohort.device import rcs_session_zip, session_table_csv
-from ml.cohort.participants import PARTICIPANTS
-from ml.cohort.sessions import SimulatedSession, run_session
+from ml.cohort import PARTICIPANTS, SimulatedSession, rcs_session_zip, run_session, session_table_csv
 
 VISITS = 3
 """Visits with data; one more is planned after them."""
@@ -22,6 +20,8 @@ DEVICE_PARTICIPANT = "P1"
 """This participant's sessions arrive as RC+S folders, the others' as tables."""
 _STEPS_PER_MINUTE = 30
 _LEAD_STEPS = 10
+_DEVICE_STARTS_S = 5
+"""Seconds from the start of a simulated device recording to its first sample."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class DemoSession:
         """Name and bytes of the session's file."""
         stem = f"{self.code}-visit{self.visit}-session{self.ordinal}"
         if self.code == DEVICE_PARTICIPANT:
-            recording_starts = self.begins - dt.timedelta(seconds=2 * _LEAD_STEPS)
-            return f"{stem}.zip", rcs_session_zip(self.simulated, started_at=recording_starts)
+            recording_starts = self.begins - dt.timedelta(seconds=_DEVICE_STARTS_S + 2 * _LEAD_STEPS)
+            return f"{stem}.zip", rcs_session_zip(self.simulated, started_ms=round(1000 * recording_starts.timestamp()))
         return f"{stem}.csv", session_table_csv(self.simulated)
 
     def qoc(self) -> dict[str, Any]:

@@ -1,51 +1,64 @@
-// Follows the server-sent events of a job: <section data-live="/api/v1/jobs/ID/events">. An event is {id, kind, step, at, data}:
-//   progress {progress, job_progress, message}   fills [data-step="STEP"] and [data-step="job"] (`progress` macros with these keys)
-//   step, status {status}                        fills [data-status="STEP"] or, without a step, [data-status="job"]
-//   log      {text}                              adds a line to [data-log]
-//   points   {points: [{x, values}]}             adds to the figure [data-curve="STEP"]
-// The first event, `job`, and the last, `end`, hold the whole job: at the end the page is loaded again.
-const KINDS = ["status", "step", "progress", "points", "log"];
-
+// Follows the server-sent events of a job: <section data-live="/api/v1/jobs/ID/events">. In the section, KEY is a step's key or "job":
+//   [data-step="KEY"]     a bar (the `progress` macro with that key)
+//   [data-status="KEY"]   an element whose text is the status
+//   [data-log]            log lines are added to it (anywhere in the page); what stands there is replaced, for the log comes whole
+//   figure[data-curve="KEY"]  points are added to the traces named like their values (or with them as `meta`)
+// A step that the page does not know yet, and the job's end, load the page again.
 function follow(section) {
   const source = new EventSource(section.dataset.live);
-  for (const kind of KINDS) source.addEventListener(kind, (event) => {
-    const { step, data } = JSON.parse(event.data);
-    apply(section, { ...data, step, log: data.text });
-    if (typeof data.job_progress === "number") apply(section, { progress: data.job_progress, message: data.message });
+  const on = (kind, act) => source.addEventListener(kind, (event) => act(JSON.parse(event.data)));
+  let first = true;
+  on("job", (state) => {
+    if (first) for (const log of document.querySelectorAll("[data-log]")) log.replaceChildren();
+    first = false;
+    show(section, "job", state);
+    for (const step of state.steps) show(section, step.key, step);
   });
-  source.addEventListener("job", (event) => {
-    const job = JSON.parse(event.data);
-    apply(section, { progress: job.progress, message: job.message, status: job.status });
-    for (const step of job.steps) apply(section, { step: step.key, progress: step.progress, message: step.message, status: step.status });
+  for (const kind of ["status", "step", "progress"]) on(kind, (event) => {
+    if (event.step && !byKey(section, "status", event.step).length && !byKey(section, "step", event.step).length) reload(section);
+    show(section, event.step ?? "job", event.data);
+    if (event.step && typeof event.data.job_progress === "number") show(section, "job", { progress: event.data.job_progress });
   });
-  source.addEventListener("end", () => { source.close(); location.reload(); });
+  on("log", (event) => addLog(event.step, event.data.text));
+  on("points", (event) => { for (const point of event.data.points) addPoint(section, event.step ?? "job", point); });
+  on("end", (state) => {
+    show(section, "job", state);
+    source.close();
+    reload(section);
+  });
   source.addEventListener("error", () => { section.dataset.connection = source.readyState === EventSource.CLOSED ? "closed" : "retrying"; });
   source.addEventListener("open", () => { section.dataset.connection = "open"; });
   addEventListener("pagehide", () => source.close(), { once: true });
 }
 
-const stepOf = (data) => data.step ?? null;
 const byKey = (section, attribute, key) => section.querySelectorAll(`[data-${attribute}="${CSS.escape(key)}"]`);
+const TONES = { succeeded: "good", failed: "bad", running: "info", cancelled: "warn" };
 
-function apply(section, data) {
-  const key = stepOf(data) ?? "job";
-  if (typeof data.progress === "number") {
-    for (const bar of byKey(section, "step", key)) {
-      bar.querySelector("progress").value = data.progress;
-      bar.querySelector("[data-progress-text]").textContent = `${Math.round(100 * data.progress)} %`;
+function show(section, key, { status, progress, message }) {
+  for (const bar of byKey(section, "step", key)) {
+    if (typeof progress === "number") {
+      bar.querySelector("progress").value = progress;
+      bar.querySelector("[data-progress-text]").textContent = `${Math.round(100 * progress)} %`;
     }
+    if (typeof message === "string") bar.querySelector("[data-progress-message]").textContent = message;
   }
-  if (data.message !== undefined) for (const bar of byKey(section, "step", key)) bar.querySelector("[data-progress-message]").textContent = data.message;
-  if (data.status) for (const badge of byKey(section, "status", key)) badge.textContent = data.status;
-  if (data.log) for (const log of section.querySelectorAll("[data-log]")) {
-    const atEnd = log.scrollHeight - log.scrollTop - log.clientHeight < 40;
-    log.append(`${stepOf(data) ? `[${stepOf(data)}] ` : ""}${data.log}\n`);
-    if (atEnd) log.scrollTop = log.scrollHeight;
+  if (status) for (const place of byKey(section, "status", key)) {
+    const badge = document.createElement("span");
+    badge.className = `badge ${TONES[status] ?? ""}`;
+    badge.textContent = status;
+    place.replaceChildren(badge);
   }
-  for (const point of data.points ?? []) addPoint(section, key, point);
 }
 
-// learning curves: traces are named after the values; a repeated x after a resumed step replaces its point
+function addLog(step, text) {
+  for (const log of document.querySelectorAll("[data-log]")) {
+    const atEnd = log.scrollHeight - log.scrollTop - log.clientHeight < 40;
+    log.append(`${step ? `[${step}] ` : ""}${text}\n`);
+    if (atEnd) log.scrollTop = log.scrollHeight;
+  }
+}
+
+// a repeated x, after a resumed step, replaces its point
 const waiting = new Set();
 function addPoint(section, key, { x, values }) {
   for (const figure of byKey(section, "curve", key)) {
@@ -62,6 +75,13 @@ function addPoint(section, key, { x, values }) {
     waiting.add(figure);
     setTimeout(() => { waiting.delete(figure); figure.dispatchEvent(new Event("betaloop:redraw", { bubbles: true })); }, 500);
   }
+}
+
+// at most once per page and not within two seconds of its loading, so that a job that ends at once does not make the page flicker
+function reload(section) {
+  if (section.dataset.reloading) return;
+  section.dataset.reloading = "yes";
+  setTimeout(() => location.reload(), Math.max(0, 2000 - performance.now()));
 }
 
 for (const section of document.querySelectorAll("[data-live]")) follow(section);

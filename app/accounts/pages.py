@@ -13,7 +13,7 @@ from app.accounts import repository, service
 from app.accounts.deps import COOKIE, CurrentCaller
 from app.accounts.models import Role, User
 from app.accounts.policy import Caller
-from app.platform.database import Db
+from app.platform.database import Db, set_actor
 from app.platform.errors import BetaloopError, Invalid, NotFound
 from app.platform.forms import FormValues
 from app.platform.schemas import RowId
@@ -38,6 +38,7 @@ def sign_in(request: Request, db: Db, values: FormValues) -> Response:
     email, target = str(values.get("email", "")), local_path(str(values.get("next", "/")))
     try:
         token = service.sign_in(db, email, str(values.get("password", "")))
+        set_actor(db, email.strip().lower(), request_id=request.state.request_id)
     except BetaloopError as error:
         db.commit()  # failures count
         page = render(request, "accounts/sign_in.html", problem=error.problem(request.url.path), email=email, next=target)
@@ -54,6 +55,8 @@ def sign_in(request: Request, db: Db, values: FormValues) -> Response:
 def sign_out(request: Request, db: Db) -> Response:
     """End the browser session, here and on the server."""
     if token := request.cookies.get(COOKIE):
+        if caller := service.caller_of_cookie(db, token):
+            set_actor(db, caller.label, caller.user_id, request.state.request_id)
         service.sign_out(db, token)
         db.commit()
     answer = RedirectResponse("/sign-in?done=out", 303)

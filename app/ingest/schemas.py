@@ -4,8 +4,21 @@ from __future__ import annotations
 
 from datetime import datetime
 
-from app.platform.schemas import Model
+from pydantic import Field
+
+from app.platform.schemas import Int, Model, Text
+from app.study.models import Controller, Hemisphere
 from app.study.schemas import SessionOut
+
+
+class UploadForm(Model):
+    """What the upload page asks about the session that a file holds."""
+
+    visit: Int = Field(ge=1)
+    controller: Controller
+    policy: Text | None = Field(None, max_length=100)
+    started_at: datetime | None = None
+    hemisphere: Hemisphere | None = None
 
 
 class ProblemOut(Model):

@@ -29,7 +29,7 @@ _COLUMNS = (
     ("Started\nhh:mm", 18), ("Grasp\nHz", 16), ("Rating\n1-10", 15), ("Tremor\n%", 15), ("Notes, adverse effects", 44),
 )  # fmt: skip
 _FIRST_BLANK = 8
-_ROW_MM = 10.5
+_ROW_MM, _CLOSING_MM = 9.3, 35.0
 _SHADES = {
     Controller.CDBS: (210, 228, 242),
     Controller.RL: (250, 221, 199),
@@ -51,14 +51,13 @@ class _Sheet(FPDF):  # type: ignore[misc]
         self.set_auto_page_break(True, 16)
         self.set_draw_color(*_LINE)
         self.set_line_width(0.2)
+        self.c_margin = 0.0  # text begins where boxes begin
         self.set_creation_date(printed_at)
         self.set_title(latin(f"Visit plan {view.visit.participant.code}, visit {view.visit.number}"))
         self.set_creator("betaloop")
 
     def header(self) -> None:
         plan, visit = self._view.plan, self._view.visit
-        if plan.status != "approved":
-            self._watermark("DRAFT" if plan.status == "draft" else "SUPERSEDED")
         self.set_text_color(*_INK)
         self.set_font("Helvetica", "B", 17)
         self.cell(0, 8, latin(f"Visit plan  {visit.participant.code}  visit {visit.number}"))
@@ -85,15 +84,16 @@ class _Sheet(FPDF):  # type: ignore[misc]
         self.cell(0, 5, latin(f"betaloop \u00b7 plan {plan.id}, seed {plan.seed}, {ranking} \u00b7 {self._printed}"))
         self.set_x(self.l_margin)
         self.cell(0, 5, f"Page {self.page_no()} of {{nb}}", align="R")
+        if plan.status != "approved":
+            self._watermark(plan.status.upper())
 
     def _watermark(self, word: str) -> None:
-        x, y = self.get_x(), self.get_y()
-        self.set_font("Helvetica", "B", 110)
-        self.set_text_color(228, 232, 236)
+        """Over everything, so that no filled cell hides it, and faint, so that it hides nothing."""
+        self.set_font("Helvetica", "B", 120)
+        self.set_text_color(*_INK)
         width = self.get_string_width(word)
-        with self.rotation(28, self.w / 2, self.h / 2):
+        with self.local_context(fill_opacity=0.09), self.rotation(25, self.w / 2, self.h / 2):
             self.text((self.w - width) / 2, self.h / 2 + 14, word)
-        self.set_xy(x, y)
 
 
 def render(view: PlanView, printed_by: str, printed_at: datetime) -> bytes:
@@ -105,6 +105,7 @@ def render(view: PlanView, printed_by: str, printed_at: datetime) -> bytes:
     pdf = _Sheet(view, printed_by, printed_at)
     pdf.add_page()
     _timeline(pdf, view)
+    _circumstances(pdf, view)
     if view.plan.note:
         _paragraph(pdf, "Note", view.plan.note)
     _table(pdf, view)
@@ -142,6 +143,17 @@ def _timeline(pdf: _Sheet, view: PlanView) -> None:
     pdf.set_xy(pdf.l_margin, top + height + 5.5)
 
 
+def _circumstances(pdf: _Sheet, view: PlanView) -> None:
+    """The stimulation that the day starts from, and blanks for what else bears on it."""
+    stated = [f"{a.hemisphere} {a.amplitude_ma:g} mA" + (f" (program {a.program})" if a.program else "") for a in view.visit.cdbs_amplitudes]
+    shorthand = view.visit.participant.current_settings.cdbs_amplitude_ma
+    amplitude = ", ".join(stated) or (f"{shorthand:g} mA" if shorthand else "__________ mA")
+    pdf.set_text_color(*_INK)
+    pdf.set_font("Helvetica", "", 9)
+    blanks = f"Last medication, time and dose: {'_' * 38}    Stimulation site and program: {'_' * 30}"
+    pdf.cell(0, 7, latin(f"cDBS amplitude: {amplitude}    {blanks}"), new_x=XPos.LMARGIN, new_y=YPos.NEXT)
+
+
 def _table(pdf: _Sheet, view: PlanView) -> None:
     pdf.set_font("Helvetica", "", 9)
     pdf.set_text_color(*_INK)
@@ -159,7 +171,7 @@ def _table(pdf: _Sheet, view: PlanView) -> None:
                 shade = FontFace(fill_color=_SHADES[Controller(line.item.controller)], emphasis="BOLD") if i == 2 else planned
                 row.cell(latin(text), style=shade, align="RIGHT" if i in (0, 1, 4, 5, 7) else "LEFT")
             for _ in _COLUMNS[_FIRST_BLANK:]:
-                row.cell("")
+                row.cell("", style=FontFace(fill_color=(255, 255, 255)))
     pdf.ln(2)
 
 
@@ -199,10 +211,11 @@ def _reading(pdf: _Sheet, view: PlanView) -> None:
     pdf.set_text_color(*_MUTED)
     pdf.multi_cell(_WIDTH, 3.8, latin(" ".join(sentences)), align="L", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
     pdf.ln(1.5)
-    for warning in view.warnings:
+    if view.warnings:
         pdf.set_text_color(*_INK)
         pdf.set_font("Helvetica", "B", 9)
-        pdf.multi_cell(_WIDTH, 4.2, latin(f"! {warning}"), align="L", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
+        text = "   ".join(f"! {warning}" for warning in view.warnings)
+        pdf.multi_cell(_WIDTH, 4.2, latin(text), align="L", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
 
 
 def _paragraph(pdf: _Sheet, title: str, text: str) -> None:
@@ -214,15 +227,15 @@ def _paragraph(pdf: _Sheet, title: str, text: str) -> None:
 
 def _closing(pdf: _Sheet, view: PlanView) -> None:
     """Stop rules and signatures, kept together on one page."""
-    if pdf.will_page_break(44):
+    if pdf.will_page_break(_CLOSING_MM):
         pdf.add_page()
-    pdf.ln(2)
+    pdf.ln(1)
     pdf.set_text_color(*_INK)
     pdf.set_font("Helvetica", "B", 9)
     pdf.cell(0, 5, "Stop rules", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
     pdf.set_font("Helvetica", "", 9)
     pdf.multi_cell(_WIDTH, 4.4, STOP_RULES, align="L", border=1, padding=1.5, new_x=XPos.LMARGIN, new_y=YPos.NEXT)
-    line_y, width = pdf.get_y() + 15, 86.0
+    line_y, width = pdf.get_y() + 12, 86.0
     who = "name, signature, date"
     signers = (f"Clinician in charge: {who}", f"Study engineer: {who}", "Back on clinical settings: time, initials")
     pdf.set_font("Helvetica", "", 8)

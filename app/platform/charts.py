@@ -80,7 +80,8 @@ def figure(data: Sequence[Mapping[str, Any]], **layout: Any) -> dict[str, Any]:
 
 def axis(title: str, unit: str = "", **more: Any) -> dict[str, Any]:
     """An axis with its unit in the title."""
-    return {"title": {"text": f"{title} ({unit})" if unit else title}, **more}
+    text = f"{title} ({unit})" if title and unit else title or unit
+    return {"title": {"text": text, "font": {"size": 13}}, **more}
 
 
 def horizontal(

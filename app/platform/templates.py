@@ -75,6 +75,15 @@ def minutes(seconds: float | None) -> str:
     return f"{whole // 60} min" + (f" {whole % 60} s" if whole % 60 else "") if whole >= 60 else f"{whole} s"
 
 
+def size(value: int) -> str:
+    """Bytes for people."""
+    amount, unit = float(value), "B"
+    for larger in ("KiB", "MiB", "GiB"):
+        if amount >= 1024:
+            amount, unit = amount / 1024, larger
+    return f"{number(amount)} {unit}"
+
+
 def when(value: datetime | date | None) -> str:
     """A date, or a time to the minute (UTC)."""
     if value is None:
@@ -82,5 +91,5 @@ def when(value: datetime | date | None) -> str:
     return value.strftime("%Y-%m-%d %H:%M UTC") if isinstance(value, datetime) else value.isoformat()
 
 
-_environment.filters.update(number=number, fixed=fixed, minutes=minutes, when=when)
+_environment.filters.update(number=number, fixed=fixed, minutes=minutes, size=size, when=when)
 _environment.globals.update(static_url=static_url, plotly_url=plotly_url)

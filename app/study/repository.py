@@ -139,6 +139,12 @@ def policy_id(db: Session, participant_id: int, name_or_id: str) -> int | None:
     return found
 
 
+def policy_names(db: Session, participant_id: int) -> Sequence[str]:
+    """Names of a participant's policies."""
+    policies = table("policy", column("participant_id"), column("name"))
+    return db.scalars(select(policies.c.name).where(policies.c.participant_id == participant_id).order_by(policies.c.name)).all()
+
+
 def policy_name(db: Session, policy_id: int | None) -> str | None:
     """Name of a policy, by its number."""
     policies = table("policy", column("id"), column("name"))

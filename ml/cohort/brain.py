@@ -5,13 +5,13 @@ Two populations, subthalamic nucleus (S) and external globus pallidus (G), in sp
     tau_S dS/dt = F_S(w_CS (Ctx + sigma_c xi) - w_GS G(t - 6 ms)) - S
     tau_G dG/dt = F_G((1 - eta E) w_SG S(t - 6 ms) - w_GG G(t - 4 ms) - w_XG Str) - G
 
-with the sigmoid F(x) = M / (1 + exp(-4 x / M) (M - B) / B) and weights on the line from the healthy (K = 0) to the parkinsonian (K = 1) set of
-Nevado-Holgado, Terry and Bogacz 2010 (J Neurosci 30:12340). DBS removes a share eta E of the STN-GPe loop gain, where E follows the amplitude
-fraction with fast wash-in and slow wash-out. Every population input is delayed, so over one step of 1 ms the drive is known and the leak is
-integrated exactly (exponential integrator, trapezoid in the drive).
+with the sigmoid F(x) = M / (1 + exp(-4 x / M) (M - B) / B) and weights on the line from the healthy (K = 0) to the parkinsonian
+(K = 1) set of Nevado-Holgado, Terry and Bogacz 2010 (J Neurosci 30:12340). DBS removes a share eta E of the STN-GPe loop gain, where E
+follows the amplitude fraction with fast wash-in and slow wash-out. Every population input is delayed, so over one step of 1 ms the drive
+is known and the leak is integrated exactly (exponential integrator, trapezoid in the drive).
 
-Each session owns its random streams: splitmix64, a counter hashed per draw, keyed by the session's seed. A session's numbers therefore depend
-neither on the batch it runs in, nor on threads, nor on what the controller does (two policies with one seed see the same noise).
+Each session owns its random streams: splitmix64, a counter hashed per draw, keyed by the session's seed. A session's numbers therefore
+depend neither on the batch it runs in, nor on threads, nor on what the controller does (two policies with one seed see the same noise).
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ def advance(state: Any, counters: Any, constants: Any, amplitude: Any, medicatio
 
 @njit(cache=True)
 def initial_state(counters: Any, constants: Any, amplitude: float) -> Any:
-    """State of N sessions that have been under one constant amplitude for long, shape [N, STATE_SIZE]; the fast part still has to settle."""
+    """State of N sessions long under one constant amplitude, shape [N, STATE_SIZE]; the fast part still has to settle."""
     state = np.zeros((counters.shape[0], STATE_SIZE))
     for i in range(counters.shape[0]):
         state[i, _S : _S + 8] = 15.0

@@ -12,8 +12,9 @@ from typing import Final
 
 import numpy as np
 
+from ml.cohort.controllers import Controller
 from ml.cohort.participants import PARTICIPANTS, ParticipantModel
-from ml.cohort.sessions import Controller, SimulatedSession, run_sessions
+from ml.cohort.sessions import SimulatedSession, run_sessions
 from ml.mdp import MdpSettings
 from ml.progress import Report, silent
 from ml.rl.policy import Policy

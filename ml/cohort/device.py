@@ -84,11 +84,9 @@ def rcs_session_zip(
     streams = _Streams(np.random.default_rng(seed), clock_ms, packet_loss, bad_gen_times)
     for block in blocks:
         streams.record(block)
-    files: dict[str, Any] = {
-        name: [{"RecordInfo": info | {"HostUnixTime": started_ms + 3_000}, key: streams.packets[name]}]
-        for name, key in _STREAM_KEYS.items()
-    }
-    files |= {name: [{"RecordInfo": info | {"HostUnixTime": started_ms + 3_000}, key: []}] for name, key in _UNUSED_STREAMS.items()}
+    begun = info | {"HostUnixTime": started_ms + 3_000}
+    files: dict[str, Any] = {name: [{"RecordInfo": begun, key: streams.packets[name]}] for name, key in _STREAM_KEYS.items()}
+    files |= {name: [{"RecordInfo": begun, key: []}] for name, key in _UNUSED_STREAMS.items()}
     files["AdaptiveLog"] = []
     files["ErrorLog"] = []
     files["DiagnosticsLog"] = _timed(info, [(started_ms + 2_500, _latency_test())])

@@ -157,7 +157,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=25.0,
         c3=25.0,
         c4=25.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.28, eta=0.64, a50=0.65, hill=2.0, s_act=0.25, c_med=0.15, s_k=0.30),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.64, a50=0.65, hill=2.0, s_act=0.25, c_med=0.15, s_k=0.35),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=2.0,
             tremor_theta=0.30,
@@ -169,7 +169,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             brady_hill=2.0,
             grasp_min_hz=1.9,
             grasp_max_hz=2.9,
-            side_effect=0.9,
+            side_effect=0.75,
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
@@ -186,7 +186,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.29, eta=0.68, a50=0.70, hill=2.5, s_act=0.25, c_med=0.05, s_k=0.30),  # assumed
+        brain=BrainConstants(k0=0.29, eta=0.68, a50=0.70, hill=2.5, s_act=0.25, c_med=0.05, s_k=0.35),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=5.0,
             tremor_theta=0.62,
@@ -198,7 +198,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             brady_hill=2.0,
             grasp_min_hz=1.2,
             grasp_max_hz=2.5,
-            side_effect=0.9,
+            side_effect=0.75,
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(), constant=0.15),  # selegiline and pramipexole (appendix); size assumed
@@ -215,7 +215,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.30, eta=0.80, a50=0.60, hill=2.0, s_act=0.25, c_med=0.18, s_k=0.30),  # assumed
+        brain=BrainConstants(k0=0.30, eta=0.80, a50=0.60, hill=2.0, s_act=0.25, c_med=0.18, s_k=0.35),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=4.0,
             tremor_theta=0.55,
@@ -227,7 +227,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             brady_hill=2.0,
             grasp_min_hz=1.4,
             grasp_max_hz=2.6,
-            side_effect=0.9,
+            side_effect=0.75,
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
@@ -244,11 +244,11 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.28, eta=0.70, a50=0.65, hill=2.0, s_act=0.25, c_med=0.12, s_k=0.30),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.70, a50=0.65, hill=2.0, s_act=0.25, c_med=0.12, s_k=0.35),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=3.5,
             tremor_theta=0.50,
-            tremor_up_s=12.0,
+            tremor_up_s=10.0,
             tremor_down_s=8.0,
             tremor_episodic=False,
             brady_beta_share=0.60,
@@ -256,7 +256,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             brady_hill=2.0,
             grasp_min_hz=1.5,
             grasp_max_hz=2.7,
-            side_effect=1.3,
+            side_effect=1.1,
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(-2.0,), constant=0.0),  # appendix: one tablet at about 7 o'clock

@@ -5,35 +5,31 @@ All sessions of a call advance together, and each keeps its own random streams: 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ml.cohort import brain, symptoms
-from ml.cohort.brain import PERIOD_S, SAMPLES_PER_PERIOD, STREAM_CONTROLLER
+from ml.cohort.brain import PERIOD_S, SAMPLES_PER_PERIOD
+from ml.cohort.controllers import Controller, chooser, delivery
 from ml.cohort.days import DayEffect, day_effect
 from ml.cohort.medication import effect
 from ml.cohort.outcomes import GRASP_TEST_STEPS, Outcomes, measure
 from ml.cohort.participants import PARTICIPANTS, ParticipantModel
 from ml.progress import Report, silent
 from ml.qoc import Qoc
-from ml.rl.policy import Policy
 from ml.trajectories import SessionTrajectory
 
 Floats = NDArray[np.float64]
-FixedController = Literal["random", "cdbs", "no_dbs"]
-Controller = Policy | FixedController
 
 SETTLE_STEPS: Final = 5
 """Periods before the first beta that is kept: the fast dynamics and the band-pass forget their start within seconds."""
 GRASP_GAIN: Final = 0.9
 """Factor on K while the hand moves: beta decreases with movement (PMC1474736); size assumed."""
-_FIXED: Final[dict[str, float]] = {"cdbs": 1.0, "no_dbs": 0.0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,8 +272,8 @@ def run_sessions(
         lead_amplitude=lead_amplitude,
         threads=threads,
     )
-    choose = _chooser(controller, simulation.counters, lower_bound)
-    deliver = _delivery(model, resolution_ma, lower_bound if controller == "random" else 0.0)
+    choose = chooser(controller, simulation.counters, lower_bound)
+    deliver = delivery(model, resolution_ma, lower_bound if controller == "random" else 0.0)
     beta, amplitude = np.empty((n, total)), np.full((n, total), lead_amplitude)
     hidden = {key: np.empty((n, steps)) for key in ("medication", "activity", "brady", "tremor", "overload")}
     lfp = np.empty((n, total * SAMPLES_PER_PERIOD), dtype=np.float32) if keep_lfp else None
@@ -358,40 +354,8 @@ def _model(participant: ParticipantModel | str) -> ParticipantModel:
 
 
 def _medication(participant: ParticipantModel, day: DayEffect, hour: float, periods: int) -> Floats:
-    hours = hour + np.arange(periods) * (PERIOD_S / 3600.0)
+    hours: Floats = hour + np.arange(periods, dtype=np.float64) * (PERIOD_S / 3600.0)
     return effect(participant.regimen, hours, day.dose_factor, day.delay_h)
-
-
-def _chooser(controller: Controller, counters: NDArray[np.uint64], lower_bound: float) -> Callable[[Floats], Floats]:
-    """What to ask for at each step, from the beta windows [N, W]."""
-    if controller == "random":
-        if not 0 <= lower_bound < 1:
-            raise ValueError(f"the random controller needs a lower bound in [0, 1), not {lower_bound}")
-        return lambda states: np.array([lower_bound + (1 - lower_bound) * brain.uniform(row, STREAM_CONTROLLER) for row in counters])
-    if isinstance(controller, str):
-        if controller not in _FIXED:
-            raise ValueError(f"there is no controller {controller!r}; use 'random', 'cdbs', 'no_dbs' or a policy")
-        return lambda states: np.full(len(states), _FIXED[controller])
-    policy = controller
-
-    def act(states: Floats) -> Floats:
-        asked = np.asarray(policy.act(states.copy()), dtype=np.float64)
-        if asked.shape != (len(states),):
-            raise ValueError(f"the policy answered with shape {asked.shape} to {len(states)} states; it must give one amplitude for each")
-        if not bool(np.all((asked >= -1e-6) & (asked <= 1 + 1e-6))):
-            raise ValueError(f"the policy asked for an amplitude fraction outside [0, 1]: {asked.min()} to {asked.max()}")
-        return np.clip(asked, 0.0, 1.0)
-
-    return act
-
-
-def _delivery(participant: ParticipantModel, resolution_ma: float | None, lower_bound: float) -> Callable[[Floats], Floats]:
-    """What the device delivers of what is asked, as fractions; rounding never goes below a random controller's bound."""
-    if resolution_ma is None:
-        return lambda asked: asked
-    unit = resolution_ma / participant.cdbs_amplitude_ma
-    lowest = math.ceil(lower_bound / unit - 1e-9)
-    return lambda asked: np.minimum(np.maximum(np.rint(asked / unit), lowest) * unit, 1.0)
 
 
 def _for_all(work: Callable[[slice], None], parts: Sequence[slice], pool: ThreadPoolExecutor | None) -> None:

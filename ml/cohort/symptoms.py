@@ -37,7 +37,8 @@ def advance(state: Any, counters: Any, constants: Any, amplitude: Any, medicatio
 
     Args:
         state: [N, STATE_SIZE]. counters: random streams, [N, STREAMS]. constants: [N, 10] from `constants_of`.
-        amplitude: amplitude fraction in force, [N]. medication: effect 0-1, [N]. activity: drift of the parkinsonian state (sd about 1), [N].
+        amplitude: amplitude fraction in force, [N]. medication: effect 0-1, [N].
+        activity: drift of the parkinsonian state (sd about 1), [N].
         beta: P_beta of this period in uV, [N]. brady: [N], receives bradykinesia (0 none, 1 full).
     """
     for i in range(state.shape[0]):

@@ -9,8 +9,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.cohort.controllers import Controller
 from ml.cohort.participants import ParticipantModel, ReferenceBeta
-from ml.cohort.sessions import Controller, Floats, SessionBatch, run_sessions
+from ml.cohort.sessions import Floats, SessionBatch, run_sessions
 from ml.mdp import MdpSettings, end_reward, step_reward
 from ml.progress import Report, silent
 from ml.rl.policy import ConstantPolicy

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -85,7 +86,13 @@ class Jobs:
         return self.get(job_id)
 
     def children(self, worker: subprocess.Popen[bytes]) -> list[psutil.Process]:
-        return [p for p in psutil.Process(worker.pid).children(recursive=True) if "app.platform.jobs.child" in p.cmdline()]
+        """Live compute children of a worker."""
+        found = []
+        for process in psutil.Process(worker.pid).children(recursive=True):
+            with contextlib.suppress(psutil.Error):  # ended between two looks
+                if "app.platform.jobs.child" in process.cmdline():
+                    found.append(process)
+        return found
 
     def counted(self, job_id: str) -> list[int]:
         """Parts that were stored, in order, once for every time."""
