@@ -164,9 +164,11 @@ def _load_and_rank(url: str, state_path: Path, children: list[subprocess.Popen[b
             for code in PARTICIPANTS:
                 if code not in state["loaded"]:
                     loader.load(code, bars)
-                if code not in state["jobs"]:
-                    loader.submit(code)
-        _follow(client, state["jobs"][PARTICIPANTS[0]], children)
+        for i, code in enumerate(PARTICIPANTS):
+            if code not in state["jobs"]:
+                loader.submit(code)
+            if i == 0:  # the first ranking has the machine to itself; the others follow in the background
+                _follow(client, state["jobs"][code], children)
     console.print(f"  Ranked policies of {PARTICIPANTS[0]}: [underline]{url}/participants/{PARTICIPANTS[0]}/ranking[/]")
     console.print(f"  The other participants are ranked in the background: [underline]{url}/participants/{PARTICIPANTS[1]}/jobs[/]")
 
@@ -228,18 +230,20 @@ class _Loader:
 def _follow(client: httpx.Client, job_id: str, children: list[subprocess.Popen[bytes]]) -> None:
     """A progress bar for every step of a job, until it has ended."""
     columns = (TextColumn("  {task.description:<42}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
-    with Progress(*columns, console=console) as bars:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
         known: dict[str, TaskID] = {}
         while True:
             _check(children)
             job = client.get(f"/jobs/{job_id}").json()
             for step in job["steps"]:
-                if step["key"] not in known:
+                if not console.is_terminal and step["status"] == "succeeded" and step["key"] not in known:
+                    console.print(f"  {step['title']}: done")  # bars need a terminal; a log file gets lines
+                if step["key"] not in known and (console.is_terminal or step["status"] == "succeeded"):
                     known[step["key"]] = bars.add_task(step["title"], total=1.0, start=False)
-                task = known[step["key"]]
-                if step["status"] != "queued":
-                    bars.start_task(task)
-                bars.update(task, completed=step["progress"])
+                if (task := known.get(step["key"])) is not None:
+                    if step["status"] != "queued":
+                        bars.start_task(task)
+                    bars.update(task, completed=step["progress"])
             if job["status"] in {"succeeded", "failed", "cancelled"}:
                 break
             time.sleep(_POLL_S)

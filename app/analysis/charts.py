@@ -42,10 +42,10 @@ def metric_chart(metric: MetricResult) -> Chart:
     for at, g in enumerate(shown):
         data += [_box(at, g), _points(at, g, metric)]
     names = [f"{SHORT.get(g.controller, g.label)}<br>n = {g.n}" for g in shown]
-    places = {"tickvals": list(range(len(shown))), "ticktext": names, "range": [-0.6, len(shown) - 0.4]}
+    places = {"tickvals": list(range(len(shown))), "ticktext": names, "range": [-0.6, len(shown) - 0.4], "tickangle": 0}
     layout: dict[str, Any] = {
         "xaxis": {**places, "showgrid": False, "zeroline": False},
-        "yaxis": axis(metric.title, metric.unit, rangemode="tozero" if metric.metric != "rating" else "normal", zeroline=False),
+        "yaxis": axis(metric.unit, rangemode="tozero", zeroline=False),
         "annotations": [_p_label(at, tests.get(g.controller)) for at, g in enumerate(shown)],
         "margin": {"l": 52, "r": 8, "t": 30, "b": 44},
         "showlegend": False,
@@ -59,17 +59,19 @@ def metric_chart(metric: MetricResult) -> Chart:
 
 
 def p_text(p: float | None) -> str:
-    """A p-value for people."""
+    """A p-value for people, without the p and without the zero that every p has before its point."""
     if p is None:
         return "\u2014"
-    return "p < .001" if p < 0.001 else f"p = {p:.3f}".replace("0.", ".", 1)
+    if p < 0.001:
+        return "< .001"
+    return "1" if p > 0.9995 else f"{p:.3f}".removeprefix("0")
 
 
 def _box(at: int, g: Group) -> dict[str, Any]:
     return {
         "type": "box", "x": [at], "q1": [g.q1], "median": [g.median], "q3": [g.q3],
-        "lowerfence": [min(g.values)], "upperfence": [max(g.values)], "width": 0.5, "boxpoints": False, "hoverinfo": "skip", "line": {"color": colour(g.controller), "width": 1.5},
-        "fillcolor": colour(g.controller, 0.12),
+        "lowerfence": [min(g.values)], "upperfence": [max(g.values)], "width": 0.5, "boxpoints": False, "hoverinfo": "skip",
+        "line": {"color": colour(g.controller), "width": 1.5}, "fillcolor": colour(g.controller, 0.12),
     }  # fmt: skip
 
 
@@ -93,7 +95,7 @@ def _spread(values: Sequence[float]) -> list[float]:
 
 def _p_label(at: int, test: Comparison | None) -> dict[str, Any]:
     strong = test is not None and test.p_value is not None and test.p_value < ALPHA
-    text = "reference" if test is None else p_text(test.p_value) if test.p_value is not None else "too few"
+    text = "p" if test is None else p_text(test.p_value) if test.p_value is not None else "too few"
     return {
         "x": at, "y": 1.0, "yref": "paper", "yanchor": "bottom", "showarrow": False, "text": f"<b>{text}</b>" if strong else text,
         "font": {"size": 12, "color": TEXT if strong else MUTED},

@@ -171,7 +171,7 @@ def _chosen(view: PlanView | None, values: FormData | None) -> Sequence[int]:
 
 def _form_values(view: PlanView | None, values: FormData | None) -> dict[str, Any]:
     """What the form shows: what was sent, else the present plan's note, else the defaults."""
-    shown: dict[str, Any] = PlanOptions().model_dump() | {"reason": ""}
+    shown: dict[str, Any] = {k: f"{v:g}" if isinstance(v, float) else v for k, v in PlanOptions().model_dump().items()}
     if view:
         shown["note"] = view.plan.note
     if values is not None:

@@ -48,6 +48,12 @@ def open_visits(db: Session, participant_id: int, today: date) -> Sequence[Visit
     ).all()
 
 
+def visits_with_approved_plan(db: Session, participant_id: int) -> set[int]:
+    """Ids of the visits whose plan is approved."""
+    query = select(Plan.visit_id).join(Visit, Visit.id == Plan.visit_id)
+    return set(db.scalars(query.where(Visit.participant_id == participant_id, Plan.status == "approved")))
+
+
 def next_visit_number(db: Session, participant_id: int) -> int:
     """The number after the participant's last visit."""
     return (db.scalar(select(func.max(Visit.number)).where(Visit.participant_id == participant_id)) or 0) + 1

@@ -178,7 +178,7 @@ def visit_for_draft(
 ) -> Visit:
     """The visit that a draft is for: an open one by its id, or a new one.
 
-    With neither id nor number: the first open visit, or a new one with the next number.
+    With neither id nor number: the first open visit whose plan is not approved, or a new one with the next number.
 
     Raises:
         Invalid: the visit is not open: another participant's, past, or with sessions. Conflict: the number is taken.
@@ -193,8 +193,11 @@ def visit_for_draft(
             "Choose another.",
         )
     if number is None:
-        if open_visits and day is None:
-            return open_visits[0]
+        if day is None:
+            approved = repository.visits_with_approved_plan(db, participant.id)
+            free = [visit for visit in open_visits if visit.id not in approved]
+            if free:
+                return free[0]
         number = repository.next_visit_number(db, participant.id)
     return study.add_visit(db, participant, VisitIn(number=number, date=day), caller)
 

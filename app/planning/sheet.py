@@ -145,7 +145,9 @@ def _timeline(pdf: _Sheet, view: PlanView) -> None:
 
 def _circumstances(pdf: _Sheet, view: PlanView) -> None:
     """The stimulation that the day starts from, and blanks for what else bears on it."""
-    stated = [f"{a.hemisphere} {a.amplitude_ma:g} mA" + (f" (program {a.program})" if a.program else "") for a in view.visit.cdbs_amplitudes]
+    stated = [
+        f"{a.hemisphere} {a.amplitude_ma:g} mA" + (f" (program {a.program})" if a.program else "") for a in view.visit.cdbs_amplitudes
+    ]
     shorthand = view.visit.participant.current_settings.cdbs_amplitude_ma
     amplitude = ", ".join(stated) or (f"{shorthand:g} mA" if shorthand else "__________ mA")
     pdf.set_text_color(*_INK)

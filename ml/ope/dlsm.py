@@ -209,7 +209,7 @@ class FittedDlsm:
         logged, simulated = coverage
         flags = list(dict.fromkeys((*logged.flags, *(() if logged.flags else simulated.flags))))
         if not seen[0]:
-            flags.append("no session has an end-of-session reward: the estimate is the step return alone")
+            flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
         other_step, other_end = zip(*(self._parts(run) for run in others), strict=True)
         return Estimate(
             method=self.method,

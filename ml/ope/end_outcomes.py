@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.batches import outcome_table
+from ml.ope.batches import FEWEST_OUTCOMES, outcome_table
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
@@ -67,7 +67,7 @@ class EndModel:
 def fit_end_model(buffer: ReplayBuffer, indices: NDArray[np.int64] | None = None) -> EndModel:
     """Fit to all sessions; with resamples of sessions, [D, n], the weights are those of D refits with the penalties of all sessions."""
     table, x, centre, spread = _design(buffer)
-    seen = tuple(bool(np.isfinite(table[:, j]).sum() >= 3) for j in range(table.shape[1]))
+    seen = tuple(bool(np.isfinite(table[:, j]).sum() >= FEWEST_OUTCOMES) for j in range(table.shape[1]))
     n_outcomes = table.shape[1]
     penalties, skill, residual = np.ones(n_outcomes), np.full(n_outcomes, np.nan), np.zeros(n_outcomes)
     for j in range(n_outcomes):

@@ -63,14 +63,20 @@ def add_session(db: Session, enrolled: str) -> AddSession:
             packed, valid = pack(array, ~np.isnan(array))
             db.add(
                 Trace(
-                    recording_id=recording.id, decode_version=1, stream=stream, unit=named, source=origin, dt_s=2.0, first_end_s=2.0,
-                    n=steps, values_f32=packed, valid_bits=valid,
-                )  # fmt: skip
+                    recording_id=recording.id,
+                    decode_version=1,
+                    stream=stream,
+                    unit=named,
+                    source=origin,
+                    dt_s=2.0,
+                    first_end_s=2.0,
+                    n=steps,
+                    values_f32=packed,
+                    valid_bits=valid,
+                )
             )
         if not (grasp is None and rating is None and tremor is None):
-            db.add(
-                QocRevision(session_id=session.id, revision=1, grasp_hz=grasp, rating=rating, tremor_percent=tremor, entered_by="test")
-            )
+            db.add(QocRevision(session_id=session.id, revision=1, grasp_hz=grasp, rating=rating, tremor_percent=tremor, entered_by="test"))
         db.commit()
         return session.id
 

@@ -42,10 +42,22 @@ def test_tied_values_use_the_normal_approximation_and_say_so() -> None:
     assert result.p_value > ALPHA
 
 
+def test_ties_do_not_give_a_smaller_p_than_so_few_sessions_can() -> None:
+    # cDBS always runs at 1: its energies tie, and the normal curve alone would say .0005
+    three, eleven = [0.0, 0.0, 0.0], [1.0] * 11
+    assert rank_sum(three, eleven).p_value < 0.001
+    result = compare(_group(Controller.NO_DBS, three), _group(Controller.CDBS, eleven))
+    assert result.p_value == pytest.approx(2 / 364)  # C(14, 3)
+
+
 @pytest.mark.parametrize(
     ("tested", "cdbs", "words"),
     [
-        (2, 5, "needs at least 4 sessions on each side, or 3 against 5; No DBS has 2, cDBS 5. So few cannot give a two-sided p below 0.095"),
+        (
+            2,
+            5,
+            "needs at least 4 sessions on each side, or 3 against 5; No DBS has 2, cDBS 5. So few cannot give a two-sided p below 0.095",
+        ),
         (3, 4, "needs at least 4 sessions on each side; No DBS has 3, cDBS 4. So few cannot give a two-sided p below 0.057"),
         (6, 2, "or 8 against 2; No DBS has 6, cDBS 2"),
         (0, 9, "needs at least 4 sessions with this metric on each side; No DBS has 0, cDBS 9"),
@@ -53,7 +65,9 @@ def test_tied_values_use_the_normal_approximation_and_say_so() -> None:
     ],
 )
 def test_not_enough_data_names_the_check_that_failed(tested: int, cdbs: int, words: str) -> None:
-    result = compare(_group(Controller.NO_DBS, [0.1 * i for i in range(tested)]), _group(Controller.CDBS, [5 + 0.1 * i for i in range(cdbs)]))
+    result = compare(
+        _group(Controller.NO_DBS, [0.1 * i for i in range(tested)]), _group(Controller.CDBS, [5 + 0.1 * i for i in range(cdbs)])
+    )
     assert result.p_value is None
     assert result.difference is None
     assert words in result.note

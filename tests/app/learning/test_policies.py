@@ -107,12 +107,12 @@ def test_the_bundle_is_whole_and_says_for_whom_and_within_which_limits(client: T
     upload("random")
     client.post("/api/v1/participants/P1/snapshots")
     policy = post_policy(client, constant_onnx(0.6, 10)).json()["id"]
-    answer = client.get(f"/api/v1/policies/{policy}/bundle", params={"max_ma": 2.5, "ramp_ma_per_s": 0.5})
-    assert answer.headers["content-type"] == "application/zip", answer.text
+    answer = client.get(f"/api/v1/policies/{policy}/bundle", params={"min_ma": 0.5, "max_ma": 3.5, "ramp_ma_per_s": 0.5})
+    assert answer.headers["content-type"] == "application/zip"
     assert answer.headers["content-disposition"] == f'attachment; filename="P1-policy-{policy}.zip"'
     manifest = verify_bundle(answer.content)
     assert (manifest.participant, manifest.policy_id, manifest.window, manifest.beta_unit) == ("P1", policy, 10, "uV")
-    assert (manifest.min_ma, manifest.max_ma, manifest.cdbs_ma, manifest.ramp_ma_per_s) == (0.0, 2.5, 3.0, 0.5)
+    assert (manifest.min_ma, manifest.max_ma, manifest.cdbs_ma, manifest.ramp_ma_per_s) == (0.5, 3.5, 3.0, 0.5)
     assert manifest.approvals == ()
     vectors = json.loads(zipfile.ZipFile(io.BytesIO(answer.content)).read("test_vectors.json"))
     assert 50 <= len(vectors["windows"]) <= 64

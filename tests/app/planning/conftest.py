@@ -64,7 +64,9 @@ def _hold(db: Session, participant: Participant, visit: Visit, ordinal: int) -> 
     db.flush()
 
 
-def _policy(db: Session, participant: Participant, snapshot: BufferSnapshot | None, name: str, kind: str, teacher: int | None = None) -> Policy:
+def _policy(
+    db: Session, participant: Participant, snapshot: BufferSnapshot | None, name: str, kind: str, teacher: int | None = None
+) -> Policy:
     row = Policy(
         participant_id=participant.id,
         name=name,

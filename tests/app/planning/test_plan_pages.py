@@ -30,12 +30,14 @@ def test_the_page_of_a_visit_without_a_plan_offers_the_ranked_policies(client: T
 
 def test_draft_then_approve_with_forms_alone(client: TestClient, studied: Any, db: Session) -> None:
     path = f"/visits/{studied.visit}/plan"
-    drafted = _post(client, path, policy_ids=[str(i) for i in studied.policies[:2]], minutes_per_session="12,5", no_dbs="yes", seed="", note="")
+    drafted = _post(
+        client, path, policy_ids=[str(i) for i in studied.policies[:2]], minutes_per_session="12,5", no_dbs="yes", seed="", note=""
+    )
     assert (drafted.status_code, drafted.headers["location"]) == (303, f"{path}?done=drafted")
     plan = db.scalars(select(Plan)).one()
     assert [i.minutes for i in plan.items] == [12.5, 12.5, 12.5, 5]
     page = client.get(f"{path}?done=drafted", headers=PAGE).text
-    for words in ("Plan drafted.", "Approve plan", "plan.pdf", "not approved yet", "<svg", "95.00", "93.00 to 96.50"):
+    for words in ("Plan drafted.", "Approve plan", "plan.pdf", "not approved yet", "<svg", "95.00", "93.00 to 96.50", "DLSM"):
         assert words in page, words
     approved = _post(client, f"{path}/approve", plan_id=str(plan.id))
     assert (approved.status_code, approved.headers["location"]) == (303, f"{path}?done=approved")
@@ -70,6 +72,15 @@ def test_ticked_policies_of_the_ranking_go_to_the_first_open_visit(client: TestC
     answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[0])], evaluation_id=str(studied.evaluation))
     assert (answer.status_code, answer.headers["location"]) == (303, f"/visits/{studied.visit}/plan?done=drafted")
     assert client.get(f"/api/v1/visits/{studied.visit}/plan").json()["evaluation"]["id"] == studied.evaluation
+
+
+def test_ticked_policies_never_replace_an_approved_plan_unasked(client: TestClient, studied: Any, db: Session) -> None:
+    client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
+    client.post(f"/api/v1/visits/{studied.visit}/plan/approve")
+    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[1])])
+    made = db.scalars(select(Visit).where(Visit.number == 3)).one()
+    assert answer.headers["location"] == f"/visits/{made.id}/plan?done=drafted"
+    assert client.get(f"/api/v1/visits/{studied.visit}/plan").json()["status"] == "approved"
 
 
 def test_a_draft_can_make_its_visit(client: TestClient, studied: Any, db: Session) -> None:

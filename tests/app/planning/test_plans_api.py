@@ -129,7 +129,8 @@ def test_a_ranking_of_somebody_else_cannot_be_pinned(client: TestClient, studied
 
 
 @pytest.mark.parametrize(
-    "body", [{}, {"policy_ids": []}, {"policy_ids": ["1"]}, {"policy_ids": [1], "no_dbs": "yes"}, {"policy_ids": [1], "minutes_per_session": 4}]
+    "body",
+    [{}, {"policy_ids": []}, {"policy_ids": ["1"]}, {"policy_ids": [1], "no_dbs": "yes"}, {"policy_ids": [1], "minutes_per_session": 4}],
 )
 def test_bad_drafts_are_refused(client: TestClient, studied: Any, body: dict[str, Any]) -> None:
     answer = client.post(_path(studied.visit), json=body)
@@ -143,7 +144,9 @@ def test_a_new_draft_supersedes_the_old_one(client: TestClient, studied: Any, db
     assert {p.id: p.status for p in db.scalars(select(Plan))} == {first["id"]: "superseded", second["id"]: "draft"}
 
 
-def test_an_approved_plan_is_fixed_and_superseded_only_with_a_reason_in_the_audit_trail(client: TestClient, studied: Any, db: Session) -> None:
+def test_an_approved_plan_is_fixed_and_superseded_only_with_a_reason_in_the_audit_trail(
+    client: TestClient, studied: Any, db: Session
+) -> None:
     draft = _draft(client, studied).json()
     approved = client.post(_path(studied.visit, "/approve"), json={"plan_id": draft["id"]}).json()
     assert (approved["status"], approved["approved_by"]) == ("approved", "admin@clinic.example")
@@ -152,7 +155,9 @@ def test_an_approved_plan_is_fixed_and_superseded_only_with_a_reason_in_the_audi
     assert again.status_code == 409
     assert "was approved by admin@clinic.example already" in again.json()["detail"]
     _draft(client, studied, reason="participant came late")
-    rows = db.scalars(select(AuditEvent).where(AuditEvent.entity == "plan", AuditEvent.entity_id == str(draft["id"])).order_by(AuditEvent.id)).all()
+    rows = db.scalars(
+        select(AuditEvent).where(AuditEvent.entity == "plan", AuditEvent.entity_id == str(draft["id"])).order_by(AuditEvent.id)
+    ).all()
     assert [r.action for r in rows] == ["insert", "update", "update"]
     assert rows[-1].reason == f"approved plan {draft['id']} superseded by a new draft: participant came late"
     kept = db.get_one(Plan, draft["id"])

@@ -84,7 +84,15 @@ def test_names_outside_latin_1_are_spelled(client: TestClient, studied: Any, ext
 
 @pytest.mark.parametrize(
     ("text", "printed"),
-    [("β γ Ω", "beta gamma Omega"), ("Łódź", "Lódz"), ("a–b — “c”…", 'a-b - "c"...'), ("çåß µ ±", "çåß µ ±"), ("ﬁ", "fi"), ("雨\x00\u200b", "?"), ("ή", "eta")],
+    [
+        ("β γ Ω", "beta gamma Omega"),
+        ("Łódź", "Lódz"),
+        ("a–b — “c”…", 'a-b - "c"...'),
+        ("çåß µ ±", "çåß µ ±"),
+        ("ﬁ", "fi"),
+        ("雨\x00\u200b", "?"),
+        ("ή", "eta"),
+    ],
 )
 def test_every_character_has_a_spelling_or_a_question_mark(text: str, printed: str) -> None:
     assert latin(text) == printed

@@ -92,7 +92,7 @@ def test_cancelling_kills_the_children_within_two_seconds(jobs):
     worker = jobs.start_worker(beat_s=5.0)
     job_id = jobs.submit(parts=3, numbers=1000, pause_s=0.1)
     jobs.wait(lambda: len(jobs.children(worker)) == 2)
-    jobs.wait(lambda: jobs.numbers(job_id, 0))
+    jobs.wait(lambda: sum(bool(jobs.numbers(job_id, part)) for part in range(3)) == 2)
     children = jobs.children(worker)
     with transaction("boss@clinic.example") as db:
         service.cancel(db, repository.get(db, job_id), "boss@clinic.example")

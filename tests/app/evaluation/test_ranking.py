@@ -1,0 +1,294 @@
+"""The ranking: order, references, staleness, actual results, CSV and page, from estimates with known values."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from app.accounts.policy import SYSTEM
+from app.evaluation.models import Evaluation
+from app.evaluation.service import store_evaluation
+from app.learning.baselines import constant_onnx, ensure_baselines
+from app.learning.models import Policy
+from app.learning.snapshots import collect, take_snapshot
+from app.platform.errors import Invalid
+from app.study.repository import participant_by_code
+from ml.ope.estimate import Estimate
+
+Upload = Callable[..., int]
+RANKING = "/api/v1/participants/P1/ranking"
+
+
+def estimate(method: str, value: float, *, supported: bool = True, spread: float = 1.0, draws: Sequence[float] = ()) -> dict[str, Any]:
+    return Estimate(
+        method=method,
+        value=value,
+        low=value - spread,
+        high=value + spread,
+        level=0.9,
+        standard_error=spread / 1.64,
+        step_return=value - 80,
+        end_reward=80.0,
+        predicted={"energy": 0.4, "mean_beta": 0.9, "grasp_hz": 2.1, "rating": 7.5, "tremor_percent": 12.0},
+        supported=supported,
+        flags=() if supported else ("not supported by the data: in 60 % of steps",),
+        n=100,
+        details={"draws": list(draws)} if draws else {},
+    ).to_json()
+
+
+@pytest.fixture
+def policies(client: TestClient, upload: Upload) -> list[int]:
+    """Ids of three policies made elsewhere, for a participant with four sessions."""
+    for controller in ("random", "random", "cdbs", "random"):
+        upload(controller)
+    ids = []
+    for k in range(3):
+        answer = client.post(
+            "/api/v1/participants/P1/policies", data={"name": f"p{k}"}, files={"file": (f"p{k}.onnx", constant_onnx(0.4 + 0.2 * k, 10))}
+        )
+        ids.append(int(answer.json()["id"]))
+    return ids
+
+
+@pytest.fixture
+def evaluate(db: Session, policies: list[int]) -> Callable[..., int]:
+    """Store an evaluation; `dlsm` values by policy, further methods by name."""
+
+    def store(dlsm: dict[int, dict[str, Any]], baselines: dict[float, float] | None = None, **others: dict[str, Any]) -> int:
+        db.rollback()
+        participant = participant_by_code(db, "P1", SYSTEM)
+        snapshot = take_snapshot(db, participant, SYSTEM)
+        made = {
+            p.config.get("amplitude"): p.id for p in ensure_baselines(db, participant, snapshot, collect(db, participant).buffer, "test")
+        }
+        table = {str(i): e for i, e in dlsm.items()}
+        table |= {str(made[a]): estimate("dlsm", v) for a, v in (baselines or {}).items()}
+        row = store_evaluation(
+            db,
+            job_id=None,
+            created_by="test",
+            snapshot=snapshot,
+            horizon_steps=snapshot.median_steps,
+            candidates=list(dlsm),
+            results={"dlsm": {"estimates": table}, **others},
+            config={},
+        )
+        db.commit()
+        return row.id
+
+    return store
+
+
+def ranked(client: TestClient) -> dict[str, Any]:
+    answer = client.get(RANKING)
+    assert answer.status_code == 200, answer.text
+    body: dict[str, Any] = answer.json()
+    return body
+
+
+def test_before_any_evaluation_the_ranking_says_what_to_do(client: TestClient, enrolled: str) -> None:
+    answer = client.get(RANKING)
+    assert answer.status_code == 404
+    assert "pipeline" in answer.json()["mend"]
+    page = client.get("/participants/P1/ranking")
+    assert page.status_code == 200
+    assert "Not enough data." in page.text
+    assert "no confirmed session" in page.text
+
+
+def test_candidates_are_ranked_by_value_and_unsupported_ones_come_last(
+    client: TestClient, policies: list[int], evaluate: Callable[..., int]
+) -> None:
+    a, b, c = policies
+    evaluate({a: estimate("dlsm", 50.0), b: estimate("dlsm", 99.0, supported=False), c: estimate("dlsm", 52.0)})
+    body = ranked(client)
+    assert [(p["policy_id"], p["rank"], p["supported"]) for p in body["policies"]] == [(c, 1, True), (a, 2, True), (b, 3, False)]
+    best = body["policies"][0]
+    assert best["estimates"]["dlsm"] == {
+        "value": 52.0, "low": 51.0, "high": 53.0, "level": 0.9, "standard_error": pytest.approx(1 / 1.64), "step_return": -28.0,
+        "end_reward": 80.0, "supported": True, "flags": [], "n": 100, "predicted": best["predicted"],
+    }  # fmt: skip
+    assert best["predicted"]["energy"] == 0.4
+    assert (body["horizon_steps"], body["gamma"], body["default_method"], body["stale"]) == (60, 0.99, "dlsm", False)
+    assert "60 % of steps" in body["policies"][2]["flags"][0]
+
+
+def test_the_probability_of_being_best_counts_aligned_draws(client: TestClient, policies: list[int], evaluate: Callable[..., int]) -> None:
+    a, b, _ = policies
+    # a common shift makes the intervals wide, and yet b is better in three of four draws
+    common = [0.0, 10.0, -10.0, 5.0]
+    evaluate(
+        {
+            a: estimate("dlsm", 50.0, spread=15, draws=[50 + x for x in common]),
+            b: estimate("dlsm", 51.0, spread=15, draws=[51 + common[0], 51 + common[1], 51 + common[2], 49 + common[3]]),
+        }
+    )
+    assert {p["policy_id"]: p["probability_best"] for p in ranked(client)["policies"]} == {a: 0.25, b: 0.75}
+
+
+def test_references_stand_beside_the_candidates_and_the_best_constant_is_named(
+    client: TestClient, policies: list[int], evaluate: Callable[..., int]
+) -> None:
+    evaluate({policies[0]: estimate("dlsm", 50.0)}, {1.0: 45.0, 0.7: 55.0, 0.4: 40.0})
+    body = ranked(client)
+    assert [p["policy_id"] for p in body["policies"]] == [policies[0]]
+    assert {p["reference"]: p["estimates"]["dlsm"]["value"] for p in body["references"]} == {
+        "best_constant": 55.0,
+        "cdbs": 45.0,
+        "constant": 40.0,
+    }
+    assert all(p["rank"] is None for p in body["references"])
+
+
+def test_a_method_that_failed_is_named_and_another_ranks(client: TestClient, policies: list[int], db: Session) -> None:
+    participant = participant_by_code(db, "P1", SYSTEM)
+    snapshot = take_snapshot(db, participant, SYSTEM)
+    arguments: dict[str, Any] = {"job_id": None, "created_by": "test", "snapshot": snapshot, "horizon_steps": 60, "config": {}}
+    linear = {"estimates": {str(policies[0]): estimate("linear", 3.0)}}
+    store_evaluation(db, candidates=policies, results={"dlsm": {"failed": "too few sessions"}, "linear": linear}, **arguments)
+    with pytest.raises(Invalid, match="too few sessions"):
+        store_evaluation(db, candidates=policies, results={"dlsm": {"failed": "too few sessions"}}, **arguments)
+    db.commit()
+    body = ranked(client)
+    assert (body["default_method"], body["failed_methods"]) == ("linear", {"dlsm": "too few sessions"})
+    assert client.get(RANKING, params={"method": "dlsm"}).status_code == 422
+
+
+def test_another_method_can_rank(client: TestClient, policies: list[int], evaluate: Callable[..., int]) -> None:
+    a, b, _ = policies
+    pdis = {"estimates": {str(a): estimate("pdis", 1.0), str(b): estimate("pdis", 2.0)}}
+    evaluate({a: estimate("dlsm", 60.0), b: estimate("dlsm", 50.0)}, pdis=pdis)
+    assert [p["policy_id"] for p in ranked(client)["policies"]] == [a, b]
+    assert [p["policy_id"] for p in client.get(RANKING, params={"method": "pdis"}).json()["policies"]] == [b, a]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda c, u: u("random", visit=1), "1 session newer: visit 1"),
+        (lambda c, u: c.put("/api/v1/sessions/1/qoc", json={"rating": 2}), "1 session with corrected QoCs"),
+        (lambda c, u: c.patch("/api/v1/sessions/1", json={"excluded_reason": "tablet froze"}), "1 session newly left out"),
+        (lambda c, u: c.put("/api/v1/participants/P1/settings", json={"settings": {"c1": 0.5}}), "settings version 2 is in force"),
+        (lambda c, u: c.put("/api/v1/participants/P1/settings", json={"settings": {"xi_beta": None}}), "no beta threshold"),
+        (
+            lambda c, u: c.post(
+                "/api/v1/participants/P1/policies", data={"name": "late"}, files={"file": ("l.onnx", constant_onnx(0.5, 10))}
+            ),
+            "1 policy not in it: late",
+        ),
+    ],
+    ids=["new session", "corrected QoC", "excluded session", "new settings", "threshold gone", "new policy"],
+)
+def test_whatever_changes_since_makes_the_ranking_stale_and_is_named(
+    client: TestClient,
+    upload: Upload,
+    policies: list[int],
+    evaluate: Callable[..., int],
+    change: Callable[[TestClient, Upload], Any],
+    reason: str,
+) -> None:
+    evaluate({i: estimate("dlsm", 50.0) for i in policies})
+    assert ranked(client)["stale_reasons"] == []
+    change(client, upload)
+    body = ranked(client)
+    assert body["stale"] is True
+    assert any(reason in r for r in body["stale_reasons"]), body["stale_reasons"]
+    assert body["snapshot"]["settings_version"] == 1
+    assert "This ranking is out of date" in client.get("/participants/P1/ranking").text
+
+
+def test_the_newest_evaluation_is_the_ranking_and_older_ones_are_not_mixed_in(
+    client: TestClient, upload: Upload, policies: list[int], evaluate: Callable[..., int]
+) -> None:
+    a, b, c = policies
+    evaluate({a: estimate("dlsm", 50.0), b: estimate("dlsm", 60.0), c: estimate("dlsm", 70.0)})
+    upload("random")
+    second = evaluate({a: estimate("dlsm", 50.0), b: estimate("dlsm", 40.0)})
+    body = ranked(client)
+    assert body["evaluation_id"] == second
+    assert [p["policy_id"] for p in body["policies"]] == [a, b]
+    assert body["stale_reasons"] == ["1 policy not in it: p2"]
+
+
+def test_where_a_policy_ran_its_actual_return_stands_beside_the_estimate(
+    client: TestClient, upload: Upload, policies: list[int], evaluate: Callable[..., int]
+) -> None:
+    session = upload("rl", level=0.8, policy=policies[0], qoc={"grasp_hz": 2.0, "rating": 8, "tremor_percent": 20.0})
+    evaluate({i: estimate("dlsm", 50.0) for i in policies})
+    tested = {p["policy_id"]: p["tested"] for p in ranked(client)["policies"]}
+    trace = client.get(f"/api/v1/sessions/{session}/trace").json()
+    beta = np.array(trace["beta"][10:])
+    steps = (np.where(beta < 1.0, 0.0, -1.0) - 0.3 * 0.8) * 0.99 ** np.arange(60)
+    assert tested[policies[0]] == {
+        "sessions": 1,
+        "sessions_with_return": 1,
+        "mean_return": pytest.approx(steps.sum() + 10 * 2.0 + 10 * 8 - 10 * 0.2, abs=1e-5),
+        "mean_step_return": pytest.approx(steps.sum(), abs=1e-5),
+        "mean_end_reward": pytest.approx(98.0),
+        "energy": pytest.approx(0.64, abs=1e-5),
+    }
+    assert tested[policies[1]] is None
+
+
+def test_one_job_has_one_evaluation(db: Session, client: TestClient, policies: list[int]) -> None:
+    job = client.post("/api/v1/participants/P1/jobs", json={"kind": "evaluate"}).json()["id"]
+    participant = participant_by_code(db, "P1", SYSTEM)
+    snapshot = take_snapshot(db, participant, SYSTEM)
+    for value in (50.0, 60.0):
+        store_evaluation(
+            db, job_id=job, created_by="test", snapshot=snapshot, horizon_steps=60, candidates=policies, config={},
+            results={"dlsm": {"estimates": {str(policies[0]): estimate("dlsm", value)}}},
+        )  # fmt: skip
+    db.commit()
+    assert db.scalar(select(func.count()).select_from(Evaluation)) == 1
+    assert ranked(client)["policies"][0]["estimates"]["dlsm"]["value"] == 50.0
+
+
+def test_the_csv_has_a_row_for_every_policy_and_method_and_no_formulas(
+    client: TestClient, db: Session, policies: list[int], evaluate: Callable[..., int]
+) -> None:
+    db.get_one(Policy, policies[0]).name = "=cmd()"
+    db.commit()
+    evaluate(
+        {policies[0]: estimate("dlsm", 50.0), policies[1]: estimate("dlsm", 51.0)},
+        wis={"estimates": {str(policies[0]): estimate("wis", 9.0)}},
+    )
+    answer = client.get(RANKING, params={"format": "csv"})
+    assert answer.headers["content-type"].startswith("text/csv")
+    rows = list(csv.DictReader(io.StringIO(answer.text)))
+    assert [(r["policy_id"], r["method"], float(r["value"])) for r in rows] == [
+        (str(policies[1]), "dlsm", 51.0),
+        (str(policies[0]), "dlsm", 50.0),
+        (str(policies[0]), "wis", 9.0),
+    ]
+    assert rows[1]["name"] == "'=cmd()"
+    assert client.get("/participants/P1/ranking.csv").text == answer.text
+
+
+def test_the_page_shows_ranks_intervals_flags_and_sends_picks_to_the_plan(
+    client: TestClient, policies: list[int], evaluate: Callable[..., int]
+) -> None:
+    evaluation = evaluate(
+        {policies[0]: estimate("dlsm", 50.0), policies[1]: estimate("dlsm", 99.0, supported=False)}, {1.0: 45.0}
+    )  # fmt: skip
+    page = client.get("/participants/P1/ranking").text
+    for text in (
+        "cDBS (reference)",
+        "not supported",
+        "60 % of steps",
+        'action="/participants/P1/plan/draft"',
+        f'name="evaluation_id" value="{evaluation}"',
+        f'name="policy_ids" value="{policies[0]}"',
+        "Estimated return",
+    ):
+        assert text in page
+    assert 'type="checkbox"' in page
