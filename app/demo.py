@@ -26,11 +26,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from app.accounts import repository as accounts_repository
 from app.accounts import service as accounts
 from app.accounts.models import Role
+from app.demo_study import DemoVisit, demo_visits, participant_body
 from app.platform.database import transaction
 from app.platform.errors import BetaloopError, Conflict
 from app.platform.migrate import migrate
 from app.settings import get_settings
-from app.demo_study import DemoVisit, demo_visits, participant_body
 
 ACCOUNTS = {"admin@demo.example": Role.ADMIN, "clinician@demo.example": Role.CLINICIAN, "engineer@demo.example": Role.ENGINEER}
 PARTICIPANTS = ("P1", "P2", "P3", "P4")

@@ -58,7 +58,7 @@ def set_password(db: Session, user: User, password: str) -> None:
 
 
 def change_own_password(db: Session, user_id: int, present: str, new: str) -> None:
-    """Change a password by its owner, who proves to know the present one. Raises Forbidden when that is wrong, Invalid for a bad new one."""
+    """Change a password by its owner, who proves to know the present one. Raises Forbidden when it is wrong, Invalid for a bad new one."""
     user = db.get_one(User, user_id)
     if not _hasher.verify(present, user.password_hash):
         raise Forbidden("The present password is wrong.", "Nothing was changed; try again.")

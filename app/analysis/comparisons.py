@@ -45,7 +45,7 @@ class Comparison:
     """A controller against cDBS.
 
     Attributes:
-        p_value: two-sided, unadjusted as in the paper, never below `smallest_p`; None where there is not enough data.
+        p_value: two-sided, unadjusted as in the paper; None where there is not enough data.
         p_holm: the same adjusted for all comparisons of the participant.
         method: `exact` or `normal approximation`.
         difference: Hodges-Lehmann estimate of controller less cDBS, in the metric's unit.
@@ -81,9 +81,7 @@ def compare(tested: Group, cdbs: Group) -> Comparison:
     if missing:
         return replace(plain, note=missing)
     result = rank_sum(tested.values, cdbs.values, level=LEVEL)
-    # with ties in a handful of sessions the normal curve promises less than any ranking of so few can give
-    p_value = max(result.p_value, smallest_p(tested.n, cdbs.n))
-    return replace(plain, p_value=p_value, method=result.method, difference=result.shift, low=result.low, high=result.high)
+    return replace(plain, p_value=result.p_value, method=result.method, difference=result.shift, low=result.low, high=result.high)
 
 
 def smallest_p(n_x: int, n_y: int) -> float:

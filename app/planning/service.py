@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import date
 
 from sqlalchemy.orm import Session
@@ -95,6 +95,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
         evaluation_id=evaluation.id if evaluation else None,
         status="draft",
         seed=seed,
+        rules=asdict(rules),
         note=draft.note,
         created_by=caller.label,
     )

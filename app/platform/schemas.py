@@ -5,11 +5,19 @@ from __future__ import annotations
 from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Depends, Query
-from pydantic import BaseModel, ConfigDict, Field, Strict
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict
 
 Item = TypeVar("Item")
 
-Int = Annotated[int, Strict(), Field(ge=-(2**31), le=2**31 - 1)]
+
+def _fits_the_database(value: int) -> int:
+    if not -(2**31) <= value < 2**31:
+        raise ValueError(f"the number must lie between {-(2**31)} and {2**31 - 1}")
+    return value
+
+
+# a validator and no `Field(ge=…, le=…)`: bounds written here would silently replace the bounds that a field states for itself
+Int = Annotated[int, Strict(), AfterValidator(_fits_the_database), Field(json_schema_extra={"format": "int32"})]
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Bool = Annotated[bool, Strict()]
 RowId = Annotated[int, Field(ge=1, le=2**31 - 1)]

@@ -489,6 +489,7 @@ def upgrade() -> None:
     sa.Column('evaluation_id', sa.Integer(), nullable=True),
     sa.Column('status', sa.String(length=20), server_default='draft', nullable=False),
     sa.Column('seed', sa.Integer(), nullable=False),
+    sa.Column('rules', postgresql.JSONB(astext_type=sa.Text()), nullable=False),
     sa.Column('note', sa.Text(), server_default='', nullable=False),
     sa.Column('created_at', sa.DateTime(timezone=True), server_default=sa.text('now()'), nullable=False),
     sa.Column('created_by', sa.String(length=254), nullable=False),

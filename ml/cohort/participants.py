@@ -215,7 +215,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.30, eta=0.80, a50=0.60, hill=2.0, s_act=0.25, c_med=0.18, s_k=0.35),  # assumed
+        brain=BrainConstants(k0=0.30, eta=0.80, a50=0.60, hill=2.0, s_act=0.25, c_med=0.18, s_k=0.40),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=4.0,
             tremor_theta=0.55,
@@ -231,7 +231,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.454, at_03=1.986, off=2.280),
+        reference=ReferenceBeta(cdbs=1.590, at_03=2.157, off=2.423),
     ),
     "P4": ParticipantModel(
         code="P4",

@@ -23,7 +23,7 @@ class RankSum:
     Attributes:
         u: Mann-Whitney U of x: pairs with x > y, ties counting one half.
         p_value: two-sided.
-        method: `exact`, or `normal approximation` (with tie and continuity correction).
+        method: `exact` (given the ties, where there are any), or `normal approximation` (with tie and continuity correction).
         n_x, n_y: sessions on either side.
         median_x, median_y: medians.
         shift: Hodges-Lehmann estimate of x - y, in the unit of the measurements.
@@ -153,7 +153,45 @@ def _u(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
 
 
 def _is_exact(x: NDArray[np.float64], y: NDArray[np.float64]) -> bool:
-    return x.size * y.size <= EXACT_UP_TO and np.unique(np.concatenate([x, y])).size == x.size + y.size
+    return x.size * y.size <= EXACT_UP_TO
+
+
+def _null(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Exact probabilities of 2 U = 0 ... 2 n_x n_y, given which values are tied; shape [2 n_x n_y + 1]."""
+    sizes = np.unique(np.concatenate([x, y]), return_counts=True)[1]
+    if sizes.max() > 1:
+        return u_distribution_given_ties(x.size, tuple(sizes.tolist()))
+    doubled = np.zeros(2 * x.size * y.size + 1)
+    doubled[::2] = u_distribution(x.size, y.size)
+    return doubled
+
+
+@lru_cache(maxsize=256)
+def u_distribution_given_ties(n_x: int, sizes: tuple[int, ...]) -> NDArray[np.float64]:
+    """Exact probabilities of 2 U given the ties: every choice of n_x of the pooled mid-ranks is equally likely.
+
+    Args:
+        n_x: values of the first group.
+        sizes: how many pooled values are equal, from the smallest value to the largest; they sum to n_x + n_y.
+
+    Returns:
+        Probabilities of 2 U = 0 ... 2 n_x n_y, shape [2 n_x n_y + 1]. Doubled, because tied values have ranks of one half.
+    """
+    n = sum(sizes)
+    counts = np.zeros((n_x + 1, n * (n + 1) + 1))
+    counts[0, 0] = 1.0
+    below = 0
+    for size in sizes:
+        doubled_rank = 2 * below + size + 1
+        for _ in range(size):
+            # choose the value or not; from the largest choice down, so that none is chosen twice
+            counts[1:, doubled_rank:] += counts[:-1, :-doubled_rank].copy()
+        below += size
+    start = n_x * (n_x + 1)  # 2 U is twice the rank sum less this
+    chosen = counts[n_x, start : start + 2 * n_x * (n - n_x) + 1]
+    probabilities = chosen / chosen.sum()
+    probabilities.flags.writeable = False
+    return probabilities
 
 
 def _standard_deviation(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
@@ -167,7 +205,7 @@ def _standard_deviation(x: NDArray[np.float64], y: NDArray[np.float64]) -> float
 def _tail(x: NDArray[np.float64], y: NDArray[np.float64], u: float, exact: bool) -> float:
     """P(U >= u) under the null hypothesis."""
     if exact:
-        return float(min(1.0, u_distribution(x.size, y.size)[round(u) :].sum()))
+        return float(min(1.0, _null(x, y)[round(2 * u) :].sum()))
     sd = _standard_deviation(x, y)
     if sd == 0:
         return 1.0
@@ -180,7 +218,7 @@ def _shift_interval(
     """Interval of the shift: the k-th smallest and largest of the pairwise differences, k from the null distribution of U."""
     tail = (1 - level) / 2
     if exact:
-        k = int(np.searchsorted(np.cumsum(u_distribution(x.size, y.size)), tail, side="right"))
+        k = int(np.searchsorted(np.cumsum(_null(x, y))[::2], tail, side="right"))
     else:
         k = int(np.floor(x.size * y.size / 2 - float(norm.ppf(1 - tail)) * _standard_deviation(x, y)))
     k = min(max(k, 1), (differences.size + 1) // 2)

@@ -41,7 +41,9 @@ def test_a_table_becomes_a_confirmed_session_on_the_papers_grid(client: TestClie
     (session,) = body["sessions"]
     assert (session["controller"], session["visit"], session["status"], session["duration_s"]) == ("random", 1, "confirmed", 6)
     trace = client.get(f"/api/v1/sessions/{session['id']}/trace").json()
-    rows = {t: (b, m, a) for t, b, m, a in zip(trace["t_s"], trace["beta"], trace["amplitude_ma"], trace["amplitude_fraction"], strict=True)}
+    rows = {
+        t: (b, m, a) for t, b, m, a in zip(trace["t_s"], trace["beta"], trace["amplitude_ma"], trace["amplitude_fraction"], strict=True)
+    }
     assert trace["t_s"] == [2.0 * k for k in range(-9, 4)]
     assert rows[-4] == (None, None, None)
     assert rows[0][0] == pytest.approx(0.9)
@@ -189,7 +191,9 @@ def test_the_stimulation_sweep_becomes_a_session_with_its_steps(client: TestClie
     amplitudes = [a for a in trace["amplitude_ma"] if a is not None]
     assert (min(amplitudes), max(amplitudes)) == (0, pytest.approx(2.4))
     by_amplitude = {
-        level: [b for b, a in zip(trace["beta"], trace["amplitude_ma"], strict=True) if b is not None and a == pytest.approx(level, abs=1e-4)]
+        level: [
+            b for b, a in zip(trace["beta"], trace["amplitude_ma"], strict=True) if b is not None and a == pytest.approx(level, abs=1e-4)
+        ]
         for level in (0, 1.1, 2.4)
     }
     means = {level: sum(b) / len(b) for level, b in by_amplitude.items()}
@@ -210,9 +214,7 @@ def test_no_identity_of_a_device_file_is_stored_anywhere(client: TestClient, enr
             assert not any(s.encode() in stored for s in serials)
 
 
-def test_a_stated_start_inside_a_recording_leaves_what_came_before_as_the_lead(
-    client: TestClient, enrolled: str, recordings: Path
-) -> None:
+def test_a_stated_start_inside_a_recording_leaves_what_came_before_as_the_lead(client: TestClient, enrolled: str, recordings: Path) -> None:
     content = (recordings / "rcs" / "stim_sweep.zip").read_bytes()
     body = upload(client, content, "stim_sweep.zip", controller="other", started_at="2019-08-15T19:33:53.6Z").json()
     session = body["sessions"][0]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 
 import pytest
 from fastapi.testclient import TestClient
+from pwdlib import PasswordHash
 
 from app.accounts import service
-from app.accounts.models import Role
+from app.accounts.deps import COOKIE
+from app.accounts.models import Membership, Role, SignIn, User
 from app.platform.database import transaction
 
 PASSWORD = "correct horse battery"
@@ -21,17 +24,24 @@ def anonymous(service_app) -> TestClient:  # type: ignore[no-untyped-def]
     return TestClient(service_app, headers=HTML, follow_redirects=False)
 
 
+@pytest.fixture(scope="session")
+def password_hash() -> str:
+    """The hash of PASSWORD; made once, for it is meant to be slow."""
+    return PasswordHash.recommended().hash(PASSWORD)
+
+
 @pytest.fixture
-def sign_in(service_app) -> Callable[[str], TestClient]:  # type: ignore[no-untyped-def]
-    """Make a user of a role and sign in through the form."""
+def sign_in(service_app, password_hash: str) -> Callable[[str], TestClient]:  # type: ignore[no-untyped-def]
+    """Make a user of a role with PASSWORD and an open browser session."""
 
     def make(role: str) -> TestClient:
         with transaction("test") as db:
-            service.add_user(db, f"{role}-page@clinic.example", Role(role), PASSWORD)
-        browser = TestClient(service_app, headers=HTML, follow_redirects=False)
-        answer = browser.post("/sign-in", data={"email": f"{role}-page@clinic.example", "password": PASSWORD})
-        assert answer.status_code == 303
-        return browser
+            user = User(email=f"{role}-page@clinic.example", name="", password_hash=password_hash)
+            user.memberships.append(Membership(study_id=service.study_of(db, None).id, role=Role(role)))
+            db.add(user)
+            db.flush()
+            db.add(SignIn(token_sha256=hashlib.sha256(role.encode()).hexdigest(), user_id=user.id))
+        return TestClient(service_app, headers=HTML, cookies={COOKIE: role}, follow_redirects=False)
 
     return make
 

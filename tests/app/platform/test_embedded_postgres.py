@@ -49,7 +49,8 @@ def test_the_server_outlives_one_of_two_users_and_not_the_last(tmp_path: Path) -
         f"s = E(pathlib.Path({str(folder)!r})); s.start(); print(s.pid(), flush=True); sys.stdin.readline()"
     )
     users = [
-        subprocess.Popen([sys.executable, "-W", "ignore", "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(2)
+        subprocess.Popen([sys.executable, "-W", "ignore", "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
     ]
     pids = {int(u.stdout.readline()) for u in users if u.stdout}
     assert len(pids) == 1

@@ -1,0 +1,131 @@
+"""The service in a thread and a real Chromium before it; everything that goes wrong on a page is written down."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+import uvicorn
+from fastapi.testclient import TestClient
+
+PASSWORD = "correct horse battery"
+FLAGS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync",
+]  # fmt: skip
+
+
+@dataclass
+class Watched:
+    """A browser window, and what it complained about.
+
+    Attributes:
+        errors: console errors and warnings, and exceptions of scripts.
+        foreign: addresses outside the service that the page asked for.
+    """
+
+    page: Any
+    address: str
+    errors: list[str] = field(default_factory=list)
+    foreign: list[str] = field(default_factory=list)
+
+    def open(self, path: str) -> None:
+        """Go to a path of the service."""
+        answer = self.page.goto(self.address + path)
+        assert answer.status == 200, f"{path}: {answer.status}"
+
+    def sign_in(self) -> None:
+        """Sign in through the form."""
+        self.open("/sign-in")
+        self.page.fill("[name=email]", "admin@clinic.example")
+        self.page.fill("[name=password]", PASSWORD)
+        self.page.click("main button")
+        self.page.wait_for_selector("a.who")
+
+    def charts_drawn(self) -> int:
+        """Scroll every chart into view and wait until it is drawn; how many there are."""
+        charts = self.page.query_selector_all("figure[data-chart]")
+        for chart in charts:
+            chart.scroll_into_view_if_needed()
+            self.page.wait_for_selector(f"#{chart.get_attribute('id')}[data-drawn=yes] .main-svg", timeout=60_000)
+        return len(charts)
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """A running Chromium; skips where there is none."""
+    path = os.environ.get("BETALOOP_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no Chromium here: install it, or name its program in BETALOOP_CHROMIUM")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def address(service_app) -> Iterator[str]:  # type: ignore[no-untyped-def]
+    """Where the service answers; it runs in a thread on the test's database."""
+    server = uvicorn.Server(uvicorn.Config(service_app, host="127.0.0.1", port=0, log_level="warning"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    deadline = time.monotonic() + 60
+    while not server.started:
+        assert thread.is_alive(), "the service ended before it listened"
+        assert time.monotonic() < deadline, "the service did not listen within 60 s"
+        time.sleep(0.05)
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    server.should_exit = True
+    thread.join(timeout=30)
+    assert not thread.is_alive()
+
+
+@pytest.fixture
+def window(chromium: Any, address: str, client: TestClient) -> Iterator[Callable[..., Watched]]:
+    """Open windows of a size and colour scheme; `client` has made the administrator."""
+    contexts = []
+
+    def make(width: int = 1400, height: int = 900, scheme: str = "light") -> Watched:
+        context = chromium.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
+        contexts.append(context)
+        watched = Watched(context.new_page(), address)
+        watched.page.on("console", lambda m: watched.errors.append(m.text) if m.type in ("error", "warning") else None)
+        watched.page.on("pageerror", lambda e: watched.errors.append(str(e)))
+        watched.page.on(
+            "request", lambda r: watched.foreign.append(r.url) if not r.url.startswith((address, "data:", "blob:")) else None
+        )
+        return watched
+
+    yield make
+    for context in contexts:
+        context.close()
+
+
+@pytest.fixture
+def table() -> bytes:
+    """A table of 40 steps after a full window; three steps without beta."""
+    rows = [f"{2 * i},{'' if 11 <= i <= 13 else 1 + 0.5 * (i % 3)},{0.5 + 0.01 * (i % 5)}" for i in range(-9, 41)]
+    return "\n".join(["t_s,beta,amplitude_fraction", *rows]).encode()
+
+
+@pytest.fixture
+def studied(client: TestClient, enrolled: str, table: bytes) -> list[int]:
+    """Participant P1 with two sessions of cDBS and one of the random controller; their numbers."""
+    ids = []
+    for i, controller in enumerate(["cdbs", "random", "cdbs"]):
+        data = {"participant": enrolled, "visit": "1", "controller": controller}
+        # another beta in one row makes another recording
+        content = table + f"\n{82},{1 + i},0.5".encode()
+        answer = client.post("/api/v1/uploads", data=data, files={"file": (f"{i}.csv", content)})
+        assert answer.status_code == 201, answer.text
+        ids.append(int(answer.json()["sessions"][0]["id"]))
+        client.put(f"/api/v1/sessions/{ids[-1]}/qoc", json={"grasp_hz": 2.0 + i, "rating": 5 + i, "tremor_percent": 10.0 * i})
+    return ids

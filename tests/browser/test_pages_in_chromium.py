@@ -1,0 +1,141 @@
+"""Pages as a person meets them: real Chromium, real service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from fastapi.testclient import TestClient
+
+pytestmark = pytest.mark.browser
+
+SMALL_TARGETS = """() => [...document.querySelectorAll('a, button, input:not([type=hidden]), select, summary, textarea')]
+  .filter((e) => e.checkVisibility() && !e.closest('.modebar, .skip, .behind table'))
+  .filter((e) => !e.closest('p, .note, .help, dd') || e.matches('button, .button'))
+  .map((e) => [e, e.matches('input[type=checkbox], input[type=radio]') ? e.closest('label') : e])
+  .map(([e, target]) => [e, target.getBoundingClientRect()])
+  .filter(([e, box]) => box.width > 0 && (box.height < 43.5 || box.width < 24))
+  .map(([e, box]) => `${e.tagName} "${e.textContent.trim().slice(0, 30)}" ${e.name ?? ''} ${Math.round(box.width)}x${Math.round(box.height)}`)"""
+
+
+def test_from_sign_in_to_a_participants_charts(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+    watched = window()
+    watched.sign_in()
+    watched.page.click("article.participant h2 a")
+    assert watched.page.inner_text("h1") == "P1"
+    assert watched.charts_drawn() == 5
+    assert watched.errors == []
+    assert watched.foreign == []
+
+
+def test_no_chart_offers_to_send_data_elsewhere(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+    watched = window()
+    watched.sign_in()
+    watched.open(f"/sessions/{studied[0]}")
+    assert watched.charts_drawn() >= 1
+    titles = [b.get_attribute("data-title") or "" for b in watched.page.query_selector_all(".modebar-btn")]
+    assert titles, "the chart's own buttons are expected, e.g. download as a picture"
+    assert [t for t in titles if any(word in t.lower() for word in ("share", "cloud", "edit", "plotly"))] == []
+    assert watched.errors == []
+    assert watched.foreign == []
+
+
+def test_the_session_chart_breaks_its_line_at_missing_beta(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+    watched = window()
+    watched.sign_in()
+    watched.open(f"/sessions/{studied[0]}")
+    watched.charts_drawn()
+    first = watched.page.query_selector("#control .scatterlayer .trace")
+    assert len(first.query_selector_all("path.js-line")) == 2
+    text = watched.page.inner_text("#control .main-svg >> nth=0") + watched.page.text_content("#control .infolayer")
+    assert "threshold 1 uV" in text
+    assert "Amplitude (mA)" in text
+
+
+def test_the_theme_is_chosen_kept_and_redraws_the_charts(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+    watched = window(scheme="light")
+    watched.sign_in()
+    watched.open(f"/sessions/{studied[0]}")
+    watched.charts_drawn()
+
+    def colours() -> tuple[str, str]:
+        return tuple(
+            watched.page.evaluate(
+                "() => [getComputedStyle(document.body).color, getComputedStyle(document.querySelector('#control path.js-line')).stroke]"
+            )
+        )
+
+    light = colours()
+    watched.page.click("[data-theme-toggle]")
+    watched.page.wait_for_timeout(1500)
+    dark = colours()
+    assert light[0] != dark[0]
+    assert light[1] != dark[1]
+    watched.page.reload()
+    assert watched.page.get_attribute("html", "data-theme") == "dark"
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_targets_are_large_enough_for_a_finger_on_a_tablet(window: Callable, studied: list[int], scheme: str) -> None:  # type: ignore[type-arg]
+    watched = window(820, 1180, scheme)
+    watched.sign_in()
+    paths = ["/", "/participants/P1", "/participants/P1/visits", "/visits/1", f"/sessions/{studied[0]}", "/participants/P1/settings"]
+    for path in [*paths, "/participants/P1/upload", "/participants/new", "/account", "/accounts"]:
+        watched.open(path)
+        assert watched.page.evaluate(SMALL_TARGETS) == [], path
+        wide = watched.page.evaluate("() => document.documentElement.scrollWidth - document.documentElement.clientWidth")
+        assert wide <= 0, f"{path} is {wide} px wider than the tablet"
+    assert watched.errors == []
+
+
+def test_files_dropped_on_the_upload_page_become_sessions(window: Callable, enrolled: str, client: TestClient, table: bytes) -> None:  # type: ignore[type-arg]
+    watched = window()
+    watched.sign_in()
+    watched.open(f"/participants/{enrolled}/upload?visit=1")
+    watched.page.select_option("[name=controller]", "cdbs")
+    files = [["good.csv", table.decode()], ["bad <b>.csv", "a,b\n1,2\n"], ["again.csv", table.decode()]]
+    transfer = watched.page.evaluate_handle(
+        "(files) => { const t = new DataTransfer(); for (const [name, text] of files) t.items.add(new File([text], name)); return t; }", files
+    )
+    watched.page.dispatch_event("[data-drop]", "drop", {"dataTransfer": transfer})
+    watched.page.wait_for_selector("[data-upload-list] li:nth-child(3) .badge", timeout=60_000)
+    outcomes = [b.inner_text() for b in watched.page.query_selector_all("[data-upload-list] .badge")]
+    assert outcomes == ["decoded", "not usable", "known already"]
+    assert "bad <b>.csv" in watched.page.inner_text("[data-upload-list] li:nth-child(2)")
+    assert client.get("/api/v1/visits/1/sessions").json()["total"] == 1
+    watched.page.click("[data-upload-list] li:nth-child(1) a")
+    assert watched.charts_drawn() == 1
+
+
+def test_what_cannot_be_taken_back_asks_first(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
+    watched = window()
+    watched.sign_in()
+    watched.open("/account")
+    watched.page.fill("[name=name]", "a tablet")
+    watched.page.click("text=Make token")
+    assert watched.page.inner_text("code.secret").startswith("blp_")
+    row = watched.page.locator("tr", has_text="a tablet")
+    row.locator("button").click()
+    watched.page.click("dialog[open] >> text=Keep")
+    assert row.locator(".badge").inner_text() == "live"
+    row.locator("button").click()
+    watched.page.click("dialog[open] [data-confirm-yes]")
+    watched.page.wait_for_selector("text=Token revoked")
+    assert row.locator(".badge").inner_text() == "revoked"
+
+
+def test_tables_sort_numbers_as_numbers_with_missing_ones_last(window: Callable, studied: list[int], client: TestClient) -> None:  # type: ignore[type-arg]
+    client.put(f"/api/v1/sessions/{studied[1]}/qoc", json={"grasp_hz": None, "reason": "taken back"})
+    watched = window()
+    watched.sign_in()
+    watched.open("/visits/1")
+
+    def grasp() -> list[str]:
+        return [c.inner_text() for c in watched.page.query_selector_all("table.data tbody td:nth-child(9)")]
+
+    assert grasp() == ["2.00", "—", "4.00"]
+    watched.page.click("table.data th:nth-child(9) button")
+    assert grasp() == ["2.00", "4.00", "—"]
+    watched.page.click("table.data th:nth-child(9) button")
+    assert grasp() == ["4.00", "2.00", "—"]
+    assert watched.page.get_attribute("table.data th:nth-child(9)", "aria-sort") == "descending"
