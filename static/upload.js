@@ -40,7 +40,7 @@ function listed(file) {
   const head = element("div", { className: "row" }, element("b", { textContent: file.name }), words);
   const item = element("li", {}, head, element("div", { className: "progress" }, bar));
   list.append(item);
-  return { item, head, bar, words };
+  return { file: file.name, item, head, bar, words };
 }
 
 function send(file, fields, shown) {
@@ -62,7 +62,7 @@ function send(file, fields, shown) {
   });
 }
 
-function report({ item, head, words }, status, answer) {
+function report({ file, item, head, words }, status, answer) {
   item.querySelector(".progress").remove();
   const good = status >= 200 && status < 300;
   words.className = `badge ${!good ? "bad" : answer.duplicate ? "info" : "good"}`;
@@ -75,6 +75,7 @@ function report({ item, head, words }, status, answer) {
     item.append(note);
   }
   for (const one of answer.report ?? []) {
+    if (one.name !== file) item.append(element("h3", { textContent: one.name })); // a member of an archive
     const pairs = element("dl", { className: "pairs" });
     for (const [key, label] of Object.entries(LABELS)) if (one[key]?.length) {
       pairs.append(element("dt", { textContent: label }), element("dd", {}, ...one[key].map((line) => element("div", { textContent: line }))));

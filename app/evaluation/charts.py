@@ -21,8 +21,9 @@ DASHES = ("solid", "dash", "dot")
 JOB_CURVES = {
     "mean_q": ("Training: mean Q of each policy", "reward; an unbounded climb is over-estimation"),
     "action_distance": ("Training: distance from the logged amplitudes", "mean absolute difference, fraction"),
-    "loss": ("Losses", "distillation: squared action error; DLSM: negative bound per session"),
-    "held_out_score": ("DLSM: score on held-out sessions", "lower is better"),
+    "loss": ("Distillation: loss", "mean squared difference from the teacher, fraction squared"),
+    "dlsm_loss": ("DLSM: training loss", "negative objective"),
+    "dlsm_held_out_score": ("DLSM: score on held-out sessions", "lower is better"),
 }
 """Learning curves by the name that the computations give them: title and unit."""
 

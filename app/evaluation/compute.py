@@ -42,7 +42,7 @@ def fit_dlsm(params: dict[str, Any], workdir: Path, report: Report) -> dict[str,
     buffer = read_buffer(params["snapshot_sha256"])
     estimator = Dlsm(_dlsm_config(params))
     try:
-        member = estimator.fit_member(buffer, params["member"], told(report, estimator.config.steps), workdir)
+        member = estimator.fit_member(buffer, params["member"], told(report, estimator.config.steps, "dlsm_"), workdir)
     except ValueError as error:
         return {"failed": str(error)}
     return {"held_out_score": float(member.check.score), "checks": len(member.course)}

@@ -26,6 +26,7 @@ def declare_evaluation(job: JobContext, params: EvaluateParams, *, fit: bool) ->
     """Show the evaluation stage from the start."""
     if fit:
         _declare_fit(job, params)
+    job.step("choose-policies", "Choose policies and references", weight=learning.STORE_WEIGHT)
     for method in params.methods:
         job.step(f"estimate/{method}", f"Estimate every policy: {METHOD_NAMES[method]}", weight=METHOD_WEIGHTS[method])
     job.step("rank", "Store the estimates and rank", weight=learning.STORE_WEIGHT)
@@ -139,7 +140,6 @@ def _declare_fit(job: JobContext, params: EvaluateParams) -> None:
     for k in range(_members(params)):
         job.step(f"fit/{k}", f"Fit the deep latent sequential model, member {k + 1}", weight=FIT_WEIGHT)
     job.step("store-models", "Store the models", weight=learning.STORE_WEIGHT)
-    job.step("choose-policies", "Choose policies and references", weight=learning.STORE_WEIGHT)
 
 
 def _members(params: EvaluateParams) -> int:

@@ -32,10 +32,10 @@ from app.study.models import Participant
 router = APIRouter()
 
 KINDS: dict[str, tuple[str, type[Model]]] = {
-    "pipeline": ("Between-visit pipeline: train, distil, evaluate, rank", PipelineParams),
-    "evaluate": ("Evaluate and rank the policies there are", EvaluateParams),
-    "train": ("Train policies only", TrainParams),
-    "distill": ("Distil trained policies only", DistilParams),
+    "pipeline": ("Between-visit pipeline", PipelineParams),
+    "evaluate": ("Evaluate and rank policies", EvaluateParams),
+    "train": ("Train policies", TrainParams),
+    "distill": ("Distil policies", DistilParams),
 }
 SHOWN_EVENTS = 20_000
 LOG_LINES = 200

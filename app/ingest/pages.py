@@ -51,14 +51,12 @@ def upload(
     started_at: Annotated[str, Form()] = "",
     hemisphere: Annotated[str, Form()] = "",
 ) -> HTMLResponse:
-    """Take files without JavaScript: one session per file, as with it; the answer names every file's fate. Sending again changes nothing."""
+    """Take files without JavaScript: one session per file; the answer names every file's fate. Sending again changes nothing."""
     typed = {"visit": visit, "controller": controller, "policy": policy, "started_at": started_at, "hemisphere": hemisphere}
     outcomes: list[UploadOutcome] = []
     try:
         form = parse(UploadForm, typed, _LABELS)
-        stated = service.state_session(
-            db, participant, form.visit, form.controller, form.policy or None, form.started_at, form.hemisphere
-        )
+        stated = service.state_session(db, participant, form.visit, form.controller, form.policy or None, form.started_at, form.hemisphere)
         chosen = [Incoming(f.filename or "file", f.file) for f in file if f.filename]
         if not chosen:
             raise Invalid("No file was chosen.", "Choose at least one file.")

@@ -25,10 +25,13 @@ class State:
 
     Attributes:
         sessions, excluded, without_qoc, proposed: counts; the last two of sessions that are not excluded.
-        newest_session: largest row number of a session; None without any.
-        evaluated_session: largest row number of a session that the last evaluation's snapshot knew.
-        next_visit: first visit from today on; last_visit: the last one before or on today.
-        approved: visits with an approved plan, by row number.
+        newest_session: when the last session was entered; None without any.
+        last_visit, next_visit: the last one up to today, and the first from today on.
+        policies: trained, distilled and external ones that are not retired.
+        evaluated_at, snapshot_at: of the last evaluation, and of the buffer snapshot that it used.
+        plan: status of the plan of the latest visit that has one.
+        running, failed: jobs; the latter of the last 7 days.
+        attention: sentences with the page where the matter is mended.
     """
 
     sessions: int = 0
@@ -159,8 +162,9 @@ def _results(db: Session, ids: list[int], found: dict[int, State]) -> None:
     live = Job.status.in_([JobStatus.QUEUED, JobStatus.RUNNING])
     lately = (Job.status == JobStatus.FAILED) & (Job.finished_at > func.now() - dt.timedelta(days=7))
     jobs = select(Job.participant_id, func.count().filter(live), func.count().filter(lately)).where(Job.participant_id.in_(ids))
-    for key, running, failed in db.execute(jobs.group_by(Job.participant_id)):
-        found[key].running, found[key].failed = running, failed
+    for owner, running, failed in db.execute(jobs.group_by(Job.participant_id)):
+        if owner is not None:
+            found[owner].running, found[owner].failed = running, failed
 
 
 def _n(count: int, noun: str) -> str:

@@ -1,4 +1,4 @@
-"""Charts of pages: a plain Plotly figure with its unit, its n and the table behind it. Drawn by static/charts.js, which switches off the cloud.
+"""Charts of pages: a plain Plotly figure with its unit, its n and the table behind it. static/charts.js draws them, without the cloud.
 
 Colours are tokens (`token:rl`, `token:rl/0.25`); the browser replaces them by the CSS variable `--c-rl` of the theme in use.
 """

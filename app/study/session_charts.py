@@ -65,7 +65,8 @@ def control_chart(data: SessionData) -> Chart:
     traces: list[dict[str, Any]] = [
         {
             "type": "scatter", "mode": "lines+markers", "name": "Beta amplitude", "x": minutes, "y": table.beta, "connectgaps": False,
-            "line": {"color": ACCENT, "width": 1.5}, "marker": {"size": 3.5, "color": ACCENT}, "hovertemplate": f"%{{x:.2f}} min<br>%{{y:.4g}} {unit}<extra>beta</extra>",
+            "line": {"color": ACCENT, "width": 1.5}, "marker": {"size": 3.5, "color": ACCENT},
+            "hovertemplate": f"%{{x:.2f}} min<br>%{{y:.4g}} {unit}<extra>beta</extra>",
         },
         *_amplitude_traces(data, minutes),
     ]  # fmt: skip
@@ -73,7 +74,9 @@ def control_chart(data: SessionData) -> Chart:
         "grid": {"rows": 2, "columns": 1},
         "xaxis": axis("Time in session", "min", anchor="y2", zeroline=False),
         "yaxis": axis("Beta", unit, domain=[0.47, 1.0], zeroline=False, rangemode="tozero"),
-        "yaxis2": axis("Amplitude", "mA" if _has(table.amplitude_ma) else "fraction", domain=[0.0, 0.38], rangemode="nonnegative", zeroline=False),
+        "yaxis2": axis(
+            "Amplitude", "mA" if _has(table.amplitude_ma) else "fraction", domain=[0.0, 0.38], rangemode="nonnegative", zeroline=False,
+        ),
         "shapes": [], "annotations": [], "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0},
         "hovermode": "x unified", "margin": {"l": 62, "r": 62, "t": 30, "b": 44},
     }  # fmt: skip
@@ -158,7 +161,10 @@ def _amplitude_traces(data: SessionData, minutes: NDArray[np.float64]) -> list[d
     if np.any(above):
         mark = {"symbol": "triangle-up", "size": 8, "color": BAD}
         traces.append(
-            {"type": "scatter", "mode": "markers", "yaxis": "y2", "name": "above cDBS", "x": minutes[above], "y": values[above], "marker": mark, "hoverinfo": "skip"}
+            {
+                "type": "scatter", "mode": "markers", "yaxis": "y2", "name": "above cDBS", "x": minutes[above], "y": values[above],
+                "marker": mark, "hoverinfo": "skip",
+            }
         )  # fmt: skip
     return traces
 
@@ -166,7 +172,10 @@ def _amplitude_traces(data: SessionData, minutes: NDArray[np.float64]) -> list[d
 def _mark_lead(layout: dict[str, Any], first: float) -> None:
     """Shade the window before the session: the state s_0."""
     layout["shapes"].append(
-        {"type": "rect", "xref": "x", "yref": "paper", "x0": first, "x1": 0, "y0": 0, "y1": 1, "fillcolor": GRID, "opacity": 0.35, "line": {"width": 0}, "layer": "below"}
+        {
+            "type": "rect", "xref": "x", "yref": "paper", "x0": first, "x1": 0, "y0": 0, "y1": 1, "fillcolor": GRID, "opacity": 0.35,
+            "line": {"width": 0}, "layer": "below",
+        }
     )  # fmt: skip
 
 

@@ -92,7 +92,10 @@ def session_page(request: Request, session: CurrentSession, db: Db, caller: Curr
 def record_qoc(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Enter or correct QoCs."""
     try:
-        service.record_qoc(db, session, parse(QocIn, values, _QOC_LABELS), caller)
+        shown = _shown_qoc(session)
+        # what was left as shown keeps its digits, which the form does not show
+        changed = {name: text for name, text in values.items() if shown.get(name, "") != text or name == "reason"}
+        service.record_qoc(db, session, parse(QocIn, changed, _QOC_LABELS), caller)
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, session, caller, error, typed={k: str(v) for k, v in values.items()})
@@ -135,6 +138,12 @@ def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
     return RedirectResponse(f"/sessions/{session.id}?done=corrected", 303)
 
 
+def _shown_qoc(session: StudySession) -> dict[str, str]:
+    """The present QoCs as the form shows them."""
+    values = {n: getattr(session.qoc, n, None) for n in ("grasp_hz", "rating", "tremor_percent")}
+    return {name: "" if value is None else f"{value:.4g}" for name, value in values.items()}
+
+
 def _policy_id(db: Session, session: StudySession, name: str) -> int:
     found = repository.policy_id(db, session.visit.participant_id, name)
     if found is None:
@@ -160,7 +169,7 @@ def _page(
         trouble = unreadable.problem(request.url.path)
     used = {t.id for t in (data.table.beta_trace, data.table.amplitude_trace) if t} if data else set()
     others = [c for r in recordings for c in other_charts(traces[r.id], session_offset_s(session, r.id), session.duration_s, used)]
-    known = {n: getattr(session.qoc, n, None) for n in ("grasp_hz", "rating", "tremor_percent")}
+    known = _shown_qoc(session)
     page = render(
         request,
         "study/session.html",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 from app.study.models import SettingsVersion
@@ -35,6 +36,7 @@ class SettingGroup:
     fields: tuple[SettingField, ...]
 
 
+_WHOLE: dict[str, Any] = {"inputmode": "numeric"}
 _WORDS: dict[str, Any] = {"maxlength": 40, "autocomplete": "off"}
 _SOURCES = (
     ("", "not stated"),
@@ -51,9 +53,11 @@ GROUPS = (
         (
             SettingField(
                 "xi_beta", "Beta threshold ξβ",
-                "Below it a step earns r_a, at or above it r_b. In the unit of the beta trace. There is no default: jobs do not start without it.",
+                "Below it a step earns r_a, at or above it r_b. In the unit of the beta trace. No default: jobs do not start without it.",
             ),
-            SettingField("beta_unit", "Unit of beta", "As the trace states it, e.g. uV. Traces of another unit stay out of the buffer.", attrs=_WORDS),
+            SettingField(
+                "beta_unit", "Unit of beta", "As the trace states it, e.g. uV. Traces of another unit stay out of the buffer.", attrs=_WORDS
+            ),
             SettingField("beta_source", "Source of beta", "Where the trace that drives the controller comes from.", options=_SOURCES),
             SettingField(
                 "cdbs_amplitude_ma", "cDBS amplitude",
@@ -70,7 +74,7 @@ GROUPS = (
     SettingGroup(
         "State and time",
         (
-            SettingField("window", "State length W", "Number of beta amplitudes that a policy sees. The paper uses 10.", "steps", attrs={"inputmode": "numeric"}),
+            SettingField("window", "State length W", "Beta amplitudes that a policy sees. The paper uses 10.", "steps", attrs=_WHOLE),
             SettingField("period_s", "Step length m", "Time between two decisions. The paper uses 2 s.", "s"),
             SettingField("gamma", "Discount γ", "Weight of the next step against this one, 0 to below 1. The paper gives none."),
         ),
@@ -86,7 +90,7 @@ GROUPS = (
     SettingGroup(
         "End-of-session reward",
         (
-            SettingField("c2", "Weight of grasp C₂", "Times the grasp frequency in Hz. 10, or 25 where symptoms are subtle; 0 drops grasp."),
+            SettingField("c2", "Weight of grasp C₂", "Times the grasp frequency, Hz. 10, or 25 where symptoms are subtle; 0 drops grasp."),
             SettingField("c3", "Weight of rating C₃", "Times the rating, 1 to 10. 0 drops the rating."),
             SettingField("c4", "Weight of tremor C₄", "Times the tremor share, taken off. 0 drops tremor."),
             SettingField(
@@ -97,7 +101,7 @@ GROUPS = (
     ),
     SettingGroup(
         "Random controller",
-        (SettingField("lower_bound", "Lower bound B", "Lowest amplitude fraction that the random controller draws. It never bounds a policy."),),
+        (SettingField("lower_bound", "Lower bound B", "Lowest fraction that the random controller draws. It never bounds a policy."),),
     ),
 )  # fmt: skip
 
@@ -120,7 +124,7 @@ class VersionChange:
 def history(versions: list[SettingsVersion]) -> list[VersionChange]:
     """All versions, newest first, with their changes."""
     found = [VersionChange(versions[0], [])]
-    for before, after in zip(versions, versions[1:], strict=False):
+    for before, after in pairwise(versions):
         old, new = texts(before), texts(after)
         found.append(VersionChange(after, [(LABELS[n], old[n] or "—", new[n] or "—") for n in LABELS if old[n] != new[n]]))
     return found[::-1]

@@ -53,7 +53,7 @@ _M_S, _B_S, _M_G, _B_G = 300.0, 17.0, 400.0, 75.0
 _CORTEX, _STRIATUM = 27.0, 2.0
 _W_SG, _W_GS, _W_GG, _W_CS, _W_XG = (19.0, 20.0), (1.12, 10.7), (6.60, 12.3), (2.42, 9.2), (15.1, 139.4)
 _SIGMA_CORTEX, _TAU_CORTEX = 3.0, 5.0  # assumed: spikes per second and ms
-_TAU_X_S, _TAU_ACT_S = 0.35, 90.0  # assumed: bursts within, and drifts over, a session
+_TAU_X_S, _TAU_ACT_S = 0.80, 90.0  # assumed: bursts within, and drifts over, a session
 _TAU_ON_S, _TAU_OFF_S = 0.5, 4.0  # Wiest 2020 (suppressed within 0.5 s); Kuehn 2008 (reduced for about 12 s after cessation = 3 tau)
 _LFP_UV_PER_HZ, _BACKGROUND_UV, _WHITE = 0.5, 0.50, 0.3  # assumed, so that beta is 1-4 uV as in real STN recordings
 _BACKGROUND_CORNER_HZ = 3.0  # assumed: 1/f^2 above

@@ -186,7 +186,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.29, eta=0.68, a50=0.70, hill=2.5, s_act=0.25, c_med=0.05, s_k=0.35),  # assumed
+        brain=BrainConstants(k0=0.29, eta=0.68, a50=0.70, hill=2.5, s_act=0.25, c_med=0.05, s_k=0.40),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=5.0,
             tremor_theta=0.62,
@@ -202,7 +202,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(), constant=0.15),  # selegiline and pramipexole (appendix); size assumed
-        reference=ReferenceBeta(cdbs=1.649, at_03=2.374, off=2.512),
+        reference=ReferenceBeta(cdbs=1.839, at_03=2.543, off=2.664),
     ),
     "P3": ParticipantModel(
         code="P3",

@@ -14,6 +14,7 @@ import pytest
 import uvicorn
 from fastapi.testclient import TestClient
 
+PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 PASSWORD = "correct horse battery"
 FLAGS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
@@ -60,7 +61,7 @@ class Watched:
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
     """A running Chromium; skips where there is none."""
-    path = os.environ.get("BETALOOP_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    path = os.environ.get("BETALOOP_CHROMIUM") or next(filter(None, map(shutil.which, PROGRAMS)), None)
     if path is None:
         pytest.skip("no Chromium here: install it, or name its program in BETALOOP_CHROMIUM")
     from playwright.sync_api import sync_playwright
@@ -99,9 +100,7 @@ def window(chromium: Any, address: str, client: TestClient) -> Iterator[Callable
         watched = Watched(context.new_page(), address)
         watched.page.on("console", lambda m: watched.errors.append(m.text) if m.type in ("error", "warning") else None)
         watched.page.on("pageerror", lambda e: watched.errors.append(str(e)))
-        watched.page.on(
-            "request", lambda r: watched.foreign.append(r.url) if not r.url.startswith((address, "data:", "blob:")) else None
-        )
+        watched.page.on("request", lambda r: watched.foreign.append(r.url) if not r.url.startswith((address, "data:", "blob:")) else None)
         return watched
 
     yield make

@@ -141,6 +141,17 @@ def test_qocs_are_entered_and_corrected_by_form(browser: TestClient, client: Tes
     assert "read wrongly" in browser.get(f"/sessions/{session_id}").text
 
 
+def test_saving_the_form_again_keeps_digits_that_it_does_not_show(browser: TestClient, client: TestClient, session_id: int) -> None:
+    client.put(f"/api/v1/sessions/{session_id}/qoc", json={"grasp_hz": 2.4790827393, "rating": 7, "tremor_percent": 0.0})
+    fields = dict(
+        re.findall(r'name="(grasp_hz|rating|tremor_percent)" type="text" value="([^"]*)"', browser.get(f"/sessions/{session_id}").text)
+    )
+    assert fields == {"grasp_hz": "2.479", "rating": "7", "tremor_percent": "0"}
+    assert browser.post(f"/sessions/{session_id}/qoc", data=fields | {"rating": "8", "tremor_percent": ""}).status_code == 303
+    qoc = client.get(f"/api/v1/sessions/{session_id}/qoc").json()
+    assert (qoc["grasp_hz"], qoc["rating"], qoc["tremor_percent"]) == (2.4790827393, 8, None)
+
+
 def test_a_session_is_excluded_with_a_reason_and_included_again(browser: TestClient, client: TestClient, session_id: int) -> None:
     url = f"/sessions/{session_id}/exclusion"
     assert browser.post(url, data={"excluded_reason": "  "}).status_code == 422

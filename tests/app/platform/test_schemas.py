@@ -15,7 +15,9 @@ class Bounded(Model):
     count: Int = 0
 
 
-@pytest.mark.parametrize("values", [{"place": 0}, {"place": 11}, {"count": 2**31}, {"count": -(2**31) - 1}, {"place": "3"}, {"place": True}])
+@pytest.mark.parametrize(
+    "values", [{"place": 0}, {"place": 11}, {"count": 2**31}, {"count": -(2**31) - 1}, {"place": "3"}, {"place": True}]
+)
 def test_whole_numbers_out_of_bounds_are_refused(values: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         Bounded(**values)  # type: ignore[arg-type]

@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ml.cohort import run_sessions
-from ml.cohort.outcomes import minute_seconds, tremor_minutes
+from ml.cohort import PARTICIPANTS
+from ml.cohort.brain import seed_streams
+from ml.cohort.outcomes import measure, minute_seconds, tremor_minutes
 from ml.qoc import grasp_frequency, tremor_percent
 
 
@@ -34,9 +35,19 @@ def test_more_stimulation_means_faster_grasps_and_less_tremor(constant_sessions)
         assert tremor[0] > tremor[2]
 
 
-def test_a_rating_falls_when_the_amplitude_jumps_about(timetable):
-    calm = run_sessions("P1", timetable([0.7] * 100), seeds=range(40), steps=100)
-    jumping = run_sessions("P1", timetable([0.4, 1.0] * 50), seeds=range(40), steps=100)
-    difference = np.mean([c.rating - j.rating for c, j in zip(calm.outcomes, jumping.outcomes, strict=True)])
-    assert difference == pytest.approx(0.6, abs=0.5)
-    assert difference > 0.2
+def test_a_rating_falls_by_the_mean_change_of_amplitude():
+    flat, jumping = np.full(100, 0.7), np.tile([0.4, 1.0], 50)
+    brady, none = np.full(100, 0.5), np.zeros(100)
+    ratings = []
+    for amplitude in (flat, jumping):
+        counters = seed_streams(np.arange(400, dtype=np.uint64), np.ones(400, dtype=np.uint64))
+        ratings.append(np.mean([measure(PARTICIPANTS["P1"], row, amplitude, brady, none, none).rating for row in counters]))
+    assert ratings[0] == pytest.approx(9 - 3 * 0.5, abs=0.1)
+    assert ratings[0] - ratings[1] == pytest.approx(0.6, abs=0.1)
+
+
+def test_overload_and_tremor_lower_the_rating_to_no_less_than_1():
+    counters = seed_streams(np.arange(2, dtype=np.uint64), np.ones(2, dtype=np.uint64))
+    calm, bad = np.zeros(30), np.full(30, 5.0)
+    assert measure(PARTICIPANTS["P4"], counters[0], calm, calm, calm, calm).rating >= 8
+    assert measure(PARTICIPANTS["P4"], counters[1], calm, np.ones(30), bad, bad).rating == 1

@@ -67,7 +67,7 @@ def envelopes():
     sections = butter(2, (13, 35), "bandpass", fs=250, output="sos")
 
     def envelope(code, controller):
-        batch = run_sessions(code, controller, seeds=range(12), study_seed=range(12), steps=60, keep_lfp=True)
+        batch = run_sessions(code, controller, seeds=range(16), study_seed=range(16), steps=120, keep_lfp=True)
         return np.abs(hilbert(sosfiltfilt(sections, batch.lfp[:, 5_000:].astype(np.float64), axis=1), axis=1))
 
     return {code: (envelope(code, "no_dbs"), envelope(code, "cdbs")) for code in CODES}
