@@ -14,6 +14,7 @@ from sqlalchemy import text
 
 from app import __version__
 from app.platform import web
+from app.platform.compressed import CompressedFiles
 from app.platform.database import Db
 from app.platform.tables import load_tables
 from app.platform.templates import STATIC
@@ -60,7 +61,7 @@ def create_app() -> FastAPI:
     for name in PAGE_MODULES:
         app.include_router(import_module(name).router, include_in_schema=False)
     app.include_router(_service_routes())
-    app.mount("/static/plotly", _Static(packages=[(plotly.__name__, "package_data")]))
+    app.mount("/static/plotly", CompressedFiles(packages=[(plotly.__name__, "package_data")]))
     app.mount("/static", _Static(directory=STATIC))
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

@@ -6,7 +6,7 @@ import json
 import secrets
 import time
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import structlog
 from fastapi import FastAPI, Request, Response
@@ -82,7 +82,7 @@ def _answer(request: Request, error: BetaloopError) -> Response:
         return JSONResponse(json.loads(json.dumps(body, default=str)), error.status, headers, "application/problem+json")
     if isinstance(error, Unauthorized) and request.method in _SAFE:
         target = request.url.path + (f"?{request.url.query}" if request.url.query else "")
-        return RedirectResponse(f"/sign-in?next={target}" if target != "/" else "/sign-in", 303)
+        return RedirectResponse(f"/sign-in?next={quote(target, safe='/')}" if target != "/" else "/sign-in", 303)
     return HTMLResponse(render(request, "error.html", problem=body), error.status)
 
 

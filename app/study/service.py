@@ -26,9 +26,13 @@ MDP_FIELDS = (
     "window", "period_s", "r_a", "r_b", "c1", "c2", "c3", "c4", "gamma", "lower_bound", "tremor_as_fraction",
 )  # fmt: skip
 
+RESERVED_CODES = {"new"}
+
 
 def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
     """Add a participant with its first settings version. Raises Conflict when the code is taken."""
+    if draft.code.lower() in RESERVED_CODES:
+        raise Invalid(f"'{draft.code}' cannot be a participant's code: it is the address of a page.", "Choose another code.")
     site = _site(db, draft.site, caller)
     caller.require(can.WRITE_STUDY, site.study_id, site.id)
     participant = Participant(site_id=site.id, code=draft.code)

@@ -19,12 +19,12 @@ class BrainConstants:
     """Beta activity and its response.
 
     Attributes:
-        k0: resting position between healthy and parkinsonian weights; 0.2-0.3 is noise-driven resonance below the Hopf point.
+        k0: resting position between healthy and parkinsonian weights; 0.2-0.3 is noise-driven resonance around the Hopf point.
         eta: share of STN-GPe loop gain that the cDBS amplitude removes.
         a50, hill: amplitude fraction of half effect, and steepness.
-        s_act: sd of log K from drifts of 60 s (activity, stress, attention).
+        s_act: sd of log K from drifts of 90 s (activity, stress, attention).
         c_med: loss of K at full levodopa effect.
-        s_k: sd of log K from fluctuations of 0.35 s.
+        s_k: sd of log K from fluctuations of 0.8 s.
     """
 
     k0: float
@@ -157,7 +157,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=25.0,
         c3=25.0,
         c4=25.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.28, eta=0.64, a50=0.65, hill=2.0, s_act=0.25, c_med=0.15, s_k=0.35),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.72, a50=0.65, hill=2.0, s_act=0.25, c_med=0.15, s_k=0.36),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=2.0,
             tremor_theta=0.30,
@@ -186,7 +186,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.29, eta=0.68, a50=0.70, hill=2.5, s_act=0.25, c_med=0.05, s_k=0.40),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.80, a50=0.70, hill=2.5, s_act=0.25, c_med=0.05, s_k=0.37),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=5.0,
             tremor_theta=0.62,
@@ -215,7 +215,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.30, eta=0.80, a50=0.60, hill=2.0, s_act=0.25, c_med=0.18, s_k=0.40),  # assumed
+        brain=BrainConstants(k0=0.29, eta=0.82, a50=0.60, hill=2.0, s_act=0.25, c_med=0.18, s_k=0.38),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=4.0,
             tremor_theta=0.55,
@@ -244,7 +244,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.28, eta=0.70, a50=0.65, hill=2.0, s_act=0.25, c_med=0.12, s_k=0.35),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.78, a50=0.65, hill=2.0, s_act=0.25, c_med=0.12, s_k=0.38),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=3.5,
             tremor_theta=0.50,

@@ -69,7 +69,7 @@ def one_period_in_plain_python(participant, counters, state, amplitude, sos):
     for _ in range(500):
         g_x, g_background = gauss_pair(counters, STREAM_LFP)
         white, _ = gauss_pair(counters, STREAM_LFP)
-        x = math.exp(-0.004 / 0.35) * x + math.sqrt(1 - math.exp(-0.004 / 0.35) ** 2) * g_x
+        x = math.exp(-0.004 / 0.8) * x + math.sqrt(1 - math.exp(-0.004 / 0.8) ** 2) * g_x
         decay = math.exp(-0.004 * 2 * math.pi * 3)
         background = decay * background + math.sqrt(1 - decay**2) * g_background
         e += (target - e) * (1 - math.exp(-0.004 / (0.5 if target > e else 4.0)))

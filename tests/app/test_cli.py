@@ -1,0 +1,110 @@
+"""The console command as a newcomer's shell sees it: exit codes, --json, --help with an example."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+COMMANDS = (
+    "serve", "worker", "demo", "migrate", "user add", "token create", "import", "pipeline", "rank", "export",
+)  # fmt: skip
+TABLE = "t_s,beta,amplitude_fraction\n0,1,1\n2,1,0.5\n4,2,0.5\n"
+
+
+def betaloop(*arguments: str, stdin: str = "") -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own, on the database that the environment names."""
+    return subprocess.run(
+        [sys.executable, "-m", "app.cli", *arguments],
+        capture_output=True,
+        text=True,
+        input=stdin,
+        env=os.environ | {"COLUMNS": "200"},
+        check=False,
+    )
+
+
+@pytest.fixture
+def study(fresh_database: str, enrolled: str) -> str:
+    return enrolled
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(command: str) -> None:
+    from typer.testing import CliRunner
+
+    from app.cli import app
+
+    result = CliRunner().invoke(app, [*command.split(), "--help"])
+    assert result.exit_code == 0
+    assert "Example: betaloop" in result.output
+
+
+def test_a_user_and_a_token_are_made_and_the_token_is_printed_once(fresh_database: str) -> None:
+    added = betaloop(
+        "user", "add", "ada@clinic.example", "--role", "clinician", "--password-file", "-", "--json", stdin="a long password\n"
+    )
+    assert added.returncode == 0, added.stderr
+    assert json.loads(added.stdout)["role"] == "clinician"
+    token = betaloop("token", "create", "ada@clinic.example", "--name", "tablet")
+    assert token.returncode == 0
+    assert token.stdout.strip().startswith("blp_")
+    again = betaloop("token", "create", "ada@clinic.example", "--name", "tablet")
+    assert again.returncode == 1
+    assert "already has a token" in again.stderr
+    assert "Traceback" not in again.stderr
+
+
+def test_import_and_export_carry_a_session_round(study: str, tmp_path: Path) -> None:
+    table = tmp_path / "session.csv"
+    table.write_text(TABLE)
+    done = betaloop("import", str(table), "--participant", study, "--visit", "1", "--controller", "random", "--json")
+    assert done.returncode == 0, done.stderr
+    session = json.loads(done.stdout)["sessions"][0]
+    assert (session["controller"], session["duration_s"]) == ("random", 4)
+    out = tmp_path / "record.zip"
+    exported = betaloop("export", study, "--to", str(out), "--json")
+    assert exported.returncode == 0, exported.stderr
+    with zipfile.ZipFile(out) as archive:
+        steps = archive.read(f"{study}/steps.csv").decode().splitlines()
+        sessions = archive.read(f"{study}/sessions.csv").decode()
+    assert steps[-1].split(",")[1:] == ["4.0", "2.0", "1.5", "0.5"]
+    assert "random" in sessions
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "named"),
+    [
+        (["import", "missing.csv", "--participant", "P1", "--visit", "1", "--controller", "cdbs"], 2, "missing.csv"),
+        (["rank", "P404"], 1, "P404"),
+        (["export", "P404"], 1, "P404"),
+        (["pipeline", "P404"], 1, "P404"),
+        (["user", "add", "x@y.example", "--role", "king"], 2, "king"),
+        (["warp"], 2, "warp"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_a_line(fresh_database: str, arguments: list[str], code: int, named: str) -> None:
+    result = betaloop(*arguments)
+    assert result.returncode == code
+    assert named in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_file_of_no_use_is_exit_code_1_with_the_mend(study: str, tmp_path: Path) -> None:
+    table = tmp_path / "wrong.csv"
+    table.write_text("a,b\n1,2\n")
+    result = betaloop("import", str(table), "--participant", study, "--visit", "1", "--controller", "cdbs")
+    assert result.returncode == 1
+    assert "wrong.csv" in result.stderr
+    assert "amplitude_fraction" in result.stderr
+
+
+def test_migrating_twice_is_harmless(fresh_database: str) -> None:
+    for _ in range(2):
+        result = betaloop("migrate")
+        assert result.returncode == 0, result.stderr
