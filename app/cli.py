@@ -171,7 +171,7 @@ def pipeline(
     as_json: AsJson = False,
 ) -> None:
     """Train, distil, evaluate and rank: the work between two visits. A worker must be running."""
-    from app.platform.jobs import service as jobs
+    from app.evaluation.service import start_job
     from app.platform.jobs.models import JobStatus
     from app.platform.jobs.watch import show_progress
     from app.study import repository as study
@@ -179,7 +179,7 @@ def pipeline(
     params: dict[str, Any] = {} if preset is None else {"preset": preset}
     with transaction(ACTOR) as db:
         person = study.participant_by_code(db, code, SYSTEM)
-        job_id = jobs.submit(db, "pipeline", person.id, params, ACTOR).id
+        job_id = start_job(db, person, "pipeline", params, SYSTEM).id
     status = show_progress(job_id, Console(stderr=True)).status if wait else JobStatus.QUEUED
     _print({"id": job_id, "status": status.value}, as_json, f"Job {job_id}: {status}.")
     if status in {"failed", "cancelled"}:

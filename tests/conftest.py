@@ -12,10 +12,13 @@ import pytest
 from alembic import command
 from alembic.config import Config
 from fastapi.testclient import TestClient
+from pwdlib import PasswordHash
+from pwdlib.hashers.argon2 import Argon2Hasher
 from sqlalchemy import create_engine
 from sqlalchemy.orm import Session
 
 import app.platform.database as database
+from app.accounts import service as accounts
 from app.platform.embedded_postgres import EmbeddedPostgres
 from app.platform.jobs import engine as jobs_engine
 from app.settings import get_settings
@@ -36,7 +39,7 @@ def recordings() -> Path:
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedPostgres]:
     """A PostgreSQL of this test run with a migrated template database."""
-    server = EmbeddedPostgres(tmp_path_factory.mktemp("database") / "postgres")
+    server = EmbeddedPostgres(tmp_path_factory.mktemp("database") / "postgres", durable=False)
     server.start()
     engine = create_engine(server.url("betaloop"))
     with engine.begin() as connection:
@@ -72,6 +75,13 @@ def fresh_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest
     with psycopg.connect(admin, autocommit=True) as connection:
         connection.execute(f"drop database {name} with (force)")
     shutil.rmtree(tmp_path / "data", ignore_errors=True)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def cheap_passwords() -> None:
+    """Argon2 as in the service, at a cost that hundreds of tests can bear."""
+    accounts._hasher = PasswordHash((Argon2Hasher(time_cost=1, memory_cost=64, parallelism=1),))
+    accounts._decoy.cache_clear()
 
 
 @pytest.fixture

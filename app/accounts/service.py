@@ -6,6 +6,7 @@ import hashlib
 import re
 import secrets
 from datetime import timedelta
+from functools import lru_cache
 
 from pwdlib import PasswordHash
 from sqlalchemy import select
@@ -25,7 +26,12 @@ _SEEN_RESOLUTION = timedelta(minutes=1)
 _TOKEN_PREFIX = "blp_"
 
 _hasher = PasswordHash.recommended()
-_decoy = _hasher.hash(secrets.token_hex(16))
+
+
+@lru_cache(maxsize=1)
+def _decoy() -> str:
+    """Hash of a password that nobody has."""
+    return _hasher.hash(secrets.token_hex(16))
 
 
 def add_user(db: Session, email: str, role: Role, password: str, study_code: str | None = None, name: str = "") -> User:
@@ -104,7 +110,7 @@ def sign_in(db: Session, email: str, password: str) -> str:
         raise TooMany(f"Too many failed sign-ins for {email}.", f"Wait {FAILURE_WINDOW.seconds // 60} minutes and try again.")
     user = repository.user_by_email(db, email)
     # an unknown address costs the same time as a wrong password, so that addresses cannot be guessed by the clock
-    ok = _hasher.verify(password, user.password_hash if user else _decoy)
+    ok = _hasher.verify(password, user.password_hash if user else _decoy())
     if not (ok and user and user.active):
         db.add(SignInAttempt(email=email))
         raise Unauthorized("The e-mail address or the password is wrong.")

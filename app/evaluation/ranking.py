@@ -24,6 +24,7 @@ from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Participant
+from ml.ope.coverage import NO_CLOSED_LOOP
 from ml.ope.estimate import Estimate
 from ml.ope.ranking import rank_policies
 
@@ -141,11 +142,18 @@ def _rows(
                 retired=policy.retired_reason is not None,
                 estimates={m: _estimate_out(table[i][m]) for m in METHODS if m in table[i]},
                 predicted=chosen.predicted if chosen else {},
-                flags=list(chosen.flags) if chosen else [],
+                flags=_flags(chosen, i in references),
                 tested=tested.get(i),
             )
         )
     return rows
+
+
+def _flags(estimate: Estimate | None, is_reference: bool) -> list[str]:
+    """What to know of a policy. That a reference holds one amplitude is its purpose and no warning."""
+    if estimate is None:
+        return []
+    return [f for f in estimate.flags if not (is_reference and f.startswith(NO_CLOSED_LOOP))]
 
 
 def _reference(policy: Policy) -> str:

@@ -34,12 +34,14 @@ class EmbeddedPostgres:
 
     Args:
         folder: where the server's data live; its parent must exist.
+        durable: False gives up surviving a crash of the machine, for databases that are thrown away (tests).
 
     Raises:
         RuntimeError: the server does not come up; the message holds the end of its log.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, durable: bool = True) -> None:
+        self._durable = durable
         self._marker = folder.resolve()
         self._bin = _wheel_binaries()
         self._user: str | None = None
@@ -146,6 +148,8 @@ class EmbeddedPostgres:
         if self._user:
             shutil.chown(self._sockets, self._user)
         options = f"-h '' -k {self._sockets} -c max_connections=200"
+        if not self._durable:
+            options += " -c fsync=off -c full_page_writes=off -c synchronous_commit=off"
         log = self.data / "server.log"
         deadline = time.monotonic() + _START_TIMEOUT_S
         while True:

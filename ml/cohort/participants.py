@@ -173,7 +173,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.412, at_03=1.902, off=2.111),
+        reference=ReferenceBeta(cdbs=1.360, at_03=1.861, off=2.094),
     ),
     "P2": ParticipantModel(
         code="P2",
@@ -186,7 +186,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.28, eta=0.80, a50=0.70, hill=2.5, s_act=0.25, c_med=0.05, s_k=0.37),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.75, a50=0.70, hill=2.5, s_act=0.25, c_med=0.05, s_k=0.37),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=5.0,
             tremor_theta=0.62,
@@ -202,7 +202,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(), constant=0.15),  # selegiline and pramipexole (appendix); size assumed
-        reference=ReferenceBeta(cdbs=1.839, at_03=2.543, off=2.664),
+        reference=ReferenceBeta(cdbs=1.529, at_03=2.240, off=2.388),
     ),
     "P3": ParticipantModel(
         code="P3",
@@ -215,7 +215,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.29, eta=0.82, a50=0.60, hill=2.0, s_act=0.25, c_med=0.18, s_k=0.38),  # assumed
+        brain=BrainConstants(k0=0.29, eta=0.84, a50=0.60, hill=2.0, s_act=0.25, c_med=0.18, s_k=0.38),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=4.0,
             tremor_theta=0.55,
@@ -231,7 +231,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.590, at_03=2.157, off=2.423),
+        reference=ReferenceBeta(cdbs=1.405, at_03=1.908, off=2.198),
     ),
     "P4": ParticipantModel(
         code="P4",
@@ -260,6 +260,6 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(-2.0,), constant=0.0),  # appendix: one tablet at about 7 o'clock
-        reference=ReferenceBeta(cdbs=1.492, at_03=2.052, off=2.288),
+        reference=ReferenceBeta(cdbs=1.483, at_03=2.067, off=2.319),
     ),
 }

@@ -24,6 +24,14 @@ UNSUPPORTED_SHARE = 0.20
 NOTICE_SHARE = 0.05
 """Above this share the page says so."""
 
+NO_CLOSED_LOOP = "no closed loop"
+
+SAME_AMPLITUDE = 0.02
+"""A policy whose middle 98 % of amplitudes lie closer together than this does not answer to beta."""
+
+AS_GOOD_AS_OFF = 0.10
+"""Below this amplitude a step is as good as without stimulation, for the warning on the page."""
+
 FEW_EFFECTIVE = 10.0
 """Effective sessions below this: importance weights rest on a handful of sessions."""
 
@@ -37,6 +45,8 @@ class Coverage:
         thin: share of states whose pi(s) has next to no logged amplitude near it (this includes those outside).
         logged_low, logged_high: range of the logged amplitudes.
         n_states: states looked at.
+        spread: width of the middle 98 % of the policy's amplitudes. median: of its amplitudes. off: share of steps as good as without
+            stimulation.
     """
 
     outside_range: float
@@ -44,6 +54,9 @@ class Coverage:
     logged_low: float
     logged_high: float
     n_states: int
+    spread: float
+    median: float
+    off: float
 
     @property
     def supported(self) -> bool:
@@ -52,14 +65,19 @@ class Coverage:
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """Failing and noteworthy checks, in words."""
-        if self.thin <= NOTICE_SHARE:
-            return ()
-        verdict = "" if self.supported else "not supported by the data: "
-        return (
-            f"{verdict}in {100 * self.thin:.0f} % of steps the policy asks for amplitudes that are hardly or never logged "
-            f"(logged: {self.logged_low:.2f} to {self.logged_high:.2f})",
-        )
+        """Failing and noteworthy checks, in words: what the data cannot say, and what a clinician should know before ticking it."""
+        found = []
+        if self.thin > NOTICE_SHARE:
+            verdict = "" if self.supported else "not supported by the data: "
+            found.append(
+                f"{verdict}in {100 * self.thin:.0f} % of steps the policy asks for amplitudes that are hardly or never logged "
+                f"(logged: {self.logged_low:.2f} to {self.logged_high:.2f})"
+            )
+        if self.spread < SAME_AMPLITUDE:
+            found.append(f"{NO_CLOSED_LOOP}: about {100 * self.median:.0f} % of the cDBS amplitude whatever beta does")
+        if self.off > NOTICE_SHARE:
+            found.append(f"as good as no stimulation in {100 * self.off:.0f} % of steps (below {100 * AS_GOOD_AS_OFF:.0f} % of cDBS)")
+        return tuple(found)
 
     def to_json(self) -> dict[str, Any]:
         """All numbers, by name."""
@@ -86,7 +104,9 @@ class AmplitudeSupport:
         outside = (chosen < low - 0.5 * NEIGHBOURHOOD) | (chosen > high + 0.5 * NEIGHBOURHOOD)
         near = np.searchsorted(logged, chosen + NEIGHBOURHOOD, "right") - np.searchsorted(logged, chosen - NEIGHBOURHOOD, "left")
         thin = outside | (near < NEIGHBOUR_SHARE * logged.size)
-        return Coverage(float(outside.mean()), float(thin.mean()), low, high, chosen.size)
+        q01, median, q99 = (float(q) for q in np.quantile(chosen, (0.01, 0.5, 0.99)))
+        off = float(np.mean(chosen < AS_GOOD_AS_OFF))
+        return Coverage(float(outside.mean()), float(thin.mean()), low, high, chosen.size, q99 - q01, median, off)
 
     def of_policy(self, policy: Policy) -> Coverage:
         """Coverage of a policy over the states of the buffer."""
