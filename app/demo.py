@@ -1,7 +1,7 @@
 """`betaloop demo`: everything on one machine, with a small synthetic study that enters through the public upload path.
 
-Started again, it finds its study and serves it within seconds; interrupted, it goes on: every simulated session has fixed numbers, so that
-what was uploaded before is recognised by its bytes.
+Started again, it finds its study and serves it within seconds; interrupted, it goes on: every simulated session has fixed numbers and the
+day on which the demo was begun is kept, so that what was uploaded before is recognised by its bytes.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from app.accounts import repository as accounts_repository
 from app.accounts import service as accounts
 from app.accounts.models import Role
 from app.demo_study import DemoVisit, demo_visits, participant_body
-from app.platform.database import transaction
+from app.platform.database import now, transaction
 from app.platform.errors import BetaloopError, Conflict
 from app.platform.migrate import migrate
 from app.settings import get_settings
@@ -154,10 +155,13 @@ def _wait(children: list[subprocess.Popen[bytes]]) -> None:
 
 
 def _load_and_rank(url: str, state_path: Path, children: list[subprocess.Popen[bytes]]) -> None:
-    state = json.loads(state_path.read_text()) if state_path.exists() else {"loaded": [], "jobs": {}}
+    state: dict[str, Any] = (
+        json.loads(state_path.read_text()) if state_path.exists() else {"begun": now().date().isoformat(), "loaded": [], "jobs": {}}
+    )
     if set(state["loaded"]) == set(PARTICIPANTS) and set(state["jobs"]) == set(PARTICIPANTS):
         return
     columns = (TextColumn("  {task.description:<42}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    _save(state_path, state)
     with httpx.Client(base_url=f"{url}/api/v1", headers={"Authorization": f"Bearer {_token()}"}, timeout=120) as client:
         loader = _Loader(client, state, state_path)
         with Progress(*columns, console=console) as bars:
@@ -184,19 +188,19 @@ class _Loader:
     def load(self, code: str, bars: Progress) -> None:
         """One participant: enrol, add visits, upload every session's file, enter the QoCs."""
         self._post("/participants", participant_body(code), may_exist=True)
-        visits = demo_visits(code)
+        visits = demo_visits(code, date.fromisoformat(self.state["begun"]))
         total = sum(len(v.sessions) for v in visits) or 1
         bar = bars.add_task(f"{code}: simulate and upload sessions", total=total)
         for visit in visits:
             self._post(f"/participants/{code}/visits", {"number": visit.number, "date": visit.date.isoformat()}, may_exist=True)
             self._upload(code, visit, bars, bar)
         self.state["loaded"].append(code)
-        self._save()
+        _save(self.path, self.state)
 
     def submit(self, code: str) -> None:
         """Ask for the between-visit pipeline."""
         self.state["jobs"][code] = self._post(f"/participants/{code}/jobs", {"kind": "pipeline", "preset": "quick"})["id"]
-        self._save()
+        _save(self.path, self.state)
 
     def _upload(self, code: str, visit: DemoVisit, bars: Progress, bar: TaskID) -> None:
         for session in visit.sessions:
@@ -221,10 +225,11 @@ class _Loader:
         body: dict[str, Any] = answer.json()
         return body
 
-    def _save(self) -> None:
-        draft = self.path.with_suffix(".part")
-        draft.write_text(json.dumps(self.state))
-        draft.replace(self.path)
+
+def _save(path: Path, state: dict[str, Any]) -> None:
+    draft = path.with_suffix(".part")
+    draft.write_text(json.dumps(state))
+    draft.replace(path)
 
 
 def _follow(client: httpx.Client, job_id: str, children: list[subprocess.Popen[bytes]]) -> None:

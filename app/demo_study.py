@@ -13,8 +13,9 @@ VISITS = 3
 """Visits with data; one more is planned after them."""
 DAY = ("random", "cdbs", "random", "no_dbs", "cdbs", "random")
 MINUTES = {"random": 10, "cdbs": 10, "no_dbs": 5}
-FIRST_VISIT = dt.datetime(2026, 1, 12, 9, 0, tzinfo=dt.UTC)
 BETWEEN_VISITS = dt.timedelta(days=28)
+NEXT_VISIT_IN = dt.timedelta(days=14)
+MORNING = dt.time(9, 0, tzinfo=dt.UTC)
 BETWEEN_SESSIONS = dt.timedelta(minutes=20)
 DEVICE_PARTICIPANT = "P1"
 """This participant's sessions arrive as RC+S folders, the others' as tables."""
@@ -93,11 +94,12 @@ def participant_body(code: str) -> dict[str, Any]:
     }
 
 
-def demo_visits(code: str) -> list[DemoVisit]:
-    """The participant's visits, a month apart."""
+def demo_visits(code: str, today: dt.date) -> list[DemoVisit]:
+    """The participant's visits, a month apart; the next lies two weeks after `today`."""
     visits = []
+    first = dt.datetime.combine(today + NEXT_VISIT_IN - VISITS * BETWEEN_VISITS, MORNING)
     for number in range(1, VISITS + 2):
-        day = FIRST_VISIT + BETWEEN_VISITS * (number - 1)
+        day = first + BETWEEN_VISITS * (number - 1)
         sessions = (
             tuple(
                 DemoSession(code, number, i + 1, controller, day + BETWEEN_SESSIONS * i + dt.timedelta(minutes=5))

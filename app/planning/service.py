@@ -266,9 +266,11 @@ def _warnings(
             continue
         if evaluation and line.estimate is None:
             warnings.append(f"Policy '{line.policy.name}' is not in the ranking.")
+        flags = "; ".join(map(str, line.estimate.flags)) if line.estimate else ""
         if line.estimate and not line.estimate.supported:
-            flags = "; ".join(map(str, line.estimate.flags)) or "no reason given"
-            warnings.append(f"The data do not support the estimate of policy '{line.policy.name}': {flags}.")
+            warnings.append(f"The data do not support the estimate of policy '{line.policy.name}': {flags or 'no reason given'}.")
+        elif flags:
+            warnings.append(f"Policy '{line.policy.name}': {flags}.")
         if line.policy.retired_reason:
             warnings.append(f"Policy '{line.policy.name}' was retired: {line.policy.retired_reason}.")
     held = repository.session_count(db, visit.id)

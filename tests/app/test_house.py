@@ -49,3 +49,27 @@ def test_services_leave_the_commit_to_their_callers() -> None:
     allowed = {"app/ingest/service.py", "app/accounts/service.py"}
     committing = {p for p, t in sources("app").items() if p.endswith(("service.py", "repository.py")) and "db.commit()" in t}
     assert committing <= allowed
+
+
+def test_every_local_link_in_a_template_leads_to_a_page() -> None:
+    patterns = [re.compile("^" + re.sub(r"{[^}]+}", "[^/]+", path) + "$") for path in page_paths()]
+    broken = []
+    for template in sorted((ROOT / "app" / "templates").rglob("*.html")):
+        for link in re.findall(r'(?:href|action)="(/[^"]*|{{ base }}/[^"]*)"', template.read_text()):
+            link = link.replace("{{ base }}", "/participants/x")
+            target = re.sub(r"{{.*?}}|{%.*?%}", "x", link.split("?")[0].split("#")[0])
+            if not target.startswith("/static/") and not any(p.match(target) for p in patterns):
+                broken.append(f"{template.name}: {link}")
+    assert broken == []
+
+
+def page_paths() -> set[str]:
+    """Paths of every page and of every route of the interface."""
+    from importlib import import_module
+
+    from app.main import API_MODULES, PAGE_MODULES
+    from app.platform.tables import load_tables
+
+    load_tables()
+    paths = {route.path for name in PAGE_MODULES for route in import_module(name).router.routes}
+    return paths | {f"/api/v1{route.path}" for name in API_MODULES for route in import_module(name).router.routes}
