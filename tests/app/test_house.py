@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,9 +68,14 @@ def page_paths() -> set[str]:
     """Paths of every page and of every route of the interface."""
     from importlib import import_module
 
+    from fastapi.routing import iter_route_contexts
+
     from app.main import API_MODULES, PAGE_MODULES
     from app.platform.tables import load_tables
 
     load_tables()
-    paths = {route.path for name in PAGE_MODULES for route in import_module(name).router.routes}
-    return paths | {f"/api/v1{route.path}" for name in API_MODULES for route in import_module(name).router.routes}
+
+    def routes(name: str) -> Iterable[str]:
+        return (context.path for context in iter_route_contexts(import_module(name).router.routes) if context.path)
+
+    return {p for name in PAGE_MODULES for p in routes(name)} | {f"/api/v1{p}" for name in API_MODULES for p in routes(name)}
