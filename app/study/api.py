@@ -197,7 +197,7 @@ def trace_out(data: SessionData) -> TraceOut:
         beta_channel=beta.channel if beta else None,
         decode_version=beta.decode_version if beta else None,
         cdbs_amplitude_ma=table.cdbs_ma,
-        xi_beta=data.settings.xi_beta,
+        xi_beta=data.threshold,
         steps_above_cdbs=table.above_one,
         t_s=table.t_s.tolist(),
         beta=_nullable(table.beta),

@@ -155,6 +155,25 @@ class SessionData:
     settings: SettingsVersion
     table: StepTable
 
+    @property
+    def threshold_mismatch(self) -> str:
+        """Why the participant's threshold says nothing about this trace; empty where it does. Units and sources are never mixed."""
+        trace, settings = self.table.beta_trace, self.settings
+        if trace is None or settings.xi_beta is None:
+            return ""
+        wanted = (settings.beta_unit or trace.unit, settings.beta_source or trace.source)
+        if (trace.unit, trace.source) == wanted:
+            return ""
+        return (
+            f"The threshold of {settings.xi_beta:g} is in {wanted[0]} from {wanted[1]}; this trace is in {trace.unit} from {trace.source}. "
+            "They are not comparable."
+        )
+
+    @property
+    def threshold(self) -> float | None:
+        """xi_beta, where it is in the unit and from the source of this trace."""
+        return None if self.threshold_mismatch else self.settings.xi_beta
+
 
 def session_data(db: Session, session: StudySession) -> SessionData:
     """Beta and amplitude of a session."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,8 +38,54 @@ class StimulationStep:
         return self.fraction is not None and self.fraction > 1 + AMPLITUDE_TOLERANCE
 
 
-def stimulation_steps(data: SessionData) -> list[StimulationStep]:
-    """Runs of equal amplitude within the session; unknown stretches between known ones are steps without amplitude."""
+def stimulation_steps(data: SessionData, events: Sequence[Mapping[str, Any]], origin_s: float) -> list[StimulationStep]:
+    """Stretches of equal amplitude within the session: from the device's log where there is one, else from the 2 s table.
+
+    Args:
+        data: the session. events: of its control recording, as stored. origin_s: where the session starts in that recording's clock.
+    """
+    logged = [e for e in events if e["kind"] == "stimulation" and "delivered_ma" in e["data"]]
+    return _logged_steps(data, logged, origin_s) if logged else _table_steps(data)
+
+
+def _logged_steps(data: SessionData, logged: Sequence[Mapping[str, Any]], origin_s: float) -> list[StimulationStep]:
+    """Steps from the device's log, in the program that the amplitude trace shows, cut at the session's ends."""
+    trace, cdbs = data.table.amplitude_trace, data.table.cdbs_ma
+    program = int(trace.channel.rpartition(" ")[2]) if trace and trace.channel.startswith("program ") else 0
+    changes = sorted((float(e["t_s"]) - origin_s, float(e["data"]["delivered_ma"][program])) for e in logged)
+    steps: list[StimulationStep] = []
+    for i, (start, amplitude) in enumerate(changes):
+        stop = min(changes[i + 1][0] if i + 1 < len(changes) else data.session.duration_s, data.session.duration_s)
+        start = max(start, 0.0)
+        if stop <= start:
+            continue
+        if steps and steps[-1].amplitude_ma == amplitude:
+            start = steps.pop().start_s
+        steps.append(StimulationStep(start, stop, amplitude, amplitude / cdbs if cdbs else None))
+    return steps
+
+
+def operator_conflicts(events: Sequence[Mapping[str, Any]], origin_s: float) -> list[tuple[float, str, float | None]]:
+    """Operator's notes that disagree with the device: time in the session (s), the note, what the device delivered (mA)."""
+    notes = (e for e in events if e["kind"] == "operator_note" and e["data"].get("conflict"))
+    return [(float(e["t_s"]) - origin_s, str(e["label"]), e["data"].get("device_amplitude_ma")) for e in notes]
+
+
+def _fit_axis(yaxis: dict[str, Any], values: NDArray[np.float64], threshold: float | None) -> int:
+    """Keep a few huge windows (an amplifier's step) from flattening the rest; returns how many lie above the axis."""
+    known = values[~np.isnan(values)]
+    if known.size < 20:
+        return 0
+    top = 1.5 * float(np.quantile(known, 0.9))
+    if float(known.max()) <= 4 * top or top <= 0:
+        return 0
+    top = max(top, 1.2 * threshold if threshold is not None else 0.0)
+    yaxis["range"] = [0, top]
+    return int(np.sum(known > top))
+
+
+def _table_steps(data: SessionData) -> list[StimulationStep]:
+    """Runs of equal amplitude in the 2 s table; unknown stretches between known ones are steps without amplitude."""
     table, period = data.table, data.settings.period_s
     inside = table.t_s > 0
     ends, values = table.t_s[inside], np.where(np.isnan(table.amplitude_ma), table.fraction, table.amplitude_ma)[inside]
@@ -81,8 +127,9 @@ def control_chart(data: SessionData) -> Chart:
         "hovermode": "x unified", "margin": {"l": 62, "r": 62, "t": 30, "b": 44},
     }  # fmt: skip
     _mark_lead(layout, float(minutes[0]))
-    if settings.xi_beta is not None:
-        _add(layout, horizontal(settings.xi_beta, f"threshold {settings.xi_beta:.4g} {unit}".strip(), WARN))
+    if data.threshold is not None:
+        _add(layout, horizontal(data.threshold, f"threshold {data.threshold:.4g} {unit}".strip(), WARN))
+    above = _fit_axis(layout["yaxis"], table.beta, data.threshold)
     if _has(table.amplitude_ma) and table.cdbs_ma:
         _add(layout, horizontal(table.cdbs_ma, f"cDBS {table.cdbs_ma:.3g} mA", MUTED, "dot", "y2"))
         top = 1.15 * max(table.cdbs_ma, float(np.nanmax(table.amplitude_ma)))
@@ -99,6 +146,8 @@ def control_chart(data: SessionData) -> Chart:
         )
         traces.append({"type": "scatter", "x": [minutes[0]], "y": [None], "yaxis": "y3", "showlegend": False, "hoverinfo": "skip"})
     subtitle = f"{unit or 'no unit'} over {settings.period_s:g} s · n = {known} of {int(np.sum(table.t_s > 0))} steps with beta"
+    if above:
+        subtitle += f" · {above} above the axis, up to {float(np.nanmax(table.beta)):.3g}"
     columns = ("Step end (s)", f"Beta ({unit or '—'})", "Amplitude (mA)", "Fraction of cDBS")
     rows: list[list[Cell]] = [
         [float(t), _known(b), _known(a), _known(f)]

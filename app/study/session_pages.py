@@ -20,10 +20,10 @@ from app.platform.templates import render
 from app.study import repository, service
 from app.study.api import CurrentSession
 from app.study.blinding import CONTROLLER_NAMES, arm
-from app.study.models import StudySession
+from app.study.models import Recording, StudySession
 from app.study.schemas import QocIn, SessionChange
 from app.study.service import SessionData
-from app.study.session_charts import control_chart, other_charts, stimulation_steps
+from app.study.session_charts import control_chart, operator_conflicts, other_charts, stimulation_steps
 from app.study.traces import session_offset_s
 from ml.energy import relative_energy
 
@@ -75,7 +75,7 @@ def summarise(data: SessionData) -> Summary:
         longest_gap_s=float(lengths.max(initial=0) * settings.period_s),
         unit=table.beta_trace.unit if table.beta_trace else "",
         median_beta=float(np.median(valid)) if valid.size else None,
-        below_threshold=float(np.mean(valid < settings.xi_beta)) if valid.size and settings.xi_beta is not None else None,
+        below_threshold=float(np.mean(valid < data.threshold)) if valid.size and data.threshold is not None else None,
         mean_fraction=float(known.mean()) if known.size else None,
         energy=relative_energy(fraction) if known.size else None,
         above_cdbs=table.above_one,
@@ -170,6 +170,7 @@ def _page(
     used = {t.id for t in (data.table.beta_trace, data.table.amplitude_trace) if t} if data else set()
     others = [c for r in recordings for c in other_charts(traces[r.id], session_offset_s(session, r.id), session.duration_s, used)]
     known = _shown_qoc(session)
+    events, origin = _control_events(session, recordings)
     page = render(
         request,
         "study/session.html",
@@ -183,7 +184,8 @@ def _page(
         trouble=trouble,
         summary=summarise(data) if data else None,
         control=control_chart(data) if data and (data.table.beta_trace or data.table.amplitude_trace) else None,
-        steps=stimulation_steps(data) if data else [],
+        steps=stimulation_steps(data, events, origin) if data else [],
+        conflicts=operator_conflicts(events, origin),
         others=others,
         streams=[t for r in recordings for t in traces[r.id] if t.stream != "amplitude"],
         recordings=recordings,
@@ -192,3 +194,12 @@ def _page(
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)
+
+
+def _control_events(session: StudySession, recordings: list[Recording]) -> tuple[list[dict[str, Any]], float]:
+    """Events of the recording that the controller saw, as stored, and where the session starts in its clock, seconds."""
+    control = {s.recording_id for s in session.segments if s.is_control}
+    for recording in recordings:
+        if recording.id in control:
+            return list(recording.details.get("events", [])), session_offset_s(session, recording.id)
+    return [], 0.0

@@ -236,3 +236,24 @@ def test_a_stated_unit_and_source_win(client: TestClient, enrolled: str) -> None
     body = upload(client, TABLE, beta_unit="mV", beta_source="time_domain").json()
     trace = client.get(f"/api/v1/sessions/{body['sessions'][0]['id']}/trace").json()
     assert (trace["beta_unit"], trace["beta_source"]) == ("mV", "time_domain")
+
+
+def test_a_threshold_in_another_unit_is_never_held_against_a_trace(client: TestClient, enrolled: str, recordings: Path) -> None:
+    content = (recordings / "rcs" / "stim_sweep.zip").read_bytes()
+    session = upload(client, content, "stim_sweep.zip", controller="other").json()["sessions"][0]["id"]
+    assert client.get(f"/api/v1/sessions/{session}/trace").json()["xi_beta"] is None
+    page = client.get(f"/sessions/{session}").text
+    assert "They are not comparable" in page
+    assert "of valid steps" not in page
+    table = upload(client, TABLE).json()["sessions"][0]["id"]
+    assert client.get(f"/api/v1/sessions/{table}/trace").json()["xi_beta"] == 1.0
+
+
+def test_the_session_page_shows_the_devices_steps_and_the_notes_that_disagree(client: TestClient, enrolled: str, recordings: Path) -> None:
+    content = (recordings / "rcs" / "stim_sweep.zip").read_bytes()
+    session = upload(client, content, "stim_sweep.zip", controller="other").json()["sessions"][0]["id"]
+    page = client.get(f"/sessions/{session}").text
+    levels = ("0.00", "0.30", "0.80", "0.60", "0.90", "1.10", "1.30", "1.60", "1.90", "2.20", "2.40")
+    assert f"n = {len(levels)}" in page
+    assert all(f'<td class="num">{level}</td>' in page for level in levels)
+    assert "n = 4 that disagree" in page
