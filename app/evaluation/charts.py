@@ -118,9 +118,13 @@ def _curve_chart(name: str, by_step: dict[str, dict[float, float]], titles: dict
         title=title,
         subtitle=f"{unit} · n = {len(rows)} points of {len(by_step)} steps",
         figure=figure(
-            data, xaxis=axis("Update"), yaxis=axis(""), showlegend=True, legend={"orientation": "h", "y": -0.25, "font": {"color": MUTED}}
+            data,
+            xaxis=axis("Update"),
+            yaxis=axis(""),
+            showlegend=True,
+            legend={"orientation": "h", "y": -0.34, "yanchor": "top", "x": 0, "font": {"color": MUTED, "size": 11}},
         ),
         columns=["Step", "Update", title],
         rows=rows,
-        height=340,
+        height=400,
     )

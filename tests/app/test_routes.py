@@ -29,7 +29,7 @@ WRITERS = {
 }
 FORMS: dict[str, dict[str, Any]] = {
     "/api/v1/policies/{policy_id}": {"json": {"retired_reason": "worn out"}},
-    "/api/v1/participants": {"json": {"code": "NEW"}},
+    "/api/v1/participants": {"json": {"code": "Q1"}},
     "/api/v1/participants/{code}/settings": {"json": {"settings": {"gamma": 0.9}}},
     "/api/v1/participants/{code}/visits": {"json": {"number": 77}},
     "/api/v1/sessions/{session_id}": {"json": {"reason": "none"}},

@@ -58,9 +58,9 @@ class Watched:
         return len(charts)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """A running Chromium; skips where there is none."""
+    """A running Chromium, for one module: its event loop must not outlive the browser tests. Skips where there is none."""
     path = os.environ.get("BETALOOP_CHROMIUM") or next(filter(None, map(shutil.which, PROGRAMS)), None)
     if path is None:
         pytest.skip("no Chromium here: install it, or name its program in BETALOOP_CHROMIUM")

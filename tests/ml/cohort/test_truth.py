@@ -66,16 +66,16 @@ LEVELS = (0.0, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 @pytest.fixture(scope="module")
 def returns():
-    """True returns of constant amplitudes, of the random controller and of adaptive policies, all on the same 60 sessions."""
+    """True returns of constant amplitudes, of the random controller and of adaptive policies, all on the same 100 sessions."""
     out = {}
     for code, participant in PARTICIPANTS.items():
         settings = participant.mdp_settings()
         xi = settings.xi_beta
         adaptive = [ProportionalPolicy(0.7 * xi, 1.0 * xi, floor=0.5, newest=n) for n in (4, 10)]
         out[code] = {
-            "constant": [true_return(ConstantPolicy(a), participant, settings, sessions=60, threads=2) for a in LEVELS],
-            "random": true_return("random", participant, settings, sessions=60, threads=2),
-            "adaptive": [true_return(p, participant, settings, sessions=60, threads=2) for p in adaptive],
+            "constant": [true_return(ConstantPolicy(a), participant, settings, sessions=100, threads=2) for a in LEVELS],
+            "random": true_return("random", participant, settings, sessions=100, threads=2),
+            "adaptive": [true_return(p, participant, settings, sessions=100, threads=2) for p in adaptive],
         }
     return out
 
@@ -85,7 +85,7 @@ def returns():
 def test_neither_cdbs_nor_the_random_controller_is_optimal(code, returns):
     best = max(t.mean for t in returns[code]["constant"])
     cdbs = returns[code]["constant"][-1]
-    assert cdbs.mean < best - 2 * np.std(cdbs.returns - returns[code]["constant"][4].returns) / np.sqrt(60)
+    assert cdbs.mean < best - 2 * np.std(cdbs.returns - returns[code]["constant"][4].returns) / np.sqrt(100)
     assert returns[code]["random"].mean < best
 
 
