@@ -43,6 +43,7 @@ def ground_truth_s(code: str, sessions: int, threads: int) -> float:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--quick", action="store_true", help="without the six policies; the default")
     parser.add_argument("--full", action="store_true", help="also time six policies x 200 sessions x 10 minutes")
     arguments = parser.parse_args()
     run_session("P1", "random", seed=0, steps=2)  # compile

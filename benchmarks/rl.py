@@ -151,7 +151,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=50, help="updates per timing")
     parser.add_argument("--repeats", type=int, default=7, help="timings per peer")
+    parser.add_argument("--quick", action="store_true", help="few updates and repeats, for a first look")
     options = parser.parse_args()
+    if options.quick:
+        options.steps, options.repeats = 15, 3
     torch.set_num_threads(1)
     torch.manual_seed(0)
     data = {"s": torch.randn(ROWS, WINDOW), "a": torch.rand(ROWS, 1), "r": torch.randn(ROWS, 1), "s2": torch.randn(ROWS, WINDOW)}

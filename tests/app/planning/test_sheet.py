@@ -100,4 +100,5 @@ def test_every_character_has_a_spelling_or_a_question_mark(text: str, printed: s
 
 @given(st.text())
 def test_whatever_is_typed_fits_the_built_in_fonts(text: str) -> None:
-    latin(text).encode("latin-1")
+    printed = latin(text)
+    assert printed.encode("latin-1").decode("latin-1") == printed
