@@ -105,7 +105,7 @@ def sign_in(db: Session, email: str, password: str) -> str:
     Raises:
         TooMany: too many failures of this address lately. Unauthorized: wrong address or password.
     """
-    email = email.strip().lower()[:254]
+    email = email.strip().lower().replace("\0", "")[:254]
     if repository.recent_failures(db, email, FAILURE_WINDOW) >= FAILURES_ALLOWED:
         raise TooMany(f"Too many failed sign-ins for {email}.", f"Wait {FAILURE_WINDOW.seconds // 60} minutes and try again.")
     user = repository.user_by_email(db, email)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import datetime
-from typing import Annotated, Literal
+from typing import Annotated
 
 from fastapi import APIRouter, File, Form, UploadFile
 from sqlalchemy.orm import Session
@@ -16,15 +15,13 @@ from app.ingest.schemas import FileReportOut, UploadedFileOut, UploadOut
 from app.ingest.service import BetaStated, Incoming, UploadOutcome
 from app.platform.database import Db
 from app.platform.errors import Invalid
-from app.platform.schemas import RowId, problems
+from app.platform.schemas import Moment, RowId, Text, problems
 from app.study import repository as study
 from app.study.api import session_out
 from app.study.models import Controller, Hemisphere
+from app.study.schemas import BetaSource
 
 router = APIRouter(tags=["uploads"], responses=problems(401, 403, 404, 422))
-
-
-BetaSource = Literal["time_domain", "device_power", "percept_lfp", "table"]
 
 
 class UnusableUpload(Invalid):
@@ -38,13 +35,13 @@ def upload(
     db: Db,
     caller: CurrentCaller,
     file: Annotated[list[UploadFile], File(description="One or more files: an RC+S session folder as zip, or a table (CSV, Parquet).")],
-    participant: Annotated[str, Form(description="Code of the participant.")],
+    participant: Annotated[Text, Form(max_length=40, description="Code of the participant.")],
     visit: Annotated[int, Form(ge=1, le=2**31 - 1, description="Number of the visit.")],
     controller: Annotated[Controller, Form(description="What drove the stimulation.")],
-    policy: Annotated[str | None, Form(max_length=100, description="Name or number of the policy that ran.")] = None,
-    started_at: Annotated[datetime | None, Form(description="Start of the session; without an offset: UTC.")] = None,
+    policy: Annotated[Text | None, Form(max_length=100, description="Name or number of the policy that ran.")] = None,
+    started_at: Annotated[Moment | None, Form(description="Start of the session; without an offset: UTC.")] = None,
     hemisphere: Annotated[Hemisphere | None, Form(description="Side of the controlled implant, where the file does not tell.")] = None,
-    beta_unit: Annotated[str | None, Form(max_length=40, description="Unit of a table's beta; the participant's when left out.")] = None,
+    beta_unit: Annotated[Text | None, Form(max_length=40, description="Unit of a table's beta; the participant's when left out.")] = None,
     beta_source: Annotated[BetaSource | None, Form(description="Where a table's beta comes from; the participant's when left out.")] = None,
 ) -> UploadOut:
     """Upload the files of one session. The answer comes after decoding; the same bytes again give the same sessions."""
@@ -61,10 +58,7 @@ def upload(
 def read_upload(upload_id: RowId, db: Db, caller: CurrentCaller) -> UploadOut:
     """One upload with its reports."""
     row, person = repository.upload(db, upload_id, caller)
-    files = [
-        service.FileOutcome(f.name, f, service.stored_reports(f), False, list(repository.session_ids_of_file(db, f.id))) for f in row.files
-    ]
-    return upload_out(db, UploadOutcome(row, person, files), caller)
+    return upload_out(db, UploadOutcome(row, person, service.stored_outcomes(db, row)), caller)
 
 
 def unusable(outcome: UploadOutcome) -> UnusableUpload:

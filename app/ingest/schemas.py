@@ -6,7 +6,7 @@ from datetime import datetime
 
 from pydantic import Field
 
-from app.platform.schemas import Int, Model, Text
+from app.platform.schemas import Int, Model, Moment, Text
 from app.study.models import Controller, Hemisphere
 from app.study.schemas import SessionOut
 
@@ -17,7 +17,7 @@ class UploadForm(Model):
     visit: Int = Field(ge=1)
     controller: Controller
     policy: Text | None = Field(None, max_length=100)
-    started_at: datetime | None = None
+    started_at: Moment | None = None
     hemisphere: Hemisphere | None = None
 
 

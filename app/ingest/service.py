@@ -10,12 +10,14 @@ from sqlalchemy.orm import Session
 
 from app.accounts import policy as can
 from app.accounts.policy import Caller
+from app.ingest import repository
 from app.ingest.formats.log import FileReport, Problem
 from app.ingest.formats.options import DecodeOptions
 from app.ingest.models import Upload, UploadFile
 from app.ingest.receiving import BetaStated, FileOutcome, Incoming, Receiver
 from app.ingest.sessions import StatedSession
 from app.platform.errors import Invalid
+from app.platform.schemas import sensible_time
 from app.study import repository as study
 from app.study import service as study_service
 from app.study.models import Controller, Hemisphere, Participant
@@ -52,6 +54,10 @@ def state_session(
     hemisphere: Hemisphere | None = None,
 ) -> StatedSession:
     """What the sender says of the session. Raises Invalid for a visit or policy that does not exist."""
+    try:
+        started_at = sensible_time(started_at) if started_at else None
+    except ValueError as error:
+        raise Invalid(f"The stated start {started_at} is out of range: {error}.", "Give the start of the session.") from error
     visit = study.visit_by_number(db, participant.id, visit_number)
     if visit is None:
         known = ", ".join(str(v.number) for v in study.visits(db, participant.id, 500, 0)[0]) or "none yet"
@@ -95,6 +101,8 @@ def receive(
     db.flush()
     receiver = Receiver(db, participant, upload, stated, decode_options(participant, beta), beta)
     outcomes = [receiver.receive(one) for one in incoming]
+    # a file that came before has its row in another upload; this one only points at it
+    upload.stated = said | {"duplicates": [o.row.id for o in outcomes if o.duplicate]}
     upload.report = [asdict(r) for o in outcomes for r in o.reports]
     upload.status = "decoded" if any(o.row.status == "decoded" for o in outcomes) else "failed"
     db.commit()
@@ -111,6 +119,13 @@ def decode_options(participant: Participant, beta: BetaStated) -> DecodeOptions:
         min_valid_fraction=settings.min_valid_fraction,
         table_beta_unit=beta.unit or settings.beta_unit or "unstated",
     )
+
+
+def stored_outcomes(db: Session, upload: Upload) -> list[FileOutcome]:
+    """The files of an upload as they were stored, and those that had come before."""
+    own = [FileOutcome(f.name, f, stored_reports(f), False, list(repository.session_ids_of_file(db, f.id))) for f in upload.files]
+    earlier = [db.get_one(UploadFile, i) for i in upload.stated.get("duplicates", [])]
+    return own + [FileOutcome(f.name, f, stored_reports(f), True, list(repository.session_ids_of_file(db, f.id))) for f in earlier]
 
 
 def stored_reports(row: UploadFile) -> list[FileReport]:

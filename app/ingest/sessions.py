@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime
 from typing import Any
 
+import numpy as np
 from sqlalchemy.orm import Session
 
 from app.accounts.policy import SYSTEM
@@ -15,11 +16,13 @@ from app.ingest import repository
 from app.ingest.formats.log import DECODE_VERSION, RecordingLog, TraceLog
 from app.ingest.formats.redact import pseudonym
 from app.ingest.models import UploadFile
+from app.platform.errors import Invalid
+from app.platform.schemas import sensible_time
 from app.settings import get_settings
 from app.study import blinding
 from app.study import repository as study
 from app.study.models import Controller, Device, Hemisphere, Participant, Recording, SessionSegment, StudySession, Trace, Visit
-from app.study.traces import pack
+from app.study.traces import AMPLITUDE_STREAM, cdbs_in_force, pack, step_table
 
 CONTROL_STREAMS = ("beta", "band_power")
 """Streams that can drive a controller, in the order of preference where the participant's source does not decide."""
@@ -36,35 +39,98 @@ class StatedSession:
     hemisphere: Hemisphere | None = None
 
 
+@dataclass(frozen=True)
+class Stored:
+    """What became of the recordings of a file.
+
+    Attributes:
+        session_ids: sessions that the file belongs to. known: all of its recordings had come before.
+        notes, flagged: sentences for the report.
+    """
+
+    session_ids: list[int]
+    known: bool
+    notes: list[str]
+    flagged: list[str]
+
+
 def store_recordings(
     db: Session, participant: Participant, file: UploadFile, recordings: Sequence[RecordingLog], stated: StatedSession
-) -> tuple[list[int], bool, list[str]]:
+) -> Stored:
     """Store what a file gave and make its session.
 
     The recordings of one file (the two implants of one participant) belong to one session. A recording that is known by its content,
-    from another file, keeps the sessions it has.
-
-    Returns:
-        Sessions that the file belongs to; whether all of its recordings were known; sentences for the report.
+    from another file, keeps the sessions it has. A recording without any data is kept and makes no session.
     """
     known_ids: list[int] = []
+    notes: list[str] = []
+    flagged: list[str] = []
     fresh: list[tuple[Recording, RecordingLog]] = []
     for decoded in recordings:
         known = study.recording_by_fingerprint(db, participant.id, decoded.fingerprint)
         if known is not None:
             known_ids.extend(study.session_ids_of_recording(db, known.id))
         else:
-            fresh.append((_add_recording(db, participant, file, decoded), decoded))
-    notes = []
+            kept, flags = _in_milliamperes(decoded, participant, stated)
+            fresh.append((_add_recording(db, participant, file, kept), kept))
+            flagged.extend(flags)
     if known_ids:
         notes.append(f"The same recording came before in another file; it stays session {', '.join(map(str, sorted(set(known_ids))))}.")
-        notes.extend(disagreements(db, known_ids, stated))
-    if not fresh:
-        return sorted(set(known_ids)), bool(recordings), notes
+        flagged.extend(disagreements(db, known_ids, stated))
+    with_data = [(r, log) for r, log in fresh if any(t.valid.any() for t in log.traces)]
+    if fresh and not with_data:
+        flagged.append("It holds no data: the recording is kept, and no session was made.")
+    if not with_data:
+        return Stored(sorted(set(known_ids)), bool(known_ids) and not fresh, notes, flagged)
     session = _add_session(db, participant, fresh, stated)
     control = next(s.recording for s in session.segments if s.is_control)
     notes.append(_session_sentence(session, control, stated))
-    return sorted({*known_ids, session.id}), False, notes
+    flagged.extend(contradictions(db, participant, session, stated))
+    return Stored(sorted({*known_ids, session.id}), False, notes, flagged)
+
+
+def contradictions(db: Session, participant: Participant, session: StudySession, stated: StatedSession) -> list[str]:
+    """Sentences where the amplitudes of a session are not those of the controller that it is said to have had."""
+    try:
+        table = step_table(db, session, participant.current_settings)
+    except Invalid as error:
+        return [str(error)]
+    inside = table.fraction[table.t_s > 0]
+    known = inside[~np.isnan(inside)]
+    found = []
+    if table.above_one:
+        found.append(
+            f"{table.above_one} of {inside.size} steps lie above the cDBS amplitude of {table.cdbs_ma or float('nan'):g} mA; "
+            "they are kept as they are and stay out of replay buffers."
+        )
+    mean = float(known.mean()) if known.size else None
+    if mean is not None and stated.controller == Controller.CDBS and not 0.9 <= mean <= 1.1:
+        found.append(f"Said to be cDBS, but its mean amplitude is {100 * mean:.0f} % of the cDBS amplitude. Correct one of them.")
+    if mean is not None and stated.controller == Controller.NO_DBS and mean > 0.05:
+        found.append(f"Said to be without DBS, but its mean amplitude is {100 * mean:.0f} % of the cDBS amplitude. Correct one of them.")
+    if stated.controller in (Controller.RL, Controller.DISTILLED) and stated.policy_id is None:
+        found.append("No policy is named for this session: it cannot be compared with its estimate. Name one on the session's page.")
+    return found
+
+
+def _in_milliamperes(decoded: RecordingLog, participant: Participant, stated: StatedSession) -> tuple[RecordingLog, list[str]]:
+    """Fractions as the milliamperes they were, by the cDBS amplitude in force now: what was delivered must not change when that does."""
+    if not any(t.stream == AMPLITUDE_STREAM and t.unit == "fraction" for t in decoded.traces):
+        return decoded, []
+    hemisphere = stated.hemisphere or (Hemisphere(decoded.hemisphere) if decoded.hemisphere else None)
+    try:
+        cdbs = cdbs_in_force(stated.visit, hemisphere, participant.current_settings)
+    except Invalid as error:
+        return decoded, [f"Amplitudes are kept as fractions: {error}"]
+    if cdbs is None:
+        return decoded, ["Amplitudes are kept as fractions, because nobody has stated a cDBS amplitude for this participant yet."]
+    traces = tuple(
+        replace(t, unit="mA", values=(t.values * cdbs).astype(np.float32), details={**t.details, "given_as": "fraction", "cdbs_ma": cdbs})
+        if t.stream == AMPLITUDE_STREAM and t.unit == "fraction"
+        else t
+        for t in decoded.traces
+    )
+    return replace(decoded, traces=traces), []
 
 
 def disagreements(db: Session, session_ids: Sequence[int], stated: StatedSession) -> list[str]:
@@ -93,7 +159,7 @@ def _add_recording(db: Session, participant: Participant, file: UploadFile, deco
         fingerprint=decoded.fingerprint,
         hemisphere=decoded.hemisphere,
         clock=decoded.clock,
-        started_at=decoded.started_at,
+        started_at=_known_time(decoded.started_at),
         duration_s=decoded.duration_s,
         details=_json(
             {
@@ -146,9 +212,7 @@ def _add_session(
     wanted_source = participant.current_settings.beta_source
     choices = [(_control(log, wanted_source), recording, log) for recording, log in fresh]
     control, recording, log = next((c for c in choices if c[0] is not None), choices[0])
-    started_at = stated.started_at or log.started_at
-    if started_at is not None and started_at.tzinfo is None:
-        started_at = started_at.replace(tzinfo=UTC)
+    started_at = stated.started_at or _known_time(log.started_at)
     offset_s = _offset_s(log, started_at, participant.current_settings.period_s)
     session = StudySession(
         visit_id=stated.visit.id,
@@ -168,6 +232,14 @@ def _add_session(
     db.add(session)
     db.flush()
     return session
+
+
+def _known_time(value: datetime | None) -> datetime | None:
+    """A recording's own time, where its clock was set at all."""
+    try:
+        return sensible_time(value) if value is not None else None
+    except ValueError:
+        return None
 
 
 def _offset_s(log: RecordingLog, started_at: datetime | None, period_s: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Depends, Query
@@ -20,6 +21,23 @@ def _fits_the_database(value: int) -> int:
 Int = Annotated[int, Strict(), AfterValidator(_fits_the_database), Field(json_schema_extra={"format": "int32"})]
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Bool = Annotated[bool, Strict()]
+
+
+def sensible_time(value: datetime) -> datetime:
+    """UTC, and within the years that any recording can have; offsets would otherwise carry a time out of the calendar.
+
+    Raises:
+        ValueError: a year outside 1990-2200.
+    """
+    if value.tzinfo is None:
+        value = value.replace(tzinfo=UTC)
+    if not 1990 <= value.year <= 2200:
+        raise ValueError("the year must lie between 1990 and 2200")
+    return value.astimezone(UTC)
+
+
+Moment = Annotated[datetime, AfterValidator(sensible_time)]
+"""A time; without an offset it is UTC."""
 RowId = Annotated[int, Field(ge=1, le=2**31 - 1)]
 Text = Annotated[str, Field(pattern=r"^[^\x00]*$")]
 """Text without the zero character, which PostgreSQL cannot hold."""

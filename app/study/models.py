@@ -6,7 +6,7 @@ from datetime import date, datetime
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, LargeBinary, SmallInteger, String, Text, UniqueConstraint, func
+from sqlalchemy import CheckConstraint, ForeignKey, Index, LargeBinary, SmallInteger, String, Text, UniqueConstraint, func, text
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.accounts.models import Site
@@ -31,6 +31,7 @@ class Hemisphere(StrEnum):
     RIGHT = "right"
 
 
+TIME_CHECK = "started_at >= '1990-01-01Z' and started_at < '2201-01-01Z'"
 HEMISPHERE_CHECK = "hemisphere in ('left', 'right')"
 
 
@@ -38,7 +39,10 @@ class Participant(Base):
     """A person in the study, known by code only."""
 
     __tablename__ = "participant"
-    __table_args__ = (CheckConstraint("status in ('active', 'completed', 'withdrawn')", name="status"),)
+    __table_args__ = (
+        CheckConstraint("status in ('active', 'completed', 'withdrawn')", name="status"),
+        Index("uq_participant_code_lower", func.lower(text("code")), unique=True),  # T4 and t4 would be mixed up at the bedside
+    )
 
     id: Mapped[int] = mapped_column(primary_key=True)
     site_id: Mapped[int] = mapped_column(ForeignKey("site.id"), index=True)
@@ -157,6 +161,7 @@ class StudySession(Base):
         CheckConstraint("duration_s >= 0", name="duration"),
         CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"),
         CheckConstraint("excluded_reason is null or excluded_reason <> ''", name="excluded_reason"),
+        CheckConstraint(TIME_CHECK, name="started_at"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
@@ -190,6 +195,7 @@ class Recording(Base):
         UniqueConstraint("participant_id", "fingerprint"),
         CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"),
         CheckConstraint("clock in ('device', 'pc', 'table')", name="clock"),
+        CheckConstraint(TIME_CHECK, name="started_at"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)

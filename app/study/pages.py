@@ -63,11 +63,17 @@ def settings(request: Request, participant: CurrentParticipant, db: Db, caller: 
 def change_settings(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Make a new settings version of what the form changes."""
     before = participant.current_settings.version
+    seen = str(values["version"]) if "version" in values else None
+    shown = [settings_form.Shown(v.version, settings_form.texts(v), v.created_by) for v in participant.settings]
+    changes = settings_form.own_changes(values, seen, shown, settings_form.LABELS)
     try:
-        row = service.change_settings(db, participant, parse(SettingsIn, values, settings_form.LABELS), _reason(values), caller)
+        service.require(caller, can.WRITE_SETTINGS, participant)
+        changes.refuse_conflicts()
+        row = service.change_settings(db, participant, parse(SettingsIn, changes.fields, settings_form.LABELS), _reason(values), caller)
     except BetaloopError as error:
         db.rollback()
-        return _settings_page(request, db, participant, caller, _typed(values, settings_form.texts(participant.current_settings)), error)
+        typed = settings_form.texts(participant.current_settings) | changes.fields
+        return _settings_page(request, db, participant, caller, typed, error, reason=_reason(values))
     db.commit()
     return RedirectResponse(f"/participants/{participant.code}/settings?done={'changed' if row.version != before else 'same'}", 303)
 
@@ -147,6 +153,7 @@ def _settings_page(
     caller: Caller,
     values: dict[str, str],
     error: BetaloopError | None = None,
+    reason: str | None = None,
 ) -> HTMLResponse:
     page = render(
         request,
@@ -154,6 +161,7 @@ def _settings_page(
         participant=participant,
         current=participant.current_settings,
         values=values,
+        reason=reason,
         groups=settings_form.GROUPS,
         history=settings_form.history(participant.settings),
         suggestion=_suggestion(db, participant, caller),

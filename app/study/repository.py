@@ -151,6 +151,12 @@ def policy_name(db: Session, policy_id: int | None) -> str | None:
     return None if policy_id is None else db.scalar(select(policies.c.name).where(policies.c.id == policy_id))
 
 
+def has_policy(db: Session, participant_id: int, policy_id: int) -> bool:
+    """Whether a policy is the participant's."""
+    policies = table("policy", column("id"), column("participant_id"))
+    return db.scalar(select(policies.c.id).where(policies.c.id == policy_id, policies.c.participant_id == participant_id)) is not None
+
+
 def settings_version(db: Session, settings_version_id: int) -> SettingsVersion:
     """A settings version by its row number."""
     return db.get_one(SettingsVersion, settings_version_id)

@@ -4,30 +4,33 @@ from __future__ import annotations
 
 import datetime as dt
 from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints
 
 from app.platform.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
 
+BetaSource = Literal["time_domain", "device_power", "percept_lfp", "table"]
 Code = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$")]
 
 
 class SettingsIn(Model):
     """Settings of a participant; what is left out keeps its present value (for a new participant: its default)."""
 
-    xi_beta: Number | None = Field(None, description="Beta threshold, in the unit of the beta trace; no default, and jobs need it.")
-    beta_unit: Text | None = Field(None, max_length=40, description="Unit of the beta trace, e.g. uV or 'device units'.")
-    beta_source: Text | None = Field(None, max_length=40, description="time_domain, device_power, percept_lfp or table.")
+    xi_beta: Number | None = Field(
+        None, ge=-1e9, le=1e9, description="Beta threshold in the unit of the beta trace; jobs need it."
+    )
+    beta_unit: Text | None = Field(None, min_length=1, max_length=40, description="Unit of the beta trace, e.g. uV or 'device units'.")
+    beta_source: BetaSource | None = Field(None, description="Where beta comes from; sources are never mixed.")
     window: Int = Field(10, ge=1, le=500, description="W, beta amplitudes in a state.")
-    period_s: Number = Field(2.0, gt=0, le=600, description="m, seconds per step.")
-    r_a: Number = Field(0.0, description="Reward below the threshold.")
-    r_b: Number = Field(-1.0, description="Reward at or above the threshold.")
-    c1: Number = Field(0.3, ge=0, description="Price of amplitude, C1.")
-    c2: Number = Field(10.0, ge=0, description="Weight of the grasp frequency in r_end, C2; 0 drops it.")
-    c3: Number = Field(10.0, ge=0, description="Weight of the rating, C3; 0 drops it.")
-    c4: Number = Field(10.0, ge=0, description="Weight of tremor, C4; 0 drops it.")
+    period_s: Number = Field(2.0, ge=0.1, le=600, description="m, seconds per step.")
+    r_a: Number = Field(0.0, ge=-1e6, le=1e6, description="Reward below the threshold.")
+    r_b: Number = Field(-1.0, ge=-1e6, le=1e6, description="Reward at or above the threshold.")
+    c1: Number = Field(0.3, ge=0, le=1e6, description="Price of amplitude, C1.")
+    c2: Number = Field(10.0, ge=0, le=1e6, description="Weight of the grasp frequency in r_end, C2; 0 drops it.")
+    c3: Number = Field(10.0, ge=0, le=1e6, description="Weight of the rating, C3; 0 drops it.")
+    c4: Number = Field(10.0, ge=0, le=1e6, description="Weight of tremor, C4; 0 drops it.")
     gamma: Number = Field(0.99, ge=0, lt=1, description="Discount per step.")
     lower_bound: Number = Field(0.3, ge=0, lt=1, description="B, lowest fraction of the random controller; never bounds a policy.")
     tremor_as_fraction: Bool = Field(True, description="Tremor enters r_end as 0-1 instead of per cent.")

@@ -27,6 +27,8 @@ MDP_FIELDS = (
 )  # fmt: skip
 
 RESERVED_CODES = {"new"}
+POLICY_CONTROLLERS = {Controller.RL, Controller.DISTILLED, Controller.OTHER}
+"""Controllers that a policy can stand behind."""
 
 
 def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
@@ -41,7 +43,9 @@ def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
         db.flush()
     except IntegrityError as error:
         db.rollback()
-        raise Conflict(f"There is already a participant '{draft.code}'.", "Choose another code.") from error
+        raise Conflict(
+            f"There is already a participant '{draft.code}' (capitals and small letters count as the same).", "Choose another code."
+        ) from error
     _add_settings(db, participant, draft.settings.model_dump(), caller, reason=None)
     return participant
 
@@ -132,19 +136,41 @@ def change_session(db: Session, session: StudySession, change: SessionChange, ca
     arm = blinding.arm(session, caller)
     if "controller" in given or "policy_id" in given:
         controller = given.pop("controller", None) or arm.controller
-        blinding.assign(session, controller, given.pop("policy_id", arm.policy_id))
+        kept = arm.policy_id if controller in POLICY_CONTROLLERS else None
+        policy_id = given.pop("policy_id", kept)
+        _check_policy(db, session, controller, policy_id)
+        blinding.assign(session, controller, policy_id)
+    _check_control(db, session, given)
     for name, value in given.items():
         if name == "excluded_reason":
             value = (value or "").strip() or None
         elif name == "control_stream" and value is None:
             continue
         setattr(session, name, value)
-    try:
-        db.flush()
-    except IntegrityError as error:
-        db.rollback()
-        raise Invalid("There is no such policy.", "Name one of the participant's policies.") from error
+    db.flush()
     return session
+
+
+def _check_policy(db: Session, session: StudySession, controller: Controller, policy_id: int | None) -> None:
+    participant = session.visit.participant
+    if policy_id is None:
+        return
+    if controller not in POLICY_CONTROLLERS:
+        raise Invalid(f"A {controller} session has no policy.", "Leave the policy empty, or correct the controller.")
+    if not repository.has_policy(db, participant.id, policy_id):
+        raise Invalid(f"Participant {participant.code} has no policy {policy_id}.", "Name one of this participant's policies.")
+
+
+def _check_control(db: Session, session: StudySession, given: dict[str, Any]) -> None:
+    """A session can only be controlled by a trace that one of its recordings has."""
+    if given.get("control_stream") is None and given.get("control_channel") is None:
+        return
+    stream = given.get("control_stream") or session.control_stream
+    channel = given.get("control_channel", session.control_channel)
+    traces = [t for s in session.segments for t in repository.traces_of_recording(db, s.recording_id)]
+    if not any(t.stream == stream and channel in (None, t.channel) for t in traces):
+        known = "; ".join(sorted({f"{t.stream} {t.channel}".strip() for t in traces})) or "none"
+        raise Invalid(f"The session's recordings have no trace '{stream} {channel or ''}'.", f"Choose one of: {known}.")
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,11 @@ from app.platform.templates import render
 from app.study import repository, service
 from app.study.api import CurrentSession
 from app.study.blinding import CONTROLLER_NAMES, arm
-from app.study.models import Recording, StudySession
+from app.study.models import QocRevision, Recording, StudySession
 from app.study.schemas import QocIn, SessionChange
 from app.study.service import SessionData
 from app.study.session_charts import control_chart, operator_conflicts, other_charts, stimulation_steps
+from app.study.settings_form import Shown, own_changes
 from app.study.traces import session_offset_s
 from ml.energy import relative_energy
 
@@ -91,14 +92,17 @@ def session_page(request: Request, session: CurrentSession, db: Db, caller: Curr
 @router.post("/sessions/{session_id}/qoc")
 def record_qoc(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Enter or correct QoCs."""
+    # what was left as shown keeps its digits, which the form does not show, and what others entered meanwhile
+    seen = str(values["revision"]) if "revision" in values else None
+    changes = own_changes(values, seen, _qoc_revisions(session), _QOC_LABELS)
+    reason = {"reason": str(values["reason"])} if "reason" in values else {}
     try:
-        shown = _shown_qoc(session)
-        # what was left as shown keeps its digits, which the form does not show
-        changed = {name: text for name, text in values.items() if shown.get(name, "") != text or name == "reason"}
-        service.record_qoc(db, session, parse(QocIn, changed, _QOC_LABELS), caller)
+        service.require(caller, can.WRITE_STUDY, session.visit.participant)
+        changes.refuse_conflicts()
+        service.record_qoc(db, session, parse(QocIn, changes.fields | reason, _QOC_LABELS), caller)
     except BetaloopError as error:
         db.rollback()
-        return _page(request, db, session, caller, error, typed={k: str(v) for k, v in values.items()})
+        return _page(request, db, session, caller, error, typed=changes.fields | reason)
     db.commit()
     return RedirectResponse(f"/sessions/{session.id}?done=qoc", 303)
 
@@ -138,9 +142,14 @@ def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
     return RedirectResponse(f"/sessions/{session.id}?done=corrected", 303)
 
 
-def _shown_qoc(session: StudySession) -> dict[str, str]:
-    """The present QoCs as the form shows them."""
-    values = {n: getattr(session.qoc, n, None) for n in ("grasp_hz", "rating", "tremor_percent")}
+def _qoc_revisions(session: StudySession) -> list[Shown]:
+    """Every revision as the form showed it; before the first one, it was empty."""
+    return [Shown(0, _shown_qoc(None), ""), *(Shown(q.revision, _shown_qoc(q), q.entered_by) for q in session.qocs)]
+
+
+def _shown_qoc(revision: QocRevision | None) -> dict[str, str]:
+    """QoCs as the form shows them."""
+    values = {n: getattr(revision, n, None) for n in ("grasp_hz", "rating", "tremor_percent")}
     return {name: "" if value is None else f"{value:.4g}" for name, value in values.items()}
 
 
@@ -169,7 +178,7 @@ def _page(
         trouble = unreadable.problem(request.url.path)
     used = {t.id for t in (data.table.beta_trace, data.table.amplitude_trace) if t} if data else set()
     others = [c for r in recordings for c in other_charts(traces[r.id], session_offset_s(session, r.id), session.duration_s, used)]
-    known = _shown_qoc(session)
+    known = _shown_qoc(session.qoc)
     events, origin = _control_events(session, recordings)
     page = render(
         request,

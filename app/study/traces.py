@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
 from app.study import repository
-from app.study.models import SettingsVersion, StudySession, Trace
+from app.study.models import Hemisphere, SettingsVersion, StudySession, Trace, Visit
 from ml.mdp import AMPLITUDE_TOLERANCE
 
 AMPLITUDE_STREAM = "amplitude"
@@ -56,15 +56,21 @@ def unpack(trace: Trace) -> NDArray[np.float64]:
 
 
 def cdbs_amplitude_ma(session: StudySession, settings: SettingsVersion, program: int = 0) -> float | None:
-    """The cDBS amplitude in force for a session: the visit's row of its hemisphere and program, else the settings' shorthand."""
-    rows = [a for a in session.visit.cdbs_amplitudes if a.program == program and session.hemisphere in (None, a.hemisphere)]
+    """The cDBS amplitude in force for a session, mA. Raises Invalid as `cdbs_in_force` does."""
+    return cdbs_in_force(session.visit, session.hemisphere, settings, program)
+
+
+def cdbs_in_force(visit: Visit, hemisphere: Hemisphere | None, settings: SettingsVersion, program: int = 0) -> float | None:
+    """The visit's cDBS amplitude of a hemisphere and program, mA, else the settings' shorthand; None where nobody stated one.
+
+    Raises:
+        Invalid: the visit states both hemispheres, and it is not known which one is meant.
+    """
+    rows = [a for a in visit.cdbs_amplitudes if a.program == program and hemisphere in (None, a.hemisphere)]
     if len(rows) == 1:
         return rows[0].amplitude_ma
     if len(rows) > 1:
-        raise Invalid(
-            f"Session {session.id} names no hemisphere, and visit {session.visit.number} has cDBS amplitudes for both.",
-            "Set the session's hemisphere.",
-        )
+        raise Invalid(f"No hemisphere is named, and visit {visit.number} has cDBS amplitudes for both.", "Set the session's hemisphere.")
     return settings.cdbs_amplitude_ma
 
 

@@ -202,6 +202,7 @@ def upgrade() -> None:
     sa.PrimaryKeyConstraint('id', name=op.f('pk_participant')),
     sa.UniqueConstraint('code', name=op.f('uq_participant_code'))
     )
+    op.create_index('uq_participant_code_lower', 'participant', [sa.literal_column('lower(code)')], unique=True)
     op.create_index(op.f('ix_participant_site_id'), 'participant', ['site_id'], unique=False)
     op.create_table('device',
     sa.Column('id', sa.Integer(), nullable=False),
@@ -515,6 +516,7 @@ def upgrade() -> None:
     sa.Column('duration_s', sa.Double(), nullable=False),
     sa.Column('details', postgresql.JSONB(astext_type=sa.Text()), nullable=False),
     sa.CheckConstraint("clock in ('device', 'pc', 'table')", name=op.f('ck_recording_clock')),
+    sa.CheckConstraint("started_at >= '1990-01-01Z' and started_at < '2201-01-01Z'", name=op.f('ck_recording_started_at')),
     sa.CheckConstraint("hemisphere in ('left', 'right')", name=op.f('ck_recording_hemisphere')),
     sa.ForeignKeyConstraint(['device_id'], ['device.id'], name=op.f('fk_recording_device_id_device')),
     sa.ForeignKeyConstraint(['participant_id'], ['participant.id'], name=op.f('fk_recording_participant_id_participant')),
@@ -541,6 +543,7 @@ def upgrade() -> None:
     sa.Column('created_at', sa.DateTime(timezone=True), server_default=sa.text('now()'), nullable=False),
     sa.CheckConstraint("controller in ('cdbs', 'rl', 'distilled', 'no_dbs', 'random', 'other')", name=op.f('ck_session_controller')),
     sa.CheckConstraint("excluded_reason is null or excluded_reason <> ''", name=op.f('ck_session_excluded_reason')),
+    sa.CheckConstraint("started_at >= '1990-01-01Z' and started_at < '2201-01-01Z'", name=op.f('ck_session_started_at')),
     sa.CheckConstraint("hemisphere in ('left', 'right')", name=op.f('ck_session_hemisphere')),
     sa.CheckConstraint("status in ('proposed', 'confirmed')", name=op.f('ck_session_status')),
     sa.CheckConstraint('duration_s >= 0', name=op.f('ck_session_duration')),

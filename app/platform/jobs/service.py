@@ -21,6 +21,9 @@ from app.platform.jobs.repository import events_after as events_after
 STALE_S = 60.0
 """A worker that is silent for longer is taken for dead."""
 
+_MANY = 10_000
+"""More jobs than ever wait at once."""
+
 _ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -85,10 +88,16 @@ def retry(db: Session, job: Job, by: str) -> Job:
     """A new job of the same kind with the same params.
 
     Raises:
-        Conflict: the job has not ended.
+        Conflict: the job has not ended, or another one repeats it already.
     """
+    # the row's lock makes a second click wait, so that it sees the job of the first
+    job = repository.locked(db, job.id)
     if not JobStatus(job.status).ended:
         raise Conflict(f"Job {job.id} is still {job.status}.", "Wait for it or cancel it, then retry.")
+    live, _ = repository.find(db, job.participant_id, job.kind, repository.LIVE, limit=_MANY)
+    for other in live:
+        if other.participant_id == job.participant_id and other.params == job.params and other.created_at >= job.created_at:
+            raise Conflict(f"Job {other.id}, {other.status}, repeats job {job.id} already.", "Wait for it or cancel it, then retry.")
     return submit(db, job.kind, job.participant_id, job.params, by)
 
 

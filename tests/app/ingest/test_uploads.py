@@ -257,3 +257,46 @@ def test_the_session_page_shows_the_devices_steps_and_the_notes_that_disagree(cl
     assert f"n = {len(levels)}" in page
     assert all(f'<td class="num">{level}</td>' in page for level in levels)
     assert "n = 4 that disagree" in page
+
+
+def test_what_was_delivered_does_not_change_when_the_cdbs_amplitude_does(client: TestClient, enrolled: str) -> None:
+    session = upload(client, TABLE).json()["sessions"][0]["id"]
+    before = client.get(f"/api/v1/sessions/{session}/trace").json()
+    client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"cdbs_amplitude_ma": 2.0}})
+    after = client.get(f"/api/v1/sessions/{session}/trace").json()
+    assert before["amplitude_ma"] == after["amplitude_ma"]
+    assert after["amplitude_fraction"][-1] == pytest.approx(1.8)
+
+
+@pytest.mark.parametrize("start", ["0001-01-01T00:00:00+14:00", "9999-12-31T23:59:59-14:00", "1969-01-01T00:00:00Z"])
+def test_a_start_outside_the_calendar_is_refused_and_nothing_is_stored(client: TestClient, enrolled: str, start: str) -> None:
+    assert upload(client, TABLE, started_at=start).status_code == 422
+    visit = client.get("/api/v1/participants/P1/visits").json()["items"][0]["id"]
+    assert client.get(f"/api/v1/visits/{visit}/sessions").json()["total"] == 0
+
+
+def test_a_controller_that_contradicts_its_amplitudes_is_flagged(client: TestClient, enrolled: str) -> None:
+    flagged = upload(client, TABLE, controller="no_dbs").json()["report"][0]["flagged"]
+    assert any("Said to be without DBS, but its mean amplitude is 77 %" in s for s in flagged)
+
+
+def test_the_upload_of_a_file_that_came_before_can_be_read_again(client: TestClient, enrolled: str) -> None:
+    first = upload(client, TABLE).json()
+    again = upload(client, TABLE).json()
+    assert again["id"] != first["id"]
+    read = client.get(f"/api/v1/uploads/{again['id']}")
+    assert read.status_code == 200
+    assert read.json()["duplicate"] is True
+    assert read.json()["sessions"] == first["sessions"]
+
+
+def test_a_recording_without_data_is_kept_and_makes_no_session(client: TestClient, enrolled: str, recordings: Path) -> None:
+    answer = upload(client, (recordings / "rcs" / "empty_streams.zip").read_bytes(), "empty_streams.zip", controller="other")
+    assert answer.status_code == 201
+    assert answer.json()["sessions"] == []
+    assert any("no session was made" in s for s in answer.json()["report"][0]["flagged"])
+
+
+@pytest.mark.parametrize("fields", [{"beta_unit": "a\0b"}, {"participant": "P\0"}, {"policy": "\0"}])
+def test_a_zero_character_is_refused_in_words(client: TestClient, enrolled: str, fields: dict[str, str]) -> None:
+    assert upload(client, TABLE, **fields).status_code == 422

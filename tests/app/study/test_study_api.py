@@ -98,3 +98,20 @@ def test_the_database_itself_refuses_impossible_qocs(db: Session, column: str, v
     db.execute(text("insert into session (visit_id, ordinal, controller, duration_s) select id, 1, 'cdbs', 600 from visit"))
     with pytest.raises(DBAPIError, match="ck_qoc"):
         db.execute(text(f"insert into qoc (session_id, revision, entered_by, {column}) select id, 1, 'x', {value} from session"))
+
+
+def test_codes_that_differ_by_case_only_are_the_same(client: TestClient, enrolled: str) -> None:
+    assert client.post("/api/v1/participants", json={"code": enrolled.lower()}).status_code == 409
+
+
+def test_a_session_takes_only_its_own_participants_policy_and_its_own_traces(client: TestClient, enrolled: str) -> None:
+    table = b"t_s,beta,amplitude_fraction\n0,1,1\n2,1,1\n"
+    data = {"participant": enrolled, "visit": "1", "controller": "other"}
+    session = client.post("/api/v1/uploads", data=data, files={"file": ("s.csv", table)}).json()["sessions"][0]["id"]
+    foreign = client.patch(f"/api/v1/sessions/{session}", json={"controller": "rl", "policy_id": 12345})
+    assert foreign.status_code == 422
+    assert "no policy 12345" in foreign.json()["detail"]
+    nowhere = client.patch(f"/api/v1/sessions/{session}", json={"control_channel": "nope"})
+    assert nowhere.status_code == 422
+    assert "beta" in nowhere.json()["mend"]
+    assert client.get(f"/api/v1/sessions/{session}").json()["controller"] == "other"
