@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 from app.accounts.deps import CurrentCaller
 from app.accounts.policy import Caller
 from app.ingest import repository, service
+from app.ingest.formats.numbers import unit_name
 from app.ingest.models import UploadFile as UploadFileRow
 from app.ingest.schemas import FileReportOut, UploadedFileOut, UploadOut
 from app.ingest.service import BetaStated, Incoming, UploadOutcome
@@ -48,7 +49,7 @@ def upload(
     person = study.participant_by_code(db, participant, caller)
     stated = service.state_session(db, person, visit, controller, policy, started_at, hemisphere)
     incoming = [Incoming(f.filename or "file", f.file) for f in file]
-    outcome = service.receive(db, person, stated, incoming, caller, BetaStated(beta_unit, beta_source))
+    outcome = service.receive(db, person, stated, incoming, caller, BetaStated(unit_name(beta_unit) if beta_unit else None, beta_source))
     if not outcome.usable:
         raise unusable(outcome)
     return upload_out(db, outcome, caller)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Annotated, get_args
 
 from fastapi import APIRouter, File, Form, Request, UploadFile
 from fastapi.responses import HTMLResponse
+from pydantic import Field
 from sqlalchemy.orm import Session
 
 from app.accounts import policy as can
@@ -13,22 +16,34 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.policy import Caller
 from app.ingest import repository, service
 from app.ingest.schemas import UploadForm
-from app.ingest.service import Incoming, UploadOutcome
+from app.ingest.service import BetaStated, Incoming, UploadOutcome
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.forms import parse
-from app.platform.schemas import RowId
+from app.platform.schemas import RowId, Text
 from app.platform.templates import render
 from app.settings import get_settings
 from app.study import repository as study
 from app.study import service as study_service
 from app.study.api import CurrentParticipant
 from app.study.blinding import CONTROLLER_NAMES
-from app.study.models import Participant
+from app.study.models import Participant, Visit
+from app.study.schemas import BetaSource
+from app.study.settings_form import SOURCES
 
 router = APIRouter()
 
-_LABELS = {"visit": "Visit", "controller": "Controller", "policy": "Policy", "started_at": "Start", "hemisphere": "Hemisphere"}
+_LABELS = {
+    "visit": "Visit", "controller": "Controller", "policy": "Policy", "started_at": "Start", "hemisphere": "Hemisphere",
+    "beta_unit": "Unit of beta", "beta_source": "Source of beta",
+}  # fmt: skip
+
+
+class _PageForm(UploadForm):
+    """The upload form with what a person may say of a table's beta."""
+
+    beta_unit: Text | None = Field(None, max_length=40)
+    beta_source: BetaSource | None = None
 
 
 @router.get("/participants/{code}/upload")
@@ -50,18 +65,21 @@ def upload(
     policy: Annotated[str, Form()] = "",
     started_at: Annotated[str, Form()] = "",
     hemisphere: Annotated[str, Form()] = "",
+    beta_unit: Annotated[str, Form()] = "",
+    beta_source: Annotated[str, Form()] = "",
 ) -> HTMLResponse:
     """Take files without JavaScript: one session per file; the answer names every file's fate. Sending again changes nothing."""
     typed = {"visit": visit, "controller": controller, "policy": policy, "started_at": started_at, "hemisphere": hemisphere}
+    typed |= {"beta_unit": beta_unit, "beta_source": beta_source}
     outcomes: list[UploadOutcome] = []
     try:
-        form = parse(UploadForm, typed, _LABELS)
+        form = parse(_PageForm, typed, _LABELS)
         stated = service.state_session(db, participant, form.visit, form.controller, form.policy or None, form.started_at, form.hemisphere)
         chosen = [Incoming(f.filename or "file", f.file) for f in file if f.filename]
         if not chosen:
             raise Invalid("No file was chosen.", "Choose at least one file.")
         for one in chosen:
-            outcomes.append(service.receive(db, participant, stated, [one], caller))
+            outcomes.append(service.receive(db, participant, stated, [one], caller, BetaStated(form.beta_unit, form.beta_source)))
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, participant, typed, outcomes, error)
@@ -83,6 +101,19 @@ def _outcome(db: Session, upload_id: int, caller: Caller) -> UploadOutcome:
     return UploadOutcome(row, participant, files)
 
 
+def _likely_visit(visits: Sequence[Visit]) -> str:
+    """Number of the visit that files probably belong to; empty where none has taken place yet.
+
+    Args:
+        visits: by number. The last one counts where it has no date, else the newest whose date is not in the future.
+    """
+    if visits and visits[-1].date is None:
+        return str(visits[-1].number)
+    today = datetime.now(UTC).date()
+    past = [(v.date, v.number) for v in visits if v.date is not None and v.date <= today]
+    return str(max(past)[1]) if past else ""
+
+
 def _page(
     request: Request,
     db: Session,
@@ -92,15 +123,15 @@ def _page(
     error: BetaloopError | None = None,
 ) -> HTMLResponse:
     visits, _ = study.visits(db, participant.id, 1000, 0)
-    newest = str(visits[-1].number) if visits else ""
-    known = {"controller": "", "policy": "", "started_at": "", "hemisphere": ""} | typed
-    known["visit"] = typed.get("visit") or newest
+    known = dict.fromkeys(_LABELS, "") | typed
+    known["visit"] = typed.get("visit") or _likely_visit(visits)
     page = render(
         request,
         "ingest/upload.html",
         participant=participant,
         visits=visits,
         controllers=[("", "choose …"), *((c.value, name) for c, name in CONTROLLER_NAMES.items())],
+        sources=[("", "as in the settings"), *((s, label) for s, label in SOURCES if s in get_args(BetaSource))],
         policies=study.policy_names(db, participant.id),
         typed=known,
         outcomes=outcomes or [],

@@ -13,8 +13,9 @@ from sqlalchemy.orm import Session
 from app.ingest import formats, quarantine, repository, sessions
 from app.ingest.formats import FileKind
 from app.ingest.formats.log import DecodedFile, FileReport, Problem, TraceSource, UndecodableFile
+from app.ingest.formats.numbers import unit_name
 from app.ingest.formats.options import DecodeOptions
-from app.ingest.formats.redact import REDACTOR_VERSION, Redaction, redact_rcs_zip
+from app.ingest.formats.redact import REDACTOR_VERSION, Redaction, redact_rcs_zip, redact_table
 from app.ingest.models import Upload, UploadFile
 from app.ingest.sessions import StatedSession
 from app.platform import files
@@ -46,18 +47,21 @@ class BetaStated:
 
 @dataclass
 class FileOutcome:
-    """What became of one file. `name` is what the sender called it: told back to the sender, never stored."""
+    """What became of one file. `name` is what the sender called it; it and `told`, the problem in the file's own words, are told back to
+    the sender and never stored."""
 
     name: str
     row: UploadFile
     reports: list[FileReport]
     duplicate: bool = False
     session_ids: list[int] = field(default_factory=list)
+    told: Problem | None = None
 
     @property
     def reports_for_sender(self) -> list[FileReport]:
-        """The reports, naming the file as the sender does."""
-        return [replace(r, name=self.name) if r.name == self.row.name else r for r in self.reports]
+        """The reports, naming the file as the sender does, and quoting it where that shows what is wrong."""
+        own = [replace(r, name=self.name) if r.name == self.row.name else r for r in self.reports]
+        return [replace(r, problem=self.told) if r.problem is not None and self.told is not None else r for r in own]
 
 
 @dataclass(frozen=True)
@@ -126,13 +130,19 @@ class Receiver:
         return FileOutcome(name, row, [report], duplicate=True, session_ids=ids)
 
     def _keep(self, draft: Path) -> _Kept:
-        """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted."""
+        """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted.
+
+        A table is cleaned by reading it with the participant's options: one that cannot be decoded is kept encrypted too.
+        """
         redaction, clean, quarantined = Redaction(), draft, None
         try:
             kind = formats.sniff(draft)
             if kind == "rcs":
                 clean = files.draft_path()
                 redaction = redact_rcs_zip(draft, clean, get_settings().secret("pseudonyms"), self.options.archive)
+            else:
+                clean = files.draft_path()
+                redaction = redact_table(draft, clean, kind, self.options)
         except UndecodableFile as error:
             sealed = self._seal(draft)
             return _Kept("unreadable", sealed, sealed, Redaction(), error)
@@ -156,7 +166,7 @@ class Receiver:
             decoded = formats.decode(files.path_of(kept.stored_sha256), cast(FileKind, kept.kind), self.options, name=row.name)
             if kept.kind in TABLES:
                 decoded = self._name_beta(decoded)
-            ids, duplicate, notes = sessions.store_recordings(self.db, self.participant, row, decoded.recordings, self.stated)
+            stored = sessions.store_recordings(self.db, self.participant, row, decoded.recordings, self.stated)
         except UndecodableFile as error:
             self.db.rollback()
             return self._failed(name, row, kept, error)
@@ -167,14 +177,15 @@ class Receiver:
             ours = UndecodableFile("the decoder failed on this file", "file", f"Tell your administrator: upload file {row.id}.")
             return self._failed(name, row, kept, ours)
         reports = list(decoded.reports)
-        _tell(reports[0], kept.redaction, notes)
+        _tell(reports[0], kept.redaction, stored.notes)
+        reports[0].flagged.extend(stored.flagged)
         self._finish(row, "decoded", reports)
-        return FileOutcome(name, row, reports, duplicate=duplicate, session_ids=ids)
+        return FileOutcome(name, row, reports, duplicate=stored.known, session_ids=stored.session_ids)
 
     def _failed(self, name: str, row: UploadFile, kept: _Kept, problem: UndecodableFile) -> FileOutcome:
-        report = FileReport(name=row.name, removed=kept.redaction.removed, problem=Problem(problem.what, problem.where, problem.mend))
+        report = FileReport(name=row.name, removed=kept.redaction.removed, problem=problem.stored)
         self._finish(row, "failed", [report])
-        return FileOutcome(name, row, [report])
+        return FileOutcome(name, row, [report], told=problem.told)
 
     def _finish(self, row: UploadFile, status: str, reports: Sequence[FileReport]) -> None:
         row.status = status
@@ -182,16 +193,29 @@ class Receiver:
         self.db.commit()
 
     def _name_beta(self, decoded: DecodedFile) -> DecodedFile:
-        """A table's beta under its source, with a sentence where the participant's unit and source were taken."""
-        source = cast(TraceSource, self.beta.source or self.participant.current_settings.beta_source or "table")
+        """A table's beta under its source, with a sentence that says who stated unit and source."""
+        settings = self.participant.current_settings
+        source = cast(TraceSource, self.beta.source or settings.beta_source or "table")
         recordings = tuple(
             replace(r, traces=tuple(replace(t, source=source) if t.stream == "beta" else t for t in r.traces)) for r in decoded.recordings
         )
-        stated = self.beta.unit and self.beta.source
-        whose = "as stated" if stated else "as the participant's settings say, where the upload does not"
+        report = decoded.reports[0]
+        source_from = _whence(self.beta.source, settings.beta_source)
         for trace in (t for r in recordings for t in r.traces if t.stream == "beta"):
-            decoded.reports[0].understood.append(f"beta is in '{trace.unit}' from '{source}', {whose}")
+            in_header = trace.details["unit_from"] == "header"
+            unit_from = "as the file's header says" if in_header else _whence(self.beta.unit, settings.beta_unit)
+            report.understood.append(f"beta: unit '{trace.unit}' {unit_from}, source '{source}' {source_from}")
+            if in_header and self.beta.unit and unit_name(self.beta.unit) != trace.unit:
+                stated = unit_name(self.beta.unit)
+                report.flagged.append(f"the file's header gives beta in '{trace.unit}', the upload says '{stated}': the header was taken")
         return replace(decoded, recordings=recordings)
+
+
+def _whence(by_upload: str | None, by_settings: str | None) -> str:
+    """Who stated a unit or a source."""
+    if by_upload:
+        return "as stated with the upload"
+    return "as the participant's settings say" if by_settings else "because nobody stated one"
 
 
 def _tell(report: FileReport, redaction: Redaction, notes: Sequence[str]) -> None:

@@ -6,11 +6,18 @@ import datetime as dt
 from datetime import datetime
 from typing import Annotated, Literal
 
-from pydantic import Field, StringConstraints
+from pydantic import AfterValidator, Field, StringConstraints
 
 from app.platform.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
 
+
+def _one_spelling(unit: str) -> str:
+    """Micro signs are `u` and a raised two is `2`, as in decoded traces, so that one unit has one name."""
+    return " ".join(unit.translate({0xB5: "u", 0x3BC: "u", 0xB2: "2"}).split())
+
+
+Unit = Annotated[Text, AfterValidator(_one_spelling)]
 BetaSource = Literal["time_domain", "device_power", "percept_lfp", "table"]
 Code = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$")]
 
@@ -18,10 +25,8 @@ Code = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,39
 class SettingsIn(Model):
     """Settings of a participant; what is left out keeps its present value (for a new participant: its default)."""
 
-    xi_beta: Number | None = Field(
-        None, ge=-1e9, le=1e9, description="Beta threshold in the unit of the beta trace; jobs need it."
-    )
-    beta_unit: Text | None = Field(None, min_length=1, max_length=40, description="Unit of the beta trace, e.g. uV or 'device units'.")
+    xi_beta: Number | None = Field(None, ge=-1e9, le=1e9, description="Beta threshold in the unit of the beta trace; jobs need it.")
+    beta_unit: Unit | None = Field(None, min_length=1, max_length=40, description="Unit of the beta trace, e.g. uV or 'device units'.")
     beta_source: BetaSource | None = Field(None, description="Where beta comes from; sources are never mixed.")
     window: Int = Field(10, ge=1, le=500, description="W, beta amplitudes in a state.")
     period_s: Number = Field(2.0, ge=0.1, le=600, description="m, seconds per step.")

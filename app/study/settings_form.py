@@ -44,7 +44,6 @@ SOURCES = (
     ("time_domain", "time-domain LFP, band-passed and averaged here"),
     ("device_power", "band power computed on the device"),
     ("percept_lfp", "Percept band power"),
-    ("device_log", "log of the control computer"),
     ("table", "uploaded table"),
 )
 

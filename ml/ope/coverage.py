@@ -70,8 +70,8 @@ class Coverage:
         if self.thin > NOTICE_SHARE:
             verdict = "" if self.supported else "not supported by the data: "
             found.append(
-                f"{verdict}in {100 * self.thin:.0f} % of steps the policy asks for amplitudes that are hardly or never logged "
-                f"(logged: {self.logged_low:.2f} to {self.logged_high:.2f})"
+                f"{verdict}in {100 * self.thin:.0f} % of steps the policy asks for amplitudes with hardly any logged step near them "
+                f"(logged steps span {self.logged_low:.2f} to {self.logged_high:.2f})"
             )
         if self.spread < SAME_AMPLITUDE:
             found.append(f"{NO_CLOSED_LOOP}: about {100 * self.median:.0f} % of the cDBS amplitude whatever beta does")

@@ -1,4 +1,10 @@
-"""Settings of a DLSM fit; the paper gives none of the sizes."""
+"""Settings of a DLSM fit; the paper gives none of the sizes.
+
+The defaults are small and quick on purpose. On a simulated participant outside the cohort (21 random sessions of 300 steps, a hidden slow
+state, four data sets, eight policies) a larger model trained for longer (latent 12, hidden 32, 400 steps at 3e-3) answered less to the
+action: its predicted fall of beta from amplitude 0.35 to 0.95 was 0.07 to 0.20, where the truth is about 0.4 and this size gave 0.23 to
+0.39; in a fifth data set it ranked the policies the wrong way round.
+"""
 
 from __future__ import annotations
 
@@ -36,9 +42,9 @@ class DlsmConfig:
         ValueError: a value outside its range; the message names it.
     """
 
-    latent: int = 12
-    hidden: int = 32
-    heads: tuple[int, ...] = (32,)
+    latent: int = 8
+    hidden: int = 24
+    heads: tuple[int, ...] = (24,)
     objective: Objective = "sum"
     state_terms: Literal["window", "newest"] = "newest"
     action_emission: bool = True
@@ -46,14 +52,14 @@ class DlsmConfig:
     start: Literal["observed", "prior"] = "observed"
     kl_weight: float = 1.0
     end_weight: float = 1.0
-    members: int = 3
-    steps: int = 400
+    members: int = 5
+    steps: int = 150
     batch: int = 32
-    learning_rate: float = 3e-3
+    learning_rate: float = 6e-3
     clip_norm: float = 1.0
     weight_decay: float = 1e-3
     check_every: int = 25
-    patience: int = 8
+    patience: int = 4
     held_out: float = 0.2
     replay_draws: int = 16
     rollouts: int = 256
@@ -77,7 +83,7 @@ class DlsmConfig:
     @classmethod
     def demo(cls, seed: int = 0) -> DlsmConfig:
         """Small and quick: about twenty sessions of 300 steps in well under a minute of one core."""
-        return cls(latent=8, hidden=24, heads=(24,), members=2, steps=150, learning_rate=6e-3, rollouts=128, patience=4, seed=seed)
+        return cls(members=2, rollouts=128, seed=seed)
 
     def to_json(self) -> dict[str, Any]:
         """All settings, by name."""

@@ -81,5 +81,16 @@ def decode(path: Path, kind: FileKind | None = None, options: DecodeOptions | No
     options = options or DecodeOptions()
     kind = kind or sniff(path)
     if kind == "rcs":
-        return decode_rcs(path, options, name)
+        decoded = decode_rcs(path, options, name)
+        if all(_is_empty(r) for r in decoded.recordings):
+            said = "this upload holds no data: no stream has a sample and no stimulation log an amplitude; kept as a recording without data"
+            decoded.reports[0].flagged.insert(0, said)
+        return decoded
     return decode_parquet(path, options, name) if kind == "parquet" else decode_csv(path, options, name)
+
+
+def _is_empty(recording: RecordingLog) -> bool:
+    """Whether an RC+S recording has neither a sample nor an amplitude in its stimulation log."""
+    logged = (e.data for e in recording.events if e.kind == "stimulation" and e.data["origin"] == "StimLog")
+    stimulated = any(program["amplitude_ma"] is not None for data in logged for program in data["programs"])
+    return recording.duration_s == 0 and not recording.traces and not stimulated

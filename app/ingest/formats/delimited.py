@@ -55,19 +55,26 @@ class TextTable:
                 return line
         return None
 
-    def numbers(self, column: int, decimal: str) -> NDArray[np.float64]:
-        """A column as numbers [rows], NaN for cells without one. Raises UndecodableFile for text."""
-        return np.array(
-            [self._number(row[column], decimal, line, column) for row, line in zip(self.rows, self.lines, strict=True)], dtype=np.float64
-        )
+    def numbers(self, column: int, decimal: str, role: str | None = None) -> NDArray[np.float64]:
+        """A column as numbers [rows], NaN for cells without one.
 
-    def _number(self, cell: str, decimal: str, line: int, column: int) -> float:
+        `role` is what the column is called in a stored report, which must not repeat the file's own header.
+
+        Raises:
+            UndecodableFile: a cell holds text; names its line.
+        """
+        known = f"column {role}" if role else f"column number {column + 1}"
+        cells = ((row[column], line) for row, line in zip(self.rows, self.lines, strict=True))
+        return np.array([self._number(cell, decimal, line, column, known) for cell, line in cells], dtype=np.float64)
+
+    def _number(self, cell: str, decimal: str, line: int, column: int, known: str) -> float:
         try:
             value = parse_number(cell, decimal)
         except NotANumber as error:
             where = f"line {line}, column {self.headers[column].strip()}"
             mend = "Put a number there, or leave the cell empty."
-            raise UndecodableFile(f"{shown(cell.strip())} is text, not a number", where, mend) from error
+            what = f"{shown(cell.strip())} is text, not a number"
+            raise UndecodableFile(what, where, mend, "a cell holds text, not a number", f"line {line}, {known}") from error
         return math.nan if value is None else value
 
 

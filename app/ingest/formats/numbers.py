@@ -8,6 +8,13 @@ MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "inf", "+inf",
 _POINT = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _COMMA = re.compile(r"[+-]?(?:\d+,?\d*|,\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _COLUMN = re.compile(r"^(?P<name>.*?)\s*[\(\[]\s*(?P<unit>[^\)\]]*?)\s*[\)\]]\s*$")
+_SPELLING = str.maketrans({"\u00b5": "u", "\u03bc": "u", "\u00b2": "2"})
+_ELECTRIC = re.compile(r"(?P<prefix>[num]?)(?P<base>[va])(?:\^|\*\*)?(?P<square>2?)(?P<density>/hz)?")
+_WORDS = {"microvolt": "uV", "microvolts": "uV", "millivolt": "mV", "millivolts": "mV", "volt": "V", "volts": "V"}
+_WORDS |= {"microampere": "uA", "microamperes": "uA", "milliampere": "mA", "milliamperes": "mA", "milliamp": "mA", "milliamps": "mA"}
+_WORDS |= {"device unit": "device units", "device units": "device units", "percent": "%", "pct": "%", "%": "%"}
+_WORDS |= {name: name for name in ("fraction", "lsb", "counts")}
+_WORDS |= {"db": "dB", "z": "z", "zscore": "z", "z-score": "z", "z score": "z", "a.u.": "a.u.", "au": "a.u.", "arbitrary units": "a.u."}
 
 
 class NotANumber(ValueError):
@@ -37,6 +44,25 @@ def column_name(header: str) -> tuple[str, str | None]:
     if (match := _COLUMN.match(text)) is not None:
         text, unit = match["name"], match["unit"] or None
     return re.sub(r"[\s\-./]+", "_", text.strip().lower()).strip("_"), unit
+
+
+def unit_name(text: str) -> str:
+    """One spelling per unit: micro signs are `u`, squares `2`, so that `\u00b5V\u00b2` is `uV2`; an unknown unit stays as it is written."""
+    plain = " ".join(text.translate(_SPELLING).split())
+    known = _known_unit(plain)
+    return plain if known is None else known
+
+
+def known_unit(text: str) -> str | None:
+    """The unit's one spelling; None for a text that is no unit of a trace. What stands in a header may as well be a person's name."""
+    return _known_unit(" ".join(text.translate(_SPELLING).split()))
+
+
+def _known_unit(plain: str) -> str | None:
+    low = plain.lower()
+    if (match := _ELECTRIC.fullmatch(low)) is not None:
+        return f"{match['prefix']}{match['base'].upper()}{match['square']}{'/Hz' if match['density'] else ''}"
+    return _WORDS.get(low)
 
 
 def shown(cell: str, limit: int = 40) -> str:

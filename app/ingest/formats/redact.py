@@ -1,4 +1,4 @@
-"""Take identity out of an RC+S archive before it is stored: names, serial numbers, dates of birth, free text, folder names.
+"""Take identity out of a file before it is stored: names, serial numbers, dates of birth, free text, folder names, unknown columns.
 
 What stays is listed, not what goes: a text is kept only where its key is known to hold a technical word of a known shape. The result
 decodes to the same recording, apart from the device's name, which becomes a keyed pseudonym.
@@ -15,16 +15,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import IO, Any, Literal
+
+import numpy as np
 
 from app.ingest.formats.archive import ZipFiles
 from app.ingest.formats.log import FileReport, UndecodableFile
-from app.ingest.formats.options import ArchiveLimits
+from app.ingest.formats.options import ArchiveLimits, DecodeOptions
 from app.ingest.formats.rcs import SessionFiles, find_sessions
 from app.ingest.formats.rcs_json import STREAM_KEYS, JsonNotes, read_elements
 from app.ingest.formats.rcs_labels import NO_LABEL, parse, render
+from app.ingest.formats.table import Columns, decode_columns, read_csv, read_parquet
 
-REDACTOR_VERSION = 1
+REDACTOR_VERSION = 2
 EPOCH = (1980, 1, 1, 0, 0, 0)
 PSEUDONYM = re.compile(r"device-[0-9a-f]{16}")
 BLANKED = frozenset({"SubjectInfo", "LastPtmRtmInfo"})
@@ -105,6 +108,50 @@ def redact_rcs_zip(source: Path, target: Path, key: bytes, limits: ArchiveLimits
                 _write_member(archive, name, f"{label}{stem}.json", files, origin, scrub, done)
         done.removed = ["names of folders", *scrub.sentences()]
         return done
+
+
+def redact_table(source: Path, target: Path, kind: Literal["csv", "parquet"], options: DecodeOptions) -> Redaction:
+    """Write a table of the known columns alone; the same bytes in give the same bytes out.
+
+    Headers become the column's role with its unit in brackets, cells the numbers that were read, so that the table decodes to the same
+    recording with the same line numbers.
+
+    Args:
+        source: the uploaded table.
+        target: where the redacted table is written.
+        kind: what the table is.
+        options: choices of the decoder, which checks the table as the sender wrote it.
+
+    Raises:
+        UndecodableFile: the table cannot be decoded; nothing is written then.
+    """
+    columns = read_csv(source, options) if kind == "csv" else read_parquet(source, options)
+    decode_columns(columns, options, "table")
+    if kind == "csv":
+        _write_csv(columns, target)
+    else:
+        _write_parquet(columns, target)
+    others = len(columns.ignored)
+    removed = [f"{others} other column{'s' if others != 1 else ''}"] if others else []
+    return Redaction(removed=removed, repaired=list(columns.notes))
+
+
+def _write_csv(columns: Columns, target: Path) -> None:
+    with target.open("w", encoding="utf-8", newline="") as out:
+        out.write(",".join(columns.label(role) for role in columns.values) + "\n")
+        at = 2
+        for line, *cells in zip(columns.lines.tolist(), *(v.tolist() for v in columns.values.values()), strict=True):
+            # blank lines keep every row on its line, so that later reports name the line that the sender sees
+            out.write("\n" * (line - at) + ",".join("" if cell != cell else repr(cell) for cell in cells) + "\n")
+            at = line + 1
+
+
+def _write_parquet(columns: Columns, target: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    arrays = {columns.label(role): pa.array(v, type=pa.float64(), mask=np.isnan(v)) for role, v in columns.values.items()}
+    pq.write_table(pa.table(arrays), target, store_schema=False)
 
 
 def _plan(sessions: list[SessionFiles], files: ZipFiles, scrub: _Scrubber, taken: set[str]) -> Iterator[tuple[str, str, str, str]]:

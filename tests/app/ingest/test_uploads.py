@@ -229,13 +229,46 @@ def test_the_participants_unit_and_source_are_taken_and_said(client: TestClient,
     body = upload(client, TABLE).json()
     trace = client.get(f"/api/v1/sessions/{body['sessions'][0]['id']}/trace").json()
     assert (trace["beta_unit"], trace["beta_source"]) == ("uV", "table")
-    assert any("'uV' from 'table', as the participant's settings say" in s for s in body["report"][0]["understood"])
+    said = "unit 'uV' as the participant's settings say, source 'table' as the participant's settings say"
+    assert any(said in s for s in body["report"][0]["understood"])
 
 
 def test_a_stated_unit_and_source_win(client: TestClient, enrolled: str) -> None:
     body = upload(client, TABLE, beta_unit="mV", beta_source="time_domain").json()
     trace = client.get(f"/api/v1/sessions/{body['sessions'][0]['id']}/trace").json()
     assert (trace["beta_unit"], trace["beta_source"]) == ("mV", "time_domain")
+    said = "unit 'mV' as stated with the upload, source 'time_domain' as stated with the upload"
+    assert any(said in s for s in body["report"][0]["understood"])
+
+
+def test_the_headers_unit_wins_over_the_stated_one_and_a_contradiction_is_flagged(client: TestClient, enrolled: str) -> None:
+    body = upload(client, TABLE.replace(b"beta", b"beta [mV]"), beta_unit="uV").json()
+    report = body["report"][0]
+    assert any("unit 'mV' as the file's header says, source 'table' as the participant's settings say" in s for s in report["understood"])
+    assert any("header gives beta in 'mV', the upload says 'uV'" in s for s in report["flagged"])
+
+
+def test_other_columns_of_a_table_are_neither_stored_nor_named(client: TestClient, enrolled: str) -> None:
+    lines = TABLE.decode().splitlines()
+    content = "\n".join([lines[0] + ",Jane Doe MRN 4711", *(f"{line},1950-03-01" for line in lines[1:])]).encode()
+    answer = upload(client, content)
+    assert answer.status_code == 201
+    assert "Jane" not in answer.text
+    assert "1 other column" in answer.json()["report"][0]["removed"]
+    kept = files.read(answer.json()["files"][0]["stored_sha256"])
+    assert kept.startswith(b"t_s,beta,amplitude_fraction\n-2.0,0.8,1.0\n")
+    assert not any(word in kept for word in (b"Jane", b"4711", b"1950"))
+
+
+def test_a_table_of_no_use_is_quoted_to_its_sender_alone(client: TestClient, enrolled: str) -> None:
+    problem = upload(client, b"t_s,beta,Jane Doe\n2,1,1\n", "session.csv").json()
+    assert "'Jane Doe'" in problem["detail"]
+    later = client.get(f"/api/v1/uploads/{problem['upload_id']}")
+    assert "missing column amplitude_fraction" in later.text
+    assert "Jane" not in later.text
+    kept = later.json()["files"][0]
+    assert kept["kind"] == "unreadable"
+    assert b"Jane" not in files.read(kept["stored_sha256"])
 
 
 def test_a_threshold_in_another_unit_is_never_held_against_a_trace(client: TestClient, enrolled: str, recordings: Path) -> None:

@@ -115,3 +115,8 @@ def test_a_session_takes_only_its_own_participants_policy_and_its_own_traces(cli
     assert nowhere.status_code == 422
     assert "beta" in nowhere.json()["mend"]
     assert client.get(f"/api/v1/sessions/{session}").json()["controller"] == "other"
+
+
+def test_a_unit_has_one_spelling(client: TestClient) -> None:
+    settings = client.post("/api/v1/participants", json={"code": "U1", "settings": {"beta_unit": "µV²"}}).json()["settings"]
+    assert settings["beta_unit"] == "uV2"

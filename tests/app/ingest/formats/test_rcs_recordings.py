@@ -193,6 +193,7 @@ def test_a_recording_without_data_is_a_recording_and_says_so(recordings):
     recording = one(decoded)
     assert recording.traces == ()
     assert recording.duration_s == 0
+    assert "holds no data" in decoded.reports[0].flagged[0]
     assert any("without data" in text for text in report(decoded, "RawDataTD.json").flagged)
 
 

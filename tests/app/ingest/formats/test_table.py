@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -8,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.ingest.formats import DecodeOptions, UndecodableFile, decode, sniff
+from app.ingest.formats.numbers import unit_name
 
 HEADER = "t_s,beta,amplitude_fraction\n"
 
@@ -66,6 +69,107 @@ def test_milliamperes_are_kept_as_milliamperes(write):
     assert amplitude.values[0] == np.float32(2.4)
 
 
+@pytest.mark.parametrize(
+    ("header", "cell", "milliamps"),
+    [
+        ("amplitude_ma", "2.4", 2.4),
+        ("amplitude_ma [uA]", "2400", 2.4),
+        ("amplitude (\u00b5A)", "2400", 2.4),
+        ("amplitude (\u03bcA)", "25500", 25.5),
+        ("amplitude_ma (A)", "0.0024", 2.4),
+        ("Amplitude [A]", "0.0255", 25.5),
+    ],
+)
+def test_amplitudes_are_converted_to_milliamperes_by_the_unit_of_their_header(write, header, cell, milliamps):
+    amplitude = trace(decode(write(f"t_s,beta,{header}\n2,1,{cell}\n")), "amplitude")
+    assert amplitude.unit == "mA"
+    assert amplitude.values[0] == pytest.approx(milliamps, rel=1e-6)
+
+
+@pytest.mark.parametrize("unit", ["[%]", "(percent)", "(%)"])
+def test_percent_becomes_a_fraction(write, unit):
+    amplitude = trace(decode(write(f"t_s,beta,amplitude_fraction {unit}\n2,1,50\n4,1,100\n")), "amplitude")
+    assert amplitude.unit == "fraction"
+    np.testing.assert_array_equal(amplitude.values, np.array([0.5, 1.0], dtype=np.float32))
+
+
+def test_an_amplitude_unit_in_parquet_metadata_is_converted_too(tmp_path):
+    schema = pa.schema([("t_s", pa.float64()), ("beta", pa.float64()), pa.field("amplitude", pa.float64(), metadata={"unit": "uA"})])
+    path = tmp_path / "t.parquet"
+    pq.write_table(pa.table({"t_s": [2.0], "beta": [1.0], "amplitude": [1500.0]}, schema=schema), path)
+    assert trace(decode(path), "amplitude").values.tolist() == [1.5]
+
+
+def test_an_impossible_beta_is_a_gap_with_its_line_and_a_negative_one_is_kept_and_flagged_once(write):
+    decoded = decode(write(HEADER + "2,-0.5,1\n4,1e10,1\n6,-2e9,1\n8,-1,1\n"))
+    beta = trace(decoded, "beta")
+    assert beta.valid.tolist() == [True, False, False, True]
+    assert beta.values[[0, 3]].tolist() == [-0.5, -1.0]
+    assert [text for text in decoded.reports[0].flagged if "line 3, 4" in text]
+    assert len([text for text in decoded.reports[0].flagged if "2 rows have a negative beta" in text]) == 1
+
+
+def test_of_two_amplitudes_the_milliamperes_are_kept_and_a_contradiction_is_flagged(write):
+    header = "t_s,beta,amplitude_fraction,amplitude_ma\n"
+    agreed = decode(write(header + "2,1,0.5,1.5\n4,1,1,3.06\n6,1,0.01,0.5\n"))
+    assert [t.channel for t in agreed.recordings[0].traces] == ["table", "amplitude_ma"]
+    assert any("amplitude_ma is given too" in text for text in agreed.reports[0].ignored)
+    assert agreed.reports[0].flagged == []
+    contradicted = decode(write(header + "2,1,0.5,1.5\n4,1,1,3.2\n"))
+    assert any("disagree" in text and "3 to 3.2 mA" in text for text in contradicted.reports[0].flagged)
+
+
+@pytest.mark.parametrize(
+    ("written", "name"),
+    [
+        ("\u00b5V", "uV"),
+        ("\u03bcV", "uV"),
+        (" uV ", "uV"),
+        ("UV", "uV"),
+        ("\u00b5V\u00b2", "uV2"),
+        ("uV^2/Hz", "uV2/Hz"),
+        ("device  units", "device units"),
+        ("furlong", "furlong"),
+    ],
+)
+def test_one_unit_has_one_name(written, name):
+    assert unit_name(written) == name
+
+
+def test_both_micro_signs_in_header_or_settings_give_the_same_unit_and_fingerprint(write):
+    header = "t_s,beta [{}],amplitude_fraction\n2,1,1\n"
+    plain = decode(write(header.format("uV"))).recordings[0]
+    for sign in ("\u00b5V", "\u03bcV"):
+        assert decode(write(header.format(sign))).recordings[0].fingerprint == plain.fingerprint
+        stated = decode(write(HEADER + "2,1,1\n"), options=DecodeOptions(table_beta_unit=sign)).recordings[0]
+        assert stated.fingerprint == plain.fingerprint
+
+
+def test_a_text_in_brackets_that_is_no_unit_is_not_taken_for_one(write):
+    decoded = decode(write("t_s,beta (Jane Doe),amplitude_fraction\n2,1,1\n"))
+    assert trace(decoded, "beta").unit == "unstated"
+    assert any("no unit known here" in text for text in decoded.reports[0].repaired)
+    assert "Jane" not in repr(decoded)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t_s,beta,Jane Doe\n2,1,1\n",
+        "t_s,beta [Jane Doe],amplitude_fraction\n2,Jane Doe,1\n",
+        "t_s,beta,Beta (Jane Doe),a\n2,1,1,1\n",
+        "t_s,beta,amplitude (Jane Doe)\n2,1,1\n",
+        "t_s (Jane Doe),beta,a\n2,1,1\n",
+    ],
+)
+def test_the_stored_problem_does_not_repeat_the_files_words_and_the_told_one_does(write, text):
+    with pytest.raises(UndecodableFile) as caught:
+        decode(write(text))
+    assert "Jane" in caught.value.told.what + caught.value.told.where
+    assert "Jane" not in repr(caught.value.stored)
+    assert pickle.loads(pickle.dumps(caught.value)).stored == caught.value.stored
+
+
 @pytest.mark.parametrize("cell", ["", "NaN", "nan", "INF", "-inf", "n/a", "1e999"])
 def test_cells_without_a_number_become_gaps_and_are_said(write, cell):
     decoded = decode(write(HEADER + f"2,{cell},1\n4,2,1\n"))
@@ -107,6 +211,11 @@ def test_columns_of_no_use_are_named(write):
         (HEADER + ",1,1\n", "no time", "line 2, column t_s"),
         (HEADER + "-2,1,1\n0,1,1\n", "no row with t_s > 0", "column t_s"),
         (HEADER + "2,1,-0.1\n", "negative amplitude -0.1", "line 2, column amplitude_fraction"),
+        ("t_s,beta,amplitude_ma [V]\n2,1,1\n", "unknown unit 'V'", "column amplitude_ma [V]"),
+        ("t_s,beta,amplitude (W)\n2,1,1\n", "unknown unit 'W'", "column amplitude (W)"),
+        ("t_s,beta,amplitude_fraction (mA)\n2,1,1\n", "unknown unit 'mA'", "column amplitude_fraction"),
+        ("t_s,beta,amplitude_ma\n2,1,1\n4,1,25.6\n", "amplitude 25.6 mA, more than the 25.5 mA", "line 3, column amplitude_ma"),
+        (HEADER + "2,1,10.1\n", "amplitude fraction 10.1", "line 2, column amplitude_fraction"),
         (HEADER, "no rows", "after line 1"),
         ("", "empty", "file"),
         ("\n\n", "empty", "line 1"),
@@ -177,10 +286,11 @@ def test_the_same_table_has_the_same_fingerprint_and_another_does_not(write):
 
 
 CELLS = st.one_of(st.none(), st.floats(0, 1e6, allow_subnormal=False, width=32))
+CURRENTS = st.one_of(st.none(), st.floats(0, 25.5, allow_subnormal=False, width=32))
 
 
 @given(
-    rows=st.lists(st.tuples(CELLS, CELLS), min_size=1, max_size=30),
+    rows=st.lists(st.tuples(CELLS, CURRENTS), min_size=1, max_size=30),
     before=st.integers(0, 12),
     style=st.sampled_from([(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")]),
     newline=st.sampled_from(["\n", "\r\n"]),
