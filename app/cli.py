@@ -207,6 +207,8 @@ def rank(code: Code, as_json: AsJson = False) -> None:
         shown = ("—", "—", "—") if best is None else _estimate_cells(best)
         table.add_row(str(row["rank"] or "—"), row["name"], *shown)
     console.print(table)
+    for sentence in body["notes"]:
+        console.print(sentence, markup=False, highlight=False)
 
 
 @app.command("export", epilog="Example: betaloop export P1 --to p1.zip")
@@ -220,9 +222,17 @@ def export_(
     from app.study import repository as study
 
     target = to or Path(f"{code}.zip")
+    if target.is_dir() or not target.parent.is_dir():
+        raise _bad_call(
+            f"{target} cannot be written: " + ("it is a folder." if target.is_dir() else f"there is no folder {target.parent}.")
+        )
     with transaction(ACTOR) as db:
         content = export_participant(db, study.participant_by_code(db, code, SYSTEM), SYSTEM)
-    target.write_bytes(content)
+    try:
+        target.write_bytes(content)
+    except OSError as error:
+        _say(f"betaloop: {target} cannot be written: {_reason(error)}.")
+        raise typer.Exit(1) from error
     _print({"path": str(target), "bytes": len(content)}, as_json, f"Wrote {target} ({len(content)} bytes).")
 
 
@@ -236,7 +246,22 @@ def _password(path: Path | None) -> str:
         if not sys.stdin.isatty():
             raise typer.BadParameter("No terminal to ask for a password.", param_hint="--password-file")
         return getpass("Password: ")
-    return (sys.stdin.readline() if str(path) == "-" else path.read_text()).rstrip("\r\n")
+    if str(path) == "-":
+        return sys.stdin.readline().rstrip("\r\n")
+    try:
+        return path.read_text("utf-8").rstrip("\r\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise _bad_call(f"The password file {path} cannot be read: {_reason(error)}.") from error
+
+
+def _bad_call(text: str) -> typer.Exit:
+    """Say in a line what is wrong with the call; to be raised."""
+    _say(f"betaloop: {text}")
+    return typer.Exit(2)
+
+
+def _reason(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 def _stop_on_signals(stop: threading.Event) -> None:

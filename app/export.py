@@ -17,6 +17,7 @@ from app.accounts import policy as can
 from app.accounts.policy import Caller
 from app.evaluation.models import EstimateRow, Evaluation
 from app.learning.models import Policy
+from app.platform.errors import BetaloopError
 from app.study import blinding, repository, service
 from app.study.models import Participant
 from app.study.schemas import SettingsOut
@@ -24,6 +25,7 @@ from app.study.schemas import SettingsOut
 _SESSION_COLUMNS = (
     "session_id", "visit", "date", "ordinal", "controller", "policy_id", "hemisphere", "started_at_utc", "duration_s", "beta_unit",
     "beta_source", "cdbs_amplitude_ma", "steps_above_cdbs", "excluded_reason", "grasp_hz", "rating_1_10", "tremor_percent", "qoc_revision",
+    "problem",
 )  # fmt: skip
 _STEP_COLUMNS = ("session_id", "t_s", "beta", "amplitude_ma", "amplitude_fraction")
 _POLICY_COLUMNS = ("policy_id", "name", "kind", "algorithm", "teacher_id", "snapshot_id", "seed", "created_at_utc", "onnx_sha256")
@@ -34,20 +36,29 @@ _ESTIMATE_COLUMNS = (
 
 
 def export_participant(db: Session, participant: Participant, caller: Caller) -> bytes:
-    """Everything the caller may know of a participant. The controller of a session comes through the blinding gate."""
+    """Everything the caller may know of a participant. The controller of a session comes through the blinding gate.
+
+    A session whose steps cannot be read has its row all the same, with the reason in the column `problem`.
+    """
     service.require(caller, can.READ, participant)
     sessions: list[tuple[Any, ...]] = []
     steps: list[tuple[Any, ...]] = []
     for session in repository.sessions_of_participant(db, participant.id):
-        arm, table, qoc = blinding.arm(session, caller), service.session_data(db, session).table, session.qoc
-        beta = table.beta_trace
+        arm, qoc = blinding.arm(session, caller), session.qoc
+        try:
+            table, problem = service.session_data(db, session).table, None
+        except BetaloopError as error:
+            table, problem = None, str(error)
+        beta = table and table.beta_trace
         sessions.append(
             (session.id, session.visit.number, session.visit.date, session.ordinal, arm.controller, arm.policy_id, session.hemisphere,
-             session.started_at, session.duration_s, beta and beta.unit, beta and beta.source, table.cdbs_ma, table.above_one,
-             session.excluded_reason, qoc and qoc.grasp_hz, qoc and qoc.rating, qoc and qoc.tremor_percent, qoc and qoc.revision)
+             session.started_at, session.duration_s, beta and beta.unit, beta and beta.source, table and table.cdbs_ma,
+             table and table.above_one, session.excluded_reason, qoc and qoc.grasp_hz, qoc and qoc.rating,
+             qoc and qoc.tremor_percent, qoc and qoc.revision, problem)
         )  # fmt: skip
-        rows = zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, strict=True)
-        steps.extend((session.id, *(_blank_nan(v) for v in row)) for row in rows)
+        if table is not None:
+            rows = zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, strict=True)
+            steps.extend((session.id, *(_blank_nan(v) for v in row)) for row in rows)
     policies = db.scalars(select(Policy).where(Policy.participant_id == participant.id).order_by(Policy.id)).all()
     settings = [SettingsOut.model_validate(s).model_dump(mode="json") for s in participant.settings]
     contents = {
@@ -105,7 +116,7 @@ def _cell(value: Any) -> Any:
 def _readme(participant: Participant) -> str:
     return (
         f"betaloop {__version__}: record of participant {participant.code}.\n\n"
-        "sessions.csv   one row per session; QoCs in their newest revision\n"
+        "sessions.csv   one row per session; QoCs in their newest revision; problem: why a session has no steps here\n"
         "steps.csv      2 s rows: t_s is the end of the window after the session's start (t_s <= 0: before it); empty cells are invalid\n"
         "policies.csv   every policy of the participant\n"
         "estimates.csv  every estimate: E[r_end + sum over t < H of gamma^t r_t] with its interval\n"

@@ -15,6 +15,7 @@ drop.addEventListener("drop", (event) => {
   input.files = event.dataTransfer.files;
   if (form.reportValidity()) start();
 });
+form.querySelector("button.primary").addEventListener("click", () => { input.required = true; }); // comes before the browser's own check
 form.addEventListener("submit", (event) => { event.preventDefault(); start(); });
 
 let busy = Promise.resolve();
@@ -22,6 +23,7 @@ function start() {
   const fields = new FormData(form);
   const files = [...input.files];
   input.value = "";
+  input.required = false; // emptied by us: an empty field is no mistake until somebody sends it again
   for (const file of files) {
     const item = listed(file);
     busy = busy.then(() => send(file, fields, item)); // one after the other: a clinic's line is narrow
@@ -47,7 +49,7 @@ function send(file, fields, shown) {
   const body = new FormData();
   body.append("file", file, file.name);
   body.append("participant", form.dataset.participant);
-  for (const name of ["visit", "controller", "policy", "started_at", "hemisphere"]) if (fields.get(name)) body.append(name, fields.get(name));
+  for (const name of ["visit", "controller", "policy", "started_at", "hemisphere", "beta_unit", "beta_source"]) if (fields.get(name)) body.append(name, fields.get(name));
   return new Promise((done) => {
     const request = new XMLHttpRequest();
     request.open("POST", "/api/v1/uploads");

@@ -68,6 +68,17 @@ class ExcludedOut(Model):
     reason: str
 
 
+class ContradictionOut(Model):
+    """A session whose amplitudes are not those of its controller; it counts until somebody corrects it."""
+
+    session_id: int
+    visit: int
+    ordinal: int
+    controller: Controller
+    mean_fraction: float = Field(description="Mean amplitude fraction of its steps; cDBS = 1.")
+    text: str
+
+
 class FiveMetricsOut(Model):
     """The five metrics of each controller against cDBS."""
 
@@ -76,4 +87,5 @@ class FiveMetricsOut(Model):
     controllers: list[ControllerOut]
     metrics: list[MetricOut]
     excluded: list[ExcludedOut]
+    warnings: list[ContradictionOut]
     limits: list[str]

@@ -32,6 +32,9 @@ TITLES: dict[str, tuple[str, str]] = {
 }
 """The paper's five metrics: title and unit; the unit of beta is the participant's."""
 
+EXPECTED_FRACTION = {Controller.CDBS: (0.9, 1.1), Controller.NO_DBS: (0.0, 0.05)}
+"""Mean amplitude fractions that a session of a controller with a fixed amplitude can have (ours)."""
+
 LIMITS = (
     "Sessions of one visit are not independent: they share the day, the medication and what the session before left. The test treats "
     "them as independent, so that its p-values may be too small.",
@@ -57,6 +60,19 @@ class SessionMetrics:
     controller: Controller
     values: Mapping[str, float]
     beta_kind: BetaKind | None
+    mean_fraction: float | None
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A session whose mean amplitude fraction is not that of its controller; it counts all the same until somebody corrects it."""
+
+    session_id: int
+    visit: int
+    ordinal: int
+    controller: Controller
+    mean_fraction: float
+    text: str
 
 
 @dataclass(frozen=True)
@@ -114,6 +130,7 @@ class FiveMetrics:
     controllers: list[ControllerSummary]
     metrics: list[MetricResult]
     excluded: list[Excluded]
+    warnings: list[Contradiction]
     limits: list[str]
 
 
@@ -135,7 +152,7 @@ def five_metrics(db: Session, participant: Participant, caller: Caller) -> FiveM
     tests = sum(c.p_value is not None for m in metrics for c in m.comparisons)
     holm = f"p-values are unadjusted, as in the paper; Holm's adjustment beside them covers all {tests} comparisons of this page."
     controllers = [_summary(c, [s for s in included if s.controller is c], metrics[0]) for c in present]
-    return FiveMetrics(participant.code, len(included), controllers, metrics, excluded, [*LIMITS, holm])
+    return FiveMetrics(participant.code, len(included), controllers, metrics, excluded, _contradictions(included), [*LIMITS, holm])
 
 
 def session_metrics(db: Session, session: StudySession, caller: Caller) -> SessionMetrics:
@@ -156,7 +173,24 @@ def session_metrics(db: Session, session: StudySession, caller: Caller) -> Sessi
     }
     kind = BetaKind(table.beta_trace.unit, table.beta_trace.source) if table.beta_trace else None
     values = {name: float(value) for name, value in found.items() if value is not None and math.isfinite(value)}
-    return SessionMetrics(session, arm(session, caller).controller, values, kind)
+    return SessionMetrics(session, arm(session, caller).controller, values, kind, float(np.nanmean(fraction)) if _known(fraction) else None)
+
+
+def _contradictions(sessions: Sequence[SessionMetrics]) -> list[Contradiction]:
+    """Sessions that were stimulated otherwise than their controller says."""
+    found = []
+    for s in sessions:
+        expected, mean = EXPECTED_FRACTION.get(s.controller), s.mean_fraction
+        if expected is None or mean is None or expected[0] <= mean <= expected[1]:
+            continue
+        visit, ordinal = s.session.visit.number, s.session.ordinal
+        asked = "at most 0.05" if s.controller is Controller.NO_DBS else "0.9 to 1.1"
+        text = (
+            f"Session {s.session.id} (visit {visit}, place {ordinal}) is a {CONTROLLER_NAMES[s.controller]} session, but its mean "
+            f"amplitude fraction is {mean:.2f}; {asked} is expected. It counts until its controller or the cDBS amplitude is corrected."
+        )
+        found.append(Contradiction(s.session.id, visit, ordinal, s.controller, mean, text))
+    return found
 
 
 def _known(values: NDArray[np.float64]) -> bool:

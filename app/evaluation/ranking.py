@@ -15,6 +15,7 @@ from app.evaluation import repository
 from app.evaluation.actual import Actual, actual, mean_of
 from app.evaluation.estimates import estimate_of
 from app.evaluation.models import Evaluation
+from app.evaluation.notes import ranking_notes
 from app.evaluation.schemas import METHODS, EstimateOut, RankedPolicy, RankedSnapshot, RankingOut, TestedBefore
 from app.learning import repository as learning
 from app.learning.models import BufferSnapshot, Policy, SnapshotSession
@@ -48,9 +49,7 @@ def current_ranking(db: Session, participant: Participant, caller: Caller, metho
         raise NotFound(
             f"Participant {participant.code} has no ranking yet.", "Start a job of kind 'pipeline', or 'evaluate' where there are policies."
         )
-    table: Table = defaultdict(dict)
-    for row in evaluation.estimates:
-        table[row.policy_id][row.method] = estimate_of(row)
+    table = _table(evaluation)
     methods = [m for m in METHODS if any(m in by_method for by_method in table.values())]
     chosen = method or evaluation.default_method
     if chosen not in methods:
@@ -63,6 +62,7 @@ def current_ranking(db: Session, participant: Participant, caller: Caller, metho
     policies = repository.policies_by_id(db, list(table))
     tested = _tested(db, evaluation, present, caller)
     rows = _rows(evaluation, table, policies, chosen, tested)
+    candidates, references = [r for r in rows if r.reference is None], [r for r in rows if r.reference is not None]
     reasons = [trouble] if trouble else []
     reasons += _staleness(db, participant, evaluation, present)
     return RankingOut(
@@ -78,9 +78,18 @@ def current_ranking(db: Session, participant: Participant, caller: Caller, metho
         stale=bool(reasons),
         stale_reasons=reasons,
         stale_reason="; ".join(reasons) or None,
-        policies=[r for r in rows if r.reference is None],
-        references=[r for r in rows if r.reference is not None],
+        notes=ranking_notes(candidates, references, chosen),
+        policies=candidates,
+        references=references,
     )
+
+
+def evaluation_notes(db: Session, evaluation: Evaluation) -> list[str]:
+    """The notes of an evaluation's ranking by its own method, whether or not it is the newest."""
+    table = _table(evaluation)
+    rows = _rows(evaluation, table, repository.policies_by_id(db, list(table)), evaluation.default_method, {})
+    candidates, references = [r for r in rows if r.reference is None], [r for r in rows if r.reference is not None]
+    return ranking_notes(candidates, references, evaluation.default_method)
 
 
 _PREDICTED = ("energy", "mean_amplitude", "mean_beta", "grasp_hz", "rating", "tremor_percent")
@@ -108,6 +117,13 @@ def to_csv(ranking: RankingOut) -> str:
 def _safe(value: object) -> object:
     """A cell that spreadsheets do not run as a formula."""
     return f"'{value}" if isinstance(value, str) and value[:1] in set("=+-@\t\r") else value
+
+
+def _table(evaluation: Evaluation) -> Table:
+    table: Table = defaultdict(dict)
+    for row in evaluation.estimates:
+        table[row.policy_id][row.method] = estimate_of(row)
+    return table
 
 
 def _rows(

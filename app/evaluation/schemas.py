@@ -205,5 +205,8 @@ class RankingOut(Model):
     stale: bool
     stale_reasons: list[str]
     stale_reason: str | None = Field(description="All of them in one line.")
+    notes: list[str] = Field(
+        description="What to know before choosing: the best candidate against cDBS, places that are not their value's."
+    )
     policies: list[RankedPolicy]
     references: list[RankedPolicy]

@@ -20,9 +20,9 @@ from app.learning.jobs import teachers, training_starts
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.schemas import DistilParams, TrainParams
 from app.learning.snapshots import collect
-from app.platform.errors import Conflict, Invalid
+from app.platform.errors import Invalid
 from app.platform.jobs import service as jobs
-from app.platform.jobs.models import Job, JobStatus
+from app.platform.jobs.models import Job
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Participant
@@ -52,9 +52,9 @@ def start_job(db: Session, participant: Participant, kind: str, params: Mapping[
 
 
 def retry_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
-    """A new job with the same params. Raises Conflict while the job has not ended."""
-    if not JobStatus(job.status).ended:
-        raise Conflict(f"Job {job.id} is still {job.status}.", "Wait for it or cancel it, then retry.")
+    """A new job with the same params. Raises Conflict while the job has not ended, or another one repeats it."""
+    study.require(caller, can.RUN_JOBS, participant)
+    job = jobs.repeatable(db, job)
     return start_job(db, participant, job.kind, job.params, caller)
 
 

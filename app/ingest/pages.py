@@ -95,10 +95,7 @@ def report(request: Request, upload_id: RowId, db: Db, caller: CurrentCaller) ->
 
 def _outcome(db: Session, upload_id: int, caller: Caller) -> UploadOutcome:
     row, participant = repository.upload(db, upload_id, caller)
-    files = [
-        service.FileOutcome(f.name, f, service.stored_reports(f), False, list(repository.session_ids_of_file(db, f.id))) for f in row.files
-    ]
-    return UploadOutcome(row, participant, files)
+    return UploadOutcome(row, participant, service.stored_outcomes(db, row))
 
 
 def _likely_visit(visits: Sequence[Visit]) -> str:

@@ -16,10 +16,11 @@ from app.learning import repository, service
 from app.learning.api import CurrentPolicy, CurrentSnapshot, read_limited
 from app.learning.coverage import describe
 from app.learning.models import Policy
+from app.learning.schemas import PolicyChange, PolicyLabel
 from app.platform.charts import ACCENT, Chart, axis, figure
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, NotFound
-from app.platform.forms import FormValues
+from app.platform.forms import FormValues, parse
 from app.platform.schemas import PagingQuery
 from app.platform.templates import render
 from app.study import repository as study_repository
@@ -27,6 +28,8 @@ from app.study.api import CurrentParticipant
 from app.study.models import Participant
 
 router = APIRouter()
+
+LABELS = {"name": "Name", "retired_reason": "Reason"}
 
 CURVES = {
     "mean_q": ("Mean Q of the policy", "reward; an unbounded climb is over-estimation"),
@@ -56,9 +59,7 @@ def add_policy(
     try:
         if file is None or not file.filename:
             raise Invalid("No file was chosen.", "Choose an ONNX file.")
-        label = name.strip() or file.filename.removesuffix(".onnx")
-        if not label or len(label) > 100 or not label.isprintable():
-            raise Invalid("A policy's name has 1 to 100 printable characters.", "Choose another name.")
+        label = parse(PolicyLabel, {"name": name}, LABELS).name
         row = service.add_external(db, participant, label, read_limited(file), file.filename, caller)
         db.commit()
     except BetaloopError as error:
@@ -93,8 +94,8 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
 def retire_policy(participant: CurrentParticipant, policy: CurrentPolicy, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Retire a policy with a reason, or take it back."""
     _belongs(policy, participant)
-    reason = str(values.get("reason", "")).strip()[:1000]
-    service.retire(db, participant, policy, reason or None, caller)
+    reason = parse(PolicyChange, {"retired_reason": values.get("reason", "")}, LABELS).retired_reason
+    service.retire(db, participant, policy, reason, caller)
     db.commit()
     return RedirectResponse(f"/participants/{participant.code}/policies/{policy.id}?done={'retired' if reason else 'back'}", 303)
 

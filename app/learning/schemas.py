@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
+import re
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from app.platform.schemas import Int, Model, Number, Text
 
 Preset = Literal["full", "quick"]
-PolicyName = Annotated[str, Field(pattern=r"^[^\x00-\x1f]*\S[^\x00-\x1f]*$", max_length=100)]
+_CONTROL = r"\x00-\x1f\x7f-\x9f"
+
+
+def _printable(name: str) -> str:
+    if re.search(f"[{_CONTROL}]", name):
+        raise ValueError("a policy's name has no control characters, the zero character and line breaks among them")
+    if not name.strip():
+        raise ValueError("a policy's name has at least one visible character")
+    return name
+
+
+PolicyName = Annotated[
+    str,
+    Field(max_length=100, json_schema_extra={"pattern": rf"^[^{_CONTROL}]*[^\s{_CONTROL}][^{_CONTROL}]*$"}),
+    AfterValidator(_printable),
+]
 PolicyIds = Annotated[list[Annotated[Int, Field(ge=1)]], Field(max_length=50)]
 
 
@@ -93,6 +109,12 @@ class PolicyOut(Model):
     created_at: datetime
     created_by: str
     retired_reason: str | None
+
+
+class PolicyLabel(Model):
+    """The name of a new policy, as a form sends it."""
+
+    name: PolicyName
 
 
 class PolicyChange(Model):

@@ -49,6 +49,8 @@ class Limits:
 def add_external(db: Session, participant: Participant, name: str, content: bytes, file_name: str, caller: Caller) -> Policy:
     """Store a policy made elsewhere. It is run on beta windows of many scales, and on the participant's own where there are some.
 
+    The file's name, which may name a person, stands in the answer to a bad file alone and is not kept.
+
     Raises:
         Invalid: the file is no such policy; says what is wrong with it. Conflict: the name is taken.
     """
@@ -71,7 +73,7 @@ def add_external(db: Session, participant: Participant, name: str, content: byte
         kind="external",
         algorithm="external",
         settings_version_id=settings.id,
-        config={"file_name": file_name, "window": settings.window},
+        config={"window": settings.window},
         onnx_sha256=files.store(db, content, ONNX).sha256,
         metrics={"bytes": len(content)},
         code_version=__version__,

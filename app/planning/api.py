@@ -27,7 +27,10 @@ def read_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> PlanOut:
 
 @router.post("/visits/{visit_id}/plan", status_code=201)
 def draft_plan(visit: CurrentVisit, draft: PlanIn, db: Db, caller: CurrentCaller) -> PlanOut:
-    """Draft the plan of a visit: the policies in a drawn order, a cDBS session between any two. Supersedes an earlier plan."""
+    """Draft the plan of a visit: the policies in a drawn order, a cDBS session between any two.
+
+    It supersedes an earlier draft; an approved plan only for who may approve plans, and with a `reason`.
+    """
     view = service.draft_plan(db, visit, draft, caller)
     db.commit()
     return plan_out(view)

@@ -36,6 +36,8 @@ LABELS = {
     "total_minutes": "Minutes of the visit",
     "washout_minutes": "Washout",
     "random_sessions": "Random sessions",
+    "note": "Note on the sheet",
+    "reason": "Why the approved plan is replaced",
     "visit_id": "Visit",
     "visit_number": "Number of the new visit",
     "visit_date": "Date of the new visit",

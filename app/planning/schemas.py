@@ -25,7 +25,9 @@ class PlanOptions(Model):
     seed: Int | None = Field(None, ge=0, description="Draws the order; without one it is drawn too, and recorded.")
     evaluation_id: Id | None = Field(None, description="Ranking that the choice rests on; the participant's newest where not given.")
     note: Text = Field("", max_length=4000)
-    reason: Text | None = Field(None, max_length=1000, description="Why an approved plan is replaced; kept in the audit trail.")
+    reason: Text | None = Field(
+        None, max_length=1000, description="Why an approved plan is replaced; needed then, kept in the audit trail."
+    )
 
 
 class PlanIn(PlanOptions):

@@ -13,7 +13,7 @@ from app.accounts import policy as can
 from app.accounts.policy import Caller
 from app.evaluation import repository as evaluations
 from app.evaluation.models import EstimateRow, Evaluation
-from app.evaluation.ranking import current_ranking
+from app.evaluation.ranking import current_ranking, evaluation_notes
 from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning import repository
@@ -76,10 +76,11 @@ def read_plan(db: Session, visit: Visit, caller: Caller) -> PlanView:
 
 
 def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> PlanView:
-    """Lay out a visit day from chosen policies. An earlier plan is superseded, an approved one with a reason in the audit trail.
+    """Lay out a visit day from chosen policies. An earlier plan is superseded; an approved one only by who may approve, with a reason.
 
     Raises:
-        NotFound: a policy or ranking that the participant does not have. Invalid: a retired policy, or a day that does not fit.
+        NotFound: a policy or ranking that the participant does not have. Forbidden: an approved plan, and a caller who may not approve.
+        Invalid: a retired policy, a day that does not fit, or no reason why an approved plan is replaced.
     """
     participant = visit.participant
     study.require(caller, can.DRAFT_PLAN, participant)
@@ -89,7 +90,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
     day = schedule([Candidate(p.id, controller_of(p)) for p in chosen], rules, seed)
     evaluation = _evaluation(db, participant, draft.evaluation_id)
     repository.lock_visit(db, visit.id)
-    _supersede(db, visit, draft.reason)
+    _supersede(db, visit, draft.reason, caller)
     plan = Plan(
         visit_id=visit.id,
         evaluation_id=evaluation.id if evaluation else None,
@@ -212,13 +213,20 @@ def _evaluation(db: Session, participant: Participant, evaluation_id: int | None
     return found
 
 
-def _supersede(db: Session, visit: Visit, reason: str | None) -> None:
+def _supersede(db: Session, visit: Visit, reason: str | None, caller: Caller) -> None:
     """Retire the visit's present plan; the audit trail says why where it was approved."""
     earlier = repository.live_plan(db, visit.id)
     if earlier is None:
         return
     if earlier.status == "approved":
-        set_reason(db, f"approved plan {earlier.id} superseded by a new draft: {(reason or '').strip() or 'no reason given'}")
+        study.require(caller, can.APPROVE_PLAN, visit.participant)
+        why = (reason or "").strip()
+        if not why:
+            raise Invalid(
+                f"Plan {earlier.id} of visit {visit.number} is approved; no reason is given why it is replaced.",
+                "Say why the approved plan is replaced (`reason`), or leave it as it is.",
+            )
+        set_reason(db, f"approved plan {earlier.id} superseded by a new draft: {why}")
     earlier.status = "superseded"
     db.flush()
     set_reason(db, None)
@@ -259,7 +267,9 @@ def _warnings(
     db: Session, visit: Visit, plan: Plan, lines: Sequence[PlanLine], evaluation: Evaluation | None, stale: Sequence[str]
 ) -> list[str]:
     warnings = [f"The ranking is out of date: {reason}." for reason in stale]
-    if evaluation is None:
+    if evaluation:
+        warnings += evaluation_notes(db, evaluation)
+    else:
         warnings.append("No ranking stands behind this plan: the participant's policies have not been evaluated.")
     for line in lines:
         if line.policy is None:

@@ -11,6 +11,7 @@ from fpdf import FPDF, FontFace
 from fpdf.enums import XPos, YPos
 
 from app.evaluation.schemas import METHOD_NAMES
+from app.learning.models import Policy
 from app.planning.latin import latin
 from app.planning.service import PlanLine, PlanView
 from app.study.blinding import CONTROLLER_NAMES
@@ -183,9 +184,15 @@ def _cells(line: PlanLine) -> list[str]:
     estimate = f"{e.value:.4g} ({e.low:.4g} to {e.high:.4g})" + ("" if e.supported else " *") if e else "-"
     energy = "-" if line.predicted_energy is None else f"{line.predicted_energy:.2f}"
     washout = f"{item.washout_minutes:g}" if item.washout_minutes else "-"
-    policy = _breakable(line.policy.name) if line.policy else "-"
+    policy = _breakable(_printed_name(line.policy)) if line.policy else "-"
     controller = CONTROLLER_NAMES[Controller(item.controller)]
     return [str(item.position), clock(line.start_minute), controller, policy, f"{item.minutes:g}", washout, estimate, energy]
+
+
+def _printed_name(policy: Policy) -> str:
+    """A policy's name as the fonts can spell it, with its number where that is not the name itself: two policies never look alike."""
+    printed = latin(policy.name)
+    return printed if printed == policy.name else f"{printed} (#{policy.id})"
 
 
 def _breakable(name: str, longest: int = 17) -> str:
@@ -217,6 +224,8 @@ def _reading(pdf: _Sheet, view: PlanView) -> None:
         pdf.set_text_color(*_INK)
         pdf.set_font("Helvetica", "B", 9)
         text = "   ".join(f"! {warning}" for warning in view.warnings)
+        for policy in (line.policy for line in view.lines if line.policy):
+            text = text.replace(f"'{policy.name}'", f"'{_printed_name(policy)}'")
         pdf.multi_cell(_WIDTH, 4.2, latin(text), align="L", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
 
 

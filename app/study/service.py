@@ -107,14 +107,17 @@ def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Cal
 def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller) -> QocRevision:
     """Enter or correct QoCs: a new revision that keeps what the call leaves out. Same values, no revision."""
     require(caller, can.WRITE_STUDY, session.visit.participant)
+    # under a lock, and read again, so that two corrections at once become two revisions and neither is lost
+    db.execute(select(StudySession.id).where(StudySession.id == session.id).with_for_update())
+    db.expire(session, ["qocs"])
     known = session.qoc
-    merged = {name: getattr(known, name, None) for name in ("grasp_hz", "rating", "tremor_percent")}
-    merged |= values.model_dump(exclude_unset=True, exclude={"reason"})
+    given = values.model_dump(exclude_unset=True, exclude={"reason"})
+    merged = {name: getattr(known, name, None) for name in ("grasp_hz", "rating", "tremor_percent")} | given
     if known is not None and all(getattr(known, name) == value for name, value in merged.items()):
         return known
+    if known is None and all(value is None for value in merged.values()):
+        raise Invalid("No QoC was given.", "Enter at least one of grasp frequency, rating and tremor.")
     set_reason(db, values.reason)
-    # the newest revision is read again under a lock, so that two corrections at once become two revisions
-    db.execute(select(StudySession.id).where(StudySession.id == session.id).with_for_update())
     revision = QocRevision(
         session_id=session.id,
         revision=repository.qoc_revision(db, session.id) + 1,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
 import subprocess
@@ -10,6 +12,12 @@ import zipfile
 from pathlib import Path
 
 import pytest
+
+from app.accounts.policy import SYSTEM
+from app.export import export_participant
+from app.platform.database import transaction
+from app.study.models import CdbsAmplitude, Hemisphere, StudySession
+from app.study.repository import participant_by_code
 
 COMMANDS = (
     "serve", "worker", "demo", "migrate", "user add", "token create", "import", "pipeline", "rank", "export",
@@ -108,3 +116,42 @@ def test_migrating_twice_is_harmless(fresh_database: str) -> None:
     for _ in range(2):
         result = betaloop("migrate")
         assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "named"),
+    [
+        (["user", "add", "x@y.example", "--role", "viewer", "--password-file", "no-such-file"], 2, "no-such-file"),
+        (["export", "P1", "--to", "no-such-folder/x.zip"], 2, "no-such-folder"),
+        (["export", "P1", "--to", "."], 2, "is a folder"),
+    ],
+)
+def test_a_path_of_no_use_is_one_line_and_exit_code_2(study: str, arguments: list[str], code: int, named: str) -> None:
+    result = betaloop(*arguments)
+    assert result.returncode == code
+    assert named in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_a_session_that_cannot_be_read_does_not_stop_the_export(study: str, tmp_path: Path) -> None:
+    table = tmp_path / "session.csv"
+    table.write_text(TABLE)
+    done = betaloop("import", str(table), "--participant", study, "--visit", "1", "--controller", "random", "--json")
+    assert done.returncode == 0, done.stderr
+    broken = json.loads(done.stdout)["sessions"][0]["id"]
+    table.write_text(TABLE.replace("2,1,0.5", "2,1,0.75"))
+    fine = json.loads(betaloop("import", str(table), "--participant", study, "--visit", "1", "--controller", "random", "--json").stdout)
+    with transaction("test") as db:
+        db.get_one(StudySession, broken).visit.cdbs_amplitudes = [
+            CdbsAmplitude(hemisphere=side, program=0, amplitude_ma=3.0) for side in Hemisphere
+        ]
+        db.get_one(StudySession, fine["sessions"][0]["id"]).hemisphere = Hemisphere.LEFT
+    with transaction("test") as db:
+        content = export_participant(db, participant_by_code(db, study, SYSTEM), SYSTEM)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        rows = list(csv.DictReader(io.StringIO(archive.read(f"{study}/sessions.csv").decode())))
+        steps = list(csv.DictReader(io.StringIO(archive.read(f"{study}/steps.csv").decode())))
+    problems = {int(r["session_id"]): r["problem"] for r in rows}
+    assert "hemisphere" in problems[broken]
+    assert problems[fine["sessions"][0]["id"]] == ""
+    assert {int(r["session_id"]) for r in steps} == {fine["sessions"][0]["id"]}

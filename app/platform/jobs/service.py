@@ -22,7 +22,7 @@ STALE_S = 60.0
 """A worker that is silent for longer is taken for dead."""
 
 _MANY = 10_000
-"""More jobs than ever wait at once."""
+"""More jobs of one kind than ever wait at once."""
 
 _ROOT = Path(__file__).resolve().parents[3]
 
@@ -85,10 +85,16 @@ def cancel(db: Session, job: Job, by: str) -> Job:
 
 
 def retry(db: Session, job: Job, by: str) -> Job:
-    """A new job of the same kind with the same params.
+    """A new job of the same kind with the same params. Raises as `repeatable` does."""
+    job = repeatable(db, job)
+    return submit(db, job.kind, job.participant_id, job.params, by)
+
+
+def repeatable(db: Session, job: Job) -> Job:
+    """The job, its row locked, where it may be repeated.
 
     Raises:
-        Conflict: the job has not ended, or another one repeats it already.
+        Conflict: it has not ended, or another one that has not ended repeats it already.
     """
     # the row's lock makes a second click wait, so that it sees the job of the first
     job = repository.locked(db, job.id)
@@ -98,7 +104,7 @@ def retry(db: Session, job: Job, by: str) -> Job:
     for other in live:
         if other.participant_id == job.participant_id and other.params == job.params and other.created_at >= job.created_at:
             raise Conflict(f"Job {other.id}, {other.status}, repeats job {job.id} already.", "Wait for it or cancel it, then retry.")
-    return submit(db, job.kind, job.participant_id, job.params, by)
+    return job
 
 
 def describe_event(event: JobEvent) -> dict[str, Any]:

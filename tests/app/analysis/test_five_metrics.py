@@ -133,8 +133,7 @@ def test_a_session_that_cannot_be_read_does_not_stop_the_others(client: TestClie
     answer = client.get(PATH).json()
     assert _group(_metric(answer, "energy"), "cdbs")["session_ids"] == [kept]
     assert [s["session_id"] for s in answer["excluded"]] == [unclear]
-    assert "cannot be read: Session" in answer["excluded"][0]["reason"]
-    assert "names no hemisphere" in answer["excluded"][0]["reason"]
+    assert "cannot be read: No hemisphere is named" in answer["excluded"][0]["reason"]
 
 
 def test_a_participant_without_sessions_has_an_empty_analysis(client: TestClient, enrolled: str) -> None:
@@ -155,3 +154,21 @@ def test_the_page_shows_charts_tables_tests_and_limits(client: TestClient, study
 
 def test_only_who_may_read_the_participant_sees_the_analysis(service_app, enrolled: str) -> None:  # type: ignore[no-untyped-def]
     assert TestClient(service_app).get(PATH).status_code == 401
+
+
+def test_sessions_whose_amplitudes_contradict_their_controller_are_named_and_count(client: TestClient, add_session) -> None:  # type: ignore[no-untyped-def]
+    for controller, fraction in (("cdbs", 0.95), ("cdbs", 1.05), ("no_dbs", 0.04), ("rl", 0.5)):
+        add_session(controller, fraction=fraction)
+    add_session("cdbs", fraction=None)
+    wrong = {
+        add_session("cdbs", fraction=0.5): ("cdbs", 0.5),
+        add_session("cdbs", fraction=1.2): ("cdbs", 1.2),
+        add_session("no_dbs", fraction=0.9): ("no_dbs", 0.9),
+    }
+    answer = client.get(PATH).json()
+    assert {w["session_id"]: (w["controller"], pytest.approx(w["mean_fraction"], abs=1e-5)) for w in answer["warnings"]} == wrong
+    assert answer["sessions"] == 8
+    for path in ("/participants/P1/analyses", "/participants/P1"):
+        page = client.get(path, headers={"Accept": "text/html"}).text
+        assert "Sessions whose amplitudes contradict their controller" in page
+        assert "mean amplitude fraction is 1.20; 0.9 to 1.1 is expected" in page

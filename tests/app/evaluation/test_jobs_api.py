@@ -106,6 +106,11 @@ def test_a_waiting_job_is_cancelled_at_once_followed_to_its_end_and_repeated(cli
     assert again.status_code == 202
     assert again.json()["id"] != job
     assert again.json()["params"]["count"] == 2
+    twice = client.post(f"/api/v1/jobs/{job}/retry")
+    assert twice.status_code == 409
+    assert again.json()["id"] in twice.json()["detail"]
+    client.post(f"/api/v1/jobs/{again.json()['id']}/cancel")
+    assert client.post(f"/api/v1/jobs/{job}/retry").status_code == 202
 
 
 def test_a_job_that_does_not_exist_is_not_found(client: TestClient) -> None:

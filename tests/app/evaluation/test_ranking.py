@@ -292,3 +292,50 @@ def test_the_page_shows_ranks_intervals_flags_and_sends_picks_to_the_plan(
     ):
         assert text in page
     assert 'type="checkbox"' in page
+
+
+@pytest.mark.parametrize(
+    ("best", "second", "sentences"),
+    [
+        (
+            (44.0, True), (40.0, True),
+            ["The cDBS reference is estimated at 47.0, above every candidate (best: p0, 44.0): by this estimate no candidate improves on "
+             "cDBS in return."],
+        ),
+        (
+            (46.0, True), (40.0, True),
+            ["The cDBS reference is estimated at 47.0, above every candidate (best: p0, 46.0): by this estimate no candidate improves on "
+             "cDBS in return. The intervals overlap."],
+        ),
+        (
+            (48.0, True), (40.0, True),
+            ["The cDBS reference is estimated at 47.0, the best candidate, p0, at 48.0; the intervals overlap: whether it improves on cDBS "
+             "in return is open."],
+        ),
+        ((60.0, True), (59.0, False), []),
+        (
+            (44.0, True), (99.0, False),
+            ["The cDBS reference is estimated at 47.0, above every supported candidate (best: p0, 44.0): by this estimate no supported "
+             "candidate improves on cDBS in return.",
+             "Policies that the data do not support stand below all supported ones, whatever their estimated value: p1 (99.0)."],
+        ),
+        (
+            (44.0, False), (40.0, False),
+            ["No candidate is supported by the data: these estimates cannot say whether one improves on cDBS."],
+        ),
+    ],
+    ids=["below", "below and overlapping", "above and overlapping", "clearly above", "unsupported value above", "none supported"],
+)  # fmt: skip
+def test_notes_say_how_the_best_candidate_stands_to_cdbs(
+    client: TestClient,
+    policies: list[int],
+    evaluate: Callable[..., int],
+    best: tuple[float, bool],
+    second: tuple[float, bool],
+    sentences: list[str],
+) -> None:
+    a, b, _ = policies
+    evaluate({a: estimate("dlsm", best[0], supported=best[1]), b: estimate("dlsm", second[0], supported=second[1])}, {1.0: 47.0})
+    assert ranked(client)["notes"] == sentences
+    page = client.get("/participants/P1/ranking").text
+    assert all(sentence in page for sentence in sentences)

@@ -128,12 +128,17 @@ def test_limits_that_contradict_each_other_make_no_bundle(client: TestClient, en
 
 def test_the_pages_show_a_policy_and_take_one_in(client: TestClient, enrolled: str, db: Session) -> None:
     added = client.post(
-        "/participants/P1/policies", data={"name": ""}, files={"file": ("paris.onnx", constant_onnx(0.5, 10))}, follow_redirects=True
+        "/participants/P1/policies",
+        data={"name": "paris"},
+        files={"file": ("jane-doe.onnx", constant_onnx(0.5, 10))},
+        follow_redirects=True,
     )
     assert added.status_code == 200
     assert "Policy added." in added.text
     assert "paris" in added.text
+    assert "jane-doe" not in added.text
     policy = db.query(Policy).one()
+    assert policy.config == {"window": 10}
     page = client.post(f"/participants/P1/policies/{policy.id}/retire", data={"reason": "superseded"}, follow_redirects=True)
     assert "superseded" in page.text
     refused = client.post("/participants/P1/policies", data={"name": "x"}, files={"file": ("x.onnx", b"junk")})
@@ -152,3 +157,23 @@ def test_six_policies_get_learning_rates_across_the_papers_range_and_seeds_of_th
     assert distillation_config(DistilParams(updates=50, hidden=[8]), 1) == {
         "updates": 50, "sigma": 0.3, "seed": 1, "record_every": 1, "hidden": [8],
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["\x00", "a\x00b", "a\x1bb", "a\x7fb", "a\x85b", "a\nb", "  ", ""])
+def test_a_name_without_a_visible_character_or_with_a_control_character_is_refused(
+    client: TestClient, enrolled: str, db: Session, name: str
+) -> None:
+    files = {"file": ("x.onnx", constant_onnx(0.5, 10))}
+    for path in ("/api/v1/participants/P1/policies", "/participants/P1/policies"):
+        assert client.post(path, data={"name": name}, files=files).status_code == 422
+    assert db.query(Policy).count() == 0
+
+
+def test_a_control_character_in_a_name_is_named(client: TestClient, enrolled: str) -> None:
+    assert "no control characters" in post_policy(client, constant_onnx(0.5, 10), "a\x00b").text  # type: ignore[attr-defined]
+
+
+def test_a_reason_with_the_zero_character_retires_nothing(client: TestClient, enrolled: str) -> None:
+    policy = post_policy(client, constant_onnx(0.6, 10)).json()["id"]  # type: ignore[attr-defined]
+    assert client.post(f"/participants/P1/policies/{policy}/retire", data={"reason": "a\x00b"}).status_code == 422
+    assert client.get(f"/api/v1/policies/{policy}").json()["retired_reason"] is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -10,7 +11,10 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.learning.models import Policy
+from app.evaluation.estimates import estimate_of
+from app.evaluation.models import Evaluation
+from app.evaluation.service import store_evaluation
+from app.learning.models import BufferSnapshot, Policy
 from app.planning.models import Plan
 from app.platform.audit import AuditEvent
 
@@ -154,7 +158,11 @@ def test_an_approved_plan_is_fixed_and_superseded_only_with_a_reason_in_the_audi
     again = client.post(_path(studied.visit, "/approve"))
     assert again.status_code == 409
     assert "was approved by admin@clinic.example already" in again.json()["detail"]
-    _draft(client, studied, reason="participant came late")
+    unexplained = _draft(client, studied, reason=" ")
+    assert unexplained.status_code == 422
+    assert "Say why the approved plan is replaced" in unexplained.json()["mend"]
+    assert client.get(_path(studied.visit)).json()["id"] == draft["id"]
+    assert _draft(client, studied, reason="participant came late").status_code == 201
     rows = db.scalars(
         select(AuditEvent).where(AuditEvent.entity == "plan", AuditEvent.entity_id == str(draft["id"])).order_by(AuditEvent.id)
     ).all()
@@ -190,3 +198,43 @@ def test_engineers_draft_clinicians_approve_viewers_read(client: TestClient, cli
     assert viewer.post(_path(studied.visit, "/approve")).status_code == 403
     assert engineer.post(_path(studied.visit, "/approve")).status_code == 403
     assert clinician.post(_path(studied.visit, "/approve")).status_code == 200
+
+
+def test_only_who_may_approve_replaces_an_approved_plan(client: TestClient, client_as, studied: Any) -> None:  # type: ignore[no-untyped-def]
+    engineer, clinician = client_as("engineer"), client_as("clinician")
+    approved = _draft(client, studied).json()["id"]
+    client.post(_path(studied.visit, "/approve"))
+    assert _draft(engineer, studied, reason="I prefer another").status_code == 403
+    page = engineer.get(f"/visits/{studied.visit}/plan", headers={"Accept": "text/html"}).text
+    assert "Only those who may approve plans can replace it." in page
+    assert "Draft plan</button>" not in page
+    assert client.get(_path(studied.visit)).json()["id"] == approved
+    assert _draft(clinician, studied, reason="speech").status_code == 201
+
+
+def test_a_plan_repeats_what_its_ranking_says_of_unsupported_policies(client: TestClient, studied: Any, db: Session) -> None:
+    earlier = db.get_one(Evaluation, studied.evaluation)
+    estimates = {row.policy_id: estimate_of(row) for row in earlier.estimates}
+    estimates[studied.unsupported] = replace(estimates[studied.unsupported], value=99.0, high=101.0)
+    store_evaluation(
+        db,
+        job_id=None,
+        created_by="test",
+        snapshot=db.get_one(BufferSnapshot, earlier.snapshot_id),
+        horizon_steps=60,
+        candidates=list(estimates),
+        results={"dlsm": {"estimates": {str(i): e.to_json() for i, e in estimates.items()}}},
+        config={},
+    )
+    db.commit()
+    assert _draft(client, studied).json()["warnings"] == [
+        "Policies that the data do not support stand below all supported ones, whatever their estimated value: rl-02-small (99.0)."
+    ]
+
+
+def test_a_note_with_the_zero_character_is_refused(client: TestClient, studied: Any) -> None:
+    assert _draft(client, studied, note="a\x00b").status_code == 422
+    assert _draft(client, studied, reason="a\x00b").status_code == 422
+    form = {"policy_ids": str(studied.policies[0]), "note": "a\x00b"}
+    page = client.post(f"/visits/{studied.visit}/plan", data=form, headers={"Accept": "text/html"})
+    assert page.status_code == 422

@@ -78,7 +78,8 @@ def test_a_long_day_goes_over_pages_with_its_head_repeated(client: TestClient, s
 def test_names_outside_latin_1_are_spelled(client: TestClient, studied: Any, external: int) -> None:
     client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [external], "note": "雨 – β ≥ 2 µV"})
     (text,) = _sheet(client, studied.visit)
-    assert 'beta-Regler "Lódz"' in text
+    assert re.search(rf'beta-Regler "Lódz" ?\(#{external}\)', text)
+    assert f"Policy 'beta-Regler \"Lódz\" (#{external})' is not in the ranking." in text
     assert "Note: ? - beta >= 2 µV" in text
 
 

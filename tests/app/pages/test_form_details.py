@@ -1,0 +1,93 @@
+"""What forms offer before anybody types: labels, a likely visit, optional fields; and true words where data cannot be read."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime, timedelta
+from html import unescape
+
+import pytest
+from fastapi.testclient import TestClient
+
+
+def test_a_session_that_cannot_be_read_says_why_and_nothing_else(
+    browser: TestClient, client: TestClient, enrolled: str, table: bytes
+) -> None:
+    sides = [{"hemisphere": side, "amplitude_ma": 3.0} for side in ("left", "right")]
+    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 2, "cdbs_amplitudes": sides}).status_code == 201
+    upload = {"participant": enrolled, "visit": "2", "controller": "cdbs"}
+    answer = client.post("/api/v1/uploads", data=upload, files={"file": ("a.csv", table)})
+    page = unescape(browser.get(f"/sessions/{answer.json()['sessions'][0]['id']}").text)
+    assert "No hemisphere is named" in page
+    assert "Set the session's hemisphere" in page
+    assert "have none" not in page
+    assert 'id="traces-0"' in page
+
+
+@pytest.mark.parametrize("path", ["/sessions/{}", "/participants/P1/settings", "/participants/P1/upload", "/participants/P1/visits/new"])
+def test_every_field_has_a_label_of_its_own(path: str, browser: TestClient, client: TestClient, session_id: int) -> None:
+    client.put(f"/api/v1/sessions/{session_id}/qoc", json={"rating": 5})
+    page = browser.get(path.format(session_id)).text
+    ids = re.findall(r'\sid="([^"]*)"', page)
+    assert sorted(ids) == sorted(set(ids))
+    labels = re.findall(r'<label for="([^"]*)"', page)
+    fields = [tag for tag in re.findall(r"<(?:input|select|textarea) [^>]*>", page) if 'type="hidden"' not in tag]
+    assert len(fields) >= 5
+    for tag in fields:
+        own = re.search(r'\sid="([^"]*)"', tag)
+        assert own, tag
+        assert labels.count(own[1]) == 1, tag
+
+
+def chosen_visit(page: str) -> str | None:
+    visits = re.search(r'<select id="f-visit".*?</select>', page, re.S)
+    assert visits
+    assert '<option value="">choose' in visits[0]
+    found = re.findall(r'<option value="(\d*)" selected', visits[0])
+    assert len(found) <= 1
+    return found[0] if found else None
+
+
+@pytest.mark.parametrize(
+    ("days", "expected"),
+    [
+        ((-30, -1, 7), "2"),
+        ((-30, 0, 7), "2"),
+        ((-1, -30), "1"),
+        ((3, 7), None),
+        ((-30, None), "2"),
+        ((None,), "1"),
+        ((None, 7), None),
+        ((-30, None, 7), "1"),
+    ],
+)
+def test_the_upload_form_proposes_the_newest_visit_that_has_taken_place(
+    days: tuple[int | None, ...], expected: str | None, browser: TestClient, client: TestClient
+) -> None:
+    client.post("/api/v1/participants", json={"code": "P3"})
+    today = datetime.now(UTC).date()
+    for number, day in enumerate(days, 1):
+        visit = {"number": number} | ({} if day is None else {"date": (today + timedelta(days=day)).isoformat()})
+        assert client.post("/api/v1/participants/P3/visits", json=visit).status_code == 201
+    assert chosen_visit(browser.get("/participants/P3/upload").text) == expected
+    assert chosen_visit(browser.get("/participants/P3/upload?visit=1").text) == "1"
+
+
+def test_unit_and_source_of_a_tables_beta_are_stated_on_the_upload_page(
+    browser: TestClient, client: TestClient, enrolled: str, table: bytes
+) -> None:
+    url = f"/participants/{enrolled}/upload"
+    page = browser.get(url).text
+    options = re.search(r'<select id="f-beta_source".*?</select>', page, re.S)
+    assert options
+    assert re.findall(r'<option value="([^"]*)"', options[0]) == ["", "time_domain", "device_power", "percept_lfp", "table"]
+    fields = {"visit": "1", "controller": "cdbs", "beta_unit": "device units", "beta_source": "device_power"}
+    sent = browser.post(url, data=fields, files=[("file", ("a.csv", table))])
+    assert sent.status_code == 200
+    session = client.get("/api/v1/visits/1/sessions").json()["items"][0]["id"]
+    trace = client.get(f"/api/v1/sessions/{session}/trace").json()
+    assert (trace["beta_unit"], trace["beta_source"]) == ("device units", "device_power")
+    refused = browser.post(url, data=fields | {"beta_source": "hearsay"}, files=[("file", ("a.csv", table))])
+    assert refused.status_code == 422
+    assert "Source of beta" in refused.text
+    assert 'value="device units"' in refused.text

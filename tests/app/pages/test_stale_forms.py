@@ -1,0 +1,160 @@
+"""Forms that were opened before somebody else saved: nothing is taken back in silence, nothing typed is lost."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from html import unescape
+
+import pytest
+from fastapi.testclient import TestClient
+
+STORED = {"grasp_hz": 2.4790827393, "rating": 5, "tremor_percent": 10.0}
+
+
+def fields_of(page: str, action: str) -> dict[str, str]:
+    """What the last form of an address sends when nobody touches it."""
+    form = page[page.rindex(f'action="{action}"') :]
+    form = form[: form.index("</form>")]
+    found = {}
+    for tag in re.findall(r"<input [^>]*>", form):
+        name, value = re.search(r'name="([^"]*)"', tag), re.search(r'value="([^"]*)"', tag)
+        assert name, tag
+        found[name[1]] = unescape(value[1]) if value else ""
+    for name, options in re.findall(r'<select [^>]*name="([^"]*)"[^>]*>(.*?)</select>', form, re.S):
+        chosen = re.search(r'value="([^"]*)" selected', options) or re.search(r'value="([^"]*)"', options)
+        assert chosen, name
+        found[name] = unescape(chosen[1])
+    return found | {name: unescape(text) for name, text in re.findall(r'<textarea [^>]*name="([^"]*)"[^>]*>(.*?)</textarea>', form, re.S)}
+
+
+class Tab:
+    """A browser's tab with one form, as it was when it was opened."""
+
+    def __init__(self, browser: TestClient, page: str, action: str) -> None:
+        self.browser, self.action = browser, action
+        self.fields = fields_of(browser.get(page).text, action)
+
+    def send(self, **typed: str):  # type: ignore[no-untyped-def]
+        return self.browser.post(self.action, data=self.fields | typed)
+
+
+@pytest.fixture
+def qoc_tab(browser: TestClient, client: TestClient, session_id: int) -> Callable[[], Tab]:
+    assert client.put(f"/api/v1/sessions/{session_id}/qoc", json=STORED).status_code == 200
+    return lambda: Tab(browser, f"/sessions/{session_id}", f"/sessions/{session_id}/qoc")
+
+
+@pytest.fixture
+def settings_tab(browser: TestClient, enrolled: str) -> Callable[[], Tab]:
+    return lambda: Tab(browser, f"/participants/{enrolled}/settings", f"/participants/{enrolled}/settings")
+
+
+def stored_qoc(client: TestClient, session_id: int) -> tuple[object, ...]:
+    qoc = client.get(f"/api/v1/sessions/{session_id}/qoc").json()
+    return qoc["grasp_hz"], qoc["rating"], qoc["tremor_percent"], qoc["revision"]
+
+
+def settings_of(client: TestClient) -> dict[str, object]:
+    return dict(client.get("/api/v1/participants/P1").json()["settings"])
+
+
+def test_an_old_form_leaves_qocs_alone_that_another_tab_changed(client: TestClient, session_id: int, qoc_tab: Callable[[], Tab]) -> None:
+    first, second = qoc_tab(), qoc_tab()
+    assert first.send(rating="9").status_code == 303
+    assert second.send(grasp_hz="3").status_code == 303
+    assert stored_qoc(client, session_id) == (3.0, 9, 10.0, 3)
+
+
+def test_an_old_form_opened_before_the_first_entry_leaves_that_entry_alone(
+    browser: TestClient, client: TestClient, session_id: int
+) -> None:
+    old = Tab(browser, f"/sessions/{session_id}", f"/sessions/{session_id}/qoc")
+    assert old.send(rating="9").status_code == 303
+    assert old.send(grasp_hz="3").status_code == 303
+    assert stored_qoc(client, session_id) == (3.0, 9, None, 2)
+
+
+def test_two_values_for_one_qoc_are_a_conflict_that_keeps_what_was_typed(
+    client: TestClient, session_id: int, qoc_tab: Callable[[], Tab], browser: TestClient
+) -> None:
+    first, second = qoc_tab(), qoc_tab()
+    assert first.send(rating="9", tremor_percent="20").status_code == 303
+    assert client.put(f"/api/v1/sessions/{session_id}/qoc", json={"grasp_hz": 3.5}).status_code == 200
+    refused = second.send(rating="7", reason="my <reason>")
+    assert refused.status_code == 409
+    text = unescape(refused.text)
+    assert "Rating" in text
+    assert "stored now: 9, by admin-page@clinic.example; you typed: 7" in text
+    assert stored_qoc(client, session_id) == (3.5, 9, 20.0, 3)
+    again = fields_of(refused.text, second.action)
+    assert again == {"revision": "3", "grasp_hz": "3.5", "rating": "7", "tremor_percent": "20", "reason": "my <reason>"}
+    assert browser.post(second.action, data=again).status_code == 303
+    assert stored_qoc(client, session_id) == (3.5, 7, 20.0, 4)
+
+
+def test_the_same_qoc_typed_twice_is_no_conflict(client: TestClient, session_id: int, qoc_tab: Callable[[], Tab]) -> None:
+    first, second = qoc_tab(), qoc_tab()
+    assert first.send(rating="9").status_code == 303
+    assert second.send(rating="9").status_code == 303
+    assert stored_qoc(client, session_id) == (STORED["grasp_hz"], 9, 10.0, 2)
+
+
+@pytest.mark.parametrize("revision", ["", "77", "x"])
+def test_a_form_of_a_revision_that_does_not_exist_changes_nothing(
+    revision: str, client: TestClient, session_id: int, qoc_tab: Callable[[], Tab]
+) -> None:
+    assert qoc_tab().send(revision=revision, rating="9").status_code == 409
+    assert stored_qoc(client, session_id)[3] == 1
+
+
+def test_an_old_settings_form_leaves_alone_what_another_tab_changed(client: TestClient, settings_tab: Callable[[], Tab]) -> None:
+    first, second = settings_tab(), settings_tab()
+    assert first.send(gamma="0.9").status_code == 303
+    assert second.send(c1="0.5").status_code == 303
+    settings = settings_of(client)
+    assert (settings["gamma"], settings["c1"], settings["version"]) == (0.9, 0.5, 3)
+
+
+def test_two_values_for_one_setting_are_a_conflict_that_keeps_what_was_typed(
+    client: TestClient, settings_tab: Callable[[], Tab], browser: TestClient
+) -> None:
+    first, second = settings_tab(), settings_tab()
+    assert first.send(gamma="0.9", window="12").status_code == 303
+    refused = second.send(gamma="0.8", reason="my <reason>")
+    assert refused.status_code == 409
+    assert "stored now: 0.9, by admin-page@clinic.example; you typed: 0.8" in unescape(refused.text)
+    assert settings_of(client)["version"] == 2
+    again = fields_of(refused.text, second.action)
+    assert (again["version"], again["gamma"], again["window"], again["reason"]) == ("2", "0.8", "12", "my <reason>")
+    assert browser.post(second.action, data=again).headers["location"].endswith("done=changed")
+    settings = settings_of(client)
+    assert (settings["gamma"], settings["window"], settings["version"], settings["reason"]) == (0.8, 12, 3, "my <reason>")
+
+
+def test_settings_saved_untouched_make_no_version_and_keep_every_digit(
+    client: TestClient, enrolled: str, settings_tab: Callable[[], Tab]
+) -> None:
+    change = {"settings": {"xi_beta": 1.23456789012, "beta_unit": " device units "}}
+    assert client.put(f"/api/v1/participants/{enrolled}/settings", json=change).status_code == 200
+    tab = settings_tab()
+    assert tab.fields["xi_beta"] == "1.23456789"
+    assert tab.send().headers["location"].endswith("done=same")
+    assert settings_of(client)["version"] == 2
+    assert tab.send(gamma="0.9").headers["location"].endswith("done=changed")
+    settings = settings_of(client)
+    assert (settings["xi_beta"], settings["beta_unit"], settings["gamma"]) == (1.23456789012, " device units ", 0.9)
+
+
+def test_a_suggested_threshold_does_not_replace_one_that_was_set_meanwhile(browser: TestClient, client: TestClient, table: bytes) -> None:
+    client.post("/api/v1/participants", json={"code": "P2", "settings": {"cdbs_amplitude_ma": 3.0}})
+    client.post("/api/v1/participants/P2/visits", json={"number": 1})
+    upload = {"participant": "P2", "visit": "1", "controller": "cdbs", "beta_unit": "uV", "beta_source": "table"}
+    assert client.post("/api/v1/uploads", data=upload, files={"file": ("a.csv", table)}).status_code == 201
+    page = browser.get("/participants/P2/settings").text
+    button = page[: page.index("<button>Use ")]
+    fields = fields_of(button + "</form>", "/participants/P2/settings")
+    assert set(fields) == {"version", "xi_beta", "reason"}
+    assert client.put("/api/v1/participants/P2/settings", json={"settings": {"xi_beta": 9.0}}).status_code == 200
+    assert browser.post("/participants/P2/settings", data=fields).status_code == 409
+    assert client.get("/api/v1/participants/P2").json()["settings"]["xi_beta"] == 9.0
