@@ -157,7 +157,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=25.0,
         c3=25.0,
         c4=25.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.28, eta=0.72, a50=0.65, hill=2.0, s_act=0.25, c_med=0.15, s_k=0.36),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.74, a50=0.65, hill=2.0, s_act=0.30, c_med=0.15, s_k=0.35),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=2.0,
             tremor_theta=0.30,
@@ -169,11 +169,11 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             brady_hill=2.0,
             grasp_min_hz=1.9,
             grasp_max_hz=2.9,
-            side_effect=0.75,
+            side_effect=0.9,
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.360, at_03=1.861, off=2.094),
+        reference=ReferenceBeta(cdbs=1.392, at_03=1.902, off=2.132),
     ),
     "P2": ParticipantModel(
         code="P2",
@@ -186,7 +186,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.28, eta=0.75, a50=0.70, hill=2.5, s_act=0.25, c_med=0.05, s_k=0.37),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.77, a50=0.70, hill=2.5, s_act=0.30, c_med=0.05, s_k=0.36),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=5.0,
             tremor_theta=0.62,
@@ -198,11 +198,11 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             brady_hill=2.0,
             grasp_min_hz=1.2,
             grasp_max_hz=2.5,
-            side_effect=0.75,
+            side_effect=0.9,
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(), constant=0.15),  # selegiline and pramipexole (appendix); size assumed
-        reference=ReferenceBeta(cdbs=1.529, at_03=2.240, off=2.388),
+        reference=ReferenceBeta(cdbs=1.567, at_03=2.284, off=2.429),
     ),
     "P3": ParticipantModel(
         code="P3",
@@ -215,7 +215,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.29, eta=0.84, a50=0.60, hill=2.0, s_act=0.25, c_med=0.18, s_k=0.38),  # assumed
+        brain=BrainConstants(k0=0.29, eta=0.86, a50=0.60, hill=2.0, s_act=0.30, c_med=0.18, s_k=0.37),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=4.0,
             tremor_theta=0.55,
@@ -227,11 +227,11 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             brady_hill=2.0,
             grasp_min_hz=1.4,
             grasp_max_hz=2.6,
-            side_effect=0.75,
+            side_effect=0.9,
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.405, at_03=1.908, off=2.198),
+        reference=ReferenceBeta(cdbs=1.433, at_03=1.946, off=2.232),
     ),
     "P4": ParticipantModel(
         code="P4",
@@ -244,7 +244,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.28, eta=0.78, a50=0.65, hill=2.0, s_act=0.25, c_med=0.12, s_k=0.38),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.80, a50=0.65, hill=2.0, s_act=0.30, c_med=0.12, s_k=0.37),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=3.5,
             tremor_theta=0.50,
@@ -256,10 +256,10 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             brady_hill=2.0,
             grasp_min_hz=1.5,
             grasp_max_hz=2.7,
-            side_effect=1.1,
+            side_effect=1.3,
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(-2.0,), constant=0.0),  # appendix: one tablet at about 7 o'clock
-        reference=ReferenceBeta(cdbs=1.483, at_03=2.067, off=2.319),
+        reference=ReferenceBeta(cdbs=1.523, at_03=2.118, off=2.364),
     ),
 }
