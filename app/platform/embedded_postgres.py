@@ -42,16 +42,16 @@ class EmbeddedPostgres:
 
     def __init__(self, folder: Path, durable: bool = True) -> None:
         self._durable = durable
-        self._marker = folder.resolve()
+        self._asked = folder.resolve()
         self._bin = _wheel_binaries()
         self._user: str | None = None
+        self.data = self._asked
         if os.geteuid() == 0:  # PostgreSQL refuses to run as root
             _wheel_utils().ensure_user_exists(_SERVER_USER)
             self._user = _SERVER_USER
             self._bin = _reachable_binaries(self._bin)
-            if not _world_searchable(self._marker.parent):
-                self._marker = _system_folder(self._marker)
-        self.data = self._marker
+            if not _world_searchable(self._asked.parent):
+                self.data = _system_folder(self._asked)
         self._lock_path = self.data.with_name(self.data.name + ".users")
         self._sockets = self._socket_folder()
         self._lock_fd: int | None = None
@@ -102,6 +102,8 @@ class EmbeddedPostgres:
         self._run("pg_ctl", "-D", str(self.data), "-m", "immediate", "-w", "stop", check=False)
         shutil.rmtree(self.data, ignore_errors=True)
         shutil.rmtree(self._sockets, ignore_errors=True)
+        if self.data != self._asked:
+            shutil.rmtree(self.data.parent, ignore_errors=True)
 
     def url(self, database: str) -> str:
         """SQLAlchemy URL of a database of this server, over its Unix socket."""
@@ -123,6 +125,13 @@ class EmbeddedPostgres:
         return True
 
     def _initialise(self) -> None:
+        pointer = self._asked.with_name(self._asked.name + ".location")
+        elsewhere = self.data != self._asked
+        if elsewhere and self.data.exists() and not pointer.exists():
+            # the data folder was removed and made anew: its files are gone, so the old rows must not come back under it
+            self.data.rename(self.data.with_name(f"{self.data.name}-left-{time.time_ns()}"))
+        if elsewhere:
+            pointer.write_text(f"{self.data}\n")
         if (self.data / "PG_VERSION").exists():
             return
         self.data.mkdir(mode=0o700, exist_ok=True)
