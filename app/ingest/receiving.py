@@ -170,10 +170,10 @@ class Receiver:
         except UndecodableFile as error:
             self.db.rollback()
             return self._failed(name, row, kept, error)
-        except Exception:
+        except Exception as fault:
             # a fault of ours must not take the other files of the upload with it; the bytes are safe for a better decoder
             self.db.rollback()
-            log.exception("decoder failed", upload_file=row.id, kind=kept.kind)
+            log.exception("decoder failed", upload_file=row.id, kind=kept.kind, fault=repr(fault))
             ours = UndecodableFile("the decoder failed on this file", "file", f"Tell your administrator: upload file {row.id}.")
             return self._failed(name, row, kept, ours)
         reports = list(decoded.reports)
