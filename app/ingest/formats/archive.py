@@ -15,7 +15,7 @@ from app.ingest.formats.options import ArchiveLimits
 
 NESTED = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".bz2", ".xz")
 READ_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError, ValueError)
-"""What zipfile raises for damaged members, unknown compression and wrong sizes."""
+"""What zipfile raises for damaged members, wrong sizes, and (NotImplementedError) a compression that it does not know."""
 
 
 class Files(Protocol):

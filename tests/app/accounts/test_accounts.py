@@ -136,3 +136,9 @@ def test_a_grant_reaches_its_study_and_site_only() -> None:
         caller.require(WRITE_STUDY, 2, 99)
     with pytest.raises(NotFound):
         caller.require(READ, 3)
+
+
+def test_a_zero_character_in_an_address_is_a_failed_sign_in_and_no_fault(db: Session, ada: str) -> None:
+    with pytest.raises(Unauthorized):
+        service.sign_in(db, "a\x00b@x", PASSWORD)
+    db.commit()

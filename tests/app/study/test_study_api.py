@@ -120,3 +120,12 @@ def test_a_session_takes_only_its_own_participants_policy_and_its_own_traces(cli
 def test_a_unit_has_one_spelling(client: TestClient) -> None:
     settings = client.post("/api/v1/participants", json={"code": "U1", "settings": {"beta_unit": "µV²"}}).json()["settings"]
     assert settings["beta_unit"] == "uV2"
+
+
+def test_a_controller_without_a_policy_takes_none(client: TestClient, enrolled: str) -> None:
+    table = b"t_s,beta,amplitude_fraction\n0,1,1\n2,1,1\n"
+    data = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+    session = client.post("/api/v1/uploads", data=data, files={"file": ("s.csv", table)}).json()["sessions"][0]["id"]
+    refused = client.patch(f"/api/v1/sessions/{session}", json={"policy_id": 1})
+    assert refused.status_code == 422
+    assert "A cdbs session has no policy" in refused.json()["detail"]
