@@ -172,3 +172,13 @@ def test_sessions_whose_amplitudes_contradict_their_controller_are_named_and_cou
         page = client.get(path, headers={"Accept": "text/html"}).text
         assert "Sessions whose amplitudes contradict their controller" in page
         assert "mean amplitude fraction is 1.20; 0.9 to 1.1 is expected" in page
+
+
+def test_a_participant_without_cdbs_sessions_has_a_page_that_says_so(client: TestClient, enrolled: str) -> None:
+    table = b"t_s,beta,amplitude_fraction\n0,1,1\n2,1,0.5\n4,1,0.6\n"
+    data = {"participant": enrolled, "visit": "1", "controller": "random"}
+    assert client.post("/api/v1/uploads", data=data, files={"file": ("s.csv", table)}).status_code == 201
+    for path in ("/participants/P1/analyses", "/participants/P1"):
+        page = client.get(path, headers={"Accept": "text/html"})
+        assert page.status_code == 200
+        assert "cDBS 0" in page.text
