@@ -14,3 +14,12 @@ class Report(Protocol):
 
 def silent(fraction: float, message: str = "", **numbers: float) -> None:
     """A report that goes nowhere."""
+
+
+def part_of(report: Report, k: int, of: int) -> Report:
+    """A report for the k-th of several equal parts of a computation."""
+
+    def inner(fraction: float, message: str = "", **numbers: float) -> None:
+        report((k + fraction) / of, message, **numbers)
+
+    return inner

@@ -24,7 +24,7 @@ from ml.ope.dlsm_held_out import HeldOut
 from ml.ope.dlsm_rollout import Rollouts, roll_out
 from ml.ope.dlsm_training import Member, MemberTraining
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
-from ml.progress import Report, silent
+from ml.progress import Report, part_of, silent
 from ml.rl.policy import Policy
 from ml.trajectories import ReplayBuffer, content_hash, to_parquet
 
@@ -61,7 +61,7 @@ class Dlsm:
         """
         c = self.config
         data = self._prepare(buffer)
-        members = tuple(self._train(data, k, _part(report, k, c.members), checkpoint_dir) for k in range(c.members))
+        members = tuple(self._train(data, k, part_of(report, k, c.members), checkpoint_dir) for k in range(c.members))
         return FittedDlsm(self.method, c, buffer, data.batch, data.scale, members)
 
     def fit_member(self, buffer: ReplayBuffer, k: int, report: Report = silent, checkpoint_dir: Path | None = None) -> Member:
@@ -119,7 +119,8 @@ class FittedDlsm:
         if not policies:
             return {}
         runs = [
-            self._run(m, policies, horizon, k, prior=False, report=_part(report, k, len(self.members))) for k, m in enumerate(self.members)
+            self._run(m, policies, horizon, k, prior=False, report=part_of(report, k, len(self.members)))
+            for k, m in enumerate(self.members)
         ]
         others = [self._run(m, policies, horizon, k, prior=True, report=silent) for k, m in enumerate(self.members)]
         main, second = (others, runs) if self.config.start == "prior" else (runs, others)
@@ -265,12 +266,3 @@ def held_out_skill(checks: tuple[HeldOut, ...], scale: Scale, source: str) -> di
         "end_skill": 1 - float(np.mean(ends)) if ends else None,
         "sessions": len({i for c in checks for i in c.sessions}),
     }
-
-
-def _part(report: Report, k: int, of: int) -> Report:
-    """The k-th of several equal stretches of a report."""
-
-    def inner(fraction: float, message: str = "", **numbers: float) -> None:
-        report((k + fraction) / of, message, **numbers)
-
-    return inner

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ml.ope.batches import Batch
 from ml.ope.dlsm_config import DlsmConfig
-from ml.ope.dlsm_recurrence import bounded, lstm, lstm_loop, stochastic_lstm, stochastic_lstm_loop
+from ml.ope.dlsm_recurrence import LatentWeights, bounded, lstm, lstm_loop, stochastic_lstm, stochastic_lstm_loop
 from ml.ope.estimate import OUTCOMES
 
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
@@ -82,13 +82,12 @@ class LatentRecurrence(nn.Module):
 
     def run(self, x: Tensor, z0: Tensor, eps: Tensor, fast: bool = True) -> tuple[Tensor, Tensor, Tensor]:
         """z_1 ... z_T with means and log standard deviations, each [T, B, Z]; x is [T, B, X], z0 [B, Z], eps [T, B, Z]."""
-        recurrence = stochastic_lstm if fast else stochastic_lstm_loop
-        gates = x @ self.w_x + self.bias
-        return recurrence(gates, x @ self.a_x, z0, eps, self.w_z, self.w_h, self.a_z, self.w_out, self.b_out)
+        weights = LatentWeights(self.w_x, self.bias, self.a_x, self.w_z, self.w_h, self.a_z, self.w_out, self.b_out)
+        return (stochastic_lstm if fast else stochastic_lstm_loop)(x, z0, eps, weights)
 
     def follow(self, x: Tensor, z: Tensor, fast: bool = True) -> tuple[Tensor, Tensor]:
         """Means and log standard deviations of z_t given the z_{t-1} of another path, [T, B, Z]; z is z_0 ... z_{T-1}."""
-        h = (lstm if fast else lstm_loop)(torch.cat([x, z], dim=2) @ torch.cat([self.w_x, self.w_z]) + self.bias, self.w_h)
+        h = (lstm if fast else lstm_loop)(torch.cat([x, z], dim=2), torch.cat([self.w_x, self.w_z]), self.bias, self.w_h)
         head, raw = (h @ self.w_out + self.b_out).chunk(2, dim=2)
         return x @ self.a_x + z @ self.a_z + head, bounded(raw)
 
