@@ -13,6 +13,7 @@ import numpy as np
 
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller
+from ml.statistics.multiplicity import holm
 from ml.statistics.ranksum import rank_sum
 
 ALPHA = 0.05
@@ -119,11 +120,3 @@ def adjust(comparisons: Sequence[Comparison]) -> list[Comparison]:
     made = [c.p_value for c in comparisons if c.p_value is not None]
     adjusted = iter(holm(made))
     return [c if c.p_value is None else replace(c, p_holm=next(adjusted)) for c in comparisons]
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's step-down adjustment: the k-th smallest of m p-values times (m - k + 1), never falling, at most 1 (Holm 1979)."""
-    order = np.argsort(p_values, kind="stable")
-    adjusted = np.empty(len(p_values))
-    adjusted[order] = np.minimum(1.0, np.maximum.accumulate(np.asarray(p_values)[order] * np.arange(len(p_values), 0, -1)))
-    return [float(p) for p in adjusted]

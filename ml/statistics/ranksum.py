@@ -117,6 +117,16 @@ def non_inferiority(x: ArrayLike, y: ArrayLike, margin: float, *, higher_is_bett
     return NonInferiority(p, margin, p < alpha, alpha, "exact" if exact else "normal approximation")
 
 
+def p_greater(x: ArrayLike, y: ArrayLike) -> float:
+    """One-sided p-value of the rank-sum test that x tends to be larger than y.
+
+    Raises:
+        ValueError: a group `rank_sum` would refuse.
+    """
+    x, y = _group(x, "first"), _group(y, "second")
+    return _tail(x, y, _u(x, y), _is_exact(x, y))
+
+
 @lru_cache(maxsize=256)
 def u_distribution(n_x: int, n_y: int) -> NDArray[np.float64]:
     """Exact probabilities of U = 0 ... n_x n_y without ties, shape [n_x n_y + 1].

@@ -5,10 +5,8 @@ from __future__ import annotations
 from itertools import combinations
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from app.analysis.comparisons import ALPHA, Group, compare, group, holm, sessions_needed, smallest_p
+from app.analysis.comparisons import ALPHA, Group, compare, group, sessions_needed, smallest_p
 from app.study.models import Controller
 from ml.statistics.ranksum import rank_sum
 
@@ -85,19 +83,3 @@ def test_the_smallest_p_is_that_of_counting_every_ranking() -> None:
     rankings = list(combinations(range(7), 3))
     extreme = [r for r in rankings if r in {(0, 1, 2), (4, 5, 6)}]
     assert smallest_p(3, 4) == pytest.approx(len(extreme) / len(rankings))
-
-
-def test_holm_agrees_with_a_worked_example() -> None:
-    # sorted .005 .01 .03 .04 times 4 3 2 1 is .02 .03 .06 .04, and may not fall: .02 .03 .06 .06
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert holm([]) == []
-
-
-@given(st.lists(st.floats(0, 1), min_size=1, max_size=12))
-def test_holm_agrees_with_its_definition(p_values: list[float]) -> None:
-    m = len(p_values)
-    ranked = sorted(range(m), key=lambda i: p_values[i])
-    expected = {}
-    for place, i in enumerate(ranked):
-        expected[i] = max(min(1.0, (m - k) * p_values[ranked[k]]) for k in range(place + 1))
-    assert holm(p_values) == pytest.approx([expected[i] for i in range(m)])

@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 from itertools import combinations
+from math import comb
 
 import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from ml.statistics.ranksum import non_inferiority, rank_sum, u_distribution
+from ml.statistics.ranksum import non_inferiority, p_greater, rank_sum, u_distribution
 
 
 @pytest.mark.parametrize(("n_x", "n_y"), [(1, 1), (2, 5), (4, 4), (5, 3)])
@@ -93,3 +94,14 @@ def test_an_empty_group_and_a_missing_measurement_are_refused_in_words():
         rank_sum([1.0, np.nan], [2.0])
     with pytest.raises(ValueError, match="margin must be above 0"):
         non_inferiority([1.0], [2.0], 0.0, higher_is_better=True)
+
+
+def test_the_one_sided_p_value_of_complete_separation_is_one_over_the_number_of_rankings():
+    assert p_greater([5, 6, 7, 8], [1, 2, 3, 4]) == pytest.approx(1 / comb(8, 4))
+    assert p_greater([1, 2, 3, 4], [5, 6, 7, 8]) == pytest.approx(1.0)
+
+
+def test_the_two_one_sided_p_values_cover_everything_and_share_the_observed_ranking():
+    x, y = [1.0, 4.0, 6.0], [2.0, 3.0, 5.0, 7.0]
+    probability = u_distribution(3, 4)[round(rank_sum(x, y).u)]
+    assert p_greater(x, y) + p_greater(y, x) == pytest.approx(1 + probability)

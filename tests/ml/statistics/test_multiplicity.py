@@ -1,0 +1,23 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ml.statistics.multiplicity import holm
+
+
+def test_holm_agrees_with_a_worked_example():
+    # sorted .005 .01 .03 .04 times 4 3 2 1 is .02 .03 .06 .04, and may not fall: .02 .03 .06 .06
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([]) == []
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=12))
+def test_holm_agrees_with_its_definition(p_values):
+    m = len(p_values)
+    ranked = sorted(range(m), key=lambda i: p_values[i])
+    expected = {}
+    for place, i in enumerate(ranked):
+        expected[i] = max(min(1.0, (m - k) * p_values[ranked[k]]) for k in range(place + 1))
+    assert holm(p_values) == pytest.approx([expected[i] for i in range(m)])
