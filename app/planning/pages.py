@@ -31,6 +31,9 @@ from app.study.models import Participant, Visit
 
 router = APIRouter()
 
+EARLY_RANDOM_SESSIONS = 3
+"""What the form offers while a participant has no policy: with a cDBS session first, an hour."""
+
 LABELS = {
     "minutes_per_session": "Minutes per session",
     "total_minutes": "Minutes of the visit",
@@ -116,8 +119,6 @@ def _draft(values: FormData) -> PlanIn:
     wrong = [i for i in ids if not (i.isdecimal() and 0 < int(i) < 2**31)]
     if wrong:
         raise Invalid(f"'{wrong[0]}' is no policy.", "Choose policies of the list.")
-    if not ids:
-        raise Invalid("No policy is chosen.", "Tick at least one policy.")
     if len(ids) > 20:
         raise Invalid(f"{len(ids)} policies are chosen; a visit takes 20 at most.", "Tick fewer.")
     options = parse(PlanOptions, values, LABELS)
@@ -137,7 +138,8 @@ def _page(
     except NotFound:
         ranking = None
     defaults = rules_of(PlanOptions())
-    form = _form_values(view, values)
+    choices = _choices(db, participant, ranking)
+    form = _form_values(view, values, choices)
     return render(
         request,
         "planning/plan.html",
@@ -148,7 +150,7 @@ def _page(
         ranking=ranking,
         method=METHOD_NAMES.get(ranking.default_method, ranking.default_method) if ranking else "",
         plan_method=METHOD_NAMES.get(view.evaluation.default_method, view.evaluation.default_method) if view and view.evaluation else "",
-        choices=_choices(db, participant, ranking),
+        choices=choices,
         form_values=form,
         chosen=_chosen(view, values),
         problem=error.problem(request.url.path) if error else None,
@@ -171,11 +173,13 @@ def _chosen(view: PlanView | None, values: FormData | None) -> Sequence[int]:
     return [line.item.policy_id for line in view.lines if line.item.policy_id] if view else []
 
 
-def _form_values(view: PlanView | None, values: FormData | None) -> dict[str, Any]:
+def _form_values(view: PlanView | None, values: FormData | None, choices: Sequence[Any]) -> dict[str, Any]:
     """What the form shows: what was sent, else the present plan's note, else the defaults."""
     shown: dict[str, Any] = {k: f"{v:g}" if isinstance(v, float) else v for k, v in PlanOptions().model_dump().items()}
     if view:
         shown["note"] = view.plan.note
+    elif not choices:
+        shown["random_sessions"] = EARLY_RANDOM_SESSIONS
     if values is not None:
         shown |= {name: str(values[name]) for name in shown if name in values} | {"no_dbs": "no_dbs" in values}
     return shown

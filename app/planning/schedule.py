@@ -77,25 +77,27 @@ class PlannedSession:
 def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[PlannedSession]:
     """Lay out a visit day: the policies in an order drawn from the seed, a cDBS session between any two of them.
 
-    A single policy gets its cDBS session first, so that it too has a control. Random-controller sessions stand at drawn places, the no-DBS
-    session at the end. The same arguments give the same day.
+    A single policy gets its cDBS session first, so that it too has a control, and so does a day of random sessions alone: an early visit
+    that only fills the replay buffer. Random-controller sessions stand at drawn places, the no-DBS session at the end. The same arguments
+    give the same day.
 
     Raises:
-        Invalid: no policy, one twice, or a day longer than `rules.total_minutes`; the message says how many policies would fit.
+        Invalid: neither a policy nor a random session, a policy twice, or a day longer than `rules.total_minutes`; the message says how many policies would fit.
     """
-    _check_candidates(candidates)
+    _check_candidates(candidates, rules)
     needed = total_minutes(len(candidates), rules)
     if needed > rules.total_minutes + 1e-9:
         raise _too_long(len(candidates), needed, rules)
     rng = np.random.default_rng(seed)
     order = [candidates[i] for i in rng.permutation(len(candidates))]
-    day: list[tuple[Controller, int | None]] = [(Controller.CDBS, None)] if len(order) == 1 else []
+    day: list[tuple[Controller, int | None]] = [(Controller.CDBS, None)] if len(order) <= 1 else []
     for i, candidate in enumerate(order):
         if i:
             day.append((Controller.CDBS, None))
         day.append((candidate.controller, candidate.policy_id))
     for _ in range(rules.random_sessions):
-        day.insert(int(rng.integers(len(day) + 1)), (Controller.RANDOM, None))
+        # without policies the one cDBS session stays first
+        day.insert(int(rng.integers(0 if order else 1, len(day) + 1)), (Controller.RANDOM, None))
     if rules.no_dbs:
         day.append((Controller.NO_DBS, None))
     return _timed(day, rules)
@@ -103,7 +105,7 @@ def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[P
 
 def total_minutes(policies: int, rules: Rules) -> float:
     """Minutes from the first session's start to the last one's end of a day with this many policies."""
-    controls = max(policies - 1, 1) if policies else 0
+    controls = max(policies - 1, 1) if policies or rules.random_sessions else 0
     full = policies + controls + rules.random_sessions
     sessions = full + rules.no_dbs
     return full * rules.session_minutes + rules.no_dbs * rules.no_dbs_minutes + max(sessions - 1, 0) * rules.washout_minutes
@@ -117,9 +119,9 @@ def most_policies(rules: Rules) -> int:
     return count
 
 
-def _check_candidates(candidates: Sequence[Candidate]) -> None:
-    if not candidates:
-        raise Invalid("A plan needs at least one policy.", "Choose one in the ranking.")
+def _check_candidates(candidates: Sequence[Candidate], rules: Rules) -> None:
+    if not candidates and not rules.random_sessions:
+        raise Invalid("A plan needs at least one policy or one random session.", "Choose a policy in the ranking, or add random sessions.")
     ids = [c.policy_id for c in candidates]
     twice = sorted({i for i in ids if ids.count(i) > 1})
     if twice:
@@ -130,8 +132,12 @@ def _too_long(policies: int, needed: float, rules: Rules) -> Invalid:
     most = most_policies(rules)
     extras = (["the no-DBS session"] if rules.no_dbs else []) + (["random sessions"] if rules.random_sessions else [])
     ways = ["shorten sessions or washout", "give the visit more minutes"] + ([f"leave out {' and '.join(extras)}"] if extras else [])
+    tested = _policies(policies) if policies else "The random sessions"
+    said = f"{tested} with the sessions around them take {needed:g} minutes; the visit has {rules.total_minutes:g}."
+    if not policies:
+        return Invalid(said, f"Plan fewer random sessions, or {', or '.join(ways[:2])}.", minutes_needed=needed, policies_that_fit=0)
     return Invalid(
-        f"{_policies(policies)} with the sessions around them take {needed:g} minutes; the visit has {rules.total_minutes:g}.",
+        said,
         f"{'Choose ' + ('at most ' if most > 1 else '') + _policies(most) if most else 'Not even one policy fits'}, "
         f"or {', or '.join(ways)}.",
         minutes_needed=needed,

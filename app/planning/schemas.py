@@ -33,7 +33,9 @@ class PlanOptions(Model):
 class PlanIn(PlanOptions):
     """A plan to draft."""
 
-    policy_ids: list[Id] = Field(min_length=1, max_length=20, description="Policies to test, each in one session.")
+    policy_ids: list[Id] = Field(
+        default_factory=list, max_length=20, description="Policies to test, each in one session; none for a visit of random sessions alone."
+    )
 
 
 class Approval(Model):

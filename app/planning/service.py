@@ -269,7 +269,7 @@ def _warnings(
     warnings = [f"The ranking is out of date: {reason}." for reason in stale]
     if evaluation:
         warnings += evaluation_notes(db, evaluation)
-    else:
+    elif any(line.policy for line in lines):
         warnings.append("No ranking stands behind this plan: the participant's policies have not been evaluated.")
     for line in lines:
         if line.policy is None:

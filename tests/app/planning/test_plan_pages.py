@@ -60,7 +60,7 @@ def test_a_refused_form_comes_back_as_it_was_filled_in(client: TestClient, studi
     assert db.scalars(select(Plan)).all() == []
     nothing = _post(client, path, note="x")
     assert nothing.status_code == 422
-    assert "Tick at least one policy." in nothing.text
+    assert "at least one policy or one random session" in nothing.text
     wrong = _post(client, path, policy_ids=["x"])
     assert wrong.status_code == 422
     spelled = _post(client, path, policy_ids=chosen[:1], washout_minutes="five")
@@ -129,3 +129,14 @@ def test_a_viewer_sees_the_plan_and_no_buttons(client: TestClient, client_as, st
     assert "Draft plan" not in page
     assert _post(viewer, f"/visits/{studied.visit}/plan", policy_ids=[str(studied.policies[0])]).status_code == 403
     assert _post(viewer, f"/visits/{studied.visit}/plan/approve").status_code == 403
+
+
+def test_a_participant_without_policies_gets_a_visit_of_random_sessions(client: TestClient, enrolled: str) -> None:
+    visit = client.get(f"/api/v1/participants/{enrolled}/visits").json()["items"][0]["id"]
+    page = client.get(f"/visits/{visit}/plan").text
+    assert "A visit of random sessions fills the replay buffer first" in page
+    drafted = _post(client, f"/visits/{visit}/plan", random_sessions="3")
+    assert drafted.status_code == 200
+    plan = client.get(f"/api/v1/visits/{visit}/plan").json()
+    assert [s["controller"] for s in plan["sessions"]] == ["cdbs", "random", "random", "random"]
+    assert plan["warnings"] == []

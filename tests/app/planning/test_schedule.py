@@ -90,8 +90,17 @@ def test_a_day_too_short_for_any_policy_says_so() -> None:
 def test_the_same_policy_twice_and_none_at_all_are_refused() -> None:
     with pytest.raises(Invalid, match="Policy 3 is named twice"):
         schedule([Candidate(3, Controller.RL), Candidate(3, Controller.RL)], Rules(), seed=0)
-    with pytest.raises(Invalid, match="at least one policy"):
+    with pytest.raises(Invalid, match="at least one policy or one random session"):
         schedule([], Rules(), seed=0)
+
+
+def test_an_early_visit_without_policies_is_random_sessions_after_one_of_cdbs() -> None:
+    day = schedule([], Rules(random_sessions=3, no_dbs=True), seed=3)
+    assert [s.controller for s in day] == ["cdbs", "random", "random", "random", "no_dbs"]
+    assert day[-1].end_minute == pytest.approx(total_minutes(0, Rules(random_sessions=3, no_dbs=True)))
+    with pytest.raises(Invalid, match=r"The random sessions .* take 130 minutes") as refusal:
+        schedule([], Rules(random_sessions=8), seed=3)
+    assert refusal.value.mend.startswith("Plan fewer random sessions, or shorten sessions or washout")
 
 
 @pytest.mark.parametrize("minutes", [4.9, 20.1])
