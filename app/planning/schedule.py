@@ -82,7 +82,8 @@ def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[P
     give the same day.
 
     Raises:
-        Invalid: neither a policy nor a random session, a policy twice, or a day longer than `rules.total_minutes`; the message says how many policies would fit.
+        Invalid: neither a policy nor a random session, a policy twice, or a day longer than `rules.total_minutes`; the message says how
+            many policies would fit.
     """
     _check_candidates(candidates, rules)
     needed = total_minutes(len(candidates), rules)
