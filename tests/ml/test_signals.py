@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ml.signals import band_pass, band_rows, row_means, row_of, step_means
+from ml.signals import SEGMENTS_AT_ONCE, band_pass, band_rows, row_means, row_of, spectrum, step_means
 
 RATE = 500.0
 LOW, HIGH = 13.0, 35.0
@@ -113,3 +113,63 @@ def test_step_means_agree_with_a_fine_sum(steps, end):
     np.testing.assert_allclose(known, share, atol=5e-3)
     some = share > 0.2
     np.testing.assert_allclose(means[some], np.nanmean(at[some], axis=1) if some.any() else [], atol=0.1)
+
+
+def test_the_spectrum_of_white_noise_is_flat_and_adds_up_to_its_variance():
+    noise = np.random.default_rng(5).normal(0.0, 3.0, int(200 * RATE))
+    hz, density, seconds = spectrum([(0.0, RATE, noise)], max_hz=RATE / 2)
+    assert seconds == pytest.approx(200.0)
+    np.testing.assert_allclose(density[2:-2], 9.0 / (RATE / 2), rtol=0.35)
+    assert density.sum() * (hz[1] - hz[0]) == pytest.approx(9.0, rel=0.03)
+
+
+def test_a_sine_stands_at_its_frequency_with_half_its_squared_amplitude():
+    hz, density, _ = spectrum([(0.0, RATE, sine(22.0, 20.0, 3.0))])
+    assert hz[np.argmax(density)] == 22.0
+    assert density[20:25].sum() == pytest.approx(4.5, rel=0.01)
+    assert hz[-1] == 100.0
+
+
+def test_gaps_add_nothing_to_the_spectrum():
+    x = sine(22.0, 30.0, 2.0)
+    whole = spectrum([(0.0, RATE, x)])
+    lossy = spectrum([(0.0, RATE, x[:4000]), (9.0, RATE, x[4500:4900]), (11.0, RATE, x[5500:])])
+    assert lossy[2] == pytest.approx(8.0 + 19.0)
+    np.testing.assert_allclose(lossy[1], whole[1], rtol=0.02, atol=1e-4)
+
+
+def test_a_spectrum_needs_one_stretch_as_long_as_a_segment():
+    hz, density, seconds = spectrum([(0.0, RATE, np.ones(100)), (1.0, RATE, np.ones(0))])
+    assert hz.size == density.size == 0
+    assert seconds == 0.0
+
+
+def test_a_long_stretch_is_cut_into_blocks_without_losing_a_segment():
+    noise = np.random.default_rng(6).normal(size=(SEGMENTS_AT_ONCE + 40) * 32 + 32)
+    hz, density, seconds = spectrum([(0.0, 64.0, noise)])
+    windows = np.lib.stride_tricks.sliding_window_view(noise, 64)[::32]
+    taper = np.hanning(65)[:-1]
+    slow = np.abs(np.fft.rfft((windows - windows.mean(axis=1, keepdims=True)) * taper)) ** 2 / (64.0 * np.sum(taper**2))
+    slow[:, 1:-1] *= 2
+    np.testing.assert_allclose(density, slow.mean(axis=0), rtol=1e-9, atol=1e-15)
+    assert len(windows) > SEGMENTS_AT_ONCE
+    assert hz[-1] == 32.0
+    assert seconds == pytest.approx(noise.size / 64.0)
+
+
+def test_above_half_of_the_lower_rate_the_spectrum_rests_on_the_faster_stretches():
+    rng = np.random.default_rng(7)
+    slow, fast = rng.normal(size=50 * 100), rng.normal(size=250 * 100)
+    hz, density, seconds = spectrum([(0.0, 50.0, slow), (100.0, 250.0, fast)])
+    assert seconds == pytest.approx(200.0)
+    alone = spectrum([(0.0, 250.0, fast)])[1]
+    np.testing.assert_allclose(density[hz > 25], alone[hz > 25])
+    assert density[5:20].mean() == pytest.approx((1 / 25 + 1 / 125) / 2, rel=0.15)
+
+
+@pytest.mark.parametrize("rate_hz", [249.9, 65.104])
+def test_a_rate_that_is_no_whole_number_keeps_the_grid(rate_hz):
+    t = np.arange(int(40 * rate_hz)) / rate_hz
+    hz, density, _ = spectrum([(0.0, rate_hz, np.sin(2 * np.pi * 20.0 * t))])
+    assert hz[np.argmax(density)] == 20.0
+    assert density[17:24].sum() == pytest.approx(0.5, rel=0.05)
