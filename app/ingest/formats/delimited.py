@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,12 +78,12 @@ class TextTable:
         return math.nan if value is None else value
 
 
-def read_delimited(path: Path, max_rows: int, needed: str) -> TextTable:
+def read_delimited(path: Path, max_rows: int | Callable[[Sequence[str]], int], needed: str) -> TextTable:
     """Read a text table.
 
     Args:
         path: the file.
-        max_rows: rows it may have.
+        max_rows: rows it may have, or what tells this by the headers.
         needed: the columns that are expected, for the message about an empty file.
 
     Raises:
@@ -99,8 +99,12 @@ def read_delimited(path: Path, max_rows: int, needed: str) -> TextTable:
             delimiter, offset = _delimiter(first), 1
         if not first.strip():
             raise UndecodableFile("the file is empty", "line 1", f"Upload a table with the columns {needed}.")
-        headers = next(csv.reader([first], delimiter=delimiter))
-        lines, rows = _cells(source, delimiter, len(headers), offset, max_rows)
+        try:
+            headers = next(csv.reader([first], delimiter=delimiter))
+        except csv.Error as error:
+            raise UndecodableFile(f"not readable as a table: {error}", f"line {offset}", "Save the table as CSV (UTF-8).") from error
+        most = max_rows if isinstance(max_rows, int) else max_rows(headers)
+        lines, rows = _cells(source, delimiter, len(headers), offset, most)
     return TextTable(headers, lines, rows, delimiter, notes)
 
 
@@ -157,3 +161,17 @@ def _cells(source: Iterator[str], delimiter: str, width: int, offset: int, max_r
     except csv.Error as error:
         raise UndecodableFile(f"not readable as a table: {error}", f"line {number + 1}", "Save the table as CSV (UTF-8).") from error
     return lines, rows
+
+
+def read_headers(path: Path) -> list[str]:
+    """The headers of a text table, nothing else of it; empty where there are none. Raises UndecodableFile for what is no text."""
+    with _open_text(path, [], "t_s") as stream:
+        source = _lines(stream)
+        first = next(source, "")
+        delimiter = _delimiter(first)
+        if first.lower().startswith("sep=") and len(first.strip()) == 5:
+            delimiter, first = first.strip()[4], next(source, "")
+        try:
+            return next(csv.reader([first], delimiter=delimiter), [])
+        except csv.Error:
+            return []

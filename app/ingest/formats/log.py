@@ -15,7 +15,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-DECODE_VERSION = 2
+from ml.qoc import TREMOR_CLASSES as TREMOR_CLASSES
+
+DECODE_VERSION = 3
 """Raised whenever a decoder would give other numbers for the same bytes; traces are stored per version."""
 
 TraceSource = Literal["time_domain", "device_power", "percept_lfp", "device_log", "table"]
@@ -111,6 +113,54 @@ class TraceLog:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SpectrumLog:
+    """Power spectral density of one channel over a whole recording, gaps left out.
+
+    Attributes:
+        channel: as in the traces. unit: e.g. `uV2/Hz`.
+        hz, density: frequencies and density, both shape [n].
+        seconds: how much signal it rests on.
+    """
+
+    channel: str
+    unit: str
+    hz: NDArray[np.float64]
+    density: NDArray[np.float64]
+    seconds: float
+
+    def same_as(self, other: SpectrumLog) -> bool:
+        """Equal in every field."""
+        named = (self.channel, self.unit, self.seconds) == (other.channel, other.unit, other.seconds)
+        return named and np.array_equal(self.hz, other.hz) and np.array_equal(self.density, other.density)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TremorLog:
+    """Minutes of tremor in time order, on the clock of the wall.
+
+    Attributes:
+        start_unix_s: begin of each minute, shape [n].
+        duration_s: length of each minute's measurement, shape [n].
+        fractions: share per class in the order of `TREMOR_CLASSES`, shape [n, 6]; NaN where the export does not split the tremor.
+        any_tremor: share with slight or worse tremor, shape [n]; NaN where not told.
+    """
+
+    start_unix_s: NDArray[np.float64]
+    duration_s: NDArray[np.float64]
+    fractions: NDArray[np.float64]
+    any_tremor: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraspLog:
+    """One hand's test: times of open fists in s, shape [n], strictly increasing; which intervals are implausible, shape [n - 1]."""
+
+    hand: Hemisphere | None
+    open_fist_s: NDArray[np.float64]
+    implausible: NDArray[np.bool_]
+
+
 @dataclass(frozen=True, slots=True)
 class EventLog:
     """Something that happened at one time: a stimulation step, an operator's label, a change of settings."""
@@ -127,6 +177,8 @@ class RecordingLog:
 
     `device_key` is opaque and may still be a serial number: decode redacted bytes, or replace it, before anything is stored.
     `fingerprint` is a SHA-256 over the decoded content without the device's name, so the same recording in another archive has the same.
+    `run` says which recordings of one file were made together (the two sides of a Percept, the two implants of a participant) and so belong
+    to one session; None for what is no session: surveys, tests, the history that a device keeps.
     """
 
     kind: str
@@ -141,14 +193,18 @@ class RecordingLog:
     settings: Mapping[str, Any]
     quality: Mapping[str, Any]
     fingerprint: str
+    spectra: tuple[SpectrumLog, ...] = ()
+    run: int | None = 0
 
 
 @dataclass(frozen=True, slots=True)
 class DecodedFile:
-    """Everything one uploaded file gave."""
+    """Everything one uploaded file gave: recordings of a device, minutes of tremor, hand-grasp tests."""
 
     recordings: tuple[RecordingLog, ...]
     reports: tuple[FileReport, ...]
+    tremor: tuple[TremorLog, ...] = ()
+    grasps: tuple[GraspLog, ...] = ()
 
 
 SessionLog = DecodedFile

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
+
+BetaMeasure = Literal["rms", "power"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,18 +26,24 @@ class DecodeOptions:
     Attributes:
         period_s: length of one step, s.
         beta_low_hz, beta_high_hz: edges of the beta band, Hz.
+        beta_measure: what the stream `beta` is where samples give it: the RMS amplitude in the band (uV) or its power (uV2).
         min_valid_fraction: share of a window's samples that must be there for the window to be valid, 0..1.
         table_beta_unit: unit of `beta` in a table whose header states none.
-        max_table_rows: rows a table may have.
+        table_lfp_unit: unit of `lfp` in a table whose header states none; such a table is refused where nobody states it.
+        max_table_rows: rows a table of steps may have.
+        max_lfp_rows: rows a table of raw LFP may have.
         archive: bounds for archives.
     """
 
     period_s: float = 2.0
     beta_low_hz: float = 13.0
     beta_high_hz: float = 35.0
+    beta_measure: BetaMeasure = "rms"
     min_valid_fraction: float = 0.7
     table_beta_unit: str = "unstated"
+    table_lfp_unit: str | None = None
     max_table_rows: int = 500_000
+    max_lfp_rows: int = 1_500_000
     archive: ArchiveLimits = field(default_factory=ArchiveLimits)
 
     def __post_init__(self) -> None:
@@ -44,3 +53,12 @@ class DecodeOptions:
             raise ValueError(f"beta band must rise from above 0 Hz, not {self.beta_low_hz} to {self.beta_high_hz} Hz")
         if not 0 < self.min_valid_fraction <= 1:
             raise ValueError(f"min_valid_fraction must lie in (0, 1], not {self.min_valid_fraction}")
+        if self.beta_measure not in ("rms", "power"):
+            raise ValueError(f"beta_measure must be rms or power, not {self.beta_measure!r}")
+
+    @property
+    def beta_streams(self) -> tuple[tuple[str, str, BetaMeasure], tuple[str, str, BetaMeasure]]:
+        """(stream, unit, measure) of the two traces that time-domain samples in uV give: `beta`, and the other measure beside it."""
+        if self.beta_measure == "rms":
+            return ("beta", "uV", "rms"), ("beta_power", "uV2", "power")
+        return ("beta", "uV2", "power"), ("beta_rms", "uV", "rms")

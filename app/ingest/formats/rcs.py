@@ -6,7 +6,7 @@ Any stream may be missing, empty or cut: what is there is decoded, and a report 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
@@ -15,24 +15,31 @@ from app.ingest.formats.archive import Files, FolderFiles, ZipFiles
 from app.ingest.formats.log import DecodedFile, FileReport, Problem, RecordingLog, UndecodableFile
 from app.ingest.formats.options import DecodeOptions
 from app.ingest.formats.rcs_json import JsonNotes, read_elements
+from app.ingest.formats.rcs_leads import leads_only
 from app.ingest.formats.rcs_recording import Streams, build_recording
+from app.ingest.formats.rcs_scan import Batch, batch_of, scan
 from app.ingest.formats.rcs_settings import Settings, follow
-from app.ingest.formats.rcs_streams import read_adaptive, read_power, read_time_domain
+from app.ingest.formats.rcs_streams import Interval, read_accel, read_adaptive, read_fft, read_power, read_time_domain, read_time_sync
 
 T = TypeVar("T")
 MAX_RECORDS = 200_000
-DEFAULT_INTERVAL_S = 0.1
-USED = ("DeviceSettings", "StimLog", "RawDataTD", "RawDataPower", "AdaptiveLog", "EventLog")
-UNUSED = {
-    "RawDataAccel": "accelerometer",
-    "RawDataFFT": "on-device spectra",
-    "TimeSync": "clock exchanges",
-    "ErrorLog": "device errors",
-    "DiagnosticsLog": "diagnostics",
+NEEDED = ("DeviceSettings", "StimLog", "RawDataTD", "RawDataPower", "AdaptiveLog", "EventLog")
+"""Files whose absence is worth a word."""
+
+COUNTED = {"ErrorLog": "errors", "DiagnosticsLog": "diagnostics"}
+KEY_OF = {
+    "RawDataTD": "TimeDomainData",
+    "RawDataPower": "PowerDomainData",
+    "RawDataAccel": "AccelData",
+    "RawDataFFT": "FftData",
+    "TimeSync": "TimeSyncData",
 }
-KNOWN = {name.lower(): name for name in (*USED, *UNUSED)}
-KEY_OF = {"RawDataTD": "TimeDomainData", "RawDataPower": "PowerDomainData"}
+KNOWN = {name.lower(): name for name in (*NEEDED, *KEY_OF, *COUNTED)}
 NEEDED_SETTINGS = ("RecordInfo", "UtcOffset", "GeneralData", "SensingConfig", "SenseState", "AdaptiveConfig", "DetectionConfig")
+SLOW_BATCH = 256
+MAX_PACKETS = 2_000_000
+MAX_NUMBERS = 64_000_000
+"""Packets and samples that are taken of one file: 55 h of ten packets, 9 h of 2000 samples a second, the most the device can stream."""
 
 
 @dataclass(slots=True)
@@ -108,49 +115,79 @@ def decode_session(session: SessionFiles, files: Files, options: DecodeOptions) 
     streams = Streams(
         time_domain=_stream(session, files, "RawDataTD", infos, read_time_domain),
         power=_stream(session, files, "RawDataPower", infos, lambda packets: read_power(packets, interval_at)),
-        adaptive=_stream(session, files, "AdaptiveLog", infos, lambda packets: read_adaptive(packets, interval_at)),
+        adaptive=_stream(session, files, "AdaptiveLog", infos, lambda records: read_adaptive(records, interval_at)),
+        accel=_stream(session, files, "RawDataAccel", infos, read_accel),
+        fft=_stream(session, files, "RawDataFFT", infos, lambda packets: read_fft(packets, interval_at)),
+        time_sync=_stream(session, files, "TimeSync", infos, read_time_sync),
         settings=settings,
         notes=records["EventLog"],
         infos=infos,
+        counts={name: sum(1 for _ in _elements(session, files, stem, infos)) for stem, name in COUNTED.items() if stem in session.members},
     )
-    for stem, what in UNUSED.items():
-        if stem in session.members:
-            session.report(stem).ignored.append(f"{what}: not used by this version; kept with the upload")
-    missing = [stem for stem in USED if stem not in session.members]
-    if missing:
-        for stem in missing:
+    for stem in NEEDED:
+        if stem not in session.members:
             session.report(stem).flagged.append("not in the upload; the recording was decoded without it")
     return build_recording(streams, session.report, options)
 
 
-def _interval_at(settings: Settings) -> Callable[[float], float]:
-    def interval_at(pc_ms: float) -> float:
+def _interval_at(settings: Settings) -> Interval:
+    def interval_at(pc_ms: float) -> float | None:
         state = settings.sensing.at(pc_ms if pc_ms == pc_ms else -1.0)
-        return state.fft_interval_s if state is not None and state.fft_interval_s else DEFAULT_INTERVAL_S
+        return None if state is None else state.fft_interval_s
 
     return interval_at
 
 
 def _elements(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]]) -> Iterator[Any]:
-    """Packets or records of one file; its report is complete when the iterator is exhausted."""
+    """Records of one file, or its packets, in runs where they are plain; its report is complete when the iterator is exhausted."""
     report = session.report(stem)
     notes = JsonNotes()
+    wanted = KEY_OF.get(stem)
     try:
         with files.open(session.members[stem]) as stream:
-            for element, _ in read_elements(stream, notes):
+            for element, _ in read_elements(stream, notes, scan if wanted else None):
                 yield element
     except UndecodableFile as error:
         session.reports[stem] = FileReport(report.name, problem=Problem(error.what, report.name, error.mend))
         return
     infos.extend(notes.record_infos[:1])
     report.repaired.extend(notes.defects)
-    wanted = KEY_OF.get(stem)
     if notes.stream_key is not None and notes.stream_key != wanted:
         report.flagged.append(f"holds {notes.stream_key}, not what its name says")
     if notes.elements == 0:
         report.flagged.append("holds no data")
     else:
         report.understood.append(f"{notes.elements} {'packets' if wanted else 'records'}")
+
+
+def _limited(elements: Iterable[Any], report: FileReport) -> Iterator[Any]:
+    """Elements up to what one file may ask of the memory; what is beyond is counted in the report."""
+    packets = numbers = beyond = 0
+    for element in elements:
+        size, many = (element.size, element.pool.size) if isinstance(element, Batch) else (1, 0)
+        if beyond or packets + size > MAX_PACKETS or numbers + many > MAX_NUMBERS:
+            beyond += size
+        else:
+            packets, numbers = packets + size, numbers + many
+            yield element
+    if beyond:
+        report.flagged.append(f"longer than any recording of the device: {beyond} packets at its end were left out")
+
+
+def _batches(elements: Iterable[Any]) -> Iterator[Batch]:
+    """Packets in the order of the file, whichever way they were read."""
+    others: list[Any] = []
+    for element in elements:
+        plain = isinstance(element, Batch)
+        if others and (plain or len(others) == SLOW_BATCH):
+            yield batch_of(others)
+            others.clear()
+        if plain:
+            yield element
+        else:
+            others.append(element)
+    if others:
+        yield batch_of(others)
 
 
 def _records(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]]) -> list[Any]:
@@ -164,7 +201,7 @@ def _records(session: SessionFiles, files: Files, stem: str, infos: list[dict[st
         if stem == "DeviceSettings":
             record = {
                 k: v for k, v in record.items() if k in NEEDED_SETTINGS or k.startswith(("TherapyConfigGroup", "AmplitudeLimitsGroup"))
-            }
+            } | leads_only(record)
         if len(out) == MAX_RECORDS:
             session.report(stem).flagged.append(f"more than {MAX_RECORDS} records; the rest was left out")
             break
@@ -176,4 +213,6 @@ def _stream(session: SessionFiles, files: Files, stem: str, infos: list[dict[str
     """A stream file read by `read`; None where the file is missing."""
     if stem not in session.members:
         return None
-    return read(_elements(session, files, stem, infos))
+    report = session.report(stem)
+    elements = _elements(session, files, stem, infos)
+    return read(_limited(_batches(elements) if stem in KEY_OF else elements, report))

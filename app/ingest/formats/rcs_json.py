@@ -2,6 +2,8 @@
 
 Real files hold bare NaN, `INF` and cut ends (see the format notes, A.10). The reader looks for elements of the innermost list of
 interest: packets under a stream key, or whole records. It holds one chunk of text, never the file.
+
+Where a scanner is given, runs of plain packets go through it and come out as one batch; the reader steps in for every other packet.
 """
 
 from __future__ import annotations
@@ -9,11 +11,12 @@ from __future__ import annotations
 import codecs
 import json
 import re
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from typing import IO, Any
 
 from app.ingest.formats.archive import READ_ERRORS
+from app.ingest.formats.rcs_scan import PADDING, Batch
 
 STREAM_KEYS = ("TimeDomainData", "AccelData", "PowerDomainData", "FftData", "TimeSyncData")
 CHUNK = 1 << 20
@@ -23,8 +26,16 @@ MAX_ELEMENT = 8 << 20
 NEAR_END = 1 << 16
 """An error this close to the end of the text read so far may be a token cut by the chunk's end."""
 
+MAX_DEPTH = 64
+"""Levels of nesting in one element; the device writes ten."""
+
+TOO_DEEP = "brackets nested deeper than any device writes them; that part was left out"
+
 MAX_DAMAGED = 1_000
 """Damaged packets after which a file is given up: no recording is like that, and each costs a search."""
+
+Scanner = Callable[[bytes, int], tuple[Batch, int, bool]]
+"""Such as `rcs_scan.scan`: padded text and a place in it to plain packets, where they end, and whether the next is only cut."""
 
 _INF = re.compile(r"(?<=[\[:,\s])([+-]?)(?:INF|Inf|inf)(?=[\],}\s])")
 _SPACE = re.compile(r"[\s,\ufeff\x00]*")
@@ -54,6 +65,7 @@ class _Text:
         self.at = 0
         self.ended = False
         self.mending_inf = False
+        self._plain = ("", b"")
 
     def more(self) -> bool:
         """Read another chunk, dropping what was used; False at the end of the file."""
@@ -72,6 +84,12 @@ class _Text:
         self.text = self.text[self.at :] + fresh
         self.at = 0
         return not self.ended
+
+    def plain(self) -> bytes | None:
+        """The text as padded bytes; None where bytes and characters do not count the same."""
+        if self._plain[0] is not self.text:
+            self._plain = (self.text, self.text.encode() + PADDING if self.text.isascii() else b"")
+        return self._plain[1] or None
 
     def mend_inf(self, at: int) -> bool:
         """Where an INF token stands at `at`, spell it the way the parser knows, here and in all that follows; True when that was so."""
@@ -92,12 +110,13 @@ class _Text:
                 return ""
 
 
-def read_elements(stream: IO[bytes], notes: JsonNotes) -> Iterator[tuple[Any, str]]:
+def read_elements(stream: IO[bytes], notes: JsonNotes, scanner: Scanner | None = None) -> Iterator[tuple[Any, str]]:
     """Packets of a stream file, or records of a record file, each with its text as it stood in the file.
 
     Args:
         stream: the file's bytes.
-        notes: filled in while reading: defects, number of elements, the stream key, every RecordInfo met.
+        notes: filled in while reading: defects, number of elements, the stream key, the first RecordInfo met.
+        scanner: reads runs of plain packets; each run comes out as one `Batch` with the run's text, which is JSON once it has brackets.
     """
     window = _Text(stream, notes)
     decoder = json.JSONDecoder()
@@ -114,7 +133,7 @@ def read_elements(stream: IO[bytes], notes: JsonNotes) -> Iterator[tuple[Any, st
     while True:
         key = _enter_stream(window, notes, decoder)
         if key is not None:
-            yield from _read_list(window, notes, decoder, "packets")
+            yield from _read_list(window, notes, decoder, "packets", scanner)
             closed = _leave_stream(window)
             continue
         if window.skip_space() == "{":
@@ -140,7 +159,7 @@ def _enter_stream(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) ->
         info = decoder.decode(head).get("RecordInfo")
     except (ValueError, RecursionError):
         return None
-    if isinstance(info, dict):
+    if isinstance(info, dict) and not notes.record_infos:
         notes.record_infos.append(info)
     notes.stream_key = notes.stream_key or match[1]
     window.at = match.end()
@@ -155,10 +174,15 @@ def _leave_stream(window: _Text) -> bool:
     return window.skip_space() == "]"
 
 
-def _read_list(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder, kind: str) -> Generator[tuple[Any, str], None, bool]:
+def _read_list(
+    window: _Text, notes: JsonNotes, decoder: json.JSONDecoder, kind: str, scanner: Scanner | None = None
+) -> Generator[tuple[Any, str], None, bool]:
     """Elements until the list closes; returns True when it does."""
     while True:
         mark = window.skip_space()
+        if scanner is not None and mark == "{":
+            yield from _scan(window, notes, scanner)
+            mark = window.skip_space()
         if mark == "]":
             return True
         if mark == "":
@@ -168,7 +192,7 @@ def _read_list(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder, kind:
         element = _element(window, notes, decoder) if mark == "{" else None
         if element is not None:
             value, text = element
-            if isinstance(value, dict) and isinstance(value.get("RecordInfo"), dict):
+            if not notes.record_infos and isinstance(value, dict) and isinstance(value.get("RecordInfo"), dict):
                 notes.record_infos.append(value["RecordInfo"])
             notes.elements += 1
             yield value, text
@@ -179,13 +203,26 @@ def _read_list(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder, kind:
             return False
 
 
+def _scan(window: _Text, notes: JsonNotes, scanner: Scanner) -> Iterator[tuple[Batch, str]]:
+    """The plain packets from here on; afterwards the window stands before something else."""
+    while window.skip_space() == "{" and (raw := window.plain()) is not None:
+        batch, end, cut = scanner(raw, window.at)
+        if batch.size:
+            text = window.text[window.at : end]
+            window.at = end
+            notes.elements += batch.size
+            yield batch, text
+        elif not (cut and len(window.text) - window.at < MAX_ELEMENT and window.more()):
+            return
+
+
 def _element(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) -> tuple[Any, str] | None:
     """The object that begins here, or None when it is damaged."""
     while True:
         try:
             value, end = decoder.raw_decode(window.text, window.at)
         except RecursionError:
-            _note(notes, "brackets nested deeper than any device writes them; that part was left out")
+            _note(notes, TOO_DEEP)
             return None
         except ValueError as error:
             at = getattr(error, "pos", len(window.text))
@@ -196,8 +233,22 @@ def _element(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) -> tupl
                 continue
             return None
         text = window.text[window.at : end]
+        if text.count("{") + text.count("[") > MAX_DEPTH and _deeper(value, MAX_DEPTH):
+            _note(notes, TOO_DEEP)
+            return None
         window.at = end
         return value, text
+
+
+def _deeper(value: Any, levels: int) -> bool:
+    """Whether objects and lists are nested deeper than so many levels."""
+    layer = [value]
+    for _ in range(levels):
+        inner = [item.values() if isinstance(item, dict) else item for item in layer]
+        layer = [item for items in inner for item in items if isinstance(item, dict | list)]
+        if not layer:
+            return False
+    return True
 
 
 def _resync(window: _Text, notes: JsonNotes, kind: str) -> bool:

@@ -11,20 +11,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.ingest.formats.log import FileReport, RecordingLog, TraceLog, fingerprint
+from app.ingest.formats.log import FileReport, Hemisphere, RecordingLog, SpectrumLog, TraceLog, fingerprint
 from app.ingest.formats.options import DecodeOptions
 from app.ingest.formats.rcs_amplitude import AmplitudeSteps, amplitude_steps
+from app.ingest.formats.rcs_beta import beta_traces, time_domain_spectra, time_domain_stretches
 from app.ingest.formats.rcs_events import adaptive_events, note_events, stimulation_events
+from app.ingest.formats.rcs_leads import described, hemisphere
+from app.ingest.formats.rcs_quality import STEMS, describe_quality
 from app.ingest.formats.rcs_settings import GROUPS, Settings, get, integer, number
-from app.ingest.formats.rcs_streams import Adaptive, Power, TimeDomain
+from app.ingest.formats.rcs_streams import Accel, Adaptive, Fft, Power, TimeDomain, TimeSync
 from app.ingest.formats.rcs_time import PacketHeaders, PacketTimes, reconstruct
-from app.ingest.formats.rcs_traces import Grid, amplitude_traces, beta_traces, flat_share, power_traces
+from app.ingest.formats.rcs_traces import Grid, accel_traces, amplitude_traces, fft_results, power_traces
 
 MAX_ROWS = 100_000
 """Rows a recording may have (55 h of 2 s steps): clocks that span more are wrong."""
 
-STEMS = {"time_domain": "RawDataTD", "power": "RawDataPower", "adaptive": "AdaptiveLog"}
+PRIMARY = ("time_domain", "power", "adaptive")
+"""Streams that say what was recorded; the others matter for identity only where none of these is there."""
+
 Report = Callable[[str], FileReport]
+Stream = TimeDomain | Power | Adaptive | Accel | Fft | TimeSync
 
 
 @dataclass(slots=True)
@@ -34,14 +40,22 @@ class Streams:
     time_domain: TimeDomain | None
     power: Power | None
     adaptive: Adaptive | None
+    accel: Accel | None
+    fft: Fft | None
+    time_sync: TimeSync | None
     settings: Settings
     notes: list[Any]
     infos: list[dict[str, Any]]
+    counts: dict[str, int]
+
+    def data(self) -> dict[str, Stream]:
+        """The streams whose file is there, by name."""
+        named: dict[str, Stream | None] = {name: getattr(self, name) for name in STEMS}
+        return {name: data for name, data in named.items() if data is not None}
 
     def headers(self) -> dict[str, PacketHeaders]:
         """Headers of the streams that hold packets."""
-        named = {"time_domain": self.time_domain, "power": self.power, "adaptive": self.adaptive}
-        return {name: data.headers for name, data in named.items() if data is not None and data.headers.size}
+        return {name: data.headers for name, data in self.data().items() if data.headers.size}
 
 
 def build_recording(streams: Streams, report: Report, options: DecodeOptions) -> RecordingLog:
@@ -49,17 +63,19 @@ def build_recording(streams: Streams, report: Report, options: DecodeOptions) ->
     times = {name: reconstruct(headers) for name, headers in streams.headers().items()}
     spans = _spans(streams.headers(), times, report, options)
     times = {name: t for name, t in times.items() if name in spans}
-    start_ms = min((span[0] for span in spans.values()), default=_first_record_ms(streams))
-    end_ms = max((span[1] for span in spans.values()), default=start_ms)
+    main = {name: span for name, span in spans.items() if name in PRIMARY} or {n: s for n, s in spans.items() if n != "time_sync"}
+    start_ms = min((span[0] for span in main.values()), default=_first_record_ms(streams))
+    end_ms = max((span[1] for span in main.values()), default=start_ms)
     duration_s = (end_ms - start_ms) / 1000.0
     grid = Grid(start_ms, duration_s, max(0, math.ceil(duration_s / options.period_s - 1e-6)), options)
     steps = amplitude_steps(streams.settings, streams.adaptive if "adaptive" in times else None, times.get("adaptive"))
-    traces = _traces(streams, times, steps, grid, report) if spans else []
-    if not spans:
+    traces, spectra = _traces(streams, times, steps, grid, report) if main else ([], [])
+    if not main:
         report("RawDataTD").flagged.append("a recording without data: no stream holds a packet that can be placed in time")
-    quality = _quality(streams, times, report)
+    quality = describe_quality(streams.data(), times, streams.counts, report)
     quality["valid_fraction"] = {f"{t.stream} {t.channel}": round(float(t.valid.mean()), 4) for t in traces if t.valid.size}
-    device_clock = bool(times) and all(t.device_clock for t in times.values())
+    quality["spike_packets"] = {t.channel: t.details["spike_packets"] for t in traces if t.details.get("spike_packets")}
+    device_clock = bool(main) and all(times[name].device_clock for name in main)
     started = None if start_ms <= 0 else datetime.fromtimestamp(start_ms / 1000.0, UTC)
     events = [*stimulation_events(streams.settings, grid), *note_events(streams.notes, steps, grid)]
     if streams.adaptive is not None and "adaptive" in times:
@@ -67,7 +83,7 @@ def build_recording(streams: Streams, report: Report, options: DecodeOptions) ->
     return RecordingLog(
         kind="rcs",
         device_key=_text(streams.infos, "DeviceId"),
-        hemisphere=None,
+        hemisphere=_hemisphere(streams, report),
         clock="device" if device_clock else "pc",
         started_at=started,
         duration_s=round(duration_s, 4),
@@ -77,7 +93,24 @@ def build_recording(streams: Streams, report: Report, options: DecodeOptions) ->
         settings=_summary(streams, grid),
         quality=quality,
         fingerprint=_fingerprint(streams),
+        spectra=tuple(spectra),
     )
+
+
+def _hemisphere(streams: Streams, report: Report) -> Hemisphere | None:
+    """The side that the leads behind the sensed channels share, where the settings tell."""
+    subject = get(streams.settings.merged, "SubjectInfo")
+    keys: set[int] = set()
+    if streams.time_domain is not None:
+        keys |= {key for key, x in enumerate(streams.time_domain.samples) if x.size}
+    if streams.power is not None and streams.power.bands.size:
+        keys |= {i // 2 for i in range(8) if np.isfinite(streams.power.bands[:, i]).any()}
+    side = hemisphere(subject, keys)
+    if side is not None:
+        report("DeviceSettings").understood.append(f"leads on the {side} side")
+    elif any(described(subject)):
+        report("DeviceSettings").flagged.append("the leads of the sensed channels have no common side: name the hemisphere with the upload")
+    return side
 
 
 def _spans(
@@ -115,49 +148,28 @@ def _first_record_ms(streams: Streams) -> float:
     return min(known, default=0.0)
 
 
-def _traces(streams: Streams, times: dict[str, PacketTimes], steps: AmplitudeSteps, grid: Grid, report: Report) -> list[TraceLog]:
+def _traces(
+    streams: Streams, times: dict[str, PacketTimes], steps: AmplitudeSteps, grid: Grid, report: Report
+) -> tuple[list[TraceLog], list[SpectrumLog]]:
     traces: list[TraceLog] = []
+    spectra: list[SpectrumLog] = []
     if streams.time_domain is not None and "time_domain" in times:
-        traces += beta_traces(streams.time_domain, times["time_domain"], streams.settings, grid, report("RawDataTD").flagged)
+        channels = time_domain_stretches(streams.time_domain, times["time_domain"], streams.settings)
+        traces += beta_traces(channels, grid, report("RawDataTD").flagged)
+        spectra += time_domain_spectra(channels)
     if streams.power is not None and "power" in times:
         traces += power_traces(streams.power, times["power"], streams.settings, grid, report("RawDataPower").flagged)
+    if streams.fft is not None and "fft" in times:
+        fft_traces, fft_spectra = fft_results(streams.fft, times["fft"], streams.settings, grid)
+        traces, spectra = traces + fft_traces, spectra + fft_spectra
+    if streams.accel is not None and "accel" in times:
+        traces += accel_traces(streams.accel, times["accel"], grid)
     amplitude = amplitude_traces(steps, grid)
     if not amplitude:
         report("StimLog").flagged.append("no enabled program known: the recording has no amplitude trace")
     if steps.assumed_program:
         report("StimLog").flagged.append("no settings say which programs are enabled: program 0 is taken to be the one that stimulates")
-    return traces + amplitude
-
-
-def _quality(streams: Streams, times: dict[str, PacketTimes], report: Report) -> dict[str, Any]:
-    """Packets, loss and chunks per stream, also as sentences in the reports."""
-    quality: dict[str, Any] = {}
-    for name, t in times.items():
-        data = getattr(streams, name)
-        quality[name] = {
-            "packets": int(data.headers.size),
-            "missing": t.missing,
-            "loss": round(t.loss, 4),
-            "chunks": t.chunks,
-            "rejected": dict(t.rejected),
-            "unusable": data.unusable,
-        }
-        said = report(STEMS[name])
-        if t.missing:
-            said.flagged.append(f"{100 * t.loss:.1f} % of the packets are missing ({t.missing}); {t.chunks} stretches without a gap")
-        said.repaired.extend(f"{count} packet{'s' if count != 1 else ''} left out: {why}" for why, count in t.rejected.items())
-        if data.unusable:
-            said.repaired.append(f"{data.unusable} packet{'s' if data.unusable != 1 else ''} left out: fields missing or of the wrong kind")
-        if t.device_clock:
-            said.flagged.append("no packet has a PacketGenTime: placed by the device's clock and the times of arrival")
-    if streams.time_domain is not None and "time_domain" in quality:
-        td = streams.time_domain
-        quality["time_domain"]["flat_share"] = {f"key {k}": round(flat_share(x), 4) for k, x in enumerate(td.samples) if x.size}
-        if lost := int(sum(np.isnan(x).sum() for x in td.samples)):
-            report("RawDataTD").repaired.append(f"{lost} samples that are no finite number became gaps")
-    if streams.power is not None and streams.power.over_range:
-        report("RawDataPower").flagged.append(f"{streams.power.over_range} packets over range: gaps")
-    return quality
+    return traces + amplitude, spectra
 
 
 def _limits(settings: Settings) -> dict[str, Any]:
@@ -194,6 +206,7 @@ def _summary(streams: Streams, grid: Grid) -> dict[str, Any]:
         "utc_offset_h": number(get(settings.merged, "UtcOffset")),
         "adaptive_mode": integer(get(settings.merged, "AdaptiveConfig", "adaptiveMode")),
         "ld0_thresholds": [number(get(settings.merged, "DetectionConfig", "Ld0", "biasTerm", i)) for i in range(2)],
+        "leads": described(get(settings.merged, "SubjectInfo")),
         "sensing": sensing,
     }
 
@@ -205,7 +218,9 @@ def _text(infos: list[dict[str, Any]], key: str) -> str | None:
 def _fingerprint(streams: Streams) -> str:
     """Over packets, settings times and stimulation; not over the device's name, nor anything that redaction changes."""
     parts: list[str | bytes | NDArray[Any]] = []
-    for name, head in sorted(streams.headers().items()):
+    headers = streams.headers()
+    told = {name: head for name, head in headers.items() if name in PRIMARY} or headers
+    for name, head in sorted(told.items()):
         parts += [name, head.seconds, head.tick, head.sequence, head.gen_ms, head.samples]
     if streams.time_domain is not None:
         parts += list(streams.time_domain.samples)

@@ -13,6 +13,10 @@ FFT_SIZE = {0: 64, 1: 256, 3: 1024}
 EMBEDDED_ADAPTIVE = 2
 ADAPTIVE_BIT = 128
 GROUPS = "ABCD"
+SENSING_SECTIONS = frozenset({"SensingConfig", "SenseState"})
+THERAPY_SECTIONS = frozenset({"GeneralData", "therapyStatusData"})
+"""Sections that sensing and stimulation are read from, beside the therapy groups; a record without them changes neither."""
+
 T = TypeVar("T")
 
 
@@ -220,10 +224,11 @@ def follow(settings: Iterable[Any], stim: Iterable[Any]) -> Settings:
         delta = {key: value for key, value in record.items() if key != "RecordInfo"}
         if origin == 0:
             out.merged = merge(out.merged, delta)
-            out.sensing.add(time_ms, sensing_of(out.merged))
+            if not out.sensing.states or not delta.keys().isdisjoint(SENSING_SECTIONS):
+                out.sensing.add(time_ms, sensing_of(out.merged))
         else:
             logged = merge(logged or {}, delta)
-        if logged is not None or origin == 1:
+        if logged is not None and (not out.therapy.states or _tells_therapy(delta)):
             out.therapy.add(time_ms, therapy_of(out.merged, logged))
     out.stim_log = logged is not None
     if logged is None:
@@ -231,9 +236,15 @@ def follow(settings: Iterable[Any], stim: Iterable[Any]) -> Settings:
     return out
 
 
+def _tells_therapy(delta: dict[str, Any]) -> bool:
+    return any(key in THERAPY_SECTIONS or key.startswith("TherapyConfigGroup") for key in delta)
+
+
 def _therapy_from_settings(out: Settings, moves: list[tuple[float, int, int, Any]]) -> None:
     """Without a stimulation log the settings' own therapy groups have to do."""
     state: dict[str, Any] = {}
     for time_ms, _, _, record in sorted(moves, key=lambda move: move[:3]):
-        state = merge(state, {key: value for key, value in record.items() if key != "RecordInfo"})
-        out.therapy.add(time_ms, therapy_of(state, None))
+        delta = {key: value for key, value in record.items() if key != "RecordInfo"}
+        state = merge(state, delta)
+        if not out.therapy.states or _tells_therapy(delta):
+            out.therapy.add(time_ms, therapy_of(state, None))

@@ -1,50 +1,28 @@
 """Packets of an RC+S session as arrays. Source: format notes, A.2 to A.4, A.7.
 
-Each reader takes packets one at a time and keeps numbers only; a packet with a field of the wrong kind is left out and counted.
+Each reader takes packets in batches and keeps numbers only; a packet with a field of the wrong kind is left out and counted.
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from app.ingest.formats.rcs_scan import ARRAYS, Batch, join
 from app.ingest.formats.rcs_settings import RATE_HZ, get, integer, number
-from app.ingest.formats.rcs_time import PacketHeaders
+from app.ingest.formats.rcs_time import ROLLOVER, TICKS_PER_S, PacketHeaders
 
-HEADER_FIELDS = (("timestamp", "seconds"), ("systemTick",), ("dataTypeSequence",))
+ACCEL_RATE_HZ = {0: 65.104, 1: 32.552, 2: 16.276, 3: 8.138, 4: 4.069}
+AXES = ("XSamples", "YSamples", "ZSamples")
+Interval = Callable[[float], float | None]
+"""A packet's PC time in ms (NaN when unknown) to the FFT interval in force then, s; None where no settings tell."""
 
-
-@dataclass(slots=True)
-class HeaderRows:
-    """Header fields collected packet by packet."""
-
-    ints: tuple[array[int], ...] = field(default_factory=lambda: tuple(array("q") for _ in range(4)))
-    floats: tuple[array[float], ...] = field(default_factory=lambda: tuple(array("d") for _ in range(3)))
-    unusable: int = 0
-
-    def add(self, packet: Any, samples: int, rate_hz: float) -> bool:
-        """Take a packet's header; False (and counted) when it lacks a field."""
-        found = [integer(get(packet, "Header", *path), bits=48) for path in HEADER_FIELDS]
-        if any(value is None for value in found):
-            self.unusable += 1
-            return False
-        for column, value in zip(self.ints, (*found, samples), strict=True):
-            column.append(value or 0)
-        times = (number(get(packet, "PacketGenTime")), number(get(packet, "PacketRxUnixTime")), rate_hz)
-        for floats, time in zip(self.floats, times, strict=True):
-            floats.append(float("nan") if time is None else time)
-        return True
-
-    def headers(self) -> PacketHeaders:
-        """The collected fields as arrays [n]."""
-        seconds, tick, sequence, samples = (np.array(column, dtype=np.int64) for column in self.ints)
-        gen, rx, rate = (np.array(column, dtype=np.float64) for column in self.floats)
-        return PacketHeaders(seconds, tick, gen, rx, sequence, samples, rate)
+DEFAULT_INTERVAL_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +55,37 @@ class Power:
 
 
 @dataclass(frozen=True, slots=True)
+class Accel:
+    """Accelerometer packets: acceleration of all samples one after another, centiG [m, 3]; where each packet's begin, [n]."""
+
+    headers: PacketHeaders
+    samples: NDArray[np.float64]
+    offsets: NDArray[np.int64]
+    unusable: int
+
+
+@dataclass(frozen=True, slots=True)
+class Fft:
+    """On-device spectra: amplitude per bin in mV, [n, bins], NaN beyond a packet's own bins; channel key, FFT size, sampling rate [n]."""
+
+    headers: PacketHeaders
+    amplitude_mv: NDArray[np.float64]
+    channel: NDArray[np.int64]
+    fft_size: NDArray[np.int64]
+    td_rate_hz: NDArray[np.float64]
+    unusable: int
+
+
+@dataclass(frozen=True, slots=True)
+class TimeSync:
+    """Clock exchanges: measured latency in ms, [n]; NaN where none was told."""
+
+    headers: PacketHeaders
+    latency_ms: NDArray[np.float64]
+    unusable: int
+
+
+@dataclass(frozen=True, slots=True)
 class Adaptive:
     """Adaptive log: delivered amplitude in mA [n, 4], state, detector output and inputs, sensing status bits [n]."""
 
@@ -89,119 +98,210 @@ class Adaptive:
     unusable: int
 
 
-def read_time_domain(packets: Iterable[Any]) -> TimeDomain:
-    """Collect `TimeDomainData` packets."""
-    rows = HeaderRows()
+class _Table:
+    """Scalars of usable packets, batch by batch."""
+
+    def __init__(self) -> None:
+        self._columns: dict[str, list[NDArray[np.float64]]] = {}
+        self.unusable = 0
+
+    def take(self, batch: Batch, fits: NDArray[np.bool_], **more: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Keep the packets that fit and have a whole header; their rows in the batch."""
+        for name in ("seconds", "systemTick", "dataTypeSequence"):
+            value = batch.column(name)
+            fits = fits & (np.abs(value) < 2.0**48) & (value == np.floor(value))
+        rows = np.flatnonzero(fits)
+        self.unusable += batch.size - rows.size
+        scalars = {name: batch.column(name) for name in _KEPT}
+        for name, column in (scalars | more).items():
+            self._columns.setdefault(name, []).append(column[rows])
+        return rows
+
+    def column(self, name: str) -> NDArray[np.float64]:
+        """One of the collected columns, [n]."""
+        pieces = self._columns.get(name)
+        return np.concatenate(pieces) if pieces else np.empty(0)
+
+    def codes(self, name: str) -> NDArray[np.int64]:
+        """A column of codes, [n]; -1 where it holds no whole number."""
+        return _codes(self.column(name))
+
+    def headers(self, samples: NDArray[np.float64] | None = None, rate_hz: NDArray[np.float64] | None = None) -> PacketHeaders:
+        """The collected headers, [n]; one sample a packet where `samples` are not given."""
+        seconds, tick, sequence = (self.column(name).astype(np.int64) for name in ("seconds", "systemTick", "dataTypeSequence"))
+        many = np.ones(seconds.size) if samples is None else samples
+        rate = self.column("rate") if rate_hz is None else rate_hz
+        gen, rx = self.column("PacketGenTime"), self.column("PacketRxUnixTime")
+        return PacketHeaders(seconds, tick, gen, rx, sequence, many.astype(np.int64), rate)
+
+    def pc_ms(self) -> NDArray[np.float64]:
+        """PC time of every packet, ms: when it was generated, else when it arrived; NaN when neither is told."""
+        gen, rx = self.column("PacketGenTime"), self.column("PacketRxUnixTime")
+        return np.where(gen > 0, gen, np.where(rx > 0, rx, np.nan))
+
+    def rate_of(self, interval_at: Interval) -> NDArray[np.float64]:
+        """Packets per second under the FFT interval in force at each packet, [n]."""
+        told = [interval_at(t) for t in self.pc_ms().tolist()]
+        return _rate(np.array([np.nan if value is None else value for value in told], dtype=np.float64), self.column("systemTick"))
+
+
+_KEPT = ("seconds", "systemTick", "dataTypeSequence", "PacketGenTime", "PacketRxUnixTime", "SampleRate", "FftSize", "Channel")
+
+
+def _rate(interval_s: NDArray[np.float64], tick: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Packets per second, [n]; where the settings do not tell the interval, from the median step of the device's clock."""
+    steps = np.diff(tick) % ROLLOVER / TICKS_PER_S
+    usual = float(np.median(steps)) if steps.size else 0.0
+    return np.asarray(1.0 / np.where(np.isfinite(interval_s), interval_s, usual if usual > 0 else DEFAULT_INTERVAL_S))
+
+
+def _codes(column: NDArray[np.float64]) -> NDArray[np.int64]:
+    usable = (np.abs(column) < 2.0**31) & (column == np.floor(column))
+    return np.where(usable, column, -1.0).astype(np.int64)
+
+
+def _rates(codes: NDArray[np.int64], known: dict[int, float]) -> NDArray[np.float64]:
+    """Rate in Hz by code, NaN for codes without one."""
+    rate = np.full(codes.size, np.nan)
+    for code, hz in known.items():
+        rate[codes == code] = hz
+    return rate
+
+
+def read_time_domain(batches: Iterable[Batch]) -> TimeDomain:
+    """Collect `TimeDomainData` packets: usable are those with a known rate and channels of one length."""
+    table = _Table()
     samples = tuple(array("d") for _ in range(4))
-    offsets = tuple(array("q") for _ in range(4))
-    for packet in packets:
-        rate = RATE_HZ.get(_code(packet, "SampleRate"))
-        channels = _channels(packet)
-        if rate is None or not channels:
-            rows.unusable += 1
-        elif rows.add(packet, len(next(iter(channels.values()))), rate):
-            for key in range(4):
-                offsets[key].append(len(samples[key]) if key in channels else -1)
-                samples[key].extend(channels.get(key, ()))
+    offsets: tuple[list[NDArray[np.int64]], ...] = ([], [], [], [])
+    for batch in batches:
+        lengths = batch.lengths[:, :4]
+        longest = lengths.max(axis=1, initial=0)
+        even = np.all((lengths <= 0) | (lengths == longest[:, None]), axis=1)
+        rate = _rates(_codes(batch.column("SampleRate")), RATE_HZ)
+        rows = table.take(batch, even & (longest > 0) & np.isfinite(rate), rate=rate, samples=longest.astype(np.float64))
+        for key in range(4):
+            size = np.maximum(lengths[rows, key], 0)
+            offsets[key].append(np.where(size > 0, len(samples[key]) + np.cumsum(size) - size, -1))
+            samples[key].frombytes(join(batch, ARRAYS[key], rows).tobytes())
     arrays = tuple(np.frombuffer(column, dtype=np.float64) if column else np.empty(0) for column in samples)
-    for column in arrays:
-        column[~np.isfinite(column)] = np.nan
-    return TimeDomain(rows.headers(), arrays, tuple(np.array(column, dtype=np.int64) for column in offsets), rows.unusable)
+    starts = tuple(np.concatenate(column) if column else np.empty(0, dtype=np.int64) for column in offsets)
+    return TimeDomain(table.headers(table.column("samples")), arrays, starts, table.unusable)
 
 
-def _channels(packet: Any) -> dict[int, array[float]]:
-    """Samples by channel key; empty when the channels have different lengths or none at all."""
-    found: dict[int, array[float]] = {}
-    listed = get(packet, "ChannelSamples")
-    for channel in listed if isinstance(listed, list) else ():
-        key, values = integer(get(channel, "Key")), get(channel, "Value")
-        if key in range(4) and key not in found and isinstance(values, list) and values and key is not None:
-            try:
-                found[key] = array("d", values)
-            except (TypeError, OverflowError):
-                found[key] = array("d", [float("nan") if (v := number(item)) is None else v for item in values])
-    return found if len({len(values) for values in found.values()}) == 1 else {}
-
-
-def _code(packet: Any, name: str) -> int:
-    code = integer(get(packet, name))
-    return -1 if code is None else code
-
-
-def read_power(packets: Iterable[Any], interval_at: Any) -> Power:
-    """Collect `PowerDomainData` packets.
-
-    Args:
-        packets: the packets.
-        interval_at: function of a packet's PC time in ms (NaN when unknown) to the FFT interval in force, s.
-    """
-    rows = HeaderRows()
-    bands, sizes, rates = array("d"), array("q"), array("d")
+def read_power(batches: Iterable[Batch], interval_at: Interval) -> Power:
+    """Collect `PowerDomainData` packets."""
+    table = _Table()
+    bands = [np.empty((0, 8))]
     over_range = 0
-    for packet in packets:
-        values = get(packet, "Bands")
-        if not isinstance(values, list) or len(values) != 8:
-            rows.unusable += 1
-            continue
-        if not rows.add(packet, 1, 1.0 / interval_at(_pc_ms(packet))):
-            continue
-        over = get(packet, "IsPowerChannelOverrange") is True
-        over_range += over
-        mask = _mask(packet)
-        for i, item in enumerate(values):
-            value = number(item)
-            bands.append(float("nan") if value is None or over or not mask >> i & 1 else value)
-        sizes.append(_code(packet, "FftSize"))
-        rates.append(RATE_HZ.get(_code(packet, "SampleRate"), float("nan")))
-    table = np.array(bands, dtype=np.float64).reshape(-1, 8)
-    return Power(rows.headers(), table, np.array(sizes, dtype=np.int64), np.array(rates, dtype=np.float64), rows.unusable, over_range)
+    for batch in batches:
+        rows = table.take(batch, batch.lengths[:, ARRAYS.index("Bands")] == 8)
+        values = join(batch, "Bands", rows).reshape(-1, 8)
+        mask = _codes(batch.column("ValidDataMask")[rows])
+        over = batch.column("IsPowerChannelOverrange")[rows] == 1.0
+        over_range += int(over.sum())
+        valid = np.where(mask < 0, 255, mask)[:, None] >> np.arange(8) & 1 == 1
+        bands.append(np.where(valid & ~over[:, None], values, np.nan))
+    headers = table.headers(rate_hz=table.rate_of(interval_at))
+    rates = _rates(table.codes("SampleRate"), RATE_HZ)
+    return Power(headers, np.concatenate(bands), table.codes("FftSize"), rates, table.unusable, over_range)
 
 
-def _mask(packet: Any) -> int:
-    mask = integer(get(packet, "ValidDataMask"))
-    return 255 if mask is None or mask < 0 else mask
+def read_accel(batches: Iterable[Batch]) -> Accel:
+    """Collect `AccelData` packets: usable are those with a known rate and three axes of one length."""
+    table = _Table()
+    slots = [ARRAYS.index(axis) for axis in AXES]
+    pieces = [np.empty((0, 3))]
+    for batch in batches:
+        lengths = batch.lengths[:, slots]
+        rate = _rates(_codes(batch.column("SampleRate")), ACCEL_RATE_HZ)
+        fits = (lengths[:, 0] > 0) & np.all(lengths == lengths[:, :1], axis=1) & np.isfinite(rate)
+        rows = table.take(batch, fits, rate=rate, samples=lengths[:, 0].astype(np.float64))
+        pieces.append(np.stack([join(batch, axis, rows) for axis in AXES], axis=1))
+    headers = table.headers(table.column("samples"))
+    return Accel(headers, np.concatenate(pieces), np.cumsum(headers.samples) - headers.samples, table.unusable)
 
 
-def _pc_ms(packet: Any) -> float:
-    """PC time of a packet, ms: when it was generated, else when it arrived; NaN when neither is told."""
-    gen = number(get(packet, "PacketGenTime"))
-    if gen is not None and gen > 0:
-        return gen
-    rx = number(get(packet, "PacketRxUnixTime"))
-    return rx if rx is not None and rx > 0 else float("nan")
+def read_fft(batches: Iterable[Batch], interval_at: Interval) -> Fft:
+    """Collect `FftData` packets."""
+    table = _Table()
+    pieces: list[NDArray[np.float64]] = []
+    slot = ARRAYS.index("FftOutput")
+    for batch in batches:
+        bins = batch.lengths[:, slot]
+        rows = table.take(batch, (bins > 0) & (bins <= MAX_BINS))
+        out = np.full((rows.size, MAX_BINS), np.nan)
+        out[np.arange(MAX_BINS) < bins[rows, None]] = join(batch, "FftOutput", rows)
+        pieces.append(out[:, : int(bins[rows].max(initial=0))])
+    width = max((piece.shape[1] for piece in pieces), default=0)
+    whole = [np.pad(piece, ((0, 0), (0, width - piece.shape[1])), constant_values=np.nan) for piece in pieces]
+    amplitude = np.concatenate(whole) if whole else np.empty((0, 0))
+    headers = table.headers(rate_hz=table.rate_of(interval_at))
+    rates = _rates(table.codes("SampleRate"), RATE_HZ)
+    return Fft(headers, amplitude, table.codes("Channel"), table.codes("FftSize"), rates, table.unusable)
 
 
-def read_adaptive(records: Iterable[Any], interval_at: Any) -> Adaptive:
-    """Collect `AdaptiveUpdate` records; `interval_at` as in `read_power`."""
-    rows = HeaderRows()
-    amplitudes, outputs, inputs = array("d"), array("d"), array("d")
-    states, bits = array("q"), array("q")
-    for record in records:
-        update = get(record, "AdaptiveUpdate")
-        delivered = get(update, "CurrentProgramAmplitudesInMilliamps")
-        if not isinstance(delivered, list) or len(delivered) != 4:
-            rows.unusable += 1
-            continue
-        if not rows.add(update, 1, 1.0 / interval_at(_pc_ms(update))):
-            continue
-        amplitudes.extend(_floats(delivered, 4))
-        states.append(_code(update, "CurrentAdaptiveState"))
-        outputs.extend(_floats([get(update, "Ld0Status", "output")], 1))
-        features = get(update, "Ld0Status", "featureInputs")
-        inputs.extend(_floats(features if isinstance(features, list) else [], 4))
-        bits.append(max(0, _code(update, "SensingStatus")))
+MAX_BINS = 512
+"""Half of the largest FFT the device makes."""
+
+
+def read_time_sync(batches: Iterable[Batch]) -> TimeSync:
+    """Collect `TimeSyncData` packets, about one a second."""
+    table = _Table()
+    for batch in batches:
+        table.take(batch, np.ones(batch.size, dtype=bool), latency=batch.column("LatencyMilliseconds"))
+    one_a_second = np.ones(table.column("seconds").size)
+    return TimeSync(table.headers(rate_hz=one_a_second), table.column("latency"), table.unusable)
+
+
+def read_adaptive(records: Iterable[Any], interval_at: Interval) -> Adaptive:
+    """Collect `AdaptiveUpdate` records: usable are those with a whole header and four delivered amplitudes."""
+    rows = list(_adaptive_rows(records, interval_at))
+    table = np.array([row for row in rows if row is not None], dtype=np.float64).reshape(-1, 17)
+    header = table[:, :6]
+    whole = header[:, :3].astype(np.int64)
+    rate = _rate(header[:, 5], header[:, 1])
+    headers = PacketHeaders(whole[:, 0], whole[:, 1], header[:, 3], header[:, 4], whole[:, 2], np.ones(len(table), dtype=np.int64), rate)
     return Adaptive(
-        rows.headers(),
-        np.array(amplitudes, dtype=np.float64).reshape(-1, 4),
-        np.array(states, dtype=np.int64),
-        np.array(outputs, dtype=np.float64),
-        np.array(inputs, dtype=np.float64).reshape(-1, 4),
-        np.array(bits, dtype=np.int64),
-        rows.unusable,
+        headers,
+        table[:, 6:10],
+        table[:, 10].astype(np.int64),
+        table[:, 11],
+        table[:, 12:16],
+        table[:, 16].astype(np.int64),
+        len(rows) - len(table),
     )
 
 
-def _floats(values: list[Any], count: int) -> list[float]:
-    """Exactly `count` numbers, NaN where there is none."""
-    padded = [*values[:count], *([None] * (count - len(values)))]
-    return [float("nan") if (v := number(item)) is None else v for item in padded]
+def _adaptive_rows(records: Iterable[Any], interval_at: Interval) -> Iterator[array[float] | None]:
+    """Of each record 3 numbers of the header, 2 times, interval, 4 amplitudes, state, output, 4 inputs, status bits; None when unusable."""
+    for record in records:
+        update = get(record, "AdaptiveUpdate")
+        delivered = get(update, "CurrentProgramAmplitudesInMilliamps")
+        found = [
+            integer(get(update, "Header", *path), bits=48) for path in (("timestamp", "seconds"), ("systemTick",), ("dataTypeSequence",))
+        ]
+        if not isinstance(delivered, list) or len(delivered) != 4 or None in found:
+            yield None
+            continue
+        gen, rx = (_float(get(update, name)) for name in ("PacketGenTime", "PacketRxUnixTime"))
+        interval = interval_at(gen if gen > 0 else rx if rx > 0 else float("nan"))
+        features = get(update, "Ld0Status", "featureInputs")
+        inputs = [*(features if isinstance(features, list) else []), *[None] * 4][:4]
+        state, bits = (integer(get(update, name), bits=31) for name in ("CurrentAdaptiveState", "SensingStatus"))
+        yield array(
+            "d",
+            (
+                *(float(value or 0) for value in found),
+                *(gen, rx, _float(interval)),
+                *map(_float, delivered),
+                -1.0 if state is None else float(state),
+                _float(get(update, "Ld0Status", "output")),
+                *map(_float, inputs),
+                float(max(0, bits or 0)),
+            ),
+        )
+
+
+def _float(value: Any) -> float:
+    found = number(value)
+    return float("nan") if found is None else found

@@ -8,7 +8,8 @@ Differences from the toolbox, on purpose:
 - packets whose PacketGenTime is 0 or negative are kept; they only have no say in where their chunk lies;
 - a chunk, or a whole recording, without any PacketGenTime is placed by the device clock;
 - the deviation of the device clock from PacketGenTime is judged against its median, so one bad first packet rejects nothing else;
-- a chunk is placed at the median of (PacketGenTime - elapsed), the first packet included.
+- a chunk is placed at the median of (PacketGenTime - elapsed), the first packet included;
+- packets that arrived out of order are put in the order of the device's clock first.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ ROLLOVER_S = ROLLOVER / TICKS_PER_S
 DAY_S = 86_400
 CLOCK_DEVIATION_MS = 2_000
 BACK_STEP_MS = 500
+TWICE = "the same packet twice"
 UNSEEN_GAP_S = 6.5
 """Beyond this the 8-bit sequence number says nothing about how many packets are missing, or whether the stream was on."""
 
@@ -45,6 +47,10 @@ class PacketHeaders:
         """Number of packets n."""
         return int(self.seconds.size)
 
+    def take(self, index: NDArray[np.int64]) -> PacketHeaders:
+        """Some of the packets."""
+        return PacketHeaders(*(getattr(self, name)[index] for name in PacketHeaders.__slots__))
+
 
 @dataclass(frozen=True, slots=True)
 class PacketTimes:
@@ -56,6 +62,7 @@ class PacketTimes:
         device_clock: True when no packet had a usable PacketGenTime and arrival times placed the recording.
         missing: packets lost within the stream, by sequence number.
         rejected: how many packets were rejected, by reason.
+        reordered: how many packets stood after a later one in the file.
     """
 
     last_ms: NDArray[np.float64]
@@ -63,6 +70,7 @@ class PacketTimes:
     device_clock: bool
     missing: int
     rejected: dict[str, int] = field(default_factory=dict)
+    reordered: int = 0
 
     @property
     def chunks(self) -> int:
@@ -86,14 +94,32 @@ def reconstruct(headers: PacketHeaders) -> PacketTimes:
     index = np.flatnonzero(keep)
     if index.size == 0:
         return PacketTimes(last_ms, chunk, False, 0, rejected)
-    kept = PacketHeaders(*(getattr(headers, name)[index] for name in PacketHeaders.__slots__))
-    breaks = _breaks(kept)
-    number = np.concatenate(([0], np.cumsum(breaks)))
+    index, reordered = _in_device_order(headers, index, rejected)
+    kept = headers.take(index)
     device_ms = _device_ms(kept)
+    number = np.concatenate(([0], np.cumsum(_breaks(kept))))
     anchor, device_clock = _anchors(kept, gen[index], number, device_ms)
     last_ms[index] = anchor[number] + _elapsed_ms(kept, number)
     chunk[index] = number
-    return PacketTimes(last_ms, chunk, device_clock, _missing(kept, device_ms), rejected)
+    return PacketTimes(last_ms, chunk, device_clock, _missing(kept, device_ms), rejected, reordered)
+
+
+def _in_device_order(headers: PacketHeaders, index: NDArray[np.int64], rejected: dict[str, int]) -> tuple[NDArray[np.int64], int]:
+    """The packets in the order of the device's clock without repetitions, and how many of them were late."""
+    device_ms = _device_ms(headers.take(index))
+    reordered = int(np.sum(device_ms < np.maximum.accumulate(device_ms)))
+    if reordered == 0:
+        return index, 0
+    order = index[np.argsort(device_ms, kind="stable")]
+    twin = np.concatenate(([False], _same_packet(headers.take(order))))
+    if twin.any():
+        rejected[TWICE] = rejected.get(TWICE, 0) + int(twin.sum())
+    return order[~twin], reordered
+
+
+def _same_packet(headers: PacketHeaders) -> NDArray[np.bool_]:
+    """Where a packet repeats the one before, [n - 1]."""
+    return np.asarray((np.diff(headers.sequence) == 0) & (np.diff(headers.tick) == 0))
 
 
 def _acceptable(headers: PacketHeaders, gen: NDArray[np.float64], rejected: dict[str, int]) -> NDArray[np.bool_]:
@@ -112,9 +138,7 @@ def _acceptable(headers: PacketHeaders, gen: NDArray[np.float64], rejected: dict
     if np.any(usable := keep & np.isfinite(deviation)):
         far = np.abs(deviation - np.median(deviation[usable])) > CLOCK_DEVIATION_MS
         drop(np.isfinite(deviation) & far, "device and PC clock disagree by more than 2 s")
-    twin = np.zeros_like(keep)
-    twin[1:] = (np.diff(headers.sequence) == 0) & (np.diff(headers.tick) == 0)
-    drop(twin, "the same packet twice")
+    drop(np.concatenate(([False], _same_packet(headers))), TWICE)
     drop(_after_back_step(gen), "PacketGenTime steps back")
     return keep
 
@@ -146,10 +170,36 @@ def _breaks(kept: PacketHeaders) -> NDArray[np.bool_]:
 
 
 def _device_ms(kept: PacketHeaders) -> NDArray[np.float64]:
-    """The device's own clock made continuous, ms after the first packet, [n]: ticks, with the rollovers that `timestamp` tells of."""
+    """The device's own clock made continuous, ms after the first packet, [n]: ticks, with the rollovers that `timestamp` tells of.
+
+    A step is the one of its ticks that lies nearest to the step of `timestamp`, which is right to a second: forwards or backwards.
+    """
     ticks = (np.diff(kept.tick) % ROLLOVER) / TICKS_PER_S
-    turns = np.maximum(0, np.rint((np.diff(kept.seconds) - ticks) / ROLLOVER_S))
+    turns = np.rint((np.diff(kept.seconds) - ticks) / ROLLOVER_S)
     return np.concatenate(([0.0], np.cumsum(1000.0 * (ticks + ROLLOVER_S * turns))))
+
+
+DRIFT_SPAN_S = 30.0
+"""Over less time than this the PC's jitter of some 20 ms says nothing about drift."""
+
+
+def device_clock_drift(headers: PacketHeaders) -> float | None:
+    """How fast the device's clock runs against the PC's: relative, 0 when both agree; None when the stream is too short to tell.
+
+    The median of the slopes between packets half the stream apart (the robust line of Theil and Sen on few pairs), PacketGenTime against
+    the device's ticks, of packets in rising order of the device's clock.
+    """
+    kept = np.flatnonzero(headers.gen_ms > 0)
+    kept = kept[np.abs(headers.seconds[kept] - np.median(headers.seconds[kept])) <= DAY_S] if kept.size else kept
+    if kept.size < 4:
+        return None
+    chosen = headers.take(kept)
+    device_ms, half = _device_ms(chosen), kept.size // 2
+    device, pc = device_ms[half:] - device_ms[:-half], chosen.gen_ms[half:] - chosen.gen_ms[:-half]
+    long = device > 500.0 * DRIFT_SPAN_S
+    if device_ms[-1] < 1000.0 * DRIFT_SPAN_S or not long.any():
+        return None
+    return float(np.median(device[long] / np.where(pc[long] == 0, np.nan, pc[long]))) - 1.0
 
 
 def _elapsed_ms(kept: PacketHeaders, number: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -191,8 +241,12 @@ def _place_by_device_clock(offset: NDArray[np.float64], device_ms: NDArray[np.fl
 
 
 def _missing(kept: PacketHeaders, device_ms: NDArray[np.float64]) -> int:
-    """Packets lost in gaps short enough for the sequence number to count them."""
+    """Packets lost in gaps short enough for the sequence number to count them.
+
+    The counter starts anew at times; where it says something else than the clock, the clock counts.
+    """
     gap_s = np.diff(device_ms) / 1000.0
-    step = np.diff(kept.sequence) % 256
-    counted = (gap_s < UNSEEN_GAP_S) & (step > 0)
-    return int(np.sum(step[counted] - 1))
+    by_clock = np.maximum(0, np.rint(gap_s * kept.rate_hz[1:] / np.maximum(kept.samples[1:], 1)) - 1)
+    by_number = (np.diff(kept.sequence) - 1) % 256
+    agree = np.abs(by_number - by_clock) <= np.maximum(2, 0.5 * by_clock)
+    return int(np.sum(np.where(agree, by_number, by_clock)[gap_s < UNSEEN_GAP_S]))

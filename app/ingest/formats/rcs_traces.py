@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.ingest.formats.log import TraceLog, TraceSource
+from app.ingest.formats.log import SpectrumLog, TraceLog, TraceSource
 from app.ingest.formats.options import DecodeOptions
 from app.ingest.formats.rcs_amplitude import AmplitudeSteps
-from app.ingest.formats.rcs_settings import FFT_SIZE, Settings
-from app.ingest.formats.rcs_streams import Power, TimeDomain
+from app.ingest.formats.rcs_outliers import power_spikes
+from app.ingest.formats.rcs_settings import FFT_SIZE, Settings, get, integer
+from app.ingest.formats.rcs_streams import Accel, Fft, Power
 from app.ingest.formats.rcs_time import PacketTimes
-from ml.signals import band_rows, row_means, step_means
+from ml.signals import row_means, row_of, step_means
 
 POWER_BIT = 4
 UV_PER_MV = 1000.0
+MAX_HZ = 100.0
+WINDOW_SAMPLES = {64: 62, 256: 250, 1024: 1000}
+"""Samples the device puts into an FFT of each size; the rest is zeros."""
+
 SETTLE_S = 1.0
 """Five time constants of the 0.85 Hz high-pass: until then what the amplifier shows after switching on is its own step, not the brain."""
 
@@ -52,84 +56,12 @@ class Grid:
         return TraceLog(*names, source, period, period, stored, valid, {**details, "min_valid_fraction": self.options.min_valid_fraction})
 
 
-def beta_traces(data: TimeDomain, times: PacketTimes, settings: Settings, grid: Grid, notes: list[str]) -> list[TraceLog]:
-    """RMS amplitude (`beta`, uV) and power (`beta_power`, uV^2) of the beta band per channel and contact pair."""
-    options = grid.options
-    out: list[TraceLog] = []
-    for channel, pieces in sorted(time_domain_stretches(data, times, settings).items()):
-        fits = [(grid.seconds(np.array([start]))[0], rate, x * UV_PER_MV) for start, rate, x in pieces if options.beta_high_hz < rate / 2]
-        if len(fits) < len(pieces):
-            notes.append(f"{channel}: sampled too slowly for a band up to {options.beta_high_hz:g} Hz; left out there")
-        if not fits:
-            continue
-        rows = band_rows(fits, grid.rows, options.period_s, options.beta_low_hz, options.beta_high_hz)
-        details = {
-            "low_hz": options.beta_low_hz,
-            "high_hz": options.beta_high_hz,
-            "rates_hz": sorted({rate for _, rate, _ in fits}),
-            "contacts": channel.partition(" ")[2],
-        }
-        out.append(grid.trace(("beta", channel, "uV"), "time_domain", rows.rms, rows.covered, {**details, "measure": "rms"}))
-        out.append(grid.trace(("beta_power", channel, "uV2"), "time_domain", rows.power, rows.covered, {**details, "measure": "power"}))
-    return out
-
-
-def time_domain_stretches(
-    data: TimeDomain, times: PacketTimes, settings: Settings
-) -> dict[str, list[tuple[float, float, NDArray[np.float64]]]]:
-    """Gap-free stretches (time of the first sample in PC ms, rate in Hz, samples in mV) by channel, e.g. `key 0 +2-0`.
-
-    Samples that are not strictly later than those before them are dropped, so overlapping packets count once.
-    """
-    out: dict[str, list[tuple[float, float, NDArray[np.float64]]]] = defaultdict(list)
-    for key in range(4):
-        used = np.flatnonzero((data.offsets[key] >= 0) & np.isfinite(times.last_ms))
-        if used.size == 0:
-            continue
-        names = _channel_names(key, times.last_ms[used], settings)
-        for name in dict.fromkeys(names):
-            chosen = used[[n == name for n in names]]
-            out[name].extend(_stretches(data, times, key, chosen))
-    return dict(out)
-
-
-def _channel_names(key: int, t_ms: NDArray[np.float64], settings: Settings) -> list[str]:
-    states = (settings.sensing.at(float(t)) for t in t_ms)
-    return [f"key {key} {state.contacts[key]}".strip() if state is not None else f"key {key}" for state in states]
-
-
-def _stretches(
-    data: TimeDomain, times: PacketTimes, key: int, packets: NDArray[np.int64]
-) -> Iterator[tuple[float, float, NDArray[np.float64]]]:
-    """Pieces of one key's samples; arrays of the recording's length are dropped as soon as they are used, a long one has many samples."""
-    count = data.headers.samples[packets]
-    step = 1000.0 / data.headers.rate_hz[packets]
-    before = np.cumsum(count) - count
-    t_ms = np.arange(int(count.sum()), dtype=np.float64)
-    t_ms -= np.repeat(before, count)
-    x = data.samples[key][np.repeat(data.offsets[key][packets], count) + t_ms.astype(np.int64)]
-    width = np.repeat(step, count)
-    t_ms *= width
-    t_ms += np.repeat(times.last_ms[packets] - (count - 1) * step, count)
-    keep = np.isfinite(x)
-    keep[1:] &= t_ms[1:] > np.maximum.accumulate(t_ms)[:-1] + 0.01 * width[1:]
-    if not keep.all():
-        t_ms, x, width = t_ms[keep], x[keep], width[keep]
-    cuts = (np.flatnonzero((np.diff(t_ms) > 1.5 * width[1:]) | (np.diff(width) != 0)) + 1).tolist()
-    bounds = [0, *cuts, t_ms.size]
-    heads = [(float(t_ms[i]), 1000.0 / float(width[i])) for i in bounds[:-1] if i < t_ms.size]
-    del t_ms, width, keep
-    for (start_ms, rate_hz), first, end in zip(heads, bounds, bounds[1:], strict=False):
-        yield start_ms, rate_hz, x[first:end]
-
-
-def flat_share(samples: NDArray[np.float64]) -> float:
-    """Share of samples equal to the one before: near 0 for a living channel, near 1 for one at its rail."""
-    return float(np.mean(np.diff(samples) == 0)) if samples.size > 1 else 0.0
-
-
 def power_traces(data: Power, times: PacketTimes, settings: Settings, grid: Grid, notes: list[str]) -> list[TraceLog]:
-    """On-device band power (`band_power`, device units) per band and band edges in force."""
+    """On-device band power (`band_power`, device units) per band and band edges in force, without spikes.
+
+    A spike in one band counts in all: the amplifier's transient is broad, and a band of a single bin varies too much to show it.
+    `details` counts the packets left out as spikes and lists the rows they were in; such a row is invalid when too little of it is left.
+    """
     t_s = grid.seconds(times.last_ms)
     interval = 1.0 / data.headers.rate_hz
     settling = settling_packets(data, times, settings)
@@ -137,20 +69,63 @@ def power_traces(data: Power, times: PacketTimes, settings: Settings, grid: Grid
         notes.append(
             f"{int(settling.sum())} power packets right after sensing was switched on left out: their FFT window holds the switching step"
         )
-    out: list[TraceLog] = []
     placed = np.isfinite(t_s)
-    for i in range(8):
-        if not np.any(np.isfinite(data.bands[:, i])):
-            continue
-        names, edges = _band_names(i, data, times, settings)
-        for name in sorted(set(names) - {""}):
-            chosen = placed & np.array([n == name for n in names])
-            values = np.where(chosen & ~settling, data.bands[:, i], np.nan)
-            means, covered = row_means(np.where(placed, t_s, -1e9), values, interval, grid.rows, grid.options.period_s)
-            low, high = edges.get(name, (None, None))
-            details = {"band": i + 1, "channel_key": i // 2, "low_hz": low, "high_hz": high}
-            out.append(grid.trace(("band_power", name, "device units"), "device_power", means, covered, details))
+    channels = _channels(data, times, settings, placed & ~settling)
+    spikes = np.zeros(data.headers.size, dtype=bool)
+    for _, _, values in channels.values():
+        spikes |= _spikes(values, t_s, data)
+    out: list[TraceLog] = []
+    for name, (i, edges, values) in channels.items():
+        hit = spikes & np.isfinite(values)
+        rows = np.unique(row_of(t_s[hit], grid.options.period_s))
+        if rows.size:
+            notes.append(f"{name}: {int(hit.sum())} packets with power spikes in {rows.size} rows became gaps")
+        left = np.where(spikes, np.nan, values)
+        means, covered = row_means(np.where(placed, t_s, -1e9), left, interval, grid.rows, grid.options.period_s)
+        details = {
+            "band": i + 1,
+            "channel_key": i // 2,
+            "low_hz": edges[0],
+            "high_hz": edges[1],
+            "spike_packets": int(hit.sum()),
+            "spike_rows": rows.tolist(),
+        }
+        out.append(grid.trace(("band_power", name, "device units"), "device_power", means, covered, details))
     return out
+
+
+Edges = tuple[float | None, float | None]
+
+
+def _channels(
+    data: Power, times: PacketTimes, settings: Settings, usable: NDArray[np.bool_]
+) -> dict[str, tuple[int, Edges, NDArray[np.float64]]]:
+    """Band index, edges in Hz and power in usable packets, [n] with NaN elsewhere, of every channel name that a band ever has."""
+    out: dict[str, tuple[int, Edges, NDArray[np.float64]]] = {}
+    for i in range(8):
+        if np.any(np.isfinite(data.bands[:, i])):
+            names, edges = _band_names(i, data, times, settings)
+            for name in sorted(set(names)):
+                chosen = usable & np.array([n == name for n in names])
+                out[name] = (i, edges.get(name, (None, None)), np.where(chosen, data.bands[:, i], np.nan))
+    return out
+
+
+def _spikes(values: NDArray[np.float64], t_s: NDArray[np.float64], data: Power) -> NDArray[np.bool_]:
+    """Spikes of one band, [n]; each FFT interval and size by itself."""
+    out = np.zeros(values.size, dtype=bool)
+    windows = window_s(data)
+    for rate, window in sorted(set(zip(data.headers.rate_hz.tolist(), windows.tolist(), strict=True))):
+        same = np.flatnonzero((data.headers.rate_hz == rate) & (windows == window) & np.isfinite(values))
+        same = same[np.argsort(t_s[same], kind="stable")]
+        out[same] = power_spikes(values[same], 1.0 / rate, window)
+    return out
+
+
+def window_s(data: Power | Fft) -> NDArray[np.float64]:
+    """Length of each packet's FFT window, s, [n]; 0 where size or rate are not told."""
+    sizes = np.array([FFT_SIZE.get(code, 0) for code in data.fft_size.tolist()], dtype=np.float64)
+    return np.where(np.isfinite(data.td_rate_hz), sizes / np.nan_to_num(data.td_rate_hz, nan=1.0), 0.0)
 
 
 def settling_packets(data: Power, times: PacketTimes, settings: Settings) -> NDArray[np.bool_]:
@@ -160,9 +135,7 @@ def settling_packets(data: Power, times: PacketTimes, settings: Settings) -> NDA
     for time_ms, state in zip(settings.sensing.times_ms, settings.sensing.states, strict=True):
         on = None if state.sense_bits is None else bool(state.sense_bits & POWER_BIT)
         if on and on_before is False:
-            rates = data.td_rate_hz
-            sizes = np.array([FFT_SIZE.get(int(code), 0) for code in data.fft_size], dtype=np.float64)
-            window_ms = 1000.0 * (SETTLE_S + np.where(np.isfinite(rates), sizes / rates, 0.0))
+            window_ms = 1000.0 * (SETTLE_S + window_s(data))
             out |= (times.last_ms >= time_ms) & (times.last_ms < time_ms + window_ms)
         on_before = on
     return out
@@ -190,3 +163,56 @@ def amplitude_traces(steps: AmplitudeSteps, grid: Grid) -> list[TraceLog]:
         details = {"program": p, "origin": "AdaptiveLog" if steps.from_adaptive else "StimLog", "assumed_program": steps.assumed_program}
         out.append(grid.trace(("amplitude", f"program {p}", "mA"), "device_log", means, covered, details))
     return out
+
+
+def accel_traces(data: Accel, times: PacketTimes, grid: Grid) -> list[TraceLog]:
+    """Root mean square acceleration per row (`acceleration`, centiG), over the three axes, each freed of its mean in the row.
+
+    The mean is gravity (about 100 centiG along the vertical) and the sensor's offset.
+    """
+    used = np.flatnonzero(np.isfinite(times.last_ms))
+    count, step_s = data.headers.samples[used], 1.0 / data.headers.rate_hz[used]
+    within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+    t_s = np.repeat(grid.seconds(times.last_ms[used]), count) - (np.repeat(count, count) - 1 - within) * np.repeat(step_s, count)
+    x = data.samples[np.repeat(data.offsets[used], count) + within]
+    weight = np.repeat(step_s, count)
+    whole = np.all(np.isfinite(x), axis=1)
+    square = np.zeros(grid.rows)
+    covered = np.zeros(grid.rows)
+    for axis in range(3):
+        values = np.where(whole, x[:, axis], np.nan)
+        mean, covered = row_means(t_s, values, weight, grid.rows, grid.options.period_s)
+        row = np.clip(row_of(t_s, grid.options.period_s), 0, max(0, grid.rows - 1))
+        square += row_means(t_s, (values - mean[row]) ** 2, weight, grid.rows, grid.options.period_s)[0]
+    details = {"measure": "rms of three axes without their mean", "rates_hz": sorted(set(data.headers.rate_hz[used].tolist()))}
+    return [grid.trace(("acceleration", "implant", "centiG"), "device_log", np.sqrt(square), covered, details)]
+
+
+def fft_results(data: Fft, times: PacketTimes, settings: Settings, grid: Grid) -> tuple[list[TraceLog], list[SpectrumLog]]:
+    """On-device spectra as a trace of the amplitude within the beta band (`band_amplitude`, uV rms) and as a mean spectrum per channel.
+
+    The device streams the amplitude F of a sine in each bin: F = 4 |FFT| / N with a Hann window over n of N samples (notes, A.11), so that
+    the one-sided density is F^2 N^2 / (3 n rate) and the rms within the band the root of its integral.
+    """
+    traces, spectra = [], []
+    placed = np.isfinite(times.last_ms)
+    offset = integer(get(settings.merged, "SensingConfig", "fftConfig", "streamOffsetBins")) or 0
+    kinds = set(zip(data.channel.tolist(), data.fft_size.tolist(), data.td_rate_hz.tolist(), strict=True))
+    for key, code, rate in sorted(kind for kind in kinds if kind[1] in FFT_SIZE and np.isfinite(kind[2])):
+        size = FFT_SIZE[code]
+        chosen = np.flatnonzero(placed & (data.channel == key) & (data.fft_size == code) & (data.td_rate_hz == rate))
+        hz = (offset + np.arange(data.amplitude_mv.shape[1])) * rate / size
+        density = (UV_PER_MV * data.amplitude_mv[chosen]) ** 2 * size**2 / (3.0 * WINDOW_SAMPLES[size] * rate)
+        density[:, hz == 0] /= 2.0
+        channel = f"key {key} on-device FFT {size} at {rate:g} Hz"
+        band = (hz >= grid.options.beta_low_hz) & (hz <= grid.options.beta_high_hz)
+        seconds = 1.0 / data.headers.rate_hz[chosen]
+        if chosen.size and band.any():
+            power = density[:, band].sum(axis=1) * rate / size
+            means, covered = row_means(grid.seconds(times.last_ms[chosen]), power, seconds, grid.rows, grid.options.period_s)
+            details = {"low_hz": float(hz[band][0]), "high_hz": float(hz[band][-1]), "channel_key": key, "fft_size": size, "rate_hz": rate}
+            traces.append(grid.trace(("band_amplitude", channel, "uV"), "device_power", np.sqrt(means), covered, details))
+        shown = (hz <= MAX_HZ) & np.any(np.isfinite(density), axis=0)
+        if chosen.size and shown.any():
+            spectra.append(SpectrumLog(channel, "uV2/Hz", hz[shown], np.nanmean(density[:, shown], axis=0), round(float(seconds.sum()), 3)))
+    return traces, spectra

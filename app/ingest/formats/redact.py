@@ -1,4 +1,4 @@
-"""Take identity out of a file before it is stored: names, serial numbers, dates of birth, free text, folder names, unknown columns.
+"""Take identity out of an RC+S archive before it is stored: names, serial numbers, dates of birth, free text, folder names.
 
 What stays is listed, not what goes: a text is kept only where its key is known to hold a technical word of a known shape. The result
 decodes to the same recording, apart from the device's name, which becomes a keyed pseudonym.
@@ -6,30 +6,28 @@ decodes to the same recording, apart from the device's name, which becomes a key
 
 from __future__ import annotations
 
-import hmac
 import json
 import re
 import zipfile
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from hashlib import sha256
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, Literal
-
-import numpy as np
+from typing import IO, Any
 
 from app.ingest.formats.archive import ZipFiles
 from app.ingest.formats.log import FileReport, UndecodableFile
-from app.ingest.formats.options import ArchiveLimits, DecodeOptions
+from app.ingest.formats.options import ArchiveLimits
 from app.ingest.formats.rcs import SessionFiles, find_sessions
 from app.ingest.formats.rcs_json import STREAM_KEYS, JsonNotes, read_elements
 from app.ingest.formats.rcs_labels import NO_LABEL, parse, render
-from app.ingest.formats.table import Columns, decode_columns, read_csv, read_parquet
+from app.ingest.formats.rcs_leads import clean_leads
+from app.ingest.formats.rcs_scan import Batch, scan
+from app.ingest.formats.redaction import PSEUDONYM, Redaction, pseudonym
 
-REDACTOR_VERSION = 2
+DEFLATE_LEVEL = 1
+"""Packing is what cleaning an archive takes longest over: level 6 takes five times as long and saves a fifth."""
+
 EPOCH = (1980, 1, 1, 0, 0, 0)
-PSEUDONYM = re.compile(r"device-[0-9a-f]{16}")
 BLANKED = frozenset({"SubjectInfo", "LastPtmRtmInfo"})
 SERIALS = frozenset({"telMDeviceId", "implantDate"})
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
@@ -54,32 +52,6 @@ PACKET_WORDS = frozenset(
     )
 )
 _QUOTED = re.compile(r'"([^"]*)"')
-
-
-@dataclass(slots=True)
-class Redaction:
-    """What was done, in sentences for the upload's report.
-
-    Attributes:
-        removed: identity that was taken out.
-        repaired: defects met; the redacted file is whole JSON and no longer shows them.
-        ignored: files not carried over.
-        unreadable: files of the session that could not be read at all, so could not be redacted.
-    """
-
-    removed: list[str] = field(default_factory=list)
-    repaired: list[str] = field(default_factory=list)
-    ignored: list[str] = field(default_factory=list)
-    unreadable: list[str] = field(default_factory=list)
-
-
-def pseudonym(serial: str, key: bytes) -> str:
-    """Keyed pseudonym of a device; a pseudonym stays as it is. Raises ValueError for a key under 16 bytes."""
-    if len(key) < 16:
-        raise ValueError("the pseudonym key must have at least 16 bytes")
-    if PSEUDONYM.fullmatch(serial):
-        return serial
-    return "device-" + hmac.new(key, serial.strip().upper().encode(), sha256).hexdigest()[:16]
 
 
 def redact_rcs_zip(source: Path, target: Path, key: bytes, limits: ArchiveLimits | None = None) -> Redaction:
@@ -108,50 +80,6 @@ def redact_rcs_zip(source: Path, target: Path, key: bytes, limits: ArchiveLimits
                 _write_member(archive, name, f"{label}{stem}.json", files, origin, scrub, done)
         done.removed = ["names of folders", *scrub.sentences()]
         return done
-
-
-def redact_table(source: Path, target: Path, kind: Literal["csv", "parquet"], options: DecodeOptions) -> Redaction:
-    """Write a table of the known columns alone; the same bytes in give the same bytes out.
-
-    Headers become the column's role with its unit in brackets, cells the numbers that were read, so that the table decodes to the same
-    recording with the same line numbers.
-
-    Args:
-        source: the uploaded table.
-        target: where the redacted table is written.
-        kind: what the table is.
-        options: choices of the decoder, which checks the table as the sender wrote it.
-
-    Raises:
-        UndecodableFile: the table cannot be decoded; nothing is written then.
-    """
-    columns = read_csv(source, options) if kind == "csv" else read_parquet(source, options)
-    decode_columns(columns, options, "table")
-    if kind == "csv":
-        _write_csv(columns, target)
-    else:
-        _write_parquet(columns, target)
-    others = len(columns.ignored)
-    removed = [f"{others} other column{'s' if others != 1 else ''}"] if others else []
-    return Redaction(removed=removed, repaired=list(columns.notes))
-
-
-def _write_csv(columns: Columns, target: Path) -> None:
-    with target.open("w", encoding="utf-8", newline="") as out:
-        out.write(",".join(columns.label(role) for role in columns.values) + "\n")
-        at = 2
-        for line, *cells in zip(columns.lines.tolist(), *(v.tolist() for v in columns.values.values()), strict=True):
-            # blank lines keep every row on its line, so that later reports name the line that the sender sees
-            out.write("\n" * (line - at) + ",".join("" if cell != cell else repr(cell) for cell in cells) + "\n")
-            at = line + 1
-
-
-def _write_parquet(columns: Columns, target: Path) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    arrays = {columns.label(role): pa.array(v, type=pa.float64(), mask=np.isnan(v)) for role, v in columns.values.items()}
-    pq.write_table(pa.table(arrays), target, store_schema=False)
 
 
 def _plan(sessions: list[SessionFiles], files: ZipFiles, scrub: _Scrubber, taken: set[str]) -> Iterator[tuple[str, str, str, str]]:
@@ -200,10 +128,11 @@ def _write_member(archive: zipfile.ZipFile, name: str, shown: str, files: ZipFil
     notes = JsonNotes()
     info = zipfile.ZipInfo(name, EPOCH)
     info.compress_type = zipfile.ZIP_DEFLATED
+    info._compresslevel = DEFLATE_LEVEL  # type: ignore[attr-defined, unused-ignore]  # no public name before Python 3.13
     info.create_system, info.external_attr = 3, 0o100600 << 16
     try:
         with files.open(origin) as stream:
-            elements = read_elements(stream, notes)
+            elements = read_elements(stream, notes, scan)
             first = next(elements, None)
             if first is None and notes.defects and not notes.record_infos:
                 done.unreadable.append(f"{shown}: {notes.defects[0]}")
@@ -251,7 +180,9 @@ class _Scrubber:
         return pseudonym(serial, self._key)
 
     def text(self, value: Any, text: str) -> str:
-        """Clean JSON text of one element; packets that hold nothing but known words are copied as they stand."""
+        """Clean JSON text of one element, or of a run; packets that hold nothing but known words are copied as they stand."""
+        if isinstance(value, Batch):
+            return text
         if "\\" not in text and PACKET_WORDS.issuperset(_QUOTED.findall(text)):
             return text
         return _dump(self.clean(value))
@@ -273,7 +204,7 @@ class _Scrubber:
     def _entry(self, name: str, item: Any) -> Iterator[tuple[str, Any]]:
         if name in BLANKED:
             self._gone[name] += 1
-            yield name, {}
+            yield name, clean_leads(item) if name == "SubjectInfo" else {}
         elif name in SERIALS or "serial" in name.lower():
             self._gone["serial"] += 1
         elif not (KEY.fullmatch(name) or name in STREAM_KEYS):
@@ -300,7 +231,8 @@ class _Scrubber:
     def sentences(self) -> list[str]:
         """What was taken out, without showing any of it."""
         said = {
-            "SubjectInfo": "subject's details (SubjectInfo: identifier, dates, sex, diagnosis, targets, notes, program names)",
+            "SubjectInfo": "subject's details (SubjectInfo: identifier, dates, sex, diagnosis, notes, program names): "
+            "side and target of the leads stay",
             "LastPtmRtmInfo": "programmers' details (LastPtmRtmInfo)",
             "device": "device names: a keyed pseudonym stays",
             "serial": "serial numbers, telemetry addresses and the date of the implant",

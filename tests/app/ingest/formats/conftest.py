@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import zipfile
 from collections.abc import Callable, Iterable
@@ -102,6 +103,108 @@ class Rcs:
         return {"RecordInfo": info(ms), "Event": {"EventName": "UserCustom", **fields, "UnixOnsetTime": ms, "UnixOffsetTime": ms}}
 
 
+PERCEPT_RATE = 250
+PERCEPT_TICK = 310_250
+PERCEPT_TIME = "2024-03-14T10:05:52.000Z"
+
+
+class Percept:
+    """Small Percept session reports in the spellings that real ones have."""
+
+    first_tick = PERCEPT_TICK
+
+    def time_domain(
+        self, channel: str, samples: np.ndarray, first_tick: int = PERCEPT_TICK, lost: tuple[int, ...] = (), spelling: str = "comma"
+    ) -> dict[str, Any]:
+        """Packets of 125 samples every 500 ms; the packets numbered in `lost` are not there."""
+        count = samples.size // 125
+        kept = [k for k in range(count) if k not in lost]
+        lists = {
+            "GlobalSequences": [(3 * k + 1) // 2 % 256 for k in kept],
+            "GlobalPacketSizes": [125] * len(kept),
+            "TicksInMses": [first_tick + 500 * k for k in kept],
+        }
+        write = {
+            "comma": lambda values: ",".join(map(str, values)) + ",",
+            "bracket": lambda values: str(values),
+            "list": lambda values: values,
+        }[spelling]
+        return {
+            "Pass": "",
+            **{name: write(values) for name, values in lists.items()},
+            "Channel": channel,
+            "Gain": 227,
+            "FirstPacketDateTime": PERCEPT_TIME,
+            "SampleRateInHz": PERCEPT_RATE,
+            "TimeDomainData": np.concatenate([samples[125 * k : 125 * (k + 1)] for k in kept]).round(6).tolist(),
+        }
+
+    def power(
+        self,
+        channel: str,
+        values: int,
+        first_tick: int = PERCEPT_TICK,
+        when: str = PERCEPT_TIME,
+        left_ma: float = 0.0,
+        right_ma: float = 2.0,
+    ) -> dict[str, Any]:
+        """The device's power at 2 Hz: 100, 101, … on the sensed sides, and constant amplitudes."""
+        sensed = {side: side.upper() in channel for side in ("Left", "Right")}
+        rows = [
+            {
+                "Seq": 2 + k,
+                "TicksInMs": first_tick + 500 * k,
+                "StatusBytes": "00 00 00 00",
+                "Left": {"LFP": (100 + k) * sensed["Left"], "mA": left_ma},
+                "Right": {"LFP": (100 + k) * sensed["Right"], "mA": right_ma},
+            }
+            for k in range(values)
+        ]
+        limits = {"LowerLimitInMilliAmps": 0.5, "UpperLimitInMilliAmps": 3.5, "FrequencyInHertz": 20.51, "RateInHertz": 125}
+        return {
+            "Channel": channel,
+            "FirstPacketDateTime": when,
+            "SampleRateInHz": 2,
+            "TherapySnapshot": {"ActiveGroup": "GroupIdDef.GROUP_B", **{side: limits for side, on in sensed.items() if on}},
+            "LfpData": rows,
+        }
+
+    def sine(self, seconds: float, hz: float = 20.0, amplitude: float = 3.0) -> np.ndarray:
+        return amplitude * np.sin(2 * np.pi * hz * np.arange(int(seconds * PERCEPT_RATE)) / PERCEPT_RATE)
+
+    def report(self, **sections: Any) -> dict[str, Any]:
+        """A whole report with identity in every corner where devices put it."""
+        return {
+            "AbnormalEnd": False,
+            "SessionDate": "2022-12-16T17:28:33Z",
+            "ProgrammerTimezone": "Pacific/Ockham",
+            "ProgrammerUtcOffset": "+01:00",
+            "PatientInformation": {"Final": {"PatientFirstName": "Ada", "PatientLastName": "Lovelace", "PatientId": "MRN4711"}},
+            "DeviceInformation": {
+                "Final": {
+                    "Neurostimulator": "Percept PC",
+                    "NeurostimulatorSerialNumber": "NPX799999H",
+                    "ImplantDate": "2020-02-20T00:00:00Z",
+                    "DeviceName": "Ada's device",
+                    "DeviceDateTime": "2024-03-14T09:51:07Z",
+                },
+                "Initial": {"DeviceDateTime": "2024-03-14T09:51:07Z"},
+            },
+            "LeadConfiguration": {"Final": [{"Hemisphere": "HemisphereLocationDef.Right", "LeadSerialNumber": "LEAD4711"}]},
+            **sections,
+        }
+
+    def one_run(self, channel: str = "ONE_THREE_RIGHT", seconds: float = 20.0, **kwargs: Any) -> dict[str, Any]:
+        """A report of one run of one channel with a sine."""
+        domain = self.time_domain(channel, self.sine(seconds), **kwargs)
+        return self.report(BrainSenseTimeDomain=[domain], BrainSenseLfp=[self.power(channel, int(2 * seconds) - 1)])
+
+
+@pytest.fixture
+def percept() -> Percept:
+    return Percept()
+
+
 @pytest.fixture
 def rcs() -> Rcs:
     return Rcs()
@@ -119,3 +222,19 @@ def pack(tmp_path: Path) -> Callable[..., Path]:
         return path
 
     return make
+
+
+@pytest.fixture
+def same_recording() -> Callable[[Any, Any], None]:
+    """Asserts that two recordings are equal in everything but the device's name."""
+
+    def check(first: Any, second: Any) -> None:
+        for field in dataclasses.fields(first):
+            a, b = getattr(first, field.name), getattr(second, field.name)
+            if field.name in ("traces", "spectra"):
+                assert len(a) == len(b)
+                assert all(x.same_as(y) for x, y in zip(a, b, strict=True)), field.name
+            elif field.name != "device_key":
+                assert a == b, field.name
+
+    return check

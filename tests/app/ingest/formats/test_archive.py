@@ -5,6 +5,7 @@ import struct
 import tracemalloc
 import zipfile
 
+import numpy as np
 import pytest
 
 from app.ingest.formats import ArchiveLimits, DecodeOptions, UndecodableFile, decode
@@ -78,6 +79,30 @@ def test_a_claim_of_more_bytes_than_allowed_is_refused_at_its_word(pack):
     path.write_bytes(raw)
     with pytest.raises(UndecodableFile, match="4000 MB"):
         decode(path)
+
+
+def test_a_claim_of_ten_gigabytes_is_refused_at_its_word(tmp_path):
+    path = tmp_path / "x.zip"
+    info = zipfile.ZipInfo("RawDataTD.json")
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(info, "[]")
+        info.file_size = 10 * 10**9  # written into the directory as ZIP64
+    with pytest.raises(UndecodableFile, match="10000 MB"):
+        decode(path)
+
+
+@pytest.mark.parametrize("claimed", [1, 100, 5_000])
+def test_a_member_that_claims_less_than_it_holds_never_gives_more_than_it_claims(rcs, pack, claimed):
+    path = pack({"d/RawDataTD.json": rcs.time_domain(np.full(50_000, 0.01)), "d/StimLog.json": rcs.stim((0, rcs.program(1.0)))})
+    raw = bytearray(path.read_bytes())
+    for mark, at in ((b"PK\x03\x04", 22), (b"PK\x01\x02", 24)):
+        place = raw.find(mark)
+        raw[place + at : place + at + 4] = struct.pack("<I", claimed)
+    path.write_bytes(raw)
+    decoded = decode(path)
+    assert any(r.name == "StimLog.json" and r.understood for r in decoded.reports)
+    about = next(r for r in decoded.reports if r.name == "RawDataTD.json")
+    assert about.repaired or about.problem or about.flagged
 
 
 def test_one_file_larger_than_the_limit_costs_only_itself(pack):

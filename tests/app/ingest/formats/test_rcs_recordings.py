@@ -11,6 +11,7 @@ import pytest
 from app.ingest.formats import DecodeOptions, FileReport, decode
 from app.ingest.formats.archive import ZipFiles
 from app.ingest.formats.rcs import _interval_at, _records, _stream, decode_rcs, find_sessions
+from app.ingest.formats.rcs_outliers import power_spikes
 from app.ingest.formats.rcs_settings import follow
 from app.ingest.formats.rcs_streams import read_adaptive, read_power, read_time_domain
 from app.ingest.formats.rcs_time import reconstruct
@@ -88,8 +89,58 @@ def test_the_two_second_rows_of_the_sweep_show_the_same_dose_response(sweep):
 def test_the_amplifiers_own_step_after_switching_on_is_left_out(sweep):
     band = next(t for t in sweep.traces if t.channel.startswith("band 1 "))
     assert not band.valid[0]
-    assert band.valid[1:].mean() > 0.99
+    assert band.valid[1:16].all()
     assert np.nanmax(band.values[:16]) < 5000
+
+
+def test_spikes_at_amplitude_steps_are_marked_and_reach_no_row(recordings, sweep):
+    bands = [t for t in sweep.traces if t.stream == "band_power"]
+    power, _ = stream(recordings / "rcs/stim_sweep.zip", "RawDataPower", read_bands)
+    for band in bands:
+        raw = power.bands[:, band.details["band"] - 1]
+        assert np.nanmax(raw) > 100 * np.nanmax(band.values)
+        assert np.nanmax(band.values) < 20 * np.nanmedian(band.values)
+        assert band.details["spike_packets"] == sweep.quality["spike_packets"][band.channel] == 281
+        assert set(np.flatnonzero(~band.valid)) - {0} <= set(band.details["spike_rows"])
+    steps = [e.t_s for e in sweep.events if e.kind == "stimulation" and e.t_s > 30]
+    rows = np.array(bands[0].details["spike_rows"])
+    near = [any(abs(2.0 * row + 1.0 - t) < 4.0 for t in steps) for row in rows]
+    assert np.mean(near) > 0.9
+    said = next(r for r in decode(recordings / "rcs/stim_sweep.zip").reports if r.name == "RawDataPower.json")
+    assert any("281 packets with power spikes in 24 rows became gaps" in text for text in said.flagged)
+
+
+def test_the_medians_per_amplitude_hold_without_the_spikes_too(recordings, sweep):
+    power, settings = stream(recordings / "rcs/stim_sweep.zip", "RawDataPower", read_bands)
+    times = reconstruct(power.headers)
+    amplitude = np.array([settings.therapy.at(t).programs[0].amplitude_ma for t in times.last_ms])
+    kept = ~power_spikes(power.bands[:, 0], 0.1, 2.048)
+    medians = {a: float(np.median(power.bands[(amplitude == a) & kept, 0])) for a in MEDIAN_BAND_1}
+    for a, median in medians.items():
+        assert median == pytest.approx(MEDIAN_BAND_1[a], rel=0.1)
+
+
+def test_the_bench_recording_of_six_ramps_has_no_spike(adaptive):
+    band = next(t for t in adaptive.traces if t.stream == "band_power")
+    assert band.details["spike_packets"] == 0
+    assert adaptive.quality["spike_packets"] == {}
+
+
+def test_the_hemisphere_is_that_of_the_leads(sweep, adaptive, recordings):
+    assert (sweep.hemisphere, adaptive.hemisphere) == ("right", "right")
+    montage = one(decode(recordings / "rcs/montage_packet_loss.zip"))
+    assert (montage.hemisphere, montage.settings["leads"]) == ("left", ["left STN", "", "left M1", ""])
+
+
+def test_movement_clocks_and_errors_are_told(sweep, adaptive):
+    movement = next(t for t in sweep.traces if t.stream == "acceleration")
+    assert (movement.unit, movement.values.shape) == ("centiG", (222,))
+    assert movement.valid.mean() > 0.99
+    assert 0.5 < np.nanmedian(movement.values) < 5
+    assert sweep.quality["accel"]["packets"] == 3617
+    assert (sweep.quality["time_sync"]["packets"], sweep.quality["time_sync"]["latency_median_ms"]) == (446, 36.183)
+    assert abs(sweep.quality["time_sync"]["clock_drift_ppm"]) < 200
+    assert (sweep.quality["errors"], adaptive.quality["errors"]) == (3, 2)
 
 
 def test_four_of_the_twenty_two_notes_disagree_with_the_device(sweep):
@@ -186,6 +237,20 @@ def test_the_montage_keeps_contact_pairs_apart_and_shows_gaps(recordings):
     assert not (beta["key 0 +2-0"].valid & beta["key 0 +1-0"].valid).any()
     amplitude = next(t for t in recording.traces if t.stream == "amplitude")
     assert np.all(amplitude.values[amplitude.valid] == 0)
+
+
+def test_the_spectra_of_the_montage_peak_in_beta_8_to_11_db_above_the_background(recordings):
+    spectra = {s.channel: s for s in one(decode(recordings / "rcs/montage_packet_loss.zip")).spectra}
+    assert len(spectra) == 13
+    for channel in ("key 0 +2-0", "key 0 +3-0"):
+        hz, db = spectra[channel].hz, 10 * np.log10(spectra[channel].density)
+        assert (hz[1] - hz[0], hz[-1], spectra[channel].unit) == (1.0, 100.0, "uV2/Hz")
+        background = ((hz >= 5) & (hz <= 12)) | ((hz >= 40) & (hz <= 90))
+        line = np.polyval(np.polyfit(np.log10(hz[background]), db[background], 1), np.log10(np.maximum(hz, 1)))
+        beta = np.flatnonzero((hz >= 13) & (hz <= 35))
+        peak = beta[np.argmax((db - line)[beta])]
+        assert 24 <= hz[peak] <= 29
+        assert 8 < (db - line)[peak] < 11.5
 
 
 def test_a_recording_without_data_is_a_recording_and_says_so(recordings):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.ingest.formats.rcs_time import PacketHeaders, reconstruct
+from app.ingest.formats.rcs_time import PacketHeaders, device_clock_drift, reconstruct
 
 RATE = 500.0
 PER_PACKET = 50
@@ -147,6 +147,45 @@ def test_a_change_of_rate_starts_a_chunk():
     samples[100:] = 100
     times = reconstruct(dataclasses.replace(headers, rate_hz=rate, samples=samples))
     assert times.chunks == 2
+
+
+def in_order(headers, order):
+    return headers.take(np.asarray(order))
+
+
+def test_packets_that_arrived_out_of_order_are_placed_where_they_were_measured():
+    headers, true = packets(count=400, lost=(300,))
+    order = np.arange(399)
+    order[[100, 101]], order[[200, 201, 202]], order[[65, 66]] = [101, 100], [202, 201, 200], [66, 65]
+    times = reconstruct(in_order(headers, order))
+    assert (times.chunks, times.missing, times.reordered) == (2, 1, 4)
+    np.testing.assert_allclose(times.last_ms, true[order], atol=1e-3)
+
+
+def test_a_packet_that_comes_again_later_counts_once():
+    headers, _ = packets()
+    order = np.insert(np.arange(200), 104, 100)
+    times = reconstruct(in_order(headers, order))
+    assert times.rejected == {"the same packet twice": 1}
+    assert np.flatnonzero(np.isnan(times.last_ms)).tolist() == [104]
+    assert (times.chunks, times.missing) == (1, 0)
+
+
+def test_a_counter_that_starts_anew_is_no_loss():
+    headers, true = packets()
+    sequence = headers.sequence.copy()
+    sequence[90:] = np.arange(110)
+    times = reconstruct(dataclasses.replace(headers, sequence=sequence))
+    assert (times.chunks, times.missing) == (2, 0)
+    np.testing.assert_allclose(times.last_ms, true, atol=1e-3)
+
+
+def test_drift_is_told_in_parts_and_only_over_a_stream_long_enough():
+    headers, true = packets(count=3000, noise_ms=20.0)
+    slow = with_gen(headers, headers.gen_ms + 1e-4 * (true - true[0]))
+    assert device_clock_drift(slow) == pytest.approx(-1e-4, abs=2e-5)
+    assert device_clock_drift(in_order(headers, np.arange(200))) is None
+    assert device_clock_drift(with_gen(headers, np.full(3000, -1.0))) is None
 
 
 def test_no_packets_give_no_times():

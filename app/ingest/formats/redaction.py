@@ -1,0 +1,37 @@
+"""What every redactor shares: its account of what it did, and the keyed pseudonym of a device."""
+
+from __future__ import annotations
+
+import hmac
+import re
+from dataclasses import dataclass, field
+from hashlib import sha256
+
+REDACTOR_VERSION = 3
+PSEUDONYM = re.compile(r"device-[0-9a-f]{16}")
+
+
+@dataclass(slots=True)
+class Redaction:
+    """What was done, in sentences for the upload's report.
+
+    Attributes:
+        removed: identity that was taken out.
+        repaired: defects met; the redacted file is whole and no longer shows them.
+        ignored: files and rows not carried over.
+        unreadable: files of the session that could not be read at all, so could not be redacted.
+    """
+
+    removed: list[str] = field(default_factory=list)
+    repaired: list[str] = field(default_factory=list)
+    ignored: list[str] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
+
+
+def pseudonym(serial: str, key: bytes) -> str:
+    """Keyed pseudonym of a device; a pseudonym stays as it is. Raises ValueError for a key under 16 bytes."""
+    if len(key) < 16:
+        raise ValueError("the pseudonym key must have at least 16 bytes")
+    if PSEUDONYM.fullmatch(serial):
+        return serial
+    return "device-" + hmac.new(key, serial.strip().upper().encode(errors="replace"), sha256).hexdigest()[:16]
