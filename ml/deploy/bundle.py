@@ -1,10 +1,13 @@
-"""The controller bundle: one ZIP that carries a policy from the study to the tablet, and proves that it arrived whole.
+"""The controller bundle: one ZIP that carries a policy from the study to the tablet or an implant, and proves that it arrived whole.
 
-    model.onnx         the network: beta_window [N, W] to amplitude_fraction [N, 1]
-    test_vectors.json  beta windows and the fractions that every runtime must give for them
-    README.txt         the one-page sheet
-    manifest.json      whose, for which signal, within which limits; SHA-256 of each file above
-    manifest.sig       Ed25519 signature of manifest.json, where the bundle is signed
+    sheet.html                    the one-page sheet for the clinician, to be printed
+    manifest.json, manifest.sig   whose, for which signal, within which limits; SHA-256 of every file; its Ed25519 signature
+    model.onnx                    the network: beta_window [N, W] to amplitude_fraction [N, 1]
+    test_vectors.json             what every runtime must answer, and one session with everything that can go wrong with beta
+  and for the networks that betaloop trains:
+    weights.f32, controller/      the reference runner: `python -m controller`, Python and numpy alone
+    betaloop_controller.h         the whole controller in C99, float32; selftest.c checks it
+    betaloop_controller_int8.h    the same in whole numbers, for small networks; selftest_int8.c checks it
 
 The bytes of a bundle depend on its contents alone: no times, fixed order, no compression (its output differs between zlib versions).
 """
@@ -14,9 +17,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import textwrap
 import zipfile
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,22 +27,54 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from numpy.typing import NDArray
 
+from ml.deploy import vectors
+from ml.deploy.c_header import fixed_point_header, float_header, self_test
+from ml.deploy.fixed_point import CutNetwork, quantise
 from ml.deploy.manifest import BundleError, BundleManifest
+from ml.deploy.runtime.__main__ import check
+from ml.deploy.runtime.envelope import Signal
+from ml.deploy.runtime.loop import Controller, WindowNetwork
+from ml.deploy.runtime.network import MlpNetwork
+from ml.deploy.sheet import render
+from ml.deploy.windows import PolicyWindow, mlp_of
 from ml.rl.onnx_policy import MAX_FILE_BYTES, OnnxPolicy, PolicyFileError, PolicyOutputError
 
-MODEL, VECTORS, SHEET, MANIFEST, SIGNATURE = "model.onnx", "test_vectors.json", "README.txt", "manifest.json", "manifest.sig"
-VECTOR_TOLERANCE = 1e-5
-"""Largest difference between two runtimes on a test vector, amplitude fraction."""
+SHEET, MANIFEST, SIGNATURE, MODEL, VECTORS = "sheet.html", "manifest.json", "manifest.sig", "model.onnx", "test_vectors.json"
+WEIGHTS, HEADER, SELF_TEST = "weights.f32", "betaloop_controller.h", "selftest.c"
+HEADER_INT8, SELF_TEST_INT8 = "betaloop_controller_int8.h", "selftest_int8.c"
+_RUNTIME = Path(__file__).parent / "runtime"
+RUNNER = tuple(f"controller/{path.name}" for path in sorted(_RUNTIME.glob("*.py")))
+_REQUIRED = {SHEET, MODEL, VECTORS}
+_OF_NETWORKS = {WEIGHTS, HEADER, SELF_TEST, *RUNNER}
+_OF_SMALL_NETWORKS = {HEADER_INT8, SELF_TEST_INT8}
+_ORDER = (SHEET, MANIFEST, SIGNATURE, MODEL, VECTORS, WEIGHTS, HEADER, SELF_TEST, HEADER_INT8, SELF_TEST_INT8, *RUNNER)
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a ZIP can hold
 
 
+@dataclass(frozen=True)
+class OpenBundle:
+    """A bundle that has been verified.
+
+    Attributes:
+        manifest: what it says about itself.
+        network: keeps its own window; in numpy, or by onnxruntime for a policy made elsewhere.
+    """
+
+    manifest: BundleManifest
+    network: WindowNetwork
+
+    def controller(self) -> Controller:
+        """The network within the clinician's limits; one per session."""
+        return Controller(self.network, self.manifest.limits(), Signal(self.manifest.beta_unit, self.manifest.beta_source))
+
+
 def build_bundle(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDArray[Any]) -> bytes:
-    """Pack a policy for the tablet.
+    """Pack a policy.
 
     Args:
         policy_onnx: the network.
-        manifest: everything but `files`, which is filled in here.
-        test_windows: beta windows for the test vectors, shape [M, W], M at least 1, finite.
+        manifest: everything but the layers, the facts of the fixed-point header and `files`, which are filled in here.
+        test_windows: beta windows for the test vectors, shape [M, W], M at least 1, finite; windows at the edges are added.
 
     Returns:
         The ZIP's bytes, the same for the same arguments.
@@ -52,24 +87,44 @@ def build_bundle(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDA
     if windows.ndim != 2 or windows.shape[1] != manifest.window or len(windows) == 0 or not np.isfinite(windows).all():
         raise BundleError(f"test windows must be finite and of shape [M, {manifest.window}], M at least 1, not {list(windows.shape)}")
     policy = OnnxPolicy(policy_onnx, manifest.window, probe=windows)
-    vectors = {"tolerance": VECTOR_TOLERANCE, "windows": windows.tolist(), "expected": policy.act(windows).tolist()}
-    files = {
-        MODEL: policy_onnx,
-        VECTORS: (json.dumps(vectors, allow_nan=False) + "\n").encode(),
-        SHEET: _sheet(manifest, policy_onnx).encode(),
-    }
+    windows = vectors.edge_windows(windows)
+    network = mlp_of(policy_onnx)
+    expected = policy.act(windows)
+    steps = vectors.session(manifest, network or PolicyWindow(policy, manifest.window), windows)
+    files = {MODEL: policy_onnx, VECTORS: vectors.to_json(windows, expected, steps)}
+    if network is not None:
+        mean, std = network.mean, network.std
+        layers = (network.window, *(len(bias) for _, bias in network.layers))
+        manifest = replace(manifest, layers=layers, normalisation_mean=mean, normalisation_std=std)
+        files |= {f"controller/{path.name}": path.read_bytes() for path in _RUNTIME.glob("*.py")}
+        test = self_test(manifest, HEADER, windows, expected, steps, vectors.TOLERANCE, exact=True)
+        files |= {WEIGHTS: network.to_bytes(), HEADER: float_header(manifest, network).encode(), SELF_TEST: test.encode()}
+        fixed = quantise(network)
+        if fixed is not None:
+            manifest = replace(manifest, int8_bound=fixed.bound, int8_planes=fixed.planes, int8_bytes=fixed.size_bytes)
+            expected_cut = policy.act(fixed.cut(windows))  # the bound is against the real network on the window cut to the int16 inputs
+            steps = vectors.session(manifest, CutNetwork(network, fixed), windows)
+            test = self_test(manifest, HEADER_INT8, windows, expected_cut, steps, fixed.bound, exact=False)
+            files |= {HEADER_INT8: fixed_point_header(manifest, fixed).encode(), SELF_TEST_INT8: test.encode()}
+    files[SHEET] = render(manifest, hashlib.sha256(policy_onnx).hexdigest()).encode()
     full = replace(manifest, files={name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
     return _pack(files | {MANIFEST: full.to_bytes()})
 
 
 def verify_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) -> BundleManifest:
-    """Check a bundle as the tablet must before it stimulates.
-
-    Every file is named in the manifest and has its SHA-256, nothing else is inside, the network gives the test vectors' fractions again
-    within 1e-5 and, with a public key, the manifest is signed by it.
+    """Check a bundle as the tablet must before it stimulates; see `open_bundle`.
 
     Returns:
         The manifest.
+    """
+    return open_bundle(content, public_key).manifest
+
+
+def open_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) -> OpenBundle:
+    """Check a bundle and load its network.
+
+    Every file is named in the manifest and has its SHA-256, nothing else is inside, ONNX file and reference runner give the test vectors'
+    fractions and decisions again within 1e-5 and, with a public key, the manifest is signed by it.
 
     Raises:
         BundleError: whatever is not as it should be; the message names it.
@@ -82,29 +137,43 @@ def verify_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) ->
     if public_key is not None:
         _check_signature(raw, signature, public_key)
     manifest = BundleManifest.from_bytes(raw)
-    if set(manifest.files) != {MODEL, VECTORS, SHEET}:
-        raise BundleError(
-            f"the manifest must name {MODEL}, {VECTORS} and {SHEET}; it names {', '.join(sorted(manifest.files)) or 'nothing'}"
-        )
-    for name in sorted(set(files) ^ set(manifest.files)):
-        raise BundleError(
-            f"the bundle lacks {name}" if name in manifest.files else f"the bundle holds {name}, which the manifest does not name"
-        )
+    _check_names(manifest, set(files))
     for name, digest in manifest.files.items():
         found = hashlib.sha256(files[name]).hexdigest()
         if found != digest:
             raise BundleError(f"{name} is not the file that the manifest names: SHA-256 {found[:12]}... instead of {digest[:12]}...")
-    _check_vectors(files[MODEL], files[VECTORS], manifest.window)
-    return manifest
+    policy = _check_vectors(files[MODEL], files[VECTORS], manifest.window)
+    if WEIGHTS not in files:
+        return OpenBundle(manifest, PolicyWindow(policy, manifest.window))
+    mean, std = manifest.normalisation_mean, manifest.normalisation_std
+    if mean is None or std is None:
+        raise BundleError(f"the manifest must state the normalisation of {WEIGHTS}")
+    try:
+        check(json.loads(raw), MlpNetwork.from_bytes(files[WEIGHTS], manifest.layers, mean, std), json.loads(files[VECTORS]))
+        return OpenBundle(manifest, MlpNetwork.from_bytes(files[WEIGHTS], manifest.layers, mean, std))
+    except (ValueError, KeyError, TypeError) as error:
+        raise BundleError(f"{WEIGHTS} does not agree with {VECTORS}: {error}") from error
+
+
+def _check_names(manifest: BundleManifest, present: set[str]) -> None:
+    """The files named, and those inside, are one of the three sets that a bundle can be."""
+    named = set(manifest.files)
+    wanted = _REQUIRED | (_OF_NETWORKS if manifest.layers else set()) | (_OF_SMALL_NETWORKS if manifest.int8_bound is not None else set())
+    if named != wanted:
+        raise BundleError(f"the manifest must name {', '.join(sorted(wanted))}; it names {', '.join(sorted(named)) or 'nothing'}")
+    for name in sorted(present ^ named):
+        raise BundleError(f"the bundle lacks {name}" if name in named else f"the bundle holds {name}, which the manifest does not name")
 
 
 def sign(content: bytes, private_key: Ed25519PrivateKey) -> bytes:
     """The bundle with a signature of its manifest, which by its hashes covers every file; an older signature is replaced.
 
     Raises:
-        BundleError: the bundle is not intact.
+        BundleError: the bundle is not intact, or names another key.
     """
-    verify_bundle(content)
+    named = verify_bundle(content).public_key
+    if named is not None and named != private_key.public_key().public_bytes_raw().hex():
+        raise BundleError("the manifest names another key than the one to sign with")
     files = _unpack(content)
     return _pack(files | {SIGNATURE: private_key.sign(files[MANIFEST])})
 
@@ -126,29 +195,31 @@ def _check_signature(manifest: bytes, signature: bytes | None, public_key: Ed255
         raise BundleError("the signature of the manifest does not belong to this public key, or the manifest was changed") from error
 
 
-def _check_vectors(model: bytes, raw: bytes, window: int) -> None:
+def _check_vectors(model: bytes, raw: bytes, window: int) -> OnnxPolicy:
     try:
-        vectors = json.loads(raw)
-        windows = np.array(vectors["windows"], dtype=np.float64)
-        expected = np.array(vectors["expected"], dtype=np.float64)
+        stated = json.loads(raw)
+        windows = np.array(stated["windows"], dtype=np.float64)
+        expected = np.array(stated["expected"], dtype=np.float64)
     except (ValueError, KeyError, TypeError) as error:
         raise BundleError(f"{VECTORS} cannot be read: {error}") from error
     if expected.ndim != 1 or expected.size == 0 or windows.shape != (expected.size, window):
         raise BundleError(f"{VECTORS} holds windows {list(windows.shape)} and answers {list(expected.shape)}; the window is {window}")
     try:
-        answers = OnnxPolicy(model, window).act(windows)
+        policy = OnnxPolicy(model, window)
+        answers = policy.act(windows)
     except (PolicyFileError, PolicyOutputError) as error:
         raise BundleError(f"{MODEL} cannot be run: {error}") from error
     difference = np.abs(answers - expected)
-    if not np.all(difference <= VECTOR_TOLERANCE):  # False for NaN as well
+    if not np.all(difference <= vectors.TOLERANCE):  # False for NaN as well
         row = int(np.argmax(np.nan_to_num(difference, nan=np.inf)))
         raise BundleError(f"the network answers {answers[row]:.6f} to test vector {row}; the bundle says {expected[row]:.6f}")
+    return policy
 
 
 def _pack(files: dict[str, bytes]) -> bytes:
     sink = io.BytesIO()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive:
-        for name in (MANIFEST, SIGNATURE, SHEET, MODEL, VECTORS):
+        for name in _ORDER:
             if name in files:
                 entry = zipfile.ZipInfo(name, _EPOCH)
                 entry.create_system = 3  # the same on every operating system
@@ -165,52 +236,10 @@ def _unpack(content: bytes) -> dict[str, bytes]:
             if len(set(names)) != len(names):
                 raise BundleError("the bundle holds two files of one name")
             too_large = [entry.filename for entry in entries if entry.file_size > MAX_FILE_BYTES]
-            if too_large or len(entries) > 16:
+            if too_large or len(entries) > 32:
                 raise BundleError(f"this is no controller bundle: {len(entries)} files, too large: {', '.join(too_large) or 'none'}")
             return {entry.filename: archive.read(entry) for entry in entries}
     except (zipfile.BadZipFile, EOFError, RuntimeError, OSError, ValueError) as error:
         if isinstance(error, BundleError):
             raise
         raise BundleError(f"this is no intact ZIP file: {error}") from error
-
-
-def _sheet(manifest: BundleManifest, model: bytes) -> str:
-    """The one-page sheet, 82 characters wide."""
-    limits = manifest.limits()
-    age = limits.period_s if limits.max_beta_age_s is None else limits.max_beta_age_s
-    back = "at once" if limits.fallback_ramp_ma_per_s is None else f"at {limits.fallback_ramp_ma_per_s:g} mA/s"
-    scale = "inside the network"
-    if manifest.normalisation_mean is not None:
-        scale += f" (mean {manifest.normalisation_mean:.6g}, sd {manifest.normalisation_std:.6g})"
-    approvals = [f"  {a.name} ({a.role}), {a.approved_at}: {a.statement}" for a in manifest.approvals] or [
-        "  none: not to be used on a participant"
-    ]
-    lines = [
-        "CONTROLLER BUNDLE",
-        "=================",
-        f"Participant       {manifest.participant}",
-        f"Policy            {manifest.policy_name} (no. {manifest.policy_id})",
-        f"Model SHA-256     {hashlib.sha256(model).hexdigest()}",
-        f"Snapshot SHA-256  {manifest.snapshot_sha256 or 'none: trained outside this study'}",
-        f"Made by           betaloop {manifest.code_version}",
-        "",
-        "SIGNAL",
-        f"Every {manifest.period_s:g} s the newest {manifest.window} beta amplitudes, oldest first,",
-        f"in {manifest.beta_unit}, from {manifest.beta_source}. Scaling: {scale}.",
-        "",
-        "STIMULATION",
-        f"Fraction 1 is the cDBS amplitude, {manifest.cdbs_ma:g} mA.",
-        f"Limits            {manifest.min_ma:g} to {manifest.max_ma:g} mA",
-        f"Ramp              {manifest.ramp_ma_per_s:g} mA/s, {manifest.ramp_ma_per_s * manifest.period_s:g} mA per period",
-        f"If beta is missing, not a number, older than {age:g} s or not yet a whole",
-        f"window, or the network fails: cDBS amplitude, {back}, in that very period.",
-        "",
-        "BEFORE USE",
-        "Check the bundle (`betaloop` verifies every SHA-256, the signature where",
-        "there is one, and the test vectors). Use it for this participant only.",
-        "",
-        "APPROVALS",
-        *approvals,
-        "",
-    ]
-    return "\n".join(wrapped for line in lines for wrapped in textwrap.wrap(line, 82, subsequent_indent="    ") or [""])

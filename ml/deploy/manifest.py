@@ -6,11 +6,12 @@ import json
 import math
 import re
 from dataclasses import MISSING, asdict, dataclass, field, fields
+from itertools import pairwise
 from typing import Any
 
-from ml.deploy.envelope import EnvelopeLimits
+from ml.deploy.runtime.envelope import EnvelopeLimits
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -42,14 +43,24 @@ class BundleManifest:
     Attributes:
         participant: the participant's code.
         policy_id, policy_name: as the study knows the policy.
+        hemisphere: `left` or `right`; None where the study states one amplitude for all.
         window: W, beta amplitudes per decision, oldest first.
         period_s: m, seconds per decision.
         beta_unit, beta_source: of the beta amplitudes that the network takes.
+        beta_low_hz, beta_high_hz, min_valid_fraction: how they are made from local field potentials.
         normalisation_mean, normalisation_std: z-scoring constants inside the network; None where the file does not show them.
         min_ma, max_ma, cdbs_ma, ramp_ma_per_s: the clinician's limits, as in `EnvelopeLimits`.
-        max_beta_age_s, fallback_ramp_ma_per_s: as in `EnvelopeLimits`.
+        max_beta_age_s: as in `EnvelopeLimits`.
+        limits_stated_by: who stated the limits, or how they came about.
+        device_min_ma, device_max_ma: amplitude limits read from the participant's stimulator; None where no recording held them.
         snapshot_sha256: of the buffer snapshot that the policy was trained on; None for a policy made elsewhere.
+        policy_code_version: of the betaloop that trained the policy.
         code_version: of the betaloop that made the bundle.
+        teacher_name: of the policy that this one was distilled from; None where it was not.
+        agreement_mean, agreement_p99, agreement_worst: absolute difference of the fraction from the teacher's over the buffer's states.
+        layers: units from the window to the output; empty where the network is no multi-layer perceptron of betaloop.
+        int8_bound, int8_planes, int8_bytes: of the fixed-point header; None where there is none.
+        public_key: Ed25519 key that the bundle is signed with, 64 hexadecimal digits; it names the signer and proves nothing by itself.
         approvals: sign-offs, in order.
         files: SHA-256 by file name of everything else in the bundle; filled in when the bundle is built.
         schema_version: of this manifest.
@@ -69,12 +80,28 @@ class BundleManifest:
     cdbs_ma: float
     ramp_ma_per_s: float
     code_version: str
+    policy_code_version: str = "unknown"
     period_s: float = 2.0
+    hemisphere: str | None = None
+    beta_low_hz: float = 13.0
+    beta_high_hz: float = 35.0
+    min_valid_fraction: float = 0.7
     normalisation_mean: float | None = None
     normalisation_std: float | None = None
     max_beta_age_s: float | None = None
-    fallback_ramp_ma_per_s: float | None = None
+    limits_stated_by: str = "nobody: defaults"
+    device_min_ma: float | None = None
+    device_max_ma: float | None = None
     snapshot_sha256: str | None = None
+    teacher_name: str | None = None
+    agreement_mean: float | None = None
+    agreement_p99: float | None = None
+    agreement_worst: float | None = None
+    layers: tuple[int, ...] = ()
+    int8_bound: float | None = None
+    int8_planes: int | None = None
+    int8_bytes: int | None = None
+    public_key: str | None = None
     approvals: tuple[Approval, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
     schema_version: int = SCHEMA_VERSION
@@ -82,16 +109,40 @@ class BundleManifest:
     def __post_init__(self) -> None:
         if self.schema_version != SCHEMA_VERSION:
             raise BundleError(f"this bundle has manifest version {self.schema_version}; this betaloop reads {SCHEMA_VERSION}")
-        for name in ("participant", "policy_name", "beta_unit", "beta_source", "code_version"):
+        for name in ("participant", "policy_name", "beta_unit", "beta_source", "code_version", "policy_code_version"):
             if not getattr(self, name).strip():
                 raise BundleError(f"the manifest needs a {name}")
-        for name, digest in [("snapshot_sha256", self.snapshot_sha256), *self.files.items()]:
+        for name, digest in [("snapshot_sha256", self.snapshot_sha256), ("public_key", self.public_key), *self.files.items()]:
             if digest is not None and not _SHA256.fullmatch(digest):
                 raise BundleError(f"the SHA-256 of {name} must be 64 hexadecimal digits, not '{digest}'")
         scale = (self.normalisation_mean, self.normalisation_std)
         if any(v is not None for v in scale) and not all(v is not None and math.isfinite(v) for v in scale):
             raise BundleError(f"normalisation needs a finite mean and standard deviation, or neither, not {scale}")
+        if self.hemisphere not in (None, "left", "right"):
+            raise BundleError(f"hemisphere must be left or right, not '{self.hemisphere}'")
+        if not 0 < self.beta_low_hz < self.beta_high_hz or not 0 < self.min_valid_fraction <= 1:
+            raise BundleError(f"the beta band {self.beta_low_hz} to {self.beta_high_hz} Hz or its valid share cannot be used")
+        if self.layers and (min(self.layers) < 1 or self.layers[0] != self.window or self.layers[-1] != 1):
+            raise BundleError(f"layers {list(self.layers)} do not lead from the window to one output")
         self.limits()
+        self._check_device_limits()
+
+    def _check_device_limits(self) -> None:
+        """The clinician's limits lie within what the stimulator was set to allow."""
+        if self.device_max_ma is not None and self.max_ma > self.device_max_ma + 1e-6:
+            raise BundleError(f"the highest amplitude, {self.max_ma:g} mA, is above the stimulator's own limit, {self.device_max_ma:g} mA")
+        if self.device_min_ma is not None and self.min_ma < self.device_min_ma - 1e-6:
+            raise BundleError(f"the lowest amplitude, {self.min_ma:g} mA, is below the stimulator's own limit, {self.device_min_ma:g} mA")
+
+    @property
+    def macs(self) -> int:
+        """Multiply-accumulate operations of one decision; 0 where the layers are not known."""
+        return sum(i * o for i, o in pairwise(self.layers))
+
+    @property
+    def parameters(self) -> int:
+        """Weights and biases; 0 where the layers are not known."""
+        return sum(i * o + o for i, o in pairwise(self.layers))
 
     def limits(self) -> EnvelopeLimits:
         """The limits for the safety envelope. Raises BundleError where they contradict each other."""
@@ -120,7 +171,10 @@ class BundleManifest:
             raise BundleError("approvals in manifest.json must be a list of objects")
         for item in approvals:
             _check_keys("an approval in manifest.json", Approval, item)
-        return BundleManifest(**values, approvals=tuple(Approval(**item) for item in approvals))
+        layers = values.pop("layers", [])
+        if not isinstance(layers, list) or not all(isinstance(units, int) and not isinstance(units, bool) for units in layers):
+            raise BundleError("layers in manifest.json must be a list of whole numbers")
+        return BundleManifest(**values, layers=tuple(layers), approvals=tuple(Approval(**item) for item in approvals))
 
 
 _TEXT, _WHOLE, _NUMBER = (str,), (int,), (int, float)
@@ -130,6 +184,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "float": _NUMBER,
     "float | None": (*_NUMBER, type(None)),
     "str | None": (*_TEXT, type(None)),
+    "int | None": (*_WHOLE, type(None)),
     "dict[str, str]": (dict,),
 }
 

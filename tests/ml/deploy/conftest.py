@@ -32,6 +32,14 @@ def manifest() -> BundleManifest:
         max_ma=3.2,
         cdbs_ma=3.0,
         ramp_ma_per_s=0.25,
+        hemisphere="left",
+        limits_stated_by="ada@clinic.example, 2026-03-01 08:55 UTC",
+        device_min_ma=0.0,
+        device_max_ma=3.4,
+        teacher_name="rl-03",
+        agreement_mean=0.0012,
+        agreement_p99=0.0081,
+        agreement_worst=0.0121,
         snapshot_sha256="ab" * 32,
         code_version="0.1.0",
         approvals=(Approval(name="A. Clinician", role="clinician", approved_at="2026-03-01T09:00:00+00:00", statement="limits checked"),),
@@ -40,4 +48,4 @@ def manifest() -> BundleManifest:
 
 @pytest.fixture(scope="session")
 def test_windows() -> np.ndarray:
-    return np.random.default_rng(0).normal(120.0, 40.0, (16, 10))
+    return np.abs(np.random.default_rng(0).normal(120.0, 40.0, (16, 10)))

@@ -4,6 +4,9 @@ import dataclasses
 import hashlib
 import io
 import json
+import re
+import shutil
+import subprocess
 import zipfile
 
 import numpy as np
@@ -11,10 +14,11 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pypdf import PdfReader
 
-from ml.deploy.bundle import build_bundle, model_of, sign, verify_bundle
-from ml.deploy.envelope import EnvelopeLimits
+from ml.deploy.bundle import RUNNER, build_bundle, model_of, open_bundle, sign, verify_bundle
 from ml.deploy.manifest import BundleError, BundleManifest
+from ml.deploy.runtime.envelope import BetaSample, EnvelopeLimits, Signal
 from ml.rl.networks import MlpPolicy
 from ml.rl.onnx_policy import PolicyFileError
 
@@ -47,16 +51,55 @@ def with_file(bundle, name, content, *, restate=False):
     return pack(files)
 
 
-def test_a_bundle_holds_the_network_its_vectors_the_sheet_and_every_hash(bundle, network, manifest, test_windows):
+NETWORK_FILES = {"sheet.html", "model.onnx", "test_vectors.json", "weights.f32", "betaloop_controller.h", "selftest.c", *RUNNER}
+SMALL_FILES = {"betaloop_controller_int8.h", "selftest_int8.c"}
+
+
+def test_a_bundle_holds_the_network_in_every_form_its_vectors_the_sheet_and_every_hash(bundle, network, manifest, test_windows):
     files = unpack(bundle)
-    assert set(files) == {"model.onnx", "test_vectors.json", "README.txt", "manifest.json"}
+    assert set(files) == NETWORK_FILES | SMALL_FILES | {"manifest.json"}
     assert files["model.onnx"] == network.to_onnx() == model_of(bundle)
     stated = verify_bundle(bundle)
-    assert dataclasses.replace(stated, files={}) == manifest
     assert stated.files == {name: hashlib.sha256(content).hexdigest() for name, content in files.items() if name != "manifest.json"}
+    assert (stated.layers, stated.parameters, stated.macs) == ((10, 20, 10, 1), network.parameter_count, network.macs)
+    filled = {"files": {}, "layers": (), "int8_bound": None, "int8_planes": None, "int8_bytes": None}
+    assert dataclasses.replace(stated, **filled) == manifest
     vectors = json.loads(files["test_vectors.json"])
-    np.testing.assert_array_equal(vectors["windows"], test_windows)
-    np.testing.assert_allclose(vectors["expected"], network.act(test_windows), atol=1e-5)
+    np.testing.assert_array_equal(vectors["windows"][: len(test_windows)], test_windows)
+    np.testing.assert_allclose(vectors["expected"], network.act(np.array(vectors["windows"])), atol=1e-5)
+
+
+def test_the_test_vectors_reach_saturation_and_every_way_in_which_beta_goes_wrong(bundle):
+    vectors = json.loads(unpack(bundle)["test_vectors.json"])
+    assert min(vectors["expected"]) < 1e-3 or max(vectors["expected"]) > 1 - 1e-3
+    met = {reason for step in vectors["session"] for reason in step["reasons"]}
+    assert met >= {
+        "no_beta",
+        "stale_beta",
+        "invalid_beta",
+        "wrong_signal",
+        "window_incomplete",
+        "window_gap",
+        "late_sample",
+        "minimum",
+        "ramp",
+    }
+    assert any(step["t_s"] is None for step in vectors["session"])
+    assert any(step["t_s"] is not None and step["beta"] is None for step in vectors["session"])
+
+
+def test_a_policy_made_elsewhere_leaves_as_onnx_alone_and_runs_within_the_same_envelope(manifest, test_windows):
+    from app.learning.baselines import constant_onnx
+
+    made = build_bundle(
+        constant_onnx(0.5, 10), dataclasses.replace(manifest, normalisation_mean=None, normalisation_std=None), test_windows
+    )
+    assert set(unpack(made)) == {"sheet.html", "model.onnx", "test_vectors.json", "manifest.json"}
+    opened = open_bundle(made)
+    controller, signal = opened.controller(), Signal("uV", "time_domain")
+    amplitudes = [controller.decide(2.0 * k, BetaSample(2.0 * k, 120.0, signal)).amplitude_ma for k in range(20)]
+    assert amplitudes[8] == 3.0
+    assert amplitudes[9:13] == pytest.approx([2.5, 2.0, 1.5, 1.5])
 
 
 def test_the_same_arguments_give_the_same_bytes(bundle, network, manifest, test_windows):
@@ -64,37 +107,56 @@ def test_the_same_arguments_give_the_same_bytes(bundle, network, manifest, test_
     assert build_bundle(network.to_onnx(), dataclasses.replace(manifest, policy_id=42), test_windows) != bundle
 
 
-def test_the_sheet_fits_one_page_and_says_what_matters(bundle, network):
-    sheet = unpack(bundle)["README.txt"].decode()
-    lines = sheet.splitlines()
-    assert len(lines) <= 60
-    assert max(map(len, lines)) <= 82
-    for fact in (
-        "P-07",
-        "uV",
-        "time_domain",
-        "3 mA",
-        "0.5 to 3.2 mA",
-        "0.25 mA/s",
-        "A. Clinician",
+def test_the_sheet_says_what_matters(bundle, network):
+    sheet = unpack(bundle)["sheet.html"].decode()
+    facts = (
+        "P-07", "left hemisphere", "uV, from time_domain", "3 mA", "0.5 mA", "3.2 mA", "0.25 mA/s", "A. Clinician", "0 to 3.4 mA",
+        "ada@clinic.example", "10 → 20 → 10 → 1", "441 weights", "410 multiply-adds", "teacher rl-03", "0.0012", "fraction within",
         hashlib.sha256(network.to_onnx()).hexdigest(),
-    ):
-        assert fact in sheet
+    )  # fmt: skip
+    for fact in facts:
+        assert fact in sheet, fact
+    assert "NOT APPROVED" not in sheet.upper()
 
 
 def test_a_sheet_without_approval_forbids_its_use(network, manifest, test_windows):
-    bare = build_bundle(network.to_onnx(), dataclasses.replace(manifest, approvals=()), test_windows)
-    assert "not to be used on a participant" in unpack(bare)["README.txt"].decode()
+    bare = unpack(build_bundle(network.to_onnx(), dataclasses.replace(manifest, approvals=()), test_windows))
+    assert "not to be used on a participant" in bare["sheet.html"].decode()
+    assert "NOT APPROVED" in bare["betaloop_controller.h"].decode()
+
+
+@pytest.mark.browser
+def test_the_sheet_prints_on_one_page_even_with_long_names(network, manifest, test_windows, tmp_path):
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        pytest.skip("needs Chromium")
+    approval = dataclasses.replace(manifest.approvals[0], statement="plan 12 of visit 7")
+    long = dataclasses.replace(manifest, policy_name="fine-tuned after visit 3, seed 2, distilled " * 2, approvals=(approval, approval))
+    (tmp_path / "sheet.html").write_bytes(unpack(build_bundle(network.to_onnx(), long, test_windows))["sheet.html"])
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer", f"--user-data-dir={tmp_path / 'profile'}"]
+    printed = [chromium, *options, f"--print-to-pdf={tmp_path / 'sheet.pdf'}", (tmp_path / "sheet.html").as_uri()]
+    subprocess.run(printed, check=True, capture_output=True, timeout=120)
+    pages = PdfReader(tmp_path / "sheet.pdf").pages
+    assert len(pages) == 1
+    assert "P-07" in pages[0].extract_text()
+
+
+def test_no_name_can_leave_its_place_in_the_sheet(network, manifest, test_windows):
+    bad = "<script>alert(1)</script>&\"'"
+    changed = dataclasses.replace(manifest, participant=bad, policy_name=bad, beta_unit=bad, teacher_name=bad, limits_stated_by=bad)
+    sheet = unpack(build_bundle(network.to_onnx(), changed, test_windows))["sheet.html"].decode()
+    assert "<script" not in sheet
+    assert sheet.count("&lt;script&gt;") >= 4
 
 
 def test_the_manifests_limits_are_the_envelopes(manifest):
     assert manifest.limits() == EnvelopeLimits(min_ma=0.5, max_ma=3.2, cdbs_ma=3.0, ramp_ma_per_s=0.25, window=10, period_s=2.0)
 
 
-@pytest.mark.parametrize("name", ["model.onnx", "test_vectors.json", "README.txt"])
+@pytest.mark.parametrize("name", sorted(NETWORK_FILES | SMALL_FILES))
 def test_a_changed_file_is_named(bundle, name):
     changed = unpack(bundle)[name] + b" "
-    with pytest.raises(BundleError, match=f"{name} is not the file"):
+    with pytest.raises(BundleError, match=f"{re.escape(name)} is not the file"):
         verify_bundle(with_file(bundle, name, changed))
 
 
@@ -178,16 +240,34 @@ def test_a_signed_bundle_is_accepted_with_its_key_and_no_other(bundle):
 def test_a_signature_covers_the_limits(bundle):
     key = Ed25519PrivateKey.generate()
     files = unpack(sign(bundle, key))
-    stated = json.loads(files["manifest.json"]) | {"max_ma": 5.0}
+    stated = json.loads(files["manifest.json"]) | {"max_ma": 3.3}
     forged = pack(files | {"manifest.json": json.dumps(stated).encode()})
-    assert verify_bundle(forged).max_ma == 5.0, "without a key nobody can tell"
+    assert verify_bundle(forged).max_ma == 3.3, "without a key nobody can tell"
     with pytest.raises(BundleError, match="manifest was changed"):
         verify_bundle(forged, key.public_key())
 
 
+def test_a_bundle_is_signed_with_the_key_that_it_names(network, manifest, test_windows):
+    key = Ed25519PrivateKey.generate()
+    named = dataclasses.replace(manifest, public_key=key.public_key().public_bytes_raw().hex())
+    made = build_bundle(network.to_onnx(), named, test_windows)
+    assert verify_bundle(sign(made, key), key.public_key()).public_key == named.public_key
+    with pytest.raises(BundleError, match="another key"):
+        sign(made, Ed25519PrivateKey.generate())
+
+
+def test_other_weights_fail_the_test_vectors_even_where_their_hash_is_restated(bundle):
+    weights = np.frombuffer(unpack(bundle)["weights.f32"], dtype="<f4").copy()
+    weights[-1] += 0.01
+    with pytest.raises(BundleError, match=r"weights\.f32 does not agree"):
+        verify_bundle(with_file(bundle, "weights.f32", weights.tobytes(), restate=True))
+    with pytest.raises(BundleError, match="do not fit layers"):
+        verify_bundle(with_file(bundle, "weights.f32", weights[:-1].tobytes(), restate=True))
+
+
 def test_a_damaged_bundle_is_not_signed(bundle):
-    with pytest.raises(BundleError, match=r"README\.txt"):
-        sign(with_file(bundle, "README.txt", b"x"), Ed25519PrivateKey.generate())
+    with pytest.raises(BundleError, match=r"sheet\.html"):
+        sign(with_file(bundle, "sheet.html", b"x"), Ed25519PrivateKey.generate())
 
 
 def test_a_policy_of_another_window_or_none_is_not_packed(manifest, test_windows):
@@ -219,6 +299,14 @@ def test_a_manifest_goes_through_json(manifest):
         ({"snapshot_sha256": "abc"}, "64 hexadecimal digits"),
         ({"normalisation_std": None}, "normalisation needs"),
         ({"schema_version": 99}, "manifest version 99"),
+        ({"max_ma": 3.5}, "above the stimulator's own limit, 3.4 mA"),
+        ({"min_ma": 0.1, "device_min_ma": 0.2}, "below the stimulator's own limit, 0.2 mA"),
+        ({"hemisphere": "middle"}, "left or right"),
+        ({"layers": [10, "20", 1]}, "list of whole numbers"),
+        ({"layers": [9, 1]}, "from the window"),
+        ({"max_beta_age_s": 3.0}, "stale after one period"),
+        ({"beta_low_hz": 40.0}, "beta band"),
+        ({"int8_planes": 1.5}, "int8_planes in manifest.json must be int"),
         ({"colour": "red"}, "unknown entries: colour"),
         ({"files": {"model.onnx": 3}}, "files in manifest.json must map"),
         ({"approvals": [{"name": "A"}]}, "lacks approved_at, role, statement"),

@@ -1,0 +1,159 @@
+"""How long one decision takes, as in the paper's table of computation times: microseconds, one thread, batch 1.
+
+    python benchmarks/deploy.py [--passes N] [--json]
+
+Full (400x300) and distilled (20x10) policies, by torch, onnxruntime, the numpy network and the whole Python controller (window update and
+safety envelope with it), and the C header (-O3; a whole decision too; float32 and whole numbers). `wall` is the time that passed, with the
+slices in which the machine did something else; `CPU` is the thread's own time. The timer's own cost, measured the same way, stands first
+and is not taken off. C is timed inside C over blocks of 1000 decisions, since one is shorter than the timer's steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import shutil
+import subprocess
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ml.deploy.bundle import build_bundle, open_bundle
+from ml.deploy.manifest import BundleManifest
+from ml.deploy.runtime.envelope import BetaSample, Signal
+from ml.rl.networks import STUDENT_HIDDEN, TEACHER_HIDDEN, MlpPolicy
+from ml.rl.onnx_policy import OnnxPolicy
+
+WINDOW, MEAN, STD = 10, 120.0, 35.0
+WARM_UP, BLOCK = 200, 1000
+PAPER = {"full": "4780 mean, 32260 std (Surface Go)", "distilled": "2980 mean, 1720 std (Surface Go)"}
+TIMER = r"""
+#define _POSIX_C_SOURCE 199309L
+#include <stdio.h>
+#include <time.h>
+#include HEADER
+static double now_us(clockid_t clock) {
+    struct timespec t;
+    clock_gettime(clock, &t);
+    return 1e6 * (double)t.tv_sec + 1e-3 * (double)t.tv_nsec;
+}
+int main(void) {
+    betaloop_state s;
+    long i, block;
+    int64_t now = 0;
+    volatile float sink = 0.0f;
+    betaloop_start(&s);
+    for (block = 0; block < BLOCKS; ++block) {
+        double wall = now_us(CLOCK_MONOTONIC), cpu = now_us(CLOCK_THREAD_CPUTIME_ID);
+        for (i = 0; i < REPEATS; ++i, now += BETALOOP_PERIOD_MS) {
+            betaloop_sample b = {0, 0.0f, BETALOOP_UNIT, BETALOOP_SOURCE};
+            b.t_ms = now;
+            b.beta = 90.0f + (float)(now % 67);
+            sink += betaloop_decide(&s, now, &b).amplitude_ma;
+        }
+        cpu = now_us(CLOCK_THREAD_CPUTIME_ID) - cpu;
+        wall = now_us(CLOCK_MONOTONIC) - wall;
+        printf("%.6f %.6f\n", wall / REPEATS, cpu / REPEATS);
+    }
+    return sink < 0.0f;
+}
+"""
+
+
+def timed(work: Callable[[int], Any], passes: int) -> tuple[Any, Any]:
+    """Wall and CPU time of each pass, microseconds, both [passes]."""
+    for i in range(WARM_UP):
+        work(i)
+    wall, cpu = np.empty(passes), np.empty(passes)
+    for i in range(passes):
+        c, w = time.thread_time_ns(), time.perf_counter_ns()
+        work(WARM_UP + i)
+        wall[i] = (time.perf_counter_ns() - w) / 1000
+        cpu[i] = (time.thread_time_ns() - c) / 1000
+    return wall, cpu
+
+
+def timed_c(folder: Path, header: str, full: bool, blocks: int) -> tuple[Any, Any]:
+    """The C header's decisions, means over blocks, microseconds."""
+    (folder / "timer.c").write_text(TIMER)
+    options = [f'-DHEADER="{header}"', f"-DBLOCKS={blocks}", f"-DREPEATS={20 if full else BLOCK}"]
+    subprocess.run(["cc", "-std=c99", "-O3", *options, "timer.c", "-o", "timer"], cwd=folder, check=True)
+    out = subprocess.run([folder / "timer"], capture_output=True, text=True, check=True).stdout
+    rows = np.array([[float(x) for x in line.split()] for line in out.splitlines()])
+    return rows[:, 0], rows[:, 1]
+
+
+def measure(name: str, hidden: tuple[int, ...], passes: int) -> dict[str, tuple[Any, Any]]:
+    """Every runtime of one policy."""
+    policy = MlpPolicy(WINDOW, hidden, mean=MEAN, std=STD, seed=1)
+    manifest = BundleManifest(
+        participant="bench", policy_id=1, policy_name=name, window=WINDOW, beta_unit="uV", beta_source="time_domain", min_ma=0.0,
+        max_ma=3.0, cdbs_ma=3.0, ramp_ma_per_s=1.5, code_version="bench",
+    )  # fmt: skip
+    windows = np.abs(np.random.default_rng(0).normal(MEAN, STD, (256, WINDOW)))
+    bundle = build_bundle(policy.to_onnx(), manifest, windows[:8])
+    opened, onnx = open_bundle(bundle), OnnxPolicy(policy.to_onnx(), WINDOW)
+    rows = [windows[i : i + 1] for i in range(256)]
+    signal, controller = Signal("uV", "time_domain"), opened.controller()
+    betas = windows.ravel().tolist()
+
+    def step(i: int) -> None:
+        opened.network.push(betas[i % len(betas)])
+        opened.network.fraction()
+
+    out = {
+        "torch": timed(lambda i: policy.act(rows[i % 256]), passes),
+        "onnxruntime": timed(lambda i: onnx.act(rows[i % 256]), passes),
+        "numpy, window update and network": timed(step, passes),
+        "numpy, whole decision": timed(lambda i: controller.decide(2.0 * i, BetaSample(2.0 * i, betas[i % len(betas)], signal)), passes),
+    }
+    if shutil.which("cc"):
+        with tempfile.TemporaryDirectory() as scratch:
+            with zipfile.ZipFile(io.BytesIO(bundle)) as archive:
+                archive.extractall(scratch)
+            folder = Path(scratch)
+            out["C float32, whole decision"] = timed_c(folder, "betaloop_controller.h", name == "full", max(passes // 5, 200))
+            if (folder / "betaloop_controller_int8.h").exists():
+                out["C whole numbers, whole decision"] = timed_c(folder, "betaloop_controller_int8.h", False, max(passes // 5, 200))
+    return out
+
+
+def figures(values: Any) -> dict[str, float]:
+    """Mean, standard deviation, median and 99th percentile."""
+    return {"mean": values.mean(), "std": values.std(), "median": np.median(values), "p99": np.quantile(values, 0.99)}
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--passes", type=int, default=2000, help="timed passes, at least 200 as in the paper")
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    passes = max(given.passes, 200)
+    rows = [("timer alone", "", *timed(lambda i: None, passes))]
+    for name, hidden in (("full", TEACHER_HIDDEN), ("distilled", STUDENT_HIDDEN)):
+        rows += [(name, runtime, wall, cpu) for runtime, (wall, cpu) in measure(name, hidden, passes).items()]
+    if given.json:
+        print(json.dumps([{"policy": p, "runtime": r, "wall_us": figures(w), "cpu_us": figures(c)} for p, r, w, c in rows], indent=1))
+        return
+    print(f"{'policy':<12}{'runtime':<36}{'wall: mean':>11}{'std':>9}{'median':>9}{'p99':>9}{'CPU: mean':>12}{'std':>9}{'median':>9}")
+    for policy, runtime, wall, cpu in rows:
+        w, c = figures(wall), figures(cpu)
+        print(
+            f"{policy:<12}{runtime:<36}{w['mean']:>11.3f}{w['std']:>9.2f}{w['median']:>9.3f}{w['p99']:>9.2f}"
+            f"{c['mean']:>12.3f}{c['std']:>9.2f}{c['median']:>9.3f}"
+        )
+    for name, text in PAPER.items():
+        print(f"{name:<12}the paper, network alone: {text}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,203 @@
+"""The C text that is the same for every policy: types, the safety envelope, tanh. Rules as in `runtime/envelope.py`."""
+
+from __future__ import annotations
+
+TYPES = """\
+/* Why a decision differs from the network's wish: bits of `reasons`. */
+enum {
+    BETALOOP_NO_BETA = 1,
+    BETALOOP_STALE_BETA = 2,
+    BETALOOP_INVALID_BETA = 4,
+    BETALOOP_WRONG_SIGNAL = 8,
+    BETALOOP_WINDOW_INCOMPLETE = 16,
+    BETALOOP_WINDOW_GAP = 32,
+    BETALOOP_LATE_SAMPLE = 64,
+    BETALOOP_POLICY_OUTPUT = 256,
+    BETALOOP_MINIMUM = 512,
+    BETALOOP_MAXIMUM = 1024,
+    BETALOOP_RAMP = 2048
+};
+
+/* One beta amplitude: the end of its window, its value (NaN where the device gave none), and what it says it is. */
+typedef struct {
+    int64_t t_ms;
+    float beta;
+    const char *unit;
+    const char *source;
+} betaloop_sample;
+
+/* What the next decision depends on. Set up by betaloop_start. */
+typedef struct {
+    int64_t last_sample_ms;
+    int64_t last_decision_ms;
+    int32_t has_sample;
+    int32_t has_decision;
+    int32_t streak;
+    float amplitude_ma;
+    betaloop_score scores[BETALOOP_WINDOW];
+} betaloop_state;
+
+typedef struct {
+    float amplitude_ma; /* to deliver */
+    float fraction;     /* the network's answer; -1 where it was not asked */
+    int32_t fallback;   /* 1: the cDBS amplitude stands in for the network */
+    int32_t valid;      /* valid beta amplitudes in the window */
+    uint32_t reasons;
+} betaloop_decision;
+"""
+
+TANH = """\
+/* tanh as a ratio of polynomials, within 1e-6 of the true value; NaN stays NaN. */
+static inline float betaloop_tanh(float x) {
+    float s, p, q;
+    if (x > 7.90531110763549805f) x = 7.90531110763549805f;
+    if (x < -7.90531110763549805f) x = -7.90531110763549805f;
+    s = x * x;
+    p = -2.76076847742355e-16f;
+    p = p * s + 2.00018790482477e-13f;
+    p = p * s - 8.60467152213735e-11f;
+    p = p * s + 5.12229709037114e-08f;
+    p = p * s + 1.48572235717979e-05f;
+    p = p * s + 6.37261928875436e-04f;
+    p = p * s + 4.89352455891786e-03f;
+    q = 1.19825839466702e-06f;
+    q = q * s + 1.18534705686654e-04f;
+    q = q * s + 2.26843463243900e-03f;
+    q = q * s + 4.89352518554385e-03f;
+    return x * p / q;
+}
+"""
+
+ENVELOPE = """\
+static inline int betaloop_same(const char *a, const char *b) {
+    if (!a || !b) return 0;
+    while (*a && *a == *b) {
+        ++a;
+        ++b;
+    }
+    return *a == *b;
+}
+
+/* The start of a session: cDBS in force, no beta yet. */
+static inline void betaloop_start(betaloop_state *s) {
+    int i;
+    s->last_sample_ms = 0;
+    s->last_decision_ms = 0;
+    s->has_sample = 0;
+    s->has_decision = 0;
+    s->streak = 0;
+    s->amplitude_ma = BETALOOP_CDBS_MA;
+    for (i = 0; i < BETALOOP_WINDOW; ++i) s->scores[i] = 0;
+}
+
+/* Judge a new beta amplitude; a valid one enters the window. Returns the reasons against it. */
+static inline uint32_t betaloop_admit(betaloop_state *s, int64_t now_ms, const betaloop_sample *sample) {
+    uint32_t reasons = 0;
+    uint64_t spacing = 0;
+    int had = s->has_sample, i;
+    if (sample->t_ms > now_ms || (had && sample->t_ms <= s->last_sample_ms)) return BETALOOP_LATE_SAMPLE;
+    if (had) spacing = (uint64_t)sample->t_ms - (uint64_t)s->last_sample_ms;
+    s->last_sample_ms = sample->t_ms;
+    s->has_sample = 1;
+    if (!betaloop_same(sample->unit, BETALOOP_UNIT) || !betaloop_same(sample->source, BETALOOP_SOURCE)) reasons = BETALOOP_WRONG_SIGNAL;
+    if (!(sample->beta >= 0.0f && sample->beta <= 3.4028234663852886e38f)) reasons |= BETALOOP_INVALID_BETA;
+    if (reasons) {
+        s->streak = 0;
+        return reasons;
+    }
+    if (had && s->streak && (spacing < BETALOOP_CLOSEST_MS || spacing > BETALOOP_FARTHEST_MS)) {
+        s->streak = 0;
+        reasons = BETALOOP_WINDOW_GAP;
+    }
+    if (s->streak < BETALOOP_WINDOW) ++s->streak;
+    for (i = 0; i + 1 < BETALOOP_WINDOW; ++i) s->scores[i] = s->scores[i + 1];
+    s->scores[BETALOOP_WINDOW - 1] = betaloop_score_of(sample->beta);
+    return reasons;
+}
+
+/* Decide on the amplitude of the period that starts now. `sample`: the beta amplitude that came since the last decision; 0: none came. */
+static inline betaloop_decision betaloop_decide(betaloop_state *s, int64_t now_ms, const betaloop_sample *sample) {
+    betaloop_decision d;
+    uint32_t reasons = 0, trouble;
+    uint64_t elapsed = BETALOOP_PERIOD_MS;
+    float most, wanted, requested, amplitude, before = s->amplitude_ma;
+    if (s->has_sample && now_ms < s->last_sample_ms) { /* the clock has run back: what came before is forgotten */
+        s->has_sample = 0;
+        s->streak = 0;
+    }
+    if (s->has_decision && now_ms < s->last_decision_ms) s->last_decision_ms = now_ms;
+    if (sample) reasons = betaloop_admit(s, now_ms, sample);
+    trouble = reasons & ~(uint32_t)(BETALOOP_LATE_SAMPLE | BETALOOP_WINDOW_GAP);
+    d.fraction = -1.0f;
+    d.valid = s->streak;
+    if (!s->has_sample) trouble |= BETALOOP_NO_BETA;
+    else if ((uint64_t)now_ms - (uint64_t)s->last_sample_ms > BETALOOP_STALE_AFTER_MS)
+        trouble |= BETALOOP_STALE_BETA;
+    if (s->streak < BETALOOP_WINDOW) trouble |= BETALOOP_WINDOW_INCOMPLETE;
+    if (!trouble) {
+        d.fraction = betaloop_fraction(s->scores);
+        if (!(d.fraction >= -1e-4f && d.fraction <= 1.0f + 1e-4f)) trouble |= BETALOOP_POLICY_OUTPUT;
+    }
+    if (s->has_decision) elapsed = now_ms > s->last_decision_ms ? (uint64_t)now_ms - (uint64_t)s->last_decision_ms : 0;
+    if (elapsed > 0) {
+        s->last_decision_ms = now_ms;
+        s->has_decision = 1;
+    }
+    if (elapsed > BETALOOP_PERIOD_MS) elapsed = BETALOOP_PERIOD_MS;
+    d.reasons = reasons | trouble;
+    d.fallback = trouble != 0;
+    if (trouble) {
+        s->amplitude_ma = d.amplitude_ma = BETALOOP_CDBS_MA; /* at once, in this decision: not ramped */
+        return d;
+    }
+    most = BETALOOP_RAMP_MA_PER_S * 0.001f * (float)elapsed;
+    requested = (d.fraction < 0.0f ? 0.0f : d.fraction > 1.0f ? 1.0f : d.fraction) * BETALOOP_CDBS_MA;
+    wanted = requested < BETALOOP_MIN_MA ? BETALOOP_MIN_MA : requested > BETALOOP_MAX_MA ? BETALOOP_MAX_MA : requested;
+    if (wanted > requested + BETALOOP_FLAG_MA) d.reasons |= BETALOOP_MINIMUM;
+    if (wanted < requested - BETALOOP_FLAG_MA) d.reasons |= BETALOOP_MAXIMUM;
+    amplitude = wanted > before + most ? before + most : wanted < before - most ? before - most : wanted;
+    amplitude = amplitude < BETALOOP_MIN_MA ? BETALOOP_MIN_MA : amplitude > BETALOOP_MAX_MA ? BETALOOP_MAX_MA : amplitude;
+    if (amplitude > wanted + BETALOOP_FLAG_MA || amplitude < wanted - BETALOOP_FLAG_MA) d.reasons |= BETALOOP_RAMP;
+    s->amplitude_ma = d.amplitude_ma = amplitude;
+    return d;
+}
+"""
+
+SELF_TEST = """\
+int main(void) {
+    betaloop_score scores[BETALOOP_WINDOW];
+    betaloop_state state;
+    double worst = 0.0, worst_ma = 0.0;
+    long wrong = 0, i, j;
+    for (i = 0; i < WINDOWS; ++i) {
+        double difference;
+        for (j = 0; j < BETALOOP_WINDOW; ++j) scores[j] = betaloop_score_of(windows[i][j]);
+        difference = (double)betaloop_fraction(scores) - (double)expected[i];
+        if (difference < 0) difference = -difference;
+        if (difference > worst) worst = difference;
+        if (!(difference <= TOLERANCE)) ++wrong;
+    }
+    betaloop_start(&state);
+    for (i = 0; i < STEPS; ++i) {
+        betaloop_sample sample;
+        betaloop_decision d;
+        double difference;
+        sample.t_ms = steps[i].t_ms;
+        sample.beta = steps[i].valid ? steps[i].beta : zero / zero;
+        sample.unit = steps[i].unit;
+        sample.source = steps[i].source;
+        d = betaloop_decide(&state, steps[i].now_ms, steps[i].came ? &sample : (const betaloop_sample *)0);
+        difference = (double)d.amplitude_ma - (double)steps[i].amplitude_ma;
+        if (difference < 0) difference = -difference;
+        if (difference > worst_ma) worst_ma = difference;
+        if (!(difference <= TOLERANCE_MA) || (d.reasons & FALLBACK_REASONS) != (steps[i].reasons & FALLBACK_REASONS)) {
+            ++wrong;
+            printf("step %ld: %.7g mA, reasons %lu; expected %.7g mA, %lu\\n", i, (double)d.amplitude_ma, (unsigned long)d.reasons,
+                   (double)steps[i].amplitude_ma, (unsigned long)steps[i].reasons);
+        }
+    }
+    printf("windows %ld, worst difference %.3g; steps %ld, worst difference %.3g mA; %ld wrong\\n", (long)WINDOWS, worst, (long)STEPS,
+           worst_ma, wrong);
+    return wrong ? 1 : 0;
+}
+"""

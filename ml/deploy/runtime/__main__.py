@@ -1,0 +1,84 @@
+"""`python -m controller [FOLDER] [--run]`: check an unpacked bundle against its test vectors, and run it on standard input.
+
+Hashes are checked here; the signature of the manifest is not (that needs a cryptography library): `betaloop control` does.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .envelope import BetaSample, EnvelopeLimits, Signal, reason_names
+from .loop import Controller
+from .network import MlpNetwork
+
+_LIMITS = ("min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s", "window", "period_s", "max_beta_age_s")
+
+
+def main(arguments: list[str]) -> int:
+    """Exit code 0: everything agrees; 1: something does not, said on standard error."""
+    folder = Path(next((a for a in arguments if not a.startswith("-")), "."))
+    try:
+        manifest = json.loads((folder / "manifest.json").read_bytes())
+        for name, digest in manifest["files"].items():
+            if hashlib.sha256((folder / name).read_bytes()).hexdigest() != digest:
+                raise ValueError(f"{name} is not the file that the manifest names")
+        network = MlpNetwork.from_bytes(
+            (folder / "weights.f32").read_bytes(), manifest["layers"], manifest["normalisation_mean"], manifest["normalisation_std"]
+        )
+        worst, worst_ma = check(manifest, network, json.loads((folder / "test_vectors.json").read_bytes()))
+    except (OSError, ValueError, KeyError) as error:
+        sys.stderr.write(f"this bundle cannot be used: {error}\n")
+        return 1
+    sys.stderr.write(f"test vectors agree: worst difference {worst:.3g} of a fraction, {worst_ma:.3g} mA\n")
+    if "--run" in arguments:
+        run(manifest, network)
+    return 0
+
+
+def check(manifest: dict[str, Any], network: MlpNetwork, vectors: dict[str, Any]) -> tuple[float, float]:
+    """Worst differences of fractions and of decisions (mA) from the test vectors. Raises ValueError where one is too large."""
+    worst = float(np.abs(network.act(np.array(vectors["windows"])) - np.array(vectors["expected"])).max())
+    controller = _controller(manifest, network)
+    worst_ma = 0.0
+    for step in vectors["session"]:
+        sample = None
+        if step["t_s"] is not None:
+            beta = math.nan if step["beta"] is None else float(step["beta"])
+            sample = BetaSample(step["t_s"], beta, Signal(step["unit"], step["source"]))
+        decision = controller.decide(step["now_s"], sample)
+        worst_ma = max(worst_ma, abs(decision.amplitude_ma - step["amplitude_ma"]))
+        if list(reason_names(decision.reasons)) != step["reasons"]:
+            raise ValueError(f"at {step['now_s']} s the reasons are {reason_names(decision.reasons)} instead of {step['reasons']}")
+    if not (worst <= vectors["tolerance"] and worst_ma <= vectors["tolerance"] * manifest["cdbs_ma"]):
+        raise ValueError(f"the answers differ from the test vectors by {worst:.3g} of a fraction and {worst_ma:.3g} mA")
+    return worst, worst_ma
+
+
+def run(manifest: dict[str, Any], network: MlpNetwork) -> None:
+    """One beta amplitude per line in (anything else counts as no number), one amplitude in mA and its reasons per line out."""
+    controller, signal = _controller(manifest, network), Signal(manifest["beta_unit"], manifest["beta_source"])
+    for k, line in enumerate(sys.stdin):
+        try:
+            beta = float(line)
+        except ValueError:
+            beta = math.nan
+        now_s = k * manifest["period_s"]
+        decision = controller.decide(now_s, BetaSample(now_s, beta, signal))
+        sys.stdout.write(f"{decision.amplitude_ma:.6g} {' '.join(reason_names(decision.reasons))}\n")
+        sys.stdout.flush()
+
+
+def _controller(manifest: dict[str, Any], network: MlpNetwork) -> Controller:
+    limits = EnvelopeLimits(**{name: manifest[name] for name in _LIMITS})
+    return Controller(network, limits, Signal(manifest["beta_unit"], manifest["beta_source"]))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

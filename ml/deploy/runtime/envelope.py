@@ -1,0 +1,267 @@
+"""The safety envelope: what stands between a network's wish and the stimulator. `ml/deploy/c_envelope.py` holds the same rules in C.
+
+It knows nothing of how the fraction was made. Every period it decides on one amplitude in milliamperes, and says why:
+
+* amplitudes lie within the clinician's limits, always;
+* from one decision to the next the amplitude moves by no more than the ramp limit times the time between them, and never by more than the
+  ramp limit times one period, however late a decision comes;
+* beta that is missing, not a number, negative, of another unit or source, older than one period or not yet a whole window without a gap,
+  and a network that fails or answers outside [0, 1], give the cDBS amplitude in the very decision in which that is found. This return to
+  the programmed therapy is *not* ramped: a ramp would leave the participant under-treated for some periods on a signal that nobody trusts.
+  It is the one exception to the ramp limit;
+* the network is asked again once a whole window of valid beta amplitudes has come; from cDBS the amplitude then moves at the ramp limit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+SPACING_TOLERANCE = 0.5
+"""Two beta amplitudes may lie this share of a period closer or farther than one period; beyond, the window has a gap."""
+RANGE_TOLERANCE = 1e-4
+"""A fraction this far outside [0, 1] is rounding and is cut; farther outside it is a fault."""
+LARGEST_BETA = 3.4028234663852886e38
+"""The largest float32: every runtime takes beta amplitudes as such."""
+_TIME_EPSILON_S = 1e-9
+FLAG_MA = 1e-4
+"""A limit that takes off less than this many mA is rounding and is not named among the reasons."""
+
+
+class Reason:
+    """Why a decision differs from the network's wish: bits of `Decision.reasons`, the same in the C header."""
+
+    NO_BETA = 1  # no beta amplitude has come yet
+    STALE_BETA = 2  # the newest beta amplitude is too old
+    INVALID_BETA = 4  # the beta amplitude is not a number, negative or infinite
+    WRONG_SIGNAL = 8  # the beta amplitude is of another unit or source than the network was trained on
+    WINDOW_INCOMPLETE = 16  # fewer than W valid beta amplitudes since the start or the last fault
+    WINDOW_GAP = 32  # the beta amplitude is not one period after the one before
+    LATE_SAMPLE = 64  # a beta amplitude not newer than the last one, or from the future, was left out
+    POLICY_FAILED = 128  # the network raised an error
+    POLICY_OUTPUT = 256  # the network's answer is no fraction in [0, 1]
+    MINIMUM = 512  # raised to the clinician's minimum
+    MAXIMUM = 1024  # lowered to the clinician's maximum
+    RAMP = 2048  # held back by the ramp limit
+
+
+_NOTES = Reason.LATE_SAMPLE | Reason.WINDOW_GAP  # no trouble in themselves: the window that they leave behind is judged
+REASON_NAMES = {value: name.lower() for name, value in vars(Reason).items() if name.isupper()}
+
+
+def reason_names(reasons: int) -> tuple[str, ...]:
+    """Names of the bits, lowest first."""
+    return tuple(name for bit, name in REASON_NAMES.items() if reasons & bit)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvelopeLimits:
+    """The clinician's limits for one participant.
+
+    Attributes:
+        min_ma, max_ma: lowest and highest amplitude, mA.
+        cdbs_ma: cDBS amplitude, mA: what fraction 1 means, and the fall-back. Lies within the limits.
+        ramp_ma_per_s: fastest change of the amplitude, mA per second.
+        window: W, beta amplitudes per decision.
+        period_s: m, seconds per decision.
+        max_beta_age_s: age at which a beta amplitude is stale, at most one period; None means one period.
+
+    Raises:
+        ValueError: a value outside its range; the message names it.
+    """
+
+    min_ma: float
+    max_ma: float
+    cdbs_ma: float
+    ramp_ma_per_s: float
+    window: int = 10
+    period_s: float = 2.0
+    max_beta_age_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name} must be a finite number, not {value}")
+        if not 0 <= self.min_ma <= self.max_ma:
+            raise ValueError(f"the amplitude limits must rise from 0 or more, not {self.min_ma} to {self.max_ma} mA")
+        if not self.min_ma <= self.cdbs_ma <= self.max_ma or self.cdbs_ma <= 0:
+            raise ValueError(
+                f"the cDBS amplitude {self.cdbs_ma} mA must lie within the limits, {self.min_ma} to {self.max_ma} mA, and above 0"
+            )
+        for name in ("ramp_ma_per_s", "period_s", "max_beta_age_s"):
+            value = getattr(self, name)
+            if value is not None and value <= 0:
+                raise ValueError(f"{name} must be positive, not {value}")
+        if self.max_beta_age_s is not None and self.max_beta_age_s > self.period_s:
+            raise ValueError(f"beta is stale after one period ({self.period_s} s) at the latest, not after {self.max_beta_age_s} s")
+        if self.window < 1:
+            raise ValueError(f"window must be at least 1 step, not {self.window}")
+
+    @property
+    def stale_after_s(self) -> float:
+        """Age beyond which a beta amplitude is stale, seconds."""
+        return self.period_s if self.max_beta_age_s is None else self.max_beta_age_s
+
+
+class Signal(NamedTuple):
+    """What a beta amplitude is: its unit and how it was made."""
+
+    unit: str
+    source: str
+
+
+class BetaSample(NamedTuple):
+    """One beta amplitude (NaN where the device gave none), the time of its window's end in seconds, and what it says it is."""
+
+    t_s: float
+    beta: float
+    signal: Signal
+
+
+class Decision(NamedTuple):
+    """One entry of the decision log.
+
+    Attributes:
+        t_s: time of the decision, seconds.
+        amplitude_ma: amplitude to deliver, mA.
+        fallback: True when the cDBS amplitude stands in for the network.
+        reasons: bits of `Reason`; 0 when the network's wish was delivered as it is.
+        fraction: the network's answer as it came; None where it was not asked or failed.
+        requested_ma: the wish in mA, before the limits; None where there was none.
+        beta_age_s: age of the newest beta amplitude; None before the first.
+        valid: valid beta amplitudes in the window, 0 to W.
+        detail: the network's error text, where it failed.
+    """
+
+    t_s: float
+    amplitude_ma: float
+    fallback: bool
+    reasons: int
+    fraction: float | None
+    requested_ma: float | None
+    beta_age_s: float | None
+    valid: int
+    detail: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """The entry for a log; numbers that are not finite become None, as JSON has none."""
+        values = self._asdict() | {"reasons": list(reason_names(self.reasons))}
+        return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
+
+
+class Envelope:
+    """Counts valid beta amplitudes, and turns a network's fraction into an amplitude that the clinician allows.
+
+    Args:
+        limits: the clinician's.
+        signal: unit and source that the network was trained on.
+
+    A session starts with cDBS in force and no beta. The same inputs in the same order always give the same decisions.
+    """
+
+    __slots__ = ("_age_s", "_closest_s", "_farthest_s", "_last_decision_s", "_last_sample_s", "_streak", "amplitude_ma", "limits", "signal")
+
+    def __init__(self, limits: EnvelopeLimits, signal: Signal) -> None:
+        self.limits = limits
+        self.signal = signal
+        self.amplitude_ma = limits.cdbs_ma
+        self._age_s = limits.stale_after_s + _TIME_EPSILON_S
+        self._closest_s = (1 - SPACING_TOLERANCE) * limits.period_s - _TIME_EPSILON_S
+        self._farthest_s = (1 + SPACING_TOLERANCE) * limits.period_s + _TIME_EPSILON_S
+        self._last_sample_s: float | None = None
+        self._last_decision_s: float | None = None
+        self._streak = 0
+
+    def begin(self, now_s: float) -> None:
+        """Start a decision: when the clock has run back, what came before it is forgotten, so that a corrected clock does not lock the
+        network out."""
+        if self._last_sample_s is not None and now_s < self._last_sample_s - _TIME_EPSILON_S:
+            self._last_sample_s, self._streak = None, 0
+        if self._last_decision_s is not None and now_s < self._last_decision_s:
+            self._last_decision_s = now_s
+
+    def admit(self, now_s: float, sample: BetaSample) -> tuple[int, bool]:
+        """Judge a new beta amplitude. Returns the reasons against it, and whether it belongs into the network's window."""
+        t_s, beta, signal = sample
+        last = self._last_sample_s
+        if not (t_s <= now_s + _TIME_EPSILON_S and (last is None or t_s > last)) or t_s == -math.inf:  # NaN is never in order
+            return Reason.LATE_SAMPLE, False
+        self._last_sample_s = t_s
+        reasons = 0
+        if signal is not self.signal and signal != self.signal:
+            reasons = Reason.WRONG_SIGNAL
+        if not 0.0 <= beta <= LARGEST_BETA:
+            reasons |= Reason.INVALID_BETA
+        if reasons:
+            self._streak = 0
+            return reasons, False
+        if last is not None and self._streak and not self._closest_s <= t_s - last <= self._farthest_s:
+            self._streak = 0
+            reasons = Reason.WINDOW_GAP
+        if self._streak < self.limits.window:
+            self._streak += 1
+        return reasons, True
+
+    def decide(self, now_s: float, reasons: int, ask: Callable[[], float]) -> Decision:
+        """Decide on the amplitude of the period that starts now.
+
+        Args:
+            now_s: time of this decision, seconds, on the clock of the samples.
+            reasons: from `admit`, 0 where no beta amplitude came.
+            ask: the network's fraction for its window; called only when the window is whole and fresh.
+        """
+        limits = self.limits
+        last_s = self._last_sample_s
+        age = None if last_s is None else now_s - last_s
+        trouble = reasons & ~_NOTES
+        if age is None:
+            trouble |= Reason.NO_BETA
+        elif not age <= self._age_s:  # so written that a clock that is not a number counts as stale
+            trouble |= Reason.STALE_BETA
+        if self._streak < limits.window:
+            trouble |= Reason.WINDOW_INCOMPLETE
+        fraction: float | None = None
+        detail = ""
+        if not trouble:
+            fraction, trouble, detail = _asked(ask)
+        most = self._most_ma(now_s)
+        reasons |= trouble
+        if trouble:
+            self.amplitude_ma = limits.cdbs_ma
+            return Decision(now_s, limits.cdbs_ma, True, reasons, fraction, None, age, self._streak, detail)
+        requested = min(max(fraction or 0.0, 0.0), 1.0) * limits.cdbs_ma
+        wanted = min(max(requested, limits.min_ma), limits.max_ma)
+        if wanted > requested + FLAG_MA:
+            reasons |= Reason.MINIMUM
+        elif wanted < requested - FLAG_MA:
+            reasons |= Reason.MAXIMUM
+        before = self.amplitude_ma
+        amplitude = min(max(wanted, before - most), before + most)
+        amplitude = min(max(amplitude, limits.min_ma), limits.max_ma)
+        if abs(amplitude - wanted) > FLAG_MA:
+            reasons |= Reason.RAMP
+        self.amplitude_ma = amplitude
+        return Decision(now_s, amplitude, False, reasons, fraction, requested, age, self._streak)
+
+    def _most_ma(self, now_s: float) -> float:
+        """The largest change that the ramp limit allows at this decision, mA."""
+        period = self.limits.period_s
+        last = self._last_decision_s
+        elapsed = period if last is None else now_s - last
+        if not elapsed > 0:  # a clock that stands, has run back or is not a number
+            return 0.0
+        self._last_decision_s = now_s
+        return self.limits.ramp_ma_per_s * min(elapsed, period)
+
+
+def _asked(ask: Callable[[], float]) -> tuple[float | None, int, str]:
+    """The network's fraction; or why it cannot be used."""
+    try:
+        fraction = float(ask())
+    except Exception as error:  # whatever a network does, the participant is stimulated: the fault goes into the log
+        return None, Reason.POLICY_FAILED, f"{type(error).__name__}: {error}"
+    if not -RANGE_TOLERANCE <= fraction <= 1 + RANGE_TOLERANCE:
+        return fraction, Reason.POLICY_OUTPUT, f"answer {fraction} outside [0, 1]"
+    return fraction, 0, ""

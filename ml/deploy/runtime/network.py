@@ -1,0 +1,89 @@
+"""The network in numpy: a multi-layer perceptron with ReLU on z-scored beta windows, (tanh(x) + 1) / 2 at its end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Weights [outputs, inputs] and biases [outputs]."""
+_ZERO = np.zeros(1, dtype=np.float32)  # an array: a Python number would be converted at each call
+
+
+class MlpNetwork:
+    """A policy that keeps its own window, so that a decision costs three small matrix products.
+
+    Args:
+        layers: from the window to the one output.
+        mean, std: of beta, in the unit of the beta amplitudes.
+
+    Raises:
+        ValueError: layers that do not fit together, weights that are not finite, or a standard deviation that is not positive.
+    """
+
+    def __init__(self, layers: Sequence[Layer], mean: float, std: float) -> None:
+        sizes = [layers[0][0].shape[1], *(w.shape[0] for w, _ in layers)]
+        if any(w.shape != (o, i) or b.shape != (o,) for (w, b), (i, o) in zip(layers, pairwise(sizes), strict=True)) or sizes[-1] != 1:
+            raise ValueError(f"the layers do not fit together: {[w.shape for w, _ in layers]}")
+        if not all(np.isfinite(w).all() and np.isfinite(b).all() for w, b in layers):
+            raise ValueError("a weight is not a finite number")
+        if not (math.isfinite(mean) and math.isfinite(std) and std > 0):
+            raise ValueError(f"the beta scale needs a finite mean and a positive standard deviation, not {mean} and {std}")
+        self.layers = [(w.astype(np.float32), b.astype(np.float32)) for w, b in layers]
+        self.mean, self.std = float(np.float32(mean)), float(np.float32(std))
+        self.window = sizes[0]
+        # The bias is a column of the weights and a 1 behind the inputs: one call of numpy less per layer.
+        self._inputs = [np.ones(size + 1, dtype=np.float32) for size in sizes]
+        self._steps = [
+            (np.ascontiguousarray(np.column_stack([w, b])), self._inputs[i], self._inputs[i + 1][:-1])
+            for i, (w, b) in enumerate(self.layers)
+        ]
+        scores = self._inputs[0][:-1]
+        scores[:] = 0.0
+        self._older, self._newer, self._scores, self._newest = scores[:-1], scores[1:], scores, self.window - 1
+        matrix, inputs, _ = self._steps.pop()
+        self._last = np.ascontiguousarray(matrix[0]), inputs
+
+    def push(self, beta: float) -> None:
+        """Move the window on by one beta amplitude."""
+        self._older[...] = self._newer
+        self._scores[self._newest] = (beta - self.mean) / self.std
+
+    def fraction(self) -> float:
+        """Amplitude fraction for the window as it stands."""
+        dot, maximum = np.dot, np.maximum
+        for matrix, inputs, outputs in self._steps:
+            maximum(dot(matrix, inputs), _ZERO, out=outputs)
+        weights, inputs = self._last
+        return 0.5 * (math.tanh(dot(weights, inputs)) + 1.0)
+
+    def act(self, states: NDArray[Any]) -> NDArray[np.float64]:
+        """Amplitude fractions, shape [N], for beta windows [N, W]; the window kept inside does not move."""
+        hidden = ((np.asarray(states, dtype=np.float32) - np.float32(self.mean)) / np.float32(self.std)).T
+        for weights, biases in self.layers[:-1]:
+            hidden = np.maximum(weights @ hidden + biases[:, None], np.float32(0.0))
+        weights, biases = self.layers[-1]
+        return np.asarray(0.5 * (np.tanh((weights @ hidden + biases[:, None])[0]) + 1.0), dtype=np.float64)
+
+    def to_bytes(self) -> bytes:
+        """Weights and biases layer by layer, row by row, little-endian float32."""
+        return b"".join(np.ascontiguousarray(a, dtype="<f4").tobytes() for layer in self.layers for a in layer)
+
+    @staticmethod
+    def from_bytes(content: bytes, sizes: Sequence[int], mean: float, std: float) -> MlpNetwork:
+        """The inverse of `to_bytes`, for the sizes [W, ..., 1]. Raises ValueError where the bytes are too few or too many."""
+        numbers = np.frombuffer(content, dtype="<f4") if len(content) % 4 == 0 else np.empty(0, dtype="<f4")
+        if numbers.size != sum(o * i + o for i, o in pairwise(sizes)):
+            raise ValueError(f"{len(content)} bytes of weights do not fit layers of {list(sizes)}")
+        layers: list[Layer] = []
+        at = 0
+        for i, o in pairwise(sizes):
+            weights, biases = numbers[at : at + o * i].reshape(o, i), numbers[at + o * i : at + o * i + o]
+            layers.append((weights.astype(np.float32), biases.astype(np.float32)))
+            at += o * i + o
+        return MlpNetwork(layers, mean, std)

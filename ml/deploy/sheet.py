@@ -1,0 +1,167 @@
+"""The one-page sheet of a bundle: HTML that prints on one A4 page, for the clinician who answers for the limits."""
+
+from __future__ import annotations
+
+from html import escape
+
+from ml.deploy.manifest import BundleManifest
+
+_STYLE = """
+@page { size: A4; margin: 11mm 14mm; }
+* { box-sizing: border-box; }
+body { font: 9.4pt/1.36 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; color: #14202b; max-width: 182mm;
+       margin: 0 auto; padding: 8px 0; background: #fff; }
+header { display: flex; justify-content: space-between; align-items: flex-end; border-bottom: 2.5px solid #14202b; padding-bottom: 6px; }
+h1 { font-size: 21pt; line-height: 1.1; margin: 0; letter-spacing: -.01em; overflow-wrap: anywhere; }
+h2 { font-size: 8.4pt; letter-spacing: .07em; text-transform: uppercase; color: #51606d; margin: 10px 0 3px; }
+.kind { color: #51606d; text-align: right; }
+.ban { border: 2px solid #a3261c; color: #8a1c13; padding: 6px 10px; margin-top: 10px; font-weight: 650; }
+.signed { border: 1px solid #2f6b46; color: #22523a; padding: 5px 10px; margin-top: 10px; }
+.big { display: grid; grid-template-columns: repeat(4, 1fr); border: 1px solid #c3ccd3; margin-top: 4px; }
+.big div { padding: 6px 10px 7px; border-left: 1px solid #c3ccd3; }
+.big div:first-child { border-left: 0; }
+.big b { display: block; font-size: 17pt; line-height: 1.2; font-variant-numeric: tabular-nums; }
+.big small, .muted { color: #51606d; }
+.columns { display: grid; grid-template-columns: 5fr 6fr; column-gap: 22px; }
+p { margin: 4px 0; }
+table { border-collapse: collapse; width: 100%; }
+th { text-align: left; font-weight: 400; color: #51606d; padding: 2px 10px 2px 0; vertical-align: top; width: 29%; }
+td { padding: 2px 0; vertical-align: top; font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
+tr + tr > * { border-top: 1px solid #e4e9ed; }
+code { font: 8pt/1.35 ui-monospace, "DejaVu Sans Mono", Consolas, monospace; overflow-wrap: anywhere; }
+ol { margin: 2px 0 0; padding-left: 18px; }
+svg { display: block; width: 100%; height: auto; margin-top: 6px; }
+.lines { display: grid; grid-template-columns: 1fr 1fr; gap: 26px; margin-top: 34px; }
+.lines div { border-top: 1px solid #14202b; padding-top: 3px; color: #51606d; font-size: 8.6pt; }
+footer { margin-top: 10px; color: #51606d; font-size: 8.2pt; }
+"""
+
+
+def render(manifest: BundleManifest, model_sha256: str) -> str:
+    """The sheet.
+
+    Args:
+        manifest: of the bundle, all but its files.
+        model_sha256: of the ONNX file.
+    """
+    code = escape(manifest.participant)
+    side = f" · {manifest.hemisphere} hemisphere" if manifest.hemisphere else ""
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Controller bundle {code}, policy {manifest.policy_id}</title><style>{_STYLE}</style></head><body>
+<header><div><h1>{code}</h1>{escape(manifest.policy_name)} <span class="muted">· policy {manifest.policy_id}{side}</span></div>
+<div class="kind">Closed-loop DBS controller<br>one-page sheet of the bundle</div></header>
+{_approval(manifest)}
+<h2>Stimulation limits</h2>
+<div class="big"><div><small>Lowest</small><b>{manifest.min_ma:g} mA</b></div><div><small>Highest</small><b>{manifest.max_ma:g} mA</b></div>
+<div><small>cDBS = fraction 1</small><b>{manifest.cdbs_ma:g} mA</b></div>
+<div><small>Ramp</small><b>{manifest.ramp_ma_per_s:g} mA/s</b></div></div>
+{_scale(manifest)}
+<p class="muted">Stated by {escape(manifest.limits_stated_by)}. {_device(manifest)}</p>
+<div class="columns"><div>
+<h2>Signal</h2><table>{_rows(_signal(manifest))}</table>
+</div><div>
+<h2>Network</h2><table>{_rows(_network(manifest))}</table>
+</div></div>
+<h2>When the controller gives way</h2>
+<p style="margin:2px 0">Every {manifest.period_s:g} s it decides anew. In the same decision, and without a ramp, it returns to the cDBS
+amplitude of <b>{manifest.cdbs_ma:g} mA</b> when beta is missing for more than {manifest.limits().stale_after_s:g} s, is not a number,
+negative, or of another unit or source, when the window has a gap, or when the network fails. It takes over again after {manifest.window}
+valid beta amplitudes in a row ({manifest.window * manifest.period_s:g} s), moving at most
+{manifest.ramp_ma_per_s * manifest.period_s:g} mA per period.</p>
+<h2>Before use</h2>
+<ol><li>Check the bundle on the tablet: <code>betaloop control --bundle FILE --key KEY</code> verifies signature, every SHA-256 and the test
+vectors.</li>
+<li>Compare participant, hemisphere, contacts and cDBS amplitude with the stimulator. For this participant only.</li>
+<li>Keep the clinical settings at hand: the sheet replaces neither the stop rules of the protocol nor the device's own limits.</li></ol>
+<h2>Where it comes from</h2><table>{_rows(_origin(manifest, model_sha256))}</table>
+<div class="lines"><div>Clinician: limits checked against the stimulator. Name, signature, date</div>
+<div>Engineer: bundle verified on the tablet. Name, signature, date</div></div>
+<footer>Made by betaloop {escape(manifest.code_version)}. For research; betaloop is no medical device.</footer>
+</body></html>
+"""
+
+
+def _approval(m: BundleManifest) -> str:
+    if not m.approvals:
+        return '<div class="ban">Not approved: not to be used on a participant.</div>'
+    lines = "<br>".join(
+        f"Approved by {escape(a.name)} ({escape(a.role)}), {escape(a.approved_at)}: {escape(a.statement)}" for a in m.approvals
+    )
+    return f'<div class="signed">{lines}</div>'
+
+
+def _device(m: BundleManifest) -> str:
+    if m.device_min_ma is None or m.device_max_ma is None:
+        return "No recording held the stimulator's own limits: compare them by hand."
+    return f"The stimulator's own limits, as last recorded: {m.device_min_ma:g} to {m.device_max_ma:g} mA."
+
+
+def _scale(m: BundleManifest) -> str:
+    """The amplitudes to scale: the stimulator's own range, the clinician's within it, cDBS marked."""
+    top = max(m.max_ma, m.device_max_ma or 0.0) * 1.04
+
+    def x(ma: float) -> float:
+        return 8 + 684 * ma / top
+
+    device = ""
+    if m.device_max_ma is not None and m.device_min_ma is not None:
+        low, high = x(m.device_min_ma), x(m.device_max_ma)
+        device = f'<rect x="{low:.1f}" y="16" width="{high - low:.1f}" height="12" fill="none" stroke="#8b98a3" stroke-dasharray="4 3"/>'
+    marks = {0.0: "0", m.min_ma: f"{m.min_ma:g}", m.max_ma: f"{m.max_ma:g}"}
+    labels = "".join(f'<text x="{x(ma):.1f}" y="43" text-anchor="middle">{text}</text>' for ma, text in marks.items())
+    return (
+        '<svg viewBox="0 0 700 48" role="img" aria-label="Amplitude limits in mA" font-size="11" fill="#51606d">'
+        f'<line x1="8" y1="22" x2="692" y2="22" stroke="#c3ccd3"/>{device}'
+        f'<rect x="{x(m.min_ma):.1f}" y="18" width="{max(x(m.max_ma) - x(m.min_ma), 1):.1f}" height="8" fill="#2b6c99"/>'
+        f'<line x1="{x(m.cdbs_ma):.1f}" y1="13" x2="{x(m.cdbs_ma):.1f}" y2="31" stroke="#c1571b" stroke-width="2.5"/>{labels}'
+        f'<text x="{min(x(m.cdbs_ma), 650):.1f}" y="10" text-anchor="middle" fill="#a8470f">cDBS {m.cdbs_ma:g} mA</text></svg>'
+    )
+
+
+def _signal(m: BundleManifest) -> list[tuple[str, str]]:
+    scale = "inside the network"
+    if m.normalisation_mean is not None:
+        scale = f"(beta - {m.normalisation_mean:.5g}) / {m.normalisation_std:.5g}, inside"
+    return [
+        ("Beta amplitude", f"{m.beta_unit}, from {m.beta_source}"),
+        ("Band", f"{m.beta_low_hz:g} to {m.beta_high_hz:g} Hz"),
+        ("Window", f"{m.window} values, one per {m.period_s:g} s"),
+        ("Valid share", f"{100 * m.min_valid_fraction:g} % of a period's samples"),
+        ("Scaling", scale),
+    ]
+
+
+def _network(m: BundleManifest) -> list[tuple[str, str]]:
+    if not m.layers:
+        return [("Form", "ONNX only: made elsewhere, or a baseline; no C header")]
+    rows = [
+        ("Units", " → ".join(str(units) for units in m.layers)),
+        ("Size", f"{m.parameters} weights, {4 * m.parameters} bytes as float32"),
+        ("Work", f"{m.macs} multiply-adds per decision"),
+    ]
+    if m.int8_bound is not None:
+        planes = "two planes of int8" if m.int8_planes == 2 else "int8"
+        bound = f"fraction within {m.int8_bound:.2g} ({m.int8_bound * m.cdbs_ma:.2g} mA)"
+        rows.append(("Whole numbers", f"{m.int8_bytes} bytes, {planes}; {bound}"))
+    if m.agreement_mean is not None:
+        spread = f"99 % within {m.agreement_p99:.3g}, worst {m.agreement_worst:.3g} of the fraction"
+        rows.append(("Agreement", f"with teacher {m.teacher_name or 'unknown'}: mean difference {m.agreement_mean:.3g}, {spread}"))
+    return rows
+
+
+def _origin(m: BundleManifest, model_sha256: str) -> list[tuple[str, str]]:
+    return [
+        ("Network SHA-256", model_sha256),
+        ("Snapshot SHA-256", m.snapshot_sha256 or "none: trained outside this study"),
+        ("Trained by", f"betaloop {m.policy_code_version}"),
+        ("Signing key", m.public_key or "not signed"),
+    ]
+
+
+def _rows(rows: list[tuple[str, str]]) -> str:
+    return "".join(f"<tr><th>{escape(name)}</th><td>{_value(name, text)}</td></tr>" for name, text in rows)
+
+
+def _value(name: str, text: str) -> str:
+    return f"<code>{escape(text)}</code>" if "SHA-256" in name or "key" in name else escape(text)
