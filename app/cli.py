@@ -27,8 +27,12 @@ from app.settings import get_settings
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="betaloop: the study system for closed-loop deep brain stimulation.")
 user_app = typer.Typer(no_args_is_help=True, help="Users.")
 token_app = typer.Typer(no_args_is_help=True, help="API tokens.")
+ingest_app = typer.Typer(no_args_is_help=True, help="Stored uploads.")
 app.add_typer(user_app, name="user")
 app.add_typer(token_app, name="token")
+study_app = typer.Typer(no_args_is_help=True, help="Whole studies.")
+app.add_typer(study_app, name="study")
+app.add_typer(ingest_app, name="ingest")
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Code = Annotated[str, typer.Argument(help="Code of the participant, e.g. P1.")]
@@ -134,31 +138,61 @@ def token_create(
 
 @app.command("import", epilog="Example: betaloop import session.zip --participant P1 --visit 2 --controller random")
 def import_(
-    path: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A zip of an RC+S session folder, or a table (CSV, Parquet).")],
+    path: Annotated[
+        Path, typer.Argument(exists=True, dir_okay=False, help="A zip of an RC+S session folder, a Percept report, a table, an export.")
+    ],
     participant: Annotated[str, typer.Option(help="Code of the participant.")],
-    visit: Annotated[int, typer.Option(min=1, help="Number of the visit.")],
-    controller: Annotated[str, typer.Option(help="cdbs, rl, distilled, no_dbs, random or other.")],
+    visit: Annotated[int | None, typer.Option(min=1, help="Number of the visit; left out, it is proposed by its date.")] = None,
+    controller: Annotated[
+        str | None, typer.Option(help="cdbs, rl, distilled, no_dbs, random or other; left out, sessions are proposed.")
+    ] = None,
     policy: Annotated[str | None, typer.Option(help="Name or number of the policy that ran.")] = None,
     started_at: Annotated[datetime | None, typer.Option(help="Start of the session, UTC.")] = None,
     beta_unit: Annotated[str | None, typer.Option(help="Unit of a table's beta; the participant's when left out.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Import the file of one session, as an upload does."""
+    """Import a file, as an upload does: with visit and controller its sessions count at once, else they wait for confirmation."""
     from app.ingest import api, service
     from app.study import repository as study
     from app.study.models import Controller
 
-    if controller not in set(Controller):
+    if controller is not None and controller not in set(Controller):
         raise typer.BadParameter(f"'{controller}' is none of {', '.join(Controller)}.", param_hint="--controller")
     with transaction(ACTOR) as db, path.open("rb") as stream:
         person = study.participant_by_code(db, participant, SYSTEM)
-        stated = service.state_session(db, person, visit, Controller(controller), policy, started_at)
+        arm = Controller(controller) if controller is not None else None
+        stated = service.state_session(db, person, visit, arm, policy, started_at)
         outcome = service.receive(db, person, stated, [service.Incoming(path.name, stream)], SYSTEM, service.BetaStated(beta_unit))
         if not outcome.usable:
             raise api.unusable(outcome)
         answer = api.upload_out(db, outcome, SYSTEM).model_dump(mode="json")
     lines = [f"{r['name']}: {s}" for r in answer["report"] for key in ("understood", "repaired", "flagged", "removed") for s in r[key]]
     _print(answer, as_json, "\n".join(lines))
+
+
+@ingest_app.command("redecode", epilog="Example: betaloop ingest redecode --participant P1 --dry-run")
+def redecode_(
+    participant: Annotated[str | None, typer.Option(help="Code of a participant; every one when left out.")] = None,
+    upload_file: Annotated[int | None, typer.Option(min=1, help="Number of one file, from its upload's page.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Tell what would change, and change nothing.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Read stored files with the present decoder; sessions use what it gives from then on, snapshots keep what they pin."""
+    from app.ingest.redecode import redecode
+    from app.study import repository as study
+
+    with transaction(ACTOR) as db:
+        only = study.participant_by_code(db, participant, SYSTEM).id if participant else None
+    table = Table("file", "participant", "kind", "state", "what changed" if not dry_run else "what would change")
+    changes = list(redecode(only, upload_file, dry_run, ACTOR))
+    for c in changes:
+        table.add_row(str(c.upload_file_id), c.participant, c.kind, c.state, "\n".join(c.said))
+    if as_json:
+        _print({"dry_run": dry_run, "files": [vars(c) for c in changes]}, True, "")
+    else:
+        Console().print(table)
+    if any(c.state == "failed" for c in changes):
+        raise typer.Exit(1)
 
 
 @app.command(epilog="Example: betaloop pipeline P1 --preset quick")
@@ -211,6 +245,32 @@ def rank(code: Code, as_json: AsJson = False) -> None:
         console.print(sentence, markup=False, highlight=False)
 
 
+@study_app.command("simulate", epilog="Example: betaloop study simulate --participants P1 --preset quick")
+def simulate(
+    visits: Annotated[int | None, typer.Option(min=2, max=60, help="Visits of each participant; the preset's when left out.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything random in the study.")] = 0,
+    participants: Annotated[str, typer.Option(help="Codes of synthetic participants, with commas between them.")] = "P1,P2,P3,P4",
+    preset: Annotated[str, typer.Option(help="'quick': for a first look; 'full': about the paper's trial time.")] = "quick",
+    as_json: AsJson = False,
+) -> None:
+    """Run the whole trial loop on synthetic participants, who are not fitted to patients; started again, it goes on where it was."""
+    from app.platform.migrate import migrate as bring_up_to_date
+    from app.simulation.design import design
+    from app.simulation.report import as_dict, as_table
+    from app.simulation.run import simulate as run_study
+
+    wanted = design(participants.split(","), visits, seed, preset)
+    bring_up_to_date()
+    caller = run_study(wanted)
+    with transaction(ACTOR) as db:
+        table = as_table(db, wanted.participants, caller)
+        result = as_dict(db, wanted.participants, caller)
+    if as_json:
+        _print(result, True, "")
+    else:
+        Console().print(table)
+
+
 @app.command("export", epilog="Example: betaloop export P1 --to p1.zip")
 def export_(
     code: Code,
@@ -234,6 +294,29 @@ def export_(
         _say(f"betaloop: {target} cannot be written: {_reason(error)}.")
         raise typer.Exit(1) from error
     _print({"path": str(target), "bytes": len(content)}, as_json, f"Wrote {target} ({len(content)} bytes).")
+
+
+@app.command("control", epilog="Example: betaloop control --bundle P1-policy-3.zip --source session.zip --speed fast --log decisions.csv")
+def control_(
+    bundle: Annotated[Path, typer.Option(help="Controller bundle.")],
+    source: Annotated[str | None, typer.Option(help="Recording, cohort:P1[:SEED], or - (betas, a line each); none: verify only.")] = None,
+    speed: Annotated[str, typer.Option(help="realtime or fast.")] = "realtime",
+    log: Annotated[Path | None, typer.Option(help="CSV of every decision.")] = None,
+    key: Annotated[str | None, typer.Option(help="Public key, or a file with it; this installation's own when left out.")] = None,
+    channel: Annotated[str | None, typer.Option(help="Channel of a recording with several.")] = None,
+    beta_source: Annotated[str | None, typer.Option(help="How the beta of a table was made, where not by 'table'.")] = None,
+    steps: Annotated[int, typer.Option(min=1, help="Length of a simulated session.")] = 300,
+    as_json: AsJson = False,
+) -> None:
+    """Verify a controller bundle and run it on a stream of beta, as the tablet does."""
+    from app.control import control, lines
+    from app.control_sources import Wish
+
+    if speed not in ("realtime", "fast"):
+        raise typer.BadParameter(f"'{speed}' is neither realtime nor fast.", param_hint="--speed")
+    wish = Wish(channel=channel, beta_source=beta_source, steps=steps, realtime=speed == "realtime")
+    summary = control(bundle, source, wish, log=log, key=key)
+    _print(summary, as_json, lines(summary))
 
 
 def _estimate_cells(estimate: dict[str, Any]) -> tuple[str, str, str]:

@@ -25,6 +25,19 @@ _DEVICE_STARTS_S = 5
 """Seconds from the start of a simulated device recording to its first sample."""
 
 
+def device_session(code: str) -> bool:
+    """Whether the participant's sessions arrive as device recordings, whose start must be stated."""
+    return code == DEVICE_PARTICIPANT
+
+
+def session_file(stem: str, simulated: SimulatedSession, begins: dt.datetime) -> tuple[str, bytes]:
+    """Name and bytes of a simulated session's file: an RC+S folder or a table; `begins` is when its step 0 begins."""
+    if device_session(simulated.participant):
+        recording_starts = begins - dt.timedelta(seconds=_DEVICE_STARTS_S + 2 * simulated.lead_beta.size)
+        return f"{stem}.zip", rcs_session_zip(simulated, started_ms=round(1000 * recording_starts.timestamp()))
+    return f"{stem}.csv", session_table_csv(simulated)
+
+
 @dataclass(frozen=True)
 class DemoSession:
     """One session of the demo; simulated when its file is asked for."""
@@ -52,15 +65,11 @@ class DemoSession:
     @property
     def started_at(self) -> dt.datetime | None:
         """Start of the session proper: a device's recording begins with the window before it; a table tells it by its times."""
-        return self.begins if self.code == DEVICE_PARTICIPANT else None
+        return self.begins if device_session(self.code) else None
 
     def file(self) -> tuple[str, bytes]:
         """Name and bytes of the session's file."""
-        stem = f"{self.code}-visit{self.visit}-session{self.ordinal}"
-        if self.code == DEVICE_PARTICIPANT:
-            recording_starts = self.begins - dt.timedelta(seconds=_DEVICE_STARTS_S + 2 * _LEAD_STEPS)
-            return f"{stem}.zip", rcs_session_zip(self.simulated, started_ms=round(1000 * recording_starts.timestamp()))
-        return f"{stem}.csv", session_table_csv(self.simulated)
+        return session_file(f"{self.code}-visit{self.visit}-session{self.ordinal}", self.simulated, self.begins)
 
     def qoc(self) -> dict[str, Any]:
         """End-of-session QoCs for the REST interface."""

@@ -8,8 +8,10 @@ from fastapi.responses import HTMLResponse
 from app.accounts.deps import CurrentCaller
 from app.analysis import service
 from app.analysis.charts import view
+from app.analysis.trial_time import trial_time
 from app.platform.database import Db
 from app.platform.templates import render
+from app.study import repository as study
 from app.study.api import CurrentParticipant
 
 router = APIRouter()
@@ -20,3 +22,10 @@ def analyses(request: Request, participant: CurrentParticipant, db: Db, caller: 
     """The five metrics by controller, with tests, tables and limits."""
     analysis = view(service.five_metrics(db, participant, caller))
     return HTMLResponse(render(request, "analysis/analyses.html", participant=participant, analysis=analysis))
+
+
+@router.get("/trial-time")
+def trial_time_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """Minutes of every controller in every participant that the caller may read."""
+    participants, _ = study.participants(db, caller, 1000, 0)
+    return HTMLResponse(render(request, "analysis/trial_time.html", trial=trial_time(db, participants, caller)))

@@ -138,7 +138,7 @@ def five_metrics(db: Session, participant: Participant, caller: Caller) -> FiveM
     """Energy, mean beta, grasp, rating and tremor of every session, by controller, each controller compared with cDBS."""
     included: list[SessionMetrics] = []
     excluded: list[Excluded] = []
-    for session in study.sessions_of_participant(db, participant.id):
+    for session in study.sessions_of_participant(db, participant.id, with_proposals=True):
         reason = session.excluded_reason or ("not confirmed yet" if session.status == "proposed" else "")
         if not reason:
             try:

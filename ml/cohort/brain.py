@@ -2,13 +2,14 @@
 
 Two populations, subthalamic nucleus (S) and external globus pallidus (G), in spikes per second:
 
-    tau_S dS/dt = F_S(w_CS (Ctx + sigma_c xi) - w_GS G(t - 6 ms)) - S
+    tau_S dS/dt = F_S(w_CS (Ctx + (1 - kappa E) sigma_c xi) - w_GS G(t - 6 ms)) - S
     tau_G dG/dt = F_G((1 - eta E) w_SG S(t - 6 ms) - w_GG G(t - 4 ms) - w_XG Str) - G
 
 with the sigmoid F(x) = M / (1 + exp(-4 x / M) (M - B) / B) and weights on the line from the healthy (K = 0) to the parkinsonian
-(K = 1) set of Nevado-Holgado, Terry and Bogacz 2010 (J Neurosci 30:12340). DBS removes a share eta E of the STN-GPe loop gain, where E
-follows the amplitude fraction with fast wash-in and slow wash-out. Every population input is delayed, so over one step of 1 ms the drive
-is known and the leak is integrated exactly (exponential integrator, trapezoid in the drive).
+(K = 1) set of Nevado-Holgado, Terry and Bogacz 2010 (J Neurosci 30:12340). DBS acts in two places: it removes a share eta E of the STN-GPe
+loop gain, and a share kappa E of the cortical fluctuations xi that reach the nucleus through the hyperdirect pathway. Its effect E has two
+parts: one follows the amplitude within half a second, the other builds up over seconds and outlasts stimulation. Every population input is
+delayed, so over one step of 1 ms the drive is known and the leak is integrated exactly (exponential integrator, trapezoid in the drive).
 
 Each session owns its random streams: splitmix64, a counter hashed per draw, keyed by the session's seed. A session's numbers therefore
 depend neither on the batch it runs in, nor on threads, nor on what the controller does (two policies with one seed see the same noise).
@@ -34,8 +35,8 @@ BETA_UNIT: Final = "uV"
 
 # Columns of the state of one session.
 _S, _G = 0, 8  # delay lines of eight 1 ms steps each
-_XI, _X, _BACKGROUND, _E, _ACT, _FILTER = 16, 17, 18, 19, 20, 21
-STATE_SIZE: Final = 21 + 8
+_XI, _X, _BACKGROUND, _AT_ONCE, _LASTING, _ACT, _FILTER = 16, 17, 18, 19, 20, 21, 22
+STATE_SIZE: Final = 22 + 8
 ACT: Final = _ACT
 # Columns of the constants of one session.
 _K0, _ETA, _A50, _HILL, _S_ACT, _C_MED, _S_K = range(7)
@@ -53,8 +54,11 @@ _M_S, _B_S, _M_G, _B_G = 300.0, 17.0, 400.0, 75.0
 _CORTEX, _STRIATUM = 27.0, 2.0
 _W_SG, _W_GS, _W_GG, _W_CS, _W_XG = (19.0, 20.0), (1.12, 10.7), (6.60, 12.3), (2.42, 9.2), (15.1, 139.4)
 _SIGMA_CORTEX, _TAU_CORTEX = 3.0, 5.0  # assumed: spikes per second and ms
-_TAU_X_S, _TAU_ACT_S = 0.80, 90.0  # assumed: bursts within, and drifts over, a session
-_TAU_ON_S, _TAU_OFF_S = 0.5, 4.0  # Wiest 2020 (suppressed within 0.5 s); Kuehn 2008 (reduced for about 12 s after cessation = 3 tau)
+_TAU_X_S, _TAU_ACT_S = 0.40, 90.0  # assumed: bursts within, and drifts over, a session
+_TAU_AT_ONCE_S = 0.5  # Wiest 2020: suppressed within 0.5 s of onset; that this part ends as fast is assumed
+_TAU_ON_S, _TAU_OFF_S = 2.0, 12.0  # build-up assumed; Kuehn 2008: still reduced about 12 s after cessation
+_AT_ONCE_SHARE = 0.40  # assumed
+_KAPPA = 0.30  # assumed size; antidromic blocking of the hyperdirect pathway: Li 2012, from general knowledge
 _LFP_UV_PER_HZ, _BACKGROUND_UV, _WHITE = 0.5, 0.50, 0.3  # assumed, so that beta is 1-4 uV as in real STN recordings
 _BACKGROUND_CORNER_HZ = 3.0  # assumed: 1/f^2 above
 
@@ -64,6 +68,7 @@ _DECAY_XI = math.exp(-_DT / _TAU_CORTEX)
 _DECAY_X = math.exp(-4e-3 / _TAU_X_S)
 _DECAY_BG = math.exp(-4e-3 * 2 * math.pi * _BACKGROUND_CORNER_HZ)
 _DECAY_ACT = math.exp(-PERIOD_S / _TAU_ACT_S)
+_GAIN_AT_ONCE = 1 - math.exp(-4e-3 / _TAU_AT_ONCE_S)
 _GAIN_ON, _GAIN_OFF = 1 - math.exp(-4e-3 / _TAU_ON_S), 1 - math.exp(-4e-3 / _TAU_OFF_S)
 
 
@@ -128,7 +133,8 @@ def _one_period(state: Any, counters: Any, c: Any, amplitude: float, k_period: f
     e_inf = saturation(amplitude, c[_A50], c[_HILL])
     noise_xi = _SIGMA_CORTEX * math.sqrt(1.0 - _DECAY_XI**2)
     noise_x, noise_bg = math.sqrt(1.0 - _DECAY_X**2), math.sqrt(1.0 - _DECAY_BG**2)
-    xi, x, background, e = state[_XI], state[_X], state[_BACKGROUND], state[_E]
+    xi, x, background = state[_XI], state[_X], state[_BACKGROUND]
+    at_once, lasting = state[_AT_ONCE], state[_LASTING]
     power = 0.0
     now = 0  # 500 samples of 4 steps are a multiple of the delay lines' 8: every period starts at slot 0
     for n in range(SAMPLES_PER_PERIOD):
@@ -136,7 +142,10 @@ def _one_period(state: Any, counters: Any, c: Any, amplitude: float, k_period: f
         g_white, _ = gauss_pair(counters, STREAM_LFP)
         x = _DECAY_X * x + noise_x * g_x
         background = _DECAY_BG * background + noise_bg * g_bg
-        e += (e_inf - e) * (_GAIN_ON if e_inf > e else _GAIN_OFF)
+        at_once += (e_inf - at_once) * _GAIN_AT_ONCE
+        lasting += (e_inf - lasting) * (_GAIN_ON if e_inf > lasting else _GAIN_OFF)
+        e = _AT_ONCE_SHARE * at_once + (1.0 - _AT_ONCE_SHARE) * lasting
+        passed = 1.0 - _KAPPA * e
         k = k_period * math.exp(c[_S_K] * x)
         w_sg = (1.0 - c[_ETA] * e) * (_W_SG[0] + k * (_W_SG[1] - _W_SG[0]))
         w_gs = _W_GS[0] + k * (_W_GS[1] - _W_GS[0])
@@ -153,7 +162,7 @@ def _one_period(state: Any, counters: Any, c: Any, amplitude: float, k_period: f
             nxt = (now + 1) & 7
             s_6, g_6, g_4 = state[_S + ((now + 2) & 7)], state[_G + ((now + 2) & 7)], state[_G + ((now + 4) & 7)]
             s_5, g_5, g_3 = state[_S + ((now + 3) & 7)], state[_G + ((now + 3) & 7)], state[_G + ((now + 5) & 7)]
-            drive_s = _rate(w_cs * (_CORTEX + xi) - w_gs * 0.5 * (g_6 + g_5), _M_S, _B_S)
+            drive_s = _rate(w_cs * (_CORTEX + passed * xi) - w_gs * 0.5 * (g_6 + g_5), _M_S, _B_S)
             drive_g = _rate(w_sg * 0.5 * (s_6 + s_5) - w_gg * 0.5 * (g_4 + g_3) - striatum, _M_G, _B_G)
             state[_S + nxt] = drive_s + (state[_S + now] - drive_s) * _DECAY_S
             state[_G + nxt] = drive_g + (state[_G + now] - drive_g) * _DECAY_G
@@ -163,7 +172,8 @@ def _one_period(state: Any, counters: Any, c: Any, amplitude: float, k_period: f
             lfp[n] = sample * 1e-3
         beta = _filtered(sample, state, sos)
         power += beta * beta
-    state[_XI], state[_X], state[_BACKGROUND], state[_E] = xi, x, background, e
+    state[_XI], state[_X], state[_BACKGROUND] = xi, x, background
+    state[_AT_ONCE], state[_LASTING] = at_once, lasting
     return math.sqrt(power / SAMPLES_PER_PERIOD)
 
 
@@ -193,7 +203,7 @@ def initial_state(counters: Any, constants: Any, amplitude: float) -> Any:
         state[i, _S : _S + 8] = 15.0
         state[i, _G : _G + 8] = 60.0
         state[i, _X], state[i, _ACT] = gauss_pair(counters[i], STREAM_SLOW)
-        state[i, _E] = saturation(amplitude, constants[i, _A50], constants[i, _HILL])
+        state[i, _AT_ONCE] = state[i, _LASTING] = saturation(amplitude, constants[i, _A50], constants[i, _HILL])
     return state
 
 

@@ -19,7 +19,7 @@ TREMOR_BOUNDS: Final = (0.3, 1.0, 2.0, 3.2)  # assumed: mean severity of a minut
 STEPS_PER_MINUTE: Final = 30
 
 _GRASP_NOISE_HZ, _INTERVAL_CV, _DECREMENT = 0.12, 0.06, 0.01  # assumed
-_RATING_TOP, _RATING_BRADY, _RATING_TREMOR, _RATING_OVERLOAD, _RATING_CHANGE, _RATING_NOISE = 9.0, 3.0, 4.0, 4.0, 1.0, 0.5  # assumed
+_RATING_TOP, _RATING_BRADY, _RATING_TREMOR, _RATING_OVERLOAD, _RATING_CHANGE, _RATING_NOISE = 9.0, 3.0, 4.0, 3.0, 1.0, 0.5  # assumed
 _TREMOR_FULL = 2.5  # assumed: severity at which tremor costs its full share of the rating
 
 

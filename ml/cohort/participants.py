@@ -24,7 +24,7 @@ class BrainConstants:
         a50, hill: amplitude fraction of half effect, and steepness.
         s_act: sd of log K from drifts of 90 s (activity, stress, attention).
         c_med: loss of K at full levodopa effect.
-        s_k: sd of log K from fluctuations of 0.8 s.
+        s_k: sd of log K from fluctuations of 0.4 s.
     """
 
     k0: float
@@ -48,7 +48,7 @@ class SymptomConstants:
         brady_beta_share: share of bradykinesia that follows beta (w_b); the rest follows stimulation directly.
         brady_a50, brady_hill: response of the direct share.
         grasp_min_hz, grasp_max_hz: grasp frequency at full and without bradykinesia.
-        side_effect: loss of rating by over-stimulation (4 points times this at full load).
+        side_effect: loss of rating by over-stimulation (3 points times this at full load).
         rating_bias: habit of rating higher or lower.
     """
 
@@ -157,7 +157,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=25.0,
         c3=25.0,
         c4=25.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.28, eta=0.74, a50=0.65, hill=2.0, s_act=0.30, c_med=0.15, s_k=0.35),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.42, a50=0.65, hill=2.0, s_act=0.20, c_med=0.15, s_k=0.35),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=2.0,
             tremor_theta=0.30,
@@ -173,7 +173,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.392, at_03=1.902, off=2.132),
+        reference=ReferenceBeta(cdbs=1.182, at_03=1.839, off=2.051),
     ),
     "P2": ParticipantModel(
         code="P2",
@@ -186,10 +186,10 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.28, eta=0.77, a50=0.70, hill=2.5, s_act=0.30, c_med=0.05, s_k=0.36),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.50, a50=0.70, hill=2.5, s_act=0.20, c_med=0.05, s_k=0.35),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=5.0,
-            tremor_theta=0.62,
+            tremor_theta=0.54,
             tremor_up_s=8.0,
             tremor_down_s=5.0,
             tremor_episodic=False,
@@ -198,11 +198,11 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             brady_hill=2.0,
             grasp_min_hz=1.2,
             grasp_max_hz=2.5,
-            side_effect=0.9,
+            side_effect=1.4,
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(), constant=0.15),  # selegiline and pramipexole (appendix); size assumed
-        reference=ReferenceBeta(cdbs=1.567, at_03=2.284, off=2.429),
+        reference=ReferenceBeta(cdbs=1.272, at_03=2.172, off=2.319),
     ),
     "P3": ParticipantModel(
         code="P3",
@@ -215,10 +215,10 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.29, eta=0.86, a50=0.60, hill=2.0, s_act=0.30, c_med=0.18, s_k=0.37),  # assumed
+        brain=BrainConstants(k0=0.29, eta=0.56, a50=0.60, hill=2.0, s_act=0.20, c_med=0.18, s_k=0.38),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=4.0,
-            tremor_theta=0.55,
+            tremor_theta=0.52,
             tremor_up_s=10.0,
             tremor_down_s=6.0,
             tremor_episodic=False,
@@ -227,11 +227,11 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             brady_hill=2.0,
             grasp_min_hz=1.4,
             grasp_max_hz=2.6,
-            side_effect=0.9,
+            side_effect=1.1,
             rating_bias=0.0,
         ),
         regimen=_SINEMET_TWICE,
-        reference=ReferenceBeta(cdbs=1.433, at_03=1.946, off=2.232),
+        reference=ReferenceBeta(cdbs=1.166, at_03=1.912, off=2.190),
     ),
     "P4": ParticipantModel(
         code="P4",
@@ -244,7 +244,7 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
         c2=10.0,
         c3=10.0,
         c4=10.0,  # Gao et al. 2023, section 6.2
-        brain=BrainConstants(k0=0.28, eta=0.80, a50=0.65, hill=2.0, s_act=0.30, c_med=0.12, s_k=0.37),  # assumed
+        brain=BrainConstants(k0=0.28, eta=0.48, a50=0.65, hill=2.0, s_act=0.20, c_med=0.12, s_k=0.35),  # assumed
         symptoms=SymptomConstants(  # assumed, shaped by the appendix
             tremor_max=3.5,
             tremor_theta=0.50,
@@ -256,10 +256,10 @@ PARTICIPANTS: Final[dict[str, ParticipantModel]] = {
             brady_hill=2.0,
             grasp_min_hz=1.5,
             grasp_max_hz=2.7,
-            side_effect=1.3,
+            side_effect=1.35,
             rating_bias=0.0,
         ),
         regimen=Regimen(levodopa_h=(-2.0,), constant=0.0),  # appendix: one tablet at about 7 o'clock
-        reference=ReferenceBeta(cdbs=1.523, at_03=2.118, off=2.364),
+        reference=ReferenceBeta(cdbs=1.228, at_03=1.980, off=2.219),
     ),
 }

@@ -62,24 +62,26 @@ def one_period_in_plain_python(participant, counters, state, amplitude, sos):
     weights = {"SG": (19.0, 20.0), "GS": (1.12, 10.7), "GG": (6.60, 12.3), "CS": (2.42, 9.2), "XG": (15.1, 139.4)}
     rate = lambda x, m, b: m / (1 + math.exp(-4 * x / m) * (m - b) / b)  # noqa: E731
     s, g = [state[0]] * 8, [state[8]] * 8
-    xi, x, background, e = state[16:20]
+    xi, x, background, at_once, lasting = state[16:21]
     target = saturation(amplitude, p.a50, p.hill)
-    k_period = p.k0 * math.exp(p.s_act * state[20])
+    k_period = p.k0 * math.exp(p.s_act * state[21])
     lfp = []
     for _ in range(500):
         g_x, g_background = gauss_pair(counters, STREAM_LFP)
         white, _ = gauss_pair(counters, STREAM_LFP)
-        x = math.exp(-0.004 / 0.8) * x + math.sqrt(1 - math.exp(-0.004 / 0.8) ** 2) * g_x
+        x = math.exp(-0.004 / 0.4) * x + math.sqrt(1 - math.exp(-0.004 / 0.4) ** 2) * g_x
         decay = math.exp(-0.004 * 2 * math.pi * 3)
         background = decay * background + math.sqrt(1 - decay**2) * g_background
-        e += (target - e) * (1 - math.exp(-0.004 / (0.5 if target > e else 4.0)))
+        at_once += (target - at_once) * (1 - math.exp(-0.004 / 0.5))
+        lasting += (target - lasting) * (1 - math.exp(-0.004 / (2.0 if target > lasting else 12.0)))
+        e = 0.4 * at_once + 0.6 * lasting
         k = k_period * math.exp(p.s_k * x)
         w = {name: healthy + k * (ill - healthy) for name, (healthy, ill) in weights.items()}
         for _ in range(2):
             for draw in gauss_pair(counters, STREAM_CORTEX):
                 xi = math.exp(-1 / 5) * xi + 3.0 * math.sqrt(1 - math.exp(-1 / 5) ** 2) * draw
                 delayed = lambda history, ms: 0.5 * (history[-1 - ms] + history[-ms])  # noqa: E731
-                to_s = rate(w["CS"] * (27 + xi) - w["GS"] * delayed(g, 6), 300, 17)
+                to_s = rate(w["CS"] * (27 + (1 - 0.3 * e) * xi) - w["GS"] * delayed(g, 6), 300, 17)
                 to_g = rate((1 - p.eta * e) * w["SG"] * delayed(s, 6) - w["GG"] * delayed(g, 4) - w["XG"] * 2, 400, 75)
                 s.append(to_s + (s[-1] - to_s) * math.exp(-1 / 6))
                 g.append(to_g + (g[-1] - to_g) * math.exp(-1 / 14))
@@ -96,7 +98,7 @@ def test_the_kernel_equals_the_equations_written_out_in_plain_python(amplitude):
     advance_act = math.exp(-2 / 90)
     own_counters, own_state = counters.copy(), state[0].copy()
     draw, _ = gauss_pair(own_counters[0], 2)
-    own_state[20] = advance_act * own_state[20] + math.sqrt(1 - advance_act**2) * draw
+    own_state[21] = advance_act * own_state[21] + math.sqrt(1 - advance_act**2) * draw
     expected = one_period_in_plain_python(participant, own_counters[0], own_state, amplitude, beta_filter())
 
     beta, lfp = np.empty(1), np.empty((1, 500), dtype=np.float32)

@@ -33,13 +33,25 @@ def test_no_dbs_differs_from_cdbs_in_beta_with_as_few_sessions_as_the_paper_had(
 
 
 @pytest.mark.parametrize("code", CODES)
-def test_beta_washes_out_to_63_percent_within_4_to_12_s(code, timetable):
-    drop = run_sessions(code, timetable([1.0] * 15 + [0.15] * 35), seeds=range(150), study_seed=range(150), steps=50)
-    mean = drop.beta.mean(axis=0)
-    before, after = mean[5:15].mean(), mean[30:45].mean()
-    rise = (mean[15:] - before) / (after - before)
-    first = int(np.argmax(rise >= 0.632))
-    assert 4 <= 2 * (first + 1) <= 12, rise[:8]
+def test_beta_washes_out_to_63_percent_4_to_12_s_after_a_drop(code, timetable):
+    """The drop against sessions of the same noise that stay at 1 and that were always at 0.15: the rise as a share, window by window."""
+    common = {"seeds": range(200), "study_seed": range(200), "steps": 25}
+    drop = run_sessions(code, timetable([1.0] * 10 + [0.15] * 15), **common).beta.mean(axis=0)
+    high = run_sessions(code, timetable([1.0] * 25), **common).beta.mean(axis=0)
+    low = run_sessions(code, timetable([0.15] * 25), lead_amplitude=0.15, **common).beta.mean(axis=0)
+    rise = ((drop - high) / (low - high))[10:]
+    middles_s = 2.0 * np.arange(15) + 1
+    assert 4 <= np.interp(0.632, np.maximum.accumulate(rise), middles_s) <= 12, rise
+    assert rise[0] > 0.15  # a part of the effect follows the amplitude within a second
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_beta_answers_to_the_amplitude_of_its_own_window_in_random_sessions(code):
+    batch = run_sessions(code, "random", seeds=range(40), study_seed=range(40), hours=np.linspace(0, 5.5, 40), steps=300)
+    within = [np.corrcoef(a, b)[0, 1] for a, b in zip(batch.amplitude, batch.beta, strict=True)]
+    assert -0.20 < np.mean(within) < -0.06
+    windows = np.lib.stride_tricks.sliding_window_view(batch.beta, 10, axis=1).mean(axis=2)
+    assert np.corrcoef(windows.ravel(), batch.hidden["activity"][:, 9:].ravel())[0, 1] > 0.6  # what a state shows of the drift
 
 
 def test_tremor_is_above_mild_within_10_s_of_a_drop_to_015_in_participants_2_to_4_and_not_in_1(timetable):
@@ -53,6 +65,15 @@ def test_tremor_is_above_mild_within_10_s_of_a_drop_to_015_in_participants_2_to_
         else:
             calm = before < 0.3
             assert np.mean(after[calm] >= 1) < 0.02
+
+
+def test_bradykinesia_washes_out_in_two_steps(timetable):
+    """Cooper 2011, 2013: much within a minute, the rest over more than five; paired with sessions that stay under cDBS."""
+    common = {"seeds": range(12), "study_seed": range(12), "steps": 610}
+    off, on = (run_sessions("P1", timetable([1.0] * 10 + [a] * 600), **common).hidden["brady"].mean(axis=0) for a in (0.0, 1.0))
+    share = (off - on)[10:] / (off - on)[-60:].mean()
+    assert 0.4 < share[25:35].mean() < 0.8
+    assert share[25:35].mean() + 0.1 < share[130:170].mean() < 0.97
 
 
 def test_tremor_of_participant_1_comes_in_episodes_more_often_without_stimulation(constant_sessions):
@@ -90,8 +111,8 @@ def test_bursts_last_200_to_500_ms_without_stimulation_and_are_shorter_and_rarer
     long, short = burst_seconds(off, threshold), burst_seconds(on, threshold)
     assert 0.2 < long.mean() < 0.5
     assert 0.05 < np.mean(long > 0.5) < 0.35
-    assert short.mean() < 0.8 * long.mean()
-    assert short.size / on.size < 0.5 * long.size / off.size
+    assert short.mean() < 0.95 * long.mean()
+    assert short.size / on.size < 0.35 * long.size / off.size
 
 
 @pytest.mark.parametrize("code", CODES)

@@ -1,0 +1,225 @@
+"""The trial loop of one synthetic participant: collect, learn, evaluate, plan, test. Each part looks first what is there already."""
+
+from __future__ import annotations
+
+import datetime as dt
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.accounts.policy import Caller
+from app.demo_study import participant_body
+from app.evaluation.ranking import current_ranking
+from app.evaluation.schemas import RankedPolicy
+from app.evaluation.service import start_job
+from app.learning import repository as learning
+from app.learning.models import Policy
+from app.planning import repository as plans
+from app.planning import service as planning
+from app.planning.schedule import total_minutes
+from app.planning.schemas import PlanIn
+from app.platform.database import new_session, set_actor
+from app.platform.errors import BetaloopError, Conflict, NotFound
+from app.platform.jobs.models import Job, JobStatus
+from app.platform.jobs.watch import POLL_S, look
+from app.simulation import sessions
+from app.simulation.design import BETWEEN_VISITS, MORNING, STEPS_PER_MINUTE, Design, Remembered, collecting_day
+from app.simulation.sessions import PlacedSession
+from app.study import repository as study_repository
+from app.study import service as study
+from app.study.blinding import CONTROLLER_NAMES, arm
+from app.study.models import Controller, Participant, Visit
+from app.study.schemas import ParticipantIn, VisitIn
+
+LEARNED_KINDS = ("trained", "distilled")
+_WASHOUT_MINUTES = 5.0
+
+
+class Progress(Protocol):
+    """Where the loop tells how far it is."""
+
+    def say(self, code: str, what: str) -> None:
+        """What is going on."""
+
+    def session_held(self, code: str) -> None:
+        """One more session is in the study."""
+
+    def job(self, code: str, share: float) -> None:
+        """How far the present job is, 0-1; 1 ends it."""
+
+
+def refuse_foreign(participant: Participant, caller: Caller) -> None:
+    """Raises Conflict for a participant that the simulation did not enrol."""
+    enrolled_by = participant.settings[0].created_by
+    if enrolled_by != caller.label:
+        raise Conflict(
+            f"Participant {participant.code} was enrolled by {enrolled_by}, not by a simulated study; it is left alone.",
+            "Choose other participants, or another data folder (BETALOOP_DATA_DIR).",
+        )
+
+
+@dataclass
+class ParticipantLoop:
+    """All visits of one participant.
+
+    Args:
+        design: the study. remembered: its seed and its first day. caller: the simulated clinician who uploads, drafts and approves.
+        progress: where to tell. check_worker: raises when nobody works on jobs any more.
+    """
+
+    code: str
+    design: Design
+    remembered: Remembered
+    caller: Caller
+    progress: Progress
+    check_worker: Callable[[], None]
+
+    def run(self) -> None:
+        """Go on from wherever the study stands.
+
+        Raises:
+            Conflict: the participant exists, and was not enrolled by this simulation. BetaloopError: a job failed.
+        """
+        with self._transaction() as db:
+            self._participant(db)
+            db.commit()
+        for number in range(1, self.design.visits + 1):
+            self._visit(number)
+
+    def _transaction(self) -> Session:
+        db = new_session()
+        set_actor(db, self.caller.label, self.caller.user_id)
+        return db
+
+    def _participant(self, db: Session) -> Participant:
+        try:
+            found = study_repository.participant_by_code(db, self.code, self.caller)
+        except NotFound:
+            return study.enrol(db, ParticipantIn.model_validate(participant_body(self.code)), self.caller)
+        refuse_foreign(found, self.caller)
+        return found
+
+    def _visit(self, number: int) -> None:
+        day = self.remembered.first + (number - 1) * BETWEEN_VISITS
+        with self._transaction() as db:
+            person = self._participant(db)
+            visit = study_repository.visit_by_number(db, person.id, number)
+            if visit is None:
+                note = "Simulated: the participant is synthetic and not fitted to a patient."
+                visit = study.add_visit(db, person, VisitIn(number=number, date=day, note=note), self.caller)
+                db.commit()
+            if number > self.design.preset.random_visits:
+                if plans.live_plan(db, visit.id) is None:
+                    self._learn(db, person, number)
+                    self._draft(db, person, visit)
+                self.progress.job(self.code, 1.0)
+                self._approve(db, visit)
+                placed = self._planned(db, visit, day)
+            else:
+                placed = self._collecting(day)
+            for one in placed:
+                self.progress.say(self.code, f"visit {number}: {_name(one)}")
+                sessions.hold(db, person, visit, one, self.design.seed, self.caller)
+                self.progress.session_held(self.code)
+
+    def _learn(self, db: Session, person: Participant, number: int) -> None:
+        """The pipeline before a visit: the one that was begun for it, or a new one; waits for its end."""
+        wanted = number - self.design.preset.random_visits
+        query = select(Job).where(Job.participant_id == person.id, Job.kind == "pipeline").order_by(Job.created_at, Job.id)
+        begun = [job for job in db.scalars(query) if job.status not in (JobStatus.FAILED, JobStatus.CANCELLED)]
+        if len(begun) >= wanted:
+            job_id = begun[wanted - 1].id
+        else:
+            parents = self._parents(db, person) if self.design.fine_tunes(number) else []
+            params = self.design.preset.pipeline | {"policies": parents, "seed": (self.design.seed + 100 * number) % 10**6}
+            job_id = start_job(db, person, "pipeline", params, self.caller).id
+        db.commit()
+        while not (view := look(job_id)).status.ended:
+            self.check_worker()
+            step = next((s.title for s in view.steps if s.status == JobStatus.RUNNING), "waiting for the worker")
+            self.progress.say(self.code, f"before visit {number}: {step}")
+            self.progress.job(self.code, min(view.progress, 0.99))
+            time.sleep(POLL_S)
+        if view.status != JobStatus.SUCCEEDED:
+            raise BetaloopError(
+                f"The pipeline before visit {number} of {self.code} {view.status}: {view.error or 'no reason given'}",
+                "Look at its page under Jobs, then start the simulation again: it goes on from here.",
+            )
+
+    def _parents(self, db: Session, person: Participant) -> list[int]:
+        """The full-sized policies that did best in the clinic, by the mean actual return of their sessions."""
+        returns: dict[int, list[float]] = {}
+        for session in study_repository.sessions_of_participant(db, person.id):
+            ran = arm(session, self.caller)
+            value = sessions.actual_return(db, session) if ran.controller is Controller.RL else None
+            if ran.policy_id is not None and value is not None:
+                returns.setdefault(ran.policy_id, []).append(value)
+        usable = {p.id for p in learning.candidates(db, person.id) if p.kind == "trained"}
+        ordered = sorted(usable & returns.keys(), key=lambda i: (-sum(returns[i]) / len(returns[i]), i))
+        return ordered[: self.design.preset.policies_per_kind]
+
+    def _draft(self, db: Session, person: Participant, visit: Visit) -> None:
+        """Draft the visit from the best-ranked policies of each kind."""
+        ranked = sorted((r for r in current_ranking(db, person, self.caller).policies if r.rank and not r.retired), key=_rank)
+        chosen = [
+            row.policy_id for kind in LEARNED_KINDS for row in [r for r in ranked if r.kind == kind][: self.design.preset.policies_per_kind]
+        ]
+        minutes = float(self.design.preset.session_minutes)
+        draft = PlanIn(
+            policy_ids=chosen,
+            minutes_per_session=minutes,
+            washout_minutes=_WASHOUT_MINUTES,
+            no_dbs=True,
+            seed=(self.design.seed + visit.number) % planning.MAX_SEED,
+            note="Drafted by the simulated study from the best-ranked policies of each kind.",
+        )
+        needed = total_minutes(len(chosen), planning.rules_of(draft))
+        planning.draft_plan(db, visit, draft.model_copy(update={"total_minutes": max(needed, draft.total_minutes)}), self.caller)
+        db.commit()
+
+    def _approve(self, db: Session, visit: Visit) -> None:
+        plan = planning.read_plan(db, visit, self.caller).plan
+        if plan.status == "draft":
+            planning.approve_plan(db, visit, self.caller, plan.id)
+            db.commit()
+
+    def _planned(self, db: Session, visit: Visit, day: dt.date) -> list[PlacedSession]:
+        """The sessions of the approved plan."""
+        lines = planning.read_plan(db, visit, self.caller).lines
+        policies: dict[int, Policy] = {
+            p.id: p for p in learning.policies_named(db, visit.participant_id, [i.item.policy_id for i in lines if i.item.policy_id])
+        }
+        return [
+            _placed(
+                line.item.position,
+                Controller(line.item.controller),
+                policies[line.item.policy_id] if line.item.policy_id else None,
+                day,
+                line.start_minute / 60,
+                round(line.item.minutes * STEPS_PER_MINUTE),
+            )
+            for line in lines
+        ]
+
+    def _collecting(self, day: dt.date) -> list[PlacedSession]:
+        """The sessions of a visit that only collects."""
+        rows = enumerate(collecting_day(self.design.preset), start=1)
+        return [_placed(i, Controller(row.controller), None, day, row.hour, row.steps) for i, row in rows]
+
+
+def _placed(position: int, controller: Controller, policy: Policy | None, day: dt.date, hour: float, steps: int) -> PlacedSession:
+    begins = dt.datetime.combine(day, MORNING) + dt.timedelta(hours=hour)
+    begins = begins.replace(microsecond=0)
+    return PlacedSession(position=position, controller=controller, policy=policy, begins=begins, hour=hour, steps=steps)
+
+
+def _rank(row: RankedPolicy) -> int:
+    return row.rank or 0
+
+
+def _name(one: PlacedSession) -> str:
+    return f"session {one.position}, {CONTROLLER_NAMES[one.controller]}" + (f" ({one.policy.name})" if one.policy else "")

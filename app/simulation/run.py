@@ -1,0 +1,148 @@
+"""`betaloop study simulate`: an in-silico study from the first visit to the last, with a worker of its own; interrupted, it goes on."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from sqlalchemy import text
+
+from app.accounts import repository as accounts_repository
+from app.accounts import service as accounts
+from app.accounts.models import Role
+from app.accounts.policy import SYSTEM, Caller
+from app.platform.database import get_engine, new_session, now, transaction
+from app.platform.errors import BetaloopError, Conflict
+from app.platform.jobs.worker import run_worker
+from app.settings import get_settings
+from app.simulation.design import STATE_FILE, Design, remember
+from app.simulation.loop import ParticipantLoop, refuse_foreign
+from app.study import repository as study
+
+ACCOUNT = "simulated-clinician@simulation.example"
+"""Uploads, drafts and approves; nobody can sign in with it, for its password is thrown away."""
+_LOCK = "betaloop simulated study"
+_JOB_UNITS = 5.0
+"""A job counts on the bar as this many sessions."""
+
+
+def simulate(design: Design, console: Console | None = None, slots: int | None = None) -> Caller:
+    """Run the study, or what is missing of it; returns the account it ran under.
+
+    Args:
+        design: what to simulate. console: where the progress bars go; stderr by default.
+        slots: compute steps side by side; the installation's setting by default.
+
+    Raises:
+        Conflict: another simulation runs, or another study was begun in this data folder. BetaloopError: a job failed.
+    """
+    settings = get_settings()
+    with _alone(), _worker(settings.worker_slots if slots is None else slots) as check_worker:
+        caller = _account()
+        _refuse_foreign(design, caller)
+        remembered = remember(settings.data_dir / STATE_FILE, design, now().date())
+        with _Bars(design, console or Console(stderr=True)) as bars:
+            for code in design.participants:
+                ParticipantLoop(code, design, remembered, caller, bars, check_worker).run()
+                bars.say(code, "all visits held")
+    return caller
+
+
+def _account() -> Caller:
+    with transaction("simulated study") as db:
+        user = accounts_repository.user_by_email(db, ACCOUNT)
+        if user is None:
+            user = accounts.add_user(db, ACCOUNT, Role.CLINICIAN, secrets.token_urlsafe(32), name="Simulated clinician")
+        return accounts.caller_of(user)
+
+
+def _refuse_foreign(design: Design, caller: Caller) -> None:
+    with new_session() as db:
+        for participant in study.participants(db, SYSTEM, 10_000, 0)[0]:
+            if participant.code in design.participants:
+                refuse_foreign(participant, caller)
+
+
+@contextmanager
+def _alone() -> Iterator[None]:
+    """Hold the database's lock of simulations; it ends with this process."""
+    with get_engine().connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        if not connection.scalar(text("select pg_try_advisory_lock(hashtextextended(:name, 0))"), {"name": _LOCK}):
+            raise Conflict("A simulated study is running on this database already.", "Wait for its end, or stop it first.")
+        try:
+            yield
+        finally:
+            connection.execute(text("select pg_advisory_unlock(hashtextextended(:name, 0))"), {"name": _LOCK})
+
+
+@contextmanager
+def _worker(slots: int) -> Iterator[Callable[[], None]]:
+    """A worker in a thread of this process; yields a function that raises when it has ended."""
+    stop = threading.Event()
+    failure: list[Exception] = []
+
+    def work() -> None:
+        try:
+            run_worker(slots, stop)
+        except Exception as error:  # handed to the thread that waits for the jobs
+            failure.append(error)
+
+    thread = threading.Thread(target=work, name="simulation-worker")
+    thread.start()
+
+    def check() -> None:
+        if failure or not thread.is_alive():
+            cause = failure[0] if failure else None
+            raise BetaloopError("The worker of the simulation ended.", "Start it again: it goes on from here.") from cause
+
+    try:
+        yield check
+    finally:
+        stop.set()
+        thread.join()
+
+
+class _Bars:
+    """A bar for each participant."""
+
+    def __init__(self, design: Design, console: Console) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
+        self._progress = Progress(*columns, TextColumn("{task.fields[what]}"), console=console)
+        jobs = design.visits - design.preset.random_visits
+        total = sum(design.expected_sessions(v) for v in range(1, design.visits + 1)) + jobs * _JOB_UNITS
+        self._tasks: dict[str, TaskID] = {c: self._progress.add_task(c, total=total, start=False, what="") for c in design.participants}
+        self._done = dict.fromkeys(design.participants, 0.0)
+        self._said: dict[str, str] = {}
+
+    def __enter__(self) -> _Bars:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def say(self, code: str, what: str) -> None:
+        """What is going on."""
+        if not self._progress.console.is_terminal and self._said.get(code) != what:
+            self._progress.console.print(f"{code}, {what}", highlight=False)  # bars need a terminal; a log file gets lines
+        self._said[code] = what
+        self._progress.start_task(self._tasks[code])
+        self._progress.update(self._tasks[code], what=what)
+
+    def session_held(self, code: str) -> None:
+        """One more session is in the study."""
+        self._advance(code, 1.0)
+
+    def job(self, code: str, share: float) -> None:
+        """How far the present job is, 0-1; 1 ends it."""
+        self._progress.update(self._tasks[code], completed=self._done[code] + _JOB_UNITS * share)
+        if share >= 1.0:
+            self._advance(code, _JOB_UNITS)
+
+    def _advance(self, code: str, units: float) -> None:
+        self._done[code] += units
+        self._progress.update(self._tasks[code], completed=self._done[code])

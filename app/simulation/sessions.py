@@ -1,0 +1,110 @@
+"""One session of the study in silico: simulated, uploaded as a patient's file would be, and rated."""
+
+from __future__ import annotations
+
+import datetime as dt
+import io
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from app.accounts.policy import Caller
+from app.demo_study import device_session, session_file
+from app.ingest import service as ingest
+from app.learning.models import Policy
+from app.platform import files
+from app.platform.errors import BetaloopError
+from app.study import repository as study_repository
+from app.study import service as study
+from app.study.models import Controller, Participant, StudySession, Visit
+from app.study.schemas import QocIn
+from ml.cohort import SimulatedSession, run_session
+from ml.cohort.controllers import Controller as CohortController
+from ml.mdp import discounted_sum, end_reward, step_reward
+from ml.rl.onnx_policy import OnnxPolicy
+
+RESOLUTION_MA = 0.1
+"""What an RC+S delivers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedSession:
+    """A session of a visit day: `position` counts from 1, `hour` from the day's first session."""
+
+    position: int
+    controller: Controller
+    policy: Policy | None
+    begins: dt.datetime
+    hour: float
+    steps: int
+
+
+def simulate(participant: Participant, visit: Visit, placed: PlacedSession, seed: int) -> SimulatedSession:
+    """The session's numbers: the same whenever it is asked for."""
+    settings = study.mdp_settings(participant.current_settings)
+    controller: CohortController
+    if placed.policy is not None:
+        controller = OnnxPolicy(files.read(placed.policy.onnx_sha256), settings.window)
+    else:
+        controller = placed.controller.value  # type: ignore[assignment]
+    return run_session(
+        participant.code,
+        controller,
+        visit=visit.number,
+        hour=placed.hour,
+        seed=int(np.random.default_rng([seed, visit.number, placed.position]).integers(0, 2**63)),
+        steps=placed.steps,
+        lead_steps=settings.window,
+        lower_bound=settings.lower_bound,
+        resolution_ma=RESOLUTION_MA,
+        study_seed=seed,
+        name=placed.controller.value,
+    )
+
+
+def hold(db: Session, participant: Participant, visit: Visit, placed: PlacedSession, seed: int, caller: Caller) -> None:
+    """Hold a session: upload its file and enter its QoCs; what is there already is left as it is. Commits.
+
+    Raises:
+        BetaloopError: the file was not understood, which would be a fault of the decoder or of the simulator.
+    """
+    held = _session_at(db, visit, placed.position)
+    if held is not None and held.qoc is not None:
+        return
+    simulated = simulate(participant, visit, placed, seed)
+    if held is None:
+        name, content = session_file(f"{participant.code}-visit{visit.number}-session{placed.position}", simulated, placed.begins)
+        stated = ingest.state_session(
+            db,
+            participant,
+            visit.number,
+            placed.controller,
+            None if placed.policy is None else str(placed.policy.id),
+            placed.begins if device_session(participant.code) else None,
+        )
+        outcome = ingest.receive(db, participant, stated, [ingest.Incoming(name, io.BytesIO(content))], caller)
+        if not outcome.usable:
+            problems = "; ".join(str(r.problem) for f in outcome.files for r in f.reports if r.problem)
+            raise BetaloopError(f"The simulated file {name} was not understood: {problems}.")
+        held = _session_at(db, visit, placed.position)
+        if held is None:
+            raise BetaloopError(f"The simulated file {name} made no session at place {placed.position} of visit {visit.number}.")
+    qoc = simulated.qoc
+    study.record_qoc(db, held, QocIn(grasp_hz=qoc.grasp_hz, rating=simulated.rating, tremor_percent=qoc.tremor_percent), caller)
+    db.commit()
+
+
+def actual_return(db: Session, session: StudySession) -> float | None:
+    """What a session brought: r_end plus its discounted step rewards, steps of unknown reward left out; None without its QoCs."""
+    settings = study.mdp_settings(session.visit.participant.current_settings)
+    table = study.session_data(db, session).table
+    during = table.t_s > 0
+    rewards = step_reward(settings, table.beta[during], table.fraction[during])
+    end = end_reward(settings, study.qoc_of(session))
+    return None if end is None else end + discounted_sum(np.nan_to_num(rewards), settings.gamma)
+
+
+def _session_at(db: Session, visit: Visit, position: int) -> StudySession | None:
+    db.expire_all()
+    return next((s for s in study_repository.sessions_of_visit(db, visit.id)[0] if s.ordinal == position), None)

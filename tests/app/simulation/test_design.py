@@ -1,0 +1,59 @@
+"""The size and the timetable of a simulated study."""
+
+from __future__ import annotations
+
+import datetime as dt
+from itertools import pairwise
+
+import pytest
+
+from app.planning.schedule import SESSION_MINUTES
+from app.platform.errors import Conflict, Invalid
+from app.simulation.design import PRESETS, collecting_day, design, remember, visit_day
+
+TODAY = dt.date(2026, 6, 1)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_keeps_to_the_papers_session_rules(preset):
+    size = PRESETS[preset]
+    assert 2 <= 2 * size.policies_per_kind <= 4
+    assert SESSION_MINUTES[0] <= size.session_minutes <= SESSION_MINUTES[1]
+    day = collecting_day(size)
+    assert [s.steps for s in day if s.controller == "no_dbs"] == [150]
+    random = [i for i, s in enumerate(day) if s.controller == "random"]
+    assert len(random) == size.random_sessions
+    assert all("cdbs" in [s.controller for s in day[i:j]] for i, j in pairwise(random))
+
+
+def test_the_full_preset_spends_about_the_minutes_of_the_papers_table():
+    size = PRESETS["full"]
+    tested = (size.visits - size.random_visits) * size.policies_per_kind * size.session_minutes
+    assert 80 <= tested <= 182  # RL and distilled RL, each; Table 1 of the paper has 80 to 182
+    assert 36 <= size.visits * 5 + 5 <= 52  # no-DBS; Table 1 has 36 to 52
+
+
+def test_visits_are_a_month_apart_and_all_past():
+    days = [visit_day(TODAY, 5, n) for n in range(1, 6)]
+    assert all(later - earlier == dt.timedelta(days=28) for earlier, later in pairwise(days))
+    assert days[-1] < TODAY
+
+
+@pytest.mark.parametrize(
+    ("codes", "visits", "preset", "message"),
+    [(["P9"], 3, "quick", "P9"), (["P1", "P1"], 3, "quick", "each once"), (["P1"], 1, "quick", "1 visits"), (["P1"], 3, "slow", "slow")],
+)
+def test_a_study_that_cannot_be_simulated_is_refused_by_name(codes, visits, preset, message):
+    with pytest.raises(Invalid, match=message):
+        design(codes, visits, 0, preset)
+
+
+def test_a_study_goes_on_under_its_first_date_and_another_one_is_refused_in_its_place(tmp_path):
+    path = tmp_path / "state.json"
+    wanted = design(["P1"], 3, 5, "quick")
+    begun = remember(path, wanted, TODAY)
+    longer = design(["P1", "P2"], 6, 5, "quick")
+    assert remember(path, longer, TODAY + dt.timedelta(days=9)).first == begun.first == visit_day(TODAY, 3, 1)
+    for other in (design(["P1"], 3, 6, "quick"), design(["P1"], 3, 5, "full")):
+        with pytest.raises(Conflict, match="seed 5"):
+            remember(path, other, TODAY)

@@ -1,0 +1,114 @@
+"""A whole small study through the service: killed twice, gone on with, and held against the paper's rules."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from sqlalchemy import func, select
+
+from app.accounts.policy import SYSTEM
+from app.analysis.trial_time import trial_time
+from app.evaluation.models import Evaluation
+from app.ingest.models import UploadFile
+from app.planning.models import Plan
+from app.platform.audit import AuditEvent
+from app.platform.database import new_session
+from app.platform.errors import Conflict
+from app.platform.jobs.models import Job, JobStatus
+from app.settings import get_settings
+from app.simulation.design import STATE_FILE, design
+from app.simulation.run import ACCOUNT, simulate
+from app.simulation.sessions import actual_return
+from app.study import repository as study
+from app.study.blinding import arm
+from app.study.models import Controller, QocRevision, Recording, StudySession
+
+ROOT = Path(__file__).resolve().parents[3]
+PROGRAM = """
+import sys
+from app.platform.tables import load_tables
+from app.simulation.design import Design, Preset
+from app.simulation.run import simulate
+
+load_tables()
+size = Preset(
+    visits=2, random_visits=1, random_sessions=1, session_minutes=5, policies_per_kind=1,
+    pipeline={"preset": "quick", "count": 1, "updates": 20, "distil_updates": 20, "methods": ["linear", "wis"]},
+)
+simulate(Design(participants=("P2",), visits=2, seed=3, preset=size), slots=1)
+"""
+
+
+def start() -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", PROGRAM], cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}, stderr=subprocess.PIPE)
+
+
+def kill_when(reached: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
+    deadline = time.monotonic() + 120
+    while not reached():
+        assert process.poll() is None, process.communicate()[1].decode()[-3000:]
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+
+
+def count(query) -> int:
+    with new_session() as db:
+        return db.scalar(query)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_a_simulated_study_that_is_killed_goes_on_with_nothing_lost_and_nothing_twice(fresh_database):
+    kill_when(lambda: count(select(func.count()).select_from(StudySession)) >= 2, start())
+    kill_when(lambda: count(select(func.count()).select_from(Job).where(Job.status == JobStatus.RUNNING)) >= 1, start())
+    last = start()
+    assert last.wait(240) == 0, last.communicate()[1].decode()[-3000:]
+
+    with new_session() as db:
+        person = study.participant_by_code(db, "P2", SYSTEM)
+        held = study.sessions_of_participant(db, person.id)
+        assert [(s.visit.number, s.ordinal) for s in held] == [(v, i) for v in (1, 2) for i in (1, 2, 3, 4)]
+        arms = [arm(s, SYSTEM).controller for s in held]
+        assert arms[:4] == [Controller.CDBS, Controller.RANDOM, Controller.CDBS, Controller.NO_DBS]
+        learned = [i for i, c in enumerate(arms) if c in (Controller.RL, Controller.DISTILLED)]
+        assert {arms[i] for i in learned} == {Controller.RL, Controller.DISTILLED}
+        assert all(Controller.CDBS in arms[i:j] for i, j in pairwise(learned))
+        assert arms[-1] == Controller.NO_DBS
+        assert all(s.duration_s == 300 for s in held)
+        assert (held[4].visit.date - held[0].visit.date).days == 28
+
+        assert db.scalar(select(func.count()).select_from(Recording)) == 8
+        assert db.scalar(select(func.count()).select_from(UploadFile).where(UploadFile.status == "decoded")) == 8
+        assert db.scalars(select(QocRevision.revision)).all() == [1] * 8
+        assert db.scalars(select(Job.status).where(Job.kind == "pipeline")).all() == [JobStatus.SUCCEEDED]
+        (plan,) = db.scalars(select(Plan)).all()
+        assert (plan.status, plan.approved_by) == ("approved", ACCOUNT)
+        assert plan.evaluation_id == db.scalar(select(func.max(Evaluation.id)))
+        actors = set(db.scalars(select(AuditEvent.actor).where(AuditEvent.entity.in_(("participant", "visit", "session", "plan")))))
+        assert ACCOUNT in actors
+
+        ran = [s for s in held if arm(s, SYSTEM).policy_id is not None]
+        estimated = {e.policy_id for e in db.get_one(Evaluation, plan.evaluation_id).estimates}
+        assert {arm(s, SYSTEM).policy_id for s in ran} <= estimated  # what the figure of estimates against actual returns is drawn from
+        assert all(actual_return(db, s) is not None for s in ran)
+        table = {t.controller: (t.sessions, t.minutes) for t in trial_time(db, [person], SYSTEM).rows[0].tested}
+        assert table[Controller.CDBS] == (3, 15)
+        assert table[Controller.RL] == table[Controller.DISTILLED] == (1, 5)
+        assert table[Controller.NO_DBS] == (2, 10)
+
+
+def test_a_participant_that_people_enrolled_is_left_alone(enrolled, db):
+    with pytest.raises(Conflict, match="P1 was enrolled by"):
+        simulate(design(["P1"], 2, 0, "quick"), slots=1)
+    assert db.scalar(select(func.count()).select_from(StudySession)) == 0
+    assert not (get_settings().data_dir / STATE_FILE).exists()
