@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, File, Form, Query, Response, UploadFile
+from fastapi.responses import PlainTextResponse
 from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
-from app.learning import repository, service, snapshots
+from app.learning import bundles, repository, service, snapshots
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.schemas import PolicyChange, PolicyName, PolicyOut, SnapshotOut, SnapshotSessionOut
 from app.platform.database import Db
@@ -83,14 +84,27 @@ def change_policy(policy: CurrentPolicy, change: PolicyChange, db: Db, caller: C
 def read_bundle(
     policy: CurrentPolicy,
     db: Db,
-    min_ma: Annotated[Milliamperes, Query(description="Lowest amplitude, mA; 0 where not given.")] = None,
+    caller: CurrentCaller,
+    min_ma: Annotated[Milliamperes, Query(description="Lowest amplitude, mA; the stimulator's own limit, or 0, where not given.")] = None,
     max_ma: Annotated[Milliamperes, Query(description="Highest amplitude, mA; the cDBS amplitude where not given.")] = None,
     ramp_ma_per_s: Annotated[float | None, Query(gt=0, le=100, allow_inf_nan=False, description="Fastest change, mA/s.")] = None,
     hemisphere: Annotated[Hemisphere | None, Query(description="Needed where a visit states several cDBS amplitudes.")] = None,
 ) -> Response:
-    """The controller bundle as a ZIP: network, manifest with the clinician's limits, test vectors, one-page sheet."""
-    limits = service.Limits(min_ma, max_ma, ramp_ma_per_s)
-    return bundle_response(db, policy, limits, hemisphere)
+    """The signed controller bundle as a ZIP: network, C header, reference runner, test vectors, the clinician's limits, a sheet.
+
+    Each is stored as it left, and the audit trail says who took it, for whom and within which limits.
+    """
+    participant = db.get_one(Participant, policy.participant_id)
+    content = bundles.bundle(db, participant, policy, bundles.Limits(min_ma, max_ma, ramp_ma_per_s), hemisphere, caller)
+    db.commit()
+    name = f"{participant.code}-policy-{policy.id}.zip"
+    return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+@router.get("/bundle-key", response_class=PlainTextResponse)
+def read_bundle_key(caller: CurrentCaller) -> str:
+    """The public key that this installation's bundles are signed with: 64 hexadecimal digits. Give it to a tablet once."""
+    return bundles.public_key() + "\n"
 
 
 @router.get("/participants/{code}/snapshots")
@@ -122,14 +136,6 @@ def read_limited(file: UploadFile) -> bytes:
             f"'{file.filename}' is larger than {service.UPLOAD_LIMIT >> 20} MiB.", "A policy of the study's kind has some kilobytes."
         )
     return content
-
-
-def bundle_response(db: Session, policy: Policy, limits: service.Limits, hemisphere: Hemisphere | None) -> Response:
-    """A bundle as a download."""
-    participant = db.get_one(Participant, policy.participant_id)
-    content = service.bundle(db, participant, policy, limits, hemisphere)
-    name = f"{participant.code}-policy-{policy.id}.zip"
-    return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
 
 def policy_out(db: Session, p: Policy, participant: Participant) -> PolicyOut:

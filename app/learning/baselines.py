@@ -33,7 +33,8 @@ def ensure_baselines(
     db: Session, participant: Participant, snapshot: BufferSnapshot, buffer: ReplayBuffer, created_by: str
 ) -> list[Policy]:
     """The participant's baseline policies, made where they are missing: constants once per window length, and proportional control
-    between quantiles of the beta amplitudes (0.25 and 0.9), made once from the first snapshot in a unit and source of beta.
+    between quantiles of the beta amplitudes (0.25 and 0.9), made once from the first snapshot in a unit and source of beta. With them
+    the clone of the snapshot's logged behaviour, where a sweep has made one.
     """
     window = buffer.settings.window
     made = {p.name: p for p in repository.baselines(db, participant.id)}
@@ -48,7 +49,11 @@ def ensure_baselines(
     if name not in made and proportional is not None:
         config = {"controller": "proportional", "low": proportional.low, "high": proportional.high, "window": window}
         made[name] = _add(db, participant, snapshot, name, "proportional", config, proportional_onnx(proportional, window), created_by)
-    return [p for p in made.values() if p.config.get("window") == window and (p.algorithm == "constant" or p.name == name)]
+    return [
+        p
+        for p in made.values()
+        if p.config.get("window") == window and (p.algorithm == "constant" or p.name == name or p.snapshot_id == snapshot.id)
+    ]
 
 
 def constant_onnx(amplitude: float, window: int) -> bytes:

@@ -1,7 +1,9 @@
-"""What the child processes of learning run: train one policy, distil one policy. The learners (torch) are loaded in the child alone."""
+"""What the child processes of learning run: training, scores of what learns nothing, distillation. Only they load the learners."""
 
 from __future__ import annotations
 
+import contextlib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +13,17 @@ from ml import progress
 from ml.trajectories import ReplayBuffer, from_parquet
 
 if TYPE_CHECKING:
-    from ml.rl.actor_critic import DdpgConfig, TrainedPolicy
+    from ml.rl.held_out import HeldOut
     from ml.rl.networks import MlpPolicy
+    from ml.rl.policy import Policy
+    from ml.rl.trainer import TrainedPolicy
 
-POLICY, TRAINING = "policy.onnx", "training.pt"
+POLICY, CLONE = "policy.onnx", "clone.onnx"
+FEWEST_TO_HOLD_OUT = 5
+"""Sessions below which none is held out of a training."""
+
+CONSTANT_GRID = tuple(round(0.05 * k, 2) for k in range(21))
+CLONE_UPDATES = 2000
 _CURVE_POINTS = 200
 
 
@@ -36,39 +45,126 @@ def read_buffer(sha256: str) -> ReplayBuffer:
 
 @compute("train")
 def train(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
-    """Train one policy with DDPG on a snapshot, from scratch or from another policy.
+    """Train the policies of one group side by side on a snapshot, from scratch or from another policy.
 
     Args:
-        params: `snapshot_sha256`; `config`, members of `DdpgConfig`; optionally `initial` with `checkpoint_sha256` or `onnx_sha256`.
-        workdir: gets the policy as `policy.onnx` and the whole training as `training.pt`.
+        params: `snapshot_sha256`; `algorithm`; `configs`, members of its configuration; `held_out`, whether sessions are left out;
+            optionally `initial` with `checkpoint_sha256` or `onnx_sha256`.
+        workdir: gets each policy as `policy-K.onnx` and its whole training as `training-K.pt`.
         report: learning curves over updates.
+
+    Returns:
+        `members` with `config` and `metrics` each; `held_out_sessions`.
     """
-    from ml.rl import actor_critic
+    from ml.rl.algorithms import algorithm
     from ml.rl.training import CheckpointError, TrainingDiverged
 
     buffer = read_buffer(params["snapshot_sha256"])
     try:
+        method = algorithm(params["algorithm"])
         initial = _initial(params.get("initial"))
-        config = _config(params["config"], initial)
-        result = actor_critic.train(buffer, config, told(report, config.updates), workdir / "checkpoint.pt", initial)
+        configs = [method.config.from_json(_with_start(given, initial)) for given in params["configs"]]
+        updates = configs[0].updates
+        learnt, held_out = _hold_out(buffer, params["held_out"], every=max(1, updates // 10))
+        told_to = told(report, updates)
+        results = method.train_many(learnt, configs, told_to, workdir / "checkpoint.pt", initial, held_out)
     except (TrainingDiverged, CheckpointError, ValueError) as error:
-        raise JobError(f"The policy cannot be trained: {error}.") from error
-    write_atomically(workdir / POLICY, result.policy.to_onnx())
-    write_atomically(workdir / TRAINING, result.to_bytes())
+        raise JobError(f"The policies cannot be trained: {error}.") from error
     states = buffer.transitions().states
-    actions = result.policy.act(states)
-    last = {name: float(values[-1]) for name, values in result.curve.items()}
-    return {
-        "config": config.to_json(),
-        "metrics": {
-            "curve": {name: _thinned(values.tolist()) for name, values in result.curve.items()},
-            "last": last,
-            "mean_amplitude_on_buffer": float(actions.mean()),
-            "parameters": result.policy.parameter_count,
-            "macs": result.policy.macs,
-        }
-        | _scale_of(result.policy),
+    members = []
+    for k, result in enumerate(results):
+        write_atomically(workdir / policy_file(k), result.policy.to_onnx())
+        write_atomically(workdir / training_file(k), result.to_bytes())
+        members.append({"config": result.config.to_json(), "metrics": _metrics(result, states)})
+    return {"members": members, "held_out_sessions": [s.session_id for s in held_out.sessions.sessions] if held_out else []}
+
+
+def policy_file(member: int) -> str:
+    """Name of a trained policy's file in the folder of its step."""
+    return f"policy-{member}.onnx"
+
+
+def training_file(member: int) -> str:
+    """Name of a whole training's file in the folder of its step."""
+    return f"training-{member}.pt"
+
+
+@compute("yardsticks")
+def yardsticks(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+    """Score controllers that learn nothing, or no more than to imitate, as the policies of the sweep are scored.
+
+    Args:
+        params: `snapshot_sha256`; `held_out`, whether sessions are left out; `seed`.
+        workdir: gets the clone of the logged behaviour as `clone.onnx`.
+        report: progress.
+
+    Returns:
+        `rows` with `controller`, `score` and `mean_amplitude`; `best_constant`, the amplitude that scores best; `held_out_sessions`.
+    """
+    from ml.ope.fqe_score import fqe_value
+    from ml.rl.algorithms import algorithm
+    from ml.rl.baselines import behaviour_mean, proportional_from_buffer
+    from ml.rl.policy import ConstantPolicy
+    from ml.rl.training import TrainingDiverged
+
+    buffer = read_buffer(params["snapshot_sha256"])
+    learnt, held_out = _hold_out(buffer, params["held_out"], every=1)
+    watched = held_out.sessions.sessions if held_out else ()
+    cloning = algorithm("cloning")
+    try:
+        clone = cloning.train(learnt, cloning.config.from_json({"updates": CLONE_UPDATES, "seed": params["seed"]})).policy
+    except (TrainingDiverged, ValueError) as error:
+        raise JobError(f"The logged behaviour cannot be cloned: {error}.") from error
+    write_atomically(workdir / CLONE, clone.to_onnx())
+    report.progress(0.3, "scoring constant amplitudes")
+    scores = {a: fqe_value(learnt, ConstantPolicy(a), watched).value for a in CONSTANT_GRID}
+    best = max(scores, key=lambda a: scores[a])
+    named: dict[str, Policy] = {
+        "cDBS": ConstantPolicy(1.0),
+        f"best constant, {best:.2f}": ConstantPolicy(best),
+        "mean logged amplitude, held": behaviour_mean(learnt),
+        "behaviour clone": clone,
+        "no DBS": ConstantPolicy(0.0),
     }
+    with contextlib.suppress(ValueError):  # beta without spread has no proportional control
+        named["proportional to beta"] = proportional_from_buffer(learnt)
+    states = buffer.transitions().states
+    rows = [
+        {"controller": name, "score": fqe_value(learnt, p, watched).value, "mean_amplitude": float(p.act(states).mean())}
+        for name, p in named.items()
+    ]
+    return {"rows": rows, "best_constant": best, "held_out_sessions": [s.session_id for s in watched]}
+
+
+def _hold_out(buffer: ReplayBuffer, wanted: bool, every: int) -> tuple[ReplayBuffer, HeldOut | None]:
+    """Sessions to learn from, and those that watch; all and none where they are too few to spare any."""
+    from ml.ope.fqe_score import fqe_value
+    from ml.rl.held_out import HeldOut, split_sessions
+
+    if not wanted or len(buffer.sessions) < FEWEST_TO_HOLD_OUT:
+        return buffer, None
+    learnt, left = split_sessions(buffer)
+    # a split may leave nothing to start a score from; then nobody watches
+    if not any(s.usable().any() for s in left.sessions) or not learnt.transitions().states.size:
+        return buffer, None
+    watching = HeldOut(
+        sessions=left, score=lambda policy: fqe_value(learnt, policy, left.sessions).value, score_name="fqe", every=every, patience=6
+    )
+    return learnt, watching
+
+
+def _metrics(result: TrainedPolicy, states: Any) -> dict[str, Any]:
+    """What a trained policy is stored with."""
+    held = {name: values.tolist() for name, values in result.held_out.items()}
+    return {
+        "curve": {name: _thinned(values.tolist()) for name, values in result.curve.items()},
+        "last": {name: float(values[-1]) for name, values in result.curve.items()},
+        "held_out": held,
+        "best_update": result.best_update,
+        "mean_amplitude_on_buffer": float(result.policy.act(states).mean()),
+        "parameters": result.policy.parameter_count,
+        "macs": result.policy.macs,
+    } | _scale_of(result.policy)
 
 
 @compute("distil")
@@ -89,7 +185,7 @@ def distil(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, A
     try:
         config = DistilConfig(**(given | ({"hidden": tuple(given["hidden"])} if "hidden" in given else {})))
         teacher = OnnxPolicy(files.read(params["teacher_sha256"]), buffer.settings.window)
-        result = distil(teacher, buffer, config, told(report, config.updates))
+        result = distil(teacher, buffer, config, told(report, config.updates), partial(_returns_beside, buffer))
     except (TrainingDiverged, ValueError) as error:
         raise JobError(f"The policy cannot be distilled: {error}.") from error
     write_atomically(workdir / POLICY, result.policy.to_onnx())
@@ -105,9 +201,19 @@ def distil(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, A
     }
 
 
+def _returns_beside(buffer: ReplayBuffer, student: Policy, teacher: Policy) -> dict[str, float]:
+    """Estimated returns of student and teacher by one fitted Q evaluation of the whole buffer, reward units."""
+    from ml.ope.fqe_score import fqe_value
+
+    return {
+        "student_return": fqe_value(buffer, student, ()).value,
+        "teacher_return": fqe_value(buffer, teacher, ()).value,
+    }
+
+
 def _initial(start: dict[str, str] | None) -> TrainedPolicy | MlpPolicy | None:
-    from ml.rl.actor_critic import TrainedPolicy
     from ml.rl.networks import MlpPolicy
+    from ml.rl.trainer import TrainedPolicy
 
     if start is None:
         return None
@@ -116,15 +222,16 @@ def _initial(start: dict[str, str] | None) -> TrainedPolicy | MlpPolicy | None:
     return MlpPolicy.from_onnx(files.read(start["onnx_sha256"]))
 
 
-def _config(values: dict[str, Any], initial: TrainedPolicy | MlpPolicy | None) -> DdpgConfig:
-    """The hyper-parameters; a fine-tuned policy keeps the layers of its start, and without its critic learns that one first."""
-    from ml.rl.actor_critic import DdpgConfig, TrainedPolicy
+def _with_start(values: dict[str, Any], initial: TrainedPolicy | MlpPolicy | None) -> dict[str, Any]:
+    """Hyper-parameters for a start: a fine-tuned policy keeps its layers, and without its critic learns that one first."""
+    if initial is None:
+        return values
+    from ml.rl.trainer import TrainedPolicy
 
     if isinstance(initial, TrainedPolicy):
-        values = values | {"hidden": list(initial.config.hidden)}
-    elif initial is not None:
-        values = values | {"hidden": list(initial.hidden), "critic_warmup": values["updates"] // 4}
-    return DdpgConfig.from_json(values)
+        return values | {"hidden": list(initial.config.hidden)}
+    warmup = {"critic_warmup": values["updates"] // 4} if "critic_lr" in values else {}
+    return values | {"hidden": list(initial.hidden)} | warmup
 
 
 def _scale_of(policy: MlpPolicy) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from app.learning.schemas import DistilParams, TrainParams
@@ -14,30 +15,74 @@ TRAINING: dict[str, dict[str, Any]] = {
     # values here were picked after seeing true returns of that synthetic participant too, so they are no evidence of how well DDPG learns.
     "quick": {"updates": 4_000, "batch": 64, "low": 1e-5, "high": 3e-4, "critic_lr": 1e-3},
 }
+CONSTRAINED = {"low": 1e-4, "high": 1e-3}
+"""Learning rates of the other algorithms: around the 3e-4 of their publications."""
+
 FINE_TUNING = {"low": 1e-7, "high": 1e-5}
 """The paper's learning rates when going on from a tested policy."""
 
 DISTILLATION: dict[str, dict[str, Any]] = {"full": {"updates": 5_000, "sigma": 0.3}, "quick": {"updates": 1_500, "sigma": 0.3}}
 
 
-def training_configs(params: TrainParams) -> list[dict[str, Any]]:
-    """Hyper-parameters of each policy (`DdpgConfig`): the policies' learning rates spread evenly in the logarithm, seeds counting up."""
-    preset = TRAINING[params.preset]
-    spread = FINE_TUNING if params.policies else preset
+def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]) -> list[dict[str, Any]]:
+    """The policies of a sweep in groups that are trained side by side, each in a child process of its own.
+
+    From scratch the policies are dealt to the algorithms in turn; those of one algorithm have learning rates spread evenly in the
+    logarithm and fill two groups, one for each core. Seeds count up over all. A fine-tuned policy is a group of its own.
+
+    Args:
+        params: what was asked for.
+        starts: one for each policy: None from scratch, else `policy_id`, `algorithm` and the hash of the parent's file.
+
+    Returns:
+        For each group: `key` of its step, `algorithm`, `configs` (members of the algorithm's configuration), `start`.
+    """
+    if params.policies:
+        return [_fine_tuning(params, k, start) for k, start in enumerate(starts) if start is not None]
+    groups: list[dict[str, Any]] = []
+    for which, algorithm in enumerate(params.algorithms):
+        numbers = list(range(which, params.count, len(params.algorithms)))
+        low, high = _rates(params, algorithm)
+        configs = [
+            _config(params, algorithm, actor_lr=_between(low, high, k, len(numbers)), seed=params.seed + number)
+            for k, number in enumerate(numbers)
+        ]
+        half = -(-len(configs) // 2)
+        groups += [{"algorithm": algorithm, "configs": part, "start": None} for part in (configs[:half], configs[half:]) if part]
+    return [{"key": f"train/{k}"} | group for k, group in enumerate(groups)]
+
+
+def _fine_tuning(params: TrainParams, k: int, start: dict[str, Any]) -> dict[str, Any]:
+    low, high = _rates(params, start["algorithm"])
+    rate = _between(low, high, k, len(params.policies))
+    config = _config(params, start["algorithm"], actor_lr=rate, seed=params.seed + k)
+    return {"key": f"train/{k}", "algorithm": start["algorithm"], "configs": [config], "start": start}
+
+
+def _rates(params: TrainParams, algorithm: str) -> tuple[float, float]:
+    """Lowest and highest learning rate of the policies."""
+    spread = FINE_TUNING if params.policies else TRAINING[params.preset] if algorithm == "ddpg" else CONSTRAINED
     low = spread["low"] if params.actor_lr_low is None else params.actor_lr_low
     high = spread["high"] if params.actor_lr_high is None else params.actor_lr_high
-    n = len(params.policies) or params.count
-    common = {
-        "updates": preset["updates"] if params.updates is None else params.updates,
+    return low, high
+
+
+def _config(params: TrainParams, algorithm: str, *, actor_lr: float, seed: int) -> dict[str, Any]:
+    preset = TRAINING[params.preset]
+    updates = preset["updates"] if params.updates is None else params.updates
+    every = max(1, updates // 100)
+    config = {
+        "updates": updates,
         "batch": preset["batch"] if params.batch is None else params.batch,
-        "critic_lr": preset["critic_lr"] if params.critic_lr is None else params.critic_lr,
+        "actor_lr": actor_lr,
+        "seed": seed,
+        "record_every": every,
+        "checkpoint_every": max(200, 5 * every),
+        "device": "auto",
     }
-    every = max(1, common["updates"] // 100)
-    return [
-        common
-        | {"actor_lr": _between(low, high, k, n), "seed": params.seed + k, "record_every": every, "checkpoint_every": max(200, 5 * every)}
-        for k in range(n)
-    ]
+    if algorithm != "cloning":
+        config["critic_lr"] = preset["critic_lr"] if params.critic_lr is None else params.critic_lr
+    return config
 
 
 def distillation_config(params: DistilParams, k: int) -> dict[str, Any]:

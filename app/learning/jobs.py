@@ -9,15 +9,17 @@ from sqlalchemy.orm import Session
 
 from app.accounts.policy import Caller
 from app.learning import compute as compute  # registers its functions
-from app.learning import repository, service, snapshots
-from app.learning.configs import distillation_config, training_configs
+from app.learning import repository, service, snapshots, sweeps
+from app.learning.configs import distillation_config, training_groups
 from app.learning.models import BufferSnapshot, Policy
-from app.learning.schemas import DistilParams, TrainParams
+from app.learning.schemas import ALGORITHM_NAMES, DistilParams, TrainParams
+from app.learning.sweeps import Group
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext, job_kind
 from app.study.models import Participant
 
-TRAIN_WEIGHT, DISTIL_WEIGHT, STORE_WEIGHT = 10.0, 2.0, 0.1
+TRAIN_WEIGHT, YARDSTICK_WEIGHT, DISTIL_WEIGHT, STORE_WEIGHT = 10.0, 3.0, 2.0, 0.1
+YARDSTICKS = "yardsticks"
 Call = tuple[str, str, dict[str, Any]]
 
 
@@ -44,7 +46,7 @@ def snapshot_facts(snapshot: BufferSnapshot) -> dict[str, Any]:
 
 
 def training_starts(db: Session, participant_id: int, params: TrainParams) -> list[dict[str, Any] | None]:
-    """Where each training starts: None from scratch, else the parent's id and its files.
+    """Where each training starts: None from scratch, else the parent's id, algorithm and files.
 
     Raises:
         NotFound: no such policy. Invalid: a policy that cannot be trained further.
@@ -58,40 +60,64 @@ def training_starts(db: Session, participant_id: int, params: TrainParams) -> li
                 f"Policy '{policy.name}' is {policy.kind}: only policies trained here can be trained further.", "Choose a trained policy."
             )
         known = {"checkpoint_sha256": policy.checkpoint_sha256} if policy.checkpoint_sha256 else {"onnx_sha256": policy.onnx_sha256}
-        starts.append({"policy_id": policy.id, **known})
+        # a student has no critic: the sweep's own algorithm goes on from it
+        algorithm = policy.algorithm if policy.checkpoint_sha256 else params.algorithms[0]
+        starts.append({"policy_id": policy.id, "algorithm": algorithm, **known})
     return starts
 
 
-def training_calls(params: TrainParams, sha256: str, starts: Sequence[dict[str, Any] | None]) -> list[Call]:
-    """Compute steps of the training stage."""
+def training_calls(params: TrainParams, sha256: str, groups: Sequence[Group]) -> list[Call]:
+    """Compute steps of the training stage: the groups of policies, then the yardsticks."""
     calls: list[Call] = []
-    for k, (config, start) in enumerate(zip(training_configs(params), starts, strict=True)):
-        call: dict[str, Any] = {"snapshot_sha256": sha256, "config": config}
-        if start is not None:
-            call["initial"] = {name: value for name, value in start.items() if name.endswith("sha256")}
-        calls.append((f"train/{k}", "train", call))
-    return calls
+    for group in groups:
+        call = {"snapshot_sha256": sha256, "algorithm": group["algorithm"], "configs": group["configs"], "held_out": params.held_out}
+        if group["start"] is not None:
+            call["initial"] = {name: value for name, value in group["start"].items() if name.endswith("sha256")}
+        calls.append((group["key"], "train", call))
+    return [*calls, (YARDSTICKS, "yardsticks", {"snapshot_sha256": sha256, "held_out": params.held_out, "seed": params.seed})]
 
 
 def declare_training(job: JobContext, params: TrainParams) -> None:
-    """Show the training stage from the start."""
-    for k, config in enumerate(training_configs(params)):
-        job.step(f"train/{k}", f"Train policy {k + 1} (learning rate {config['actor_lr']:g})", weight=TRAIN_WEIGHT)
+    """Show the training stage from the start; what is fine-tuned is known once the plan is made."""
+    if not params.policies:
+        _declare_groups(job, training_groups(params, [None] * params.count))
+    job.step(YARDSTICKS, "Score controllers without learning", weight=YARDSTICK_WEIGHT)
     job.step("store-policies", "Store the policies", weight=STORE_WEIGHT)
 
 
+def _declare_groups(job: JobContext, groups: Sequence[Group]) -> None:
+    first = 1
+    for group in groups:
+        count = len(group["configs"])
+        numbers = f"policy {first}" if count == 1 else f"policies {first} to {first + count - 1}"
+        job.step(group["key"], f"Train {numbers} ({ALGORITHM_NAMES[group['algorithm']]})", weight=TRAIN_WEIGHT * count)
+        first += count
+
+
 def store_trained(
-    job: JobContext, snapshot_id: int, results: Sequence[dict[str, Any]], starts: Sequence[dict[str, Any] | None]
+    job: JobContext, params: TrainParams, snapshot_id: int, groups: Sequence[Group], results: Sequence[dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Store the training stage's policies; returns their ids, names and files."""
+    """Store the training stage's sweep and policies; returns the policies' ids, names and files.
+
+    Args:
+        job, params: the job. snapshot_id: what was trained on.
+        groups: as `training_groups` made them. results: of `training_calls`, in that order.
+    """
 
     def store(db: Session) -> dict[str, Any]:
-        snapshot = db.get_one(BufferSnapshot, snapshot_id)
-        steps = [
-            (f"train/{k}", result, job.workdir(f"train/{k}"), start["policy_id"] if start else None)
-            for k, (result, start) in enumerate(zip(results, starts, strict=True))
-        ]
-        return {"policies": _facts(service.store_trained(db, job.id, job.created_by, snapshot, steps))}
+        policies = sweeps.store(
+            db,
+            job_id=job.id,
+            created_by=job.created_by,
+            snapshot=db.get_one(BufferSnapshot, snapshot_id),
+            name=params.sweep,
+            config=params.model_dump(mode="json"),
+            groups=groups,
+            results=results[:-1],
+            workdirs=[job.workdir(group["key"]) for group in groups],
+            yardsticks=(results[-1], job.workdir(YARDSTICKS)),
+        )
+        return {"policies": _facts(policies)}
 
     stored: list[dict[str, Any]] = job.transact("store-policies", store)["policies"]
     return stored
@@ -140,8 +166,9 @@ def run_train(job: JobContext) -> dict[str, Any]:
         return {"snapshot": snapshot_facts(snapshot), "starts": training_starts(db, snapshot.participant_id, params)}
 
     planned = job.transact("plan", plan)
-    results = job.compute_all(training_calls(params, planned["snapshot"]["sha256"], planned["starts"]))
-    policies = store_trained(job, planned["snapshot"]["id"], results, planned["starts"])
+    groups = training_groups(params, planned["starts"])
+    results = job.compute_all(training_calls(params, planned["snapshot"]["sha256"], groups))
+    policies = store_trained(job, params, planned["snapshot"]["id"], groups, results)
     return {"snapshot_id": planned["snapshot"]["id"], "policy_ids": [p["id"] for p in policies]}
 
 

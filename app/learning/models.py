@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
+from enum import StrEnum
 from typing import Any
 
 from sqlalchemy import CheckConstraint, ForeignKey, String, Text, UniqueConstraint, func
@@ -52,6 +53,50 @@ class SnapshotSession(Base):
     left_out_reason: Mapped[str | None] = mapped_column(Text)
 
 
+class GateChoice(StrEnum):
+    """What a clinician decided about sessions of learned policies."""
+
+    OPEN = "open"
+    SHUT = "shut"
+    TEST = "test"
+
+
+class BufferGateDecision(Base):
+    """A clinician's word on whether sessions of learned policies enter a participant's replay buffer; the newest holds. Insert only."""
+
+    __tablename__ = "buffer_gate_decision"
+    __table_args__ = (
+        CheckConstraint("choice in ('open', 'shut', 'test')", name="choice"),
+        CheckConstraint("reason <> ''", name="reason"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    choice: Mapped[GateChoice] = mapped_column(String(10))
+    reason: Mapped[str] = mapped_column(Text)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+
+
+class Sweep(Base):
+    """Policies trained in one action on one snapshot, to be compared with each other and with controllers that learn nothing."""
+
+    __tablename__ = "sweep"
+    __table_args__ = (UniqueConstraint("participant_id", "name"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    name: Mapped[str] = mapped_column(String(100))
+    snapshot_id: Mapped[int] = mapped_column(ForeignKey("buffer_snapshot.id"))
+    job_id: Mapped[str] = mapped_column(ForeignKey("job.id"), unique=True)
+    config: Mapped[dict[str, Any]]
+    yardsticks: Mapped[dict[str, Any]]
+    code_version: Mapped[str] = mapped_column(String(80))
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+    policies: Mapped[list[Policy]] = relationship(back_populates="sweep", order_by="Policy.id")
+
+
 class Policy(Base):
     """A trained controller. Immutable: a better one is a new policy."""
 
@@ -76,6 +121,7 @@ class Policy(Base):
     settings_version_id: Mapped[int] = mapped_column(ForeignKey("settings_version.id"))
     job_id: Mapped[str | None] = mapped_column(ForeignKey("job.id"), index=True)
     job_step: Mapped[str | None] = mapped_column(String(100))
+    sweep_id: Mapped[int | None] = mapped_column(ForeignKey("sweep.id"), index=True)
     config: Mapped[dict[str, Any]]
     seed: Mapped[int | None]
     onnx_sha256: Mapped[str] = mapped_column(ForeignKey("stored_file.sha256"))
@@ -85,3 +131,4 @@ class Policy(Base):
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
     retired_reason: Mapped[str | None] = mapped_column(Text)
+    sweep: Mapped[Sweep | None] = relationship(back_populates="policies")

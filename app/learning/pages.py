@@ -12,11 +12,11 @@ from sqlalchemy.orm import Session
 from app.accounts import policy as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.policy import Caller
-from app.learning import repository, service
+from app.learning import bundles, repository, service
 from app.learning.api import CurrentPolicy, CurrentSnapshot, read_limited
 from app.learning.coverage import describe
 from app.learning.models import Policy
-from app.learning.schemas import PolicyChange, PolicyLabel
+from app.learning.schemas import ALGORITHM_NAMES, PolicyChange, PolicyLabel
 from app.platform.charts import ACCENT, Chart, axis, figure
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, NotFound
@@ -34,6 +34,7 @@ LABELS = {"name": "Name", "retired_reason": "Reason"}
 CURVES = {
     "mean_q": ("Mean Q of the policy", "reward; an unbounded climb is over-estimation"),
     "action_distance": ("Distance from the logged amplitudes", "mean absolute difference, fraction"),
+    "saturated": ("States answered with next to 0 or 1", "share; at 1 the policy is cDBS or no DBS by another name"),
     "critic_loss": ("Critic loss", "mean squared temporal-difference error, reward squared"),
     "loss": ("Distillation loss", "mean squared difference from the teacher, fraction squared"),
 }
@@ -85,6 +86,8 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
         curves=curve_charts(policy.metrics.get("curve", {}), f"policy {policy.name}"),
         config={k: v for k, v in policy.config.items() if not k.endswith("_every")},
         cdbs_ma=participant.current_settings.cdbs_amplitude_ma,
+        device=bundles.device_limits(db, participant, None),
+        sides=sorted({a.hemisphere for visit in participant.visits for a in visit.cdbs_amplitudes}),
         may_write=_may(caller, can.WRITE_POLICIES, participant),
     )
     return HTMLResponse(page)
@@ -154,6 +157,8 @@ def _policies(
         offset=offset,
         snapshots=snapshots,
         snapshot_count=snapshot_count,
+        sweeps=repository.sweeps(db, participant.id, 10, 0)[0],
+        algorithm_names=ALGORITHM_NAMES,
         problem=problem,
         name=name,
         window=participant.current_settings.window,

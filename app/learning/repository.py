@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session, selectinload
 
 from app.accounts.models import Site
 from app.accounts.policy import Caller
-from app.learning.models import BufferSnapshot, Policy, SnapshotSession
+from app.learning.models import BufferGateDecision, BufferSnapshot, Policy, SnapshotSession, Sweep
 from app.platform.errors import NotFound
 from app.study.models import Participant
 from app.study.repository import count, in_scope
@@ -47,6 +47,16 @@ def newest_snapshot(db: Session, participant_id: int) -> BufferSnapshot | None:
     """The snapshot that was taken last."""
     return db.scalar(
         select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id).order_by(BufferSnapshot.id.desc()).limit(1)
+    )
+
+
+def newest_gate_decision(db: Session, participant_id: int) -> BufferGateDecision | None:
+    """The last word on the participant's buffer gate."""
+    return db.scalar(
+        select(BufferGateDecision)
+        .where(BufferGateDecision.participant_id == participant_id)
+        .order_by(BufferGateDecision.id.desc())
+        .limit(1)
     )
 
 
@@ -129,3 +139,34 @@ def names_in_use(db: Session, participant_id: int, prefix: str) -> set[str]:
 def snapshot_members(db: Session, snapshot_id: int) -> Sequence[SnapshotSession]:
     """The sessions of a snapshot, left-out ones among them."""
     return db.scalars(select(SnapshotSession).where(SnapshotSession.snapshot_id == snapshot_id).order_by(SnapshotSession.session_id)).all()
+
+
+def sweep(db: Session, sweep_id: int, caller: Caller) -> Sweep:
+    """A sweep with its policies. Raises NotFound."""
+    row = db.scalar(
+        select(Sweep)
+        .join(Participant, Participant.id == Sweep.participant_id)
+        .join(Site, Site.id == Participant.site_id)
+        .where(Sweep.id == sweep_id, in_scope(caller))
+        .options(selectinload(Sweep.policies))
+    )
+    if row is None:
+        raise NotFound(f"There is no sweep {sweep_id}, or you have no access to it.")
+    return row
+
+
+def sweeps(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[Sweep], int]:
+    """A page of a participant's sweeps, newest first."""
+    query = select(Sweep).where(Sweep.participant_id == participant_id)
+    rows = db.scalars(query.order_by(Sweep.id.desc()).limit(limit).offset(offset).options(selectinload(Sweep.policies)))
+    return rows.all(), count(db, query)
+
+
+def sweep_of_job(db: Session, job_id: str) -> Sweep | None:
+    """The sweep that a job made."""
+    return db.scalar(select(Sweep).where(Sweep.job_id == job_id))
+
+
+def sweep_names(db: Session, participant_id: int) -> set[str]:
+    """Names of the participant's sweeps."""
+    return set(db.scalars(select(Sweep.name).where(Sweep.participant_id == participant_id)))

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from app.learning.models import GateChoice
 from app.platform.schemas import Int, Model, Number, Text
 
 Preset = Literal["full", "quick"]
@@ -27,15 +28,36 @@ PolicyName = Annotated[
     Field(max_length=100, json_schema_extra={"pattern": rf"^[^{_CONTROL}]*[^\s{_CONTROL}][^{_CONTROL}]*$"}),
     AfterValidator(_printable),
 ]
+SweepName = PolicyName
+AlgorithmName = Literal["ddpg", "td3_bc", "rebrac", "iql", "cloning"]
 PolicyIds = Annotated[list[Annotated[Int, Field(ge=1)]], Field(max_length=50)]
 
 
-class TrainParams(Model):
-    """What `train` takes. What is left out comes from the preset."""
+ALGORITHM_NAMES: dict[str, str] = {
+    "ddpg": "DDPG", "td3_bc": "TD3+BC", "rebrac": "ReBRAC", "iql": "IQL", "cloning": "behaviour cloning", "distillation": "distillation",
+    "constant": "constant", "proportional": "proportional", "external": "made elsewhere",
+}  # fmt: skip
+"""What pages call an algorithm; a test holds those that train against the registry of the learners."""
+
+
+class SweepParams(Model):
+    """What a sweep takes: several policies trained in one action. What is left out comes from the preset."""
 
     preset: Preset = Field("full", description="`full`: sizes for a study; `quick`: for a first look.")
+    sweep: SweepName | None = Field(None, description="Name of the sweep; numbered where left out.")
+    algorithms: Annotated[list[AlgorithmName], Field(min_length=1, max_length=5)] = Field(
+        ["ddpg"], description="The policies are dealt to these in turn; from scratch only."
+    )
     policies: PolicyIds = Field(default_factory=list, description="Fine-tune from each of these; empty: train from scratch.")
     count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch; the paper trains 6.")
+    held_out: bool = Field(
+        True, description="Leave a fifth of the sessions out of the training, and keep each policy as it was when they spoke best for it."
+    )
+
+
+class TrainParams(SweepParams):
+    """What `train` takes."""
+
     updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each policy.")
     batch: Int | None = Field(None, ge=1, le=4096, description="Transitions per gradient step.")
     actor_lr_low: Number | None = Field(None, gt=0, le=1, description="Lowest learning rate of the policies.")
@@ -109,6 +131,87 @@ class PolicyOut(Model):
     created_at: datetime
     created_by: str
     retired_reason: str | None
+
+
+class QocTestOut(Model):
+    """One QoC of sessions of learned policies against those of the random controller."""
+
+    qoc: str
+    unit: str
+    n_learned: int
+    n_random: int
+    median_learned: float | None
+    median_random: float | None
+    p_better: float | None = Field(description="One-sided rank-sum test, Holm-adjusted; null where there is not enough data.")
+    p_worse: float | None
+    note: str
+
+
+class GateDecisionOut(Model):
+    """What a clinician decided, and why."""
+
+    choice: GateChoice
+    reason: str
+    created_at: datetime
+    created_by: str
+
+
+class GateOut(Model):
+    """Whether sessions of learned policies may enter the replay buffer."""
+
+    open: bool
+    grounds: str
+    opened_by_test: bool
+    tests: list[QocTestOut]
+    decision: GateDecisionOut | None
+
+
+class GateChange(Model):
+    """A clinician's decision on the gate."""
+
+    choice: GateChoice = Field(description="`open` or `shut` whatever the tests say; `test` follows the tests again.")
+    reason: Text = Field(min_length=1, max_length=1000)
+
+
+class SweepCandidateOut(Model):
+    """One policy of a sweep."""
+
+    policy_id: int
+    name: str
+    algorithm: str
+    actor_lr: float | None
+    seed: int | None
+    best_update: int | None = Field(description="The update whose state was kept; null: the last.")
+    score: float | None = Field(description="Estimated return on the held-out sessions by fitted Q evaluation; null where none were.")
+    over_logged: float | None = Field(description="Q of the held-out first states less the return logged from them.")
+    action_distance: float | None = Field(description="Mean absolute difference from the logged amplitudes, fraction.")
+    saturated: float | None = Field(description="Share of states answered with next to 0 or 1.")
+    mean_amplitude: float | None
+
+
+class YardstickOut(Model):
+    """A controller that learns nothing, or only to imitate, scored as the policies are."""
+
+    controller: str
+    score: float
+    mean_amplitude: float
+
+
+class SweepOut(Model):
+    """Policies trained in one action, the best score on held-out sessions first."""
+
+    id: int
+    participant: str
+    name: str
+    snapshot_id: int
+    job_id: str
+    config: dict[str, Any]
+    held_out_sessions: list[int]
+    candidates: list[SweepCandidateOut]
+    yardsticks: list[YardstickOut]
+    code_version: str
+    created_at: datetime
+    created_by: str
 
 
 class PolicyLabel(Model):

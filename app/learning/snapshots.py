@@ -1,8 +1,7 @@
 """Buffer snapshots: which sessions a result may rest on, the version of everything in them, and why the others were left out.
 
 Every confirmed session is looked at. What cannot enter is kept in the snapshot's list with its reason. Sessions of learned policies enter
-from the first one on; the paper lets them in once their QoCs are significantly better than the random controller's (section 4.1), a test
-that betaloop does not make.
+when the gate is open (`app.learning.gate`).
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from sqlalchemy.orm import Session
 from app.accounts import policy as can
 from app.accounts.policy import SYSTEM, Caller
 from app.learning import repository
+from app.learning.gate import LEARNED, Gate, gate
 from app.learning.models import BufferSnapshot, SnapshotSession
 from app.platform import files
 from app.platform.errors import Invalid
@@ -114,7 +114,8 @@ def collect(db: Session, participant: Participant) -> Collection:
     sessions = [s for s in study_repository.sessions_of_participant(db, participant.id) if s.status == "confirmed"]
     read = [_read(db, session, settings) for session in sessions]
     unit, source, chosen_by = _signal(version, read)
-    members = tuple(_admit(m, unit, source, chosen_by) for m in read)
+    barrier = gate(db, participant, sessions)
+    members = tuple(_pass_gate(_admit(m, unit, source, chosen_by), barrier) for m in read)
     if not any(m.trajectory for m in members):
         reasons = Counter(m.left_out for m in members)
         listed = "; ".join(f"{n} x {reason}" for reason, n in reasons.most_common(4))
@@ -249,6 +250,13 @@ def _admit(m: Member, unit: str | None, source: str | None, chosen_by: str) -> M
         return m
     reason = f"its beta is in {trace.unit} from {trace.source}; {chosen_by} {unit or 'another unit'} from {source or 'another source'}"
     return Member(m.session, m.table, None, reason)
+
+
+def _pass_gate(m: Member, barrier: Gate) -> Member:
+    """Leave out sessions of learned policies while the gate is shut."""
+    if m.trajectory is None or barrier.is_open or blinding.arm(m.session, SYSTEM).controller not in LEARNED:
+        return m
+    return Member(m.session, m.table, None, f"session of a learned policy, and the buffer's gate is shut: {barrier.grounds}")
 
 
 def _row(snapshot_id: int, m: Member) -> SnapshotSession:

@@ -30,7 +30,7 @@ def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] |
 
     Args:
         model: the API type; only its fields are read.
-        values: field name to text.
+        values: field name to text, or to a list of texts where the field is repeated.
         labels: names as the page shows them, for the errors.
 
     Raises:
@@ -41,6 +41,9 @@ def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] |
     data: dict[str, Any] = {}
     for name, info in model.model_fields.items():
         if name in values:
+            if isinstance(values[name], list):
+                data[name] = values[name]
+                continue
             try:
                 data[name] = _value(str(values[name]), info.annotation, info.is_required())
             except ValueError as error:

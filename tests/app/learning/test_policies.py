@@ -14,9 +14,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts.policy import SYSTEM
 from app.learning.baselines import constant_onnx, ensure_baselines, proportional_onnx
-from app.learning.configs import distillation_config, training_configs
+from app.learning.configs import distillation_config
 from app.learning.models import Policy
-from app.learning.schemas import DistilParams, TrainParams
+from app.learning.schemas import DistilParams
 from app.learning.snapshots import collect, take_snapshot
 from app.platform import files
 from app.study.repository import participant_by_code
@@ -146,14 +146,7 @@ def test_the_pages_show_a_policy_and_take_one_in(client: TestClient, enrolled: s
     assert "not an ONNX file" in refused.text
 
 
-def test_six_policies_get_learning_rates_across_the_papers_range_and_seeds_of_their_own() -> None:
-    configs = training_configs(TrainParams(seed=3))
-    rates = [c["actor_lr"] for c in configs]
-    assert (min(rates), max(rates), len(set(rates))) == (1e-5, 1e-3, 6)
-    np.testing.assert_allclose(np.diff(np.log10(rates)), 2 / 5, atol=0.01)
-    assert [c["seed"] for c in configs] == [3, 4, 5, 6, 7, 8]
-    fine = training_configs(TrainParams(policies=[4, 9]))
-    assert [c["actor_lr"] for c in fine] == [1e-7, 1e-5]
+def test_a_student_gets_the_asked_layers_and_a_seed_of_its_own() -> None:
     assert distillation_config(DistilParams(updates=50, hidden=[8]), 1) == {
         "updates": 50, "sigma": 0.3, "seed": 1, "record_every": 1, "hidden": [8],
     }  # fmt: skip

@@ -139,4 +139,4 @@ def test_a_participant_without_policies_gets_a_visit_of_random_sessions(client: 
     assert drafted.status_code == 303
     plan = client.get(f"/api/v1/visits/{visit}/plan").json()
     assert [s["controller"] for s in plan["sessions"]] == ["cdbs", "random", "random", "random"]
-    assert plan["warnings"] == []
+    assert not any("ranking" in warning for warning in plan["warnings"])

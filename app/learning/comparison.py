@@ -1,0 +1,107 @@
+"""How the policies of a sweep compare: on sessions that they did not learn from, with each other and with controllers without learning."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from app.learning.models import Policy, Sweep
+from app.platform.charts import Chart, axis, figure
+
+PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")
+DASHES = ("solid", "dash", "dot")
+CURVES = (
+    ("held_out", "score", "Estimated return on held-out sessions", "reward, fitted Q evaluation"),
+    ("held_out", "over_logged", "Q beyond the logged return", "reward; Q of the first states less the return logged from them"),
+    ("curve", "mean_q", "Mean Q of the policy", "reward; an unbounded climb is over-estimation"),
+    ("curve", "action_distance", "Distance from the logged amplitudes", "mean absolute difference, fraction"),
+)
+"""Where a curve stands in a policy's metrics, its name there, its title and unit."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One policy of a sweep.
+
+    Attributes:
+        score: estimated return on the held-out sessions at the state that was kept; None where none were held out.
+        over_logged: mean Q of the held-out sessions' first states less the return logged from them, at the same state.
+        action_distance: mean absolute difference from the logged amplitudes at the end of training, fraction.
+        saturated: share of states answered with next to 0 or 1 at the end of training.
+        mean_amplitude: over the buffer's states, fraction.
+        best_update: the update whose state was kept; None: the last.
+        rate: the policy's learning rate. seed: of its training.
+    """
+
+    policy: Policy
+    score: float | None
+    over_logged: float | None
+    action_distance: float | None
+    saturated: float | None
+    mean_amplitude: float | None
+    best_update: int | None
+    rate: float | None
+    seed: int | None
+
+
+def candidates(sweep: Sweep) -> list[Candidate]:
+    """The sweep's policies, the best score first; in the order of training where nothing was held out."""
+    found = [_candidate(p) for p in sweep.policies]
+    return sorted(found, key=lambda c: -c.score if c.score is not None else float("inf"))
+
+
+def _candidate(policy: Policy) -> Candidate:
+    held, last = policy.metrics.get("held_out", {}), policy.metrics.get("last", {})
+    at = _kept(held, policy.metrics.get("best_update"))
+    return Candidate(
+        policy=policy,
+        score=_at(held, "score", at),
+        over_logged=_at(held, "over_logged", at),
+        action_distance=last.get("action_distance"),
+        saturated=last.get("saturated"),
+        mean_amplitude=policy.metrics.get("mean_amplitude_on_buffer"),
+        best_update=policy.metrics.get("best_update"),
+        rate=policy.config.get("actor_lr"),
+        seed=policy.seed,
+    )
+
+
+def _kept(held: dict[str, list[float]], best_update: int | None) -> int:
+    """Index of the scoring whose state was kept."""
+    updates = held.get("update", [])
+    return updates.index(best_update) if best_update in updates else len(updates) - 1
+
+
+def _at(curves: dict[str, list[float]], name: str, index: int) -> float | None:
+    values = curves.get(name)
+    return values[index] if values else None
+
+
+def charts(sweep: Sweep) -> list[Chart]:
+    """Learning curves of all policies of a sweep, one chart for each kind of curve that was recorded."""
+    made = (_chart(sweep.policies, *curve) for curve in CURVES)
+    return [chart for chart in made if chart is not None]
+
+
+def _chart(policies: Sequence[Policy], place: str, name: str, title: str, unit: str) -> Chart | None:
+    data: list[dict[str, Any]] = []
+    rows: list[list[Any]] = []
+    for k, policy in enumerate(policies):
+        curves = policy.metrics.get(place, {})
+        if not curves.get(name):
+            continue
+        line = {"color": PALETTE[k % len(PALETTE)], "dash": DASHES[k // len(PALETTE) % len(DASHES)], "width": 1.8}
+        data.append({"type": "scatter", "mode": "lines", "name": policy.name, "x": curves["update"], "y": curves[name], "line": line})
+        rows += [[policy.name, int(u), float(v)] for u, v in zip(curves["update"], curves[name], strict=True)]
+    if not rows:
+        return None
+    return Chart(
+        id=f"sweep-{name.replace('_', '-')}",
+        title=title,
+        subtitle=f"{unit} · n = {len(data)} policies",
+        figure=figure(data, xaxis=axis("Update"), yaxis=axis(""), showlegend=True, legend={"orientation": "h", "y": -0.3}),
+        columns=["Policy", "Update", title],
+        rows=rows,
+        height=320,
+    )
