@@ -1,9 +1,12 @@
 """Training and decision speed of `ml.rl`: CPU seconds, one thread, peers timed in turn within the same run.
 
-    python benchmarks/rl.py [--steps N] [--repeats N]
+    python benchmarks/rl.py [--steps N] [--repeats N] [--six]
 
-`fused_vs_eager`: one DDPG update of `ml.rl.actor_critic` against the loop as usually written in PyTorch (below), 400x300, batch 64 and 256.
-`ddpg_vs_d3rlpy`: the same against d3rlpy's DDPG, where d3rlpy is installed (the `bench` extra).
+`ddpg_vs_eager`: one DDPG update of `ml.rl.actor_critic` against the loop as usually written in PyTorch (below), 400x300, batch 64 and 256.
+`six_vs_eager`: six policies side by side against six such loops, batch 64.
+`ddpg_vs_d3rlpy`: one update against d3rlpy's DDPG at batch 256, where d3rlpy is installed (the `bench` extra).
+`ddpg_of_products`: share of the update's time that its matrix products alone take, in their own shapes, batch 256.
+`--six` trains six policies for 10 000 updates at batch 64 in two processes of three and distils them; wall and CPU seconds.
 """
 
 from __future__ import annotations
@@ -11,6 +14,8 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import multiprocessing
+import resource
 import statistics
 import time
 from collections.abc import Callable
@@ -20,13 +25,19 @@ import numpy as np
 import torch
 from torch import nn
 
+from ml.mdp import MdpSettings
 from ml.rl.actor_critic import DdpgConfig, DdpgLearner
+from ml.rl.algorithms import algorithm
+from ml.rl.batches import BLOCK, PackedTransitions, RewardScale, batch_indices
+from ml.rl.distillation import DistilConfig, distil
 from ml.rl.networks import STUDENT_HIDDEN, TEACHER_HIDDEN, Critic, MlpPolicy
 from ml.rl.onnx_policy import OnnxPolicy
-from ml.rl.training import PackedTransitions, RewardScale, batch_indices
+from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 WINDOW, ROWS, GAMMA, TAU = 10, 100_000, 0.99, 0.005
 BATCHES = (64, 256)
+SIX_BATCH = 64
+SIX_UPDATES = 10_000
 
 
 class EagerDdpg:
@@ -67,18 +78,64 @@ class EagerDdpg:
                     old.mul_(1 - TAU).add_(TAU * new)
 
 
-def fused_stepper(data: dict[str, Any], batch: int) -> Callable[[], None]:
-    """One update of ours, with the drawing of its batch."""
+def own_stepper(data: dict[str, Any], batch: int, members: int = 1) -> Callable[[], None]:
+    """One update of ours for each of `members` policies, with the drawing of their batches."""
     packed = PackedTransitions(data["s"], data["a"][:, 0], data["r"][:, 0], data["s2"])
-    learner = DdpgLearner(MlpPolicy(WINDOW), Critic(WINDOW), DdpgConfig(tau=TAU, batch=batch), RewardScale(0.0, 1.0, GAMMA))
+    starts = [{"policy": MlpPolicy(WINDOW, seed=k), "critic": Critic(WINDOW, seed=k)} for k in range(members)]
+    configs = [DdpgConfig(tau=TAU, batch=batch, seed=k) for k in range(members)]
+    learner = DdpgLearner(starts, configs, RewardScale(0.0, 1.0, GAMMA))
     state: dict[str, Any] = {"count": 0, "rows": None}
 
     def step() -> None:
-        block, row = divmod(state["count"], 256)
+        block, row = divmod(state["count"], BLOCK)
         if row == 0:
-            state["rows"] = batch_indices(0, block, ROWS, batch)
+            state["rows"] = torch.stack([batch_indices(k, block, ROWS, batch) for k in range(members)], dim=1)
         learner.update(packed.take(state["rows"][row]))
         state["count"] += 1
+
+    return step
+
+
+class Products:
+    """The matrix products of one network's passes and nothing else: its own shapes, layouts and operands, results into kept memory."""
+
+    def __init__(self, members: int, batch: int) -> None:
+        a, b = TEACHER_HIDDEN
+        self.layers = []
+        for inputs, outputs in ((WINDOW, a), (a, b), (b, 1)):
+            x, w, dy = (torch.rand(members, *shape) for shape in ((batch, inputs), (outputs, inputs), (batch, outputs)))
+            self.layers.append((x, w, dy, torch.empty_like(dy), torch.empty_like(w), torch.empty_like(x)))
+
+    def forward(self) -> None:
+        for x, w, _, y, _, _ in self.layers:
+            torch.bmm(x, w.transpose(1, 2), out=y)
+
+    def backward(self) -> None:
+        """By the weights of every layer, by the inputs of the second and third."""
+        for i, (x, w, dy, _, dw, dx) in enumerate(self.layers):
+            torch.bmm(dy.transpose(1, 2), x, out=dw)
+            if i > 0:
+                torch.bmm(dy, w, out=dx)
+
+    def back_to_the_action(self) -> None:
+        """The action joins at the second layer: only the last one is passed."""
+        _, w, dy, _, _, dx = self.layers[-1]
+        torch.bmm(dy, w, out=dx)
+
+
+def products_stepper(batch: int, members: int = 1) -> Callable[[], None]:
+    """The matrix products of one update of DDPG, in its order."""
+    target_actor, target_critic, critic, actor = (Products(members, batch) for _ in range(4))
+
+    def step() -> None:
+        target_actor.forward()
+        target_critic.forward()
+        critic.forward()
+        critic.backward()
+        actor.forward()
+        critic.forward()
+        critic.back_to_the_action()
+        actor.backward()
 
     return step
 
@@ -119,22 +176,6 @@ def in_turn(steppers: dict[str, Callable[[], None]], steps: int, repeats: int) -
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def product_floor_ms(batch: int) -> float:
-    """CPU milliseconds of the matrix products of one update alone, at the rate that the largest of them reaches at this batch."""
-    a, b = TEACHER_HIDDEN
-    network = WINDOW * a + a * b + b
-    # Forward: both targets, critic twice, actor once. Backward: critic by weights and by its last two layers' inputs; the actor's step goes
-    # through the critic's last layer, then through the actor by weights and inputs.
-    macs = batch * (5 * network + (network + a * b + b) + b + (network + a * b + b))
-    left, right, out = torch.rand(batch, a), torch.rand(a, b), torch.empty(batch, b)
-    rate = 2 * batch * a * b / (cpu_ms(lambda: _product(left, right, out), 300) * 1e-3)
-    return 2 * macs / rate * 1e3
-
-
-def _product(left: Any, right: Any, out: Any) -> None:
-    torch.mm(left, right, out=out)
-
-
 def decision_us(act: Callable[[Any], Any], repeats: int = 1000) -> dict[str, float]:
     """Median and 99th percentile of the CPU time of one decision, microseconds."""
     state = np.random.default_rng(0).normal(size=(1, WINDOW))
@@ -147,11 +188,45 @@ def decision_us(act: Callable[[Any], Any], repeats: int = 1000) -> dict[str, flo
     return {"median_us": float(np.median(times)), "p99_us": float(np.quantile(times, 0.99))}
 
 
+def random_sessions(count: int = 9, steps: int = 300) -> ReplayBuffer:
+    """Sessions of a random controller on a participant whose beta falls with the amplitude; their content does not change the speed."""
+    rng = np.random.default_rng(0)
+    sessions = []
+    for i in range(count):
+        amplitude = rng.uniform(0.3, 1, steps)
+        beta = 200 * np.exp(0.3 * rng.standard_normal(steps) - amplitude)
+        sessions.append(SessionTrajectory(i, 1, "random", np.full(WINDOW, 120.0), beta, amplitude, random_lower_bound=0.3))
+    return ReplayBuffer(MdpSettings(xi_beta=100.0), tuple(sessions), "uV", "table")
+
+
+def train_and_distil(seeds: tuple[int, ...]) -> float:
+    """Train policies of these seeds side by side, then distil each; CPU seconds of this process."""
+    buffer = random_sessions()
+    configs = [DdpgConfig(updates=SIX_UPDATES, batch=SIX_BATCH, seed=seed, actor_lr=10.0 ** -(3 + seed / 5)) for seed in seeds]
+    for trained in algorithm("ddpg").train_many(buffer, configs):
+        distil(trained.policy, buffer, DistilConfig(seed=trained.seed))
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
+
+
+def six_policies() -> dict[str, float]:
+    """Six policies x 10 000 updates and their distillation in two processes of three."""
+    start = time.perf_counter()
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        cpu = pool.map(train_and_distil, [(0, 1, 2), (3, 4, 5)], chunksize=1)
+    timing = {"wall_s": time.perf_counter() - start, "cpu_s": sum(cpu)}
+    print(
+        f"six policies x {SIX_UPDATES} updates and distillation: {timing['wall_s']:.0f} s wall, {timing['cpu_s']:.0f} s CPU in 2 processes"
+    )
+    return timing
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=50, help="updates per timing")
     parser.add_argument("--repeats", type=int, default=7, help="timings per peer")
     parser.add_argument("--quick", action="store_true", help="few updates and repeats, for a first look")
+    parser.add_argument("--six", action="store_true", help="train and distil six policies; takes minutes")
     options = parser.parse_args()
     if options.quick:
         options.steps, options.repeats = 15, 3
@@ -162,26 +237,39 @@ def main() -> None:
 
     figures: dict[str, Any] = {}
     ratios: dict[str, float] = {}
-    print(f"{'DDPG 400x300':<22}{'batch':>6}{'CPU ms/update':>16}{'updates/s':>12}{'of floor':>10}")
+    print(f"{'DDPG 400x300':<34}{'batch':>6}{'CPU ms/update':>16}{'updates/s':>12}{'of products':>14}")
     for batch in BATCHES:
         eager = EagerDdpg(data)
-        steppers = {"eager": lambda eager=eager, batch=batch: eager.step(batch), "fused": fused_stepper(data, batch)}
+        steppers = {
+            "eager": lambda eager=eager, batch=batch: eager.step(batch),
+            "ours": own_stepper(data, batch),
+            "products": products_stepper(batch),
+        }
         if has_d3rlpy:
             steppers["d3rlpy"] = d3rlpy_stepper(data, batch)
+        if batch == SIX_BATCH:
+            steppers["six of ours"] = own_stepper(data, batch, 6)
         medians = in_turn(steppers, options.steps, options.repeats)
-        floor = product_floor_ms(batch)
         for name, ms in medians.items():
-            figures[f"{name}_batch{batch}_ms"] = ms
-            print(f"{name:<22}{batch:>6}{ms:>16.2f}{1e3 / ms:>12.0f}{floor / ms:>10.0%}")
-        figures[f"floor_batch{batch}_ms"] = floor
-        ratios[f"fused_vs_eager_batch{batch}"] = medians["eager"] / medians["fused"]
+            each = ms / 6 if name == "six of ours" else ms  # per policy
+            figures[f"{name.replace(' ', '_')}_batch{batch}_ms"] = ms
+            print(f"{name + ' (each)' * (each != ms):<34}{batch:>6}{each:>16.2f}{1e3 / each:>12.0f}{medians['products'] / each:>14.0%}")
+        ratios[f"ddpg_vs_eager_batch{batch}"] = medians["eager"] / medians["ours"]
+        ratios[f"ddpg_of_products_batch{batch}"] = medians["products"] / medians["ours"]
         if has_d3rlpy:
-            ratios[f"ddpg_vs_d3rlpy_batch{batch}"] = medians["d3rlpy"] / medians["fused"]
-    ratios["fused_vs_eager"] = ratios["fused_vs_eager_batch64"]
+            ratios[f"ddpg_vs_d3rlpy_batch{batch}"] = medians["d3rlpy"] / medians["ours"]
+        if batch == SIX_BATCH:
+            ratios["six_vs_eager"] = 6 * medians["eager"] / medians["six of ours"]
+    ratios["ddpg_vs_eager"] = ratios[f"ddpg_vs_eager_batch{SIX_BATCH}"]
+    ratios["ddpg_of_products"] = ratios["ddpg_of_products_batch256"]
     if has_d3rlpy:
         ratios["ddpg_vs_d3rlpy"] = ratios["ddpg_vs_d3rlpy_batch256"]
     else:
-        print("d3rlpy is not installed (the `bench` extra): no ddpg_vs_d3rlpy")
+        print("d3rlpy is not installed (the `bench` extra): ddpg_vs_d3rlpy was NOT measured")
+    for name, ratio in ratios.items():
+        print(f"{name:<34}{ratio:>6.2f}")
+    if options.six:
+        figures["six"] = six_policies()
 
     print(f"\n{'one decision':<34}{'median us':>12}{'p99 us':>12}")
     for size, hidden in (("teacher", TEACHER_HIDDEN), ("student", STUDENT_HIDDEN)):

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
+from ml.rl.held_out import Score
 from ml.rl.policy import ConstantPolicy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 
@@ -11,6 +15,42 @@ from ml.trajectories import ReplayBuffer
 def behaviour_mean(buffer: ReplayBuffer) -> ConstantPolicy:
     """The mean amplitude fraction of the buffer's usable steps, held constant: what the logged sessions spent, without their variation."""
     return ConstantPolicy(float(buffer.transitions().actions.mean()))
+
+
+CONSTANT_GRID = tuple(round(0.3 + 0.05 * k, 2) for k in range(15))
+"""Amplitude fractions from 0.30 to 1.00 tried by `best_constant`."""
+
+
+@dataclass(frozen=True)
+class ConstantChoice:
+    """The constant amplitude that the data prefer, and the estimate of every one that was tried.
+
+    Attributes:
+        policy: the constant with the largest estimate; of equals the smallest amplitude.
+        estimates: by amplitude fraction.
+    """
+
+    policy: ConstantPolicy
+    estimates: Mapping[float, float]
+
+
+def best_constant(score: Score, amplitudes: Sequence[float] = CONSTANT_GRID) -> ConstantChoice:
+    """The best constant amplitude by an estimate from data.
+
+    Args:
+        score: estimate of a policy's worth from sessions left out of the estimator's fit (fitted Q evaluation, for example).
+        amplitudes: fractions to try. Outside the logged range an estimate is extrapolation.
+
+    Raises:
+        ValueError: no amplitude, one outside [0, 1], or an estimate that is not finite.
+    """
+    estimates = {float(a): float(score(ConstantPolicy(a))) for a in sorted(amplitudes)}
+    if not estimates:
+        raise ValueError("choosing a constant amplitude needs one or more to try")
+    wrong = [a for a, value in estimates.items() if not np.isfinite(value)]
+    if wrong:
+        raise ValueError(f"the estimate of a constant amplitude of {wrong[0]:g} is not finite")
+    return ConstantChoice(ConstantPolicy(max(estimates, key=estimates.__getitem__)), estimates)
 
 
 def proportional_from_buffer(

@@ -7,7 +7,8 @@ states: buffer states with Gaussian noise on every element.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,9 @@ from ml.rl.networks import STUDENT_HIDDEN, MlpPolicy
 from ml.rl.policy import Policy
 from ml.rl.training import TrainingDiverged, single_thread
 from ml.trajectories import ReplayBuffer
+
+Agreement = Callable[[Policy, Policy], dict[str, float]]
+"""Compares a student with its teacher, in that order, beyond their actions: by estimated returns, for example."""
 
 _BLOCK = 64  # batches whose noisy states the teacher labels in one call
 _TRAIN_STREAM, _TEST_STREAM = 2, 3
@@ -64,6 +68,16 @@ class DistilConfig:
         """All hyper-parameters, by name."""
         return asdict(self) | {"hidden": list(self.hidden)}
 
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> DistilConfig:
+        """The inverse of `to_json`; missing names take their default. Raises ValueError for a name that is none."""
+        unknown = sorted(set(values) - set(DistilConfig.__dataclass_fields__))
+        if unknown:
+            known = ", ".join(DistilConfig.__dataclass_fields__)
+            raise ValueError(f"distillation has no hyper-parameter {', '.join(unknown)}; it has {known}")
+        config = DistilConfig(**values)
+        return replace(config, hidden=tuple(config.hidden))
+
 
 @dataclass(frozen=True)
 class ActionError:
@@ -92,6 +106,7 @@ class DistilledPolicy:
         macs: multiply-accumulate operations per decision.
         curve: `update` and `loss` (mean squared action error since the last point), arrays of one length.
         config: the hyper-parameters.
+        agreement: what the caller's comparison with the teacher says, by name.
     """
 
     policy: MlpPolicy
@@ -101,6 +116,12 @@ class DistilledPolicy:
     macs: int
     curve: dict[str, NDArray[np.float64]]
     config: DistilConfig
+    agreement: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def weight_bytes(self) -> int:
+        """Bytes of the weights as float32; a quarter of it as int8."""
+        return 4 * self.parameters
 
     def report(self) -> dict[str, Any]:
         """Errors and size, for storing beside the policy."""
@@ -108,11 +129,15 @@ class DistilledPolicy:
             "on_buffer": asdict(self.on_buffer),
             "on_noise": asdict(self.on_noise) if self.on_noise else None,
             "parameters": self.parameters,
+            "weight_bytes": self.weight_bytes,
             "macs": self.macs,
+            "agreement": dict(self.agreement),
         }
 
 
-def distil(teacher: Policy, buffer: ReplayBuffer, config: DistilConfig, report: Report = silent) -> DistilledPolicy:
+def distil(
+    teacher: Policy, buffer: ReplayBuffer, config: DistilConfig, report: Report = silent, agreement: Agreement | None = None
+) -> DistilledPolicy:
     """Train a student to act as the teacher does (eq:distillation).
 
     Args:
@@ -120,6 +145,7 @@ def distil(teacher: Policy, buffer: ReplayBuffer, config: DistilConfig, report: 
         buffer: sessions whose states the student learns on, whatever controller they had.
         config: hyper-parameters.
         report: told of the progress.
+        agreement: compares student and teacher once, at the end.
 
     Returns:
         The student, the same bit for bit for the same teacher, buffer and configuration on one machine.
@@ -140,7 +166,27 @@ def distil(teacher: Policy, buffer: ReplayBuffer, config: DistilConfig, report: 
             noisy = np.repeat(states, _TEST_COPIES, axis=0)
             noisy = noisy + rng.normal(0.0, config.sigma * std, noisy.shape)
             on_noise = ActionError.between(student.act(noisy), teacher.act(noisy))
-    return DistilledPolicy(student, on_buffer, on_noise, student.parameter_count, student.macs, curve, config)
+    agreed = {} if agreement is None else agreement(student, teacher)
+    return DistilledPolicy(student, on_buffer, on_noise, student.parameter_count, student.macs, curve, config, agreed)
+
+
+def distil_sizes(
+    teacher: Policy,
+    buffer: ReplayBuffer,
+    sizes: Sequence[tuple[int, ...]],
+    config: DistilConfig,
+    report: Report = silent,
+    agreement: Agreement | None = None,
+) -> list[DistilledPolicy]:
+    """Students of several sizes, all else as in `config`: how small may it be? Arguments and errors as in `distil`."""
+
+    def part(done: int) -> Report:
+        def tell(fraction: float, message: str = "", **numbers: float) -> None:
+            report((done + fraction) / len(sizes), f"student {' x '.join(map(str, sizes[done]))}: {message}", **numbers)
+
+        return tell
+
+    return [distil(teacher, buffer, replace(config, hidden=tuple(size)), part(i), agreement) for i, size in enumerate(sizes)]
 
 
 def _fit(

@@ -176,16 +176,19 @@ class Critic(nn.Module):
     Args:
         window: W.
         hidden: units of each hidden layer; at least two layers, since the action joins at the second.
+        layer_norm: normalise each hidden layer's rectified output (Tarasov et al. 2023); without weights of its own, which the next
+            layer would absorb.
         seed: seed of the initial weights.
 
     Raises:
         ValueError: fewer than two hidden layers.
     """
 
-    def __init__(self, window: int, hidden: Sequence[int] = TEACHER_HIDDEN, *, seed: int = 0) -> None:
+    def __init__(self, window: int, hidden: Sequence[int] = TEACHER_HIDDEN, *, layer_norm: bool = False, seed: int = 0) -> None:
         super().__init__()
         if len(hidden) < 2:
             raise ValueError(f"the critic needs two hidden layers or more (the action joins at the second), not {tuple(hidden)}")
+        self.layer_norm = layer_norm
         sizes = [window, *hidden, 1]
         self.layers = nn.ModuleList(nn.utils.skip_init(nn.Linear, i, o) for i, o in pairwise(sizes))
         self.action = nn.utils.skip_init(nn.Linear, 1, hidden[1], bias=False)
@@ -197,10 +200,36 @@ class Critic(nn.Module):
 
     def forward(self, scores: Any, actions: Any) -> Any:
         """Values [N, 1] of actions [N, 1] in z-scored windows [N, W], tensors of float32."""
-        hidden = torch.relu(self.layers[0](scores))
+        hidden = self._rectified(self.layers[0](scores))
         # The action's column of the second layer stands apart: the actor's gradient then needs no product with the other columns.
-        hidden = torch.relu(self.layers[1](hidden) + self.action(2.0 * actions - 1.0))
+        hidden = self._rectified(self.layers[1](hidden) + self.action(2.0 * actions - 1.0))
         for layer in self.layers[2:-1]:
+            hidden = self._rectified(layer(hidden))
+        return self.layers[-1](hidden)
+
+    def _rectified(self, outputs: Any) -> Any:
+        hidden = torch.relu(outputs)
+        return nn.functional.layer_norm(hidden, hidden.shape[-1:]) if self.layer_norm else hidden
+
+
+class Value(nn.Module):
+    """The state value function V(s) on z-scored windows: a critic without an action.
+
+    Args:
+        window: W.
+        hidden: units of each hidden layer.
+        seed: seed of the initial weights.
+    """
+
+    def __init__(self, window: int, hidden: Sequence[int] = TEACHER_HIDDEN, *, seed: int = 0) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.utils.skip_init(nn.Linear, i, o) for i, o in pairwise([window, *hidden, 1]))
+        initialise(self.layers, torch.Generator().manual_seed(seed))
+
+    def forward(self, scores: Any) -> Any:
+        """Values [N, 1] of z-scored windows, float32 tensor [N, W]."""
+        hidden = scores
+        for layer in self.layers[:-1]:
             hidden = torch.relu(layer(hidden))
         return self.layers[-1](hidden)
 

@@ -1,8 +1,9 @@
-"""The training loop that every offline learner shares: packed data, reproducible batches, learning curves, checkpoints.
+"""The training loop that every offline learner shares: reproducible batches, learning curves, checkpoints.
 
-A learner knows one gradient step; the loop knows when to measure, report and save. Batches are drawn from a counter, not from a running
-generator: block b of a run with seed s always holds the same rows. The state of the random numbers is therefore the update number alone,
-and a run resumed from a checkpoint goes on bit for bit as if it had not been interrupted (same machine, one thread).
+A learner knows one gradient step of K policies side by side; the loop knows when to measure, report and save. Batches are drawn from a
+counter, not from a running generator: block b of a run with seed s always holds the same rows. The state of the random numbers is
+therefore the update number alone, and a run resumed from a checkpoint goes on bit for bit as if it had not been interrupted (same
+machine, one thread).
 """
 
 from __future__ import annotations
@@ -13,21 +14,23 @@ import io
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ml.progress import Report
-from ml.trajectories import Transitions
+from ml.rl.batches import BLOCK, Batch, PackedTransitions, batch_indices, batch_noise
+from ml.rl.held_out import HeldOut
+from ml.rl.networks import MlpPolicy
 
-_BLOCK = 256  # batches drawn at once: one call of the generator per block instead of one per update
-_BATCH_STREAM = 1
-_CHECKPOINT_FORMAT = 1
-_PROBE_STATES = 2048
+_CHECKPOINT_FORMAT = 2
+
+Curve = dict[str, NDArray[np.float64]]
 
 
 class TrainingDiverged(ArithmeticError):
@@ -38,81 +41,26 @@ class CheckpointError(ValueError):
     """The checkpoint file cannot be read, or belongs to another run."""
 
 
-class Batch(NamedTuple):
-    """Rows of a buffer as float32 tensors: z-scored states [B, W], actions [B, 1], scaled rewards [B, 1], z-scored next states [B, W]."""
-
-    states: Any
-    actions: Any
-    rewards: Any
-    next_states: Any
-
-
-class PackedTransitions:
-    """A buffer in one tensor [N, 2W + 2], so that a batch is one gather.
-
-    Args:
-        states, next_states: z-scored windows, float32 tensors [N, W].
-        actions, rewards: float32 tensors [N].
-    """
-
-    def __init__(self, states: Any, actions: Any, rewards: Any, next_states: Any) -> None:
-        self._window = states.shape[1]
-        self._rows = torch.cat([states, actions[:, None], rewards[:, None], next_states], dim=1).contiguous()
-
-    def __len__(self) -> int:
-        return int(self._rows.shape[0])
-
-    def take(self, index: Any) -> Batch:
-        """The rows of an int64 tensor [B]; a copy, so that nothing a learner does can reach the buffer."""
-        rows, w = self._rows.index_select(0, index), self._window
-        return Batch(rows[:, :w], rows[:, w : w + 1], rows[:, w + 1 : w + 2], rows[:, w + 2 :])
-
-    def probe(self) -> Batch:
-        """Up to 2048 rows spread evenly over the buffer, for measurements."""
-        return self.take(torch.from_numpy(np.unique(np.linspace(0, len(self) - 1, _PROBE_STATES).astype(np.int64))))
-
-    def digest(self) -> str:
-        """SHA-256 of the packed numbers."""
-        return hashlib.sha256(self._rows.numpy().tobytes()).hexdigest()
-
-
-class RewardScale(NamedTuple):
-    """Rewards as the critic sees them: (r - shift) * factor.
-
-    A session's end is a time limit, not a terminal state, so every target bootstraps; an affine change of the rewards is then an affine
-    change of every return, Q' = factor (Q - shift / (1 - gamma)), and no policy gains or loses by it. The shift is the buffer's mean
-    reward: without it the critic would spend its first ten thousands of updates sinking from 0 to r / (1 - gamma). The factor is
-    sqrt(1 - gamma^2) / sd(r), which gives discounted sums of independent rewards a standard deviation of 1, the scale that the networks'
-    initial weights and Adam's steps suit.
-    """
-
-    shift: float
-    factor: float
-    gamma: float
-
-    @staticmethod
-    def of(rewards: NDArray[np.float64], gamma: float) -> RewardScale:
-        """The scale of a buffer's rewards, shape [N]; factor 1 where all are equal."""
-        deviation = float(rewards.std())
-        return RewardScale(float(rewards.mean()), math.sqrt(1 - gamma**2) / deviation if deviation > 1e-12 else 1.0, gamma)
-
-    def scaled(self, rewards: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Rewards for the critic."""
-        return (rewards - self.shift) * self.factor
-
-    def value(self, scaled: float) -> float:
-        """A critic's output in the unit of the rewards."""
-        return scaled / self.factor + self.shift / (1 - self.gamma)
-
-
 class Learner(Protocol):
-    """One algorithm: its networks and one gradient step."""
+    """One algorithm: its networks and one gradient step, for K policies side by side."""
+
+    members: int
+    uses_noise: bool
 
     def update(self, batch: Batch) -> None:
         """One update of the networks; leaves the batch as it is."""
 
-    def measure(self, probe: Batch) -> dict[str, float]:
-        """Points of the learning curves: means since the last call, and values on the probe."""
+    def measure(self, probe: Batch) -> list[dict[str, float]]:
+        """Points of the learning curves of each policy: means since the last call, and values on the probe."""
+
+    def policy(self, member: int) -> MlpPolicy:
+        """A copy of one policy as it is now."""
+
+    def start_values(self, states: NDArray[np.float64]) -> list[float] | None:
+        """Mean Q(s, pi(s)) over beta windows [n, W] for each policy, in reward units; None for an algorithm without a critic."""
+
+    def rows(self, member: int) -> dict[str, Any]:
+        """One member's weights by network, copies."""
 
     def state(self) -> dict[str, Any]:
         """Everything that the next update depends on (weights, targets, optimisers): tensors, numbers, lists, dictionaries."""
@@ -121,68 +69,141 @@ class Learner(Protocol):
         """Put `state` back."""
 
 
-def packed(transitions: Transitions, normalise: Any, scale: RewardScale) -> PackedTransitions:
-    """Transitions for learners: windows z-scored by `normalise` (a policy's own), rewards scaled."""
-    return PackedTransitions(
-        normalise(torch.tensor(transitions.states, dtype=torch.float32)),
-        torch.tensor(transitions.actions, dtype=torch.float32),
-        torch.tensor(scale.scaled(transitions.rewards), dtype=torch.float32),
-        normalise(torch.tensor(transitions.next_states, dtype=torch.float32)),
-    )
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """How long to train, on which random numbers, and when to look.
+
+    Attributes:
+        updates, batch, record_every, checkpoint_every: as in `TrainConfig`. seeds: one per policy. device: of the tensors.
+    """
+
+    updates: int
+    batch: int
+    seeds: tuple[int, ...]
+    record_every: int
+    checkpoint_every: int
+    device: str = "cpu"
 
 
-def batch_indices(seed: int, block: int, size: int, batch: int) -> Any:
-    """Rows of the 256 batches of a block, int64 tensor [256, batch], drawn uniformly with replacement from a buffer of `size` rows."""
-    return torch.from_numpy(np.random.default_rng([seed, _BATCH_STREAM, block]).integers(0, size, (_BLOCK, batch)))
+@dataclass
+class Outcome:
+    """What the loop leaves of one policy.
+
+    Attributes:
+        points: of the learning curves. held_out: points on held-out sessions.
+        best_score, best_update, best_rows: the state with the best held-out score; None where nothing scored.
+    """
+
+    points: list[dict[str, float]] = field(default_factory=list)
+    held_out: list[dict[str, float]] = field(default_factory=list)
+    best_score: float | None = None
+    best_update: int | None = None
+    best_rows: dict[str, Any] | None = None
+
+    def scorings_since_best(self) -> int:
+        """Scorings after the best one."""
+        return sum(point["update"] > (self.best_update or 0) for point in self.held_out)
+
+
+class _Draws:
+    """Batches by update number, drawn in blocks."""
+
+    def __init__(self, learner: Learner, data: PackedTransitions, plan: Plan) -> None:
+        self._uses_noise, self._data, self._plan = learner.uses_noise, data, plan
+        self._block = -1
+        self._index: Any = None
+        self._noise: Any = None
+
+    def batch(self, update: int) -> Batch:
+        """The batch of update 0, 1, ..."""
+        block, row = divmod(update, BLOCK)
+        if block != self._block:
+            p = self._plan
+            index = torch.stack([batch_indices(seed, block, len(self._data), p.batch) for seed in p.seeds], dim=1)
+            self._block, self._index = block, index.to(p.device)
+            if self._uses_noise:
+                self._noise = torch.stack([batch_noise(seed, block, p.batch) for seed in p.seeds], dim=1).to(p.device)
+        return self._data.take(self._index[row], self._noise[row] if self._uses_noise else None)
 
 
 def run(
     learner: Learner,
     data: PackedTransitions,
+    plan: Plan,
     *,
-    updates: int,
-    batch: int,
-    seed: int,
-    record_every: int,
-    checkpoint_every: int,
     fingerprint: str,
     report: Report,
-    checkpoint: Path | None,
-) -> dict[str, NDArray[np.float64]]:
-    """Train for `updates` updates, from the checkpoint where there is one.
+    checkpoint: Path | None = None,
+    held_out: HeldOut | None = None,
+) -> list[Outcome]:
+    """Train for `plan.updates` updates, from the checkpoint where there is one.
 
     Returns:
-        Learning curves by name, all of one length; `update` holds the update numbers.
+        Points and best state of each policy.
 
     Raises:
         TrainingDiverged: a measured number is not finite.
         CheckpointError: the checkpoint is of another run, or damaged.
     """
-    probe = data.probe()
-    done = 0
-    points: list[dict[str, float]] = []
+    probe, draws = data.probe(learner.members), _Draws(learner, data, plan)
+    starts = held_out.starts() if held_out else None
+    done, stopped, outcomes = 0, False, [Outcome() for _ in range(learner.members)]
     if checkpoint is not None and checkpoint.exists():
-        done, points = _resume(learner, checkpoint, fingerprint)
-    rows: Any = None
-    for update in range(done, updates):
-        block, row = divmod(update, _BLOCK)
-        if row == 0 or rows is None:
-            rows = batch_indices(seed, block, len(data), batch)
-        learner.update(data.take(rows[row]))
-        finished = update + 1
-        if finished % record_every == 0 or finished == updates:
-            numbers = learner.measure(probe)
-            _require_finite(numbers, finished)
-            points.append({"update": float(finished)} | numbers)
-            report(finished / updates, f"update {finished} of {updates}", **numbers)
-        if checkpoint is not None and (finished % checkpoint_every == 0 or finished == updates):
-            _save(checkpoint, {"fingerprint": fingerprint, "update": finished, "points": points, "learner": learner.state()})
+        done, stopped, outcomes = _resume(learner, checkpoint, fingerprint)
+    while done < plan.updates and not stopped:
+        learner.update(draws.batch(done))
+        done += 1
+        last = done == plan.updates
+        if held_out and starts and (done % held_out.every == 0 or last):
+            _score(learner, held_out, starts, outcomes, done)
+            stopped = 0 < held_out.patience <= min(outcome.scorings_since_best() for outcome in outcomes)
+        if done % plan.record_every == 0 or last or stopped:
+            _record(learner.measure(probe), outcomes, done, plan, report)
+        if checkpoint is not None and (done % plan.checkpoint_every == 0 or last or stopped):
+            saved = [vars(outcome) for outcome in outcomes]
+            _save(
+                checkpoint, {"fingerprint": fingerprint, "update": done, "stopped": stopped, "outcomes": saved, "learner": learner.state()}
+            )
+    return outcomes
+
+
+def as_curve(points: Sequence[dict[str, float]]) -> Curve:
+    """Points as arrays by name, all of one length; `update` holds the update numbers."""
     return {name: np.array([point[name] for point in points]) for name in points[0]} if points else {}
 
 
-def fingerprint_of(data: PackedTransitions, config: dict[str, Any], start: dict[str, Any]) -> str:
-    """A name for a run: data, configuration and the weights it starts from. `checkpoint_every` changes no result and is left out."""
-    digest = hashlib.sha256(json.dumps({k: v for k, v in config.items() if k != "checkpoint_every"}, sort_keys=True).encode())
+def _record(numbers: list[dict[str, float]], outcomes: list[Outcome], done: int, plan: Plan, report: Report) -> None:
+    told: dict[str, float] = {}
+    for k, (outcome, own) in enumerate(zip(outcomes, numbers, strict=True)):
+        of = f" of policy {k + 1}" if len(outcomes) > 1 else ""
+        _require_finite(own, done, of)
+        outcome.points.append({"update": float(done)} | own)
+        told |= own if len(outcomes) == 1 else {f"{name}_{k + 1}": value for name, value in own.items()}
+    report(done / plan.updates, f"update {done} of {plan.updates}", **told)
+
+
+def _score(learner: Learner, held_out: HeldOut, starts: tuple[NDArray[np.float64], float], outcomes: list[Outcome], done: int) -> None:
+    """A point on the held-out sessions for each policy; keeps the state of the best score, the earlier one of equals."""
+    states, logged = starts
+    values = learner.start_values(states)
+    for k, outcome in enumerate(outcomes):
+        point = {"update": float(done)}
+        if values is not None:
+            point |= {"start_q": values[k], "over_logged": values[k] - logged}
+        if held_out.score is not None:
+            score = float(held_out.score(learner.policy(k)))
+            _require_finite({"the held-out score": score}, done, f" of policy {k + 1}" if len(outcomes) > 1 else "")
+            point["score"] = score
+            if values is not None and held_out.is_step_return:
+                point["over_estimate"] = values[k] - score
+            if outcome.best_score is None or score > outcome.best_score:
+                outcome.best_score, outcome.best_update, outcome.best_rows = score, done, learner.rows(k)
+        outcome.held_out.append(point)
+
+
+def fingerprint_of(data: PackedTransitions, config: Any, start: dict[str, Any]) -> str:
+    """A name for a run: data, configuration (anything JSON holds) and the weights it starts from."""
+    digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
     digest.update(data.digest().encode())
     for tensor in _tensors(start):
         digest.update(tensor.numpy().tobytes())
@@ -218,7 +239,7 @@ def tensors_from_bytes(content: bytes) -> dict[str, Any]:
     return state
 
 
-def _resume(learner: Learner, checkpoint: Path, fingerprint: str) -> tuple[int, list[dict[str, float]]]:
+def _resume(learner: Learner, checkpoint: Path, fingerprint: str) -> tuple[int, bool, list[Outcome]]:
     try:
         saved = tensors_from_bytes(checkpoint.read_bytes())
         format_, owner = saved["format"], saved["fingerprint"]
@@ -230,7 +251,7 @@ def _resume(learner: Learner, checkpoint: Path, fingerprint: str) -> tuple[int, 
             "delete it to train from the start, or name another file"
         )
     learner.load_state(saved["learner"])
-    return int(saved["update"]), list(saved["points"])
+    return int(saved["update"]), bool(saved["stopped"]), [Outcome(**outcome) for outcome in saved["outcomes"]]
 
 
 def _save(checkpoint: Path, content: dict[str, Any]) -> None:
@@ -243,10 +264,10 @@ def _save(checkpoint: Path, content: dict[str, Any]) -> None:
     part.replace(checkpoint)
 
 
-def _require_finite(numbers: dict[str, float], update: int) -> None:
+def _require_finite(numbers: dict[str, float], update: int, of: str = "") -> None:
     for name, value in numbers.items():
         if not math.isfinite(value):
-            raise TrainingDiverged(f"{name} is {value} after update {update}: the training diverged; lower the learning rates")
+            raise TrainingDiverged(f"{name}{of} is {value} after update {update}: the training diverged; lower the learning rates")
 
 
 def _tensors(state: Any) -> Iterator[Any]:

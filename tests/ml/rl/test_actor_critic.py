@@ -8,10 +8,11 @@ import torch
 from scipy.stats import norm
 
 from ml.mdp import MdpSettings
-from ml.rl.actor_critic import DdpgConfig, DdpgLearner, TrainedPolicy, train, train_on
+from ml.rl.actor_critic import DdpgConfig, DdpgLearner, TrainedPolicy, train
+from ml.rl.batches import Batch, RewardScale, batch_indices, packed
 from ml.rl.networks import Critic, MlpPolicy
-from ml.rl.training import Batch, RewardScale, TrainingDiverged, batch_indices, packed
-from ml.trajectories import Transitions
+from ml.rl.stacked import into_module
+from ml.rl.training import TrainingDiverged
 
 SMALL = DdpgConfig(hidden=(16, 12), updates=60, batch=16, record_every=10, checkpoint_every=7, actor_lr=1e-3)
 
@@ -25,33 +26,6 @@ def same(left, right):
 
 
 # --- known answers ------------------------------------------------------------------------------------------------------------------
-
-
-def linear_quadratic(count=4000, gamma=0.9, keep=0.9, push=0.8, price=0.3, seed=0):
-    """x' = 0.9 x + 0.8 u + noise at cost x^2 + 0.3 u^2, u = a - 0.5: transitions, and the gain K of the optimal u = -K x."""
-    rng = np.random.default_rng(seed)
-    x, older, action = rng.uniform(-0.8, 0.8, count), rng.uniform(-0.8, 0.8, count), rng.uniform(0, 1, count)
-    u = action - 0.5
-    following = keep * x + push * u + rng.normal(0, 0.05, count)
-    p = 1.0
-    for _ in range(500):  # the discounted Riccati equation
-        p = 1 + gamma * keep**2 * p - (gamma * keep * push * p) ** 2 / (price + gamma * push**2 * p)
-    gain = gamma * keep * push * p / (price + gamma * push**2 * p)
-    rows = np.arange(count)
-    return Transitions(np.c_[older, x], action, -(x**2) - price * u**2, np.c_[x, following], rows * 0, rows), gain, gamma
-
-
-def test_ddpg_finds_the_linear_quadratic_regulator():
-    transitions, gain, gamma = linear_quadratic()
-    config = DdpgConfig(actor_lr=3e-4, critic_lr=2e-3, tau=0.02, batch=128, hidden=(48, 48), updates=2500, seed=1)
-    trained = train_on(transitions, gamma, (0.0, 0.46), config)
-    x = np.linspace(-0.5, 0.5, 41)
-    optimal = 0.5 - gain * x
-    assert np.ptp(optimal) > 0.7, "a problem that a constant would not solve"
-    for older in (-0.5, 0.5):  # the optimal action does not depend on the older element
-        error = np.abs(trained.policy.act(np.c_[np.full(41, older), x]) - optimal)
-        assert error.mean() < 0.06
-        assert error.max() < 0.15
 
 
 def test_without_a_future_ddpg_finds_the_amplitude_that_balances_threshold_and_price(make_buffer):
@@ -168,27 +142,29 @@ class SlowDdpg:
 
 @pytest.mark.parametrize("decay", [0.0, 0.01])
 def test_an_update_equals_the_slow_twin_in_plain_loops(decay):
-    config = DdpgConfig(hidden=(6, 5), tau=0.1, actor_lr=1e-3, critic_lr=2e-3, critic_weight_decay=decay)
+    config = DdpgConfig(hidden=(6, 5), batch=8, tau=0.1, actor_lr=1e-3, critic_lr=2e-3, critic_weight_decay=decay)
     policy, critic = MlpPolicy(3, (6, 5), seed=1), Critic(3, (6, 5), seed=2)
     with torch.no_grad():  # last layers as after some training, so that every gradient is far from Adam's epsilon
         policy.layers[-1].weight.mul_(100)
         critic.layers[-1].weight.mul_(100)
-    learner = DdpgLearner(policy, critic, config, RewardScale(0.0, 1.0, 0.95))
+    learner = DdpgLearner([{"policy": policy, "critic": critic}], [config], RewardScale(0.0, 1.0, 0.95))
     twin = SlowDdpg(policy, critic, config, 0.95)
     start = twin.pi.flat()
     rng = np.random.default_rng(0)
     for _ in range(5):
         s, a, r, s2 = (rng.normal(size=(8, 3)), rng.uniform(size=8), rng.normal(size=8), rng.normal(size=(8, 3)))
-        learner.update(Batch(*(torch.tensor(x, dtype=torch.float32) for x in (s, a[:, None], r[:, None], s2))))
+        columns = (s, a[:, None], r[:, None], s2, a[:, None], a[:, None])
+        learner.update(Batch(*(torch.tensor(x, dtype=torch.float32)[None] for x in columns)))
         twin.update(list(zip(s, a, r, s2, strict=True)))
     assert np.abs(twin.pi.flat() - start).max() > 4e-3, "the updates must move the weights"
-    for fast, slow in (
-        (learner.policy, twin.pi),
-        (learner.critic, twin.q),
-        (learner.target_policy, twin.pi_target),
-        (learner.target_critic, twin.q_target),
+    for fast, slow, module in (
+        (learner.stacks["policy"], twin.pi, policy),
+        (learner.stacks["critic"], twin.q, critic),
+        (learner.target_stacks["policy"], twin.pi_target, policy),
+        (learner.target_stacks["critic"], twin.q_target, critic),
     ):
-        np.testing.assert_allclose(Net(fast).flat(), slow.flat(), atol=2e-5)
+        into_module(fast.weights[0], module)
+        np.testing.assert_allclose(Net(module).flat(), slow.flat(), atol=2e-5)
 
 
 # --- conduct ------------------------------------------------------------------------------------------------------------------------
@@ -208,28 +184,26 @@ def test_another_seed_gives_another_policy(buffer):
     assert train(buffer, SMALL).policy.to_onnx() != train(buffer, other).policy.to_onnx()
 
 
-def test_an_update_leaves_its_batch_and_the_buffer_as_they_are(buffer):
-    transitions = buffer.transitions()
-    policy = MlpPolicy(10, (16, 12), mean=100.0, std=40.0)
-    data = packed(transitions, policy.normalise, RewardScale.of(transitions.rewards, 0.99))
-    before = data.digest()
-    batch = data.take(batch_indices(0, 0, len(data), 32)[0])
-    copies = [x.clone() for x in batch]
-    DdpgLearner(policy, Critic(10, (16, 12)), SMALL, RewardScale(0.0, 1.0, 0.99)).update(batch)
-    assert same(batch, copies)
-    assert data.digest() == before
-
-
 def test_a_batch_holds_the_buffers_own_rows(buffer):
     transitions = buffer.transitions()
     scale = RewardScale.of(transitions.rewards, 0.99)
-    index = batch_indices(5, 3, transitions.actions.size, 8)[17]
+    index = torch.stack([batch_indices(seed, 3, transitions.actions.size, 8)[17] for seed in (5, 6)])
     batch = packed(transitions, lambda x: x / 100, scale).take(index)
     rows = index.numpy()
     np.testing.assert_allclose(batch.states, transitions.states[rows] / 100, rtol=1e-6)
     np.testing.assert_allclose(batch.next_states, transitions.next_states[rows] / 100, rtol=1e-6)
-    np.testing.assert_allclose(batch.actions[:, 0], transitions.actions[rows], rtol=1e-6)
-    np.testing.assert_allclose(batch.rewards[:, 0] / scale.factor + scale.shift, transitions.rewards[rows], atol=1e-6)
+    np.testing.assert_allclose(batch.actions[..., 0], transitions.actions[rows], rtol=1e-6)
+    np.testing.assert_allclose(batch.rewards[..., 0] / scale.factor + scale.shift, transitions.rewards[rows], atol=1e-6)
+
+
+def test_the_next_logged_action_is_known_within_a_session_and_unknown_at_its_end_and_at_gaps(make_buffer):
+    buffer = make_buffer(MdpSettings(xi_beta=100.0), count=2, steps=6)
+    buffer.sessions[0].amplitude[3] = np.nan  # steps 0-2, 4-5 stay
+    transitions = buffer.transitions()
+    batch = packed(transitions, lambda x: x, RewardScale(0.0, 1.0, 0.9)).take(torch.arange(11)[None])
+    logged = torch.tensor(np.concatenate([s.amplitude for s in buffer.sessions]), dtype=torch.float32).tolist()
+    assert batch.next_known[0, :, 0].tolist() == [1, 1, 0, 1, 0, 1, 1, 1, 1, 1, 0]
+    assert batch.next_actions[0, :, 0].tolist() == pytest.approx([*logged[1:3], 0, logged[5], 0, *logged[7:12], 0])
 
 
 def test_batches_cover_the_buffer_evenly():

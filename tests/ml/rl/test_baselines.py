@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ml.rl.baselines import behaviour_mean, proportional_from_buffer
+from ml.rl.baselines import CONSTANT_GRID, behaviour_mean, best_constant, proportional_from_buffer
 from ml.trajectories import ReplayBuffer
 
 
@@ -31,3 +31,20 @@ def test_beta_without_spread_or_quantiles_out_of_order_are_refused(buffer):
         proportional_from_buffer(ReplayBuffer(buffer.settings, tuple(flat), "uV", "table"))
     with pytest.raises(ValueError, match="must rise"):
         proportional_from_buffer(buffer, 0.9, 0.1)
+
+
+def test_the_best_constant_is_the_one_of_the_largest_estimate_and_of_equals_the_smallest():
+    def estimate(policy):
+        return -round(abs(policy.act(np.zeros((1, 10)))[0] - 0.62), 1)
+
+    choice = best_constant(estimate)
+    assert choice.policy.amplitude == 0.6
+    assert tuple(choice.estimates) == CONSTANT_GRID
+    assert choice.estimates[1.0] == pytest.approx(-0.4)
+
+
+def test_a_choice_without_amplitudes_or_with_an_estimate_that_is_no_number_is_refused():
+    with pytest.raises(ValueError, match="one or more"):
+        best_constant(lambda policy: 0.0, ())
+    with pytest.raises(ValueError, match=r"0\.4 is not finite"):
+        best_constant(lambda policy: float("nan"), (0.4,))

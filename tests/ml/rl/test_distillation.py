@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ml.rl.distillation import ActionError, DistilConfig, distil
+from ml.rl.distillation import ActionError, DistilConfig, distil, distil_sizes
 from ml.rl.networks import MlpPolicy
 from ml.rl.policy import ConstantPolicy, ProportionalPolicy
 
@@ -89,3 +89,33 @@ def test_progress_is_told_to_the_end(buffer):
 def test_impossible_hyper_parameters_are_refused_by_name(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         DistilConfig(**wrong)
+
+
+def test_the_comparison_with_the_teacher_is_asked_once_and_reported(buffer):
+    teacher, asked = ConstantPolicy(0.4), []
+
+    def agreement(student, of):
+        asked.append(of)
+        return {"difference": float(student.act(np.full((1, 10), 100.0))[0] - of.act(np.full((1, 10), 100.0))[0])}
+
+    student = distil(teacher, buffer, DistilConfig(updates=300), agreement=agreement)
+    assert asked == [teacher]
+    assert student.report()["agreement"]["difference"] == student.policy.act(np.full((1, 10), 100.0))[0] - 0.4
+
+
+def test_students_of_several_sizes_say_what_they_weigh_and_progress_runs_through(buffer, teacher):
+    told = []
+    config = DistilConfig(updates=200, batch=64)
+    students = distil_sizes(teacher, buffer, [(4,), (20, 10)], config, lambda f, message="", **n: told.append((f, message)))
+    assert [s.policy.hidden for s in students] == [(4,), (20, 10)]
+    assert [s.report()["weight_bytes"] for s in students] == [4 * (44 + 5), 4 * 441]
+    assert [f for f, _ in told] == pytest.approx([0.25, 0.5, 0.75, 1.0])
+    assert "20 x 10" in told[-1][1]
+    assert students[1].policy.to_onnx() == distil(teacher, buffer, config).policy.to_onnx()
+
+
+def test_a_distillations_configuration_goes_through_json_and_refuses_unknown_names():
+    config = DistilConfig(hidden=(8,), sigma=0.1)
+    assert DistilConfig.from_json(config.to_json()) == config
+    with pytest.raises(ValueError, match="no hyper-parameter gamma"):
+        DistilConfig.from_json({"gamma": 0.9})

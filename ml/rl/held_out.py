@@ -1,0 +1,111 @@
+"""Sessions that a training does not see: what they say of the policy on its way, and which of its states is kept.
+
+Nothing here knows a true return. A score is an estimate from held-out sessions that the caller brings (fitted Q evaluation, for
+example: `ml.ope` uses this package, so this package cannot use it). Choosing by a score uses the sessions up: an estimate from the same
+sessions flatters the chosen state and is no evidence for deployment.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.rl.policy import Policy
+from ml.trajectories import ReplayBuffer, to_parquet
+
+Score = Callable[[Policy], float]
+"""Estimate of a policy's worth from held-out sessions; larger is better."""
+
+_SPLIT_STREAM = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOut:
+    """What watches a training from outside its data.
+
+    Attributes:
+        sessions: the sessions left out.
+        score: estimate by which the best state is kept; None keeps the last.
+        score_name: names the estimate; part of what a checkpoint belongs to.
+        is_step_return: whether `score` estimates the discounted sum of step rewards without end, from the sessions' first states; only
+            then is Q's distance from it an over-estimation.
+        every: updates between two scorings.
+        patience: scorings without a better one after which the training stops; 0 never stops.
+
+    Raises:
+        ValueError: `every` below 1 or `patience` below 0.
+    """
+
+    sessions: ReplayBuffer
+    score: Score | None = None
+    score_name: str = ""
+    is_step_return: bool = False
+    every: int = 500
+    patience: int = 0
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or self.patience < 0:
+            raise ValueError(f"every must be 1 or more and patience 0 or more, not {self.every} and {self.patience}")
+
+    def starts(self) -> tuple[NDArray[np.float64], float]:
+        """First usable states of the sessions, shape [n, W], and the mean discounted return logged from them.
+
+        The return is that of the remaining usable steps, followed by the session's mean reward for ever: a critic that bootstraps
+        through the end of a session estimates a sum without end. Raises ValueError when no session has a usable step.
+        """
+        gamma = self.sessions.settings.gamma
+        states, returns = [], []
+        for session in self.sessions.sessions:
+            usable = np.flatnonzero(session.usable())
+            if usable.size == 0:
+                continue
+            rewards = session.rewards(self.sessions.settings)
+            first, mean = int(usable[0]), float(rewards[usable].mean())
+            # A gap within the session counts as its mean reward.
+            filled = np.where(session.usable(), rewards, mean)[first:]
+            tail = gamma**filled.size * mean / (1 - gamma)
+            states.append(session.states()[first])
+            returns.append(float(filled @ gamma ** np.arange(filled.size)) + tail)
+        if not states:
+            raise ValueError("no held-out session has a usable step")
+        return np.stack(states), float(np.mean(returns))
+
+    def name(self) -> str:
+        """Names the sessions and the rule, for checkpoints."""
+        digest = hashlib.sha256(to_parquet(self.sessions)).hexdigest()
+        return f"{digest} {self.score_name} {self.score is not None} {self.every} {self.patience}"
+
+
+def split_sessions(buffer: ReplayBuffer, share: float = 0.2, seed: int = 0) -> tuple[ReplayBuffer, ReplayBuffer]:
+    """Sessions to train on and sessions held out, drawn within each controller, so that both sides see every kind where it has two.
+
+    Args:
+        buffer: the sessions; a session is never divided.
+        share: of the sessions of each controller that are held out, rounded; at least one session in all.
+        seed: of the draw.
+
+    Raises:
+        ValueError: a share outside (0, 1), or fewer than two sessions.
+    """
+    if not 0 < share < 1:
+        raise ValueError(f"the held-out share must lie in (0, 1), not {share}")
+    if len(buffer.sessions) < 2:
+        raise ValueError("holding sessions out needs two sessions or more; the buffer has one")
+    rng = np.random.default_rng([seed, _SPLIT_STREAM])
+    groups: dict[str, list[int]] = {}
+    for i, session in enumerate(buffer.sessions):
+        groups.setdefault(session.controller, []).append(i)
+    out: set[int] = set()
+    for _, members in sorted(groups.items()):
+        count = min(math.floor(share * len(members) + 0.5), len(members) - 1)
+        out |= {members[i] for i in rng.permutation(len(members))[:count]}
+    if not out:
+        out = {int(rng.integers(len(buffer.sessions)))}
+    kept = tuple(s for i, s in enumerate(buffer.sessions) if i not in out)
+    left = tuple(s for i, s in enumerate(buffer.sessions) if i in out)
+    return replace(buffer, sessions=kept), replace(buffer, sessions=left)
