@@ -1,7 +1,8 @@
-"""Importance sampling in log space: per trajectory, self-normalised, and per decision. Source: Precup, Sutton and Singh 2000.
+"""Importance sampling in log space: per trajectory and per decision, plain and self-normalised. Source: Precup, Sutton and Singh 2000.
 
-The density of the random controller is known, 1 / (1 - B) on [B, 1]. A deterministic target is given a Gaussian kernel truncated to
-[0, 1]; its bandwidth stands in every estimate. Weights at T = 300 rest on a session or two whatever is done: these are baselines.
+The density of the random controller is known, 1 / (1 - B) on [B, 1]; that of the others is estimated. A deterministic target is given a
+Gaussian kernel truncated to [0, 1]; its bandwidth follows a stated rule and stands in every estimate. Weights at T = 300 rest on a session
+or two whatever is done: these are baselines.
 """
 
 from __future__ import annotations
@@ -15,16 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from ml.ope.behaviour import Key, clones, controller_key, rule_of_thumb_bandwidth
 from ml.ope.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size
 from ml.ope.estimate import LEVEL, Estimate, checked_horizon
 from ml.progress import Report, silent
 from ml.rl.policy import Policy
-from ml.statistics.bootstrap import percentile_interval, resamples
+from ml.statistics.bootstrap import bca_interval, percentile_interval, resamples
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Weighting = Literal["is", "wis", "pdis"]
+Weighting = Literal["is", "wis", "pdis", "cwpdis"]
+WEIGHTINGS = ("is", "wis", "pdis", "cwpdis")
 
 LARGEST_LOG = 690.0
 """exp of this is a finite float; ordinary importance sampling may ask for more."""
@@ -72,6 +75,23 @@ def per_decision_terms(log_ratio: Floats, mask: Mask, rewards: Floats, gamma: fl
     return np.asarray(np.where(mask, terms, means).sum(1), dtype=np.float64)
 
 
+def consistent_weighted_per_decision(log_ratio: Floats, mask: Mask, rewards: Floats, gamma: float) -> float:
+    """Self-normalised per-decision estimate (Thomas 2015): at each step the weighted mean reward of the sessions that have the step.
+
+    A step that no session has takes the mean reward of the others; one at which every weight is zero takes its plain mean.
+    """
+    cumulative = np.where(mask, np.cumsum(np.where(mask, log_ratio, 0.0), axis=1), -np.inf)
+    top = cumulative.max(0)
+    weights = np.where(np.isfinite(top), np.exp(cumulative - np.where(np.isfinite(top), top, 0.0)), mask)
+    total = weights.sum(0)
+    reward = (weights * np.where(mask, rewards, 0.0)).sum(0) / np.maximum(total, 1e-300)
+    counted = total > 0
+    if not counted.any():
+        return 0.0
+    discount = gamma ** np.arange(rewards.shape[1])
+    return float(np.where(counted, reward, reward[counted].mean()) @ discount)
+
+
 def kernel_log_density(amplitude: Floats, centre: Floats, bandwidth: float) -> Floats:
     """Log density at `amplitude` of a Gaussian around `centre` truncated to [0, 1], elementwise (broadcasting)."""
     inside = norm.cdf((1 - centre) / bandwidth) - norm.cdf(-centre / bandwidth)
@@ -79,11 +99,14 @@ def kernel_log_density(amplitude: Floats, centre: Floats, bandwidth: float) -> F
     return np.asarray(np.where((amplitude >= 0) & (amplitude <= 1), density, -np.inf), dtype=np.float64)
 
 
-def behaviour_log_density(session: SessionTrajectory, bandwidth: float) -> Floats:
+def behaviour_log_density(session: SessionTrajectory, bandwidth: float, cloned: tuple[Policy, float] | None = None) -> Floats:
     """Log density of the logged amplitudes of a session, [T]; NaN where unusable.
 
-    Random sessions: uniform on [B, 1]. Others ran a near-deterministic controller: the kernel that smooths the target is put around what
-    it did, so that a target that acts alike has the ratio 1 and no ratio grows with the session.
+    Random sessions: uniform on [B, 1]. Others: a kernel around `cloned`, what the controller does at the window and the spread around
+    it, at least as wide as the one that smooths the target, so that a target that acts alike has the ratio 1 and none grows without end.
+
+    Raises:
+        ValueError: neither a known density nor a clone.
     """
     usable = session.usable()
     a = np.clip(session.amplitude, 0.0, 1.0)
@@ -93,31 +116,42 @@ def behaviour_log_density(session: SessionTrajectory, bandwidth: float) -> Float
     if session.random_lower_bound is not None:
         result[usable] = -np.log(1 - session.random_lower_bound)
         return result
-    result[usable] = kernel_log_density(a[usable], a[usable], bandwidth)
+    if cloned is None:
+        raise ValueError(f"session {session.session_id} has no known density, and none was estimated")
+    policy, spread = cloned
+    result[usable] = kernel_log_density(a[usable], policy.act(session.states()[:-1][usable]), max(bandwidth, spread))
     return result
+
+
+def behaviour_densities(buffer: ReplayBuffer, bandwidth: float | None, seed: int) -> tuple[list[Floats], float]:
+    """`behaviour_log_density` of every session, clones estimated where needed, and the bandwidth, by its rule where None is given."""
+    width = rule_of_thumb_bandwidth(buffer) if bandwidth is None else bandwidth
+    cloned: dict[Key, tuple[Policy, float]] = clones(buffer, seed)
+    return [behaviour_log_density(s, width, cloned.get(controller_key(s))) for s in buffer.sessions], width
 
 
 @dataclass(frozen=True)
 class ImportanceSampling:
-    """The estimator; `method` is `is`, `wis` or `pdis`.
+    """The estimator; `method` is one of `WEIGHTINGS`.
 
     Attributes:
-        method: `is` per trajectory, `wis` per trajectory and self-normalised, `pdis` per decision.
-        bandwidth: of the kernel around pi(s), as a fraction of the cDBS amplitude.
+        method: `is` per trajectory, `wis` per trajectory and self-normalised, `pdis` per decision, `cwpdis` per decision and
+            self-normalised.
+        bandwidth: of the kernel around pi(s), as a fraction of the cDBS amplitude; None takes `rule_of_thumb_bandwidth`.
         only_random: use only sessions whose density is known.
         draws: bootstrap resamples of sessions. seed: of the resamples.
     """
 
     method: Weighting = "pdis"
-    bandwidth: float = 0.1
+    bandwidth: float | None = None
     only_random: bool = False
     draws: int = 1000
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.method not in ("is", "wis", "pdis"):
-            raise ValueError(f"importance sampling is one of is, wis and pdis, not {self.method}")
-        if not self.bandwidth > 0:
+        if self.method not in WEIGHTINGS:
+            raise ValueError(f"importance sampling is one of {', '.join(WEIGHTINGS)}, not {self.method}")
+        if self.bandwidth is not None and not self.bandwidth > 0:
             raise ValueError(f"the kernel's bandwidth must be above 0, not {self.bandwidth}")
 
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedImportance:
@@ -129,9 +163,10 @@ class ImportanceSampling:
         kept = [s for s in buffer.sessions if s.usable().any() and not (self.only_random and s.random_lower_bound is None)]
         if not kept:
             raise ValueError("importance sampling has no session to weigh: none has a usable step with a behaviour density")
-        densities = [behaviour_log_density(s, self.bandwidth) for s in kept]
+        every, bandwidth = behaviour_densities(buffer, self.bandwidth, self.seed)
+        densities = [d for d, s in zip(every, buffer.sessions, strict=True) if any(s is k for k in kept)]
         report(1.0, "densities of the logged amplitudes")
-        return FittedImportance(self, buffer, tuple(kept), tuple(densities))
+        return FittedImportance(self, buffer, tuple(kept), tuple(densities), bandwidth)
 
 
 @dataclass(frozen=True)
@@ -142,6 +177,7 @@ class FittedImportance:
     buffer: ReplayBuffer
     sessions: tuple[SessionTrajectory, ...]
     densities: tuple[Floats, ...]
+    bandwidth: float
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
         """Estimate of every policy; all share the resamples of sessions."""
@@ -162,7 +198,7 @@ class FittedImportance:
             k = k[k < horizon]
             if k.size:
                 target = policy.act(s.states()[k])
-                log_ratio[i, k] = kernel_log_density(np.clip(s.amplitude[k], 0, 1), target, self.settings.bandwidth) - density[k]
+                log_ratio[i, k] = kernel_log_density(np.clip(s.amplitude[k], 0, 1), target, self.bandwidth) - density[k]
                 rewards[i, k] = s.rewards(self.buffer.settings)[k]
                 mask[i, k] = True
         return log_ratio, mask, rewards
@@ -178,13 +214,21 @@ class FittedImportance:
 
         def value(index: NDArray[np.int64]) -> tuple[float, float]:
             with_end = index[known[index]]
-            average = weighted if config.method == "wis" else ordinary
-            step = float(decisions[index].mean()) if config.method == "pdis" else average(log_weights[index], step_returns[index])
+            average = weighted if config.method in ("wis", "cwpdis") else ordinary
+            if config.method == "cwpdis":
+                step = consistent_weighted_per_decision(log_ratio[index], mask[index], rewards[index], gamma)
+            elif config.method == "pdis":
+                step = float(decisions[index].mean())
+            else:
+                step = average(log_weights[index], step_returns[index])
             return step, average(log_weights[with_end], end[with_end]) if with_end.size else 0.0
 
         step, end_value = value(np.arange(len(end)))
         draws = np.array([sum(value(index)) for index in resamples(len(end), config.draws, config.seed)])
         interval = percentile_interval(draws, LEVEL)
+        everyone = np.arange(len(end))
+        jackknife = np.array([sum(value(np.delete(everyone, i))) for i in everyone]) if len(end) > 2 else np.empty(0)
+        bca = bca_interval(draws, step + end_value, jackknife, LEVEL) if jackknife.size else None
         effective, largest = effective_sample_size(log_weights)
         logged = support.of_policy(policy)
         flags = list(logged.flags)
@@ -207,10 +251,12 @@ class FittedImportance:
             n=len(end),
             details={
                 "horizon_steps": horizon,
-                "bandwidth": config.bandwidth,
+                "bandwidth": self.bandwidth,
+                "bandwidth_rule": "Silverman, sessions as sample size" if config.bandwidth is None else "given",
+                "bca": None if bca is None else [bca.low, bca.high],
                 "effective_sample_size": effective,
                 "largest_weight_share": largest,
-                "horizon_of_ten": _horizon_of_ten(log_ratio, mask),
+                "horizon_of_ten": horizon_of_ten(log_ratio, mask),
                 "sessions_of_known_density": sum(s.random_lower_bound is not None for s in self.sessions),
                 "sessions_left_out": len(self.buffer.sessions) - len(self.sessions),
                 "coverage": logged.to_json(),
@@ -226,7 +272,7 @@ def _signed_exp(log_weights: Floats, values: Floats) -> Floats:
     return np.asarray(np.sign(values) * np.exp(np.minimum(logs, LARGEST_LOG)), dtype=np.float64)
 
 
-def _horizon_of_ten(log_ratio: Floats, mask: Mask) -> int:
+def horizon_of_ten(log_ratio: Floats, mask: Mask) -> int:
     """Steps until the effective sample size of the running weights first falls below ten."""
     cumulative = np.cumsum(np.where(mask, log_ratio, 0.0), axis=1)
     for t in range(cumulative.shape[1]):

@@ -1,12 +1,13 @@
 """Off-policy evaluation by a linear autoregressive model of beta with bootstrapped residuals and the known reward.
 
-The paper did not compare with it. Twenty lines of regression, no network, and hard to beat: every other method must earn its place
-against it.
+The paper did not compare with it. A regression, no network, and hard to beat: every other method must earn its place against it. The
+dynamics, and how they are kept from walking off, are in `linear_dynamics`; residuals are replayed in blocks of one session per trajectory,
+so that what a session has of its own stays with it; the reward is that of sampled beta, never of its mean.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,17 +19,35 @@ from ml.ope.batches import Scale, learn_scale, session_folds
 from ml.ope.coverage import AmplitudeSupport
 from ml.ope.end_outcomes import EndModel, fit_end_model, summarise
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.linear_dynamics import (
+    CANDIDATES,
+    Regression,
+    block_error,
+    choose,
+    day_columns,
+    features,
+    fit_weights,
+    largest_root,
+    noise_features,
+    noise_model,
+    regression,
+    replay_errors,
+    replay_folds,
+)
+from ml.ope.observed import day_noise
+from ml.ope.steps import fresh_memory, remember
 from ml.progress import Report, silent
 from ml.rl.policy import Policy
 from ml.statistics.bootstrap import percentile_interval, resamples
-from ml.trajectories import ReplayBuffer, SessionTrajectory
+from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
 
-DECAYS = (0.8, 0.95, 0.985)
-"""Memories of past amplitudes: exponential averages with time constants of about 5, 20 and 66 steps."""
+BLOCK = 30
+"""Steps of one session's residuals that are replayed in their order before another start in the same session is drawn."""
 
-PENALTIES = tuple(float(v) for v in 10.0 ** np.arange(-1, 5))
+BEYOND = 0.25
+"""Sampled beta may leave the logged range by this share of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +57,7 @@ class LinearConfig:
     Attributes:
         refits: bootstrap refits, each on resampled sessions. per_refit: trajectories per policy and refit.
         rollouts: trajectories per policy of the estimate itself.
-        folds: groups of sessions that choose the penalty. seed: of resamples and noise.
+        folds: groups of sessions that choose penalty and shrinkage. seed: of resamples and noise.
     """
 
     refits: int = 50
@@ -61,24 +80,23 @@ class LinearModel:
         Raises:
             ValueError: fewer than two sessions with usable steps.
         """
-        c = self.config
-        scale = learn_scale(buffer)
-        tables = [_regression_table(s, scale) for s in buffer.sessions]
-        usable = [k for k, (x, _) in enumerate(tables) if len(x)]
-        if len(usable) < 2:
-            raise ValueError(f"the linear model needs at least two sessions with usable steps; the buffer has {len(usable)}")
-        grams = np.stack([x.T @ x for x, _ in tables])
-        moments = np.stack([x.T @ y for x, y in tables])
-        penalty, error = _choose_penalty(tables, grams, moments, session_folds(buffer.sessions, c.folds, c.seed))
-        report(0.5, "fitting the linear model", held_out_error=error)
+        c, scale = self.config, learn_scale(buffer)
+        data = regression(buffer, scale)
+        if len(data.usable) < 2:
+            raise ValueError(f"the linear model needs at least two sessions with usable steps; the buffer has {len(data.usable)}")
+        ways = replay_folds(buffer, session_folds(buffer.sessions, c.folds, c.seed))
+        errors = []
+        for k, folds in enumerate(ways):
+            errors.append(replay_errors(buffer, scale, data, folds))
+            report(0.8 * (k + 1) / len(ways), "replaying left-out sessions")
+        best = choose(errors, ways)
         draws = resamples(len(buffer.sessions), c.refits, c.seed)
-        dynamics = _dynamics(tables, grams, moments, [np.arange(len(tables))], penalty, usable)
-        refits = _dynamics(tables, grams, moments, list(draws), penalty, usable)
-        variance = float(np.concatenate([y for _, y in tables]).var())
-        report(1.0, "fitting the linear model", held_out_error=error)
-        skill = 1 - error / variance if variance > 0 else 0.0
+        dynamics = _dynamics(data, [np.arange(len(buffer.sessions))], [best])
+        refits = _dynamics(data, list(draws), [choose(errors, ways, pick) for pick in draws])
+        report(1.0, "fitting the linear model")
+        skill = replay_skill(buffer, scale, errors, best)
         return FittedLinear(
-            self.method, c, buffer, scale, dynamics, refits, fit_end_model(buffer), fit_end_model(buffer, draws), penalty, skill
+            self.method, c, buffer, scale, dynamics, refits, fit_end_model(buffer), fit_end_model(buffer, draws), best, skill
         )
 
 
@@ -88,13 +106,15 @@ class Dynamics:
 
     Attributes:
         weights: [D, F]. noise_weights: of the log of the residual's scale, on (1, a, predicted beta), [D, 3].
-        residuals: standardised residuals of each session, padded by repetition, [n, L].
+        residuals: standardised residuals of each session in order of time, padded by repetition, [n, L].
+        visits: numbers of the visits, whose own levels are the last V weights.
         sources: sessions whose residuals a fit may draw, [D, n].
     """
 
     weights: Floats
     noise_weights: Floats
     residuals: Floats
+    visits: tuple[int, ...]
     sources: NDArray[np.int64]
 
 
@@ -120,8 +140,8 @@ class FittedLinear:
     refits: Dynamics
     end: EndModel
     end_refits: EndModel
-    penalty: float
-    skill: float
+    chosen: int
+    skill: float | None
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
         """Simulate every policy with the fit (the value) and with every refit (the interval), from the sessions' own s_0."""
@@ -143,21 +163,28 @@ class FittedLinear:
         fit = np.arange(rows) % len(dynamics.weights)
         starts = [s for s in sessions if np.isfinite(s.lead_beta).all()] or list(sessions)
         leads = np.stack([scale.beta(np.where(np.isfinite(s.lead_beta), s.lead_beta, self._middle())) for s in starts])
-        window = np.tile(leads[rng.integers(0, len(leads), rows)], (p, 1))
+        like = rng.integers(0, len(leads), rows)
+        window = np.tile(leads[like], (p, 1))
         source = dynamics.sources[fit, rng.integers(0, dynamics.sources.shape[1], rows)]
-        weights, noise_weights = np.tile(dynamics.weights[fit], (p, 1)), np.tile(dynamics.noise_weights[fit], (p, 1))
+        common = dynamics.weights.shape[1] - len(dynamics.visits)
+        days = day_columns(dynamics.visits, [starts[k].visit for k in like])
+        day = np.tile(np.einsum("ij,ij->i", dynamics.weights[fit, common:], days), p)
+        weights, noise_weights = np.tile(dynamics.weights[fit, :common], (p, 1)), np.tile(dynamics.noise_weights[fit], (p, 1))
+        offset = np.zeros(rows, dtype=np.int64)
         low, high = scale.beta(np.array([scale.beta_low, scale.beta_high]))
         memory: Floats | None = None
         betas, actions = np.empty((horizon, p * rows)), np.empty((horizon, p * rows))
         for t in range(horizon):
             raw = scale.raw_beta(window)
             a = np.concatenate([policy.act(raw[i * rows : (i + 1) * rows]) for i, policy in enumerate(policies)])
-            memory = np.tile(a[:, None], (1, len(DECAYS))) if memory is None else _remember(memory, a)
-            x = _features(window, a, memory)
-            predicted = np.einsum("ij,ij->i", x, weights)
-            shock = np.tile(dynamics.residuals[source, rng.integers(0, dynamics.residuals.shape[1], rows)], p)
-            newest = predicted + np.exp(np.einsum("ij,ij->i", _noise_features(a, predicted), noise_weights)) * shock
-            newest = np.clip(newest, low - (high - low), high + (high - low))
+            memory = fresh_memory(a) if memory is None else remember(memory, a)
+            x = features(window, a, memory)
+            predicted = np.einsum("ij,ij->i", x, weights) + day
+            if t % BLOCK == 0:
+                offset = rng.integers(0, dynamics.residuals.shape[1], rows)
+            shock = np.tile(dynamics.residuals[source, (offset + t) % dynamics.residuals.shape[1]], p)
+            newest = predicted + np.exp(np.einsum("ij,ij->i", noise_features(a, predicted), noise_weights)) * shock
+            newest = np.clip(newest, low - BEYOND * (high - low), high + BEYOND * (high - low))
             window = np.concatenate([window[:, 1:], newest[:, None]], axis=1)
             betas[t], actions[t] = scale.raw_beta(newest), a
         return self._simulated(betas, actions, end, fit, settings, p, rows)
@@ -189,11 +216,14 @@ class FittedLinear:
         # Rows go fit by fit, so a column of this table is one refit.
         draws = returns.reshape(self.config.per_refit, self.config.refits).mean(0)
         value = step + float(end)
-        interval = percentile_interval(draws - draws.mean() + value, LEVEL)
+        noise, unknown = day_noise(self.buffer, horizon, len(draws), self.config.seed)
+        # Every pair of a refit and a day: what is common to all policies widens the interval, but is no part of the kept draws.
+        interval = percentile_interval(np.add.outer(draws - draws.mean(), noise).ravel() + value, LEVEL)
         logged, simulated = support.of_policy(policy), support.look(main.actions[i][:, :: max(1, horizon // 50)])
         flags = list(logged.flags or simulated.flags)
         if not with_end:
             flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+        flags += [unknown] if unknown else []
         predicted = {
             "energy": float(main.energy[i].mean()),
             "mean_amplitude": float(main.amplitude[i].mean()),
@@ -217,11 +247,14 @@ class FittedLinear:
             n=main.step_return.shape[1],
             details={
                 "horizon_steps": horizon,
-                "penalty": self.penalty,
+                "penalty": CANDIDATES[self.chosen][0],
+                "root_shrinkage": CANDIDATES[self.chosen][1],
+                "level_of_each_visit": CANDIDATES[self.chosen][2] < float("inf"),
+                "largest_root": largest_root(self.dynamics.weights[0], self.buffer.settings.window),
                 "coverage": logged.to_json(),
                 "coverage_simulated": simulated.to_json(),
                 "held_out": {
-                    "one_step_skill": self.skill,
+                    "replay_skill": self.skill,
                     "end_skill": float(self.end.skill[0]) if with_end else None,
                     "sessions": len(self.buffer.sessions),
                 },
@@ -230,93 +263,24 @@ class FittedLinear:
         )
 
 
-def _features(window: Floats, a: Floats, memory: Floats) -> Floats:
-    """Regressors of the next beta, [N, 1 + W + 8]: the window, the amplitude, its memories, and a few non-linear terms."""
-    newest = window[:, -1]
-    parts = [np.ones((len(a), 1)), window, a[:, None], (a**2)[:, None], (a * newest)[:, None], memory, (memory[:, :1] ** 2)]
-    return np.concatenate([*parts, (memory[:, 1:2] * newest[:, None])], axis=1)
+def replay_skill(buffer: ReplayBuffer, scale: Scale, errors: Sequence[Floats], best: int) -> float | None:
+    """1 - error / error of the overall mean beta, over the replayed left-out sessions (all ways of leaving out); None where none was."""
+    own, plain = [], []
+    constant = np.zeros((len(CANDIDATES), 1))
+    for table in errors:
+        for k in np.flatnonzero(np.isfinite(table[best])):
+            beta = scale.beta(buffer.sessions[k].beta)
+            own.append(table[best, k])
+            plain.append(block_error(beta, np.tile(constant[:1], (1, beta.size)))[0])
+    return 1 - float(np.sum(own) / np.sum(plain)) if own and np.sum(plain) > 0 else None
 
 
-def _remember(memory: Floats, a: Floats) -> Floats:
-    decay = np.array(DECAYS)
-    return memory * decay + (1 - decay) * a[:, None]
-
-
-def _noise_features(a: Floats, predicted: Floats) -> Floats:
-    return np.stack([np.ones_like(a), a, np.clip(predicted, -3.0, 3.0)], axis=1)
-
-
-def _regression_table(session: SessionTrajectory, scale: Scale) -> tuple[Floats, Floats]:
-    """Features and standardised next beta of the usable steps of a session, [K, F] and [K]."""
-    usable = session.usable()
-    a = session.amplitude.copy()
-    known = np.isfinite(a)
-    if not known.any():
-        a[:] = 0.0
-    held = np.where(known, np.arange(a.size), -1)
-    a = a[np.where(np.maximum.accumulate(held) < 0, int(np.argmax(known)), np.maximum.accumulate(held))]
-    memory = np.empty((a.size, len(DECAYS)))
-    memory[0] = a[0]
-    for k in range(1, a.size):
-        memory[k] = _remember(memory[k - 1 : k], a[k : k + 1])[0]
-    windows = scale.beta(session.states()[:-1][usable])
-    return _features(windows, a[usable], memory[usable]), scale.beta(session.beta[usable])
-
-
-def _solve(grams: Floats, moments: Floats, penalty: float) -> Floats:
-    ridge = np.full(grams.shape[1], penalty)
-    ridge[0] = 1e-6
-    return np.asarray(np.linalg.solve(grams + np.diag(ridge), moments), dtype=np.float64)
-
-
-def _choose_penalty(tables: list[tuple[Floats, Floats]], grams: Floats, moments: Floats, folds: list[list[int]]) -> tuple[float, float]:
-    """Penalty with the least squared error on sessions left out, and that error."""
-    errors = []
-    for penalty in PENALTIES:
-        squared, count = 0.0, 0
-        for fold in folds:
-            rest = [k for k in range(len(tables)) if k not in set(fold)]
-            weights = _solve(grams[rest].sum(0), moments[rest].sum(0), penalty)
-            for k in fold:
-                squared += float(np.sum((tables[k][1] - tables[k][0] @ weights) ** 2))
-                count += len(tables[k][1])
-        errors.append(squared / max(count, 1))
-    best = int(np.argmin(errors))
-    return PENALTIES[best], errors[best]
-
-
-def _dynamics(
-    tables: list[tuple[Floats, Floats]],
-    grams: Floats,
-    moments: Floats,
-    picks: list[NDArray[np.int64]],
-    penalty: float,
-    usable: list[int],
-) -> Dynamics:
-    """One fit per list of sessions; residuals are those of the fit to all sessions."""
-    base = _solve(grams.sum(0), moments.sum(0), penalty)
-    noise, residuals = _noise_model(tables, base, usable)
-    weights = np.stack([_solve(grams[pick].sum(0), moments[pick].sum(0), penalty) for pick in picks])
-    rank = {k: r for r, k in enumerate(usable)}
+def _dynamics(data: Regression, picks: list[NDArray[np.int64]], candidates: list[int]) -> Dynamics:
+    """One fit per list of sessions with a candidate each; residuals are those of the first candidate's fit to all sessions."""
+    base = fit_weights(data, np.arange(len(data.x)), *CANDIDATES[candidates[0]])
+    noise, residuals = noise_model(data, base)
+    weights = np.stack([fit_weights(data, pick, *CANDIDATES[c]) for pick, c in zip(picks, candidates, strict=True)])
+    rank = {k: r for r, k in enumerate(data.usable)}
     sources = [[rank[k] for k in pick if k in rank] or [0] for pick in picks]
     width = max(len(s) for s in sources)
-    return Dynamics(weights, np.tile(noise, (len(picks), 1)), residuals, np.stack([np.resize(s, width) for s in sources]))
-
-
-def _noise_model(tables: list[tuple[Floats, Floats]], weights: Floats, usable: list[int]) -> tuple[Floats, Floats]:
-    """Weights of the residuals' log scale, [3], and standardised residuals per usable session, [n, L]."""
-    all_noise, all_logs, per_session = [], [], []
-    for k in usable:
-        x, y = tables[k]
-        predicted = x @ weights
-        residual = y - predicted
-        # The second column of the window block's end is the amplitude: features are 1, W betas, a, ...
-        a = x[:, x.shape[1] - 8]
-        all_noise.append(_noise_features(a, predicted))
-        all_logs.append(np.log(np.maximum(np.abs(residual), 1e-6)))
-        per_session.append(residual)
-    design, logs = np.concatenate(all_noise), np.concatenate(all_logs)
-    noise = _solve((design.T @ design)[None], (design.T @ logs)[None, :, None], 10.0)[0, :, 0]
-    scaled = [r * np.exp(-(d @ noise)) for r, d in zip(per_session, all_noise, strict=True)]
-    longest = max(len(r) for r in scaled)
-    return noise, np.stack([np.resize(r, longest) for r in scaled])
+    return Dynamics(weights, np.tile(noise, (len(picks), 1)), residuals, data.visits, np.stack([np.resize(s, width) for s in sources]))

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from ml.ope.estimate import Estimate
 
-PREFERENCE = ("dlsm", "linear", "wis", "pdis", "is")
+PREFERENCE = ("dlsm", "linear", "fqe", "wdr", "cwpdis", "wis", "dual_dice", "pdis", "is")
 """Order in which a method is taken for the ranking where the data do not decide."""
 
-MODELS = ("dlsm", "linear")
-"""Methods that predict whole sessions; importance weights at these horizons never outrank them."""
+MODELS = ("dlsm", "linear", "fqe")
+"""Methods that predict whole sessions without importance weights, which at these horizons never outrank them."""
 
 
 @dataclass(frozen=True)

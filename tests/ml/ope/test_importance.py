@@ -8,16 +8,19 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import truncnorm
 
+from ml.ope.behaviour import clone, clones, rule_of_thumb_bandwidth
 from ml.ope.importance import (
     ImportanceSampling,
     behaviour_log_density,
+    consistent_weighted_per_decision,
+    horizon_of_ten,
     kernel_log_density,
     ordinary,
     per_decision_terms,
     per_trajectory,
     weighted,
 )
-from ml.rl.policy import ConstantPolicy
+from ml.rl.policy import ConstantPolicy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 
 
@@ -129,7 +132,7 @@ def test_the_density_of_a_random_session_is_known_and_a_like_acting_controller_h
     np.testing.assert_allclose(log_ratio[mask], 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("method", ["is", "wis", "pdis"])
+@pytest.mark.parametrize("method", ["is", "wis", "pdis", "cwpdis"])
 def test_evaluating_the_controller_that_made_the_data_gives_its_mean_return(small_buffer, method):
     constant = tuple(replace(s, beta=s.beta[:30], amplitude=s.amplitude[:30]) for s in small_buffer.sessions if s.controller == "cdbs")
     buffer = ReplayBuffer(small_buffer.settings, constant, "uV", "table")
@@ -153,3 +156,96 @@ def test_sessions_of_unknown_density_can_be_left_out_and_none_left_is_an_error(s
     cdbs = tuple(s for s in small_buffer.sessions if s.controller == "cdbs")
     with pytest.raises(ValueError, match="no session to weigh"):
         ImportanceSampling("wis", only_random=True).fit(ReplayBuffer(small_buffer.settings, cdbs, "uV", "table"))
+
+
+def slow_cwpdis(log_ratio, mask, rewards, gamma):
+    """The weighted mean reward of each step, in linear space, by loops."""
+    total = 0.0
+    for t in range(rewards.shape[1]):
+        above = below = 0.0
+        for i in range(len(rewards)):
+            if mask[i, t]:
+                w = math.exp(sum(log_ratio[i, j] for j in range(t + 1) if mask[i, j]))
+                above, below = above + w * rewards[i, t], below + w
+        total += gamma**t * above / below
+    return total
+
+
+def test_the_consistent_weighted_estimate_is_that_of_loops_also_with_gaps():
+    rng = np.random.default_rng(5)
+    log_ratio, rewards, mask = 0.4 * rng.normal(size=(7, 30)), rng.normal(size=(7, 30)), rng.random((7, 30)) > 0.3
+    mask[0] = True
+    fast = consistent_weighted_per_decision(log_ratio, mask, rewards, 0.95)
+    assert fast == pytest.approx(slow_cwpdis(log_ratio, mask, rewards, 0.95))
+
+
+def test_the_consistent_weighted_estimate_reaches_the_exact_value_of_a_tabular_mdp():
+    log_ratio, rewards, _, gamma, exact, _ = tabular(200_000, 3)
+    mask = np.ones_like(rewards, dtype=bool)
+    assert consistent_weighted_per_decision(log_ratio, mask, rewards, gamma) == pytest.approx(exact, rel=0.02)
+
+
+def test_a_padded_batch_gives_what_its_unpadded_members_give():
+    rng = np.random.default_rng(6)
+    log_ratio, rewards, mask = rng.normal(size=(5, 12)), rng.normal(size=(5, 12)), np.ones((5, 12), dtype=bool)
+
+    def padded(x, fill):
+        return np.concatenate([x, np.full((5, 8), fill)], axis=1)
+
+    one = per_trajectory(log_ratio, mask, rewards, np.zeros(5), 1 - 1e-15)[0]
+    two = per_trajectory(padded(log_ratio, 3.0), padded(mask, False), padded(rewards, 9.0), np.zeros(5), 1 - 1e-15)[0]
+    np.testing.assert_allclose(one, two)
+    cumulative = np.cumsum(log_ratio, axis=1)
+    assert horizon_of_ten(log_ratio, mask) == 0
+    short = consistent_weighted_per_decision(log_ratio, mask, rewards, 0.9)
+    long = consistent_weighted_per_decision(padded(log_ratio, 3.0), padded(mask, False), padded(rewards, 9.0), 0.9)
+    weights = np.exp(cumulative - cumulative.max(0))
+    mean = ((weights * rewards).sum(0) / weights.sum(0)).mean()
+    assert long - short == pytest.approx(mean * 0.9**12 * (1 - 0.9**8) / 0.1)
+
+
+def test_weights_of_a_hundred_and_fifty_narrow_kernels_give_a_weighted_mean_of_returns_where_linear_space_gives_zero():
+    # SCOPE-RL 0.2.1: cumulative products in linear space, self-normalised by mean + 1e-10, returned -6e-138 here.
+    rng = np.random.default_rng(8)
+    a, rewards = rng.uniform(0.3, 1.0, (20, 150)), -rng.random((20, 150))
+    log_ratio = kernel_log_density(a, np.full_like(a, 0.5), 0.1) - np.log(1 / 0.7)
+    ratios = np.exp(log_ratio).prod(axis=1)
+    linear_space = float((ratios / (ratios.mean() + 1e-10) * rewards.sum(1)).mean())
+    mask = np.ones_like(a, dtype=bool)
+    log_weights, returns = per_trajectory(log_ratio, mask, rewards, np.zeros(20), 1 - 1e-15)
+    assert abs(linear_space) < 1e-6
+    assert returns.min() <= weighted(log_weights, returns) <= returns.max() < -50
+
+
+def test_a_cloned_controller_acts_like_the_one_that_was_logged_and_its_density_is_estimated(small_buffer):
+    rng = np.random.default_rng(0)
+    states = rng.normal(1.0, 0.3, (2000, 10))
+    policy = ProportionalPolicy(0.6, 1.4, 0.3, 3)
+    copy, spread = clone(states, policy.act(states))
+    fresh = rng.normal(1.0, 0.3, (500, 10))
+    assert np.abs(copy.act(fresh) - policy.act(fresh)).mean() < 0.03
+    assert spread < 0.05
+    found = clones(small_buffer)
+    assert found[("cdbs", None)][1] == 0.0
+    assert found[("random", None)][0].act(states).min() >= 0.3
+    session = next(s for s in small_buffer.sessions if s.controller == "rl")
+    assert np.isfinite(behaviour_log_density(session, 0.1, found[("rl", None)])).all()
+    with pytest.raises(ValueError, match="no known density"):
+        behaviour_log_density(session, 0.1)
+
+
+def test_the_bandwidth_follows_its_stated_rule_unless_given(small_buffer):
+    expected = 1.06 * small_buffer.transitions().actions.std() * 9 ** (-0.2)
+    assert rule_of_thumb_bandwidth(small_buffer) == pytest.approx(expected)
+    assert ImportanceSampling("wis").fit(small_buffer).bandwidth == pytest.approx(expected)
+    assert ImportanceSampling("wis", bandwidth=0.2).fit(small_buffer).bandwidth == 0.2
+
+
+def test_an_estimate_has_a_bca_interval_beside_the_percentiles_from_three_sessions_on(small_buffer):
+    estimate = ImportanceSampling("cwpdis").fit(small_buffer).evaluate({"half": ConstantPolicy(0.5)}, 40)["half"]
+    low, high = estimate.details["bca"]
+    assert low < high
+    assert low <= max(estimate.details["draws"])
+    assert high >= min(estimate.details["draws"])
+    two = replace(small_buffer, sessions=small_buffer.sessions[:2])
+    assert ImportanceSampling("wis").fit(two).evaluate({"half": ConstantPolicy(0.5)}, 40)["half"].details["bca"] is None

@@ -1,0 +1,145 @@
+"""What the logged controllers were observed to return: the reference of every estimate, and what held-out predictions are held against."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.mdp import MdpSettings
+from ml.ope.behaviour import Key, controllers
+from ml.ope.estimate import LEVEL
+from ml.ope.importance import per_trajectory
+from ml.statistics.bootstrap import Interval, session_bootstrap
+from ml.trajectories import ReplayBuffer, SessionTrajectory
+
+Floats = NDArray[np.float64]
+
+FEWEST_FOR_INTERVAL = 3
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Mean return of one controller's sessions.
+
+    Attributes:
+        controller: kind and policy. n: sessions.
+        value: mean return over the horizon; steps that a session lacks are taken like those that it has.
+        step_return: mean of the steps' part. end_reward: mean r_end of the sessions that have one; None where none has.
+        standard_error: of `value`, over sessions; None for a single one.
+        interval: BCa bootstrap over sessions; None below `FEWEST_FOR_INTERVAL`.
+    """
+
+    controller: Key
+    n: int
+    value: float
+    step_return: float
+    end_reward: float | None
+    standard_error: float | None
+    interval: Interval | None
+
+
+def session_returns(sessions: list[SessionTrajectory], settings: MdpSettings, horizon: int) -> tuple[Floats, Floats]:
+    """Discounted step returns over the horizon, and r_end (NaN where not measured), [n] each; sessions need a usable step within it."""
+    mask, rewards = np.zeros((len(sessions), horizon), dtype=bool), np.zeros((len(sessions), horizon))
+    for i, s in enumerate(sessions):
+        k = np.flatnonzero(s.usable())
+        k = k[k < horizon]
+        mask[i, k] = True
+        rewards[i, k] = s.rewards(settings)[k]
+    _, steps = per_trajectory(np.zeros_like(rewards), mask, rewards, np.zeros(len(sessions)), settings.gamma)
+    ends = [s.end_reward(settings) for s in sessions]
+    return steps, np.array([np.nan if e is None else e for e in ends], dtype=np.float64)
+
+
+def observed(buffer: ReplayBuffer, horizon: int, seed: int = 0) -> dict[Key, Observed]:
+    """Every controller of a buffer that has a usable step within the horizon."""
+    result = {}
+    for key, indices in controllers(buffer).items():
+        sessions = [buffer.sessions[i] for i in indices if buffer.sessions[i].usable()[:horizon].any()]
+        if not sessions:
+            continue
+        steps, ends = session_returns(sessions, buffer.settings, horizon)
+        known = np.isfinite(ends)
+        end = float(ends[known].mean()) if known.any() else None
+        # A session without r_end takes the mean of the others, so that it still counts for the steps.
+        returns = steps + (np.where(known, ends, end) if end is not None else 0.0)
+        n = len(returns)
+
+        def mean(index: NDArray[Any], values: Floats = returns) -> float:
+            return float(values[index].mean())
+
+        interval = session_bootstrap(mean, n, level=LEVEL, seed=seed, method="bca") if n >= FEWEST_FOR_INTERVAL else None
+        error = float(returns.std(ddof=1) / math.sqrt(n)) if n > 1 else None
+        result[key] = Observed(key, n, float(returns.mean()), float(steps.mean()), end, error, interval)
+    return result
+
+
+def day_noise(buffer: ReplayBuffer, horizon: int, draws: int, seed: int) -> tuple[Floats, str | None]:
+    """What the few visits of a record leave open about the level of returns, as draws [draws] that all policies share.
+
+    Resampling sessions alone takes the sessions of one day for independent; a bad day lowers them all. Returns less their controller's mean
+    are split into days and sessions by one-way analysis of variance; the draws are those of the mean over days, from Student's t with the
+    number of visits less one. They widen intervals and cancel between policies.
+
+    Returns:
+        The draws, all 0 where days do not differ beyond chance, and a flag where the days cannot be told apart at all.
+    """
+    groups = [i for i in controllers(buffer).values() if len({buffer.sessions[k].visit for k in i}) > 1]
+    left, visit = [], []
+    for indices in groups:
+        sessions = [buffer.sessions[i] for i in indices if buffer.sessions[i].usable()[:horizon].any()]
+        if len(sessions) < 2:
+            continue
+        steps, ends = session_returns(sessions, buffer.settings, horizon)
+        known = np.isfinite(ends)
+        returns = steps + (np.where(known, ends, ends[known].mean()) if known.any() else 0.0)
+        left += list(returns - returns.mean())
+        visit += [s.visit for s in sessions]
+    values, numbers = np.array(left), np.array(visit)
+    days = np.unique(numbers)
+    if len(days) < 2 or len(values) <= len(days):
+        return np.zeros(draws), "how returns differ from day to day cannot be told from these sessions: the intervals leave it out"
+    sizes = np.array([(numbers == d).sum() for d in days], dtype=np.float64)
+    means = np.array([values[numbers == d].mean() for d in days])
+    within = sum(float(np.sum((values[numbers == d] - m) ** 2)) for d, m in zip(days, means, strict=True)) / (len(values) - len(days))
+    between = float(np.sum(sizes * (means - values.mean()) ** 2)) / (len(days) - 1)
+    effective = (len(values) - float(np.sum(sizes**2)) / len(values)) / (len(days) - 1)
+    spread = math.sqrt(max(0.0, (between - within) / effective))
+    error = spread * math.sqrt(float(np.sum(sizes**2))) / len(values)
+    # Three visits or fewer have a Student's t without a variance; what is drawn is then cut to what can be averaged.
+    noise = np.random.default_rng([seed, 0xDA7]).standard_t(max(len(days) - 1, 1), draws)
+    return np.asarray(error * np.clip(noise, -6.0, 6.0), dtype=np.float64), None
+
+
+def empirical_bernstein(values: Floats, low: float, high: float, level: float = LEVEL) -> tuple[float, float]:
+    """Interval of a mean of independent values within [low, high] at any sample size (Maurer and Pontil 2009, theorem 4, both sides).
+
+    Args:
+        values: [n], n at least 2. low, high: the range that the values can have, not the one that they had.
+
+    Raises:
+        ValueError: fewer than two values, or one outside the range.
+    """
+    n, log = _checked(values, low, high, level)
+    half = math.sqrt(2 * float(values.var(ddof=1)) * log / n) + 7 * (high - low) * log / (3 * (n - 1))
+    return max(low, float(values.mean()) - half), min(high, float(values.mean()) + half)
+
+
+def hoeffding(values: Floats, low: float, high: float, level: float = LEVEL) -> tuple[float, float]:
+    """Interval of a mean of independent values within [low, high]: half-width (high - low) sqrt(log(2 / (1 - level)) / (2 n))."""
+    n, log = _checked(values, low, high, level)
+    half = (high - low) * math.sqrt((log - math.log(2)) / (2 * n))
+    return max(low, float(values.mean()) - half), min(high, float(values.mean()) + half)
+
+
+def _checked(values: Floats, low: float, high: float, level: float) -> tuple[int, float]:
+    """Number of values and log(4 / (1 - level))."""
+    if values.size < 2:
+        raise ValueError(f"an interval of a mean needs at least two values, not {values.size}")
+    if float(values.min()) < low or float(values.max()) > high:
+        raise ValueError(f"values from {values.min():g} to {values.max():g} lie outside the stated range [{low:g}, {high:g}]")
+    return int(values.size), math.log(4 / (1 - level))

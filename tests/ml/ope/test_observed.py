@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ml.ope.observed import day_noise, empirical_bernstein, hoeffding, observed, session_returns
+from ml.qoc import Qoc
+
+
+def test_the_observed_return_of_a_controller_is_the_mean_over_its_sessions(small_buffer):
+    found = observed(small_buffer, 30)[("cdbs", None)]
+    sessions = [s for s in small_buffer.sessions if s.controller == "cdbs"]
+    discount = small_buffer.settings.gamma ** np.arange(30)
+    by_hand = [float(s.rewards(small_buffer.settings)[:30] @ discount) + s.end_reward(small_buffer.settings) for s in sessions]
+    assert found.n == 3
+    assert found.value == pytest.approx(np.mean(by_hand))
+    assert found.standard_error == pytest.approx(np.std(by_hand, ddof=1) / np.sqrt(3))
+    assert found.interval.low <= found.value <= found.interval.high
+
+
+def test_a_single_session_has_no_standard_error_and_no_interval(small_buffer):
+    found = observed(small_buffer, 30)[("other", None)]
+    assert (found.n, found.standard_error, found.interval) == (1, None, None)
+
+
+def test_a_session_without_outcomes_counts_for_its_steps(small_buffer):
+    sessions = list(small_buffer.sessions)
+    k = next(i for i, s in enumerate(sessions) if s.controller == "cdbs")
+    sessions[k] = replace(sessions[k], qoc=Qoc())
+    found = observed(replace(small_buffer, sessions=tuple(sessions)), 30)[("cdbs", None)]
+    steps, ends = session_returns([s for s in sessions if s.controller == "cdbs"], small_buffer.settings, 30)
+    assert np.isnan(ends).sum() == 1
+    assert found.value == pytest.approx(steps.mean() + np.nanmean(ends))
+
+
+def test_hoeffdings_interval_narrows_with_the_sample_where_a_known_library_widens():
+    # SCOPE-RL 0.2.1 computes sqrt(log(2 / alpha) / 2 * n): n = 10 gave [-3.5, 4.6], n = 10 000 gave [-135, 136].
+    rng = np.random.default_rng(0)
+    widths = []
+    for n in (10, 100, 10_000):
+        low, high = hoeffding(rng.random(n), -5.0, 5.0, 0.95)
+        widths.append(high - low)
+    assert widths[0] > widths[1] > widths[2]
+    assert widths[2] / 2 == pytest.approx(10 * 0.013581, rel=1e-3)
+
+
+def test_empirical_bernstein_covers_and_is_narrower_where_values_hardly_vary():
+    rng = np.random.default_rng(1)
+    hits = []
+    for _ in range(300):
+        low, high = empirical_bernstein(rng.beta(2, 5, 40), 0.0, 1.0, 0.90)
+        hits.append(low <= 2 / 7 <= high)
+    assert np.mean(hits) >= 0.90
+    steady = 0.5 + 0.001 * rng.random(5000)
+    own, other = empirical_bernstein(steady, 0.0, 1.0), hoeffding(steady, 0.0, 1.0)
+    assert own[1] - own[0] < 0.3 * (other[1] - other[0])
+
+
+def test_the_range_of_the_reward_is_asked_for_and_a_value_outside_it_refused():
+    with pytest.raises(ValueError, match="outside the stated range"):
+        empirical_bernstein(np.array([-1.2, -0.3]), -1.0, 0.0)
+    with pytest.raises(ValueError, match="at least two values"):
+        hoeffding(np.array([0.5]), 0.0, 1.0)
+
+
+def shifted_days(small_buffer, shift, seed=0):
+    """Twelve cDBS sessions on four days whose ratings differ by day."""
+    rng = np.random.default_rng(seed)
+    base = next(s for s in small_buffer.sessions if s.controller == "cdbs")
+    days = shift * rng.normal(size=4)
+    sessions = [
+        replace(base, session_id=i, visit=1 + i // 3, qoc=Qoc(2.0 + days[i // 3] + 0.05 * rng.normal(), 7, 10.0)) for i in range(12)
+    ]
+    return replace(small_buffer, sessions=tuple(sessions)), days
+
+
+def test_days_that_differ_widen_what_is_known_of_the_level_by_the_error_of_their_mean(small_buffer):
+    buffer, days = shifted_days(small_buffer, 0.5)
+    noise, flag = day_noise(buffer, 30, 20_000, 0)
+    assert flag is None
+    expected = 10.0 * days.std(ddof=1) / 2.0  # C2 times the spread of days over the root of their number
+    quartile = 0.7649  # of Student's t with 3 degrees of freedom
+    assert np.quantile(noise, 0.75) == pytest.approx(expected * quartile, rel=0.2)
+
+
+def test_days_that_do_not_differ_add_nothing_and_a_single_day_is_flagged(small_buffer):
+    buffer, _ = shifted_days(small_buffer, 0.0, seed=3)
+    assert np.abs(day_noise(buffer, 30, 50, 0)[0]).max() < 1.0
+    one = replace(buffer, sessions=tuple(replace(s, visit=1) for s in buffer.sessions))
+    noise, flag = day_noise(one, 30, 50, 0)
+    assert not noise.any()
+    assert "day to day" in flag
