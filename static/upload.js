@@ -1,33 +1,56 @@
-// Drag and drop with progress: every file goes to the public upload route by itself, so that one bad file loses nothing else.
+// Drag and drop with progress: files and whole folders go to the public upload route as one upload, so that recordings that belong together
+// (the two implants, the loose files of a folder) meet; one bad file loses nothing else there.
 const form = document.querySelector("form[data-upload]");
 const drop = form.querySelector("[data-drop]");
 const input = form.querySelector('input[type="file"]');
 const list = document.querySelector("[data-upload-list]");
+const home = `/participants/${form.dataset.participant}`;
 const LABELS = { understood: "Understood", flagged: "Flagged", repaired: "Repaired", ignored: "Left aside", removed: "Removed" };
+const FIELDS = ["visit", "controller", "policy", "started_at", "hemisphere", "beta_unit", "beta_source", "lfp_unit", "session"];
+const STATES = { decoded: ["decoded", "good"], received: ["being read", "info"], released: ["released unread", "warn"], discarded: ["discarded", "warn"] };
 
-form.querySelector("[data-drop-hint]").prepend("Drop files here, or choose them. ");
+form.querySelector("[data-drop-hint]").prepend("Drop files or whole folders here, or choose them. ");
 
 for (const kind of ["dragenter", "dragover"]) drop.addEventListener(kind, (event) => { event.preventDefault(); drop.classList.add("over"); });
 drop.addEventListener("dragleave", (event) => { if (!drop.contains(event.relatedTarget)) drop.classList.remove("over"); });
-drop.addEventListener("drop", (event) => {
+drop.addEventListener("drop", async (event) => {
   event.preventDefault();
   drop.classList.remove("over");
-  input.files = event.dataTransfer.files;
-  if (form.reportValidity()) start();
+  const entries = [...event.dataTransfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
+  const files = entries.length ? (await Promise.all(entries.map(filesOf))).flat() : named(event.dataTransfer.files);
+  start(files);
 });
 form.querySelector("button.primary").addEventListener("click", () => { input.required = true; }); // comes before the browser's own check
-form.addEventListener("submit", (event) => { event.preventDefault(); start(); });
+form.addEventListener("submit", (event) => { event.preventDefault(); start(named(input.files)); });
+
+function named(files) {
+  return [...files].map((file) => ({ file, path: file.webkitRelativePath || file.name }));
+}
+
+// every file below a dropped folder, with its path, by which loose files of one recording are kept together
+async function filesOf(entry) {
+  const path = entry.fullPath.replace(/^\//, "");
+  if (entry.isFile) return [{ file: await new Promise((found, failed) => entry.file(found, failed)), path }];
+  const reader = entry.createReader();
+  const inside = [];
+  for (let batch; (batch = await new Promise((found, failed) => reader.readEntries(found, failed))).length;) inside.push(...batch);
+  return (await Promise.all(inside.map(filesOf))).flat();
+}
 
 let busy = Promise.resolve();
-function start() {
+function start(files) {
+  if (!files.length) return;
   const fields = new FormData(form);
-  const files = [...input.files];
   input.value = "";
   input.required = false; // emptied by us: an empty field is no mistake until somebody sends it again
-  for (const file of files) {
-    const item = listed(file);
-    busy = busy.then(() => send(file, fields, item)); // one after the other: a clinic's line is narrow
+  const shown = listed(files);
+  const limit = Number(form.dataset.limitMb);
+  const total = files.reduce((sum, { file }) => sum + file.size, 0) / 1048576;
+  if (total > limit) {
+    report(shown, 413, { detail: `These files have ${Math.round(total)} MiB together; one upload may have ${limit} MiB.`, mend: "Send them in several uploads." });
+    return;
   }
+  busy = busy.then(() => send(files, fields, shown)); // one upload after the other: a clinic's line is narrow
 }
 
 function element(name, properties = {}, ...children) {
@@ -36,20 +59,22 @@ function element(name, properties = {}, ...children) {
   return made;
 }
 
-function listed(file) {
+function listed(files) {
   const bar = element("progress", { max: 1, value: 0 });
   const words = element("span", { textContent: "waiting" });
-  const head = element("div", { className: "row" }, element("b", { textContent: file.name }), words);
+  const title = files.length === 1 ? files[0].path : `${files.length} files`;
+  const head = element("div", { className: "row" }, element("b", { textContent: title }), words);
   const item = element("li", {}, head, element("div", { className: "progress" }, bar));
-  list.append(item);
-  return { file: file.name, item, head, bar, words };
+  list.prepend(item);
+  return { item, head, bar, words };
 }
 
-function send(file, fields, shown) {
+function send(files, fields, shown) {
   const body = new FormData();
-  body.append("file", file, file.name);
+  for (const { file, path } of files) body.append("file", file, path);
   body.append("participant", form.dataset.participant);
-  for (const name of ["visit", "controller", "policy", "started_at", "hemisphere", "beta_unit", "beta_source"]) if (fields.get(name)) body.append(name, fields.get(name));
+  for (const name of FIELDS) if (fields.get(name)) body.append(name, fields.get(name));
+  if (!fields.get("visit")) body.append("confirm", "false"); // proposed, with the visit of their date
   return new Promise((done) => {
     const request = new XMLHttpRequest();
     request.open("POST", "/api/v1/uploads");
@@ -59,29 +84,36 @@ function send(file, fields, shown) {
       shown.words.textContent = event.loaded < event.total ? `sending, ${Math.round((100 * event.loaded) / event.total)} %` : "decoding …";
     });
     request.addEventListener("load", () => { report(shown, request.status, request.response ?? {}); done(); });
-    request.addEventListener("error", () => { report(shown, 0, { detail: "The connection broke off.", mend: "Send the file again; what has arrived is not counted twice." }); done(); });
+    request.addEventListener("error", () => { report(shown, 0, { detail: "The connection broke off.", mend: "Send the files again; what has arrived is not counted twice." }); done(); });
     request.send(body);
   });
 }
 
-function report({ file, item, head, words }, status, answer) {
+function badge(text, tone) { return element("span", { className: `badge ${tone}`, textContent: text }); }
+
+function report({ item, head, words }, status, answer) {
   item.querySelector(".progress").remove();
   const good = status >= 200 && status < 300;
-  words.className = `badge ${!good ? "bad" : answer.duplicate ? "info" : "good"}`;
-  words.textContent = !good ? "not usable" : answer.duplicate ? "known already" : "decoded";
-  for (const session of answer.sessions ?? []) head.append(element("a", { className: "button", href: `/sessions/${session.id}`, textContent: `Session ${session.id}` }));
+  words.replaceWith(badge(!good ? "not usable" : answer.duplicate ? "known already" : "received", !good ? "bad" : answer.duplicate ? "info" : "good"));
+  if (answer.proposals?.length) head.append(element("a", { className: "button primary", href: `${home}/proposals`, textContent: `Confirm ${answer.proposals.length} proposed session${answer.proposals.length > 1 ? "s" : ""}` }));
+  for (const session of answer.sessions ?? []) if (session.status === "confirmed") head.append(element("a", { className: "button", href: `/sessions/${session.id}`, textContent: `Session ${session.id}` }));
   if (!good) {
     const note = element("div", { className: "note bad" }, element("b", { textContent: answer.detail ?? `The service answered ${status}.` }));
     note.setAttribute("role", "alert");
     if (answer.mend) note.append(element("div", { textContent: answer.mend }));
     item.append(note);
   }
+  const states = new Map((answer.files ?? []).map((file) => [file.name, file]));
   for (const one of answer.report ?? []) {
-    if (one.name !== file) item.append(element("h3", { textContent: one.name })); // a member of an archive
+    const file = states.get(one.name);
+    const line = element("div", { className: "row" }, element("h3", { textContent: one.name })); // a file, or a member of an archive
+    if (file) line.append(file.duplicate ? badge("known already", "info") : badge(...(STATES[file.status] ?? ["not usable, kept", "bad"])));
+    item.append(line);
+    if (one.problem && good) item.append(element("div", { className: "note bad" }, element("b", { textContent: one.problem.what }), element("div", { textContent: one.problem.where }), element("div", { textContent: one.problem.mend })));
     const pairs = element("dl", { className: "pairs" });
     for (const [key, label] of Object.entries(LABELS)) if (one[key]?.length) {
-      pairs.append(element("dt", { textContent: label }), element("dd", {}, ...one[key].map((line) => element("div", { textContent: line }))));
+      pairs.append(element("dt", { textContent: label }), element("dd", {}, ...one[key].map((text) => element("div", { textContent: text }))));
     }
-    item.append(pairs);
+    if (pairs.children.length) item.append(pairs);
   }
 }

@@ -11,6 +11,7 @@ READ = "read"
 WRITE_STUDY = "study:write"  # participants, visits, sessions, QoCs
 WRITE_SETTINGS = "settings:write"
 UPLOAD = "upload"
+DECIDE_QUARANTINE = "quarantine:decide"  # may see what could not be freed of identity
 RUN_JOBS = "jobs:run"
 WRITE_POLICIES = "policies:write"
 DRAFT_PLAN = "plan:draft"
@@ -19,7 +20,7 @@ READ_AUDIT = "audit:read"
 MANAGE_ACCOUNTS = "accounts:write"
 
 _VIEWER = frozenset({READ})
-_CLINICIAN = _VIEWER | {WRITE_STUDY, WRITE_SETTINGS, UPLOAD, RUN_JOBS, DRAFT_PLAN, APPROVE_PLAN, READ_AUDIT}
+_CLINICIAN = _VIEWER | {WRITE_STUDY, WRITE_SETTINGS, UPLOAD, DECIDE_QUARANTINE, RUN_JOBS, DRAFT_PLAN, APPROVE_PLAN, READ_AUDIT}
 _ENGINEER = _VIEWER | {WRITE_STUDY, WRITE_SETTINGS, UPLOAD, RUN_JOBS, WRITE_POLICIES, DRAFT_PLAN, READ_AUDIT}
 PERMISSIONS: dict[Role, frozenset[str]] = {
     Role.VIEWER: _VIEWER,

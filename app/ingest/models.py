@@ -5,10 +5,11 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, Index, String, func
+from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, Index, String, Text, func
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
+from app.study.models import StudySession
 
 
 class Upload(Base):
@@ -36,7 +37,10 @@ class UploadFile(Base):
 
     __tablename__ = "upload_file"
     __table_args__ = (
-        CheckConstraint("status in ('received', 'decoded', 'failed')", name="status"),
+        CheckConstraint("status in ('received', 'decoded', 'failed', 'released', 'discarded')", name="status"),
+        CheckConstraint(
+            "(decided_at is null) = (decided_by is null) and (decided_at is null) = (decision_reason is null)", name="decision"
+        ),
         # one participant's file counts once; a file that could not be used may be tried again
         Index(
             "uq_upload_file_participant_original",
@@ -59,4 +63,33 @@ class UploadFile(Base):
     redactor_version: Mapped[int | None]
     status: Mapped[str] = mapped_column(String(20), server_default="received")
     report: Mapped[dict[str, Any]]
+    session_id: Mapped[int | None] = mapped_column(ForeignKey("session.id", ondelete="SET NULL"), index=True)
+    """The session that a file without a clock of its own (a grasp test) was attached to."""
+    released_sha256: Mapped[str | None] = mapped_column(ForeignKey("stored_file.sha256"))
+    """The original as it came, after a person has reviewed it and released it."""
+    reviewed_by: Mapped[str | None] = mapped_column(String(254))
+    reviewed_at: Mapped[datetime | None]
+    decided_by: Mapped[str | None] = mapped_column(String(254))
+    decided_at: Mapped[datetime | None]
+    decision_reason: Mapped[str | None] = mapped_column(Text)
     upload: Mapped[Upload] = relationship(back_populates="files")
+
+
+class SessionProposal(Base):
+    """Why an upload proposes a session, and how often the proposal was changed; it stays beside the session that it became.
+
+    `evidence` has one sentence per guessed field (`visit`, `controller`, …). Where `visit_open`, the visit is a place to keep the proposal
+    in and no guess. `version` lets no tab overwrite another's correction.
+    """
+
+    __tablename__ = "session_proposal"
+    __table_args__ = (CheckConstraint("version >= 1", name="version"),)
+
+    session_id: Mapped[int] = mapped_column(ForeignKey("session.id", ondelete="CASCADE"), primary_key=True)
+    upload_id: Mapped[int] = mapped_column(ForeignKey("upload.id"), index=True)
+    version: Mapped[int] = mapped_column(server_default="1")
+    visit_open: Mapped[bool]
+    evidence: Mapped[dict[str, Any]]
+    changed_by: Mapped[str] = mapped_column(String(254))
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    session: Mapped[StudySession] = relationship()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from datetime import UTC, datetime
 from typing import Annotated, get_args
 
 from fastapi import APIRouter, File, Form, Request, UploadFile
@@ -13,21 +11,20 @@ from sqlalchemy.orm import Session
 
 from app.accounts import policy as can
 from app.accounts.deps import CurrentCaller
-from app.accounts.policy import Caller
 from app.ingest import repository, service
 from app.ingest.schemas import UploadForm
 from app.ingest.service import BetaStated, Incoming, UploadOutcome
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.forms import parse
-from app.platform.schemas import RowId, Text
+from app.platform.schemas import Int, RowId, Text
 from app.platform.templates import render
 from app.settings import get_settings
 from app.study import repository as study
 from app.study import service as study_service
 from app.study.api import CurrentParticipant
 from app.study.blinding import CONTROLLER_NAMES
-from app.study.models import Participant, Visit
+from app.study.models import Participant
 from app.study.schemas import BetaSource
 from app.study.settings_form import SOURCES
 
@@ -35,22 +32,24 @@ router = APIRouter()
 
 _LABELS = {
     "visit": "Visit", "controller": "Controller", "policy": "Policy", "started_at": "Start", "hemisphere": "Hemisphere",
-    "beta_unit": "Unit of beta", "beta_source": "Source of beta",
+    "beta_unit": "Unit of beta", "beta_source": "Source of beta", "lfp_unit": "Unit of LFP", "session": "Session of grasp files",
 }  # fmt: skip
 
 
 class _PageForm(UploadForm):
-    """The upload form with what a person may say of a table's beta."""
+    """The upload form with what a person may say of tables and of grasp files."""
 
     beta_unit: Text | None = Field(None, max_length=40)
     beta_source: BetaSource | None = None
+    lfp_unit: Text | None = Field(None, max_length=40)
+    session: Int | None = Field(None, ge=1)
 
 
 @router.get("/participants/{code}/upload")
 def upload_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, visit: str = "") -> HTMLResponse:
     """The upload form and the uploads so far."""
     study_service.require(caller, can.UPLOAD, participant)
-    return _page(request, db, participant, {"visit": visit})
+    return _page(request, db, participant, {"visit": visit} if visit else {})
 
 
 @router.post("/participants/{code}/upload")
@@ -67,48 +66,37 @@ def upload(
     hemisphere: Annotated[str, Form()] = "",
     beta_unit: Annotated[str, Form()] = "",
     beta_source: Annotated[str, Form()] = "",
+    lfp_unit: Annotated[str, Form()] = "",
+    session: Annotated[str, Form()] = "",
 ) -> HTMLResponse:
-    """Take files without JavaScript: one session per file; the answer names every file's fate. Sending again changes nothing."""
+    """Take files without JavaScript, all as one upload; the answer names every file's fate. Sending again changes nothing."""
     typed = {"visit": visit, "controller": controller, "policy": policy, "started_at": started_at, "hemisphere": hemisphere}
-    typed |= {"beta_unit": beta_unit, "beta_source": beta_source}
-    outcomes: list[UploadOutcome] = []
+    typed |= {"beta_unit": beta_unit, "beta_source": beta_source, "lfp_unit": lfp_unit, "session": session}
     try:
         form = parse(_PageForm, typed, _LABELS)
-        stated = service.state_session(db, participant, form.visit, form.controller, form.policy or None, form.started_at, form.hemisphere)
+        # a controller without a visit is taken for what it says, and confirmed with the visit that the date proposes
+        counts = form.visit is not None
+        stated = service.state_session(
+            db, participant, form.visit, form.controller, form.policy or None, form.started_at, form.hemisphere, counts, form.session
+        )
         chosen = [Incoming(f.filename or "file", f.file) for f in file if f.filename]
         if not chosen:
             raise Invalid("No file was chosen.", "Choose at least one file.")
-        for one in chosen:
-            outcomes.append(service.receive(db, participant, stated, [one], caller, BetaStated(form.beta_unit, form.beta_source)))
+        beta = BetaStated(form.beta_unit, form.beta_source, form.lfp_unit)
+        outcome = service.receive(db, participant, stated, chosen, caller, beta)
     except BetaloopError as error:
         db.rollback()
-        return _page(request, db, participant, typed, outcomes, error)
-    return _page(request, db, participant, typed, outcomes)
+        return _page(request, db, participant, typed, None, error)
+    return _page(request, db, participant, typed, outcome)
 
 
 @router.get("/uploads/{upload_id}")
 def report(request: Request, upload_id: RowId, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """What became of the files of one upload."""
     row, participant = repository.upload(db, upload_id, caller)
-    return HTMLResponse(render(request, "ingest/report.html", participant=participant, outcome=_outcome(db, row.id, caller)))
-
-
-def _outcome(db: Session, upload_id: int, caller: Caller) -> UploadOutcome:
-    row, participant = repository.upload(db, upload_id, caller)
-    return UploadOutcome(row, participant, service.stored_outcomes(db, row))
-
-
-def _likely_visit(visits: Sequence[Visit]) -> str:
-    """Number of the visit that files probably belong to; empty where none has taken place yet.
-
-    Args:
-        visits: by number. The last one counts where it has no date, else the newest whose date is not in the future.
-    """
-    if visits and visits[-1].date is None:
-        return str(visits[-1].number)
-    today = datetime.now(UTC).date()
-    past = [(v.date, v.number) for v in visits if v.date is not None and v.date <= today]
-    return str(max(past)[1]) if past else ""
+    outcome = UploadOutcome(row, participant, service.stored_outcomes(db, row))
+    waiting = {s.id for s in study.proposals_of_participant(db, participant.id)} & set(outcome.session_ids)
+    return HTMLResponse(render(request, "ingest/report.html", participant=participant, outcome=outcome, waiting=len(waiting)))
 
 
 def _page(
@@ -116,25 +104,27 @@ def _page(
     db: Session,
     participant: Participant,
     typed: dict[str, str],
-    outcomes: list[UploadOutcome] | None = None,
+    outcome: UploadOutcome | None = None,
     error: BetaloopError | None = None,
 ) -> HTMLResponse:
     visits, _ = study.visits(db, participant.id, 1000, 0)
     known = dict.fromkeys(_LABELS, "") | typed
-    known["visit"] = typed.get("visit") or _likely_visit(visits)
     page = render(
         request,
         "ingest/upload.html",
         participant=participant,
         visits=visits,
-        controllers=[("", "choose …"), *((c.value, name) for c, name in CONTROLLER_NAMES.items())],
+        controllers=[("", "propose from the files"), *((c.value, name) for c, name in CONTROLLER_NAMES.items())],
         sources=[("", "as in the settings"), *((s, label) for s, label in SOURCES if s in get_args(BetaSource))],
         policies=study.policy_names(db, participant.id),
         typed=known,
-        outcomes=outcomes or [],
+        outcome=outcome,
+        sessions=study.sessions_of_participant(db, participant.id, with_proposals=True),
+        proposed=len(study.proposals_of_participant(db, participant.id)),
+        held=sum(f.quarantine_sha256 is not None for f in repository.quarantined_files(db, participant.id)),
         uploads=repository.uploads_of_participant(db, participant.id),
         limit_mb=get_settings().upload_limit_mb,
         problem=error.problem(request.url.path) if error else None,
     )
-    unusable = bool(outcomes) and not any(o.usable for o in outcomes or [])
+    unusable = outcome is not None and not outcome.usable
     return HTMLResponse(page, error.status if error else 422 if unusable else 200)

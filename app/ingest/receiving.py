@@ -1,61 +1,67 @@
-"""One file of an upload on its way in: safe on disk, identity out, decoded, and known again by its bytes or its content."""
+"""One file of an upload on its way in: safe on disk, identity out, decoded, and known again by its bytes or its content.
+
+Which sessions come out is decided when all files of the upload are in; see `app.ingest.service`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import cast
 
 import structlog
 from sqlalchemy.orm import Session
 
-from app.ingest import formats, quarantine, repository, sessions
+from app.ingest import encryption, formats, outcomes_intake, recordings, repository
 from app.ingest.formats import FileKind
-from app.ingest.formats.log import DecodedFile, FileReport, Problem, TraceSource, UndecodableFile
+from app.ingest.formats.log import DecodedFile, FileReport, GraspLog, Problem, TraceLog, TraceSource, UndecodableFile
 from app.ingest.formats.numbers import unit_name
 from app.ingest.formats.options import DecodeOptions
-from app.ingest.formats.redact import REDACTOR_VERSION, Redaction, redact_rcs_zip, redact_table
+from app.ingest.formats.redaction import REDACTOR_VERSION, Redaction
+from app.ingest.incoming import Incoming
 from app.ingest.models import Upload, UploadFile
-from app.ingest.sessions import StatedSession
 from app.platform import files
 from app.platform.errors import TooLarge
 from app.settings import get_settings
-from app.study.models import Participant
+from app.study.models import Participant, Recording, SettingsVersion
 
 log = structlog.get_logger()
 
 TABLES = ("csv", "parquet")
-_MEDIA_TYPE = "application/octet-stream"
-
-
-@dataclass(frozen=True)
-class Incoming:
-    """One file as it arrives."""
-
-    name: str
-    stream: BinaryIO
+MEDIA_TYPE = "application/octet-stream"
 
 
 @dataclass(frozen=True)
 class BetaStated:
-    """What the sender says of a table's beta column: unit and source (`time_domain`, `device_power`, `percept_lfp`, `table`)."""
+    """What the sender says of a table: unit and source (as in the settings) of its beta, and the unit of its LFP."""
 
     unit: str | None = None
     source: str | None = None
+    lfp_unit: str | None = None
 
 
 @dataclass
 class FileOutcome:
     """What became of one file. `name` is what the sender called it; it and `told`, the problem in the file's own words, are told back to
-    the sender and never stored."""
+    the sender and never stored.
+
+    Attributes:
+        duplicate: its bytes, or all of its recordings, had come before. same_bytes: its bytes had; `row` is the earlier file then.
+        session_ids: sessions that it belongs to.
+        recordings: what it holds, new and known.
+        grasps: hand-grasp tests that wait for their session.
+    """
 
     name: str
     row: UploadFile
     reports: list[FileReport]
     duplicate: bool = False
+    same_bytes: bool = False
     session_ids: list[int] = field(default_factory=list)
     told: Problem | None = None
+    recordings: list[Recording] = field(default_factory=list)
+    grasps: Sequence[GraspLog] = ()
 
     @property
     def reports_for_sender(self) -> list[FileReport]:
@@ -65,7 +71,7 @@ class FileOutcome:
 
 
 @dataclass(frozen=True)
-class _Kept:
+class Kept:
     """A file as it was stored, and why it cannot be decoded, if so."""
 
     kind: str
@@ -85,7 +91,6 @@ class Receiver:
     db: Session
     participant: Participant
     upload: Upload
-    stated: StatedSession
     options: DecodeOptions
     beta: BetaStated
 
@@ -117,43 +122,48 @@ class Receiver:
         )
         self.db.add(row)
         self.db.commit()  # the bytes are safe from here on, whatever the decoder does with them
-        return self._decode(name, row, kept)
+        return self.decode(name, row, kept)
 
     def _known(self, name: str, sha256: str) -> FileOutcome | None:
-        """The outcome for bytes that were decoded before: the same sessions, and nothing changed."""
+        """The outcome for bytes that were decoded before: the same recordings, and nothing stored again."""
         row = repository.decoded_file(self.db, self.participant.id, sha256)
         if row is None:
             return None
-        ids = list(repository.session_ids_of_file(self.db, row.id))
         note = f"The same bytes came before, as '{row.name}' in upload {row.upload_id}; nothing was stored again and nothing was changed."
-        report = FileReport(name=row.name, understood=[note], flagged=sessions.disagreements(self.db, ids, self.stated))
-        return FileOutcome(name, row, [report], duplicate=True, session_ids=ids)
+        held = [*repository.recordings_of_file(self.db, row.id), *repository.recordings_by_id(self.db, known_recordings(row))]
+        return FileOutcome(name, row, [FileReport(name=row.name, understood=[note])], duplicate=True, same_bytes=True, recordings=held)
 
-    def _keep(self, draft: Path) -> _Kept:
+    def _keep(self, draft: Path) -> Kept:
         """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted.
 
         A table is cleaned by reading it with the participant's options: one that cannot be decoded is kept encrypted too.
         """
-        redaction, clean, quarantined = Redaction(), draft, None
+        clean = files.draft_path()
         try:
             kind = formats.sniff(draft)
-            if kind == "rcs":
-                clean = files.draft_path()
-                redaction = redact_rcs_zip(draft, clean, get_settings().secret("pseudonyms"), self.options.archive)
-            else:
-                clean = files.draft_path()
-                redaction = redact_table(draft, clean, kind, self.options)
+            redaction = formats.redact(draft, clean, kind, get_settings().secret("pseudonyms"), self.options)
         except UndecodableFile as error:
-            sealed = self._seal(draft)
-            return _Kept("unreadable", sealed, sealed, Redaction(), error)
-        if redaction.unreadable:
-            quarantined = self._seal(draft)
-        return _Kept(kind, files.store(self.db, clean, _MEDIA_TYPE).sha256, quarantined, redaction, None)
+            return self._quarantined(draft, clean, error)
+        except Exception as fault:
+            # a fault of ours must not take the other files of the upload with it, and what it left behind may still name a person
+            log.exception("file could not be cleaned", upload=self.upload.id, fault=repr(fault))
+            mend = f"It is kept encrypted; tell your administrator: upload {self.upload.id}."
+            return self._quarantined(
+                draft, clean, UndecodableFile("the service failed while it took identity out of this file", "file", mend)
+            )
+        sealed = self._seal(draft) if redaction.unreadable else None
+        return Kept(kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, redaction, None)
+
+    def _quarantined(self, draft: Path, clean: Path, problem: UndecodableFile) -> Kept:
+        clean.unlink(missing_ok=True)
+        sealed = self._seal(draft)
+        return Kept("unreadable", sealed, sealed, Redaction(), problem)
 
     def _seal(self, draft: Path) -> str:
-        return files.store(self.db, quarantine.encrypt(draft), _MEDIA_TYPE).sha256
+        return files.store(self.db, encryption.encrypt(draft), MEDIA_TYPE).sha256
 
-    def _decode(self, name: str, row: UploadFile, kept: _Kept) -> FileOutcome:
+    def decode(self, name: str, row: UploadFile, kept: Kept) -> FileOutcome:
+        """Decode a stored file; whatever is wrong with it becomes its report."""
         if kept.problem is not None:
             return self._failed(name, row, kept, kept.problem)
         try:
@@ -166,7 +176,8 @@ class Receiver:
             decoded = formats.decode(files.path_of(kept.stored_sha256), cast(FileKind, kept.kind), self.options, name=row.name)
             if kept.kind in TABLES:
                 decoded = self._name_beta(decoded)
-            stored = sessions.store_recordings(self.db, self.participant, row, decoded.recordings, self.stated)
+            stored = recordings.store(self.db, self.participant, row, decoded.recordings)
+            tremor = outcomes_intake.take_tremor(self.db, row, decoded.tremor)
         except UndecodableFile as error:
             self.db.rollback()
             return self._failed(name, row, kept, error)
@@ -177,38 +188,60 @@ class Receiver:
             ours = UndecodableFile("the decoder failed on this file", "file", f"Tell your administrator: upload file {row.id}.")
             return self._failed(name, row, kept, ours)
         reports = list(decoded.reports)
-        _tell(reports[0], kept.redaction, stored.notes)
-        reports[0].flagged.extend(stored.flagged)
-        self._finish(row, "decoded", reports)
-        return FileOutcome(name, row, reports, duplicate=stored.known, session_ids=stored.session_ids)
-
-    def _failed(self, name: str, row: UploadFile, kept: _Kept, problem: UndecodableFile) -> FileOutcome:
-        report = FileReport(name=row.name, removed=kept.redaction.removed, problem=problem.stored)
-        self._finish(row, "failed", [report])
-        return FileOutcome(name, row, [report], told=problem.told)
-
-    def _finish(self, row: UploadFile, status: str, reports: Sequence[FileReport]) -> None:
-        row.status = status
-        row.report = {"reports": [asdict(r) for r in reports]}
+        _tell(reports[0], kept.redaction, tremor)
+        row.status = "decoded"
+        store_reports(row, reports, [r.id for r in stored.known])
         self.db.commit()
+        all_known = bool(stored.known) and not stored.fresh
+        return FileOutcome(name, row, reports, all_known, recordings=[*stored.known, *stored.fresh], grasps=decoded.grasps)
+
+    def _failed(self, name: str, row: UploadFile, kept: Kept, problem: UndecodableFile) -> FileOutcome:
+        report = FileReport(name=row.name, removed=kept.redaction.removed, problem=problem.stored)
+        row.status = "failed"
+        store_reports(row, [report])
+        self.db.commit()
+        return FileOutcome(name, row, [report], told=problem.told)
 
     def _name_beta(self, decoded: DecodedFile) -> DecodedFile:
         """A table's beta under its source, with a sentence that says who stated unit and source."""
-        settings = self.participant.current_settings
-        source = cast(TraceSource, self.beta.source or settings.beta_source or "table")
-        recordings = tuple(
-            replace(r, traces=tuple(replace(t, source=source) if t.stream == "beta" else t for t in r.traces)) for r in decoded.recordings
-        )
-        report = decoded.reports[0]
-        source_from = _whence(self.beta.source, settings.beta_source)
-        for trace in (t for r in recordings for t in r.traces if t.stream == "beta"):
-            in_header = trace.details["unit_from"] == "header"
-            unit_from = "as the file's header says" if in_header else _whence(self.beta.unit, settings.beta_unit)
-            report.understood.append(f"beta: unit '{trace.unit}' {unit_from}, source '{source}' {source_from}")
-            if in_header and self.beta.unit and unit_name(self.beta.unit) != trace.unit:
-                stated = unit_name(self.beta.unit)
-                report.flagged.append(f"the file's header gives beta in '{trace.unit}', the upload says '{stated}': the header was taken")
-        return replace(decoded, recordings=recordings)
+        return name_beta(decoded, self.beta, self.participant.current_settings)
+
+
+def name_beta(decoded: DecodedFile, beta: BetaStated, settings: SettingsVersion) -> DecodedFile:
+    """A table's own beta under its source; the report gets a sentence that says who stated unit and source.
+
+    Beta that was computed here, from a table of raw LFP, keeps the source `time_domain` and the unit it was computed in.
+    """
+    source = cast(TraceSource, beta.source or settings.beta_source or "table")
+    named = tuple(
+        replace(r, traces=tuple(replace(t, source=source) if _stated_by_a_person(t) else t for t in r.traces)) for r in decoded.recordings
+    )
+    report = decoded.reports[0]
+    source_from = _whence(beta.source, settings.beta_source)
+    for trace in (t for r in decoded.recordings for t in r.traces if _stated_by_a_person(t)):
+        in_header = trace.details["unit_from"] == "header"
+        unit_from = "as the file's header says" if in_header else _whence(beta.unit, settings.beta_unit)
+        report.understood.append(f"beta: unit '{trace.unit}' {unit_from}, source '{source}' {source_from}")
+        if in_header and beta.unit and unit_name(beta.unit) != trace.unit:
+            stated = unit_name(beta.unit)
+            report.flagged.append(f"the file's header gives beta in '{trace.unit}', the upload says '{stated}': the header was taken")
+    return replace(decoded, recordings=named)
+
+
+def _stated_by_a_person(trace: TraceLog) -> bool:
+    """Whether a trace is the beta column of a table, whose source nobody but a person can tell."""
+    return trace.stream == "beta" and trace.source == "table"
+
+
+def store_reports(row: UploadFile, reports: Sequence[FileReport], known: Sequence[int] = ()) -> None:
+    """Keep a file's reports, and which of its recordings had come before in other files."""
+    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known)}
+
+
+def known_recordings(row: UploadFile) -> list[int]:
+    """Recordings of a file that another file had brought before."""
+    found: list[int] = row.report.get("known_recordings", [])
+    return found
 
 
 def _whence(by_upload: str | None, by_settings: str | None) -> str:
@@ -219,10 +252,9 @@ def _whence(by_upload: str | None, by_settings: str | None) -> str:
 
 
 def _tell(report: FileReport, redaction: Redaction, notes: Sequence[str]) -> None:
-    """Add to the first report what cleaning the file found, and which session came out."""
-    report.removed.extend(redaction.removed)
-    report.repaired.extend(redaction.repaired)
-    report.ignored.extend(redaction.ignored)
+    """Add to the first report what cleaning the file found, and what was made of it."""
+    for ours, found in ((report.removed, redaction.removed), (report.repaired, redaction.repaired), (report.ignored, redaction.ignored)):
+        ours.extend(sentence for sentence in found if sentence not in ours)
     report.flagged.extend(f"kept encrypted, because it could not be read: {u}" for u in redaction.unreadable)
     report.understood.extend(notes)
 

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import datetime, timedelta
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.policy import Caller
-from app.ingest.models import Upload, UploadFile
+from app.ingest.models import SessionProposal, Upload, UploadFile
 from app.platform.errors import NotFound
-from app.study.models import Device, Participant, Recording, SessionSegment
+from app.study.models import Device, Participant, Recording, SessionSegment, StudySession, Visit
 from app.study.repository import in_scope
+
+GRASP_KIND = "grasp"
+"""Kind of a file with hand-grasp tests, which names no clock."""
 
 
 def lock_participant(db: Session, participant_id: int) -> None:
@@ -28,15 +32,16 @@ def decoded_file(db: Session, participant_id: int, sha256: str) -> UploadFile | 
     )
 
 
-def session_ids_of_file(db: Session, upload_file_id: int) -> Sequence[int]:
-    """Sessions that the recordings of a file belong to."""
-    return db.scalars(
-        select(SessionSegment.session_id)
-        .join(Recording, Recording.id == SessionSegment.recording_id)
-        .where(Recording.upload_file_id == upload_file_id)
-        .distinct()
-        .order_by(SessionSegment.session_id)
-    ).all()
+def session_ids_of_file(db: Session, file: UploadFile, known_recordings: Sequence[int] = ()) -> list[int]:
+    """Sessions that the recordings of a file belong to, or that the file was attached to.
+
+    Args:
+        known_recordings: recordings of the file that another file had brought before.
+    """
+    mine = (Recording.upload_file_id == file.id) | Recording.id.in_(known_recordings)
+    query = select(SessionSegment.session_id).join(Recording, Recording.id == SessionSegment.recording_id).where(mine)
+    attached = {file.session_id} if file.session_id is not None else set()
+    return sorted({*db.scalars(query.distinct()), *attached})
 
 
 def device(db: Session, participant_id: int, pseudonym: str) -> Device | None:
@@ -67,3 +72,91 @@ def uploads_of_participant(db: Session, participant_id: int, limit: int = 20) ->
         .limit(limit)
         .options(selectinload(Upload.files))
     ).all()
+
+
+def recordings_of_file(db: Session, upload_file_id: int) -> Sequence[Recording]:
+    """Recordings that a file gave, in the order in which they were stored."""
+    return db.scalars(select(Recording).where(Recording.upload_file_id == upload_file_id).order_by(Recording.id)).all()
+
+
+def recordings_by_id(db: Session, ids: Sequence[int]) -> Sequence[Recording]:
+    """Recordings by number."""
+    return db.scalars(select(Recording).where(Recording.id.in_(ids)).order_by(Recording.id)).all() if ids else []
+
+
+def confirmed_sessions_of_recording(db: Session, recording_id: int, besides: int) -> Sequence[int]:
+    """Confirmed sessions that count on a recording, other than the one named."""
+    query = select(StudySession.id).join(SessionSegment, SessionSegment.session_id == StudySession.id)
+    mine = (SessionSegment.recording_id == recording_id) & (StudySession.id != besides)
+    return db.scalars(query.where(mine, StudySession.status == "confirmed").distinct()).all()
+
+
+def segments_of_recording(db: Session, recording_id: int, besides: int) -> Sequence[SessionSegment]:
+    """Parts of a recording that belong to sessions, other than the one named."""
+    query = select(SessionSegment).where(SessionSegment.recording_id == recording_id, SessionSegment.session_id != besides)
+    return db.scalars(query.options(joinedload(SessionSegment.session)).order_by(SessionSegment.start_s)).all()
+
+
+def proposal(db: Session, session_id: int, caller: Caller, lock: bool = False) -> SessionProposal:
+    """The proposal behind a session; `lock`: held against others until the transaction ends. Raises NotFound."""
+    query = (
+        select(SessionProposal)
+        .join(StudySession, StudySession.id == SessionProposal.session_id)
+        .join(StudySession.visit)
+        .join(Visit.participant)
+        .join(Participant.site)
+        .where(SessionProposal.session_id == session_id, in_scope(caller))
+    )
+    row = db.scalar(query.with_for_update(of=SessionProposal).execution_options(populate_existing=True) if lock else query)
+    if row is None:
+        raise NotFound(f"There is no proposed session {session_id}, or you have no access to it.")
+    return row
+
+
+def proposals(db: Session, session_ids: Sequence[int]) -> dict[int, SessionProposal]:
+    """Proposals by session."""
+    return {p.session_id: p for p in db.scalars(select(SessionProposal).where(SessionProposal.session_id.in_(session_ids)))}
+
+
+def overlapping_proposals(db: Session, participant_id: int, begin: datetime, end: datetime) -> Sequence[StudySession]:
+    """A participant's proposed sessions with a start before `end`, newest first, that may share time with [begin, end]."""
+    query = select(StudySession).join(StudySession.visit).where(Visit.participant_id == participant_id, StudySession.status == "proposed")
+    near = StudySession.started_at.between(begin - timedelta(days=1), end)
+    return db.scalars(query.where(near).order_by(StudySession.id.desc())).all()
+
+
+def waiting_grasp_files(db: Session, participant_id: int) -> Sequence[UploadFile]:
+    """Decoded grasp files that no session has yet, oldest first."""
+    mine = (UploadFile.participant_id == participant_id) & (UploadFile.kind == GRASP_KIND)
+    query = select(UploadFile).where(mine, UploadFile.status == "decoded", UploadFile.session_id.is_(None))
+    return db.scalars(query.order_by(UploadFile.id)).all()
+
+
+def upload_file(db: Session, file_id: int, caller: Caller, lock: bool = False) -> tuple[UploadFile, Participant]:
+    """A file of an upload and its participant; `lock`: held until the transaction ends. Raises NotFound."""
+    query = (
+        select(UploadFile, Participant)
+        .join(Participant, Participant.id == UploadFile.participant_id)
+        .join(Participant.site)
+        .where(UploadFile.id == file_id, in_scope(caller))
+    )
+    row = db.execute(query.with_for_update(of=UploadFile).execution_options(populate_existing=True) if lock else query).first()
+    if row is None:
+        raise NotFound(f"There is no uploaded file {file_id}, or you have no access to it.")
+    return row[0], row[1]
+
+
+def quarantined_files(db: Session, participant_id: int) -> Sequence[UploadFile]:
+    """Files that are, or were, kept encrypted because they could not be read, newest first."""
+    touched = UploadFile.quarantine_sha256.is_not(None) | UploadFile.decided_at.is_not(None)
+    return db.scalars(select(UploadFile).where(UploadFile.participant_id == participant_id, touched).order_by(UploadFile.id.desc())).all()
+
+
+def readable_files(db: Session, participant_id: int | None, upload_file_id: int | None) -> Sequence[int]:
+    """Numbers of the decoded files, of one participant or one file where named, oldest first."""
+    query = select(UploadFile.id).where(UploadFile.status == "decoded", UploadFile.stored_sha256.is_not(None))
+    if participant_id is not None:
+        query = query.where(UploadFile.participant_id == participant_id)
+    if upload_file_id is not None:
+        query = query.where(UploadFile.id == upload_file_id)
+    return db.scalars(query.order_by(UploadFile.id)).all()

@@ -1,136 +1,253 @@
-"""From decoded recordings to rows: devices, recordings, traces, and the session that a person stated."""
+"""From recordings to sessions: what belongs together, which part of which recording it is, and what contradicts what was said."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from datetime import datetime
-from typing import Any
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 
 import numpy as np
 from sqlalchemy.orm import Session
 
 from app.accounts.policy import SYSTEM
 from app.ingest import repository
-from app.ingest.formats.log import DECODE_VERSION, RecordingLog, TraceLog
-from app.ingest.formats.redact import pseudonym
-from app.ingest.models import UploadFile
-from app.platform.errors import Invalid
-from app.platform.schemas import sensible_time
-from app.settings import get_settings
+from app.platform.errors import Conflict, Invalid
 from app.study import blinding
 from app.study import repository as study
-from app.study.models import Controller, Device, Hemisphere, Participant, Recording, SessionSegment, StudySession, Trace, Visit
-from app.study.traces import AMPLITUDE_STREAM, cdbs_in_force, pack, step_table
+from app.study.models import Controller, Hemisphere, Participant, Recording, SessionSegment, StudySession, Trace, Visit
+from app.study.traces import AMPLITUDE_STREAM, cdbs_amplitude_ma, pack, step_table, unpack
 
 CONTROL_STREAMS = ("beta", "band_power")
 """Streams that can drive a controller, in the order of preference where the participant's source does not decide."""
+TOGETHER = 0.5
+"""Two recordings belong to one session when they share at least this part of the shorter one's time."""
+LONGEST_STEP_S = 60.0
+"""What a device notes less often than this is its history, no session."""
 
 
 @dataclass(frozen=True)
 class StatedSession:
-    """What the sender says of the session that the files belong to."""
+    """What the sender says of the sessions in an upload.
 
-    visit: Visit
-    controller: Controller
+    Attributes:
+        visit, controller: None where the sender leaves it to the files and to whoever confirms the proposals.
+        confirm: whether what is stated counts at once; without a controller and a visit nothing does.
+        session: where files without a clock (grasp tests) belong; None: the single session of the upload.
+    """
+
+    visit: Visit | None = None
+    controller: Controller | None = None
     policy_id: int | None = None
     started_at: datetime | None = None
     hemisphere: Hemisphere | None = None
+    confirm: bool = True
+    session: StudySession | None = None
+
+    @property
+    def counts(self) -> bool:
+        """Whether the sessions are confirmed as they arrive."""
+        return self.confirm and self.controller is not None and self.visit is not None
 
 
-@dataclass(frozen=True)
-class Stored:
-    """What became of the recordings of a file.
+@dataclass
+class Laid:
+    """One session's recordings: the one that its controller saw, the part of it, and the others of the same time."""
 
-    Attributes:
-        session_ids: sessions that the file belongs to. known: all of its recordings had come before.
-        notes, flagged: sentences for the report.
-    """
+    control: Recording
+    recordings: list[Recording]
+    start_s: float
+    stop_s: float
+    started_at: datetime | None
+    stream: str
+    channel: str | None
+    notes: list[str] = field(default_factory=list)
 
-    session_ids: list[int]
-    known: bool
-    notes: list[str]
-    flagged: list[str]
+
+def makes_session(traces: Sequence[Trace], recording: Recording) -> bool:
+    """Whether a recording holds data of a session: any valid row, on a grid of steps, and not what the device calls a test or a history."""
+    if recording.details.get("run", 0) is None:
+        return False
+    return any(t.dt_s <= LONGEST_STEP_S and any(t.valid_bits) for t in traces)
 
 
-def store_recordings(
-    db: Session, participant: Participant, file: UploadFile, recordings: Sequence[RecordingLog], stated: StatedSession
-) -> Stored:
-    """Store what a file gave and make its session.
-
-    The recordings of one file (the two implants of one participant) belong to one session. A recording that is known by its content,
-    from another file, keeps the sessions it has. A recording without any data is kept and makes no session.
-    """
-    known_ids: list[int] = []
-    notes: list[str] = []
-    flagged: list[str] = []
-    fresh: list[tuple[Recording, RecordingLog]] = []
-    for decoded in recordings:
-        known = study.recording_by_fingerprint(db, participant.id, decoded.fingerprint)
-        if known is not None:
-            known_ids.extend(study.session_ids_of_recording(db, known.id))
+def together(recordings: Sequence[Recording]) -> list[list[Recording]]:
+    """Groups of recordings that belong to one session each, by start; recordings without a time stay with their run in the file."""
+    groups: list[list[Recording]] = []
+    for recording in sorted(recordings, key=lambda r: (r.started_at is None, r.started_at, r.id)):
+        home = next((g for g in groups if any(_belong(recording, other) for other in g)), None)
+        if home is None:
+            groups.append([recording])
         else:
-            kept, flags = _in_milliamperes(decoded, participant, stated)
-            fresh.append((_add_recording(db, participant, file, kept), kept))
-            flagged.extend(flags)
-    if known_ids:
-        notes.append(f"The same recording came before in another file; it stays session {', '.join(map(str, sorted(set(known_ids))))}.")
-        flagged.extend(disagreements(db, known_ids, stated))
-    with_data = [(r, log) for r, log in fresh if any(t.valid.any() for t in log.traces)]
-    if fresh and not with_data:
-        flagged.append("It holds no data: the recording is kept, and no session was made.")
-    if not with_data:
-        return Stored(sorted(set(known_ids)), bool(known_ids) and not fresh, notes, flagged)
-    session = _add_session(db, participant, fresh, stated)
-    control = next(s.recording for s in session.segments if s.is_control)
-    notes.append(_session_sentence(session, control, stated))
-    flagged.extend(contradictions(db, participant, session, stated))
-    return Stored(sorted({*known_ids, session.id}), False, notes, flagged)
+            home.append(recording)
+    return groups
 
 
-def contradictions(db: Session, participant: Participant, session: StudySession, stated: StatedSession) -> list[str]:
-    """Sentences where the amplitudes of a session are not those of the controller that it is said to have had."""
+def _belong(a: Recording, b: Recording) -> bool:
+    if a.started_at is not None and b.started_at is not None:
+        begin = max(a.started_at, b.started_at)
+        end = min(a.started_at + timedelta(seconds=a.duration_s), b.started_at + timedelta(seconds=b.duration_s))
+        return (end - begin).total_seconds() >= TOGETHER * min(a.duration_s, b.duration_s)
+    return a.upload_file_id == b.upload_file_id and a.details.get("run", 0) == b.details.get("run", 0)
+
+
+def lay(db: Session, participant: Participant, recordings: Sequence[Recording], stated: StatedSession, alone: bool) -> Laid:
+    """Where a session lies in its recordings.
+
+    Args:
+        recordings: of one session, none of them empty.
+        alone: whether the stated start is meant for these recordings alone; else it counts where it lies within them.
+    """
+    settings = participant.current_settings
+    choices = [(_control(study.traces_of_recording(db, r.id), settings.beta_source), r) for r in recordings]
+    # the stated side first, then recordings that a controller could have seen
+    choices.sort(key=lambda c: (stated.hemisphere is not None and c[1].hemisphere != stated.hemisphere, c[0] is None))
+    trace, control = choices[0]
+    started_at = control.started_at
+    if stated.started_at is not None and (alone or _inside(stated.started_at, control)):
+        started_at = stated.started_at
+    start_s = offset_s(control, started_at, settings.period_s)
+    stream, channel = (trace.stream, trace.channel) if trace else (CONTROL_STREAMS[0], None)
+    laid = Laid(control, list(recordings), start_s, control.duration_s, started_at, stream, channel)
+    if stated.started_at is not None and started_at is not stated.started_at:
+        laid.notes.append("The stated start does not lie in this recording: its own time was taken.")
+    return laid
+
+
+def _inside(moment: datetime, recording: Recording) -> bool:
+    return recording.started_at is None or 0 <= (moment - recording.started_at).total_seconds() < recording.duration_s
+
+
+def _control(traces: Sequence[Trace], wanted_source: str | None) -> Trace | None:
+    """The trace that the controller is taken to have seen: of the participant's source where there is one, else the first stream's."""
+    candidates = [t for stream in CONTROL_STREAMS for t in traces if t.stream == stream and any(t.valid_bits)]
+    return next((t for t in candidates if t.source == wanted_source), candidates[0] if candidates else None)
+
+
+def offset_s(recording: Recording, started_at: datetime | None, period_s: float) -> float:
+    """Where a session that starts at `started_at` begins in a recording, seconds, on the recording's grid; what comes before is its lead.
+
+    A recording without a time of its own begins with the session, and so does one that does not reach to the stated start.
+    """
+    if started_at is None or recording.started_at is None:
+        return 0.0
+    offset = round((started_at - recording.started_at).total_seconds() / period_s) * period_s
+    return offset if 0 < offset < recording.duration_s else 0.0
+
+
+def set_segments(session: StudySession, laid: Laid, period_s: float) -> None:
+    """Give a session its parts of its recordings, the same stretch of time in each."""
+    session.segments.clear()
+    for recording in laid.recordings:
+        if recording is laid.control:
+            start_s, stop_s = laid.start_s, laid.stop_s
+        else:
+            start_s = offset_s(recording, laid.started_at, period_s) if laid.started_at else laid.start_s
+            ahead = (recording.started_at - laid.started_at).total_seconds() if recording.started_at and laid.started_at else 0.0
+            # a recording that begins within the session holds less of it by what it comes too late
+            stop_s = min(start_s + (laid.stop_s - laid.start_s) - max(ahead, 0.0), recording.duration_s)
+        if recording is not laid.control and stop_s <= start_s:
+            continue
+        stop_s = max(stop_s, start_s + 1e-3)  # a segment needs a length
+        session.segments.append(SessionSegment(recording=recording, start_s=start_s, stop_s=stop_s, is_control=recording is laid.control))
+
+
+def add_session(
+    db: Session, visit: Visit, laid: Laid, controller: Controller | None, policy_id: int | None, hemisphere: Hemisphere | None, counts: bool
+) -> StudySession:
+    """A new session, confirmed or proposed."""
+    session = StudySession(
+        visit_id=visit.id,
+        ordinal=study.next_ordinal(db, visit.id),
+        hemisphere=hemisphere or laid.control.hemisphere,
+        status="confirmed" if counts else "proposed",
+        started_at=laid.started_at,
+        duration_s=laid.stop_s - laid.start_s,
+        control_stream=laid.stream,
+        control_channel=laid.channel,
+    )
+    blinding.assign(session, controller, policy_id)
+    set_segments(session, laid, visit.participant.current_settings.period_s)
+    db.add(session)
+    db.flush()
+    return session
+
+
+def fix_milliamperes(db: Session, session: StudySession) -> list[str]:
+    """Fractions as the milliamperes they were, by the cDBS amplitude in force as the session is confirmed; sentences where that fails.
+
+    What was delivered must not change when the cDBS amplitude does. Traces of a recording that an earlier session counts on stay.
+    """
+    said = []
+    for recording_id in dict.fromkeys(s.recording_id for s in session.segments):
+        given = [t for t in study.traces_of_recording(db, recording_id) if t.stream == AMPLITUDE_STREAM and t.unit == "fraction"]
+        if not given or repository.confirmed_sessions_of_recording(db, recording_id, besides=session.id):
+            continue
+        try:
+            cdbs = cdbs_amplitude_ma(session, session.visit.participant.current_settings)
+        except Invalid as error:
+            said.append(f"Amplitudes are kept as fractions: {error}")
+            continue
+        if cdbs is None:
+            said.append("Amplitudes are kept as fractions, because nobody has stated a cDBS amplitude for this participant yet.")
+            continue
+        for trace in given:
+            in_milliamperes(trace, cdbs)
+    db.flush()
+    return said
+
+
+def in_milliamperes(trace: Trace, cdbs_ma: float) -> None:
+    """Turn an amplitude trace of fractions into the milliamperes that they were."""
+    values = unpack(trace)
+    trace.values_f32, trace.valid_bits = pack((values * cdbs_ma).astype(np.float32), ~np.isnan(values))
+    trace.unit = "mA"
+    trace.details = {**trace.details, "given_as": "fraction", "cdbs_ma": cdbs_ma}
+
+
+def contradictions(db: Session, session: StudySession, visit_open: bool = False) -> list[str]:
+    """Sentences where the amplitudes or the date of a session are not those of the controller and the visit it is said to have had.
+
+    Args:
+        visit_open: nobody has said the visit yet, so that its date contradicts nothing.
+    """
+    visit, found = session.visit, []
+    if not visit_open and visit.date is not None and session.started_at is not None and session.started_at.date() != visit.date:
+        found.append(f"Recorded on {session.started_at.date()}, but visit {visit.number} is dated {visit.date}. Correct one of them.")
     try:
-        table = step_table(db, session, participant.current_settings)
+        table = step_table(db, session, visit.participant.current_settings)
     except Invalid as error:
-        return [str(error)]
+        return [str(error), *found]
     inside = table.fraction[table.t_s > 0]
     known = inside[~np.isnan(inside)]
-    found = []
     if table.above_one:
         found.append(
             f"{table.above_one} of {inside.size} steps lie above the cDBS amplitude of {table.cdbs_ma or float('nan'):g} mA; "
             "they are kept as they are and stay out of replay buffers."
         )
+    arm = blinding.stated_arm(session, SYSTEM)
+    if arm is None:
+        return found
     mean = float(known.mean()) if known.size else None
-    if mean is not None and stated.controller == Controller.CDBS and not 0.9 <= mean <= 1.1:
+    if mean is not None and arm.controller is Controller.CDBS and not 0.9 <= mean <= 1.1:
         found.append(f"Said to be cDBS, but its mean amplitude is {100 * mean:.0f} % of the cDBS amplitude. Correct one of them.")
-    if mean is not None and stated.controller == Controller.NO_DBS and mean > 0.05:
+    if mean is not None and arm.controller is Controller.NO_DBS and mean > 0.05:
         found.append(f"Said to be without DBS, but its mean amplitude is {100 * mean:.0f} % of the cDBS amplitude. Correct one of them.")
-    if stated.controller in (Controller.RL, Controller.DISTILLED) and stated.policy_id is None:
+    if arm.controller in (Controller.RL, Controller.DISTILLED) and arm.policy_id is None:
         found.append("No policy is named for this session: it cannot be compared with its estimate. Name one on the session's page.")
     return found
 
 
-def _in_milliamperes(decoded: RecordingLog, participant: Participant, stated: StatedSession) -> tuple[RecordingLog, list[str]]:
-    """Fractions as the milliamperes they were, by the cDBS amplitude in force now: what was delivered must not change when that does."""
-    if not any(t.stream == AMPLITUDE_STREAM and t.unit == "fraction" for t in decoded.traces):
-        return decoded, []
-    hemisphere = stated.hemisphere or (Hemisphere(decoded.hemisphere) if decoded.hemisphere else None)
-    try:
-        cdbs = cdbs_in_force(stated.visit, hemisphere, participant.current_settings)
-    except Invalid as error:
-        return decoded, [f"Amplitudes are kept as fractions: {error}"]
-    if cdbs is None:
-        return decoded, ["Amplitudes are kept as fractions, because nobody has stated a cDBS amplitude for this participant yet."]
-    traces = tuple(
-        replace(t, unit="mA", values=(t.values * cdbs).astype(np.float32), details={**t.details, "given_as": "fraction", "cdbs_ma": cdbs})
-        if t.stream == AMPLITUDE_STREAM and t.unit == "fraction"
-        else t
-        for t in decoded.traces
-    )
-    return replace(decoded, traces=traces), []
+def refuse_overlap(db: Session, session: StudySession) -> None:
+    """Raises Conflict where a confirmed session already counts on the same stretch of a recording."""
+    for segment in session.segments:
+        for other in repository.segments_of_recording(db, segment.recording_id, besides=session.id):
+            shared = min(segment.stop_s, other.stop_s) - max(segment.start_s, other.start_s)
+            if other.session.status == "confirmed" and shared > 1e-3:
+                raise Conflict(
+                    f"{shared:.0f} s of this part already belong to session {other.session_id} "
+                    f"({other.start_s:.0f} to {other.stop_s:.0f} s of the recording).",
+                    "Choose another part of the recording, or correct that session first.",
+                )
 
 
 def disagreements(db: Session, session_ids: Sequence[int], stated: StatedSession) -> list[str]:
@@ -138,145 +255,16 @@ def disagreements(db: Session, session_ids: Sequence[int], stated: StatedSession
     found = []
     for session_id in dict.fromkeys(session_ids):
         session = study.session(db, session_id, SYSTEM)
-        arm = blinding.arm(session, SYSTEM)
+        arm = blinding.stated_arm(session, SYSTEM)
+        controller, policy_id = (arm.controller, arm.policy_id) if arm else (None, None)
         differs = []
-        if session.visit_id != stated.visit.id:
+        if stated.visit is not None and session.visit_id != stated.visit.id:
             differs.append(f"it stands in visit {session.visit.number}, not {stated.visit.number}")
-        if arm.controller != stated.controller:
-            differs.append(f"its controller is {arm.controller}, not {stated.controller}")
-        if stated.policy_id is not None and arm.policy_id != stated.policy_id:
-            differs.append(f"its policy is {arm.policy_id or 'none'}, not {stated.policy_id}")
+        if stated.controller is not None and controller != stated.controller:
+            differs.append(f"its controller is {controller or 'still open'}, not {stated.controller}")
+        if stated.policy_id is not None and policy_id != stated.policy_id:
+            differs.append(f"its policy is {policy_id or 'none'}, not {stated.policy_id}")
         if differs:
-            found.append(f"Session {session_id} was not changed: {'; '.join(differs)}. Correct it on its page if it is wrong there.")
+            where = "among the proposals" if session.status == "proposed" else "on its page"
+            found.append(f"Session {session_id} was not changed: {'; '.join(differs)}. Correct it {where} if it is wrong there.")
     return found
-
-
-def _add_recording(db: Session, participant: Participant, file: UploadFile, decoded: RecordingLog) -> Recording:
-    recording = Recording(
-        participant_id=participant.id,
-        device_id=_device(db, participant, decoded).id,
-        upload_file_id=file.id,
-        fingerprint=decoded.fingerprint,
-        hemisphere=decoded.hemisphere,
-        clock=decoded.clock,
-        started_at=_known_time(decoded.started_at),
-        duration_s=decoded.duration_s,
-        details=_json(
-            {
-                "kind": decoded.kind,
-                "events": [asdict(e) for e in decoded.events],
-                "limits": dict(decoded.limits),
-                "settings": dict(decoded.settings),
-                "quality": dict(decoded.quality),
-            }
-        ),
-    )
-    db.add(recording)
-    db.flush()
-    db.add_all(_trace(recording.id, t) for t in decoded.traces)
-    db.flush()
-    return recording
-
-
-def _device(db: Session, participant: Participant, decoded: RecordingLog) -> Device:
-    name = pseudonym(decoded.device_key, get_settings().secret("pseudonyms")) if decoded.device_key else decoded.kind
-    device = repository.device(db, participant.id, name)
-    if device is None:
-        device = Device(participant_id=participant.id, pseudonym=name, kind=decoded.kind, hemisphere=decoded.hemisphere)
-        db.add(device)
-        db.flush()
-    return device
-
-
-def _trace(recording_id: int, trace: TraceLog) -> Trace:
-    values, valid = pack(trace.values, trace.valid)
-    return Trace(
-        recording_id=recording_id,
-        decode_version=DECODE_VERSION,
-        stream=trace.stream,
-        channel=trace.channel,
-        unit=trace.unit,
-        source=trace.source,
-        dt_s=trace.dt_s,
-        first_end_s=trace.t_end_first_s,
-        n=trace.values.size,
-        values_f32=values,
-        valid_bits=valid,
-        details=_json(dict(trace.details)),
-    )
-
-
-def _add_session(
-    db: Session, participant: Participant, fresh: Sequence[tuple[Recording, RecordingLog]], stated: StatedSession
-) -> StudySession:
-    wanted_source = participant.current_settings.beta_source
-    choices = [(_control(log, wanted_source), recording, log) for recording, log in fresh]
-    control, recording, log = next((c for c in choices if c[0] is not None), choices[0])
-    started_at = stated.started_at or _known_time(log.started_at)
-    offset_s = _offset_s(log, started_at, participant.current_settings.period_s)
-    session = StudySession(
-        visit_id=stated.visit.id,
-        ordinal=study.next_ordinal(db, stated.visit.id),
-        hemisphere=stated.hemisphere or recording.hemisphere,
-        started_at=started_at,
-        duration_s=log.duration_s - offset_s,
-        control_stream=control.stream if control else CONTROL_STREAMS[0],
-        control_channel=control.channel if control else None,
-    )
-    blinding.assign(session, stated.controller, stated.policy_id)
-    for other, other_log in fresh:
-        start_s = _offset_s(other_log, started_at, participant.current_settings.period_s)
-        # a recording without data still says what was there; a segment needs a length
-        stop_s = max(other_log.duration_s, start_s + 1e-3)
-        session.segments.append(SessionSegment(recording=other, start_s=start_s, stop_s=stop_s, is_control=other is recording))
-    db.add(session)
-    db.flush()
-    return session
-
-
-def _known_time(value: datetime | None) -> datetime | None:
-    """A recording's own time, where its clock was set at all."""
-    try:
-        return sensible_time(value) if value is not None else None
-    except ValueError:
-        return None
-
-
-def _offset_s(log: RecordingLog, started_at: datetime | None, period_s: float) -> float:
-    """Where a session that starts at `started_at` begins in a recording, seconds, on the recording's grid; what comes before is its lead.
-
-    A recording without a time of its own begins with the session, and so does one that does not reach to the stated start.
-    """
-    if started_at is None or log.started_at is None:
-        return 0.0
-    offset = round((started_at - log.started_at).total_seconds() / period_s) * period_s
-    return offset if 0 < offset < log.duration_s else 0.0
-
-
-def _control(decoded: RecordingLog, wanted_source: str | None) -> TraceLog | None:
-    """The trace that the controller is taken to have seen: of the participant's source where there is one, else the first stream's."""
-    candidates = [t for stream in CONTROL_STREAMS for t in decoded.traces if t.stream == stream and t.valid.any()]
-    return next((t for t in candidates if t.source == wanted_source), candidates[0] if candidates else None)
-
-
-def _session_sentence(session: StudySession, control: Recording, stated: StatedSession) -> str:
-    length = f"{session.duration_s / 60:.1f} min" if session.duration_s else "no data"
-    channel = f"controlled by {session.control_stream} {session.control_channel or ''}".strip()
-    return f"Session {session.id}: visit {stated.visit.number}, {stated.controller}, {length}, {channel} (recording {control.id})."
-
-
-def _json(value: Any) -> Any:
-    """Plain JSON: NaN and infinity, which PostgreSQL's JSONB refuses, become null; times become ISO text."""
-    if isinstance(value, dict):
-        return {str(k): _json(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [_json(v) for v in value]
-    if isinstance(value, bool | int | str) or value is None:
-        return value
-    if isinstance(value, datetime):
-        return value.isoformat()
-    if hasattr(value, "tolist"):
-        return _json(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return str(value)

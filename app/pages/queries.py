@@ -24,7 +24,8 @@ class State:
     """Where a participant stands.
 
     Attributes:
-        sessions, excluded, without_qoc, proposed: counts; the last two of sessions that are not excluded.
+        sessions, excluded, without_qoc: counts of confirmed sessions; the last one of those that are not excluded.
+        proposed: sessions that wait for a person's confirmation and count nowhere yet.
         newest_session: when the last session was entered; None without any.
         last_visit, next_visit: the last one up to today, and the first from today on.
         policies: trained, distilled and external ones that are not retired.
@@ -91,7 +92,7 @@ def attention(participant: Participant, state: State) -> list[tuple[str, str]]:
     if state.without_qoc:
         todo.append((f"{_n(state.without_qoc, 'session')} without QoCs", f"{home}/visits"))
     if state.proposed:
-        todo.append((f"{_n(state.proposed, 'session')} to confirm", f"{home}/visits"))
+        todo.append((f"{_n(state.proposed, 'session')} to confirm", f"{home}/proposals"))
     if state.grown:
         todo.append(("New sessions since the last ranking; it is stale", f"{home}/ranking"))
     if state.plan == "draft":
@@ -124,16 +125,17 @@ def _study(db: Session, ids: list[int], found: dict[int, State], today: dt.date)
     )
     for key, visits_n, last, coming in db.execute(visits):
         found[key].visits, found[key].last_visit, found[key].next_visit = visits_n, last, coming
-    counts = StudySession.excluded_reason.is_(None)
+    confirmed = StudySession.status == "confirmed"
+    counts = confirmed & StudySession.excluded_reason.is_(None)
     has_qoc = select(QocRevision.id).where(QocRevision.session_id == StudySession.id).exists()
     sessions = (
         select(
             Visit.participant_id,
-            func.count(),
-            func.count().filter(~counts),
+            func.count().filter(confirmed),
+            func.count().filter(confirmed & ~counts),
             func.count().filter(counts & ~has_qoc),
-            func.count().filter(counts & (StudySession.status == "proposed")),
-            func.max(StudySession.created_at),
+            func.count().filter(~confirmed),
+            func.max(StudySession.created_at).filter(confirmed),
         )
         .join(Visit, Visit.id == StudySession.visit_id)
         .where(Visit.participant_id.in_(ids))

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session, selectinload
 from app.evaluation.models import Evaluation
 from app.planning.models import Plan
 from app.study.models import StudySession, Visit
-from app.study.repository import count
+from app.study.repository import CONFIRMED, count
 
 
 def live_plan(db: Session, visit_id: int) -> Plan | None:
@@ -34,16 +34,16 @@ def lock_visit(db: Session, visit_id: int) -> None:
 
 
 def session_count(db: Session, visit_id: int) -> int:
-    """Sessions that a visit already has."""
-    return db.scalar(select(func.count()).select_from(StudySession).where(StudySession.visit_id == visit_id)) or 0
+    """Confirmed sessions that a visit already has."""
+    return db.scalar(select(func.count()).select_from(StudySession).where(StudySession.visit_id == visit_id, CONFIRMED)) or 0
 
 
 def open_visits(db: Session, participant_id: int, today: date) -> Sequence[Visit]:
-    """Visits that may still be planned: without a session, today or later or without a date; by number."""
+    """Visits that may still be planned: without a confirmed session, today or later or without a date; by number."""
     return db.scalars(
         select(Visit)
         .where(Visit.participant_id == participant_id, or_(Visit.date.is_(None), Visit.date >= today))
-        .where(~exists().where(StudySession.visit_id == Visit.id))
+        .where(~exists().where(StudySession.visit_id == Visit.id, CONFIRMED))
         .order_by(Visit.number)
     ).all()
 

@@ -12,9 +12,11 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.policy import Caller
 from app.platform.database import Db
 from app.platform.schemas import Page, PagingQuery, RowId, problems
-from app.study import blinding, repository, service
+from app.study import blinding, outcome_values, outcomes, repository, service
 from app.study.models import Participant, StudySession, Visit
 from app.study.schemas import (
+    DerivedChoice,
+    OutcomeOut,
     ParticipantIn,
     ParticipantOut,
     QocIn,
@@ -24,6 +26,7 @@ from app.study.schemas import (
     SettingsChange,
     SettingsOut,
     TraceOut,
+    VisitChange,
     VisitIn,
     VisitOut,
 )
@@ -108,9 +111,17 @@ def read_visit(visit: CurrentVisit) -> VisitOut:
     return visit_out(visit, visit.participant.code)
 
 
+@router.patch("/visits/{visit_id}")
+def change_visit(visit: CurrentVisit, change: VisitChange, db: Db, caller: CurrentCaller) -> VisitOut:
+    """Correct a visit: its date, its note, its cDBS amplitudes; amplitude fractions of its sessions follow."""
+    service.change_visit(db, visit, change, caller)
+    db.commit()
+    return visit_out(visit, visit.participant.code)
+
+
 @router.get("/visits/{visit_id}/sessions")
 def list_sessions(visit: CurrentVisit, db: Db, caller: CurrentCaller, paging: PagingQuery) -> Page[SessionOut]:
-    """Sessions of a visit, in order."""
+    """Confirmed sessions of a visit, in order; proposals stand under the participant's."""
     rows, total = repository.sessions_of_visit(db, visit.id, paging.limit, paging.offset)
     return Page(items=[session_out(s, caller) for s in rows], total=total, limit=paging.limit, offset=paging.offset)
 
@@ -149,6 +160,28 @@ def record_qoc(session: CurrentSession, values: QocIn, db: Db, caller: CurrentCa
     return QocOut.model_validate(row)
 
 
+@router.get("/sessions/{session_id}/outcomes")
+def read_outcomes(session: CurrentSession, db: Db) -> list[OutcomeOut]:
+    """QoCs as the uploaded files give them, with what they rest on; `conflicts` where a person's value stands against them."""
+    return [outcome_out(session, d) for d in outcome_values.derive(db, session)]
+
+
+@router.post("/sessions/{session_id}/outcomes")
+def take_outcome(session: CurrentSession, choice: DerivedChoice, db: Db, caller: CurrentCaller) -> QocOut:
+    """Put the value that the files give in the place of a typed one; `value` is the one that was read before."""
+    row = service.take_derived(db, session, choice, caller)
+    db.commit()
+    return QocOut.model_validate(row)
+
+
+def outcome_out(session: StudySession, derived: outcome_values.Derived) -> OutcomeOut:
+    """A derived QoC for the API."""
+    conflicts = bool(outcomes.disagreements(session, [derived]))
+    return OutcomeOut.model_validate(
+        {"name": derived.name, "value": derived.value, "unit": derived.unit, "basis": derived.basis, "conflicts": conflicts}
+    )
+
+
 def participant_out(p: Participant) -> ParticipantOut:
     """A participant for the API."""
     return ParticipantOut(
@@ -166,15 +199,15 @@ def visit_out(v: Visit, code: str) -> VisitOut:
 
 def session_out(s: StudySession, caller: Caller) -> SessionOut:
     """A session for the API; the controller comes through the blinding gate."""
-    arm = blinding.arm(s, caller)
+    arm = blinding.stated_arm(s, caller)
     return SessionOut(
         id=s.id,
         visit_id=s.visit_id,
         visit=s.visit.number,
         participant=s.visit.participant.code,
         ordinal=s.ordinal,
-        controller=arm.controller,
-        policy_id=arm.policy_id,
+        controller=arm.controller if arm else None,
+        policy_id=arm.policy_id if arm else None,
         hemisphere=s.hemisphere,
         status=s.status,
         started_at=s.started_at,

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from app.accounts.policy import Caller
+from app.platform.errors import Conflict
 from app.study.models import Controller, StudySession
 
 CONTROLLER_NAMES: dict[Controller, str] = {
@@ -34,12 +35,24 @@ class Arm:
 
 
 def arm(session: StudySession, user: Caller) -> Arm:
-    """The arm of a session for this user. Studies are open-label so far, so that whoever may read the session may know its arm."""
+    """The arm of a session for this user. Studies are open-label so far, so that whoever may read the session may know its arm.
+
+    Raises:
+        Conflict: the session is a proposal, and nobody has stated its controller yet.
+    """
+    stated = stated_arm(session, user)
+    if stated is None:
+        raise Conflict(f"Session {session.id} is a proposal without a controller.", "State its controller and confirm it first.")
+    return stated
+
+
+def stated_arm(session: StudySession, user: Caller) -> Arm | None:
+    """The arm of a session that may still be a proposal; None where its controller is open."""
     user.require("read", session.visit.participant.site.study_id, session.visit.participant.site_id)
-    return Arm(Controller(session._controller), session._policy_id)
+    return None if session._controller is None else Arm(Controller(session._controller), session._policy_id)
 
 
-def assign(session: StudySession, controller: Controller, policy_id: int | None) -> None:
-    """Set the arm of a session."""
+def assign(session: StudySession, controller: Controller | None, policy_id: int | None) -> None:
+    """Set the arm of a session; without a controller only of a proposal."""
     session._controller = controller
     session._policy_id = policy_id

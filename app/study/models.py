@@ -73,6 +73,7 @@ class SettingsVersion(Base):
         CheckConstraint("cdbs_amplitude_ma > 0", name="cdbs_amplitude"),
         CheckConstraint("beta_low_hz > 0 and beta_low_hz < beta_high_hz", name="beta_band"),
         CheckConstraint("min_valid_fraction > 0 and min_valid_fraction <= 1", name="min_valid"),
+        CheckConstraint("beta_measure in ('rms', 'power')", name="beta_measure"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
@@ -96,6 +97,7 @@ class SettingsVersion(Base):
     beta_low_hz: Mapped[float]
     beta_high_hz: Mapped[float]
     min_valid_fraction: Mapped[float]
+    beta_measure: Mapped[str] = mapped_column(String(10), server_default="rms")
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
@@ -151,13 +153,17 @@ class Visit(Base):
 
 
 class StudySession(Base):
-    """One controller at work for 5-20 minutes. Which one it was is asked of `app.study.blinding.arm` alone, hence the underscores."""
+    """One controller at work for 5-20 minutes. Which one it was is asked of `app.study.blinding.arm` alone, hence the underscores.
+
+    A proposed session is what an upload seems to hold: it counts nowhere until a person confirms it, and may have no controller yet.
+    """
 
     __tablename__ = "session"
     __table_args__ = (
         UniqueConstraint("visit_id", "ordinal"),
         CheckConstraint("controller in ('cdbs', 'rl', 'distilled', 'no_dbs', 'random', 'other')", name="controller"),
         CheckConstraint("status in ('proposed', 'confirmed')", name="status"),
+        CheckConstraint("status = 'proposed' or controller is not null", name="controller_stated"),
         CheckConstraint("duration_s >= 0", name="duration"),
         CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"),
         CheckConstraint("excluded_reason is null or excluded_reason <> ''", name="excluded_reason"),
@@ -167,7 +173,7 @@ class StudySession(Base):
     id: Mapped[int] = mapped_column(primary_key=True)
     visit_id: Mapped[int] = mapped_column(ForeignKey("visit.id"), index=True)
     ordinal: Mapped[int]
-    _controller: Mapped[Controller] = mapped_column("controller", String(20))
+    _controller: Mapped[Controller | None] = mapped_column("controller", String(20))
     _policy_id: Mapped[int | None] = mapped_column("policy_id", ForeignKey("policy.id"), index=True)
     hemisphere: Mapped[Hemisphere | None] = mapped_column(String(5))
     status: Mapped[str] = mapped_column(String(20), server_default="confirmed")
@@ -178,7 +184,9 @@ class StudySession(Base):
     excluded_reason: Mapped[str | None] = mapped_column(Text)
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     visit: Mapped[Visit] = relationship(back_populates="sessions")
-    segments: Mapped[list[SessionSegment]] = relationship(back_populates="session", order_by="SessionSegment.start_s")
+    segments: Mapped[list[SessionSegment]] = relationship(
+        back_populates="session", order_by="SessionSegment.start_s", cascade="all, delete-orphan", passive_deletes=True
+    )
     qocs: Mapped[list[QocRevision]] = relationship(back_populates="session", order_by="QocRevision.revision")
 
     @property
@@ -274,5 +282,62 @@ class QocRevision(Base):
     tremor_percent: Mapped[float | None]
     entered_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
+    derived: Mapped[list[Any]] = mapped_column(server_default="[]")
+    """Names of the QoCs that stand in this revision as they were derived from uploaded files, not as a person typed them."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     session: Mapped[StudySession] = relationship(back_populates="qocs")
+
+
+class TremorSeries(Base):
+    """Minutes of tremor from one uploaded file of a watch, on the clock of the wall.
+
+    Little-endian arrays of `n` minutes in time order: `start_unix_s_f64` and `duration_s_f64` in seconds, `fractions_f32` [n, 6] in the
+    order of `ml.qoc.TREMOR_CLASSES`, `any_tremor_f32`; NaN where the export does not tell.
+    """
+
+    __tablename__ = "tremor_series"
+    __table_args__ = (
+        UniqueConstraint("participant_id", "upload_file_id"),
+        CheckConstraint("n >= 1", name="minutes"),
+        CheckConstraint("last_end_at > first_start_at", name="order"),
+        CheckConstraint(
+            "octet_length(start_unix_s_f64) = 8 * n and octet_length(duration_s_f64) = 8 * n"
+            " and octet_length(fractions_f32) = 24 * n and octet_length(any_tremor_f32) = 4 * n",
+            name="length",
+        ),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"))
+    upload_file_id: Mapped[int] = mapped_column(ForeignKey("upload_file.id"), index=True)
+    first_start_at: Mapped[datetime]
+    last_end_at: Mapped[datetime]
+    n: Mapped[int]
+    start_unix_s_f64: Mapped[bytes] = mapped_column(LargeBinary)
+    duration_s_f64: Mapped[bytes] = mapped_column(LargeBinary)
+    fractions_f32: Mapped[bytes] = mapped_column(LargeBinary)
+    any_tremor_f32: Mapped[bytes] = mapped_column(LargeBinary)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+
+
+class GraspTest(Base):
+    """One hand's grasp test near the end of a session: times of open fists, s (little-endian float64, `n` of them).
+
+    `implausible` lists which of the n - 1 intervals between them are too short or too long to be a grasp.
+    """
+
+    __tablename__ = "grasp_test"
+    __table_args__ = (
+        UniqueConstraint("session_id", "upload_file_id", "hand", postgresql_nulls_not_distinct=True),
+        CheckConstraint("hand in ('left', 'right')", name="hand"),
+        CheckConstraint("n >= 1 and octet_length(open_fist_s_f64) = 8 * n", name="length"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    session_id: Mapped[int] = mapped_column(ForeignKey("session.id", ondelete="CASCADE"))
+    upload_file_id: Mapped[int] = mapped_column(ForeignKey("upload_file.id"), index=True)
+    hand: Mapped[Hemisphere | None] = mapped_column(String(5))
+    n: Mapped[int]
+    open_fist_s_f64: Mapped[bytes] = mapped_column(LargeBinary)
+    implausible: Mapped[list[Any]]
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())

@@ -18,11 +18,12 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.forms import FormValues, parse
 from app.platform.templates import render
-from app.study import repository, service, session_pages, settings_form
+from app.study import outcome_values, outcomes, repository, service, session_pages, settings_form, visit_form
 from app.study.api import CurrentParticipant, CurrentVisit
 from app.study.blinding import arm
-from app.study.models import Participant, StudySession
+from app.study.models import Participant, StudySession, Visit
 from app.study.schemas import CdbsAmplitudeModel, ParticipantIn, SettingsIn, VisitIn
+from app.study.settings_form import Shown, own_changes
 
 log = structlog.get_logger()
 router = APIRouter()
@@ -85,7 +86,8 @@ def visits(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
     sessions = repository.sessions_of_participant(db, participant.id)
     days = [(v, [(s, arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in rows]
     may_write = _may(caller, can.WRITE_STUDY, participant)
-    return HTMLResponse(render(request, "study/visits.html", participant=participant, days=days, may_write=may_write))
+    waiting = repository.proposals_of_participant(db, participant.id)
+    return HTMLResponse(render(request, "study/visits.html", participant=participant, days=days, waiting=waiting, may_write=may_write))
 
 
 @router.get("/participants/{code}/visits/new")
@@ -118,16 +120,52 @@ def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller:
 @router.get("/visits/{visit_id}")
 def visit_page(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """One visit day: its sessions in order."""
+    return _visit_page(request, db, visit, caller)
+
+
+@router.post("/visits/{visit_id}")
+def change_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Correct a visit's date, note or cDBS amplitudes."""
+    present = Shown(1, visit_form.texts(visit), visit_form.last_editor(db, visit))
+    seen = Shown(0, visit_form.seen(values, present.fields), "")
+    changes = own_changes(visit_form.posted(values), "0", [seen, present], visit_form.labels(present.fields))
+    typed = changes.fields | {"reason": _reason(values) or ""}
+    try:
+        service.require(caller, can.WRITE_STUDY, visit.participant)
+        changes.refuse_conflicts()
+        service.change_visit(db, visit, visit_form.change(present.fields, changes.fields, typed["reason"]), caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _visit_page(request, db, visit, caller, typed, error)
+    db.commit()
+    return RedirectResponse(f"/visits/{visit.id}?done=corrected", 303)
+
+
+def _visit_page(
+    request: Request, db: Session, visit: Visit, caller: Caller, typed: dict[str, str] | None = None, error: BetaloopError | None = None
+) -> HTMLResponse:
     sessions, _ = repository.sessions_of_visit(db, visit.id)
-    rows = [_session_row(db, s, caller) for s in sessions]
-    may_write = _may(caller, can.WRITE_STUDY, visit.participant)
-    page = render(request, "study/visit.html", visit=visit, participant=visit.participant, rows=rows, may_write=may_write)
-    return HTMLResponse(page)
+    seen = visit_form.texts(visit)
+    page = render(
+        request,
+        "study/visit.html",
+        visit=visit,
+        participant=visit.participant,
+        rows=[_session_row(db, s, caller) for s in sessions],
+        proposals=[s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id],
+        seen=seen,
+        draft=seen | {"reason": ""} | (typed or {}),
+        labels=visit_form.labels(seen),
+        may_write=_may(caller, can.WRITE_STUDY, visit.participant),
+        problem=error.problem(request.url.path) if error else None,
+    )
+    return HTMLResponse(page, error.status if error else 200)
 
 
 def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str, Any]:
     """What the visit's table says of a session; a session that cannot be laid on the grid says why."""
-    row: dict[str, Any] = {"session": session, "arm": arm(session, caller), "summary": None, "problem": ""}
+    clashes = outcomes.disagreements(session, outcome_values.derive(db, session))
+    row: dict[str, Any] = {"session": session, "arm": arm(session, caller), "summary": None, "problem": "", "clashes": clashes}
     try:
         row["summary"] = session_pages.summarise(service.session_data(db, session))
     except BetaloopError as error:

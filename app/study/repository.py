@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import datetime
 from typing import Any
 
 from sqlalchemy import ColumnElement, Select, column, false, func, or_, select, table, true
@@ -10,8 +11,23 @@ from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.models import Site
 from app.accounts.policy import Caller
+from app.platform.audit import AuditEvent
 from app.platform.errors import NotFound
-from app.study.models import Participant, QocRevision, Recording, SessionSegment, SettingsVersion, StudySession, Trace, Visit
+from app.study.models import (
+    GraspTest,
+    Participant,
+    QocRevision,
+    Recording,
+    SessionSegment,
+    SettingsVersion,
+    StudySession,
+    Trace,
+    TremorSeries,
+    Visit,
+)
+
+CONFIRMED = StudySession.status == "confirmed"
+"""Condition on `StudySession`: only what a person has confirmed counts in buffers, analyses, rankings and exports."""
 
 
 def in_scope(caller: Caller) -> ColumnElement[bool]:
@@ -87,15 +103,22 @@ def session(db: Session, session_id: int, caller: Caller) -> StudySession:
 
 
 def sessions_of_visit(db: Session, visit_id: int, limit: int = 500, offset: int = 0) -> tuple[Sequence[StudySession], int]:
-    """A page of a visit's sessions in order."""
-    query = _sessions().where(StudySession.visit_id == visit_id)
-    rows = db.scalars(query.order_by(StudySession.ordinal).limit(limit).offset(offset)).all()
-    return rows, count(db, select(StudySession.id).where(StudySession.visit_id == visit_id))
+    """A page of a visit's confirmed sessions in order."""
+    mine = (StudySession.visit_id == visit_id) & CONFIRMED
+    rows = db.scalars(_sessions().where(mine).order_by(StudySession.ordinal).limit(limit).offset(offset)).all()
+    return rows, count(db, select(StudySession.id).where(mine))
 
 
-def sessions_of_participant(db: Session, participant_id: int) -> Sequence[StudySession]:
-    """All sessions of a participant by visit and order, with QoCs, segments and recordings."""
-    return db.scalars(_sessions().where(Visit.participant_id == participant_id).order_by(Visit.number, StudySession.ordinal)).all()
+def sessions_of_participant(db: Session, participant_id: int, with_proposals: bool = False) -> Sequence[StudySession]:
+    """Confirmed sessions of a participant by visit and order, with QoCs, segments and recordings; proposals only where asked for."""
+    query = _sessions().where(Visit.participant_id == participant_id, true() if with_proposals else CONFIRMED)
+    return db.scalars(query.order_by(Visit.number, StudySession.ordinal)).all()
+
+
+def proposals_of_participant(db: Session, participant_id: int) -> Sequence[StudySession]:
+    """Sessions that wait for a person's confirmation, by visit and start."""
+    query = _sessions().where(Visit.participant_id == participant_id, StudySession.status == "proposed")
+    return db.scalars(query.order_by(Visit.number, StudySession.started_at, StudySession.id)).all()
 
 
 def next_ordinal(db: Session, visit_id: int) -> int:
@@ -124,6 +147,51 @@ def session_ids_of_recording(db: Session, recording_id: int) -> Sequence[int]:
 def qoc_revision(db: Session, session_id: int) -> int:
     """How many revisions a session's QoCs have."""
     return db.scalar(select(func.count()).select_from(QocRevision).where(QocRevision.session_id == session_id)) or 0
+
+
+def last_editor(db: Session, entity: str, row_id: int) -> str:
+    """Who changed a session or a visit (with its amplitudes) last, by the audit trail; empty where nobody did."""
+    mine = (AuditEvent.entity == entity) & (AuditEvent.entity_id == str(row_id))
+    if entity == "visit":
+        row = func.coalesce(AuditEvent.after, AuditEvent.before)
+        mine |= (AuditEvent.entity == "cdbs_amplitude") & (row["visit_id"].as_integer() == row_id)
+    return db.scalar(select(AuditEvent.actor).where(mine).order_by(AuditEvent.id.desc()).limit(1)) or ""
+
+
+def lock_session(db: Session, session: StudySession) -> None:
+    """Lock a session and read its QoCs again, so that two corrections at once become two revisions and neither is lost."""
+    db.execute(select(StudySession.id).where(StudySession.id == session.id).with_for_update())
+    db.expire(session, ["qocs"])
+
+
+def tremor_series(db: Session, participant_id: int, start: datetime, stop: datetime) -> Sequence[TremorSeries]:
+    """Files of minutes of tremor that reach into a stretch of time, oldest first."""
+    reaching = (TremorSeries.last_end_at > start) & (TremorSeries.first_start_at < stop)
+    own = select(TremorSeries).where(TremorSeries.participant_id == participant_id, reaching)
+    return db.scalars(own.order_by(TremorSeries.upload_file_id)).all()
+
+
+def tremor_series_of_file(db: Session, participant_id: int, upload_file_id: int) -> TremorSeries | None:
+    """The minutes of tremor that a file gave."""
+    own = (TremorSeries.participant_id == participant_id) & (TremorSeries.upload_file_id == upload_file_id)
+    return db.scalar(select(TremorSeries).where(own))
+
+
+def grasp_tests(db: Session, session_id: int) -> Sequence[GraspTest]:
+    """The grasp tests of a session, oldest file first."""
+    return db.scalars(select(GraspTest).where(GraspTest.session_id == session_id).order_by(GraspTest.upload_file_id, GraspTest.id)).all()
+
+
+def grasp_tests_of_file(db: Session, upload_file_id: int) -> Sequence[GraspTest]:
+    """The grasp tests that a file gave, of whatever session."""
+    return db.scalars(select(GraspTest).where(GraspTest.upload_file_id == upload_file_id)).all()
+
+
+def uploads_of_files(db: Session, upload_file_ids: Sequence[int]) -> dict[int, int]:
+    """Number of the upload that each file came in. Uploads belong to a later phase; of their table only numbers are needed here."""
+    files = table("upload_file", column("id"), column("upload_id"))
+    rows = db.execute(select(files.c.id, files.c.upload_id).where(files.c.id.in_(upload_file_ids)))
+    return {row.id: row.upload_id for row in rows}
 
 
 def policy_id(db: Session, participant_id: int, name_or_id: str) -> int | None:

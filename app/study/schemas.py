@@ -18,6 +18,7 @@ def _one_spelling(unit: str) -> str:
 
 
 Unit = Annotated[Text, AfterValidator(_one_spelling)]
+BetaMeasure = Literal["rms", "power"]
 BetaSource = Literal["time_domain", "device_power", "percept_lfp", "table"]
 Code = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$")]
 
@@ -43,6 +44,9 @@ class SettingsIn(Model):
     beta_low_hz: Number = Field(13.0, gt=0, description="Lower edge of the beta band, Hz.")
     beta_high_hz: Number = Field(35.0, gt=0, description="Upper edge of the beta band, Hz.")
     min_valid_fraction: Number = Field(0.7, gt=0, le=1, description="Share of its samples that a 2 s window needs to be valid.")
+    beta_measure: BetaMeasure = Field(
+        "rms", description="Beta from time-domain LFP: 'rms' amplitude (in its unit) or 'power' (unit squared)."
+    )
 
 
 class SettingsOut(SettingsIn):
@@ -96,6 +100,15 @@ class VisitIn(Model):
     cdbs_amplitudes: list[CdbsAmplitudeModel] = Field(default_factory=list, max_length=8)
 
 
+class VisitChange(Model):
+    """What a person may correct of a visit; what is left out stays. A list of amplitudes replaces the whole list."""
+
+    date: dt.date | None = None
+    note: Text | None = Field(None, max_length=4000)
+    cdbs_amplitudes: list[CdbsAmplitudeModel] | None = Field(None, max_length=8)
+    reason: Text = Field(min_length=1, max_length=1000, description="Why; kept in the audit trail.")
+
+
 class VisitOut(Model):
     """A visit."""
 
@@ -122,9 +135,27 @@ class QocOut(Model):
     grasp_hz: float | None
     rating: int | None
     tremor_percent: float | None
+    derived: list[str] = Field(description="Members that were derived from uploaded files and not typed.")
     revision: int
     entered_by: str
     created_at: datetime
+
+
+class DerivedChoice(Model):
+    """A derived QoC that shall replace what a person typed; `value` is the one that was shown."""
+
+    name: Literal["grasp_hz", "tremor_percent"]
+    value: Number = Field(ge=0, le=100)
+
+
+class OutcomeOut(Model):
+    """A QoC as uploaded files give it; null where they do not suffice, for the reason in `basis`."""
+
+    name: Literal["grasp_hz", "tremor_percent"]
+    value: float | None
+    unit: str
+    basis: str
+    conflicts: bool
 
 
 class SessionOut(Model):
@@ -135,7 +166,7 @@ class SessionOut(Model):
     visit: int
     participant: str
     ordinal: int
-    controller: Controller
+    controller: Controller | None = Field(description="Null only of a proposal whose controller nobody has stated yet.")
     policy_id: int | None
     hemisphere: Hemisphere | None
     status: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,9 +16,9 @@ from app.accounts.models import Site
 from app.accounts.policy import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
-from app.study import blinding, repository
+from app.study import blinding, outcomes, repository
 from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision, SettingsVersion, StudySession, Visit
-from app.study.schemas import ParticipantIn, QocIn, SessionChange, SettingsIn, VisitIn
+from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, ParticipantIn, QocIn, SessionChange, SettingsIn, VisitChange, VisitIn
 from app.study.traces import StepTable, step_table
 from ml.mdp import MdpSettings
 from ml.qoc import Qoc
@@ -77,11 +78,25 @@ def mdp_settings(settings: SettingsVersion, suggestion: float | None = None) -> 
 
 
 def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> float | None:
-    """A threshold from the data: midway between the median beta of cDBS sessions and that of no-DBS sessions, else the median of all."""
+    """A threshold from the data: midway between the median beta of cDBS sessions and that of no-DBS sessions, else the median of all.
+
+    Of confirmed sessions that are not excluded, with beta in the settings' unit and from their source; None where these leave it open and
+    the sessions have several, which are never mixed.
+    """
+    settings = participant.current_settings
     groups: dict[Controller, list[np.ndarray[Any, Any]]] = {}
+    kinds: set[tuple[str, str]] = set()
     for session in repository.sessions_of_participant(db, participant.id):
-        beta = step_table(db, session, participant.current_settings).beta
-        groups.setdefault(blinding.arm(session, caller).controller, []).append(beta[~np.isnan(beta)])
+        table = step_table(db, session, settings)
+        trace = table.beta_trace
+        if session.excluded_reason or trace is None:
+            continue
+        if (settings.beta_unit or trace.unit, settings.beta_source or trace.source) != (trace.unit, trace.source):
+            continue
+        kinds.add((trace.unit, trace.source))
+        groups.setdefault(blinding.arm(session, caller).controller, []).append(table.beta[~np.isnan(table.beta)])
+    if len(kinds) > 1:
+        return None
     medians = {c: float(np.median(np.concatenate(b))) for c, b in groups.items() if sum(x.size for x in b)}
     if Controller.CDBS in medians and Controller.NO_DBS in medians:
         return (medians[Controller.CDBS] + medians[Controller.NO_DBS]) / 2
@@ -94,9 +109,7 @@ def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Cal
     require(caller, can.WRITE_STUDY, participant)
     if repository.visit_by_number(db, participant.id, draft.number):
         raise Conflict(f"Participant {participant.code} already has a visit {draft.number}.", "Choose the next number.")
-    keys = [(a.hemisphere, a.program) for a in draft.cdbs_amplitudes]
-    if len(set(keys)) < len(keys):
-        raise Invalid("The same hemisphere and program stand twice in cdbs_amplitudes.", "Give each once.")
+    _each_once(draft.cdbs_amplitudes)
     visit = Visit(participant_id=participant.id, number=draft.number, date=draft.date, note=draft.note)
     visit.cdbs_amplitudes = [CdbsAmplitude(**a.model_dump()) for a in draft.cdbs_amplitudes]
     db.add(visit)
@@ -104,36 +117,64 @@ def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Cal
     return visit
 
 
+def change_visit(db: Session, visit: Visit, change: VisitChange, caller: Caller) -> Visit:
+    """Correct a visit's date, note or cDBS amplitudes; its sessions' fractions follow, the audit trail keeps what stood before and why."""
+    require(caller, can.WRITE_STUDY, visit.participant)
+    set_reason(db, change.reason)
+    given = change.model_fields_set
+    if "date" in given:
+        visit.date = change.date
+    if "note" in given:
+        visit.note = change.note or ""
+    if "cdbs_amplitudes" in given:
+        wanted = change.cdbs_amplitudes or []
+        _each_once(wanted)
+        stated = {(a.hemisphere, a.program): a.amplitude_ma for a in wanted}
+        for row in list(visit.cdbs_amplitudes):
+            amplitude = stated.pop((row.hemisphere, row.program), None)
+            if amplitude is None:
+                visit.cdbs_amplitudes.remove(row)
+                db.delete(row)
+            else:
+                row.amplitude_ma = amplitude
+        visit.cdbs_amplitudes += [CdbsAmplitude(hemisphere=h, program=p, amplitude_ma=ma) for (h, p), ma in stated.items()]
+    db.flush()
+    return visit
+
+
+def _each_once(amplitudes: Sequence[CdbsAmplitudeModel]) -> None:
+    keys = [(a.hemisphere, a.program) for a in amplitudes]
+    if len(set(keys)) < len(keys):
+        raise Invalid("The same hemisphere and program stand twice in cdbs_amplitudes.", "Give each once.")
+
+
 def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller) -> QocRevision:
     """Enter or correct QoCs: a new revision that keeps what the call leaves out. Same values, no revision."""
     require(caller, can.WRITE_STUDY, session.visit.participant)
-    # under a lock, and read again, so that two corrections at once become two revisions and neither is lost
-    db.execute(select(StudySession.id).where(StudySession.id == session.id).with_for_update())
-    db.expire(session, ["qocs"])
+    _refuse_proposal(session)
+    repository.lock_session(db, session)
     known = session.qoc
     given = values.model_dump(exclude_unset=True, exclude={"reason"})
-    merged = {name: getattr(known, name, None) for name in ("grasp_hz", "rating", "tremor_percent")} | given
+    merged = {name: getattr(known, name, None) for name in outcomes.QOC_FIELDS} | given
     if known is not None and all(getattr(known, name) == value for name, value in merged.items()):
         return known
     if known is None and all(value is None for value in merged.values()):
         raise Invalid("No QoC was given.", "Enter at least one of grasp frequency, rating and tremor.")
-    set_reason(db, values.reason)
-    revision = QocRevision(
-        session_id=session.id,
-        revision=repository.qoc_revision(db, session.id) + 1,
-        entered_by=caller.label,
-        reason=values.reason,
-        **merged,
-    )
-    db.add(revision)
-    db.flush()
-    db.expire(session, ["qocs"])
-    return revision
+    kept = [name for name in (known.derived if known else ()) if merged[name] == getattr(known, name)]
+    return outcomes.add_revision(db, session, given, caller.label, values.reason, kept)
+
+
+def take_derived(db: Session, session: StudySession, choice: DerivedChoice, caller: Caller) -> QocRevision:
+    """Put a derived QoC in the place of a typed one. Raises Invalid where the files give another value by now."""
+    require(caller, can.WRITE_STUDY, session.visit.participant)
+    _refuse_proposal(session)
+    return outcomes.take_derived(db, session, choice.name, choice.value, caller.label)
 
 
 def change_session(db: Session, session: StudySession, change: SessionChange, caller: Caller) -> StudySession:
     """Correct a session; the audit trail keeps what stood before and why."""
     require(caller, can.WRITE_STUDY, session.visit.participant)
+    _refuse_proposal(session)
     given = change.model_dump(exclude_unset=True, exclude={"reason"})
     set_reason(db, change.reason)
     arm = blinding.arm(session, caller)
@@ -151,7 +192,16 @@ def change_session(db: Session, session: StudySession, change: SessionChange, ca
             continue
         setattr(session, name, value)
     db.flush()
+    if "hemisphere" in given:
+        outcomes.derive_for_session(db, session)  # another hand's grasps may count now
     return session
+
+
+def _refuse_proposal(session: StudySession) -> None:
+    if session.status == "proposed":
+        raise Conflict(
+            f"Session {session.id} is a proposal that nobody has confirmed yet.", "Confirm or correct it among the proposals first."
+        )
 
 
 def _check_policy(db: Session, session: StudySession, controller: Controller, policy_id: int | None) -> None:

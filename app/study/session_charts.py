@@ -1,4 +1,4 @@
-"""Charts of one session: beta against the threshold and the amplitude on one time axis, and the recording's other traces."""
+"""The main chart of one session: beta against the threshold and the amplitude on one time axis; its stimulation steps and conflicts."""
 
 from __future__ import annotations
 
@@ -10,13 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.platform.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, figure, horizontal
-from app.study.models import Trace
+from app.study.recording_charts import trace_name
 from app.study.service import SessionData
-from app.study.traces import unpack
+from app.study.traces import amplitude_program, session_offset_s
 from ml.mdp import AMPLITUDE_TOLERANCE
-
-_DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
-_COLOURS = ("token:cdbs", "token:rl", "token:random", "token:distilled", "token:other", "token:no_dbs")
 
 
 @dataclass(frozen=True)
@@ -41,17 +38,22 @@ class StimulationStep:
 def stimulation_steps(data: SessionData, events: Sequence[Mapping[str, Any]], origin_s: float) -> list[StimulationStep]:
     """Stretches of equal amplitude within the session: from the device's log where there is one, else from the 2 s table.
 
+    Under embedded adaptive stimulation the log of stimulation does not hold what was delivered (the amplitude trace comes from AdaptiveLog
+    then): the table counts.
+
     Args:
         data: the session. events: of its control recording, as stored. origin_s: where the session starts in that recording's clock.
     """
-    logged = [e for e in events if e["kind"] == "stimulation" and "delivered_ma" in e["data"]]
+    trace = data.table.amplitude_trace
+    origin = trace.details.get("origin") if trace is not None else None
+    logged = [e for e in events if e["kind"] == "stimulation" and "delivered_ma" in e["data"] and e["data"].get("origin", origin) == origin]
     return _logged_steps(data, logged, origin_s) if logged else _table_steps(data)
 
 
 def _logged_steps(data: SessionData, logged: Sequence[Mapping[str, Any]], origin_s: float) -> list[StimulationStep]:
     """Steps from the device's log, in the program that the amplitude trace shows, cut at the session's ends."""
     trace, cdbs = data.table.amplitude_trace, data.table.cdbs_ma
-    program = int(trace.channel.rpartition(" ")[2]) if trace and trace.channel.startswith("program ") else 0
+    program = amplitude_program(trace) if trace else 0
     changes = sorted((float(e["t_s"]) - origin_s, float(e["data"]["delivered_ma"][program])) for e in logged)
     steps: list[StimulationStep] = []
     for i, (start, amplitude) in enumerate(changes):
@@ -71,17 +73,17 @@ def operator_conflicts(events: Sequence[Mapping[str, Any]], origin_s: float) -> 
     return [(float(e["t_s"]) - origin_s, str(e["label"]), e["data"].get("device_amplitude_ma")) for e in notes]
 
 
-def _fit_axis(yaxis: dict[str, Any], values: NDArray[np.float64], threshold: float | None) -> int:
-    """Keep a few huge windows (an amplifier's step) from flattening the rest; returns how many lie above the axis."""
+def _fit_axis(yaxis: dict[str, Any], values: NDArray[np.float64], threshold: float | None) -> float | None:
+    """Keep a few huge windows (an amplifier's step) from flattening the rest; returns the top of the axis where some lie above it."""
     known = values[~np.isnan(values)]
     if known.size < 20:
-        return 0
+        return None
     top = 1.5 * float(np.quantile(known, 0.9))
     if float(known.max()) <= 4 * top or top <= 0:
-        return 0
+        return None
     top = max(top, 1.2 * threshold if threshold is not None else 0.0)
     yaxis["range"] = [0, top]
-    return int(np.sum(known > top))
+    return top
 
 
 def _table_steps(data: SessionData) -> list[StimulationStep]:
@@ -103,23 +105,25 @@ def _table_steps(data: SessionData) -> list[StimulationStep]:
 
 
 def control_chart(data: SessionData) -> Chart:
-    """Beta with the threshold above, amplitude in mA and as a fraction below, one time axis; gaps stay gaps."""
+    """Beta with the threshold above, amplitude in mA and as a fraction below, one time axis; windows without valid beta stay gaps."""
     table, settings = data.table, data.settings
     minutes = table.t_s / 60
     unit = table.beta_trace.unit if table.beta_trace else ""
+    stream = table.beta_trace.stream if table.beta_trace else "beta"
+    name = {"beta": "Beta amplitude", "band_power": "Band power"}.get(stream, stream.replace("_", " ").capitalize())
     known = int(np.sum(~np.isnan(table.beta[table.t_s > 0])))
     traces: list[dict[str, Any]] = [
         {
-            "type": "scatter", "mode": "lines+markers", "name": "Beta amplitude", "x": minutes, "y": table.beta, "connectgaps": False,
+            "type": "scatter", "mode": "lines+markers", "name": name, "x": minutes, "y": table.beta, "connectgaps": False,
             "line": {"color": ACCENT, "width": 1.5}, "marker": {"size": 3.5, "color": ACCENT},
-            "hovertemplate": f"%{{x:.2f}} min<br>%{{y:.4g}} {unit}<extra>beta</extra>",
+            "hovertemplate": f"%{{x:.2f}} min<br>%{{y:.4g}} {unit}<extra></extra>",
         },
         *_amplitude_traces(data, minutes),
     ]  # fmt: skip
     layout: dict[str, Any] = {
         "grid": {"rows": 2, "columns": 1},
         "xaxis": axis("Time in session", "min", anchor="y2", zeroline=False),
-        "yaxis": axis("Beta", unit, domain=[0.47, 1.0], zeroline=False, rangemode="tozero"),
+        "yaxis": axis(name, unit, domain=[0.47, 1.0], zeroline=False, rangemode="tozero"),
         "yaxis2": axis(
             "Amplitude", "mA" if _has(table.amplitude_ma) else "fraction", domain=[0.0, 0.38], rangemode="nonnegative", zeroline=False,
         ),
@@ -129,72 +133,62 @@ def control_chart(data: SessionData) -> Chart:
     _mark_lead(layout, float(minutes[0]))
     if data.threshold is not None:
         _add(layout, horizontal(data.threshold, f"threshold {data.threshold:.4g} {unit}".strip(), WARN))
-    above = _fit_axis(layout["yaxis"], table.beta, data.threshold)
+    missing = _mark_missing(layout, data) if table.beta_trace else 0
+    if missing:
+        # an entry of the legend for the shading
+        shade = {"symbol": "square", "size": 11, "color": "token:warn/0.3"}
+        traces.append({"type": "scatter", "mode": "markers", "name": "no valid window", "x": [None], "y": [None], "marker": shade})
+    spikes = _spike_rows(data)
+    if spikes.any():
+        bottom = np.where(np.isnan(table.beta), 0.0, table.beta)
+        mark = {"symbol": "x-thin", "size": 9, "color": BAD, "line": {"width": 2, "color": BAD}}
+        traces.append(
+            {
+                "type": "scatter", "mode": "markers", "name": "power spikes left out", "x": minutes[spikes], "y": bottom[spikes],
+                "marker": mark, "hoverinfo": "skip",
+            }
+        )  # fmt: skip
+    top = _fit_axis(layout["yaxis"], table.beta, data.threshold)
+    over = table.beta > (top if top is not None else np.inf)
+    if top is not None:
+        traces.append(
+            {
+                "type": "scatter", "mode": "markers", "name": "above the axis", "x": minutes[over],
+                "y": np.full(int(over.sum()), 0.985 * top), "marker": {"symbol": "triangle-up-open", "size": 9, "color": BAD},
+                "customdata": table.beta[over], "hovertemplate": f"%{{customdata:.4g}} {unit}<extra>above the axis</extra>",
+            }
+        )  # fmt: skip
     if _has(table.amplitude_ma) and table.cdbs_ma:
         _add(layout, horizontal(table.cdbs_ma, f"cDBS {table.cdbs_ma:.3g} mA", MUTED, "dot", "y2"))
-        top = 1.15 * max(table.cdbs_ma, float(np.nanmax(table.amplitude_ma)))
-        layout["yaxis2"] |= {"range": [0, top]}
+        highest = 1.15 * max(table.cdbs_ma, float(np.nanmax(table.amplitude_ma)))
+        layout["yaxis2"] |= {"range": [0, highest]}
         layout["yaxis3"] = axis(
             "of cDBS",
             "%",
             overlaying="y2",
             side="right",
-            range=[0, 100 * top / table.cdbs_ma],
+            range=[0, 100 * highest / table.cdbs_ma],
             showgrid=False,
             zeroline=False,
             tickmode="auto",
         )
         traces.append({"type": "scatter", "x": [minutes[0]], "y": [None], "yaxis": "y3", "showlegend": False, "hoverinfo": "skip"})
-    subtitle = f"{unit or 'no unit'} over {settings.period_s:g} s · n = {known} of {int(np.sum(table.t_s > 0))} steps with beta"
-    if above:
-        subtitle += f" · {above} above the axis, up to {float(np.nanmax(table.beta)):.3g}"
-    columns = ("Step end (s)", f"Beta ({unit or '—'})", "Amplitude (mA)", "Fraction of cDBS")
-    rows: list[list[Cell]] = [
-        [float(t), _known(b), _known(a), _known(f)]
-        for t, b, a, f in zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, strict=True)
+    subtitle = f"{unit or 'no unit'} over {settings.period_s:g} s · n = {known} of {int(np.sum(table.t_s > 0))} steps with a valid window"
+    if over.any():
+        subtitle += f" · {int(over.sum())} above the axis, up to {float(np.nanmax(table.beta)):.3g}"
+    if spikes.any():
+        subtitle += f" · power spikes left out of {int(spikes.sum())} windows"
+    columns = ("Step end (s)", f"{name} ({unit or '—'})", "Amplitude (mA)", "Fraction of cDBS", "Mark")
+    marks = [
+        ", ".join(w for w, on in (("no valid window", m), ("power spikes left out", x)) if on)
+        for m, x in zip(np.isnan(table.beta), spikes, strict=True)
     ]
-    return Chart("control", "Beta and amplitude", subtitle, figure(traces, **layout), columns, rows, height=470)
-
-
-def other_charts(traces: Sequence[Trace], origin_s: float, duration_s: float, skip: set[int]) -> list[Chart]:
-    """The recording's traces besides the two that the controller used, one chart per unit."""
-    charts = []
-    rest = [t for t in traces if t.id not in skip]
-    for number, unit in enumerate(sorted({t.unit for t in rest})):
-        group = [t for t in rest if t.unit == unit]
-        lines: list[dict[str, Any]] = []
-        rows: list[list[Cell]] = []
-        for i, trace in enumerate(group):
-            ends = trace.first_end_s - origin_s + trace.dt_s * np.arange(trace.n)
-            inside = ends <= duration_s + trace.dt_s / 2
-            values = unpack(trace)
-            name = f"{trace.stream} {trace.channel}".strip().replace("_", " ")
-            lines.append(
-                {
-                    "type": "scatter", "mode": "lines", "name": name, "x": ends[inside] / 60, "y": values[inside], "connectgaps": False,
-                    "line": {"color": _COLOURS[i % len(_COLOURS)], "dash": _DASHES[i // len(_COLOURS) % len(_DASHES)], "width": 1.5},
-                }
-            )  # fmt: skip
-            known = values[inside][~np.isnan(values[inside])]
-            spread: list[Cell] = [float(np.median(known)), float(known.min()), float(known.max())] if known.size else [None, None, None]
-            rows.append([name, int(known.size), int(inside.sum()), *spread, trace.source])
-        streams = ", ".join(sorted({t.stream.replace("_", " ") for t in group}))
-        title = streams[:1].upper() + streams[1:]
-        layout = {"xaxis": axis("Time in session", "min"), "yaxis": axis("", unit, zeroline=False), "showlegend": True}
-        columns = ("Trace", "Valid steps", "Steps", f"Median ({unit})", f"Minimum ({unit})", f"Maximum ({unit})", "Source")
-        n = sum(int(r[1]) for r in rows if isinstance(r[1], int))
-        charts.append(
-            Chart(
-                f"traces-{number}",
-                title,
-                f"{unit} · n = {n} windows in {len(group)} traces",
-                figure(lines, **layout),
-                columns,
-                rows,
-                height=300,
-            )
-        )
-    return charts
+    rows: list[list[Cell]] = [
+        [float(t), _known(b), _known(a), _known(f), mark]
+        for t, b, a, f, mark in zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, marks, strict=True)
+    ]
+    title = f"{trace_name(table.beta_trace)} and amplitude" if table.beta_trace else "Amplitude"
+    return Chart("control", title[:1].upper() + title[1:], subtitle, figure(traces, **layout), columns, rows, height=470)
 
 
 def _amplitude_traces(data: SessionData, minutes: NDArray[np.float64]) -> list[dict[str, Any]]:
@@ -226,6 +220,38 @@ def _mark_lead(layout: dict[str, Any], first: float) -> None:
             "line": {"width": 0}, "layer": "below",
         }
     )  # fmt: skip
+
+
+def _mark(missing: bool, spikes: bool) -> str:
+    return ", ".join(word for word, on in (("no valid window", missing), ("power spikes left out", spikes)) if on)
+
+
+def _spike_rows(data: SessionData) -> NDArray[np.bool_]:
+    """Rows of the session's grid in which the decoder left spikes out."""
+    table, trace = data.table, data.table.beta_trace
+    out = np.zeros(table.t_s.size, dtype=bool)
+    if trace is None:
+        return out
+    rows = np.array([r for r in trace.details.get("spike_rows") or [] if isinstance(r, int)], dtype=np.int64)
+    ends = trace.first_end_s + trace.dt_s * rows - session_offset_s(data.session, trace.recording_id)
+    at = np.rint((ends - table.t_s[0]) / data.settings.period_s).astype(int)
+    out[at[(at >= 0) & (at < out.size)]] = True
+    return out
+
+
+def _mark_missing(layout: dict[str, Any], data: SessionData) -> int:
+    """Shade the session's windows without a valid value; returns how many there are."""
+    table, period = data.table, data.settings.period_s
+    missing = np.isnan(table.beta) & (table.t_s > 0)
+    edges = np.flatnonzero(np.diff(np.r_[False, missing, False].astype(int)))
+    for first, stop in zip(edges[::2], edges[1::2], strict=True):
+        layout["shapes"].append(
+            {
+                "type": "rect", "xref": "x", "x0": (table.t_s[first] - period) / 60, "x1": table.t_s[stop - 1] / 60, "yref": "y domain",
+                "y0": 0, "y1": 1, "fillcolor": "token:warn/0.18", "line": {"width": 0}, "layer": "below",
+            }
+        )  # fmt: skip
+    return int(missing.sum())
 
 
 def _add(layout: dict[str, Any], line_and_label: tuple[dict[str, Any], dict[str, Any]]) -> None:

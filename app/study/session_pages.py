@@ -17,20 +17,23 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.forms import FormValues, parse
 from app.platform.templates import render
-from app.study import repository, service
+from app.study import repository, service, session_view
 from app.study.api import CurrentSession
 from app.study.blinding import CONTROLLER_NAMES, arm
 from app.study.models import QocRevision, Recording, StudySession
-from app.study.schemas import QocIn, SessionChange
+from app.study.schemas import DerivedChoice, QocIn, SessionChange
 from app.study.service import SessionData
-from app.study.session_charts import control_chart, operator_conflicts, other_charts, stimulation_steps
+from app.study.session_charts import operator_conflicts, stimulation_steps
 from app.study.settings_form import Shown, own_changes
-from app.study.traces import session_offset_s
+from app.study.traces import AMPLITUDE_STREAM, session_offset_s
 from ml.energy import relative_energy
 
 router = APIRouter()
 
 _QOC_LABELS = {"grasp_hz": "Grasp frequency", "rating": "Rating", "tremor_percent": "Tremor", "reason": "Reason"}
+_CORRECTION_LABELS = {
+    "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "control": "Control trace", "correction_reason": "Reason",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -84,8 +87,10 @@ def summarise(data: SessionData) -> Summary:
 
 
 @router.get("/sessions/{session_id}")
-def session_page(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """One session."""
+def session_page(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller) -> Response:
+    """One session; a proposal is looked at where it is confirmed."""
+    if session.status == "proposed":
+        return RedirectResponse(f"/proposals/{session.id}", 303)
     return _page(request, db, session, caller)
 
 
@@ -127,19 +132,51 @@ def exclude(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
 @router.post("/sessions/{session_id}/correction")
 def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Correct what a session was: controller, policy, hemisphere, the trace that drove the controller."""
+    # only what the form changed of what it showed, so that an old form takes back nothing that somebody else corrected meanwhile
+    present = Shown(1, _correction(session, caller), repository.last_editor(db, "session", session.id))
+    shown = Shown(0, {n: str(values.get(f"seen_{n}", text)) for n, text in present.fields.items()}, "")
+    changes = own_changes(values, "0", [shown, present], _CORRECTION_LABELS)
+    reason = str(values.get("reason", "")).strip()[:1000]
     try:
-        fields: dict[str, Any] = {n: values.get(n, "") for n in ("controller", "hemisphere", "reason") if n in values}
-        policy = str(values.get("policy", "")).strip()
-        fields["policy_id"] = _policy_id(db, session, policy) if policy else ""
-        stream, _, channel = str(values.get("control", "")).partition("\t")
+        service.require(caller, can.WRITE_STUDY, session.visit.participant)
+        changes.refuse_conflicts()
+        fields: dict[str, Any] = {n: changes.fields[n] for n in ("controller", "hemisphere") if n in changes.fields} | {"reason": reason}
+        if "policy" in changes.fields:
+            policy = changes.fields["policy"]
+            fields["policy_id"] = _policy_id(db, session, policy) if policy else ""
+        stream, _, channel = changes.fields.get("control", "").partition("\t")
         if stream:
             fields |= {"control_stream": stream, "control_channel": channel}
-        service.change_session(db, session, parse(SessionChange, fields), caller)
+        service.change_session(db, session, parse(SessionChange, fields, _CORRECTION_LABELS), caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, db, session, caller, error, typed=changes.fields | {"correction_reason": reason})
+    db.commit()
+    return RedirectResponse(f"/sessions/{session.id}?done=corrected", 303)
+
+
+@router.post("/sessions/{session_id}/derived")
+def take_derived(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Put the value that the uploaded files give in the place of a typed one."""
+    try:
+        shown = parse(DerivedChoice, {"name": values.get("name", ""), "value": values.get("value", "")}, {"value": "Derived value"})
+        service.take_derived(db, session, shown, caller)
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, session, caller, error)
     db.commit()
-    return RedirectResponse(f"/sessions/{session.id}?done=corrected", 303)
+    return RedirectResponse(f"/sessions/{session.id}?done=derived", 303)
+
+
+def _correction(session: StudySession, caller: Caller) -> dict[str, str]:
+    """What the form of corrections shows of a session."""
+    known = arm(session, caller)
+    return {
+        "controller": known.controller.value,
+        "policy": "" if known.policy_id is None else str(known.policy_id),
+        "hemisphere": session.hemisphere or "",
+        "control": f"{session.control_stream}\t{session.control_channel or ''}",
+    }
 
 
 def _qoc_revisions(session: StudySession) -> list[Shown]:
@@ -176,9 +213,8 @@ def _page(
         data = service.session_data(db, session)
     except BetaloopError as unreadable:
         trouble = unreadable.problem(request.url.path)
-    used = {t.id for t in (data.table.beta_trace, data.table.amplitude_trace) if t} if data else set()
-    others = [c for r in recordings for c in other_charts(traces[r.id], session_offset_s(session, r.id), session.duration_s, used)]
-    known = _shown_qoc(session.qoc)
+    view = session_view.shown_trace(session, data, traces, request.query_params.get("trace", ""))
+    known, seen = _shown_qoc(session.qoc), _correction(session, caller)
     events, origin = _control_events(session, recordings)
     page = render(
         request,
@@ -192,13 +228,16 @@ def _page(
         data=data,
         trouble=trouble,
         summary=summarise(data) if data else None,
-        control=control_chart(data) if data and (data.table.beta_trace or data.table.amplitude_trace) else None,
+        view=view,
         steps=stimulation_steps(data, events, origin) if data else [],
         conflicts=operator_conflicts(events, origin),
-        others=others,
-        streams=[t for r in recordings for t in traces[r.id] if t.stream != "amplitude"],
+        blocks=session_view.recording_blocks(session, recordings, traces, view.used),
+        outcomes=session_view.outcomes_view(db, session),
+        streams=[t for r in recordings for t in traces[r.id] if t.stream != AMPLITUDE_STREAM],
         recordings=recordings,
         qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
+        correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},
+        seen=seen,
         may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
         problem=error.problem(request.url.path) if error else None,
     )

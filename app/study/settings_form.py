@@ -69,6 +69,10 @@ GROUPS = (
                 "min_valid_fraction", "Valid share of a window",
                 "A window with fewer valid samples than this share counts as missing, 0 to 1.",
             ),
+            SettingField(
+                "beta_measure", "Measure of beta", "What is computed from time-domain LFP. Recordings decoded before keep theirs.",
+                options=(("rms", "RMS amplitude, in the LFP's unit"), ("power", "power, in the LFP's unit squared")),
+            ),
         ),
     ),
     SettingGroup(

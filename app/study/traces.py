@@ -63,10 +63,13 @@ def cdbs_amplitude_ma(session: StudySession, settings: SettingsVersion, program:
 def cdbs_in_force(visit: Visit, hemisphere: Hemisphere | None, settings: SettingsVersion, program: int = 0) -> float | None:
     """The visit's cDBS amplitude of a hemisphere and program, mA, else the settings' shorthand; None where nobody stated one.
 
+    A program of which the visit says nothing has the amplitude of program 0, under which an amplitude without a program is kept.
+
     Raises:
         Invalid: the visit states both hemispheres, and it is not known which one is meant.
     """
-    rows = [a for a in visit.cdbs_amplitudes if a.program == program and hemisphere in (None, a.hemisphere)]
+    sides = [a for a in visit.cdbs_amplitudes if hemisphere in (None, a.hemisphere)]
+    rows = [a for a in sides if a.program == program] or [a for a in sides if a.program == 0]
     if len(rows) == 1:
         return rows[0].amplitude_ma
     if len(rows) > 1:
@@ -80,10 +83,7 @@ def step_table(db: Session, session: StudySession, settings: SettingsVersion) ->
     Raises:
         Invalid: traces of one recording that do not share a grid, or two segments that claim the same rows.
     """
-    cdbs = cdbs_amplitude_ma(session, settings)
-    period, lead = settings.period_s, settings.window
-    steps = int(np.floor(session.duration_s / period + 1e-6))
-    t_s = period * np.arange(-lead + 1, steps + 1, dtype=np.float64)
+    period, t_s = settings.period_s, _grid(session, settings)
     beta, amount = np.full(t_s.size, np.nan), np.full(t_s.size, np.nan)
     beta_trace = amplitude_trace = None
     for segment in session.segments:
@@ -99,11 +99,54 @@ def step_table(db: Session, session: StudySession, settings: SettingsVersion) ->
         if driving is not None:
             _place(amount, t_s, driving, origin, period)
             amplitude_trace = driving
+    cdbs = cdbs_amplitude_ma(session, settings, amplitude_program(amplitude_trace) if amplitude_trace else 0)
+    return _table(t_s, beta, amount, beta_trace, amplitude_trace, cdbs)
+
+
+def shown_table(session: StudySession, settings: SettingsVersion, trace: Trace, amplitude: Trace | None) -> StepTable:
+    """Any trace of a session's recordings on the session's grid, with an amplitude of the same recording; `beta` holds its values.
+
+    The cDBS amplitude is that of the trace's own side and of the amplitude's program.
+
+    Raises:
+        Invalid: a trace that is not on the participant's grid, or a visit that states both sides and a recording that names none.
+    """
+    program = amplitude_program(amplitude) if amplitude is not None else 0
+    cdbs = cdbs_in_force(session.visit, trace.recording.hemisphere or session.hemisphere, settings, program)
+    t_s = _grid(session, settings)
+    beta, amount = np.full(t_s.size, np.nan), np.full(t_s.size, np.nan)
+    origin = session_offset_s(session, trace.recording_id)
+    _place(beta, t_s, trace, origin, settings.period_s)
+    if amplitude is not None:
+        _place(amount, t_s, amplitude, origin, settings.period_s)
+    return _table(t_s, beta, amount, trace, amplitude, cdbs)
+
+
+def amplitude_program(trace: Trace) -> int:
+    """The stimulation program of an amplitude trace; 0 where it names none."""
+    word, _, number = trace.channel.rpartition(" ")
+    return int(number) if word == "program" and number.isdecimal() else 0
+
+
+def _grid(session: StudySession, settings: SettingsVersion) -> NDArray[np.float64]:
+    """Ends of the session's rows, with W rows before its start, s."""
+    steps = int(np.floor(session.duration_s / settings.period_s + 1e-6))
+    return settings.period_s * np.arange(-settings.window + 1, steps + 1, dtype=np.float64)
+
+
+def _table(
+    t_s: NDArray[np.float64],
+    beta: NDArray[np.float64],
+    amount: NDArray[np.float64],
+    beta_trace: Trace | None,
+    amplitude_trace: Trace | None,
+    cdbs: float | None,
+) -> StepTable:
+    unknown = np.full(t_s.size, np.nan)
     if amplitude_trace is not None and amplitude_trace.unit == "fraction":
-        fraction, milliamperes = amount, amount * cdbs if cdbs else np.full(t_s.size, np.nan)
+        milliamperes, fraction = amount * cdbs if cdbs else unknown, amount
     else:
-        milliamperes = amount
-        fraction = amount / cdbs if cdbs else np.full(t_s.size, np.nan)
+        milliamperes, fraction = amount, amount / cdbs if cdbs else unknown
     return StepTable(t_s, beta, milliamperes, fraction, beta_trace, amplitude_trace, cdbs)
 
 

@@ -20,7 +20,8 @@ from app.study.models import CdbsAmplitude, Hemisphere, StudySession
 from app.study.repository import participant_by_code
 
 COMMANDS = (
-    "serve", "worker", "demo", "migrate", "user add", "token create", "import", "pipeline", "rank", "export",
+    "serve", "worker", "demo", "migrate", "user add", "token create", "import", "pipeline", "rank", "export", "control",
+    "ingest redecode", "study simulate",
 )  # fmt: skip
 TABLE = "t_s,beta,amplitude_fraction\n0,1,1\n2,1,0.5\n4,2,0.5\n"
 

@@ -15,9 +15,19 @@ WRITERS = {
     ("post", "/api/v1/participants"): {"clinician", "engineer", "admin"},
     ("put", "/api/v1/participants/{code}/settings"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/participants/{code}/visits"): {"clinician", "engineer", "admin"},
+    ("patch", "/api/v1/visits/{visit_id}"): {"clinician", "engineer", "admin"},
     ("patch", "/api/v1/sessions/{session_id}"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/sessions/{session_id}/outcomes"): {"clinician", "engineer", "admin"},
     ("put", "/api/v1/sessions/{session_id}/qoc"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/uploads"): {"clinician", "engineer", "admin"},
+    ("patch", "/api/v1/proposals/{session_id}"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/proposals/{session_id}/confirm"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/proposals/{session_id}/split"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/proposals/{session_id}/discard"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/uploaded-files/{file_id}/session"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/uploaded-files/{file_id}/review"): {"clinician", "admin"},
+    ("post", "/api/v1/uploaded-files/{file_id}/release"): {"clinician", "admin"},
+    ("post", "/api/v1/uploaded-files/{file_id}/discard"): {"clinician", "admin"},
     ("post", "/api/v1/participants/{code}/policies"): {"engineer", "admin"},
     ("patch", "/api/v1/policies/{policy_id}"): {"engineer", "admin"},
     ("post", "/api/v1/participants/{code}/snapshots"): {"clinician", "engineer", "admin"},
@@ -26,14 +36,25 @@ WRITERS = {
     ("post", "/api/v1/jobs/{job_id}/retry"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/visits/{visit_id}/plan"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/visits/{visit_id}/plan/approve"): {"clinician", "admin"},
+    ("post", "/api/v1/participants/{code}/buffer-gate"): {"clinician", "admin"},
 }
 FORMS: dict[str, dict[str, Any]] = {
+    "/api/v1/participants/{code}/buffer-gate": {"json": {"choice": "open", "reason": "agreed in the trial meeting"}},
     "/api/v1/policies/{policy_id}": {"json": {"retired_reason": "worn out"}},
     "/api/v1/participants": {"json": {"code": "Q1"}},
     "/api/v1/participants/{code}/settings": {"json": {"settings": {"gamma": 0.9}}},
     "/api/v1/participants/{code}/visits": {"json": {"number": 77}},
+    "/api/v1/visits/{visit_id}": {"json": {"note": "tired", "reason": "forgotten"}},
     "/api/v1/sessions/{session_id}": {"json": {"reason": "none"}},
+    "/api/v1/sessions/{session_id}/outcomes": {"json": {"name": "grasp_hz", "value": 2.0}},
     "/api/v1/sessions/{session_id}/qoc": {"json": {"rating": 5}},
+    "/api/v1/proposals/{session_id}": {"json": {"version": 1}},
+    "/api/v1/proposals/{session_id}/confirm": {"json": {"version": 1}},
+    "/api/v1/proposals/{session_id}/split": {"json": {"version": 1, "parts": [{"start_s": 0, "stop_s": 4}]}},
+    "/api/v1/proposals/{session_id}/discard": {"json": {"version": 1, "reason": "none"}},
+    "/api/v1/uploaded-files/{file_id}/session": {"json": {"session_id": 1}},
+    "/api/v1/uploaded-files/{file_id}/release": {"json": {"how": "as_is", "reason": "none"}},
+    "/api/v1/uploaded-files/{file_id}/discard": {"json": {"reason": "none"}},
     "/api/v1/participants/{code}/jobs": {"json": {"kind": "pipeline"}},
     "/api/v1/visits/{visit_id}/plan": {"json": {"policy_ids": [1]}},
 }
@@ -66,9 +87,11 @@ def ids(client: TestClient, enrolled: str) -> dict[str, Any]:
         "visit_id": session["visit_id"],
         "session_id": session["id"],
         "upload_id": upload["id"],
+        "file_id": upload["files"][0]["id"],
         "policy_id": 1,
         "job_id": "00000000-0000-0000-0000-000000000000",
         "snapshot_id": 1,
+        "sweep_id": 1,
         "evaluation_id": 1,
     }
 
@@ -117,7 +140,7 @@ def test_a_caller_of_another_study_sees_nothing(service_app: Any, client: TestCl
         token = service.create_token(db, "bob@other.example", "t")
     stranger = TestClient(service_app, headers={"Authorization": f"Bearer {token}"})
     assert stranger.get("/api/v1/participants").json()["total"] == 0
-    own = {"/api/v1/participants", "/healthz"}
+    own = {"/api/v1/participants", "/healthz", "/api/v1/bundle-key"}  # the key that every bundle is verified with is public
     answers = {(m, p): call(stranger, m, p, ids).status_code for m, p in routes(service_app) if p not in own}
     assert set(answers.values()) <= {404}, {k: v for k, v in answers.items() if v != 404}
 

@@ -116,7 +116,7 @@ def test_the_session_chart_keeps_gaps_and_flags_what_exceeds_cdbs(browser: TestC
     assert (amplitude["y"][0], max(amplitude["y"])) == (1.5, pytest.approx(3.6, abs=1e-6))  # type: ignore[index]
     assert len(above["x"]) == 1  # type: ignore[index]
     assert "1 of 40 steps above 100 % of the cDBS amplitude" in page
-    assert "n = 37 of 40 steps with beta" in page
+    assert "n = 37 of 40 steps with a valid window" in page
     assert "1, longest 6 s" in page
 
 
@@ -218,7 +218,7 @@ def test_the_upload_form_takes_files_and_reports_on_each(browser: TestClient, cl
     assert "known already" in again.text
     assert client.get("/api/v1/visits/1/sessions").json()["total"] == 1
     assert browser.post(url, data=fields, files=[("file", ("bad.csv", b"nothing"))]).status_code == 422
-    refused = browser.post(url, data=fields | {"controller": ""}, files=[("file", ("good.csv", table))])
+    refused = browser.post(url, data=fields | {"controller": "warp"}, files=[("file", ("good.csv", table))])
     assert refused.status_code == 422
     assert "Controller" in refused.text
     report = re.search(r"/uploads/\d+", again.text)

@@ -1,0 +1,71 @@
+"""The form that corrects a visit: date, note, and the cDBS amplitude of each hemisphere and program."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from app.platform.errors import Invalid
+from app.platform.forms import parse
+from app.study import repository
+from app.study.models import Hemisphere, Visit
+from app.study.schemas import CdbsAmplitudeModel, VisitChange
+
+SIDES = tuple(side.value for side in Hemisphere)
+PROGRAMS = range(4)
+_PLAIN = {"date": "Date", "note": "Note"}
+
+
+def texts(visit: Visit) -> dict[str, str]:
+    """The visit as the form shows it."""
+    fields = {"date": visit.date.isoformat() if visit.date else "", "note": visit.note or ""}
+    fields |= {f"cdbs_{side}_{program}": "" for program in PROGRAMS for side in SIDES}
+    return fields | {f"cdbs_{a.hemisphere}_{a.program}": f"{a.amplitude_ma:.10g}" for a in visit.cdbs_amplitudes}
+
+
+def labels(fields: Mapping[str, str]) -> dict[str, str]:
+    """What the form calls its fields."""
+    return {name: _PLAIN.get(name) or _label(name) for name in fields}
+
+
+def seen(values: Mapping[str, Any], present: Mapping[str, str]) -> dict[str, str]:
+    """What the posted form had shown; a field of which it says nothing is held against what is stored now."""
+    return {name: posted(values).get(f"seen_{name}", text) for name, text in present.items()}
+
+
+def posted(values: Mapping[str, Any]) -> dict[str, str]:
+    """The posted fields; browsers send line breaks as two characters."""
+    return {str(name): str(value).replace("\r\n", "\n") for name, value in values.items()}
+
+
+def change(present: Mapping[str, str], changed: Mapping[str, str], reason: str) -> VisitChange:
+    """The change of a visit that the form asks for.
+
+    Raises:
+        Invalid: no reason, or a field that cannot be read; names it.
+    """
+    if not reason:
+        raise Invalid("A correction needs a reason.", "Say why the visit is corrected.")
+    fields: dict[str, Any] = {name: changed[name] for name in _PLAIN if name in changed}
+    draft = parse(VisitChange, fields | {"reason": reason}, _PLAIN)
+    merged = {**present, **changed}
+    if any(name.startswith("cdbs_") for name in changed):
+        draft.cdbs_amplitudes = [_amplitude(n, text) for n, text in merged.items() if n.startswith("cdbs_") and text.strip()]
+    return draft
+
+
+def last_editor(db: Session, visit: Visit) -> str:
+    """Who changed the visit last."""
+    return repository.last_editor(db, "visit", visit.id)
+
+
+def _amplitude(name: str, text: str) -> CdbsAmplitudeModel:
+    _, side, program = name.split("_")
+    return parse(CdbsAmplitudeModel, {"hemisphere": side, "program": program, "amplitude_ma": text}, {"amplitude_ma": _label(name)})
+
+
+def _label(name: str) -> str:
+    _, side, program = name.split("_")
+    return f"cDBS amplitude, {side}" + (f", program {program}" if program != "0" else "")

@@ -1,0 +1,81 @@
+"""Guesses at the visit and the controller of a recording, and the sentence that says why."""
+
+from __future__ import annotations
+
+from datetime import UTC, date, datetime
+
+import numpy as np
+import pytest
+
+from app.ingest.evidence import guess_controller, guess_visit
+from app.study.models import Controller, Visit
+from app.study.traces import StepTable
+
+nan = float("nan")
+
+
+def steps(amplitude_ma: list[float], cdbs_ma: float | None = 3.0) -> StepTable:
+    amount = np.array([9.9, *amplitude_ma])  # the row before the session must not count
+    t_s = 2.0 * np.arange(amount.size)
+    fraction = amount / cdbs_ma if cdbs_ma else np.full(amount.size, nan)
+    return StepTable(t_s, np.ones(amount.size), amount, fraction, None, None, cdbs_ma)
+
+
+@pytest.mark.parametrize(
+    ("amplitude_ma", "guess", "why"),
+    [
+        ([0, 0, 0, 0], Controller.NO_DBS, "0 in all 4 steps"),
+        ([0, 0, nan, 0], Controller.NO_DBS, "0 in all 3 steps where it is known"),
+        ([3.0, 3.0, 3.0], Controller.CDBS, "within 5 % of the cDBS amplitude of 3 mA"),
+        ([3.15, 2.85, 3.0], Controller.CDBS, "within 5 %"),
+        ([3.2, 3.2, 3.2], None, "constant at 3.2 mA, 107 % of the cDBS amplitude"),
+        ([1.5, 1.5, 1.5], None, "50 % of the cDBS amplitude"),
+        ([0, 0, 0, 0.1], None, "varies between 0 and 0.1 mA"),
+        ([1.0, 3.0, 2.0], None, "varies between 1 and 3 mA"),
+        ([nan, nan], None, "tells no amplitude"),
+        ([3.0, nan, nan, nan], None, "known in only 1 of 4 steps"),
+    ],
+)
+def test_the_controller_is_guessed_from_the_amplitude_or_left_open(amplitude_ma: list[float], guess: Controller | None, why: str) -> None:
+    found, said = guess_controller(steps(amplitude_ma))
+    assert found is guess
+    assert why in said
+
+
+def test_without_a_stated_cdbs_amplitude_a_constant_one_proves_nothing_but_zero_does() -> None:
+    assert guess_controller(steps([2.4, 2.4], cdbs_ma=None)) == (
+        None,
+        "the amplitude is constant at 2.4 mA, but no cDBS amplitude is stated to hold it against",
+    )
+    assert guess_controller(steps([0, 0], cdbs_ma=None))[0] is Controller.NO_DBS
+
+
+VISITS = [Visit(number=1, date=date(2026, 3, 2)), Visit(number=2, date=date(2026, 3, 30)), Visit(number=3, date=date(2026, 4, 27))]
+TODAY = date(2026, 4, 1)
+
+
+def test_the_visit_of_the_recordings_day_is_taken() -> None:
+    guess = guess_visit(VISITS, datetime(2026, 3, 2, 23, 30, tzinfo=UTC), None, TODAY)
+    assert (guess.visit.number, guess.open, guess.why) == (1, False, "recorded on 2026-03-02, the day of visit 1")
+
+
+def test_the_stated_visit_wins_over_the_day() -> None:
+    guess = guess_visit(VISITS, datetime(2026, 3, 2, tzinfo=UTC), VISITS[1], TODAY)
+    assert (guess.visit.number, guess.open) == (2, False)
+
+
+@pytest.mark.parametrize(
+    ("started_at", "why"),
+    [(None, "tells no date"), (datetime(2026, 3, 9, tzinfo=UTC), "recorded on 2026-03-09, and no visit has that date")],
+)
+def test_without_a_visit_of_that_day_the_choice_is_open_and_kept_in_the_newest_past_visit(started_at: datetime | None, why: str) -> None:
+    guess = guess_visit(VISITS, started_at, None, TODAY)
+    assert (guess.visit.number, guess.open) == (2, True)
+    assert why in guess.why
+
+
+def test_two_visits_of_one_day_leave_the_choice_open() -> None:
+    twice = [*VISITS, Visit(number=4, date=date(2026, 3, 2))]
+    guess = guess_visit(twice, datetime(2026, 3, 2, tzinfo=UTC), None, TODAY)
+    assert guess.open
+    assert "2 visits are dated 2026-03-02" in guess.why
