@@ -12,6 +12,7 @@ import pytest
 from alembic import command
 from alembic.config import Config
 from fastapi.testclient import TestClient
+from hypothesis import settings
 from pwdlib import PasswordHash
 from pwdlib.hashers.argon2 import Argon2Hasher
 from sqlalchemy import create_engine
@@ -22,6 +23,10 @@ from app.accounts import service as accounts
 from app.platform.embedded_postgres import EmbeddedPostgres
 from app.platform.jobs import engine as jobs_engine
 from app.settings import get_settings
+
+# Machines that are busy with other work make single examples slow; in CI the same examples are drawn every time.
+settings.register_profile("betaloop", deadline=None, derandomize=bool(os.environ.get("CI")))
+settings.load_profile("betaloop")
 
 ROOT = Path(__file__).resolve().parents[1]
 PASSWORD = "correct horse battery"

@@ -13,6 +13,7 @@ from ml import progress
 from ml.trajectories import ReplayBuffer, from_parquet
 
 if TYPE_CHECKING:
+    from ml.rl.configs import TrainConfig
     from ml.rl.held_out import HeldOut
     from ml.rl.networks import MlpPolicy
     from ml.rl.policy import Policy
@@ -75,7 +76,7 @@ def train(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, An
     for k, result in enumerate(results):
         write_atomically(workdir / policy_file(k), result.policy.to_onnx())
         write_atomically(workdir / training_file(k), result.to_bytes())
-        members.append({"config": result.config.to_json(), "metrics": _metrics(result, states)})
+        members.append({"config": result.config.to_json(), "metrics": _metrics(result, states) | _share_of_end(learnt, result.config)})
     return {"members": members, "held_out_sessions": [s.session_id for s in held_out.sessions.sessions] if held_out else []}
 
 
@@ -151,6 +152,16 @@ def _hold_out(buffer: ReplayBuffer, wanted: bool, every: int) -> tuple[ReplayBuf
         sessions=left, score=lambda policy: fqe_value(learnt, policy, left.sessions).value, score_name="fqe", every=every, patience=6
     )
     return learnt, watching
+
+
+def _share_of_end(learnt: ReplayBuffer, config: TrainConfig) -> dict[str, Any]:
+    """How well r_end falls apart into shares of steps, where a policy was to learn from them; null where it learned without."""
+    from ml.rl.end_reward import fit_end_reward
+
+    if config.aim != "return":
+        return {}
+    share = fit_end_reward(learnt)
+    return {"end_reward": {"skill": share.skill, "sessions": share.sessions} if share else None}
 
 
 def _metrics(result: TrainedPolicy, states: Any) -> dict[str, Any]:

@@ -27,8 +27,8 @@ DISTILLATION: dict[str, dict[str, Any]] = {"full": {"updates": 5_000, "sigma": 0
 def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]) -> list[dict[str, Any]]:
     """The policies of a sweep in groups that are trained side by side, each in a child process of its own.
 
-    From scratch the policies are dealt to the algorithms in turn; those of one algorithm have learning rates spread evenly in the
-    logarithm and fill two groups, one for each core. Seeds count up over all. A fine-tuned policy is a group of its own.
+    From scratch the policies are dealt to the algorithms (and aims) in turn; those of one algorithm have learning rates spread evenly
+    in the logarithm and fill two groups, one for each core. Seeds count up over all. A fine-tuned policy is a group of its own.
 
     Args:
         params: what was asked for.
@@ -40,11 +40,13 @@ def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]
     if params.policies:
         return [_fine_tuning(params, k, start) for k, start in enumerate(starts) if start is not None]
     groups: list[dict[str, Any]] = []
-    for which, algorithm in enumerate(params.algorithms):
-        numbers = list(range(which, params.count, len(params.algorithms)))
+    aims = ("steps", "return") if params.aim == "both" else (params.aim,)
+    kinds = [(algorithm, aim) for algorithm in params.algorithms for aim in aims]
+    for which, (algorithm, aim) in enumerate(kinds):
+        numbers = list(range(which, params.count, len(kinds)))
         low, high = _rates(params, algorithm)
         configs = [
-            _config(params, algorithm, actor_lr=_between(low, high, k, len(numbers)), seed=params.seed + number)
+            _config(params, algorithm, actor_lr=_between(low, high, k, len(numbers)), seed=params.seed + number) | {"aim": aim}
             for k, number in enumerate(numbers)
         ]
         half = -(-len(configs) // 2)
@@ -55,7 +57,9 @@ def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]
 def _fine_tuning(params: TrainParams, k: int, start: dict[str, Any]) -> dict[str, Any]:
     low, high = _rates(params, start["algorithm"])
     rate = _between(low, high, k, len(params.policies))
-    config = _config(params, start["algorithm"], actor_lr=rate, seed=params.seed + k)
+    config = _config(params, start["algorithm"], actor_lr=rate, seed=params.seed + k) | {
+        "aim": "return" if params.aim == "return" else "steps"
+    }
     return {"key": f"train/{k}", "algorithm": start["algorithm"], "configs": [config], "start": start}
 
 

@@ -48,6 +48,10 @@ class SweepParams(Model):
     algorithms: Annotated[list[AlgorithmName], Field(min_length=1, max_length=5)] = Field(
         ["ddpg"], description="The policies are dealt to these in turn; from scratch only."
     )
+    aim: Literal["steps", "return", "both"] = Field(
+        "steps",
+        description="What the critics sum: step rewards, as in the paper; each step's share of r_end besides; or one and the other.",
+    )
     policies: PolicyIds = Field(default_factory=list, description="Fine-tune from each of these; empty: train from scratch.")
     count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch; the paper trains 6.")
     held_out: bool = Field(

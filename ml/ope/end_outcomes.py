@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.batches import FEWEST_OUTCOMES, outcome_table
+from ml.statistics.ridge import leave_one_out_errors, ridge_weights
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
@@ -73,7 +74,7 @@ def fit_end_model(buffer: ReplayBuffer, indices: NDArray[np.int64] | None = None
     for j in range(n_outcomes):
         ok = np.isfinite(table[:, j])
         if seen[j]:
-            errors = [float(np.mean(_leave_one_out(x[ok], table[ok, j], p) ** 2)) for p in PENALTIES]
+            errors = [float(np.mean(leave_one_out_errors(x[ok], table[ok, j], p) ** 2)) for p in PENALTIES]
             best = int(np.argmin(errors))
             penalties[j], residual[j] = PENALTIES[best], np.sqrt(errors[best])
             variance = float(table[ok, j].var())
@@ -98,19 +99,7 @@ def _weights(x: Floats, table: Floats, penalties: Floats, everything: Floats) ->
     for j in range(table.shape[1]):
         ok = np.isfinite(table[:, j])
         if ok.any():
-            weights[:, j] = np.linalg.solve(_gram(x[ok], float(penalties[j])), x[ok].T @ table[ok, j])
+            weights[:, j] = ridge_weights(x[ok], table[ok, j], float(penalties[j]))
         elif np.isfinite(everything[:, j]).any():
             weights[0, j] = np.nanmean(everything[:, j])
     return weights
-
-
-def _gram(x: Floats, penalty: float) -> Floats:
-    ridge = np.full(x.shape[1], penalty)
-    ridge[0] = 1e-9
-    return np.asarray(x.T @ x + np.diag(ridge), dtype=np.float64)
-
-
-def _leave_one_out(x: Floats, y: Floats, penalty: float) -> Floats:
-    """Prediction errors with each session left out in turn, by the hat matrix."""
-    hat = x @ np.linalg.solve(_gram(x, penalty), x.T)
-    return np.asarray((y - hat @ y) / np.maximum(1 - np.diag(hat), 1e-6), dtype=np.float64)

@@ -11,6 +11,7 @@ import torch
 from ml.rl.networks import TEACHER_HIDDEN
 
 DEVICES = ("auto", "cpu", "cuda")
+AIMS = ("steps", "return")
 
 
 def setting(default: Any, doc: str, *, low: float | None = None, above: float | None = None, high: float = math.inf) -> Any:
@@ -42,6 +43,13 @@ class TrainConfig:
     seed: int = setting(0, "Seed of the initial weights, the batches and the noise.", low=0)
     record_every: int = setting(100, "Updates between two points of the learning curves.", low=1)
     checkpoint_every: int = setting(1000, "Updates between two checkpoints.", low=1)
+    aim: str = field(
+        default="steps",
+        metadata={
+            "doc": "What the critics sum: `steps`, the step rewards (the paper's remark 1), or `return`, each step's share of r_end "
+            "besides, where enough sessions have one and a regression predicts it (`ml.rl.end_reward`)."
+        },
+    )
     device: str = field(default="cpu", metadata={"doc": "`cpu`, `cuda`, or `auto`: CUDA where there is one."})
 
     def __post_init__(self) -> None:
@@ -50,6 +58,8 @@ class TrainConfig:
                 _check_range(name, getattr(self, name), described.metadata)
         if len(self.hidden) < 2 or min(self.hidden) < 1:
             raise ValueError(f"hidden must name two layers or more, each of 1 unit or more, not {self.hidden}")
+        if self.aim not in AIMS:
+            raise ValueError(f"aim must be one of {', '.join(AIMS)}, not {self.aim!r}")
         if self.device not in DEVICES:
             raise ValueError(f"device must be one of {', '.join(DEVICES)}, not {self.device!r}")
 

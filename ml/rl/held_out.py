@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.rl.end_reward import EndReward
 from ml.rl.policy import Policy
 from ml.trajectories import ReplayBuffer, to_parquet
 
@@ -34,6 +35,7 @@ class HeldOut:
         score_name: names the estimate; part of what a checkpoint belongs to.
         is_step_return: whether `score` estimates the discounted sum of step rewards without end, from the sessions' first states; only
             then is Q's distance from it an over-estimation.
+        end_reward: what every step adds where the critic's sum holds a share of r_end too; set by the trainer.
         every: updates between two scorings.
         patience: scorings without a better one after which the training stops; 0 never stops.
 
@@ -45,6 +47,7 @@ class HeldOut:
     score: Score | None = None
     score_name: str = ""
     is_step_return: bool = False
+    end_reward: EndReward | None = None
     every: int = 500
     patience: int = 0
 
@@ -65,6 +68,8 @@ class HeldOut:
             if usable.size == 0:
                 continue
             rewards = session.rewards(self.sessions.settings)
+            if self.end_reward is not None:
+                rewards = rewards + self.end_reward.per_step(session)
             first, mean = int(usable[0]), float(rewards[usable].mean())
             # A gap within the session counts as its mean reward.
             filled = np.where(session.usable(), rewards, mean)[first:]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from ml.progress import Report, silent
 from ml.rl.batches import RewardScale, packed
 from ml.rl.configs import TrainConfig
+from ml.rl.end_reward import fit_end_reward
 from ml.rl.held_out import HeldOut
 from ml.rl.learners import StackedLearner
 from ml.rl.networks import MlpPolicy
@@ -149,7 +150,13 @@ def train_members(
         TrainingDiverged: a loss or value is not finite.
         CheckpointError: the checkpoint belongs to another run, or is damaged.
     """
+    share = fit_end_reward(buffer) if configs and configs[0].aim == "return" else None
     data = buffer.transitions()
+    if share is not None:
+        # usable steps have a known amplitude and beta, so that every one has a share
+        shares = np.concatenate([share.per_step(s)[s.usable()] for s in buffer.sessions])
+        data = replace(data, rewards=data.rewards + shares)
+        held_out = replace(held_out, end_reward=share) if held_out else None
     return train_on(learner_type, data, buffer.settings.gamma, buffer.beta_scale(), configs, report, checkpoint, initial, held_out)
 
 

@@ -66,9 +66,12 @@ def groups(value: Any) -> list[dict[str, Any]]:
         programs += [
             _program(s, named, rate) for s in entries(inside(settings, "SensingChannel")) if (named := side_of(s.get("HemisphereLocation")))
         ]
+        letter = _letter(group.get("GroupId"))
+        if letter is None and not programs and not sensing:
+            continue  # an entry of which nothing is understood is no group
         out.append(
             {
-                "group": _letter(group.get("GroupId")),
+                "group": letter,
                 "active": group.get("ActiveGroup") is True,
                 "programs": programs,
                 "sensing": sensing,

@@ -115,7 +115,7 @@ def test_the_bundle_is_whole_and_says_for_whom_and_within_which_limits(client: T
     assert (manifest.min_ma, manifest.max_ma, manifest.cdbs_ma, manifest.ramp_ma_per_s) == (0.5, 3.5, 3.0, 0.5)
     assert manifest.approvals == ()
     vectors = json.loads(zipfile.ZipFile(io.BytesIO(answer.content)).read("test_vectors.json"))
-    assert 50 <= len(vectors["windows"]) <= 64
+    assert len(vectors["windows"]) >= 50
     assert np.ptp(vectors["windows"]) > 0.5
 
 

@@ -110,3 +110,11 @@ def test_a_sweep_stores_its_policies_and_compares_them_on_sessions_that_they_did
     again = client.post(JOBS, json=body | {"updates": 5, "count": 1}).json()["id"]
     assert ended(again, 240)["status"] == "succeeded"
     assert {s["name"] for s in client.get("/api/v1/participants/P1/sweeps").json()["items"]} == {"first try", "first try 2"}
+
+
+def test_aims_by_turns_are_groups_of_their_own() -> None:
+    groups = training_groups(TrainParams(aim="both", count=6), [None] * 6)
+    assert sorted((c["aim"], c["seed"]) for g in groups for c in g["configs"]) == [
+        ("return", 1), ("return", 3), ("return", 5), ("steps", 0), ("steps", 2), ("steps", 4),
+    ]  # fmt: skip
+    assert all(len({c["aim"] for c in g["configs"]}) == 1 for g in groups)

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ml.mdp import MdpSettings
+from ml.qoc import Qoc
+from ml.rl.algorithms import ALGORITHMS
+from ml.rl.end_reward import fit_end_reward
+from ml.rl.held_out import HeldOut
+from ml.trajectories import ReplayBuffer, SessionTrajectory
+
+SETTINGS = MdpSettings(xi_beta=1.0)
+
+
+def buffer(grasp, sessions=16, steps=60, seed=0):
+    """Random amplitudes around a level of each session, beta without memory; `grasp(a, beta)` is the session's only QoC."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for k in range(sessions):
+        a = np.clip(0.2 + 0.6 * k / (sessions - 1) + rng.uniform(-0.2, 0.2, steps), 0, 1)
+        beta = 0.5 + rng.uniform(0, 1, steps)
+        qoc = Qoc(grasp_hz=float(grasp(a, beta)), rating=5, tremor_percent=0.0)
+        made.append(SessionTrajectory(k, 1, "random", rng.uniform(0.5, 1.5, 10), beta, a, qoc, 0.0))
+    return ReplayBuffer(SETTINGS, tuple(made), "uV", "table")
+
+
+def test_the_shares_of_a_session_add_up_to_its_end_reward_where_that_is_linear_in_them():
+    data = buffer(lambda a, beta: 1.0 + 2.0 * a.mean() + 3.0 * (beta >= 1.0).mean())
+    share = fit_end_reward(data)
+    assert share is not None
+    assert share.skill > 0.99
+    for session in data.sessions:
+        told = share.per_step(session).mean() / share.factor
+        assert told == pytest.approx(session.end_reward(SETTINGS), abs=0.3)
+
+
+def test_shares_and_step_rewards_stand_in_the_proportion_of_the_return():
+    data = buffer(lambda a, beta: 1.0 + 2.0 * a.mean())
+    share = fit_end_reward(data)
+    assert share is not None
+    gamma, horizon = SETTINGS.gamma, data.median_steps()
+    # a step reward of 1 counts (1 - gamma^H) / (1 - gamma) in the return, 1 / (1 - gamma) for a critic; r_end counts once in the return
+    steps_for_critic, steps_in_return = 1 / (1 - gamma), (1 - gamma**horizon) / (1 - gamma)
+    end_for_critic = share.factor / (1 - gamma)
+    assert end_for_critic / steps_for_critic == pytest.approx(1 / steps_in_return)
+
+
+def test_without_enough_sessions_or_without_any_relation_nothing_is_shared():
+    few = buffer(lambda a, beta: a.mean(), sessions=7)
+    assert fit_end_reward(few) is None
+    rng = np.random.default_rng(5)
+    assert fit_end_reward(buffer(lambda a, beta: rng.uniform(1, 3), sessions=40)) is None
+    weightless = replace(buffer(lambda a, beta: a.mean()), settings=replace(SETTINGS, c2=0.0, c3=0.0, c4=0.0))
+    assert fit_end_reward(weightless) is None
+
+
+def test_steps_with_a_gap_have_no_share():
+    data = buffer(lambda a, beta: 1 + a.mean())
+    broken = data.sessions[0].beta.copy()
+    broken[3] = np.nan
+    share = fit_end_reward(data)
+    assert share is not None
+    told = share.per_step(replace(data.sessions[0], beta=broken))
+    assert np.isnan(told[3])
+    assert np.isfinite(np.delete(told, 3)).all()
+
+
+@pytest.mark.parametrize("name", ["ddpg", "td3_bc"])
+def test_a_policy_that_learns_for_the_return_spends_amplitude_where_the_end_rewards_it_and_else_saves_it(name):
+    # beta does not answer to the amplitude: step rewards alone say 0; every tenth of amplitude brings 5 of r_end
+    data = buffer(lambda a, beta: 1.0 + 5.0 * a.mean(), steps=80)
+    algorithm = ALGORITHMS[name]
+    states = data.transitions().states
+    means = {}
+    for aim in ("steps", "return"):
+        config = algorithm.config(aim=aim, hidden=(24, 16), updates=600, actor_lr=1e-3, seed=1)
+        means[aim] = float(algorithm.train(data, config).policy.act(states).mean())
+    assert means["steps"] < 0.35
+    assert means["return"] > 0.65
+
+
+def test_held_out_returns_hold_the_share_too_so_that_values_are_compared_with_their_like():
+    data = buffer(lambda a, beta: 1.0 + 2.0 * a.mean())
+    share = fit_end_reward(data)
+    watched = HeldOut(sessions=data)
+    _, plain = watched.starts()
+    _, shared = replace(watched, end_reward=share).starts()
+    ends = [s.end_reward(SETTINGS) for s in data.sessions]
+    scale = share.factor / (1 - SETTINGS.gamma)
+    assert shared - plain == pytest.approx(scale * float(np.mean(ends)), rel=0.05)
