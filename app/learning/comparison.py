@@ -51,6 +51,13 @@ def candidates(sweep: Sweep) -> list[Candidate]:
     return sorted(found, key=lambda c: -c.score if c.score is not None else float("inf"))
 
 
+def better_without_learning(found: Sequence[Candidate], yardsticks: Sequence[dict[str, Any]]) -> str | None:
+    """The best controller without learning where it scores above every policy of the sweep, else None; None too where nothing scored."""
+    scores = [c.score for c in found if c.score is not None]
+    best = max(yardsticks, key=lambda row: row["score"], default=None)
+    return str(best["controller"]) if best is not None and scores and best["score"] > max(scores) else None
+
+
 def _candidate(policy: Policy) -> Candidate:
     held, last = policy.metrics.get("held_out", {}), policy.metrics.get("last", {})
     at = _kept(held, policy.metrics.get("best_update"))

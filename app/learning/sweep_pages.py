@@ -30,12 +30,14 @@ CurrentSweep = Annotated[Sweep, Depends(current_sweep)]
 @router.get("/sweeps/{sweep_id}")
 def sweep_page(request: Request, sweep: CurrentSweep, db: Db) -> HTMLResponse:
     """One sweep: its policies on sessions they did not learn from, beside controllers without learning."""
+    found = comparison.candidates(sweep)
     page = render(
         request,
         "learning/sweep.html",
         participant=db.get_one(Participant, sweep.participant_id),
         sweep=sweep,
-        candidates=comparison.candidates(sweep),
+        candidates=found,
+        better=comparison.better_without_learning(found, sweep.yardsticks["rows"]),
         yardsticks=sorted(sweep.yardsticks["rows"], key=lambda row: -row["score"]),
         held_out=sweep.yardsticks["held_out_sessions"],
         charts=comparison.charts(sweep),

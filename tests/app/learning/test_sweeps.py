@@ -11,6 +11,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from app.learning.comparison import Candidate, better_without_learning
 from app.learning.configs import training_groups
 from app.learning.models import Policy
 from app.learning.schemas import ALGORITHM_NAMES, AlgorithmName, TrainParams
@@ -110,6 +111,16 @@ def test_a_sweep_stores_its_policies_and_compares_them_on_sessions_that_they_did
     again = client.post(JOBS, json=body | {"updates": 5, "count": 1}).json()["id"]
     assert ended(again, 240)["status"] == "succeeded"
     assert {s["name"] for s in client.get("/api/v1/participants/P1/sweeps").json()["items"]} == {"first try", "first try 2"}
+
+
+def test_a_sweep_below_its_yardsticks_is_told_so() -> None:
+    def scored(*scores: float | None) -> list[Candidate]:
+        return [Candidate(Policy(name=str(s)), s, None, None, None, None, None, None, None) for s in scores]
+
+    rows = [{"controller": "cDBS", "score": 5.0}, {"controller": "no DBS", "score": -3.0}]
+    assert better_without_learning(scored(4.0, 2.0), rows) == "cDBS"
+    assert better_without_learning(scored(6.0, 2.0), rows) is None
+    assert better_without_learning(scored(None), rows) is None
 
 
 def test_aims_by_turns_are_groups_of_their_own() -> None:

@@ -22,6 +22,7 @@ from ml.cohort import random_controller_buffer, true_return
 from ml.ope.fqe_score import fqe_value
 from ml.rl.algorithms import ALGORITHMS
 from ml.rl.baselines import best_constant
+from ml.rl.end_reward import fit_end_reward
 from ml.rl.held_out import HeldOut, split_sessions
 from ml.rl.policy import ConstantPolicy
 from ml.rl.trainer import TrainedPolicy
@@ -43,7 +44,7 @@ DAYS = 40
 
 @dataclass(frozen=True)
 class Learned:
-    """One of the six: how it was trained, what the data say of it, what is true of it."""
+    """One of the six: how it was trained, what the data say of it, what is true of it; whether its critic's sum holds shares of r_end."""
 
     label: str
     training: TrainedPolicy
@@ -51,12 +52,13 @@ class Learned:
     returns: np.ndarray
     energy: float
     step_return: float
+    shares: bool
 
     def over_estimate(self, gamma):
         """Q(s_0, pi(s_0)) of the state that was kept, less the true value of what its critic sums, continued for ever at its own rate."""
         watched = self.training.held_out
         kept = watched["update"] == self.training.best_update
-        true = self.step_return if self.training.config.aim == "steps" else float(self.returns.mean())
+        true = float(self.returns.mean()) if self.shares else self.step_return
         return float(watched["start_q"][kept][0]) - true / (1 - gamma**STEPS)
 
 
@@ -87,13 +89,14 @@ def test_the_best_of_six_against_continuous_random_and_constant_stimulation(part
 
     watch = HeldOut(sessions=held, score=score, score_name="fqe", every=1000)
     trained = six_policies(train, watch)
+    shared = fit_end_reward(train) is not None
 
     def truth(controller):
         result = true_return(controller, participant, buffer.settings, sessions=DAYS, seed=7, steps=STEPS)
         return result.returns, result.energy.mean, result.step_return.mean
 
     six = [
-        Learned(f"{name} {changes}", result, score(result.policy), *truth(result.policy))
+        Learned(f"{name} {changes}", result, score(result.policy), *truth(result.policy), shared and changes.get("aim") == "return")
         for (name, changes), result in zip(SIX, trained, strict=True)
     ]
     cdbs, random = truth("cdbs")[0], truth("random")[0]
@@ -104,7 +107,8 @@ def test_the_best_of_six_against_continuous_random_and_constant_stimulation(part
     best, selected = max(six, key=lambda one: one.returns.mean()), max(six, key=lambda one: one.score)
     lines = [
         f"{participant}: cDBS {cdbs.mean():.1f}, random {random.mean():.1f}, best constant {level} {constants[level].mean():.1f}, "
-        f"constant chosen from the data {chosen_constant} {constants[chosen_constant].mean():.1f}"
+        f"constant chosen from the data {chosen_constant} {constants[chosen_constant].mean():.1f}; "
+        f"{'r_end falls apart into steps' if shared else 'no share of r_end could be learnt: all six learn from step rewards'}"
     ]
     for one in six:
         gain = one.returns - constants[level]
