@@ -7,8 +7,10 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query, Response
 
 from app.accounts.deps import CurrentCaller
-from app.evaluation import jobs_api, ranking
-from app.evaluation.schemas import Method, RankingOut
+from app.evaluation import calibration, jobs_api, ranking
+from app.evaluation.calibration_schemas import CalibrationOut
+from app.evaluation.export import to_csv
+from app.evaluation.schemas import Kind, Method, RankingFilter, RankingOut
 from app.platform.database import Db
 from app.platform.schemas import problems
 from app.study.api import CurrentParticipant
@@ -31,13 +33,23 @@ def read_ranking(
     caller: CurrentCaller,
     format: Annotated[Literal["json", "csv"], Query(description="csv: one row per policy and method.")] = "json",
     method: Annotated[Method | None, Query(description="Rank by this method instead of the default one.")] = None,
+    supported: Annotated[bool, Query(description="Only candidates that the data support.")] = False,
+    kind: Annotated[Kind | None, Query(description="Only candidates of this kind.")] = None,
+    tested: Annotated[Literal["yes", "no"] | None, Query(description="Only candidates that ran in a session, or that did not.")] = None,
 ) -> RankingOut | Response:
     """Candidate policies from best to worst on one snapshot, with every method's estimate, and references beside them."""
-    found = ranking.current_ranking(db, participant, caller, method)
+    shown = RankingFilter(supported=supported, kind=kind, tested=tested)
+    found = ranking.current_ranking(db, participant, caller, method, shown)
     return csv_of(found) if format == "csv" else found
+
+
+@router.get("/participants/{code}/calibration", tags=["evaluation"])
+def read_calibration(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> CalibrationOut:
+    """Estimates made before each visit against what the visit brought, and the metrics of every method."""
+    return calibration.calibration(db, participant, caller)
 
 
 def csv_of(found: RankingOut) -> Response:
     """A ranking as a CSV download."""
     name = f"{found.participant}-ranking-{found.evaluation_id}.csv"
-    return Response(ranking.to_csv(found), media_type=CSV, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+    return Response(to_csv(found), media_type=CSV, headers={"Content-Disposition": f'attachment; filename="{name}"'})

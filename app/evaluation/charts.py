@@ -6,36 +6,52 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-from app.evaluation.schemas import METHOD_NAMES, RankedPolicy, RankingOut
+from app.evaluation.methods import METHOD_NAMES
+from app.evaluation.schemas import RankedPolicy, RankingOut
 from app.platform.charts import MUTED, Chart, axis, figure
 from app.platform.jobs.models import Job, JobEvent
 
 METHOD_STYLES = {
     "dlsm": {"color": "token:rl", "symbol": "diamond"},
     "linear": {"color": "token:distilled", "symbol": "square"},
+    "dlmm": {"color": "token:accent", "symbol": "hexagram"},
+    "fqe": {"color": "token:cdbs", "symbol": "circle"},
+    "wdr": {"color": "token:no_dbs", "symbol": "cross"},
+    "dual_dice": {"color": "token:warn", "symbol": "star"},
     "wis": {"color": "token:random", "symbol": "triangle-up"},
     "pdis": {"color": "token:other", "symbol": "x"},
+    "cwpdis": {"color": "token:muted", "symbol": "triangle-down"},
+    "aggregate": {"color": "token:text", "symbol": "pentagon"},
 }
 PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")
 DASHES = ("solid", "dash", "dot")
 JOB_CURVES = {
     "mean_q": ("Training: mean Q of each policy", "reward; an unbounded climb is over-estimation"),
     "action_distance": ("Training: distance from the logged amplitudes", "mean absolute difference, fraction"),
+    "score": ("Training: estimated return on held-out sessions", "reward, fitted Q evaluation"),
     "loss": ("Distillation: loss", "mean squared difference from the teacher, fraction squared"),
     "dlsm_loss": ("DLSM: training loss", "negative objective"),
     "dlsm_held_out_score": ("DLSM: score on held-out sessions", "lower is better"),
+    "dlmm_loss": ("DLMM: training loss", "negative evidence bound"),
+    "dlmm_held_out_bound": ("DLMM: evidence bound on held-out sessions", "higher is better"),
+    "dual_dice_dice_objective": ("DualDICE: objective", "saddle point; it need not fall"),
 }
 """Learning curves by the name that the computations give them: title and unit."""
 
 
 def shown_references(ranking: RankingOut) -> list[RankedPolicy]:
-    """References for the page: cDBS, the best constant and proportional control; the API has every constant."""
+    """References for the page: cDBS, the best constant, proportional control, the behaviour clone; the API has every constant."""
     return [p for p in ranking.references if p.reference != "constant"]
 
 
 def label(policy: RankedPolicy) -> str:
     """A policy's name in the ranking's charts and tables."""
-    names = {"cdbs": "cDBS (reference)", "best_constant": f"best constant: {policy.name}", "proportional": "proportional (reference)"}
+    names = {
+        "cdbs": "cDBS (reference)",
+        "best_constant": f"best constant: {policy.name}",
+        "proportional": "proportional (reference)",
+        "cloning": "behaviour clone (reference)",
+    }
     return names.get(policy.reference or "", policy.name)
 
 
@@ -99,9 +115,16 @@ def job_curves(job: Job, events: Sequence[JobEvent]) -> list[Chart]:
     for event in events:
         for point in event.data.get("points", []):
             for name, value in point["values"].items():
-                curves[name][event.step_key or ""][point["x"]] = value
+                curve, member = _of_member(name)
+                curves[curve][(event.step_key or "") + member][point["x"]] = value
     titles = {s.key: s.title for s in job.steps}
     return [_curve_chart(name, curves[name], titles) for name in JOB_CURVES if name in curves]
+
+
+def _of_member(name: str) -> tuple[str, str]:
+    """A curve of several policies trained side by side ends in `_1`, `_2`, ...: its name, and ` · 1` for the line's label."""
+    curve, _, number = name.rpartition("_")
+    return (curve, f" · {number}") if number.isdigit() and curve in JOB_CURVES else (name, "")
 
 
 def _curve_chart(name: str, by_step: dict[str, dict[float, float]], titles: dict[str, str]) -> Chart:
@@ -111,8 +134,10 @@ def _curve_chart(name: str, by_step: dict[str, dict[float, float]], titles: dict
     for k, (step, points) in enumerate(sorted(by_step.items())):
         x = sorted(points)
         line = {"color": PALETTE[k % len(PALETTE)], "dash": DASHES[k // len(PALETTE) % len(DASHES)], "width": 1.8}
-        data.append({"type": "scatter", "mode": "lines", "name": titles.get(step, step), "x": x, "y": [points[v] for v in x], "line": line})
-        rows += [[titles.get(step, step), v, points[v]] for v in x]
+        key, _, member = step.partition(" · ")
+        name = titles.get(key, key) + (f" · {member}" if member else "")
+        data.append({"type": "scatter", "mode": "lines", "name": name, "x": x, "y": [points[v] for v in x], "line": line})
+        rows += [[name, v, points[v]] for v in x]
     return Chart(
         id=f"job-{name}",
         title=title,

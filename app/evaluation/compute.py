@@ -1,4 +1,4 @@
-"""What the child processes of evaluation run: fit one DLSM ensemble member, estimate policies by one method."""
+"""What the child processes of evaluation run: fit one DLSM ensemble member, estimate policies by one method, choose the method."""
 
 from __future__ import annotations
 
@@ -6,12 +6,17 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from app.evaluation.methods import AGGREGATE
 from app.learning.compute import read_buffer, told
 from app.platform import files
 from app.platform.jobs import Report, compute, write_atomically
+from ml import progress
 
 if TYPE_CHECKING:
     from ml.ope.dlsm_config import DlsmConfig
+    from ml.ope.estimate import Estimator
+    from ml.rl.policy import Policy
+    from ml.trajectories import ReplayBuffer
 
 FIT_SHARE = 0.5
 """Share of an evaluation step's progress that fitting takes."""
@@ -56,7 +61,7 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: Report) -> di
         params: `snapshot_sha256`, `preset`, `seed`, `method`, `horizon_steps`, `policies` as [{`id`, `sha256`}], and for the DLSM
             `members`, the stored files of its ensemble; or `failed`, the reason why its ensemble could not be fitted.
         workdir: scratch.
-        report: progress.
+        report: progress, and learning curves where the method trains a network.
 
     Returns:
         `estimates` by policy id, or `failed` with the reason where the method cannot work on these data.
@@ -65,30 +70,68 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: Report) -> di
         return {"failed": params["failed"]}
     import torch
 
-    from ml.ope.dlsm import Dlsm
-    from ml.ope.panel import estimators
-    from ml.rl.onnx_policy import OnnxPolicy
-
     torch.set_num_threads(1)
     buffer = read_buffer(params["snapshot_sha256"])
-    method = params["method"]
-    estimator = Dlsm(_dlsm_config(params)) if method == "dlsm" else estimators(params["seed"], demo=params["preset"] == "quick")[method]
+    estimator = _estimator(params)
     for k, sha256 in enumerate(params.get("members", [])):
         write_atomically(workdir / member_file(k), files.read(sha256))
-    policies = {str(p["id"]): OnnxPolicy(files.read(p["sha256"]), buffer.settings.window) for p in params["policies"]}
+    policies = _policies(params["policies"], buffer)
 
-    def fitting(fraction: float, message: str = "", **numbers: float) -> None:
-        report.progress(FIT_SHARE * fraction, message or "fitting")
+    def part(first: float, share: float, what: str, curves: bool) -> progress.Report:
+        def tell(fraction: float, message: str = "", **numbers: float) -> None:
+            report.progress(first + share * fraction, message or what)
+            if curves and numbers:
+                report.point(round(100 * fraction, 3), **{f"{params['method']}_{name}": value for name, value in numbers.items()})
 
-    def rolling(fraction: float, message: str = "", **numbers: float) -> None:
-        report.progress(FIT_SHARE + (1 - FIT_SHARE) * fraction, message or "estimating")
+        return tell
 
+    # the DLSM has its curves from `fit_dlsm`; here its members are only read
+    fitting = part(0.0, FIT_SHARE, "fitting", params["method"] != "dlsm")
+    rolling = part(FIT_SHARE, 1 - FIT_SHARE, "estimating", True)
     try:
         fitted = estimator.fit(buffer, fitting, workdir)
         estimates = fitted.evaluate(policies, params["horizon_steps"], rolling)
     except ValueError as error:
         return {"failed": str(error)}
     return {"estimates": {policy_id: _finite(e.to_json()) for policy_id, e in estimates.items()}}
+
+
+@compute("choose_method")
+def choose_method(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+    """Hold the methods that are fitted within seconds against controllers that were left out of their fits.
+
+    Args:
+        params: `snapshot_sha256`, `seed`, `methods` asked for, `horizon_steps`, and `policies` that drove logged sessions as
+            [{`id`, `sha256`}].
+        workdir: not used. report: progress over controllers.
+
+    Returns:
+        `choice`, as `ml.ope.skill.Choice` has it, or `failed` with the reason where the data cannot choose.
+    """
+    import torch
+
+    from ml.ope.panel import quick_estimators
+    from ml.ope.skill import choose_default
+
+    torch.set_num_threads(1)
+    buffer = read_buffer(params["snapshot_sha256"])
+    quick = {name: e for name, e in quick_estimators(params["seed"]).items() if name in params["methods"]}
+    if not quick:
+        return {"failed": "none of the methods asked for is fitted fast enough to leave each controller out in turn"}
+    policies = {int(policy_id): policy for policy_id, policy in _policies(params["policies"], buffer).items()}
+    try:
+        choice = choose_default(
+            buffer,
+            quick,
+            policies=policies,
+            horizon_steps=params["horizon_steps"],
+            aggregate=AGGREGATE in params["methods"],
+            seed=params["seed"],
+            report=told(report, 1.0),
+        )
+    except ValueError as error:
+        return {"failed": str(error)}
+    return {"choice": _finite(choice.to_json())}
 
 
 def dlsm_members(preset: str, seed: int) -> int:
@@ -100,6 +143,22 @@ def _dlsm_config(params: dict[str, Any]) -> DlsmConfig:
     from ml.ope.dlsm_config import DlsmConfig
 
     return DlsmConfig.demo(params["seed"]) if params["preset"] == "quick" else DlsmConfig(seed=params["seed"])
+
+
+def _estimator(params: dict[str, Any]) -> Estimator:
+    from ml.ope.dlsm import Dlsm
+    from ml.ope.panel import estimators
+
+    quick, seed = params["preset"] == "quick", params["seed"]
+    if params["method"] == "dlsm":
+        return Dlsm(_dlsm_config(params))
+    return estimators(seed, demo=quick)[params["method"]]
+
+
+def _policies(named: list[dict[str, Any]], buffer: ReplayBuffer) -> dict[str, Policy]:
+    from ml.rl.onnx_policy import OnnxPolicy
+
+    return {str(p["id"]): OnnxPolicy(files.read(p["sha256"]), buffer.settings.window) for p in named}
 
 
 def _finite(value: Any) -> Any:

@@ -7,18 +7,21 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from app.evaluation import compute, service
-from app.evaluation.schemas import METHOD_NAMES, EvaluateParams, PipelineParams
+from app.evaluation import compute, repository, service
+from app.evaluation.methods import AGGREGATE, METHOD_NAMES, METHOD_WEIGHTS, Method
+from app.evaluation.schemas import EvaluateParams, PipelineParams
 from app.learning import jobs as learning
 from app.learning.baselines import ensure_baselines
 from app.learning.compute import read_buffer
+from app.learning.configs import training_groups
 from app.learning.models import BufferSnapshot
 from app.learning.schemas import DistilParams
 from app.platform import files
 from app.platform.jobs import JobContext, Priority, job_kind
 
 FIT_WEIGHT = 15.0
-METHOD_WEIGHTS = {"dlsm": 6.0, "linear": 2.0, "wis": 1.0, "pdis": 1.0}
+SKILL_STEP = "choose-method"
+SKILL_WEIGHT = 2.0
 _TORCH_FILE = "application/x-pytorch"
 
 
@@ -27,8 +30,9 @@ def declare_evaluation(job: JobContext, params: EvaluateParams, *, fit: bool) ->
     if fit:
         _declare_fit(job, params)
     job.step("choose-policies", "Choose policies and references", weight=learning.STORE_WEIGHT)
-    for method in params.methods:
+    for method in _fitted(params):
         job.step(f"estimate/{method}", f"Estimate every policy: {METHOD_NAMES[method]}", weight=METHOD_WEIGHTS[method])
+    job.step(SKILL_STEP, "Hold the methods against controllers that were left out", weight=SKILL_WEIGHT)
     job.step("rank", "Store the estimates and rank", weight=learning.STORE_WEIGHT)
 
 
@@ -52,14 +56,17 @@ def store_members(job: JobContext, results: Sequence[dict[str, Any]]) -> dict[st
 
 
 def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, Any], models: dict[str, Any]) -> dict[str, Any]:
-    """Estimate the candidates and references by every method, store and rank."""
+    """Estimate the candidates and references by every method, choose the default one by left-out controllers, store and rank."""
 
     def choose(db: Session) -> dict[str, Any]:
         row = db.get_one(BufferSnapshot, snapshot["id"])
         candidates = service.policies_to_rank(db, row.participant_id, params)
-        references = ensure_baselines(db, learning.participant_of(db, job), row, read_buffer(row.file_sha256), job.created_by)
+        buffer = read_buffer(row.file_sha256)
+        references = ensure_baselines(db, learning.participant_of(db, job), row, buffer, job.created_by)
+        ran = repository.policies_by_id(db, sorted({s.policy_id for s in buffer.sessions if s.policy_id is not None}))
         return {
             "candidates": [p.id for p in candidates],
+            "ran": [{"id": p.id, "sha256": p.onnx_sha256} for p in ran.values()],
             "policies": [{"id": p.id, "sha256": p.onnx_sha256} for p in (*candidates, *references)],
             "horizon_steps": params.horizon_steps or row.median_steps,
         }
@@ -72,11 +79,13 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
         "horizon_steps": chosen["horizon_steps"],
         "policies": chosen["policies"],
     }
+    methods = _fitted(params)
     calls: list[learning.Call] = [
-        (f"estimate/{method}", "evaluate_method", common | {"method": method} | (models if method == "dlsm" else {}))
-        for method in params.methods
+        (f"estimate/{method}", "evaluate_method", common | {"method": method} | (models if method == "dlsm" else {})) for method in methods
     ]
-    results = dict(zip(params.methods, job.compute_all(calls), strict=True))
+    calls.append((SKILL_STEP, "choose_method", common | {"methods": params.methods, "policies": chosen["ran"]}))
+    *estimates, skill = job.compute_all(calls)
+    results = dict(zip(methods, estimates, strict=True))
 
     def store(db: Session) -> dict[str, Any]:
         row = service.store_evaluation(
@@ -88,6 +97,7 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
             candidates=chosen["candidates"],
             results=results,
             config=params.model_dump(mode="json") | {"dlsm_members": models.get("members", [])},
+            skill=skill,
         )
         return {"evaluation_id": row.id, "default_method": row.default_method}
 
@@ -127,9 +137,10 @@ def run_pipeline(job: JobContext) -> dict[str, Any]:
 
     planned = job.transact("plan", plan)
     snapshot, starts = planned["snapshot"], planned["starts"]
-    trainings = learning.training_calls(training, snapshot["sha256"], starts)
+    groups = training_groups(training, starts)
+    trainings = learning.training_calls(training, snapshot["sha256"], groups)
     results = job.compute_all([*trainings, *fit_calls(evaluation, snapshot["sha256"])])
-    policies = learning.store_trained(job, snapshot["id"], results[: len(trainings)], starts)
+    policies = learning.store_trained(job, training, snapshot["id"], groups, results[: len(trainings)])
     models = store_members(job, results[len(trainings) :])
     students = learning.distil_all(job, DistilParams.model_validate(distillation), snapshot, policies)
     outcome = evaluate_all(job, evaluation, snapshot, models)
@@ -140,6 +151,11 @@ def _declare_fit(job: JobContext, params: EvaluateParams) -> None:
     for k in range(_members(params)):
         job.step(f"fit/{k}", f"Fit the deep latent sequential model, member {k + 1}", weight=FIT_WEIGHT)
     job.step("store-models", "Store the models", weight=learning.STORE_WEIGHT)
+
+
+def _fitted(params: EvaluateParams) -> list[Method]:
+    """Methods with a compute step: all but the combination, which is computed from their estimates."""
+    return [m for m in params.methods if m != AGGREGATE]
 
 
 def _members(params: EvaluateParams) -> int:

@@ -1,8 +1,8 @@
-"""HTML pages of evaluation: the ranking, the jobs of a participant, one job."""
+"""HTML pages of evaluation: the ranking, the calibration, the jobs of a participant, one job."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
@@ -11,12 +11,15 @@ from sqlalchemy.orm import Session
 from app.accounts import policy as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.policy import Caller
-from app.evaluation import charts, ranking, service
+from app.evaluation import calibration_charts, charts, ranking, repository, service
 from app.evaluation.api import csv_of
+from app.evaluation.calibration import calibration
+from app.evaluation.decision import RULES
 from app.evaluation.jobs_api import CurrentJob
-from app.evaluation.schemas import METHOD_NAMES, EvaluateParams, PipelineParams, RankingOut
+from app.evaluation.methods import METHOD_NAMES, METHOD_SHORT, METHODS, QUICK_METHODS
+from app.evaluation.schemas import DECISION_NAMES, EvaluateParams, PipelineParams, RankingFilter, RankingOut
 from app.learning import repository as learning
-from app.learning.schemas import DistilParams, TrainParams
+from app.learning.schemas import ALGORITHM_NAMES, AlgorithmName, DistilParams, TrainParams
 from app.learning.snapshots import collect
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, NotFound
@@ -37,6 +40,7 @@ KINDS: dict[str, tuple[str, type[Model]]] = {
     "train": ("Train policies", TrainParams),
     "distill": ("Distil policies", DistilParams),
 }
+TRAINABLE = [(name, ALGORITHM_NAMES[name]) for name in get_args(AlgorithmName)]
 SHOWN_EVENTS = 20_000
 LOG_LINES = 200
 REFRESH_S = 4
@@ -44,13 +48,21 @@ REFRESH_S = 4
 
 @router.get("/participants/{code}/ranking")
 def ranking_page(
-    request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, method: str | None = None
+    request: Request,
+    participant: CurrentParticipant,
+    db: Db,
+    caller: CurrentCaller,
+    method: str | None = None,
+    supported: str = "",
+    kind: str = "",
+    tested: str = "",
 ) -> HTMLResponse:
-    """Policies and ranking."""
+    """Policies and ranking; the filter form leaves empty what it does not ask for."""
+    shown = parse(RankingFilter, {"supported": supported, "kind": kind, "tested": tested})
     found: RankingOut | None = None
     missing: dict[str, Any] | None = None
     try:
-        found = ranking.current_ranking(db, participant, caller, method or None)
+        found = ranking.current_ranking(db, participant, caller, method or None, shown)
     except NotFound as error:
         missing = error.problem(request.url.path)
     page = render(
@@ -63,6 +75,10 @@ def ranking_page(
         references=charts.shown_references(found) if found else [],
         label=charts.label,
         method_names=METHOD_NAMES,
+        method_short=METHOD_SHORT,
+        decision_names=DECISION_NAMES,
+        rules=RULES,
+        shown=shown,
         live=_live_jobs(db, participant),
         may_run=_may(caller, can.RUN_JOBS, participant),
         may_plan=_may(caller, can.DRAFT_PLAN, participant),
@@ -79,6 +95,34 @@ def ranking_csv(participant: CurrentParticipant, db: Db, caller: CurrentCaller) 
     return csv_of(ranking.current_ranking(db, participant, caller))
 
 
+@router.get("/participants/{code}/calibration")
+def calibration_page(
+    request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, method: str | None = None
+) -> HTMLResponse:
+    """Predicted against actual, by one method on top and by every method in the tables."""
+    found = calibration(db, participant, caller)
+    if method and method not in found.methods:
+        known = f"Choose one of {', '.join(found.methods)}." if found.methods else "Nothing can be compared yet."
+        raise Invalid(f"The calibration has no estimates by '{method}'.", known)
+    newest = repository.newest_evaluation(db, participant.id)
+    usual = newest.default_method if newest is not None else None
+    chosen = method or (usual if usual in found.methods else next(iter(found.methods), None))
+    page = render(
+        request,
+        "evaluation/calibration.html",
+        participant=participant,
+        calibration=found,
+        method=chosen,
+        method_names=METHOD_NAMES,
+        label=calibration_charts.label,
+        returns=calibration_charts.returns(found, chosen) if chosen else None,
+        metrics=calibration_charts.metrics(found) if found.metrics else None,
+        outcomes=calibration_charts.quantities(found, chosen) if chosen else [],
+        quantity_names=calibration_charts.QUANTITY_NAMES,
+    )
+    return HTMLResponse(page)
+
+
 @router.get("/participants/{code}/jobs")
 def jobs_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
     """Jobs of a participant, and the form to start one."""
@@ -88,7 +132,10 @@ def jobs_page(request: Request, participant: CurrentParticipant, db: Db, caller:
 @router.post("/participants/{code}/jobs")
 def start_job(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Start a job from the form; empty fields take the preset's value."""
-    given = {name: str(v) for name, v in values.items() if str(v).strip()}
+    given: dict[str, Any] = {name: str(v) for name, v in values.items() if str(v).strip()}
+    given["algorithms"] = [str(v) for v in values.getlist("algorithms")] or ["ddpg"]
+    if methods := [str(v) for v in values.getlist("methods")]:
+        given["methods"] = methods
     try:
         if given.get("kind") not in KINDS:
             raise Invalid("The form names no kind of job.", f"Choose one of {', '.join(KINDS)}.")
@@ -146,7 +193,7 @@ def _jobs(
     limit: int,
     offset: int,
     problem: dict[str, Any] | None = None,
-    given: dict[str, str] | None = None,
+    given: dict[str, Any] | None = None,
     status: int = 200,
 ) -> HTMLResponse:
     rows, total = jobs.find(db, participant.id, limit=limit, offset=offset)
@@ -164,6 +211,10 @@ def _jobs(
         refresh_s=REFRESH_S,
         problem=problem or _readiness(db, participant, request),
         given=given or {},
+        algorithms=TRAINABLE,
+        given_algorithms=(given or {}).get("algorithms", ["ddpg"]),
+        methods=[(m, METHOD_NAMES[m], m in QUICK_METHODS) for m in METHODS],
+        given_methods=(given or {}).get("methods", []),
         workers=len(jobs.live_workers(db, job_service.STALE_S)),
         trained=[p for p in learning.candidates(db, participant.id) if p.kind == "trained"],
         may_run=_may(caller, can.RUN_JOBS, participant),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import datetime
 
 from sqlalchemy import Select, select
 from sqlalchemy.orm import Session, selectinload
@@ -24,6 +25,12 @@ def evaluation_of_job(db: Session, job_id: str) -> Evaluation | None:
 def evaluation(db: Session, participant_id: int, evaluation_id: int) -> Evaluation | None:
     """A participant's evaluation by its number."""
     return db.scalar(_evaluations().where(Evaluation.participant_id == participant_id, Evaluation.id == evaluation_id))
+
+
+def evaluation_times(db: Session, participant_id: int) -> dict[int, datetime]:
+    """When each of the participant's evaluations was stored, by its number."""
+    query = select(Evaluation.id, Evaluation.created_at).where(Evaluation.participant_id == participant_id)
+    return {row.id: row.created_at for row in db.execute(query.order_by(Evaluation.id))}
 
 
 def policies_by_id(db: Session, ids: Sequence[int]) -> dict[int, Policy]:

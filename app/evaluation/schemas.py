@@ -5,25 +5,14 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import ConfigDict, Field
 
-from app.learning.schemas import DistilParams, PolicyIds, Preset, TrainParams
+from app.evaluation.methods import METHOD_NAMES as METHOD_NAMES
+from app.evaluation.methods import METHODS as METHODS
+from app.evaluation.methods import Method as Method
+from app.evaluation.methods import Methods
+from app.learning.schemas import DistilParams, PolicyIds, Preset, SweepParams, TrainParams
 from app.platform.schemas import Int, Model, Number
-
-
-def _each_once(methods: list[str]) -> list[str]:
-    return list(dict.fromkeys(methods))
-
-
-Method = Literal["dlsm", "linear", "wis", "pdis"]
-Methods = Annotated[list[Method], Field(min_length=1, max_length=8), AfterValidator(_each_once)]
-METHODS: tuple[Method, ...] = ("dlsm", "linear", "wis", "pdis")
-METHOD_NAMES = {
-    "dlsm": "DLSM",
-    "linear": "Linear model",
-    "wis": "Weighted importance sampling",
-    "pdis": "Per-decision importance sampling",
-}
 
 
 class EvaluateParams(Model):
@@ -31,17 +20,14 @@ class EvaluateParams(Model):
 
     preset: Preset = Field("full", description="`full`: sizes for a study; `quick`: for a first look.")
     policies: PolicyIds = Field(default_factory=list, description="Policies to rank; empty: every one that is not retired.")
-    methods: Methods = Field(list(METHODS), description="Estimators to run.")
+    methods: Methods
     horizon_steps: Int | None = Field(None, ge=1, le=100_000, description="H; the snapshot's median session length where not given.")
     seed: Int = Field(0, ge=0, le=10**6)
 
 
-class PipelineParams(Model):
+class PipelineParams(SweepParams):
     """What `pipeline` takes: everything between two visits in one job."""
 
-    preset: Preset = Field("full", description="`full`: sizes for a study; `quick`: for a first look.")
-    policies: PolicyIds = Field(default_factory=list, description="Fine-tune from each of these; empty: train from scratch.")
-    count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch; the paper trains 6.")
     updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each policy.")
     actor_lr_low: Number | None = Field(None, gt=0, le=1, description="Lowest learning rate of the policies.")
     actor_lr_high: Number | None = Field(None, gt=0, le=1, description="Highest; in between they are spread evenly in the logarithm.")
@@ -49,13 +35,13 @@ class PipelineParams(Model):
         None, ge=0, le=10, description="Noise of the distillation's synthetic states, share of beta's standard deviation."
     )
     distil_updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each student.")
-    methods: Methods = Field(list(METHODS), description="Estimators to run.")
+    methods: Methods
     horizon_steps: Int | None = Field(None, ge=1, le=100_000, description="H; the snapshot's median session length where not given.")
     seed: Int = Field(0, ge=0, le=10**6, description="Seed of everything in the job.")
 
     def training(self) -> TrainParams:
         """The training stage."""
-        names = ("preset", "policies", "count", "updates", "actor_lr_low", "actor_lr_high", "seed")
+        names = (*SweepParams.model_fields, "updates", "actor_lr_low", "actor_lr_high", "seed")
         return TrainParams(**{name: getattr(self, name) for name in names})
 
     def distillation(self) -> DistilParams:
@@ -155,6 +141,23 @@ class TestedBefore(Model):
     mean_step_return: float | None
     mean_end_reward: float | None
     energy: float | None
+    mean_beta: float | None
+    grasp_hz: float | None
+    rating: float | None
+    tremor_percent: float | None
+
+
+Decision = Literal["test_next", "needs_data", "reject"]
+DECISION_NAMES: dict[str, str] = {"test_next": "test next", "needs_data": "needs more data", "reject": "reject"}
+
+
+class GainOut(Model):
+    """Estimated return less that of cDBS, by one method; what both share cancels."""
+
+    value: float
+    low: float = Field(description="Lower end of the two-sided interval: the one-sided lower 95 % bound where the level is 0.9.")
+    high: float
+    level: float
 
 
 class RankedPolicy(Model):
@@ -166,7 +169,7 @@ class RankedPolicy(Model):
     algorithm: str
     teacher_id: int | None
     rank: int | None = Field(description="1 is best; policies that the data do not support come last. Null for references.")
-    reference: str | None = Field(description="`cdbs`, `best_constant`, `constant` or `proportional`; null for candidates.")
+    reference: str | None = Field(description="`cdbs`, `best_constant`, `constant`, `proportional` or `cloning`; null for candidates.")
     supported: bool
     probability_best: float | None
     retired: bool
@@ -176,6 +179,9 @@ class RankedPolicy(Model):
     )
     flags: list[str]
     tested: TestedBefore | None
+    gain: GainOut | None = Field(description="Over cDBS by the ranking's method; null where one of the two has no estimate.")
+    decision: Decision | None = Field(description="By stated rules, in `decision_reason`; null for references.")
+    decision_reason: str
 
 
 class RankedSnapshot(Model):
@@ -188,6 +194,50 @@ class RankedSnapshot(Model):
     beta_unit: str
     beta_source: str
     settings_version: int
+
+
+class SkillOut(Model):
+    """How one method predicted controllers that were left out of its fit."""
+
+    model_config = ConfigDict(extra="ignore")  # stored with the evaluation: an older or newer one may hold more
+
+    method: str
+    controllers: int
+    difference_error: float = Field(description="Mean error of predicted differences between two controllers, share of the observed range.")
+    error: float = Field(description="Mean absolute error, share of the observed range.")
+    bias: float = Field(description="Root mean squared error, unit of the return.")
+    excess: float | None = Field(None, description="Error beyond the noise of the observed means, unit of the return: widens intervals.")
+    rank_correlation: float | None
+    pairs_in_order: float = Field(description="Share of pairs of controllers predicted in the observed order.")
+
+
+class HeldOutOut(Model):
+    """One prediction of a left-out controller."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    method: str
+    controller: str
+    sessions: int
+    predicted: float
+    observed: float
+    observed_standard_error: float | None
+    supported: bool
+
+
+class ChoiceOut(Model):
+    """Why the evaluation's default method is the default one."""
+
+    method: str
+    chosen_by_data: bool = Field(description="False: a stated order decided, for the reason given.")
+    reason: str
+    table: list[SkillOut] = Field(description="Best first.")
+    no_difference_error: float | None = Field(
+        None, description="Error of differences of a prediction that all controllers return the same: a method above it has no skill."
+    )
+    predictions: list[HeldOutOut]
+    failed: dict[str, str]
+    not_compared: list[str] = Field(description="Methods with estimates that were not held against left-out controllers.")
 
 
 class RankingOut(Model):
@@ -210,3 +260,16 @@ class RankingOut(Model):
     )
     policies: list[RankedPolicy]
     references: list[RankedPolicy]
+    choice: ChoiceOut | None = Field(description="Null for an evaluation from before methods were held against left-out controllers.")
+    hidden: int = Field(0, description="Candidates that the filter leaves out.")
+
+
+Kind = Literal["trained", "distilled", "external"]
+
+
+class RankingFilter(Model):
+    """Which candidates to show; ranks stay those among all."""
+
+    supported: bool = Field(False, description="Only policies that the data support.")
+    kind: Kind | None = Field(None, description="Only policies of this kind.")
+    tested: Literal["yes", "no"] | None = Field(None, description="Only policies that ran in a session, or only those that did not.")

@@ -11,7 +11,9 @@ from sqlalchemy.orm import Session
 from app.accounts import policy as can
 from app.accounts.policy import Caller
 from app.evaluation import repository
+from app.evaluation.choice import choose, combined, widened
 from app.evaluation.estimates import as_estimate
+from app.evaluation.methods import AGGREGATE
 from app.evaluation.models import EstimateRow, Evaluation
 from app.evaluation.ranking import current_ranking as current_ranking
 from app.evaluation.schemas import EvaluateParams, PipelineParams
@@ -27,7 +29,6 @@ from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Participant
 from ml.ope.estimate import Estimate
-from ml.ope.ranking import default_method
 
 
 def start_job(db: Session, participant: Participant, kind: str, params: Mapping[str, Any], caller: Caller) -> Job:
@@ -92,6 +93,7 @@ def store_evaluation(
     candidates: Sequence[int],
     results: Mapping[str, Mapping[str, Any]],
     config: Mapping[str, Any],
+    skill: Mapping[str, Any] | None = None,
 ) -> Evaluation:
     """Store every method's estimates of every policy; a job that has stored its evaluation gets that one.
 
@@ -100,7 +102,8 @@ def store_evaluation(
         snapshot: what all estimates rest on. horizon_steps: H.
         candidates: ids of the policies that are ranked; the others are references.
         results: by method `{"estimates": {policy id: Estimate.to_json()}}`, or `{"failed": reason}`.
-        config: how the methods ran.
+        config: how the methods ran; where its `methods` name the combination, that is computed here from the others.
+        skill: what `choose_method` found out on left-out controllers; without it a stated order chooses the default method.
 
     Raises:
         Invalid: no method could speak; lists why.
@@ -111,12 +114,22 @@ def store_evaluation(
         known = repository.evaluation_of_job(db, job_id)
         if known is not None:
             return known
-    estimates = {m: {int(i): as_estimate(e) for i, e in r["estimates"].items()} for m, r in results.items() if r.get("estimates")}
+    estimates: dict[str, dict[str, Estimate]] = {
+        m: {i: as_estimate(e) for i, e in r["estimates"].items()} for m, r in results.items() if r.get("estimates")
+    }
     failed = {m: str(r["failed"]) for m, r in results.items() if "failed" in r}
+    if AGGREGATE in config.get("methods", []):
+        made = combined(estimates, skill)
+        if "failed" in made:
+            failed[AGGREGATE] = made["failed"]
+        else:
+            estimates[AGGREGATE] = made["estimates"]
+    estimates = widened(estimates, skill)
     if not estimates:
         reasons = "; ".join(f"{m}: {reason}" for m, reason in failed.items())
         raise Invalid(f"No method could estimate these policies: {reasons}.", "Collect more sessions, then evaluate again.")
-    ranked = {m: {str(i): e for i, e in table.items() if i in set(candidates)} for m, table in estimates.items()}
+    ranked = {m: {i: e for i, e in table.items() if int(i) in set(candidates)} for m, table in estimates.items()}
+    choice = choose({m: table for m, table in ranked.items() if table}, skill)
     row = Evaluation(
         participant_id=snapshot.participant_id,
         snapshot_id=snapshot.id,
@@ -124,13 +137,13 @@ def store_evaluation(
         job_id=job_id,
         horizon_steps=horizon_steps,
         gamma=study_repository.settings_version(db, snapshot.settings_version_id).gamma,
-        default_method=default_method(ranked),
+        default_method=choice["method"],
         config=dict(config),
-        diagnostics={"failed": failed, "candidates": list(candidates)},
+        diagnostics={"failed": failed, "candidates": list(candidates), "choice": choice},
         code_version=jobs.code_version(),
         created_by=created_by,
     )
-    row.estimates = [_estimate_row(policy_id, e) for table in estimates.values() for policy_id, e in table.items()]
+    row.estimates = [_estimate_row(int(policy_id), e) for table in estimates.values() for policy_id, e in table.items()]
     db.add(row)
     db.flush()
     return row

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ml.ope.dlmm import Dlmm, DlmmConfig
 from ml.ope.dlsm import Dlsm
 from ml.ope.dlsm_config import DlsmConfig
 from ml.ope.doubly_robust import DoublyRobust
@@ -18,6 +19,7 @@ def estimators(seed: int = 0, *, demo: bool = False) -> dict[str, Estimator]:
     return {
         "dlsm": Dlsm(config),
         "linear": LinearModel(LinearConfig(seed=seed)),
+        "dlmm": Dlmm(DlmmConfig(members=1, updates=800, rollouts=64, seed=seed) if demo else DlmmConfig(seed=seed)),
         "fqe": Fqe(FqeConfig(seed=seed, members=1, refits=30) if demo else FqeConfig(seed=seed)),
         "wdr": DoublyRobust(FqeConfig(seed=seed, members=1 if demo else 3, refits=20 if demo else 30)),
         "dual_dice": DualDice(DiceConfig(seed=seed, members=1, updates=300) if demo else DiceConfig(seed=seed)),

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from app.evaluation.methods import METHODS, QUICK_METHODS
 from app.learning.baselines import constant_onnx
 
 Upload = Callable[..., int]
@@ -29,6 +30,15 @@ def test_no_job_starts_without_a_threshold_and_the_answer_suggests_one(client: T
     assert client.get(JOBS).json()["total"] == 0
 
 
+def test_the_quick_preset_runs_its_own_methods_and_named_ones_are_run_once(client: TestClient, upload: Upload) -> None:
+    upload("random")
+    quick = client.post(JOBS, json={"kind": "pipeline", "preset": "quick"}).json()
+    assert quick["params"]["methods"] == list(QUICK_METHODS)
+    assert set(QUICK_METHODS) < set(METHODS)
+    named = client.post(JOBS, json={"kind": "pipeline", "preset": "quick", "methods": ["dual_dice", "wis", "dual_dice"]}).json()
+    assert named["params"]["methods"] == ["dual_dice", "wis"]
+
+
 def test_no_job_starts_without_a_usable_session(client: TestClient, enrolled: str) -> None:
     answer = client.post(JOBS, json={"kind": "train"})
     assert answer.status_code == 422
@@ -42,7 +52,7 @@ def test_a_job_is_accepted_with_its_defaults_and_listed(client: TestClient, uplo
     assert answer.status_code == 202
     body = answer.json()
     assert (body["status"], body["progress"], body["participant"], body["created_by"]) == ("queued", 0.0, "P1", "admin@clinic.example")
-    assert (body["params"]["count"], body["params"]["preset"], body["params"]["methods"]) == (6, "full", ["dlsm", "linear", "wis", "pdis"])
+    assert (body["params"]["count"], body["params"]["preset"], body["params"]["methods"]) == (6, "full", list(METHODS))
     assert client.get(f"/api/v1/jobs/{body['id']}").json() == body
     assert client.get(JOBS).json()["items"] == [body]
     assert client.get(JOBS, params={"status": "running"}).json()["total"] == 0
@@ -60,6 +70,7 @@ def test_a_job_is_accepted_with_its_defaults_and_listed(client: TestClient, uplo
         ({"kind": "evaluate"}, 422, "no policy to rank"),
         ({"kind": "evaluate", "policies": [999]}, 404, "999"),
         ({"kind": "evaluate", "methods": ["magic"]}, 422, "methods"),
+        ({"kind": "evaluate", "methods": ["wis", "aggregate"]}, 422, "at least two other methods"),
     ],
     ids=lambda v: str(v)[:40],
 )
@@ -134,3 +145,20 @@ def test_the_jobs_page_starts_shows_and_cancels_a_job(client: TestClient, upload
     refused = client.post("/participants/P1/jobs", data={"kind": "train", "count": "many"})
     assert refused.status_code == 422
     assert "whole number" in refused.text
+
+
+def test_the_form_runs_the_ticked_methods_and_the_preset_those_of_its_size(client: TestClient, upload: Upload) -> None:
+    upload("random")
+
+    def methods_of(**ticked: list[str]) -> list[str]:
+        page = client.post("/participants/P1/jobs", data={"kind": "pipeline", "preset": "quick", **ticked}, follow_redirects=True)
+        assert page.status_code == 200, page.text
+        job = client.get(f"/api/v1/jobs/{str(page.url.path).rsplit('/', 1)[1]}").json()
+        found: list[str] = job["params"]["methods"]
+        return found
+
+    assert methods_of(methods=["wis", "dual_dice"]) == ["wis", "dual_dice"]
+    assert methods_of() == list(QUICK_METHODS)
+    refused = client.post("/participants/P1/jobs", data={"kind": "pipeline", "methods": ["wis", "aggregate"]})
+    assert refused.status_code == 422
+    assert "at least two other methods" in refused.text

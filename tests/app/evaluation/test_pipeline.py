@@ -18,7 +18,8 @@ from app.learning.models import BufferSnapshot, Policy
 from app.platform import files
 from app.study.repository import participant_by_code
 from ml.deploy.bundle import verify_bundle
-from ml.ope.panel import estimators
+from ml.ope.panel import estimators, quick_estimators
+from ml.ope.skill import choose_default
 from ml.rl.onnx_policy import OnnxPolicy
 
 Upload = Callable[..., int]
@@ -45,24 +46,40 @@ def sessions(upload: Upload) -> list[int]:
     ]
 
 
+CHEAP = ["linear", "fqe", "wdr", "wis", "pdis", "cwpdis"]
+
+
 @pytest.mark.usefixtures("worker")
-def test_an_evaluation_gives_the_numbers_that_the_estimator_gives(
+def test_an_evaluation_gives_the_numbers_that_the_estimators_give(
     client: TestClient, sessions: list[int], ended: Ended, db: Session
 ) -> None:
     added = client.post("/api/v1/participants/P1/policies", data={"name": "ext"}, files={"file": ("e.onnx", constant_onnx(0.6, 10))}).json()
-    job = client.post(JOBS, json={"kind": "evaluate", "preset": "quick", "methods": ["wis", "pdis"], "policies": [added["id"]]}).json()
-    done = ended(job["id"], 120)
+    body = {"kind": "evaluate", "preset": "quick", "methods": [*CHEAP, "aggregate"], "policies": [added["id"]]}
+    done = ended(client.post(JOBS, json=body).json()["id"], 300)
     assert done["status"] == "succeeded", done
     assert {s["status"] for s in done["steps"]} == {"succeeded"}
+    assert {f"estimate/{m}" for m in CHEAP} | {"choose-method"} <= {s["key"] for s in done["steps"]}
     ranking = client.get("/api/v1/participants/P1/ranking").json()
     assert ranking["evaluation_id"] == done["result"]["evaluation_id"]
     (policy,) = ranking["policies"]
-    assert (policy["policy_id"], policy["rank"], set(policy["estimates"])) == (added["id"], 1, {"wis", "pdis"})
+    assert (policy["policy_id"], policy["rank"], policy["kind"]) == (added["id"], 1, "external")
     buffer = read_buffer(db.get_one(BufferSnapshot, done["result"]["snapshot_id"]).file_sha256)
-    direct = (
-        estimators(0, demo=True)["pdis"].fit(buffer).evaluate({"x": OnnxPolicy(constant_onnx(0.6, 10), 10)}, buffer.median_steps())["x"]
-    )
-    assert policy["estimates"]["pdis"]["value"] == pytest.approx(direct.value, rel=1e-9)
+    panel, held = estimators(0, demo=True), OnnxPolicy(constant_onnx(0.6, 10), 10)
+    for method in CHEAP:
+        direct = panel[method].fit(buffer).evaluate({"x": held}, buffer.median_steps())["x"]
+        shown = policy["estimates"][method]
+        assert (shown["value"], shown["step_return"]) == (
+            pytest.approx(direct.value, rel=1e-9),
+            pytest.approx(direct.step_return, rel=1e-9),
+        )
+    quick = {name: e for name, e in quick_estimators(0).items() if name in CHEAP}
+    choice = choose_default(buffer, quick, horizon_steps=buffer.median_steps())
+    scores = {s["method"]: s["difference_error"] for s in ranking["choice"]["table"]}
+    assert scores == {s.method: pytest.approx(s.difference_error) for s in choice.table}
+    if ranking["choice"]["chosen_by_data"]:
+        assert ranking["default_method"] == ranking["choice"]["method"]
+    values = [policy["estimates"][m]["value"] for m in CHEAP]
+    assert min(values) <= policy["estimates"]["aggregate"]["value"] <= max(values)
     assert ranking["stale"] is False
     assert {r["reference"] for r in ranking["references"]} >= {"cdbs", "proportional"}
 

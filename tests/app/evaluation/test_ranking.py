@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,76 +16,15 @@ from sqlalchemy.orm import Session
 from app.accounts.policy import SYSTEM
 from app.evaluation.models import Evaluation
 from app.evaluation.service import store_evaluation
-from app.learning.baselines import constant_onnx, ensure_baselines
+from app.learning.baselines import constant_onnx
 from app.learning.models import Policy
-from app.learning.snapshots import collect, take_snapshot
+from app.learning.snapshots import take_snapshot
 from app.platform.errors import Invalid
 from app.study.repository import participant_by_code
-from ml.ope.estimate import Estimate
+from tests.app.evaluation.conftest import estimate
 
 Upload = Callable[..., int]
 RANKING = "/api/v1/participants/P1/ranking"
-
-
-def estimate(method: str, value: float, *, supported: bool = True, spread: float = 1.0, draws: Sequence[float] = ()) -> dict[str, Any]:
-    return Estimate(
-        method=method,
-        value=value,
-        low=value - spread,
-        high=value + spread,
-        level=0.9,
-        standard_error=spread / 1.64,
-        step_return=value - 80,
-        end_reward=80.0,
-        predicted={"energy": 0.4, "mean_beta": 0.9, "grasp_hz": 2.1, "rating": 7.5, "tremor_percent": 12.0},
-        supported=supported,
-        flags=() if supported else ("not supported by the data: in 60 % of steps",),
-        n=100,
-        details={"draws": list(draws)} if draws else {},
-    ).to_json()
-
-
-@pytest.fixture
-def policies(client: TestClient, upload: Upload) -> list[int]:
-    """Ids of three policies made elsewhere, for a participant with four sessions."""
-    for controller in ("random", "random", "cdbs", "random"):
-        upload(controller)
-    ids = []
-    for k in range(3):
-        answer = client.post(
-            "/api/v1/participants/P1/policies", data={"name": f"p{k}"}, files={"file": (f"p{k}.onnx", constant_onnx(0.4 + 0.2 * k, 10))}
-        )
-        ids.append(int(answer.json()["id"]))
-    return ids
-
-
-@pytest.fixture
-def evaluate(db: Session, policies: list[int]) -> Callable[..., int]:
-    """Store an evaluation; `dlsm` values by policy, further methods by name."""
-
-    def store(dlsm: dict[int, dict[str, Any]], baselines: dict[float, float] | None = None, **others: dict[str, Any]) -> int:
-        db.rollback()
-        participant = participant_by_code(db, "P1", SYSTEM)
-        snapshot = take_snapshot(db, participant, SYSTEM)
-        made = {
-            p.config.get("amplitude"): p.id for p in ensure_baselines(db, participant, snapshot, collect(db, participant).buffer, "test")
-        }
-        table = {str(i): e for i, e in dlsm.items()}
-        table |= {str(made[a]): estimate("dlsm", v) for a, v in (baselines or {}).items()}
-        row = store_evaluation(
-            db,
-            job_id=None,
-            created_by="test",
-            snapshot=snapshot,
-            horizon_steps=snapshot.median_steps,
-            candidates=list(dlsm),
-            results={"dlsm": {"estimates": table}, **others},
-            config={},
-        )
-        db.commit()
-        return row.id
-
-    return store
 
 
 def ranked(client: TestClient) -> dict[str, Any]:
@@ -223,8 +162,9 @@ def test_where_a_policy_ran_its_actual_return_stands_beside_the_estimate(
     client: TestClient, upload: Upload, policies: list[int], evaluate: Callable[..., int]
 ) -> None:
     session = upload("rl", level=0.8, policy=policies[0], qoc={"grasp_hz": 2.0, "rating": 8, "tremor_percent": 20.0})
-    evaluate({i: estimate("dlsm", 50.0) for i in policies})
+    evaluate({i: estimate("dlsm", 50.0) for i in policies}, {1.0: 45.0})
     tested = {p["policy_id"]: p["tested"] for p in ranked(client)["policies"]}
+    assert [(p["tested"]["sessions"], p["tested"]["energy"]) for p in ranked(client)["references"]] == [(1, pytest.approx(1.0))]  # cDBS
     trace = client.get(f"/api/v1/sessions/{session}/trace").json()
     beta = np.array(trace["beta"][10:])
     steps = (np.where(beta < 1.0, 0.0, -1.0) - 0.3 * 0.8) * 0.99 ** np.arange(60)
@@ -235,6 +175,10 @@ def test_where_a_policy_ran_its_actual_return_stands_beside_the_estimate(
         "mean_step_return": pytest.approx(steps.sum(), abs=1e-5),
         "mean_end_reward": pytest.approx(98.0),
         "energy": pytest.approx(0.64, abs=1e-5),
+        "mean_beta": pytest.approx(beta.mean(), abs=1e-5),
+        "grasp_hz": 2.0,
+        "rating": 8.0,
+        "tremor_percent": 20.0,
     }
     assert tested[policies[1]] is None
 
@@ -271,6 +215,14 @@ def test_the_csv_has_a_row_for_every_policy_and_method_and_no_formulas(
         (str(policies[0]), "wis", 9.0),
     ]
     assert rows[1]["name"] == "'=cmd()"
+    for column in (
+        "low", "high", "standard_error", "n", "step_return", "end_reward", "energy", "mean_beta", "grasp_hz", "rating", "tremor_percent",
+        "flags", "decision", "decision_reason", "gain_low", "probability_best", "retired", "beta_unit", "tested_sessions",
+        "tested_mean_return", "tested_energy", "tested_rating",
+    ):  # fmt: skip
+        assert column in rows[0], column
+    assert [r["supported"] for r in rows] == ["True"] * 3
+    assert (rows[0]["decision"], rows[0]["tested_sessions"]) == ("needs_data", "0")
     assert client.get("/participants/P1/ranking.csv").text == answer.text
 
 
@@ -292,6 +244,55 @@ def test_the_page_shows_ranks_intervals_flags_and_sends_picks_to_the_plan(
     ):
         assert text in page
     assert 'type="checkbox"' in page
+
+
+def test_the_filter_keeps_ranks_and_says_how_many_it_leaves_out(
+    client: TestClient, upload: Upload, policies: list[int], evaluate: Callable[..., int], db: Session
+) -> None:
+    a, b, c = policies
+    upload("rl", level=0.8, policy=c)
+    evaluate({a: estimate("dlsm", 50.0), b: estimate("dlsm", 99.0, supported=False), c: estimate("dlsm", 40.0)})
+
+    def kept(**query: str) -> tuple[list[tuple[int, int]], int]:
+        body = client.get(RANKING, params=query).json()
+        return [(p["policy_id"], p["rank"]) for p in body["policies"]], body["hidden"]
+
+    assert kept() == ([(a, 1), (c, 2), (b, 3)], 0)
+    assert kept(supported="true") == ([(a, 1), (c, 2)], 1)
+    assert kept(tested="yes") == ([(c, 2)], 2)
+    assert kept(tested="no", supported="true") == ([(a, 1)], 2)
+    assert kept(kind="external")[1] == 0
+    assert kept(kind="trained") == ([], 3)
+    assert client.get(RANKING, params={"kind": "magic"}).status_code == 422
+    page = client.get("/participants/P1/ranking", params={"method": "dlsm", "supported": "", "kind": "", "tested": "yes"})
+    assert page.status_code == 200
+    assert "2 of 3 left out" in page.text
+    assert f'name="policy_ids" value="{c}"' in page.text
+    assert f'name="policy_ids" value="{a}"' not in page.text
+    assert "No candidate passes this filter" in client.get("/participants/P1/ranking", params={"kind": "distilled"}).text
+    assert client.get("/participants/P1/ranking", params={"tested": "perhaps"}).status_code == 422
+
+
+def test_every_candidate_has_a_decision_with_its_reason(
+    client: TestClient, policies: list[int], evaluate: Callable[..., int], db: Session
+) -> None:
+    a, b, c = policies
+    evaluate({a: estimate("dlsm", 60.0), b: estimate("dlsm", 30.0), c: estimate("dlsm", 70.0, supported=False)}, {1.0: 45.0})
+    found = {p["policy_id"]: p for p in ranked(client)["policies"]}
+    assert {i: p["decision"] for i, p in found.items()} == {a: "test_next", b: "reject", c: "needs_data"}
+    reach = 1.645 * 2**0.5 / 1.64  # two independent standard errors of 1 / 1.64
+    assert found[a]["gain"] == {
+        "value": 15.0,
+        "low": pytest.approx(15 - reach, abs=1e-3),
+        "high": pytest.approx(15 + reach, abs=1e-3),
+        "level": 0.9,
+    }
+    assert "60 % of steps" in found[c]["decision_reason"]
+    client.patch(f"/api/v1/policies/{a}", json={"retired_reason": "worn out"})
+    assert ranked(client)["policies"][0]["decision_reason"] == "retired: worn out"
+    page = client.get("/participants/P1/ranking").text
+    assert "test next" not in page.split("The rules, in their order")[0]
+    assert "reject; gain over cDBS" in page
 
 
 @pytest.mark.parametrize(

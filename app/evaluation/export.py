@@ -1,0 +1,42 @@
+"""The ranking as a table for other programs: every column that the page and the REST interface have."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+from app.evaluation.schemas import RankingOut, TestedBefore
+
+_PREDICTED = ("energy", "mean_amplitude", "mean_beta", "grasp_hz", "rating", "tremor_percent")
+_NUMBERS = ("value", "low", "high", "level", "standard_error", "n", "step_return", "end_reward")
+_OF_RANKING = ("participant", "evaluation_id", "created_at", "default_method", "horizon_steps", "gamma", "stale")
+_OF_POLICY = ("rank", "policy_id", "name", "kind", "algorithm", "reference", "retired", "decision", "decision_reason", "probability_best")
+_GAIN = ("value", "low", "high")
+_TESTED = tuple(TestedBefore.model_fields)
+
+
+def to_csv(ranking: RankingOut) -> str:
+    """One row per policy and method. Rank, decision, gain over cDBS and probability of being best are by the default method;
+    `supported` and what follows are of the row's own method.
+    """
+    sink = io.StringIO()
+    out = csv.writer(sink, lineterminator="\n")
+    own = ["method", "supported", *_NUMBERS, *_PREDICTED, "flags"]
+    out.writerow(
+        [*_OF_RANKING, "snapshot_id", "settings_version", "beta_unit", *_OF_POLICY, *(f"gain_{n}" for n in _GAIN), *own]
+        + [f"tested_{n}" for n in _TESTED]
+    )
+    for p in (*ranking.policies, *ranking.references):
+        whole = [getattr(ranking, n) for n in _OF_RANKING]
+        whole += [ranking.snapshot.id, ranking.snapshot.settings_version, ranking.snapshot.beta_unit]
+        of_policy = [getattr(p, n) for n in _OF_POLICY] + [getattr(p.gain, n) if p.gain else None for n in _GAIN]
+        results = [getattr(p.tested, n) if p.tested else (0 if n.startswith("sessions") else None) for n in _TESTED]
+        for method, e in p.estimates.items():
+            numbers = [method, e.supported, *(getattr(e, n) for n in _NUMBERS), *(e.predicted.get(n) for n in _PREDICTED)]
+            out.writerow([_safe(cell) for cell in (*whole, *of_policy, *numbers, "; ".join(e.flags), *results)])
+    return sink.getvalue()
+
+
+def _safe(value: object) -> object:
+    """A cell that spreadsheets do not run as a formula."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in set("=+-@\t\r") else value
