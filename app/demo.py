@@ -199,7 +199,8 @@ class _Loader:
 
     def submit(self, code: str) -> None:
         """Ask for the between-visit pipeline."""
-        self.state["jobs"][code] = self._post(f"/participants/{code}/jobs", {"kind": "pipeline", "preset": "quick"})["id"]
+        asked = {"kind": "pipeline", "preset": "quick", "algorithms": ["ddpg", "rebrac"], "aim": "both"}
+        self.state["jobs"][code] = self._post(f"/participants/{code}/jobs", asked)["id"]
         _save(self.path, self.state)
 
     def _upload(self, code: str, visit: DemoVisit, bars: Progress, bar: TaskID) -> None:

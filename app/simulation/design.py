@@ -40,6 +40,9 @@ class Preset:
     pipeline: dict[str, Any]
 
 
+LEARNING: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both"}
+"""The paper's algorithm and one that keeps closer to what was logged, each with and without a share of r_end: a sweep that can differ."""
+
 PRESETS: Final = {
     "quick": Preset(
         visits=3,
@@ -47,10 +50,12 @@ PRESETS: Final = {
         random_sessions=4,
         session_minutes=5,
         policies_per_kind=1,
-        pipeline={"preset": "quick", "count": 2, "updates": 1_000, "distil_updates": 500},
+        pipeline={"preset": "quick", "count": 4, "updates": 1_000, "distil_updates": 500} | LEARNING,
     ),
     # about the minutes of the paper's Table 1: 100 of RL, 100 of distilled RL, 35 without stimulation, and cDBS between any two
-    "full": Preset(visits=7, random_visits=2, random_sessions=4, session_minutes=10, policies_per_kind=2, pipeline={"preset": "full"}),
+    "full": Preset(
+        visits=7, random_visits=2, random_sessions=4, session_minutes=10, policies_per_kind=2, pipeline={"preset": "full"} | LEARNING
+    ),
 }
 
 
