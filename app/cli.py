@@ -11,6 +11,7 @@ from getpass import getpass
 from pathlib import Path
 from typing import Annotated, Any
 
+import structlog
 import typer
 from rich.console import Console
 from rich.table import Table
@@ -66,10 +67,20 @@ def serve(
     logs.configure()
     bring_up_to_date()
     settings = get_settings()
+    service = create_app()
+    # beside the service, for reading what a crash left behind may take minutes
+    threading.Thread(target=_take_up_uploads, daemon=True).start()
     uvicorn.run(
-        create_app(), host=host or settings.host, port=port or settings.port, log_level=settings.log_level.lower(), access_log=False,
+        service, host=host or settings.host, port=port or settings.port, log_level=settings.log_level.lower(), access_log=False,
         timeout_graceful_shutdown=3,
     )  # fmt: skip
+
+
+def _take_up_uploads() -> None:
+    from app.ingest.interrupted import take_up
+
+    for taken in take_up("start of the service"):
+        structlog.get_logger().info("interrupted upload", upload=taken.upload_id, done=taken.done, said=taken.said)
 
 
 @app.command(epilog="Example: betaloop worker --slots 2")
@@ -192,6 +203,20 @@ def redecode_(
     else:
         Console().print(table)
     if any(c.state == "failed" for c in changes):
+        raise typer.Exit(1)
+
+
+@ingest_app.command("resume", epilog="Example: betaloop ingest resume")
+def resume_() -> None:
+    """Take up uploads that a stop of the service cut short; the service does so itself when it starts."""
+    from app.ingest.interrupted import take_up
+
+    taken = list(take_up(ACTOR))
+    for one in taken:
+        typer.echo(f"Upload {one.upload_id}: {one.said}")
+    if not taken:
+        typer.echo("No upload was cut short.")
+    if any(not one.done for one in taken):
         raise typer.Exit(1)
 
 

@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 from app.accounts.deps import CurrentCaller
 from app.accounts.policy import Caller
 from app.ingest import repository, service
+from app.ingest.early import UploadRoute
 from app.ingest.formats.numbers import unit_name
 from app.ingest.models import UploadFile as UploadFileRow
 from app.ingest.proposals_api import proposal_out
@@ -23,7 +24,7 @@ from app.study.api import session_out
 from app.study.models import Controller, Hemisphere
 from app.study.schemas import BetaSource
 
-router = APIRouter(tags=["uploads"], responses=problems(401, 403, 404, 422))
+router = APIRouter(route_class=UploadRoute, tags=["uploads"], responses=problems(401, 403, 404, 422))
 
 
 class UnusableUpload(Invalid):
@@ -82,8 +83,12 @@ def unusable(outcome: UploadOutcome) -> UnusableUpload:
     reports = [FileReportOut.model_validate(r).model_dump() for r in outcome.reports_for_sender]
     if first is None or first.problem is None:
         return UnusableUpload("No file in this upload holds a recording.", "Choose the files of a session.", report=reports)
+    # what is said of several files together (two recordings' loose files) comes before the first file's own problem
+    together = [sentence for aside in outcome.asides for sentence in aside.flagged]
+    kept = any(f.row.stored_sha256 for f in outcome.files if f.name == first.name)
+    what = f"{first.name}: {first.problem.what} ({first.problem.where}). {'The file is kept.' if kept else 'Nothing of it was kept.'}"
     return UnusableUpload(
-        f"{first.name}: {first.problem.what} ({first.problem.where}). The file is kept.",
+        " ".join([*together, what]),
         first.problem.mend,
         file=first.name,
         where=first.problem.where,

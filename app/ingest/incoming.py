@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import zipfile
 from collections import defaultdict
 from collections.abc import Sequence
@@ -10,12 +11,15 @@ from pathlib import PurePosixPath
 from typing import BinaryIO
 
 from app.ingest.formats.log import FileReport
-from app.ingest.formats.rcs import KNOWN
+from app.ingest.formats.rcs import KNOWN, MIXED
+from app.ingest.formats.rcs_opening import HEAD, Opening, group, read_opening, stem_in_name
 from app.platform import files
 
 EPOCH = (1980, 1, 1, 0, 0, 0)
 LITTER = frozenset({".ds_store", "thumbs.db", "desktop.ini"})
 """Files that operating systems leave in folders; they hold nothing of a recording."""
+
+LOOSE = "loose RC+S files"
 
 
 @dataclass(frozen=True)
@@ -34,36 +38,91 @@ class Arranged:
     asides: list[FileReport] = field(default_factory=list)
 
 
-def arrange(incoming: Sequence[Incoming]) -> Arranged:
-    """Bundle loose RC+S files by folder, each folder into one zip; everything else stays as it is.
+@dataclass(frozen=True)
+class _Loose:
+    """A loose file that belongs to an RC+S session."""
 
-    Files without a folder are one RC+S folder together. Two files of one name among them could belong to two sessions, and mixing them
-    would give a wrong recording: then none of them is bundled, each is kept by itself, and the report says how to send them.
+    stem: str
+    one: Incoming
+    opening: Opening
+
+    @property
+    def shown(self) -> str:
+        """Its name without folders."""
+        return PurePosixPath(self.one.name.replace("\\", "/")).name
+
+
+def arrange(incoming: Sequence[Incoming]) -> Arranged:
+    """Bundle loose RC+S files by folder, implant and session, each recording into one zip; everything else stays as it is.
+
+    Files without a folder are one folder together. A file is known by its name, else by its content. Two different files of one kind in
+    one recording could belong to two, and mixing them would give a wrong recording: then none of them is bundled, each is kept by itself,
+    and the report says how to send them.
     """
     arranged = Arranged([])
-    loose: dict[str, list[tuple[str, Incoming]]] = defaultdict(list)
+    folders: dict[str, list[_Loose]] = defaultdict(list)
     for one in incoming:
         path = PurePosixPath(one.name.replace("\\", "/"))
-        stem = KNOWN.get(path.stem.lower()) if path.suffix.lower() == ".json" else None
         if path.name.lower() in LITTER or path.name.startswith("._") or "__MACOSX" in path.parts:
             arranged.asides.append(FileReport(path.name, ignored=["left by the operating system, no recording; not kept"]))
-        elif stem is not None:
-            loose[str(path.parent)].append((stem, one))
-        else:
+            continue
+        opening = read_opening(one.stream.read(HEAD))
+        one.stream.seek(0)
+        stem = _stem(path, opening)
+        if stem is None:
             arranged.incoming.append(one)
-    for folder, members in sorted(loose.items()):
-        stems = [stem for stem, _ in members]
-        twice = sorted({stem for stem in stems if stems.count(stem) > 1})
-        if twice:
-            arranged.incoming.extend(one for _, one in members)
-            what = f"{', '.join(twice)} came more than once, so that nobody can tell which files belong together; none was put together"
-            arranged.asides.append(FileReport("loose RC+S files", flagged=[f"{what}. Drop the folders themselves, or zip each of them."]))
         else:
-            arranged.incoming.append(_bundle(folder, members))
+            folders[str(path.parent)].append(_Loose(stem, one, opening))
+    for folder, members in sorted(folders.items()):
+        groups = group([m.opening for m in members])
+        if groups.homeless:
+            said = "empty, and does not say which of the recordings beside it it belongs to; not kept"
+            arranged.asides.extend(FileReport(members[i].shown, ignored=[said]) for i in groups.homeless)
+        several = len(groups.recordings) > 1
+        if several:
+            arranged.asides.append(FileReport(LOOSE, flagged=[f"{MIXED.format(len(groups.recordings))}."]))
+        for number, places in enumerate(groups.recordings, start=1):
+            _put_together(folder, f" {number}" if several else "", [members[i] for i in places], arranged)
     return arranged
 
 
-def _bundle(folder: str, members: Sequence[tuple[str, Incoming]]) -> Incoming:
+def _stem(path: PurePosixPath, opening: Opening) -> str | None:
+    """Which file of a session a loose file is: by its name, its content, or, where that is empty or damaged, the begin of its name."""
+    if path.suffix.lower() == ".json" and (stem := KNOWN.get(path.stem.lower())) is not None:
+        return stem
+    return opening.stem or (stem_in_name(path.name) if path.suffix.lower() == ".json" else None)
+
+
+def _put_together(folder: str, number: str, members: Sequence[_Loose], arranged: Arranged) -> None:
+    """Bundle the files of one recording, the same bytes once; leave them single, and say so, where two of a kind differ."""
+    chosen: dict[str, _Loose] = {}
+    again: list[_Loose] = []
+    twice: set[str] = set()
+    for member in sorted(members, key=lambda m: m.one.name):
+        first = chosen.setdefault(member.stem, member)
+        if first is not member and _digest(first.one) == _digest(member.one):
+            again.append(member)
+        elif first is not member:
+            twice.add(member.stem)
+    arranged.asides.extend(FileReport(m.shown, ignored=["the same bytes came twice in this upload; counted once"]) for m in again)
+    if twice:
+        arranged.incoming.extend(m.one for m in members if m not in again)
+        what = f"{', '.join(sorted(twice))} came more than once, so that nobody can tell which files belong together; none was put together"
+        arranged.asides.append(FileReport(LOOSE, flagged=[f"{what}. Drop the folders themselves, or zip each of them."]))
+    else:
+        arranged.incoming.append(_bundle(folder, number, [(stem, m.one) for stem, m in chosen.items()]))
+
+
+def _digest(one: Incoming) -> str:
+    """Hash of a file's bytes; it stands at its begin afterwards."""
+    found = hashlib.sha256()
+    while chunk := one.stream.read(files.CHUNK):
+        found.update(chunk)
+    one.stream.seek(0)
+    return found.hexdigest()
+
+
+def _bundle(folder: str, number: str, members: Sequence[tuple[str, Incoming]]) -> Incoming:
     """One zip of loose files: the same files give the same bytes, whatever their order, dates and folder."""
     draft = files.draft_path()
     try:
@@ -78,4 +137,4 @@ def _bundle(folder: str, members: Sequence[tuple[str, Incoming]]) -> Incoming:
     finally:
         draft.unlink(missing_ok=True)  # the open stream keeps the bytes until they are received
     name = PurePosixPath(folder).name or "RC+S files"
-    return Incoming(f"{name} ({len(members)} file{'s' if len(members) != 1 else ''} together)", stream)
+    return Incoming(f"{name}{number} ({len(members)} file{'s' if len(members) != 1 else ''} together)", stream)

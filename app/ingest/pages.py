@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 from app.accounts import policy as can
 from app.accounts.deps import CurrentCaller
 from app.ingest import repository, service
+from app.ingest.early import UploadRoute
 from app.ingest.schemas import UploadForm
 from app.ingest.service import BetaStated, Incoming, UploadOutcome
 from app.platform.database import Db
@@ -28,7 +29,7 @@ from app.study.models import Participant
 from app.study.schemas import BetaSource
 from app.study.settings_form import SOURCES
 
-router = APIRouter()
+router = APIRouter(route_class=UploadRoute)
 
 _LABELS = {
     "visit": "Visit", "controller": "Controller", "policy": "Policy", "started_at": "Start", "hemisphere": "Hemisphere",

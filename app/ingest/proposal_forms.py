@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -49,6 +50,11 @@ class ProposalForm:
     problem: dict[str, Any] | None = None
 
     @property
+    def seen(self) -> str:
+        """The stored values for the form to send back, so that an old form's own corrections can be told from what others changed."""
+        return json.dumps(dict(self.stored))
+
+    @property
     def control(self) -> SessionSegment:
         """The part of the recording that the controller saw."""
         return next(s for s in self.session.segments if s.is_control)
@@ -77,6 +83,17 @@ def texts(db: Session, session: StudySession, proposal: SessionProposal, caller:
 def typed_texts(values: Mapping[str, Any], session_id: int, stored: Mapping[str, str]) -> dict[str, str]:
     """What the form sent for a proposal; a field that it does not have is as stored."""
     return {name: str(values.get(f"{name}-{session_id}", text)).strip() for name, text in stored.items()}
+
+
+def own_texts(values: Mapping[str, Any], session_id: int, stored: Mapping[str, str]) -> dict[str, str]:
+    """What a person changed in the form of a proposal: what was sent and is not what the form had shown, nor what is stored by now."""
+    try:
+        seen = json.loads(str(values.get(f"seen-{session_id}", "{}")))
+    except ValueError:
+        seen = {}
+    shown = {**stored, **seen} if isinstance(seen, dict) else stored
+    typed = typed_texts(values, session_id, stored)
+    return {name: text for name, text in typed.items() if text not in (str(shown[name]), stored[name])}
 
 
 def typed_parts(values: Mapping[str, Any], session_id: int) -> list[dict[str, str]]:

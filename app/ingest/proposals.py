@@ -10,7 +10,7 @@ from itertools import pairwise
 from sqlalchemy.orm import Session
 
 from app.accounts import policy as can
-from app.accounts.policy import Caller
+from app.accounts.policy import SYSTEM, Caller
 from app.ingest import outcomes_intake, repository, sessions
 from app.ingest.evidence import guess_controller, guess_visit
 from app.ingest.models import SessionProposal, Upload
@@ -21,9 +21,15 @@ from app.platform.errors import Conflict, Invalid
 from app.study import blinding
 from app.study import repository as study
 from app.study import service as study_service
+from app.study.contradictions import contradictions, control_recording, delivered, local_day
 from app.study.models import Controller, Participant, Recording, StudySession
 from app.study.service import POLICY_CONTROLLERS
-from app.study.traces import step_table
+
+STATED = "as stated"
+"""Evidence that begins so is a person's word, which no guess replaces."""
+AS_STATED = f"{STATED} with the upload"
+RESTS_ON = frozenset({"visit", "hemisphere", "start_s", "stop_s", "started_at", "controller"})
+"""Fields of a correction after which a guessed controller is guessed anew."""
 
 
 @dataclass(frozen=True)
@@ -50,24 +56,25 @@ def make_sessions(
 
 
 def _make(db: Session, participant: Participant, upload: Upload, group: list[Recording], stated: StatedSession, alone: bool) -> Made:
-    if not stated.counts and (joined := _join_earlier(db, participant, group)) is not None:
+    if (joined := _join_earlier(db, participant, group, stated)) is not None:
         return joined
     laid = sessions.lay(db, participant, group, stated, alone)
-    guess = guess_visit(study.visits(db, participant.id, 1000, 0)[0], laid.started_at, stated.visit)
+    day = local_day(laid.control, laid.started_at)[0] if laid.started_at else None
+    guess = guess_visit(study.visits(db, participant.id, 1000, 0)[0], day, stated.visit)
     session = add_session(db, guess.visit, laid, stated.controller, stated.policy_id, stated.hemisphere, stated.counts)
     length = f"{session.duration_s / 60:.1f} min" if session.duration_s else "no data"
-    seen = f"controlled by {session.control_stream} {session.control_channel or ''}".strip()
+    seen = _seen(session, laid)
     if stated.counts:
         said = f"Session {session.id}: visit {guess.visit.number}, {stated.controller}, {length}, {seen} (recording {laid.control.id})."
-        flagged = [*laid.notes, *sessions.fix_milliamperes(db, session), *sessions.contradictions(db, session)]
+        flagged = [*laid.notes, *sessions.fix_milliamperes(db, session), *contradictions(db, session)]
         return Made(session, group, [said, *outcomes_intake.derive(db, session)], flagged)
-    evidence = {"visit": guess.why, "controller": "as stated with the upload"}
+    evidence = {"visit": guess.why, "controller": AS_STATED}
     controller = stated.controller
     if controller is None:
         controller, evidence["controller"] = _guess_controller(db, session)
         blinding.assign(session, controller, stated.policy_id if controller in POLICY_CONTROLLERS else None)
     of_recording = "of the recording that a controller could have seen" if session.hemisphere else "the file tells no side"
-    evidence["hemisphere"] = "as stated with the upload" if stated.hemisphere else of_recording
+    evidence["hemisphere"] = AS_STATED if stated.hemisphere else of_recording
     proposal = SessionProposal(
         session_id=session.id, upload_id=upload.id, visit_open=guess.open, evidence=evidence, changed_by=upload.created_by, version=1
     )
@@ -78,35 +85,82 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
         f"{'visit open' if guess.open else f'visit {guess.visit.number}'} ({guess.why}), "
         f"{controller or 'controller open'} ({evidence['controller']}), {length}, {seen}."
     )
-    return Made(session, group, [said], [*laid.notes, *sessions.contradictions(db, session, guess.open)])
+    return Made(session, group, [said], [*laid.notes, *contradictions(db, session, guess.open)])
+
+
+def _seen(session: StudySession, laid: Laid) -> str:
+    """Which trace of which side the controller is taken to have seen, in words."""
+    trace = f"{session.control_stream} {session.control_channel or ''}".strip()
+    others = [r for r in laid.recordings if r is not laid.control]
+    side = f" of the {laid.control.hemisphere} side" if laid.control.hemisphere else f" of recording {laid.control.id}" if others else ""
+    beside = [f"the {r.hemisphere} side" if r.hemisphere else f"recording {r.id}" for r in others]
+    return f"controlled by {trace}{side}" + (f", recorded together with {' and '.join(beside)}" if beside else "")
 
 
 def _guess_controller(db: Session, session: StudySession) -> tuple[Controller | None, str]:
     try:
-        return guess_controller(step_table(db, session, session.visit.participant.current_settings))
+        return guess_controller(delivered(db, session))
     except Invalid as error:
         return None, f"its steps cannot be read: {error.detail}"
 
 
-def _join_earlier(db: Session, participant: Participant, group: list[Recording]) -> Made | None:
-    """The proposal of an earlier upload that these recordings share their time with (the other implant came first), if there is one."""
+def _join_earlier(db: Session, participant: Participant, group: list[Recording], stated: StatedSession) -> Made | None:
+    """The sessions of earlier uploads that these recordings share their time with (the other implant came first), if there are any.
+
+    A confirmed session gets them beside its controlled recording: nothing that counts changes.
+    """
     first = group[0]
     if first.started_at is None:
         return None
     end = first.started_at + timedelta(seconds=first.duration_s)
-    for session in repository.overlapping_proposals(db, participant.id, first.started_at, end):
+    made: Made | None = None
+    for session in repository.overlapping_sessions(db, participant.id, first.started_at, end):
         known = [s.recording for s in session.segments]
         if any(r.device_id == k.device_id for r in group for k in known) or len(sessions.together([*known, *group])) != 1:
             continue
         control = next(s for s in session.segments if s.is_control)
         laid = _as_laid(session, control.start_s, control.stop_s)
-        laid.recordings.extend(group)
-        set_segments(session, laid, participant.current_settings.period_s)
-        proposal = repository.proposals(db, [session.id])[session.id]
-        proposal.version += 1
+        period_s = participant.current_settings.period_s
+        added = [sessions.add_beside(session, r, laid, period_s) for r in group]
+        if not any(added):
+            continue
         db.flush()
-        return Made(session, group, [f"Recorded at the same time as proposed session {session.id}: it belongs to that session."], [])
-    return None
+        said, flagged = _joined(db, session, stated)
+        made = Made(session, group, [], []) if made is None else made
+        made.understood.append(said)
+        made.flagged.extend(flagged)
+    return made
+
+
+def _joined(db: Session, session: StudySession, stated: StatedSession) -> tuple[str, list[str]]:
+    """What to tell of recordings that were added to a session that was there, after their time."""
+    differs = sessions.disagreements(db, [session.id], stated)
+    if session.status == "confirmed":
+        side = f" ({control_recording(session).hemisphere} side)" if control_recording(session).hemisphere else ""
+        said = f"Recorded at the same time as session {session.id}, which counts already: added to it beside its controlled recording"
+        return f"{said}{side}.", [*differs, *contradictions(db, session)]
+    proposal = repository.proposals(db, [session.id])[session.id]
+    proposal.version += 1
+    _renew_guess(db, session, proposal)
+    db.flush()
+    said = f"Recorded at the same time as proposed session {session.id}, which counts nowhere until it is confirmed"
+    return f"{said}: it belongs to that session.", [*differs, *contradictions(db, session, proposal.visit_open)]
+
+
+def _renew_guess(db: Session, session: StudySession, proposal: SessionProposal, keep: bool = False) -> None:
+    """Guess the controller anew after what the guess rests on has changed; what a person stated stays.
+
+    Args:
+        keep: leave the controller, for somebody confirms it as it stands, and renew the reason alone.
+    """
+    if str(proposal.evidence.get("controller", "")).startswith(STATED):
+        return
+    arm = blinding.stated_arm(session, SYSTEM)
+    controller, why = _guess_controller(db, session)
+    proposal.evidence = {**proposal.evidence, "controller": why}
+    if not keep and controller != (arm.controller if arm else None):
+        kept = arm.policy_id if arm and controller in POLICY_CONTROLLERS else None
+        blinding.assign(session, controller, kept)
 
 
 def change(db: Session, session: StudySession, wanted: ProposalChange, caller: Caller) -> SessionProposal:
@@ -115,6 +169,10 @@ def change(db: Session, session: StudySession, wanted: ProposalChange, caller: C
     Raises:
         Conflict: it was confirmed, or changed after the caller looked at it. Invalid: a value that cannot be.
     """
+    return _correct(db, session, wanted, caller, confirming=False)
+
+
+def _correct(db: Session, session: StudySession, wanted: ProposalChange, caller: Caller, confirming: bool) -> SessionProposal:
     proposal = _locked(db, session, wanted.version, caller)
     given = wanted.model_dump(exclude_unset=True, exclude={"version", "reason"})
     set_reason(db, wanted.reason)
@@ -124,6 +182,13 @@ def change(db: Session, session: StudySession, wanted: ProposalChange, caller: C
         _choose_side(db, session, given)
     if {"start_s", "stop_s", "started_at"} & given.keys():
         _choose_part(session, given)
+    told = {name: f"{STATED} by {caller.label}" for name in ("visit", "controller", "hemisphere") if given.get(name) is not None}
+    if "controller" in given and given["controller"] is None:
+        told["controller"] = f"{STATED} by {caller.label}: open"
+    proposal.evidence = {**proposal.evidence, **told}
+    if RESTS_ON & given.keys():
+        db.flush()
+        _renew_guess(db, session, proposal, keep=confirming)
     proposal.version += 1
     proposal.changed_by = caller.label
     db.flush()
@@ -139,7 +204,7 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
     Raises:
         Conflict: as `change`, or another confirmed session counts on the same stretch. Invalid: visit or controller is still open.
     """
-    proposal = change(db, session, wanted, caller)
+    proposal = _correct(db, session, wanted, caller, confirming=True)
     missing = [name for name, open_ in (("visit", proposal.visit_open), ("controller", _controller(session, caller) is None)) if open_]
     if missing:
         why = "; ".join(f"{name}: {proposal.evidence.get(name, 'nobody stated it')}" for name in missing)
@@ -147,7 +212,7 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
     sessions.refuse_overlap(db, session)
     session.status = "confirmed"
     db.flush()
-    return [*sessions.fix_milliamperes(db, session), *sessions.contradictions(db, session), *outcomes_intake.derive(db, session)]
+    return [*sessions.fix_milliamperes(db, session), *contradictions(db, session), *outcomes_intake.derive(db, session)]
 
 
 def split(db: Session, session: StudySession, version: int, parts: Sequence[PartIn], caller: Caller) -> list[StudySession]:
@@ -166,7 +231,7 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
     for part in sorted(parts, key=lambda p: p.start_s):
         laid = _as_laid(session, *_on_grid(session, part.start_s, part.stop_s))
         new = add_session(db, session.visit, laid, part.controller, None, session.hemisphere, counts=False)
-        why = "as stated when the recording was cut"
+        why = f"{STATED} when the recording was cut"
         if part.controller is None:
             guessed, why = _guess_controller(db, new)
             policy_id = arm.policy_id if arm and guessed == arm.controller else None
@@ -291,7 +356,8 @@ def _on_grid(session: StudySession, start_s: float, stop_s: float) -> tuple[floa
     start, stop = round(start_s / period) * period, round(stop_s / period) * period
     if not 0 <= start < length or stop_s > length + period:
         raise Invalid(f"The recording is {length:.0f} s long; {start_s:.0f} to {stop_s:.0f} s is not within it.", "Choose a part of it.")
-    stop = min(stop, length)
+    # its end is the last row, whole or not: forms show it in whole seconds
+    stop = length if stop_s > length - 1.0 and length - stop > 0.1 else min(stop, length)
     if stop - start < period:
         raise Invalid(f"The part from {start_s:.0f} to {stop_s:.0f} s holds no step of {period:g} s.", "Let it end after it begins.")
     return start, stop

@@ -12,9 +12,9 @@ from sqlalchemy.orm import Session
 from app.accounts import policy as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.policy import Caller
-from app.ingest import proposals, repository, service, sessions
+from app.ingest import proposals, repository, service
 from app.ingest.models import SessionProposal
-from app.ingest.proposal_forms import ProposalForm, as_change, as_parts, is_clocked, texts, typed_parts, typed_texts
+from app.ingest.proposal_forms import ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
 from app.ingest.proposals_api import CurrentProposal
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
@@ -25,6 +25,7 @@ from app.study import repository as study
 from app.study import service as study_service
 from app.study.api import CurrentParticipant
 from app.study.blinding import CONTROLLER_NAMES
+from app.study.contradictions import contradictions
 from app.study.models import Participant, StudySession
 from app.study.session_charts import control_chart
 
@@ -108,7 +109,8 @@ def _decide_one(
 ) -> bool:
     """One proposal of the posted form; whether it was confirmed."""
     stored = texts(db, session, proposal, caller)
-    typed = typed_texts(values, session.id, stored)
+    own = own_texts(values, session.id, stored)
+    typed = {**stored, **own}
     version = values[f"version-{session.id}"]
     if mine and verb == "discard":
         why = values.get(f"reason-{session.id}", "").strip()
@@ -120,8 +122,8 @@ def _decide_one(
     elif verb == "confirm" and (mine or (everyone and typed["visit"] and typed["controller"])):
         proposals.confirm(db, session, as_change(session, version, stored, typed), caller)
         return True
-    elif typed != stored and (mine or version == str(proposal.version)):
-        # what another tab changed meanwhile stays as it is there; only an own correction is saved along
+    elif own:
+        # what another tab changed meanwhile stays as it is there; an own correction beside it is refused by its version, not lost
         proposals.change(db, session, as_change(session, version, stored, typed), caller)
     return False
 
@@ -150,7 +152,7 @@ def _page(
         _form(request, db, s, behind[s.id], caller, refused.get(s.id), sent) for s in waiting[:SHOWN] if s.id in behind
     ]  # fmt: skip
     everyone = study.sessions_of_participant(db, participant.id, with_proposals=True)
-    fresh = [(s, sessions.contradictions(db, s)) for s in everyone if s.id in (confirmed or []) and s.status == "confirmed"]
+    fresh = [(s, contradictions(db, s)) for s in everyone if s.id in (confirmed or []) and s.status == "confirmed"]
     page = render(
         request,
         "ingest/proposals.html",
@@ -186,10 +188,10 @@ def _form(
         session,
         proposal,
         stored,
-        typed_texts(sent, session.id, stored) if error else stored,
+        {**stored, **own_texts(sent, session.id, stored)} if error else stored,
         typed_parts(sent if error else {}, session.id),
         is_clocked(session),
-        sessions.contradictions(db, session, proposal.visit_open),
+        contradictions(db, session, proposal.visit_open),
         sent.get(f"reason-{session.id}", "") if error else "",
         error.problem(request.url.path) if error else None,
     )

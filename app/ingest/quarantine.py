@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import datetime
 from pathlib import Path
 
 from cryptography.fernet import InvalidToken
@@ -22,13 +21,12 @@ from app.ingest.formats.redaction import REDACTOR_VERSION
 from app.ingest.models import UploadFile
 from app.ingest.receiving import MEDIA_TYPE, BetaStated, Kept, Receiver
 from app.ingest.service import UploadOutcome
-from app.ingest.sessions import StatedSession
 from app.platform import files
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
 from app.settings import get_settings
 from app.study import service as study_service
-from app.study.models import Controller, Hemisphere, Participant
+from app.study.models import Participant
 
 
 def review(db: Session, file_id: int, caller: Caller) -> bytes:
@@ -74,7 +72,7 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
     kept = Kept(kind, stored, sealed if redaction.unreadable else None, redaction, None)
     outcome = UploadOutcome(upload, participant, [Receiver(db, participant, upload, options, beta).decode(file.name, file, kept)])
     if file.status == "decoded":
-        service.make_sessions(db, outcome, _stated(db, participant, said))
+        service.make_sessions(db, outcome, service.as_stated(db, participant, said))
         if not redaction.unreadable:
             _erase(db, file)
     db.commit()
@@ -155,18 +153,3 @@ def _erase(db: Session, file: UploadFile) -> None:
     db.delete(db.get_one(files.StoredFile, sealed))
     db.commit()
     files.path_of(sealed).unlink(missing_ok=True)
-
-
-def _stated(db: Session, participant: Participant, said: dict[str, object]) -> StatedSession:
-    """What the sender had said of the upload."""
-    visit, controller, side, start = (said.get(name) for name in ("visit", "controller", "hemisphere", "started_at"))
-    return service.state_session(
-        db,
-        participant,
-        visit if isinstance(visit, int) else None,
-        Controller(str(controller)) if controller else None,
-        str(said["policy_id"]) if said.get("policy_id") else None,
-        datetime.fromisoformat(start) if isinstance(start, str) else None,
-        Hemisphere(str(side)) if side else None,
-        bool(said.get("confirm", True)),
-    )

@@ -5,6 +5,8 @@ Which sessions come out is decided when all files of the upload are in; see `app
 
 from __future__ import annotations
 
+import zipfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -15,9 +17,11 @@ from sqlalchemy.orm import Session
 
 from app.ingest import encryption, formats, outcomes_intake, recordings, repository
 from app.ingest.formats import FileKind
+from app.ingest.formats.archive import ZipFiles
 from app.ingest.formats.log import DecodedFile, FileReport, GraspLog, Problem, TraceLog, TraceSource, UndecodableFile
 from app.ingest.formats.numbers import unit_name
-from app.ingest.formats.options import DecodeOptions
+from app.ingest.formats.options import ArchiveLimits, DecodeOptions
+from app.ingest.formats.rcs import find_sessions
 from app.ingest.formats.redaction import REDACTOR_VERSION, Redaction
 from app.ingest.incoming import Incoming
 from app.ingest.models import Upload, UploadFile
@@ -28,6 +32,11 @@ from app.study.models import Participant, Recording, SettingsVersion
 
 log = structlog.get_logger()
 
+EMPTY = UndecodableFile("the file is empty", "0 bytes", "Send the file again from where it was recorded; an empty one is not kept.")
+CUT_SHORT = UndecodableFile(
+    "the service was stopped while it took this file", "file", "Read it again on the page of the quarantine, or send it again."
+)
+TAKEN_UP = "The service was stopped while it read this file and has read it from the kept bytes since; what was removed is not told again."
 TABLES = ("csv", "parquet")
 MEDIA_TYPE = "application/octet-stream"
 
@@ -75,7 +84,7 @@ class Kept:
     """A file as it was stored, and why it cannot be decoded, if so."""
 
     kind: str
-    stored_sha256: str
+    stored_sha256: str | None
     quarantine_sha256: str | None
     redaction: Redaction
     problem: UndecodableFile | None
@@ -105,7 +114,7 @@ class Receiver:
         try:
             if known := self._known(name, sha256):
                 return known
-            kept = self._keep(draft)
+            kept = self._keep(draft) if size else Kept("unreadable", None, None, Redaction(), EMPTY)
         finally:
             draft.unlink(missing_ok=True)
         row = UploadFile(
@@ -129,9 +138,25 @@ class Receiver:
         row = repository.decoded_file(self.db, self.participant.id, sha256)
         if row is None:
             return None
-        note = f"The same bytes came before, as '{row.name}' in upload {row.upload_id}; nothing was stored again and nothing was changed."
-        held = [*repository.recordings_of_file(self.db, row.id), *repository.recordings_by_id(self.db, known_recordings(row))]
-        return FileOutcome(name, row, [FileReport(name=row.name, understood=[note])], duplicate=True, same_bytes=True, recordings=held)
+        note = f"The same bytes came before, as '{row.name}' in upload {row.upload_id}; nothing was stored again."
+        report = FileReport(name=row.name, understood=[note])
+        return FileOutcome(name, row, [report], duplicate=True, same_bytes=True, recordings=self._recordings(row))
+
+    def _recordings(self, row: UploadFile) -> list[Recording]:
+        return [*repository.recordings_of_file(self.db, row.id), *repository.recordings_by_id(self.db, known_recordings(row))]
+
+    def take_up(self, row: UploadFile) -> FileOutcome:
+        """Go on with a file of an upload that was interrupted: decode it where that is still to do, else as it was left."""
+        if row.status != "received":
+            return FileOutcome(row.name, row, stored_reports(row), recordings=self._recordings(row))
+        sealed = row.stored_sha256 is None or row.stored_sha256 == row.quarantine_sha256
+        outcome = self.decode(
+            row.name, row, Kept(row.kind, row.stored_sha256, row.quarantine_sha256, Redaction(), CUT_SHORT if sealed else None)
+        )
+        if not outcome.same_bytes:
+            outcome.reports[0].understood.append(TAKEN_UP)
+            store_reports(row, outcome.reports, known_recordings(row))
+        return outcome
 
     def _keep(self, draft: Path) -> Kept:
         """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted.
@@ -156,16 +181,17 @@ class Receiver:
 
     def _quarantined(self, draft: Path, clean: Path, problem: UndecodableFile) -> Kept:
         clean.unlink(missing_ok=True)
+        left_out = _left_out(draft, self.options.archive)
         sealed = self._seal(draft)
-        return Kept("unreadable", sealed, sealed, Redaction(), problem)
+        return Kept("unreadable", sealed, sealed, Redaction(ignored=left_out), problem)
 
     def _seal(self, draft: Path) -> str:
         return files.store(self.db, encryption.encrypt(draft), MEDIA_TYPE).sha256
 
     def decode(self, name: str, row: UploadFile, kept: Kept) -> FileOutcome:
         """Decode a stored file; whatever is wrong with it becomes its report."""
-        if kept.problem is not None:
-            return self._failed(name, row, kept, kept.problem)
+        if kept.problem is not None or kept.stored_sha256 is None:
+            return self._failed(name, row, kept, kept.problem or CUT_SHORT)
         try:
             repository.lock_participant(self.db, self.participant.id)
             # asked again under the lock: somebody may have sent the same bytes meanwhile
@@ -196,11 +222,30 @@ class Receiver:
         return FileOutcome(name, row, reports, all_known, recordings=[*stored.known, *stored.fresh], grasps=decoded.grasps)
 
     def _failed(self, name: str, row: UploadFile, kept: Kept, problem: UndecodableFile) -> FileOutcome:
-        report = FileReport(name=row.name, removed=kept.redaction.removed, problem=problem.stored)
+        report = FileReport(name=row.name, problem=problem.stored)
+        _tell(report, kept.redaction, ())
+        before = repository.failed_file(self.db, self.participant.id, row) if row.decided_at is None else None
+        if before is not None:
+            return self._failed_before(name, row, before, report, problem)
         row.status = "failed"
         store_reports(row, [report])
         self.db.commit()
         return FileOutcome(name, row, [report], told=problem.told)
+
+    def _failed_before(self, name: str, row: UploadFile, before: UploadFile, report: FileReport, problem: UndecodableFile) -> FileOutcome:
+        """The same bytes were of no use before, and still are: they are kept once."""
+        report.understood.append(f"The same bytes came before, as file {before.id} in upload {before.upload_id}; they are kept once.")
+        sealed = row.quarantine_sha256
+        self.db.delete(row)
+        self.db.flush()
+        if sealed is not None:
+            # encrypted anew each time, so that no other row has these bytes
+            self.db.delete(self.db.get_one(files.StoredFile, sealed))
+        store_reports(before, [report])
+        self.db.commit()
+        if sealed is not None:
+            files.path_of(sealed).unlink(missing_ok=True)
+        return FileOutcome(name, before, [report], duplicate=True, same_bytes=True, told=problem.told)
 
     def _name_beta(self, decoded: DecodedFile) -> DecodedFile:
         """A table's beta under its source, with a sentence that says who stated unit and source."""
@@ -238,6 +283,11 @@ def store_reports(row: UploadFile, reports: Sequence[FileReport], known: Sequenc
     row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known)}
 
 
+def stored_reports(row: UploadFile) -> list[FileReport]:
+    """The reports of a file as they were stored."""
+    return [FileReport(**{**r, "problem": Problem(**r["problem"]) if r["problem"] else None}) for r in row.report.get("reports", [])]
+
+
 def known_recordings(row: UploadFile) -> list[int]:
     """Recordings of a file that another file had brought before."""
     found: list[int] = row.report.get("known_recordings", [])
@@ -252,11 +302,25 @@ def _whence(by_upload: str | None, by_settings: str | None) -> str:
 
 
 def _tell(report: FileReport, redaction: Redaction, notes: Sequence[str]) -> None:
-    """Add to the first report what cleaning the file found, and what was made of it."""
+    """Add to a report what cleaning the file found, and what was made of it."""
     for ours, found in ((report.removed, redaction.removed), (report.repaired, redaction.repaired), (report.ignored, redaction.ignored)):
         ours.extend(sentence for sentence in found if sentence not in ours)
     report.flagged.extend(f"kept encrypted, because it could not be read: {u}" for u in redaction.unreadable)
     report.understood.extend(notes)
+
+
+def _left_out(path: Path, limits: ArchiveLimits) -> list[str]:
+    """Why members of an archive of no use were left out, counted, without their names, which may identify a person."""
+    if not zipfile.is_zipfile(path):
+        return []
+    listing = FileReport("archive")
+    try:
+        with ZipFiles(path, limits) as members:
+            find_sessions(members, listing)
+            reasons = Counter(sentence.rsplit(": ", 1)[-1] for sentence in members.ignored)
+    except UndecodableFile:
+        return []  # the problem itself says what is wrong with the archive
+    return [*listing.ignored, *(f"{n} file{'s' if n > 1 else ''}: {reason}" for reason, n in sorted(reasons.items()))]
 
 
 def _harmless_name(name: str, kind: str) -> str:

@@ -124,10 +124,21 @@ def _decoded(db: Session, file: UploadFile, participant: Participant) -> Decoded
 
 
 def _outcomes_again(db: Session, file: UploadFile, decoded: DecodedFile) -> list[str]:
+    """Tremor minutes and grasp tests as they are read now; what came of it, or nothing where all of it is as it was."""
+    before = _outcomes(db, file)
     said = outcomes_intake.take_tremor(db, file, decoded.tremor)
     if file.session_id is not None:
         said += outcomes_intake.take_grasps(db, file, decoded.grasps, db.get_one(StudySession, file.session_id))
-    return said
+    return said if _outcomes(db, file) != before else []
+
+
+def _outcomes(db: Session, file: UploadFile) -> list[tuple[object, ...]]:
+    """All that reading an outcome file again can change: its minutes, its grasp tests, and the QoCs of the participant's sessions."""
+    series = study.tremor_series_of_file(db, file.participant_id, file.id)
+    minutes = (series.n, series.start_unix_s_f64, series.duration_s_f64, series.fractions_f32, series.any_tremor_f32) if series else ()
+    tests = [(t.session_id, t.hand, t.open_fist_s_f64, tuple(t.implausible)) for t in study.grasp_tests_of_file(db, file.id)]
+    revisions = [(s.id, len(s.qocs)) for s in study.sessions_of_participant(db, file.participant_id)]
+    return [minutes, *tests, *revisions]
 
 
 def _version(db: Session, recording: Recording) -> int:

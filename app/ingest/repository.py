@@ -32,6 +32,14 @@ def decoded_file(db: Session, participant_id: int, sha256: str) -> UploadFile | 
     )
 
 
+def failed_file(db: Session, participant_id: int, file: UploadFile) -> UploadFile | None:
+    """The participant's earlier file of the same original bytes that could not be used either, and that nobody has decided on."""
+    same = (UploadFile.original_sha256 == file.original_sha256) & (UploadFile.id < file.id) & (UploadFile.status == "failed")
+    sealed = UploadFile.quarantine_sha256.is_not(None) if file.quarantine_sha256 else UploadFile.quarantine_sha256.is_(None)
+    query = select(UploadFile).where(UploadFile.participant_id == participant_id, same, sealed, UploadFile.decided_at.is_(None))
+    return db.scalar(query.order_by(UploadFile.id).limit(1))
+
+
 def session_ids_of_file(db: Session, file: UploadFile, known_recordings: Sequence[int] = ()) -> list[int]:
     """Sessions that the recordings of a file belong to, or that the file was attached to.
 
@@ -118,9 +126,9 @@ def proposals(db: Session, session_ids: Sequence[int]) -> dict[int, SessionPropo
     return {p.session_id: p for p in db.scalars(select(SessionProposal).where(SessionProposal.session_id.in_(session_ids)))}
 
 
-def overlapping_proposals(db: Session, participant_id: int, begin: datetime, end: datetime) -> Sequence[StudySession]:
-    """A participant's proposed sessions with a start before `end`, newest first, that may share time with [begin, end]."""
-    query = select(StudySession).join(StudySession.visit).where(Visit.participant_id == participant_id, StudySession.status == "proposed")
+def overlapping_sessions(db: Session, participant_id: int, begin: datetime, end: datetime) -> Sequence[StudySession]:
+    """A participant's sessions, proposed ones too, with a start before `end`, newest first, that may share time with [begin, end]."""
+    query = select(StudySession).join(StudySession.visit).where(Visit.participant_id == participant_id)
     near = StudySession.started_at.between(begin - timedelta(days=1), end)
     return db.scalars(query.where(near).order_by(StudySession.id.desc())).all()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any, cast
@@ -16,9 +16,10 @@ from app.ingest import formats, outcomes_intake, proposals, repository, sessions
 from app.ingest.formats import FileKind
 from app.ingest.formats.log import FileReport, Problem, UndecodableFile
 from app.ingest.formats.options import BetaMeasure, DecodeOptions
+from app.ingest.in_progress import in_progress
 from app.ingest.incoming import Incoming, arrange
 from app.ingest.models import Upload, UploadFile
-from app.ingest.receiving import BetaStated, FileOutcome, Receiver, known_recordings, store_reports
+from app.ingest.receiving import BetaStated, FileOutcome, Receiver, known_recordings, store_reports, stored_reports
 from app.ingest.repository import GRASP_KIND
 from app.ingest.sessions import StatedSession
 from app.platform import files
@@ -100,6 +101,22 @@ def state_session(
     return StatedSession(visit, controller, policy_id, started_at, hemisphere, confirm, session)
 
 
+def as_stated(db: Session, participant: Participant, said: Mapping[str, object]) -> StatedSession:
+    """What the sender of a stored upload had said of its sessions. Raises Invalid as `state_session`."""
+    visit, controller, side, start, session = (said.get(name) for name in ("visit", "controller", "hemisphere", "started_at", "session"))
+    return state_session(
+        db,
+        participant,
+        visit if isinstance(visit, int) else None,
+        Controller(str(controller)) if controller else None,
+        str(said["policy_id"]) if said.get("policy_id") else None,
+        datetime.fromisoformat(start) if isinstance(start, str) else None,
+        Hemisphere(str(side)) if side else None,
+        bool(said.get("confirm", True)),
+        session if isinstance(session, int) else None,
+    )
+
+
 def receive(
     db: Session,
     participant: Participant,
@@ -124,28 +141,35 @@ def receive(
     upload = Upload(participant_id=participant.id, visit_id=visit_id, created_by=caller.label, report=[], stated=said)
     db.add(upload)
     db.flush()
-    arranged = arrange(incoming)
-    receiver = Receiver(db, participant, upload, decode_options(participant, beta), beta)
-    outcome = UploadOutcome(upload, participant, [], arranged.asides)
-    refused: list[TooLarge] = []
-    for one in arranged.incoming:
-        try:
-            outcome.files.append(receiver.receive(one))
-        except TooLarge as error:
-            refused.append(error)
-            problem = Problem(error.detail, "file", f"It was not kept. {error.mend}")
-            outcome.asides.append(FileReport(one.name, problem=problem))
-    if refused and not outcome.files:
-        raise refused[0]
+    with in_progress(upload.id):
+        arranged = arrange(incoming)
+        receiver = Receiver(db, participant, upload, decode_options(participant, beta), beta)
+        outcome = UploadOutcome(upload, participant, [], arranged.asides)
+        refused: list[TooLarge] = []
+        for one in arranged.incoming:
+            try:
+                outcome.files.append(receiver.receive(one))
+            except TooLarge as error:
+                refused.append(error)
+                problem = Problem(error.detail, "file", f"It was not kept. {error.mend}")
+                outcome.asides.append(FileReport(one.name, problem=problem))
+        if refused and not outcome.files:
+            raise refused[0]
+        finish(db, outcome, stated)
+    return outcome
+
+
+def finish(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
+    """What is done once all files of an upload are in: sessions, grasp tests, the report. Commits."""
+    upload = outcome.upload
     make_sessions(db, outcome, stated)
     _attach_grasps(db, outcome, stated)
     # a file that came before has its row in another upload; this one only points at it
     earlier = [o.row.id for o in outcome.files if o.same_bytes]
-    upload.stated = said | {"duplicates": earlier}
+    upload.stated = {**upload.stated, "duplicates": earlier}
     upload.report = [asdict(r) for o in outcome.files for r in o.reports]
     upload.status = "decoded" if outcome.usable else "failed"
     db.commit()
-    return outcome
 
 
 def _said(stated: StatedSession, beta: BetaStated) -> dict[str, Any]:
@@ -175,14 +199,22 @@ def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) ->
         # the recordings are stored and safe; a fault of ours must not turn a whole upload away
         log.exception("sessions could not be made", upload=outcome.upload.id, fault=repr(fault))
         trouble = f"No session could be made of it. It is stored; tell your administrator: upload {outcome.upload.id}."
+    told: set[int] = set()
     for file in with_recordings:
         mine = {r.id for r in file.recordings}
+        if mine <= told:
+            _tell_copy(db, file, mine)
+            continue
+        told |= mine
         earlier = sorted({i for r in mine for i in known[r]})
         if earlier and not file.same_bytes:
             listed = ", ".join(map(str, earlier))
             file.reports[0].understood.append(f"The same recording came before in another file; it stays session {listed}.")
         file.reports[0].flagged.extend(sessions.disagreements(db, earlier, stated))
         ours = [m for m in made if any(r.id in mine for r in m.recordings)]
+        if file.same_bytes:
+            anew = "It has no session any more: it is proposed anew." if ours else "Nothing was changed."
+            file.reports[0].understood.append(anew)
         for one in ours:
             file.reports[0].understood.extend(one.understood)
             file.reports[0].flagged.extend(one.flagged)
@@ -191,6 +223,15 @@ def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) ->
             file.reports[0].flagged.append(trouble or _no_session(len(without), len(mine)))
         file.session_ids = sorted({*earlier, *(m.session.id for m in ours)})
         _keep_reports(file)
+
+
+def _tell_copy(db: Session, file: FileOutcome, recordings: set[int]) -> None:
+    """Of a further copy of what this upload holds already, only that it is one, and where it is."""
+    file.session_ids = sorted({i for r in recordings for i in study.session_ids_of_recording(db, r)})
+    where = f"; it is session {', '.join(map(str, file.session_ids))}" if file.session_ids else ""
+    file.duplicate = True
+    file.reports[0].understood.append(f"The same recording as in another file of this upload{where}.")
+    _keep_reports(file)
 
 
 def _no_session(without: int, of: int) -> str:
@@ -265,8 +306,3 @@ def stored_outcomes(db: Session, upload: Upload) -> list[FileOutcome]:
         FileOutcome(f.name, f, stored_reports(f), before, before, repository.session_ids_of_file(db, f, known_recordings(f)))
         for f, before in both
     ]
-
-
-def stored_reports(row: UploadFile) -> list[FileReport]:
-    """The reports of a file as they were stored."""
-    return [FileReport(**{**r, "problem": Problem(**r["problem"]) if r["problem"] else None}) for r in row.report.get("reports", [])]

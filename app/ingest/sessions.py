@@ -1,4 +1,4 @@
-"""From recordings to sessions: what belongs together, which part of which recording it is, and what contradicts what was said."""
+"""From recordings to sessions: what belongs together, and which part of which recording it is."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from app.platform.errors import Conflict, Invalid
 from app.study import blinding
 from app.study import repository as study
 from app.study.models import Controller, Hemisphere, Participant, Recording, SessionSegment, StudySession, Trace, Visit
-from app.study.traces import AMPLITUDE_STREAM, cdbs_amplitude_ma, pack, step_table, unpack
+from app.study.traces import AMPLITUDE_STREAM, cdbs_amplitude_ma, pack, unpack
 
 CONTROL_STREAMS = ("beta", "band_power")
 """Streams that can drive a controller, in the order of preference where the participant's source does not decide."""
@@ -95,7 +95,9 @@ def lay(db: Session, participant: Participant, recordings: Sequence[Recording], 
 
     Args:
         recordings: of one session, none of them empty.
-        alone: whether the stated start is meant for these recordings alone; else it counts where it lies within them.
+        alone: whether the upload holds these recordings alone, so that a stated start is theirs where they tell none.
+
+    A stated start counts where it lies within the recording: a recording's own clock is never overruled, but the notes say so.
     """
     settings = participant.current_settings
     choices = [(_control(study.traces_of_recording(db, r.id), settings.beta_source), r) for r in recordings]
@@ -103,14 +105,24 @@ def lay(db: Session, participant: Participant, recordings: Sequence[Recording], 
     choices.sort(key=lambda c: (stated.hemisphere is not None and c[1].hemisphere != stated.hemisphere, c[0] is None))
     trace, control = choices[0]
     started_at = control.started_at
-    if stated.started_at is not None and (alone or _inside(stated.started_at, control)):
+    if stated.started_at is not None and _inside(stated.started_at, control) and (alone or control.started_at is not None):
         started_at = stated.started_at
     start_s = offset_s(control, started_at, settings.period_s)
     stream, channel = (trace.stream, trace.channel) if trace else (CONTROL_STREAMS[0], None)
     laid = Laid(control, list(recordings), start_s, control.duration_s, started_at, stream, channel)
     if stated.started_at is not None and started_at is not stated.started_at:
-        laid.notes.append("The stated start does not lie in this recording: its own time was taken.")
+        laid.notes.append(_start_refused(stated.started_at, control))
     return laid
+
+
+def _start_refused(stated: datetime, control: Recording) -> str:
+    if control.started_at is None:
+        return "The stated start was not taken: several recordings of this upload tell no time, and one start cannot be that of each."
+    end = control.started_at + timedelta(seconds=control.duration_s)
+    return (
+        f"The stated start {stated:%Y-%m-%d %H:%M:%S} UTC does not lie in this recording ({control.started_at:%Y-%m-%d %H:%M:%S} to "
+        f"{end:%H:%M:%S} UTC by its own clock): the recording's own time was taken."
+    )
 
 
 def _inside(moment: datetime, recording: Recording) -> bool:
@@ -118,9 +130,13 @@ def _inside(moment: datetime, recording: Recording) -> bool:
 
 
 def _control(traces: Sequence[Trace], wanted_source: str | None) -> Trace | None:
-    """The trace that the controller is taken to have seen: of the participant's source where there is one, else the first stream's."""
+    """The trace that the controller is taken to have seen: of the participant's source where there is one, else of the first stream.
+
+    Of several channels it is the one with the most valid steps, and the first of equals.
+    """
     candidates = [t for stream in CONTROL_STREAMS for t in traces if t.stream == stream and any(t.valid_bits)]
-    return next((t for t in candidates if t.source == wanted_source), candidates[0] if candidates else None)
+    wanted = [t for t in candidates if t.source == wanted_source] or [t for t in candidates if t.stream == candidates[0].stream]
+    return max(wanted, key=lambda t: int(np.sum(~np.isnan(unpack(t)))), default=None)
 
 
 def offset_s(recording: Recording, started_at: datetime | None, period_s: float) -> float:
@@ -139,16 +155,22 @@ def set_segments(session: StudySession, laid: Laid, period_s: float) -> None:
     session.segments.clear()
     for recording in laid.recordings:
         if recording is laid.control:
-            start_s, stop_s = laid.start_s, laid.stop_s
+            stop_s = max(laid.stop_s, laid.start_s + 1e-3)  # a segment needs a length
+            session.segments.append(SessionSegment(recording=recording, start_s=laid.start_s, stop_s=stop_s, is_control=True))
         else:
-            start_s = offset_s(recording, laid.started_at, period_s) if laid.started_at else laid.start_s
-            ahead = (recording.started_at - laid.started_at).total_seconds() if recording.started_at and laid.started_at else 0.0
-            # a recording that begins within the session holds less of it by what it comes too late
-            stop_s = min(start_s + (laid.stop_s - laid.start_s) - max(ahead, 0.0), recording.duration_s)
-        if recording is not laid.control and stop_s <= start_s:
-            continue
-        stop_s = max(stop_s, start_s + 1e-3)  # a segment needs a length
-        session.segments.append(SessionSegment(recording=recording, start_s=start_s, stop_s=stop_s, is_control=recording is laid.control))
+            add_beside(session, recording, laid, period_s)
+
+
+def add_beside(session: StudySession, recording: Recording, laid: Laid, period_s: float) -> bool:
+    """Give a session its stretch of a recording that its controller did not see; whether the recording holds any of it."""
+    start_s = offset_s(recording, laid.started_at, period_s) if laid.started_at else laid.start_s
+    ahead = (recording.started_at - laid.started_at).total_seconds() if recording.started_at and laid.started_at else 0.0
+    # a recording that begins within the session holds less of it by what it comes too late
+    stop_s = min(start_s + (laid.stop_s - laid.start_s) - max(ahead, 0.0), recording.duration_s)
+    if stop_s <= start_s:
+        return False
+    session.segments.append(SessionSegment(recording=recording, start_s=start_s, stop_s=stop_s, is_control=False))
+    return True
 
 
 def add_session(
@@ -204,39 +226,6 @@ def in_milliamperes(trace: Trace, cdbs_ma: float) -> None:
     trace.details = {**trace.details, "given_as": "fraction", "cdbs_ma": cdbs_ma}
 
 
-def contradictions(db: Session, session: StudySession, visit_open: bool = False) -> list[str]:
-    """Sentences where the amplitudes or the date of a session are not those of the controller and the visit it is said to have had.
-
-    Args:
-        visit_open: nobody has said the visit yet, so that its date contradicts nothing.
-    """
-    visit, found = session.visit, []
-    if not visit_open and visit.date is not None and session.started_at is not None and session.started_at.date() != visit.date:
-        found.append(f"Recorded on {session.started_at.date()}, but visit {visit.number} is dated {visit.date}. Correct one of them.")
-    try:
-        table = step_table(db, session, visit.participant.current_settings)
-    except Invalid as error:
-        return [str(error), *found]
-    inside = table.fraction[table.t_s > 0]
-    known = inside[~np.isnan(inside)]
-    if table.above_one:
-        found.append(
-            f"{table.above_one} of {inside.size} steps lie above the cDBS amplitude of {table.cdbs_ma or float('nan'):g} mA; "
-            "they are kept as they are and stay out of replay buffers."
-        )
-    arm = blinding.stated_arm(session, SYSTEM)
-    if arm is None:
-        return found
-    mean = float(known.mean()) if known.size else None
-    if mean is not None and arm.controller is Controller.CDBS and not 0.9 <= mean <= 1.1:
-        found.append(f"Said to be cDBS, but its mean amplitude is {100 * mean:.0f} % of the cDBS amplitude. Correct one of them.")
-    if mean is not None and arm.controller is Controller.NO_DBS and mean > 0.05:
-        found.append(f"Said to be without DBS, but its mean amplitude is {100 * mean:.0f} % of the cDBS amplitude. Correct one of them.")
-    if arm.controller in (Controller.RL, Controller.DISTILLED) and arm.policy_id is None:
-        found.append("No policy is named for this session: it cannot be compared with its estimate. Name one on the session's page.")
-    return found
-
-
 def refuse_overlap(db: Session, session: StudySession) -> None:
     """Raises Conflict where a confirmed session already counts on the same stretch of a recording."""
     for segment in session.segments:
@@ -264,6 +253,8 @@ def disagreements(db: Session, session_ids: Sequence[int], stated: StatedSession
             differs.append(f"its controller is {controller or 'still open'}, not {stated.controller}")
         if stated.policy_id is not None and policy_id != stated.policy_id:
             differs.append(f"its policy is {policy_id or 'none'}, not {stated.policy_id}")
+        if stated.hemisphere is not None and session.hemisphere != stated.hemisphere:
+            differs.append(f"it is controlled on the {session.hemisphere or 'unknown'} side, not the {stated.hemisphere}")
         if differs:
             where = "among the proposals" if session.status == "proposed" else "on its page"
             found.append(f"Session {session_id} was not changed: {'; '.join(differs)}. Correct it {where} if it is wrong there.")

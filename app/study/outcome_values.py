@@ -183,11 +183,14 @@ def _grasp_value(counted: list[GraspView], how: str) -> tuple[float | None, str]
     undefined = [v for v in counted if v.hz is None]
     if undefined:
         return None, f"{how}; fewer than two open fists ({', '.join(v.whose for v in undefined)})"
+    low, high = PLAUSIBLE_INTERVAL_S
+    if odd_tests := [v for v in counted if v.implausible.all()]:
+        whose = ", ".join(v.whose for v in odd_tests)
+        return None, f"{how}; every interval lies outside {low:g} to {high:g} s ({whose}): are its times in the unit that the header says?"
     known = [v.hz for v in counted if v.hz is not None]
     value = float(np.mean(known))
     basis = f"{how}, {' + '.join(str(v.open_fist_s.size) for v in counted)} open fists"
     if odd := sum(int(v.implausible.sum()) for v in counted):
-        low, high = PLAUSIBLE_INTERVAL_S
         without = [v.plausible_hz for v in counted if v.plausible_hz is not None]
         basis += f", {odd} intervals outside {low:g} to {high:g} s counted"
         basis += f", without them {np.mean(without):.4g} Hz" if len(without) == len(counted) else ", nothing left without them"

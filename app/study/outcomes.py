@@ -264,7 +264,8 @@ def _derive_overlapping(db: Session, participant_id: int, spans: Sequence[tuple[
         listed = ", ".join(map(str, without_start[:20]))
         said.append(f"Confirmed sessions whose start nobody stated cannot be laid over these minutes: {listed}.")
     if not touched:
-        said.append("No confirmed session with a start lies in these minutes; they count as soon as one does.")
+        # true whatever session is made of the same upload afterwards
+        said.append("They count in every confirmed session with a start that they cover, also in one that is made later.")
     return said
 
 

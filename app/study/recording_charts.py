@@ -48,12 +48,11 @@ def trace_charts(recording: Recording, traces: Sequence[Trace], stretch: Stretch
             spread: list[Cell] = [float(np.median(known)), float(known.min()), float(known.max())] if known.size else [None, None, None]
             rows.append([name, int(known.size), int(values.size), *spread, trace.source.replace("_", " "), trace.decode_version])
         layout = {"xaxis": axis("Time in session", "min"), "yaxis": axis("", unit, zeroline=False), "showlegend": True}
-        valid, all_ = (sum(int(r[i] or 0) for r in rows) for i in (1, 2))
         charts.append(
             Chart(
                 f"traces-{recording.id}-{number}",
                 _title(group),
-                f"{unit} over {dt_s:g} s · n = {valid} valid of {all_} windows in {len(group)} traces",
+                f"{unit} over {dt_s:g} s · {_windows(rows)}",
                 figure(lines, **layout),
                 ("Trace", "Valid", "Windows", f"Median ({unit})", f"Minimum ({unit})", f"Maximum ({unit})", "Source", "Decode version"),
                 rows,
@@ -99,6 +98,20 @@ def spectrum_charts(recording: Recording, low_hz: float, high_hz: float) -> list
             )
         )
     return charts
+
+
+def _windows(rows: Sequence[Sequence[Cell]]) -> str:
+    """Valid windows of each trace in words, from rows (name, valid, windows, …)."""
+    valid, windows = (_span([int(row[i] or 0) for row in rows]) for i in (1, 2))
+    return (
+        f"n = {valid} of {windows} windows valid"
+        if len(rows) == 1
+        else f"{len(rows)} traces, n = {valid} of {windows} windows valid in each"
+    )
+
+
+def _span(counts: Sequence[int]) -> str:
+    return str(counts[0]) if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
 
 
 def trace_name(trace: Trace) -> str:

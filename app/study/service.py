@@ -240,7 +240,13 @@ class SessionData:
         trace, settings = self.table.beta_trace, self.settings
         if trace is None or settings.xi_beta is None:
             return ""
-        wanted = (settings.beta_unit or trace.unit, settings.beta_source or trace.source)
+        unstated = [name for name, value in (("unit", settings.beta_unit), ("source", settings.beta_source)) if not value]
+        if unstated:
+            return (
+                f"Nobody has stated the {' and the '.join(unstated)} of the threshold of {settings.xi_beta:g}; this trace is in "
+                f"{trace.unit} from {trace.source}. State unit and source in the participant's settings."
+            )
+        wanted = (settings.beta_unit, settings.beta_source)
         if (trace.unit, trace.source) == wanted:
             return ""
         return (
@@ -250,7 +256,7 @@ class SessionData:
 
     @property
     def threshold(self) -> float | None:
-        """xi_beta, where it is in the unit and from the source of this trace."""
+        """xi_beta, where it is stated to be in the unit and from the source of this trace."""
         return None if self.threshold_mismatch else self.settings.xi_beta
 
 

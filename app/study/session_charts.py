@@ -132,7 +132,11 @@ def control_chart(data: SessionData) -> Chart:
     }  # fmt: skip
     _mark_lead(layout, float(minutes[0]))
     if data.threshold is not None:
-        _add(layout, horizontal(data.threshold, f"threshold {data.threshold:.4g} {unit}".strip(), WARN))
+        line, _ = horizontal(data.threshold, "", WARN)
+        layout["shapes"].append(line)
+        # named in the legend: beta runs about the threshold, so that a label at the line would lie on the data
+        label = f"threshold {data.threshold:.4g} {unit}".strip()
+        traces.append({"type": "scatter", "mode": "lines", "name": label, "x": [None], "y": [None], "line": line["line"]})
     missing = _mark_missing(layout, data) if table.beta_trace else 0
     if missing:
         # an entry of the legend for the shading

@@ -20,6 +20,7 @@ from app.platform.templates import render
 from app.study import repository, service, session_view
 from app.study.api import CurrentSession
 from app.study.blinding import CONTROLLER_NAMES, arm
+from app.study.contradictions import contradictions, control_recording
 from app.study.models import QocRevision, Recording, StudySession
 from app.study.schemas import DerivedChoice, QocIn, SessionChange
 from app.study.service import SessionData
@@ -228,6 +229,8 @@ def _page(
         data=data,
         trouble=trouble,
         summary=summarise(data) if data else None,
+        contradictions=contradictions(db, session, steps_told=True),
+        control=control_recording(session),
         view=view,
         steps=stimulation_steps(data, events, origin) if data else [],
         conflicts=operator_conflicts(events, origin),

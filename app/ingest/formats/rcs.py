@@ -6,16 +6,17 @@ Any stream may be missing, empty or cut: what is there is decoded, and a report 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
-from app.ingest.formats.archive import Files, FolderFiles, ZipFiles
+from app.ingest.formats.archive import READ_ERRORS, Files, FolderFiles, ZipFiles
 from app.ingest.formats.log import DecodedFile, FileReport, Problem, RecordingLog, UndecodableFile
 from app.ingest.formats.options import DecodeOptions
 from app.ingest.formats.rcs_json import JsonNotes, read_elements
 from app.ingest.formats.rcs_leads import leads_only
+from app.ingest.formats.rcs_opening import HEAD, STEM_OF, Opening, group, read_opening
 from app.ingest.formats.rcs_recording import Streams, build_recording
 from app.ingest.formats.rcs_scan import Batch, batch_of, scan
 from app.ingest.formats.rcs_settings import Settings, follow
@@ -27,14 +28,9 @@ NEEDED = ("DeviceSettings", "StimLog", "RawDataTD", "RawDataPower", "AdaptiveLog
 """Files whose absence is worth a word."""
 
 COUNTED = {"ErrorLog": "errors", "DiagnosticsLog": "diagnostics"}
-KEY_OF = {
-    "RawDataTD": "TimeDomainData",
-    "RawDataPower": "PowerDomainData",
-    "RawDataAccel": "AccelData",
-    "RawDataFFT": "FftData",
-    "TimeSync": "TimeSyncData",
-}
+KEY_OF = {stem: key for key, stem in STEM_OF.items()}
 KNOWN = {name.lower(): name for name in (*NEEDED, *KEY_OF, *COUNTED)}
+MIXED = "the files of one folder name {} implants or sessions: each was taken as a recording of its own, for two are never mixed"
 NEEDED_SETTINGS = ("RecordInfo", "UtcOffset", "GeneralData", "SensingConfig", "SenseState", "AdaptiveConfig", "DetectionConfig")
 SLOW_BATCH = 256
 MAX_PACKETS = 2_000_000
@@ -90,20 +86,54 @@ def decode_files(files: Files, options: DecodeOptions, name: str) -> DecodedFile
 
 
 def find_sessions(files: Files, report: FileReport) -> list[SessionFiles]:
-    """Known files by folder; unknown files are counted in the report, without their names, which may identify a person."""
-    folders: dict[str, dict[str, str]] = defaultdict(dict)
+    """Known files by folder, and within a folder by the implant and the session that they name: two recordings are never mixed.
+
+    A file is known by its name, else by its content. The others are counted in the report, without their names, which may identify a
+    person.
+    """
+    folders: dict[str, list[tuple[str, str, Opening]]] = defaultdict(list)
     unknown = 0
     for name in files.names():
         path = PurePosixPath(name)
         stem = KNOWN.get(path.stem.lower()) if path.suffix.lower() == ".json" else None
+        opening = _opening(files, name)
+        stem = stem or opening.stem
         if stem is None:
             unknown += 1
         else:
-            folders[str(path.parent)].setdefault(stem, name)
+            folders[str(path.parent)].append((stem, name, opening))
     if unknown:
         report.ignored.append(f"{unknown} file{'s' if unknown != 1 else ''} not of an RC+S session")
-    many = len(folders) > 1
-    return [SessionFiles(members, f"recording {i}: " if many else "") for i, (_, members) in enumerate(sorted(folders.items()), start=1)]
+    found = [members for _, listed in sorted(folders.items()) for members in _apart(listed, report)]
+    return [SessionFiles(members, f"recording {i}: " if len(found) > 1 else "") for i, members in enumerate(found, start=1)]
+
+
+def _opening(files: Files, name: str) -> Opening:
+    """The begin of a file; one that cannot be unpacked tells nothing here and is reported when it is read."""
+    try:
+        with files.open(name) as stream:
+            return read_opening(stream.read(HEAD))
+    except (UndecodableFile, *READ_ERRORS):
+        return Opening()
+
+
+def _apart(listed: Sequence[tuple[str, str, Opening]], report: FileReport) -> list[dict[str, str]]:
+    """The files of one folder as one or more recordings, each from stem to name; what is left out is said."""
+    groups = group([opening for _, _, opening in listed])
+    if len(groups.recordings) > 1:
+        report.flagged.append(MIXED.format(len(groups.recordings)))
+    if groups.homeless:
+        report.ignored.append(f"{len(groups.homeless)} empty files that do not say which of these recordings they belong to")
+    out: list[dict[str, str]] = []
+    for places in groups.recordings:
+        # of two files of one kind the one with the device's own name counts
+        mine = sorted((listed[i] for i in places), key=lambda m: PurePosixPath(m[1]).stem.lower() not in KNOWN)
+        members: dict[str, str] = {}
+        for stem, name, _ in mine:
+            if members.setdefault(stem, name) != name:
+                report.ignored.append(f"{stem} stands more than once in one folder; one of them was used")
+        out.append(dict(sorted(members.items())))
+    return out
 
 
 def decode_session(session: SessionFiles, files: Files, options: DecodeOptions) -> RecordingLog:

@@ -39,19 +39,25 @@ Scanner = Callable[[bytes, int], tuple[Batch, int, bool]]
 
 _INF = re.compile(r"(?<=[\[:,\s])([+-]?)(?:INF|Inf|inf)(?=[\],}\s])")
 _SPACE = re.compile(r"[\s,\ufeff\x00]*")
+_COLON = re.compile(r"\s*:\s*")
 _OPEN = re.compile(r'"(' + "|".join(STREAM_KEYS) + r')"\s*:\s*\[')
 _NEXT = {"packets": re.compile(r'\{\s*"Header"'), "records": re.compile(r'\{\s*"RecordInfo"')}
 
 
 @dataclass(slots=True)
 class JsonNotes:
-    """What was met while reading one file. The reader fills it in; it is complete when the reader is exhausted."""
+    """What was met while reading one file. The reader fills it in; it is complete when the reader is exhausted.
+
+    Attributes:
+        unread_fields: fields of stream objects beside `RecordInfo` and the packets; they are stepped over.
+    """
 
     defects: list[str] = field(default_factory=list)
     elements: int = 0
     stream_key: str | None = None
     record_infos: list[dict[str, Any]] = field(default_factory=list)
     damaged: int = 0
+    unread_fields: int = 0
 
 
 class _Text:
@@ -134,7 +140,7 @@ def read_elements(stream: IO[bytes], notes: JsonNotes, scanner: Scanner | None =
         key = _enter_stream(window, notes, decoder)
         if key is not None:
             yield from _read_list(window, notes, decoder, "packets", scanner)
-            closed = _leave_stream(window)
+            closed = _leave_stream(window, notes, decoder)
             continue
         if window.skip_space() == "{":
             closed = yield from _read_list(window, notes, decoder, "records")
@@ -156,9 +162,11 @@ def _enter_stream(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) ->
         return None
     head = window.text[window.at : match.start()].rstrip().rstrip(",") + "}"
     try:
-        info = decoder.decode(head).get("RecordInfo")
+        fields = decoder.decode(head)
     except (ValueError, RecursionError):
         return None
+    info = fields.get("RecordInfo")
+    notes.unread_fields += len(fields) - ("RecordInfo" in fields)
     if isinstance(info, dict) and not notes.record_infos:
         notes.record_infos.append(info)
     notes.stream_key = notes.stream_key or match[1]
@@ -166,12 +174,36 @@ def _enter_stream(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) ->
     return match[1]
 
 
-def _leave_stream(window: _Text) -> bool:
-    """Step over what closes a stream object; True when the outer list is closed too."""
-    for mark in "]}":
-        if window.skip_space() == mark:
-            window.at += 1
+def _leave_stream(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) -> bool:
+    """Step over what closes a stream object, fields behind its packets included; True when the outer list is closed too."""
+    if window.skip_space() == "]":
+        window.at += 1
+    while window.skip_space() == '"' and _skip_field(window, notes, decoder):
+        notes.unread_fields += 1
+    if window.skip_space() == "}":
+        window.at += 1
     return window.skip_space() == "]"
+
+
+def _skip_field(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) -> bool:
+    """Step over one `"key": value`; False, and not moved, where it is damaged, cut, or longer than an element may be."""
+    while True:
+        try:
+            key, end = decoder.raw_decode(window.text, window.at)
+            colon = _COLON.match(window.text, end)
+            value, end = decoder.raw_decode(window.text, colon.end() if colon else end)
+        except RecursionError:
+            return False
+        except ValueError:
+            colon, end = None, len(window.text)
+        if end == len(window.text) and len(window.text) - window.at < MAX_ELEMENT and window.more():
+            continue  # it may go on in the next chunk
+        if colon is None:
+            return False
+        if key in STREAM_KEYS and value:
+            _note(notes, f"a second list of packets in one object ({key}) was left out")
+        window.at = end
+        return True
 
 
 def _read_list(

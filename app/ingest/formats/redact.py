@@ -1,7 +1,8 @@
 """Take identity out of an RC+S archive before it is stored: names, serial numbers, dates of birth, free text, folder names.
 
-What stays is listed, not what goes: a text is kept only where its key is known to hold a technical word of a known shape. The result
-decodes to the same recording, apart from the device's name, which becomes a keyed pseudonym.
+What stays is listed, not what goes: a field is kept only where its key is known (`rcs_keys`), and a text only where its key is known to
+hold a technical word of a known shape. The result decodes to the same recording, apart from the device's name, which becomes a keyed
+pseudonym.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ from app.ingest.formats.archive import ZipFiles
 from app.ingest.formats.log import FileReport, UndecodableFile
 from app.ingest.formats.options import ArchiveLimits
 from app.ingest.formats.rcs import SessionFiles, find_sessions
-from app.ingest.formats.rcs_json import STREAM_KEYS, JsonNotes, read_elements
+from app.ingest.formats.rcs_json import JsonNotes, read_elements
+from app.ingest.formats.rcs_keys import KEYS
 from app.ingest.formats.rcs_labels import NO_LABEL, parse, render
 from app.ingest.formats.rcs_leads import clean_leads
+from app.ingest.formats.rcs_opening import NAMED
 from app.ingest.formats.rcs_scan import Batch, scan
 from app.ingest.formats.redaction import PSEUDONYM, Redaction, pseudonym
 
@@ -30,7 +33,6 @@ DEFLATE_LEVEL = 1
 EPOCH = (1980, 1, 1, 0, 0, 0)
 BLANKED = frozenset({"SubjectInfo", "LastPtmRtmInfo"})
 SERIALS = frozenset({"telMDeviceId", "implantDate"})
-KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
 GAIN_TRIM = re.compile(r"cfg_config_data\.dev\.HT_sns_amp\d_gain\d{3,4}_trim")
 TEXTS = {
     "ApiVer": re.compile(r"\d{1,3}(\.\d{1,3}){0,3}"),
@@ -71,7 +73,8 @@ def redact_rcs_zip(source: Path, target: Path, key: bytes, limits: ArchiveLimits
         sessions = find_sessions(files, listing)
         if not sessions:
             raise UndecodableFile("no RC+S session in here", "archive", "Zip the session's Device folder with its JSON files.")
-        done = Redaction(ignored=[*listing.ignored, *files.ignored])
+        # in the archive that is written every recording has a folder of its own
+        done = Redaction(repaired=listing.flagged, ignored=[*listing.ignored, *files.ignored])
         scrub = _Scrubber(key)
         taken: set[str] = set()
         members = sorted(_plan(sessions, files, scrub, taken))
@@ -142,6 +145,7 @@ def _write_member(archive: zipfile.ZipFile, name: str, shown: str, files: ZipFil
     except UndecodableFile as error:
         done.unreadable.append(f"{shown}: {error.what}")
         return
+    scrub.fields_left_out(notes.unread_fields)
     done.repaired.extend(f"{shown}: {defect}" for defect in notes.defects)
 
 
@@ -179,6 +183,10 @@ class _Scrubber:
             self._gone["device"] += 1
         return pseudonym(serial, self._key)
 
+    def fields_left_out(self, count: int) -> None:
+        """Count fields that the reader stepped over."""
+        self._gone["key"] += count
+
     def text(self, value: Any, text: str) -> str:
         """Clean JSON text of one element, or of a run; packets that hold nothing but known words are copied as they stand."""
         if isinstance(value, Batch):
@@ -207,13 +215,13 @@ class _Scrubber:
             yield name, clean_leads(item) if name == "SubjectInfo" else {}
         elif name in SERIALS or "serial" in name.lower():
             self._gone["serial"] += 1
-        elif not (KEY.fullmatch(name) or name in STREAM_KEYS):
+        elif name not in KEYS:
             self._gone["key"] += 1
         else:
             yield name, self.clean(item, name)
 
     def _string(self, text: str, key: str) -> str:
-        if key == "DeviceId":
+        if key == "DeviceId" and NAMED.fullmatch(text.strip()):
             return self.device(text)
         if (shape := TEXTS.get(key)) is not None and shape.fullmatch(text):
             return text
@@ -238,6 +246,6 @@ class _Scrubber:
             "serial": "serial numbers, telemetry addresses and the date of the implant",
             "note": "free text of operator's notes: amplitude, rate, pulse width, group and start or stop stay",
             "text": "other texts not known to be technical",
-            "key": "fields with unknown names",
+            "key": "fields that no RC+S file is known to have, with their numbers",
         }
         return [f"{text} ({self._gone[name]}×)" for name, text in said.items() if self._gone[name]]

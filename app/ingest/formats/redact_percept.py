@@ -19,7 +19,8 @@ from app.ingest.formats.log import UndecodableFile
 from app.ingest.formats.options import ArchiveLimits
 from app.ingest.formats.percept import report_members
 from app.ingest.formats.percept_details import EVENT_WORDS
-from app.ingest.formats.percept_json import MEND, SECTIONS, channel_names, moment, read_report, word
+from app.ingest.formats.percept_enums import is_known
+from app.ingest.formats.percept_json import MEND, SECTIONS, channel_names, moment, read_report
 from app.ingest.formats.percept_keys import KEYS
 from app.ingest.formats.redaction import Redaction, pseudonym
 
@@ -47,6 +48,7 @@ TEXTS = {
     "Pass": re.compile(r"(FIRST|SECOND|THIRD)_PASS|SQC|((ZERO|ONE|TWO|THREE)_?)+"),
 }
 ENUM = re.compile(r"(Ins(Location|Port)|[A-Za-z]{2,40}Def)[._][A-Za-z0-9_]{1,60}")
+"""What looks like an enumeration; only those of `percept_enums` stay."""
 
 
 def redact_percept(source: Path, target: Path, key: bytes, limits: ArchiveLimits | None = None) -> Redaction:
@@ -152,7 +154,7 @@ class _Scrubber:
     def _text(self, text: str, key: str) -> str:
         if self._technical(text, key):
             return text
-        self._gone["text"] += 1
+        self._gone["enum" if ENUM.fullmatch(text) else "text"] += 1
         return ""
 
     @staticmethod
@@ -169,7 +171,7 @@ class _Scrubber:
             return shape.fullmatch(text) is not None
         if key.endswith(("DateTime", "Date", "date")):
             return moment(text) is not None
-        return ENUM.fullmatch(text) is not None and word(text) is not None
+        return is_known(text)
 
     def sentences(self) -> list[str]:
         """What was taken out, without showing any of it."""
@@ -178,6 +180,7 @@ class _Scrubber:
             "place": "time zone and language of the programmer, feature codes (the offset from UTC stays)",
             "device": "serial number of the neurostimulator: a keyed pseudonym stays",
             "section": "sections not known to be technical",
+            "enum": "enumerations with values that no report is known to have",
             "text": "texts not known to be technical, such as names of events",
             "key": "fields not known to be technical, such as names of devices and groups, notes and the date of the implant",
             "deep": "parts nested beyond reason",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from datetime import UTC, date, datetime
+from datetime import date
 
 import numpy as np
 import pytest
 
 from app.ingest.evidence import guess_controller, guess_visit
+from app.study.contradictions import Delivered
 from app.study.models import Controller, Visit
 from app.study.traces import StepTable
 
@@ -19,6 +20,10 @@ def steps(amplitude_ma: list[float], cdbs_ma: float | None = 3.0) -> StepTable:
     t_s = 2.0 * np.arange(amount.size)
     fraction = amount / cdbs_ma if cdbs_ma else np.full(amount.size, nan)
     return StepTable(t_s, np.ones(amount.size), amount, fraction, None, None, cdbs_ma)
+
+
+def side(table: StepTable | None, name: str = "right side") -> Delivered:
+    return Delivered(name, None, False, table)
 
 
 @pytest.mark.parametrize(
@@ -37,17 +42,36 @@ def steps(amplitude_ma: list[float], cdbs_ma: float | None = 3.0) -> StepTable:
     ],
 )
 def test_the_controller_is_guessed_from_the_amplitude_or_left_open(amplitude_ma: list[float], guess: Controller | None, why: str) -> None:
-    found, said = guess_controller(steps(amplitude_ma))
+    found, said = guess_controller([side(steps(amplitude_ma))])
     assert found is guess
     assert why in said
 
 
 def test_without_a_stated_cdbs_amplitude_a_constant_one_proves_nothing_but_zero_does() -> None:
-    assert guess_controller(steps([2.4, 2.4], cdbs_ma=None)) == (
+    assert guess_controller([side(steps([2.4, 2.4], cdbs_ma=None))]) == (
         None,
         "the amplitude is constant at 2.4 mA, but no cDBS amplitude is stated to hold it against",
     )
-    assert guess_controller(steps([0, 0], cdbs_ma=None))[0] is Controller.NO_DBS
+    assert guess_controller([side(steps([0, 0], cdbs_ma=None))])[0] is Controller.NO_DBS
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "guess", "why"),
+    [
+        (steps([0, 0, 0]), steps([0, 0, 0]), Controller.NO_DBS, "left side: the amplitude is 0 in all 3 steps"),
+        (steps([3, 3, 3]), steps([2, 2, 2], cdbs_ma=2.0), Controller.CDBS, "right side: about 2 mA throughout"),
+        (steps([3, 3, 3]), steps([0, 0, 0]), None, "right side: the amplitude is 0 in all 3 steps"),
+        (steps([1, 3, 2]), steps([0, 0, 0]), None, "left side: the amplitude varies between 1 and 3 mA"),
+        (steps([3, 3, 3]), steps([1.5, 1.5, 1.5]), None, "50 % of the cDBS amplitude"),
+        (steps([0, 0, 0]), None, None, "right side: the file tells no amplitude"),
+    ],
+)
+def test_the_controller_is_guessed_from_every_side_or_left_open(
+    left: StepTable, right: StepTable | None, guess: Controller | None, why: str
+) -> None:
+    found, said = guess_controller([side(left, "left side"), side(right)])
+    assert found is guess
+    assert why in said
 
 
 VISITS = [Visit(number=1, date=date(2026, 3, 2)), Visit(number=2, date=date(2026, 3, 30)), Visit(number=3, date=date(2026, 4, 27))]
@@ -55,27 +79,27 @@ TODAY = date(2026, 4, 1)
 
 
 def test_the_visit_of_the_recordings_day_is_taken() -> None:
-    guess = guess_visit(VISITS, datetime(2026, 3, 2, 23, 30, tzinfo=UTC), None, TODAY)
+    guess = guess_visit(VISITS, date(2026, 3, 2), None, TODAY)
     assert (guess.visit.number, guess.open, guess.why) == (1, False, "recorded on 2026-03-02, the day of visit 1")
 
 
 def test_the_stated_visit_wins_over_the_day() -> None:
-    guess = guess_visit(VISITS, datetime(2026, 3, 2, tzinfo=UTC), VISITS[1], TODAY)
+    guess = guess_visit(VISITS, date(2026, 3, 2), VISITS[1], TODAY)
     assert (guess.visit.number, guess.open) == (2, False)
 
 
 @pytest.mark.parametrize(
-    ("started_at", "why"),
-    [(None, "tells no date"), (datetime(2026, 3, 9, tzinfo=UTC), "recorded on 2026-03-09, and no visit has that date")],
+    ("day", "why"),
+    [(None, "tells no date"), (date(2026, 3, 9), "recorded on 2026-03-09, and no visit has that date")],
 )
-def test_without_a_visit_of_that_day_the_choice_is_open_and_kept_in_the_newest_past_visit(started_at: datetime | None, why: str) -> None:
-    guess = guess_visit(VISITS, started_at, None, TODAY)
+def test_without_a_visit_of_that_day_the_choice_is_open_and_kept_in_the_newest_past_visit(day: date | None, why: str) -> None:
+    guess = guess_visit(VISITS, day, None, TODAY)
     assert (guess.visit.number, guess.open) == (2, True)
     assert why in guess.why
 
 
 def test_two_visits_of_one_day_leave_the_choice_open() -> None:
     twice = [*VISITS, Visit(number=4, date=date(2026, 3, 2))]
-    guess = guess_visit(twice, datetime(2026, 3, 2, tzinfo=UTC), None, TODAY)
+    guess = guess_visit(twice, date(2026, 3, 2), None, TODAY)
     assert guess.open
     assert "2 visits are dated 2026-03-02" in guess.why

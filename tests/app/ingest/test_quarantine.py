@@ -150,3 +150,21 @@ def test_only_a_clinician_or_an_administrator_decides(held: dict[str, Any], clie
         caller = client_as(role)
         assert decide(caller, held, "review").status_code == status, role
     assert decide(caller, held, "discard", reason="done").status_code == 200
+
+
+def test_the_page_explains_once_and_gives_every_file_its_own_decision(send: Any, client: TestClient) -> None:
+    send(*((f"n{i}.bin", SECRET + bytes([i])) for i in range(5)))
+    page = client.get("/participants/P1/quarantine", headers={"Accept": "text/html"}).text
+    numbers = [row["id"] for row in client.get("/api/v1/participants/P1/quarantine").json()]
+    assert len(numbers) == 5
+    assert page.count("hands a file to the present decoder") == 1
+    assert page.count("no format this service reads") == 1
+    assert all(page.count(f'action="/uploaded-files/{i}/decision"') == 1 and f'id="file-{i}"' in page for i in numbers)
+
+
+def test_the_report_tells_files_of_one_name_apart_and_puts_what_is_of_use_first(send: Any, client: TestClient) -> None:
+    answer = send(("a.bin", SECRET), ("b.bin", SECRET + b"1"), ("t.csv", steady(1)), visit=1).json()
+    page = client.get(f"/uploads/{answer['id']}", headers={"Accept": "text/html"}).text
+    places = {f["name"]: page.index(f">file {f['id']}<") for f in answer["files"]}
+    assert places["t.csv"] < min(p for n, p in places.items() if n != "t.csv")
+    assert len(set(places.values())) == 3

@@ -21,6 +21,7 @@ from app.ingest.redecode import redecode
 from app.platform import files
 from app.study.models import Trace
 from tests.app.ingest.conftest import device_zip, steady
+from tests.app.ingest.test_outcomes_intake import GRASPS, qoc, tremor
 
 REAL = formats.decode
 
@@ -89,6 +90,37 @@ def test_a_second_run_changes_nothing(send: Any, monkeypatch: pytest.MonkeyPatch
     assert {c.state for c in all_of()} == {"up to date"}
     db.expire_all()
     assert db.scalar(select(func.count()).select_from(Trace)) == count
+
+
+def test_tremor_and_grasps_that_read_as_before_are_up_to_date(send: Any, client: TestClient) -> None:
+    send(("s.zip", device_zip()), ("m.csv", tremor()), ("g.csv", GRASPS), visit=1, controller="random")
+    for dry_run in (True, False):
+        assert [(c.kind, c.state, c.said) for c in all_of(dry_run=dry_run)] == [(k, "up to date", []) for k in ("rcs", "tremor", "grasp")]
+
+
+def test_minutes_that_the_decoder_reads_otherwise_are_told_and_count(
+    send: Any, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = send(("s.zip", device_zip()), ("m.csv", tremor()), visit=1, controller="random").json()["sessions"][0]["id"]
+    assert qoc(client, session)["tremor_percent"] == pytest.approx(25)
+    monkeypatch.setattr(formats, "decode", lambda *args, **named: more_tremor(REAL(*args, **named)))
+    changes = {c.kind: c for c in all_of()}
+    assert changes["tremor"].state == "read again"
+    assert any("tremor 50 %" in s for s in changes["tremor"].said)
+    assert qoc(client, session)["tremor_percent"] == pytest.approx(50)
+    assert {c.state for c in all_of()} == {"up to date"}
+
+
+def more_tremor(decoded: DecodedFile) -> DecodedFile:
+    """Twice the mild tremor, at the cost of none."""
+
+    def change(log: Any) -> Any:
+        fractions = log.fractions.copy()
+        fractions[:, 1] -= fractions[:, 3]
+        fractions[:, 3] *= 2
+        return replace(log, fractions=fractions, any_tremor=fractions[:, 2:].sum(axis=1))
+
+    return replace(decoded, tremor=tuple(map(change, decoded.tremor)))
 
 
 def test_a_dry_run_tells_and_changes_nothing(send: Any, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -114,7 +114,6 @@ def test_two_uploads_at_once_of_one_file_make_one_session(service_app: Any, make
 @pytest.mark.parametrize(
     ("content", "name", "named"),
     [
-        (b"", "empty.csv", "empty"),
         (b"time,level\n1,2\n", "columns.csv", "beta"),
         (b"t_s,beta,amplitude_fraction\n2,abc,1\n", "text.csv", "line 2"),
         (b"PK\x03\x04 not a zip", "broken.zip", "zip"),
@@ -133,6 +132,14 @@ def test_a_file_of_no_use_is_kept_and_named(client: TestClient, enrolled: str, c
     kept = client.get(f"/api/v1/uploads/{problem['upload_id']}").json()["files"][0]
     assert kept["status"] == "failed"
     assert files.path_of(kept["stored_sha256"]).exists()
+
+
+def test_of_an_empty_file_nothing_is_kept_and_the_answer_says_so(client: TestClient, enrolled: str) -> None:
+    answer = upload(client, b"", "empty.csv")
+    assert answer.status_code == 422
+    assert "empty.csv: the file is empty (0 bytes). Nothing of it was kept." in answer.json()["detail"]
+    again = upload(client, b"", "empty.csv").json()
+    assert client.get(f"/api/v1/uploads/{again['upload_id']}").json()["files"][0]["stored_sha256"] is None
 
 
 def test_what_cannot_be_parsed_is_kept_encrypted(client: TestClient, enrolled: str) -> None:

@@ -72,6 +72,34 @@ def test_a_form_of_an_older_version_is_refused_with_what_was_typed(browser: Test
     assert client.get(f"/api/v1/sessions/{number}").json()["controller"] == "cdbs"
 
 
+def test_a_correction_saved_from_an_old_form_is_refused_and_kept_and_the_others_stand(
+    browser: TestClient, client: TestClient, propose: Any
+) -> None:
+    first, second = propose(("a.csv", steady(0.5)), ("b.csv", steady(0.4)), visit="1")
+    old = fields_of(browser.get(URL).text, URL)
+    press(browser, "save:all", **{f"controller_{second}": "random", f"hemisphere_{second}": "left"})
+    refused = press(browser, "save:all", old, **{f"controller_{second}": "cdbs", f"controller_{first}": "other"})
+    assert refused.status_code == 409
+    assert "was changed by admin-page@clinic.example" in unescape(refused.text)
+    stored = {i: client.get(f"/api/v1/proposals/{i}").json()["session"]["controller"] for i in (first, second)}
+    assert stored == {first: "other", second: "random"}
+    again = fields_of(refused.text, URL)
+    # what was typed stands in the form, beside what the other tab had saved
+    assert (again[f"controller-{second}"], again[f"hemisphere-{second}"]) == ("cdbs", "left")
+    assert press(browser, "save:all", again).status_code == 303
+    session = client.get(f"/api/v1/proposals/{second}").json()["session"]
+    assert (session["controller"], session["hemisphere"]) == ("cdbs", "left")
+
+
+def test_an_old_form_without_a_correction_of_its_own_refuses_nothing(browser: TestClient, client: TestClient, propose: Any) -> None:
+    first, second = propose(("a.csv", steady(0.5)), ("b.csv", steady(0.4)), visit="1")
+    old = fields_of(browser.get(URL).text, URL)
+    press(browser, "save:all", **{f"controller_{second}": "random"})
+    assert press(browser, "save:all", old, **{f"controller_{first}": "other"}).status_code == 303
+    stored = [client.get(f"/api/v1/proposals/{i}").json()["session"]["controller"] for i in (first, second)]
+    assert stored == ["other", "random"]
+
+
 def test_an_old_form_does_not_take_back_what_another_tab_saved(browser: TestClient, client: TestClient, propose: Any) -> None:
     first, second = propose(("a.csv", steady(1)), ("b.csv", steady(0.5)), visit="1")
     old = fields_of(browser.get(URL).text, URL)

@@ -272,6 +272,30 @@ def test_implausible_intervals_count_and_the_value_without_them_is_told(
     assert "1 intervals outside 0.08 to 3 s counted, without them 2 Hz" in (qoc.reason or "")
 
 
+def test_a_test_whose_every_interval_is_implausible_gives_no_frequency(db: Session, study_session: StudySession, new_file: NewFile) -> None:
+    study_session.hemisphere = None
+    file = new_file(study_session)
+    microseconds = 1e6 * np.arange(10) * 0.4  # times in us under a header in s
+    outcomes.store_grasp(db, study_session, file, "left", *grasps(10, 2.0))
+    said = outcomes.store_grasp(db, study_session, file, "right", microseconds, np.ones(9, dtype=bool))
+    assert study_session.qoc is not None
+    assert study_session.qoc.grasp_hz is None
+    assert "no grasp frequency derived: mean of left hand and right hand" in said[1]
+    assert "every interval lies outside 0.08 to 3 s (right hand)" in said[1]
+
+
+def test_what_is_said_of_minutes_stays_true_when_a_session_comes_after_them(
+    db: Session, study_session: StudySession, new_file: NewFile
+) -> None:
+    study_session.status = "proposed"
+    said = store(db, study_session, new_file(study_session), HALF_MILD)
+    study_session.status = "confirmed"
+    outcomes.derive_for_session(db, study_session)
+    assert study_session.qoc is not None
+    assert [s for s in said if "No confirmed session" in s] == []
+    assert said[-1] == "They count in every confirmed session with a start that they cover, also in one that is made later."
+
+
 def test_a_frequency_that_no_hand_reaches_is_refused(db: Session, study_session: StudySession, new_file: NewFile) -> None:
     said = outcomes.store_grasp(db, study_session, new_file(study_session), "right", *grasps(100, 50.0))
     assert study_session.qoc is None

@@ -37,6 +37,31 @@ def test_a_whole_stream_gives_its_packets_and_no_defects():
     assert (notes.defects, notes.stream_key, notes.record_infos[0]["DeviceId"]) == ([], "TimeDomainData", "NPC7")
 
 
+@pytest.mark.parametrize(
+    "tail", ['],"Extra":5}]', '], "A" : {"b":[1,2]} , "C":"x"}]', '],"Long":"' + "y" * 3_000_000 + '"}]', '],"Extra":5}\n]\n']
+)
+def test_a_file_with_fields_behind_its_packets_is_whole(tail):
+    values, notes = read(whole()[:-3] + tail)
+    assert ticks(values) == list(range(5))
+    assert notes.defects == []
+    assert notes.unread_fields == tail.count('":') + tail.count('" :') - tail.count('"b"')
+
+
+def test_fields_behind_the_packets_hide_neither_a_cut_end_nor_the_next_object():
+    values, notes = read(whole()[:-3] + '],"Extra":5')
+    assert ticks(values) == list(range(5))
+    assert notes.defects == ["the end of the file is missing; every complete part before it was kept"]
+    values, notes = read(whole()[:-3] + '],"Extra":5},' + whole(2)[1:])
+    assert ticks(values) == [0, 1, 2, 3, 4, 0, 1]
+    assert notes.defects == []
+
+
+def test_a_second_list_of_packets_in_one_object_is_said_to_be_left_out():
+    values, notes = read(whole()[:-3] + '],"AccelData":[{"Header":{"systemTick":9}}]}]')
+    assert ticks(values) == list(range(5))
+    assert notes.defects == ["a second list of packets in one object (AccelData) was left out"]
+
+
 def test_packets_across_chunks_of_a_large_file_are_whole():
     values, notes = read(whole(300, pad=2000))
     assert ticks(values) == list(range(300))

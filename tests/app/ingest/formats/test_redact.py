@@ -94,6 +94,31 @@ def test_nothing_of_a_name_survives_in_bytes_names_or_report(rcs, pack, tmp_path
     assert '"actualValue":[236]' in unpacked(target)
 
 
+def test_fields_that_no_rcs_file_has_go_with_their_numbers_and_the_report_counts_them(rcs, pack, tmp_path):
+    folder = "DeviceNPC799999H/"
+    settings, td = rcs.settings(), rcs.time_domain(np.full(5000, 0.01))
+    settings[0]["MRN"] = 987654321987
+    settings[0]["GeneralData"]["HospitalNumber"] = [55, 56, 19450508]
+    settings[0]["RecordInfo"]["ZZKEYJohn"] = {"Born": 19450509}
+    for place, (key, value) in ((td[0]["TimeDomainData"][4], ("MRN", 987654321988)), (td[0], ("ZZKEYJohn", 987654321989))):
+        place[key] = value
+    td[0]["TimeDomainData"][7]["Header"]["MRN"] = 987654321990
+    td[0]["TimeDomainData"][9]["ChannelSamples"][0]["MRN"] = 987654321991
+    source = pack({folder + "DeviceSettings.json": settings, folder + "RawDataTD.json": td})
+    target = tmp_path / "r.zip"
+    done = redact_rcs_zip(source, target, KEY)
+    text = unpacked(target)
+    assert [s for s in ("MRN", "HospitalNumber", "ZZKEYJohn", "98765432", "1945", "Born") if s in text or s in repr(done)] == []
+    assert "fields that no RC+S file is known to have, with their numbers (7×)" in done.removed
+    assert_same_recording(decode(source).recordings[0], decode(target).recordings[0])
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_no_field_of_a_real_recording_counts_as_unknown(recordings, tmp_path, name):
+    done = redact_rcs_zip(recordings / f"rcs/{name}.zip", tmp_path / "r.zip", KEY)
+    assert [said for said in done.removed if "no RC+S file is known to have" in said] == []
+
+
 def test_the_same_bytes_in_give_the_same_bytes_out_and_redacting_twice_changes_nothing(rcs, pack, tmp_path):
     source = pack(secret_session(rcs))
     for name in ("a.zip", "b.zip"):

@@ -6,6 +6,7 @@ import zipfile
 import pytest
 
 from app.ingest.formats import UndecodableFile, decode, redact, sniff
+from app.ingest.formats.percept_enums import is_known
 from app.ingest.formats.redaction import pseudonym
 
 KEY = b"a key of the clinic's own"
@@ -72,6 +73,49 @@ def test_the_real_report_decodes_to_the_same_recordings(recordings, tmp_path, sa
         gone in text for gone in ("PatientGenderDef", "Diagnosis", "1900-01-01", "myName", "Automatic increase", "Europe centrale")
     )
     assert "names of files" in done.removed
+
+
+def test_enumerations_that_could_hold_a_name_are_replaced_and_counted(write, tmp_path, percept):
+    report = percept.one_run()
+    report["Groups"] = {
+        "Final": [
+            {"GroupId": "GroupIdDef.ZZGROUP", "ActiveGroup": True, "ProgramSettings": {}},
+            {"GroupId": "GroupIdDef.GROUP_B", "ActiveGroup": False, "ProgramSettings": {}},
+        ]
+    }
+    report["DeviceInformation"]["Final"]["NeurostimulatorLocation"] = "InsLocation.ZZLOC"
+    report["LeadConfiguration"]["Final"][0] |= {"LeadLocation": "LeadLocationDef.Anton", "Model": "ZZNameDef.LEAD_B33005"}
+    target = tmp_path / "r.json"
+    done = redact(write(report), target, "percept", KEY)
+    text = target.read_text()
+    assert [s for s in ("ZZ", "Anton") if s in text or s in repr(decode(target))] == []
+    assert "GroupIdDef.GROUP_B" in text
+    assert "enumerations with values that no report is known to have (4×)" in done.removed
+
+
+@pytest.mark.parametrize(
+    ("text", "known"),
+    [
+        ("GroupIdDef_GROUP_A", True),
+        ("ElectrodeDef.SenSight_1a", True),
+        ("SensingChannelDef.ONE_A_AND_TWO_A_LEFT_SEGMENT", True),
+        ("SessionStateDef.SessionStart", True),
+        ("LeadModelDef.LEAD_B33015", True),
+        ("LeadModelDef.LEAD_4711", False),
+        ("ElectrodeDef.19900101", False),
+        ("GroupIdDef.A_D_A", False),
+        ("GroupIdDef.GROUP_ADA", False),
+        ("AdaDef.GROUP_A", False),
+        ("GroupIdDef.", False),
+    ],
+)
+def test_an_enumeration_is_known_by_its_type_and_its_words(text, known):
+    assert is_known(text) is known
+
+
+def test_every_enumeration_of_the_real_report_stays(recordings, tmp_path):
+    done = redact(recordings / "percept/percept_session_report.zip", tmp_path / "r.zip", "percept", KEY)
+    assert [said for said in done.removed if "enumerations" in said] == []
 
 
 def test_group_history_alone_survives(recordings, tmp_path, same_recording):

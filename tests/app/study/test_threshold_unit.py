@@ -1,0 +1,41 @@
+"""A threshold is held against a trace only where somebody has stated its unit and its source."""
+
+from __future__ import annotations
+
+import pytest
+from sqlalchemy.orm import Session
+
+from app.accounts.policy import SYSTEM
+from app.study import service
+from app.study.models import StudySession
+from app.study.schemas import SettingsIn
+from app.study.session_charts import control_chart
+from app.study.session_pages import summarise
+
+
+def test_a_threshold_with_stated_unit_and_source_counts(db: Session, study_session: StudySession) -> None:
+    data = service.session_data(db, study_session)
+    assert (data.threshold, data.threshold_mismatch) == (1.0, "")
+    chart = control_chart(data).figure
+    assert "threshold 1 uV" in [t.get("name") for t in chart["data"]]
+    assert not any("threshold" in str(a.get("text")) for a in chart["layout"]["annotations"])  # no text over the data
+
+
+@pytest.mark.parametrize(
+    ("left_open", "named"),
+    [
+        ({"beta_unit": None}, "the unit of"),
+        ({"beta_source": None}, "the source of"),
+        ({"beta_unit": None, "beta_source": None}, "the unit and the source of"),
+    ],
+)
+def test_without_a_stated_unit_and_source_no_threshold_is_drawn_and_no_share_is_told(
+    db: Session, study_session: StudySession, left_open: dict[str, None], named: str
+) -> None:
+    service.change_settings(db, study_session.visit.participant, SettingsIn(**left_open), "unknown", SYSTEM)
+    data = service.session_data(db, study_session)
+    assert data.threshold is None
+    said = f"Nobody has stated {named} the threshold of 1; this trace is in uV from table."
+    assert data.threshold_mismatch == f"{said} State unit and source in the participant's settings."
+    assert summarise(data).below_threshold is None
+    assert not any("threshold" in str(t.get("name")) for t in control_chart(data).figure["data"])
