@@ -200,7 +200,7 @@ class TraceOut(Model):
     beta_channel: str | None
     decode_version: int | None
     cdbs_amplitude_ma: float | None
-    xi_beta: float | None = Field(description="Null also where the threshold is in another unit or from another source than this trace.")
+    xi_beta: float | None = Field(description="Null also where its unit and source were not stated, or are not those of this trace.")
     steps_above_cdbs: int
     t_s: list[float]
     beta: list[float | None]
