@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.ingest.formats import percept_details as details
-from app.ingest.formats.archive import ZipFiles
+from app.ingest.formats.archive import READ_ERRORS, ZipFiles
 from app.ingest.formats.beta import channel_spectrum, step_trace, time_domain_traces
 from app.ingest.formats.log import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
 from app.ingest.formats.options import DecodeOptions
@@ -86,7 +86,7 @@ def decode_percept(path: Path, options: DecodeOptions, name: str | None = None) 
     recordings: list[RecordingLog] = []
     reports: list[FileReport] = []
     with ZipFiles(path, options.archive) as files:
-        members = report_members(files)
+        members = report_members(files, damaged=True)
         for number, member in enumerate(members, start=1):
             report = FileReport(name or path.name if len(members) == 1 else f"report {number}")
             reports.append(report)
@@ -109,16 +109,17 @@ def decode_percept(path: Path, options: DecodeOptions, name: str | None = None) 
     return DecodedFile(tuple(recordings), tuple(reports))
 
 
-def report_members(files: ZipFiles) -> list[str]:
-    """Members of an archive that begin like a session report."""
+def report_members(files: ZipFiles, *, damaged: bool = False) -> list[str]:
+    """Members of an archive that begin like a session report; with `damaged` also JSON files that cannot be read, so that they are told."""
     out = []
     for member in files.names():
         try:
             with files.open(member) as stream:
                 if looks_like_report(stream.read(65_536)):
                     out.append(member)
-        except (UndecodableFile, OSError, EOFError, ValueError, NotImplementedError, RuntimeError):
-            continue
+        except (UndecodableFile, *READ_ERRORS):
+            if damaged and member.lower().endswith(".json"):
+                out.append(member)
     return out
 
 

@@ -74,7 +74,7 @@ def redact_percept(source: Path, target: Path, key: bytes, limits: ArchiveLimits
         target.write_bytes(_dump(clean))
     else:
         with ZipFiles(source, limits or ArchiveLimits()) as files:
-            members = report_members(files)
+            members = report_members(files, damaged=True)
             texts = {f"report-{n}.json": t for n, m in enumerate(members, start=1) if (t := _member(files, m, n, scrub, done)) is not None}
             others = len(files.names()) - len(members)
             done.ignored += [*files.ignored, *([f"{others} file{'s' if others > 1 else ''} that are no session report"] if others else [])]

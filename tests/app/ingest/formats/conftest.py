@@ -225,10 +225,10 @@ def pack(tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def same_recording() -> Callable[[Any, Any], None]:
-    """Asserts that two recordings are equal in everything but the device's name."""
+def same_recording() -> Callable[[Any, Any], bool]:
+    """Asserts that two recordings are equal in everything but the device's name, field by field; True when they are."""
 
-    def check(first: Any, second: Any) -> None:
+    def check(first: Any, second: Any) -> bool:
         for field in dataclasses.fields(first):
             a, b = getattr(first, field.name), getattr(second, field.name)
             if field.name in ("traces", "spectra"):
@@ -236,5 +236,6 @@ def same_recording() -> Callable[[Any, Any], None]:
                 assert all(x.same_as(y) for x, y in zip(a, b, strict=True)), field.name
             elif field.name != "device_key":
                 assert a == b, field.name
+        return True
 
     return check

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -203,3 +204,23 @@ def test_whatever_stands_at_any_place_of_a_report_the_rest_is_read_and_redacts_t
     redact(folder / "s.json", folder / "t.json", "percept", b"a key of the clinic's own")
     after = decode(folder / "t.json", "percept")
     assert [r.fingerprint for r in before.recordings] == [r.fingerprint for r in after.recordings]
+
+
+def test_a_damaged_member_is_told_and_the_other_reports_are_read(tmp_path):
+    path = tmp_path / "two.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("good.json", WHOLE)
+        archive.writestr("bad.json", WHOLE)
+    damaged = bytearray(path.read_bytes())
+    begin = zipfile.ZipFile(path).getinfo("bad.json").header_offset + 30 + len("bad.json")
+    damaged[begin : begin + 200] = b"\xff" * 200
+    path.write_bytes(bytes(damaged))
+    decoded = decode(path)
+    (problem,) = [r.problem for r in decoded.reports if r.problem]
+    assert problem.what
+    alone = tmp_path / "good.json"
+    alone.write_text(WHOLE)
+    assert [r.fingerprint for r in decoded.recordings] == [r.fingerprint for r in decode(alone).recordings]
+    done = redact(path, tmp_path / "clean.zip", "percept", b"a key of the clinic's own")
+    assert len(done.unreadable) == 1
+    assert zipfile.ZipFile(tmp_path / "clean.zip").namelist() == ["report-2.json"]  # bad.json comes first by name

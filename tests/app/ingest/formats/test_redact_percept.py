@@ -54,7 +54,7 @@ def test_nothing_of_a_name_survives_and_the_recordings_are_the_same(write, tmp_p
     first, second = decode(source), decode(target)
     assert len(first.recordings) == len(second.recordings) > 1
     for before, after in zip(first.recordings, second.recordings, strict=True):
-        same_recording(before, after)
+        assert same_recording(before, after)
         assert after.device_key == pseudonym("NPX799999H", KEY)
     assert not any(s in repr(second) for s in SECRETS)
     assert any("PatientInformation" in said for said in done.removed)
@@ -65,7 +65,7 @@ def test_the_real_report_decodes_to_the_same_recordings(recordings, tmp_path, sa
     done = redact(source, target, "percept", KEY)
     assert sniff(target) == "percept"
     for before, after in zip(decode(source).recordings, decode(target).recordings, strict=True):
-        same_recording(before, after)
+        assert same_recording(before, after)
     with zipfile.ZipFile(target) as archive:
         assert archive.namelist() == ["report-1.json"]
         text = archive.read("report-1.json").decode()
@@ -121,7 +121,7 @@ def test_every_enumeration_of_the_real_report_stays(recordings, tmp_path):
 def test_group_history_alone_survives(recordings, tmp_path, same_recording):
     source, target = recordings / "percept/group_history.json", tmp_path / "r.json"
     redact(source, target, "percept", KEY)
-    same_recording(decode(source).recordings[0], decode(target).recordings[0])
+    assert same_recording(decode(source).recordings[0], decode(target).recordings[0])
 
 
 def test_the_same_bytes_in_give_the_same_bytes_out_and_redacting_twice_changes_nothing(write, tmp_path, secret):

@@ -30,7 +30,7 @@ def test_a_redacted_table_holds_the_known_columns_alone_and_decodes_to_the_same_
     assert done.removed == ["1 other column"]
     assert not any(word in target.read_text() for word in ("Jane", "Doe", "4711", "1950"))
     first, second = decode(source), decode(target, name="s.csv")
-    same_recording(first.recordings[0], second.recordings[0])
+    assert same_recording(first.recordings[0], second.recordings[0])
     assert first.reports[0].flagged == second.reports[0].flagged
     assert first.reports[0].repaired == [*done.repaired, *(r for r in second.reports[0].repaired if r not in done.repaired)]
     assert "Jane" not in repr((second, done))
@@ -53,7 +53,7 @@ def test_a_redacted_parquet_table_has_no_foreign_column_and_no_metadata(tmp_path
     assert pq.read_schema(target).names == ["t_s", "beta [uV]", "amplitude_fraction"]
     assert pq.read_schema(target).metadata is None
     assert not any(word in target.read_bytes() for word in (b"Jane", b"Doe", b"MRN"))
-    same_recording(decode(source).recordings[0], decode(target).recordings[0])
+    assert same_recording(decode(source).recordings[0], decode(target).recordings[0])
 
 
 def test_a_table_that_cannot_be_decoded_is_not_written(tmp_path):
@@ -122,7 +122,7 @@ def test_a_redacted_table_of_raw_lfp_is_the_same_recording(tmp_path, same_record
     done = redact(source, target, "csv", KEY)
     assert done.removed == ["1 other column"]
     assert "Jane" not in target.read_text()
-    same_recording(decode(source).recordings[0], decode(target).recordings[0])
+    assert same_recording(decode(source).recordings[0], decode(target).recordings[0])
 
 
 @given(

@@ -123,7 +123,7 @@ def test_parquet_gives_the_same_recording_as_csv(tmp_path, write, same_recording
     x = np.sin(t)
     pq.write_table(pa.table({"t_s": t, "lfp [mV]": x}), tmp_path / "t.parquet")
     rows = "".join(f"{a!r},{b!r}\n" for a, b in zip(t.tolist(), x.tolist(), strict=True))
-    same_recording(decode(tmp_path / "t.parquet").recordings[0], decode(write("t_s,lfp [mV]\n" + rows)).recordings[0])
+    assert same_recording(decode(tmp_path / "t.parquet").recordings[0], decode(write("t_s,lfp [mV]\n" + rows)).recordings[0])
 
 
 def test_a_decimal_comma_is_read(write):
