@@ -331,17 +331,22 @@ def control_(
     channel: Annotated[str | None, typer.Option(help="Channel of a recording with several.")] = None,
     beta_source: Annotated[str | None, typer.Option(help="How the beta of a table was made, where not by 'table'.")] = None,
     steps: Annotated[int, typer.Option(min=1, help="Length of a simulated session.")] = 300,
+    participant: Annotated[str | None, typer.Option(help="Code of the participant that the bundle must be of.")] = None,
+    battery: Annotated[Path | None, typer.Option(help="JSON with assumptions about the implant, for battery life in days.")] = None,
+    bench: Annotated[bool, typer.Option("--bench", help="Nobody is connected: a bundle without approval may run live.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Verify a controller bundle and run it on a stream of beta, as the tablet does."""
-    from app.control import control, lines
+    from app.control import Task, control, lines
     from app.control_sources import Wish
 
     if speed not in ("realtime", "fast"):
         raise typer.BadParameter(f"'{speed}' is neither realtime nor fast.", param_hint="--speed")
     wish = Wish(channel=channel, beta_source=beta_source, steps=steps, realtime=speed == "realtime")
-    summary = control(bundle, source, wish, log=log, key=key)
+    summary = control(bundle, source, wish, Task(log=log, key=key, participant=participant, battery=battery, bench=bench))
     _print(summary, as_json, lines(summary))
+    if "wrong_signal" in summary:
+        raise typer.Exit(1)
 
 
 def _estimate_cells(estimate: dict[str, Any]) -> tuple[str, str, str]:

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any, Protocol
 
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
+from app.control_battery import Implant, read_implant
 from app.control_sources import Row, Source, Wish, open_source
 from app.platform.errors import Invalid
 from app.settings import get_settings
+from ml.deploy.appraisal import battery_gain, battery_words, warnings
 from ml.deploy.bundle import OpenBundle, open_bundle
-from ml.deploy.manifest import BundleError
-from ml.deploy.runtime.envelope import Decision, Reason, reason_names
+from ml.deploy.manifest import BundleError, BundleManifest
+from ml.deploy.runtime.envelope import Decision, Reason, Signal, reason_names
 from ml.energy import relative_energy, saving_percent
 
 COLUMNS = (
@@ -29,6 +33,13 @@ COLUMNS = (
     "late_ms", "missed", "detail",
 )  # fmt: skip
 _KEY = "bundle-signing"
+
+
+class Sink(Protocol):
+    """What a log is written to."""
+
+    def write(self, row: str, /) -> int:
+        """Add one line."""
 
 
 @dataclass
@@ -40,6 +51,7 @@ class Run:
     decisions: list[Decision] = field(default_factory=list)
     latency_us: list[float] = field(default_factory=list)
     signal_us: list[float] = field(default_factory=list)
+    signals: set[Signal] = field(default_factory=set)
     missed: int = 0
     worst_late_ms: float = 0.0
 
@@ -66,35 +78,110 @@ class Run:
         return body | _agreement(source)
 
 
-def control(bundle: Path, source: str | None, wish: Wish, *, log: Path | None, key: str | None) -> dict[str, Any]:
+def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[str, Any]:
     """Verify a bundle and, with a source, run its controller. Returns the summary.
 
     Args:
         bundle: the ZIP. source, wish: as `open_source` takes them; without a source the bundle is verified and no more.
-        log: CSV to write, one row per decision. key: as `verified` takes it.
+        task: what else is to be done.
 
     Raises:
         Invalid: the bundle is not what it should be, or an argument makes no sense. NotFound: no such source.
     """
-    opened = verified(bundle, key)
-    facts: dict[str, Any] = {"bundle": bundle.name, "participant": opened.manifest.participant, "policy": opened.manifest.policy_name}
-    facts["policy_id"] = opened.manifest.policy_id
-    facts["approved"] = bool(opened.manifest.approvals)
+    implant = None if task.battery is None else read_implant(task.battery)
+    opened = verified(bundle, task.key)
+    manifest = opened.manifest
+    if task.participant is not None and task.participant != manifest.participant:
+        raise Invalid(
+            f"{bundle.name} is of participant {manifest.participant}, not {task.participant}.", "A bundle is for its participant alone."
+        )
+    facts: dict[str, Any] = {"bundle": bundle.name, "participant": manifest.participant, "policy_name": manifest.policy_name}
+    facts |= {"policy_id": manifest.policy_id, "approved": bool(manifest.approvals), "warnings": warnings(manifest)}
     if source is None:
-        return facts | {"verified": True, "files": len(opened.manifest.files)}
-    stream = open_source(source, opened.manifest, wish, sys.stdin)
-    run = Run(opened.manifest.period_s, opened.manifest.cdbs_ma)
+        return facts | {"verified": True, "files": len(manifest.files)}
+    if source == "-" and wish.realtime and not manifest.approvals and not task.bench:
+        raise Invalid(
+            f"{bundle.name} is not approved and must not be run live.",
+            "Have the visit plan with this policy approved and take the bundle anew, or add --bench where nobody is connected.",
+        )
+    if isinstance(sys.stdin, io.TextIOWrapper):
+        sys.stdin.reconfigure(errors="replace")  # bytes that are no text are no number either, and no reason to stop
+    stream = open_source(source, manifest, wish, sys.stdin)
+    if stream.participant not in (None, manifest.participant):
+        facts["warnings"].append(
+            f"The bundle is of participant {manifest.participant}, the source is synthetic participant {stream.participant}."
+        )
+    run = Run(manifest.period_s, manifest.cdbs_ma)
     try:
-        if log is None:
-            drive(opened, stream, run, wish.realtime, None)
-        else:
-            with log.open("w", newline="", encoding="utf-8") as sink:
-                drive(opened, stream, run, wish.realtime, sink)
-    except OSError as error:
-        raise Invalid(f"The log {log} cannot be written: {error.strerror}.", "Name a file in a folder that you may write to.") from error
+        with nullcontext(None) if task.log is None else DecisionLog(task.log) as sink:
+            drive(opened, stream, run, wish.realtime, sink)
     except KeyboardInterrupt:  # ended by hand: what was done so far is summed up
         facts["ended"] = "by hand"
-    return facts | run.summary(stream)
+    return facts | run.summary(stream) | _battery(run, implant) | _foreign(run, manifest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What is asked of a run.
+
+    Attributes:
+        log: CSV to write, one row per decision.
+        key: as `verified` takes it.
+        participant: code that the bundle must be of.
+        battery: JSON file with assumptions about the implant, as `read_implant` takes it.
+        bench: nobody is connected, so that a bundle without approval may run live.
+    """
+
+    log: Path | None = None
+    key: str | None = None
+    participant: str | None = None
+    battery: Path | None = None
+    bench: bool = False
+
+
+class DecisionLog:
+    """A new CSV file that gets one row per decision, each handed to the operating system at once, so that a killed process loses none.
+
+    Args:
+        path: of the file; one that holds something already is not written over.
+
+    Raises:
+        Invalid: the file is there already or cannot be written, at the start or at any row.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._rows = path, -1  # the first row is the header
+        try:
+            if path.is_file() and path.stat().st_size:
+                raise Invalid(f"The log {path} is there already.", "Name a new file: no decision is written over.")
+            self._stream = path.open("w", newline="", encoding="utf-8")
+        except OSError as error:
+            raise self._unwritten(error) from error
+
+    def __enter__(self) -> DecisionLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            self._stream.close()
+        except OSError as error:
+            raise self._unwritten(error) from error
+
+    def write(self, row: str) -> int:
+        """Add one line, whole or not at all as far as a kill is concerned."""
+        try:
+            self._stream.write(row)
+            self._stream.flush()
+        except OSError as error:
+            raise self._unwritten(error) from error
+        self._rows += 1
+        return len(row)
+
+    def _unwritten(self, error: OSError) -> Invalid:
+        done = f" The run ended after {self._rows} decisions." if self._rows >= 0 else ""
+        return Invalid(
+            f"The log {self._path} cannot be written: {error.strerror}.{done}", "Name a file where there is room and leave to write."
+        )
 
 
 def verified(path: Path, key: str | None) -> OpenBundle:
@@ -115,12 +202,13 @@ def verified(path: Path, key: str | None) -> OpenBundle:
 
 
 def drive(
-    opened: OpenBundle, source: Source, run: Run, realtime: bool, sink: IO[str] | None, wait: Callable[[float], None] = time.sleep
+    opened: OpenBundle, source: Source, run: Run, realtime: bool, sink: Sink | None, wait: Callable[[float], None] = time.sleep
 ) -> None:
     """Run the loop to the end of the source, one decision per row.
 
     Args:
-        opened: the bundle. source: what comes. run: is filled in. realtime: wait until each row is due.
+        opened: the bundle. source: what comes. run: is filled in.
+        realtime: wait until each row is due, and decide by the clock, so that a decision which comes a period late finds its beta stale.
         sink: gets the log, row by row, so that a crash loses none. wait: sleeps for so many seconds.
     """
     controller = opened.controller()
@@ -135,13 +223,16 @@ def drive(
         due = began_s + row.now_s
         if realtime and (pause := due - time.perf_counter()) > 0:
             wait(pause)
+        now_s = max(row.now_s, time.perf_counter() - began_s) if realtime else row.now_s
         start = time.perf_counter_ns()
-        decision = controller.decide(row.now_s, row.sample)
+        decision = controller.decide(now_s, row.sample)
         latency_us = (time.perf_counter_ns() - start) / 1000.0
         # A decision is late when it is not there within one period of the end of the window it is about.
         late_s = (max(0.0, time.perf_counter() - due) if realtime else latency_us / 1e6) + row.signal_us / 1e6
         missed = late_s > run.period_s
         run.decisions.append(decision)
+        if row.sample is not None:
+            run.signals.add(row.sample.signal)
         run.latency_us.append(latency_us)
         run.signal_us.append(row.signal_us)
         run.missed += missed
@@ -150,9 +241,8 @@ def drive(
         run.worst_late_ms = max(run.worst_late_ms, 1000.0 * late_s)
         if row.sample is not None and not decision.reasons & Reason.LATE_SAMPLE:
             window.append(row.sample.beta)
-        if writer and sink:
+        if writer:
             writer.writerow(_log_row(row, decision, list(window), latency_us, late_s, missed))
-            sink.flush()
         try:
             row = rows.send(decision.amplitude_ma)
         except StopIteration:
@@ -161,14 +251,17 @@ def drive(
 
 def lines(summary: dict[str, Any]) -> str:
     """The summary for a person."""
+    use = "approved" if summary["approved"] else "NOT APPROVED: not to be used on a participant"
+    who = f"participant {summary['participant']}, policy {summary['policy_name']} (no. {summary['policy_id']}), {use}"
+    warned = [f"warning          {text}" for text in summary["warnings"]]
     if summary.get("verified"):
-        use = "approved" if summary["approved"] else "NOT APPROVED: not to be used on a participant"
-        who = f"participant {summary['participant']}, policy {summary['policy']} (no. {summary['policy_id']}), {use}"
-        return f"{summary['bundle']}: signature, {summary['files']} files and test vectors are right. {who}."
+        return "\n".join([f"{summary['bundle']}: signature, {summary['files']} files and test vectors are right. {who}.", *warned])
     latency = summary["latency_us"]
     reasons = ", ".join(f"{name} {count}" for name, count in summary["reasons"].items()) or "none"
     out = [
-        f"{summary['source']}",
+        f"bundle           {who}",
+        *warned,
+        f"source           {summary['source']}",
         f"decisions        {summary['decisions']}: {summary['fallbacks']} on cDBS as fall-back",
         f"reasons          {reasons}",
         f"deadline misses  {summary['deadline_misses']} (worst {summary['worst_late_ms']:.3g} ms after the window's end)",
@@ -180,11 +273,17 @@ def lines(summary: dict[str, Any]) -> str:
     if summary["mean_amplitude_ma"] is not None:
         out.append(f"mean amplitude   {summary['mean_amplitude_ma']:.3f} mA")
         out.append(f"energy           {summary['energy_of_cdbs']:.3f} of cDBS: {summary['energy_saved_percent']:.1f} % saved")
+    if "battery" in summary:
+        out.append(f"battery          {summary['battery']}")
+    if "battery_life" in summary:
+        out += [f"battery life     {summary['battery_life']}", f"  on cDBS        {summary['battery_life_on_cdbs']}"]
     if "streaming_correlation" in summary:
         out.append(
             f"P_beta in time   correlation with afterwards {summary['streaming_correlation']:.5f}, mean difference "
             f"{summary['streaming_mean_percent']:.2f} %, worst {summary['streaming_worst_percent']:.2f} % (n = {summary['streaming_n']})"
         )
+    if "wrong_signal" in summary:
+        out.append(f"NO DECISION BY THE POLICY: {summary['wrong_signal']}")
     return "\n".join(out)
 
 
@@ -212,7 +311,7 @@ def _log_row(row: Row, decision: Decision, window: list[float], latency_us: floa
     sample = row.sample
     shown = window[len(window) - decision.valid :] if decision.valid else []
     return [
-        f"{row.now_s:.3f}",
+        f"{decision.t_s:.3f}",
         "" if sample is None else f"{sample.beta:.6g}",
         "" if sample is None else sample.signal.unit,
         decision.valid,
@@ -239,6 +338,30 @@ def _spread(values: Any) -> dict[str, float] | None:
         "median": float(np.median(values)),
         "p99": float(np.quantile(values, 0.99)),
     }
+
+
+def _foreign(run: Run, manifest: BundleManifest) -> dict[str, Any]:
+    """Said where every beta amplitude that came was of another unit or source than the bundle's."""
+    came = [d for d in run.decisions if not d.reasons & (Reason.NO_BETA | Reason.STALE_BETA)]
+    if not came or not all(d.reasons & Reason.WRONG_SIGNAL for d in came):
+        return {}
+    given = ", ".join(sorted(f"{unit} from {source}" for unit, source in run.signals))
+    return {"wrong_signal": f"the bundle takes beta in {manifest.beta_unit} from {manifest.beta_source}; the source gives {given}"}
+
+
+def _battery(run: Run, implant: Implant | None) -> dict[str, Any]:
+    """What the session's amplitudes mean for a battery; nothing where nothing was decided."""
+    fractions = np.array([d.amplitude_ma for d in run.decisions]) / run.cdbs_ma
+    if not fractions.size:
+        return {}
+    energy, charge = float(np.mean(fractions**2)), float(fractions.mean())
+    gain = battery_gain(energy, charge)
+    facts: dict[str, Any] = {"battery": battery_words(energy, charge), "battery_life_of_cdbs": [gain.low, gain.high]}
+    if implant is None:
+        return facts
+    life, cdbs = implant.life(fractions * run.cdbs_ma), implant.life([run.cdbs_ma])
+    facts |= {"battery_life": str(life), "battery_days": [life.days.low, life.days.high]}
+    return facts | {"battery_life_on_cdbs": str(cdbs), "battery_days_on_cdbs": [cdbs.days.low, cdbs.days.high]}
 
 
 def _agreement(source: Source) -> dict[str, Any]:

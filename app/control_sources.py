@@ -36,6 +36,7 @@ from ml.deploy.streaming import StreamingBeta, Stretch, split_by_period
 
 LFP_UNITS = {"uV": 1.0, "mV": 1000.0, "V": 1e6}
 _COHORT = re.compile(r"cohort:([A-Za-z0-9]+)(?::(\d{1,9}))?")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _PACKETS_AT_ONCE = 4096
 
 
@@ -60,12 +61,14 @@ class Source:
         description: of the source, for the summary.
         offline: P_beta of the same periods as computed afterwards, NaN where invalid; empty where there is nothing to compare.
         streamed: P_beta as it was known in time; grows while `rows` runs.
+        participant: code of a synthetic participant; None where the source does not say whose it is.
     """
 
     rows: Rows
     description: str
     offline: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     streamed: list[float] = field(default_factory=list)
+    participant: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +172,10 @@ def _live_lines(lines: Iterable[str], manifest: BundleManifest) -> Rows:
     """Lines as they arrive, and a row in every period whether or not one did; of several the newest counts, since the others are past."""
     inbox: SimpleQueue[str | None] = SimpleQueue()
     Thread(target=_pump, args=(lines, inbox), daemon=True).start()
-    line = inbox.get()  # the session starts with the first line
+    try:
+        line = inbox.get(timeout=manifest.period_s)  # the session starts with the first line, and without it after a period
+    except Empty:
+        line = ""
     began, k = time.perf_counter(), 0
     while line is not None:
         now_s = k * manifest.period_s
@@ -181,9 +187,11 @@ def _live_lines(lines: Iterable[str], manifest: BundleManifest) -> Rows:
 
 def _pump(lines: Iterable[str], inbox: SimpleQueue[str | None]) -> None:
     """Hand lines on from a thread of its own, None at their end, so that the loop never waits for one."""
-    for line in lines:
-        inbox.put(line)
-    inbox.put(None)
+    try:
+        for line in lines:
+            inbox.put(line)
+    finally:
+        inbox.put(None)
 
 
 def _newest(inbox: SimpleQueue[str | None]) -> str | None:
@@ -204,10 +212,7 @@ def _sample(line: str, now_s: float, manifest: BundleManifest) -> BetaSample | N
     """A number, taken to be of the bundle's unit and source; NaN where there is another text, nothing where the line is empty."""
     if not line.strip():
         return None
-    try:
-        beta = float(line)
-    except ValueError:
-        beta = math.nan
+    beta = float(line) if _NUMBER.fullmatch(line.strip()) else math.nan  # float() alone takes "1_5" for 15
     return BetaSample(now_s, beta, Signal(manifest.beta_unit, manifest.beta_source))
 
 
@@ -319,7 +324,8 @@ def _cohort(text: str, manifest: BundleManifest, steps: int) -> Source:
     if found is None or found[1] not in PARTICIPANTS:
         raise NotFound(f"There is no synthetic participant '{text}'.", f"Name one of cohort:{', cohort:'.join(PARTICIPANTS)}, with :SEED.")
     name, seed = found[1], int(found[2] or 0)
-    return Source(_simulate(name, seed, manifest, steps), f"synthetic participant {name}, seed {seed}, closed loop of {steps} steps")
+    description = f"synthetic participant {name}, seed {seed}, closed loop of {steps} steps"
+    return Source(_simulate(name, seed, manifest, steps), description, participant=name)
 
 
 def _simulate(name: str, seed: int, manifest: BundleManifest, steps: int) -> Rows:

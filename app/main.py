@@ -38,6 +38,7 @@ PAGE_MODULES = (
     "app.ingest.proposals_pages",
     "app.ingest.quarantine_pages",
     "app.learning.pages",
+    "app.learning.bundle_pages",
     "app.learning.gate_pages",
     "app.learning.sweep_pages",
     "app.evaluation.pages",

@@ -1,11 +1,16 @@
-"""How long one decision takes, as in the paper's table of computation times: microseconds, one thread, batch 1.
+"""The paper's two tables of the deployed controller: how long one decision takes, and what it saves of energy and battery.
 
-    python benchmarks/deploy.py [--passes N] [--json]
+    python benchmarks/deploy.py [--passes N] [--json]     microseconds per decision, one thread, batch 1
+    python benchmarks/deploy.py --energy                  closed loop on the synthetic participants; about two minutes
 
 Full (400x300) and distilled (20x10) policies, by torch, onnxruntime, the numpy network and the whole Python controller (window update and
 safety envelope with it), and the C header (-O3; a whole decision too; float32 and whole numbers). `wall` is the time that passed, with the
 slices in which the machine did something else; `CPU` is the thread's own time. The timer's own cost, measured the same way, stands first
 and is not taken off. C is timed inside C over blocks of 1000 decisions, since one is shorter than the timer's steps.
+
+`--energy` trains one full policy per synthetic participant on three visits (ReBRAC, 5000 updates), distils it, and runs both as bundles,
+within the safety envelope and in closed loop, beside the random controller. Battery life is a multiple of that under cDBS, under the
+assumption that `ml.deploy.appraisal` states: the paper measured the runtime of tablet and link instead.
 """
 
 from __future__ import annotations
@@ -25,14 +30,21 @@ from typing import Any
 import numpy as np
 import torch
 
+from ml.cohort import PARTICIPANTS, random_controller_buffer
+from ml.cohort.env import ParticipantEnv
+from ml.deploy.appraisal import battery_gain
 from ml.deploy.bundle import build_bundle, open_bundle
 from ml.deploy.manifest import BundleManifest
 from ml.deploy.runtime.envelope import BetaSample, Signal
+from ml.rl.algorithms import ALGORITHMS
+from ml.rl.distillation import DistilConfig, distil
 from ml.rl.networks import STUDENT_HIDDEN, TEACHER_HIDDEN, MlpPolicy
 from ml.rl.onnx_policy import OnnxPolicy
+from ml.trajectories import ReplayBuffer
 
 WINDOW, MEAN, STD = 10, 120.0, 35.0
 WARM_UP, BLOCK = 200, 1000
+SESSIONS, SESSION_STEPS = 10, 300
 PAPER = {"full": "4780 mean, 32260 std (Surface Go)", "distilled": "2980 mean, 1720 std (Surface Go)"}
 TIMER = r"""
 #define _POSIX_C_SOURCE 199309L
@@ -125,6 +137,56 @@ def measure(name: str, hidden: tuple[int, ...], passes: int) -> dict[str, tuple[
     return out
 
 
+def energies() -> list[dict[str, Any]]:
+    """Mean squared and mean amplitude over cDBS of each participant's controllers, [sessions of SESSION_STEPS], and battery life."""
+    out = []
+    for code in PARTICIPANTS:
+        buffer = random_controller_buffer(code, visits=3, sessions_per_visit=6, steps=SESSION_STEPS, seed=2026)
+        learner = ALGORITHMS["rebrac"]
+        config = learner.config(updates=5000, batch=64, actor_lr=3e-4, actor_penalty=0.1, aim="return", record_every=500, seed=0)
+        full = learner.train(buffer, config).policy
+        small = distil(full, buffer, DistilConfig()).policy
+        lowest, rng = buffer.settings.lower_bound, np.random.default_rng(5)
+        rows = {
+            "full": closed_loop(code, full, buffer),
+            "distilled": closed_loop(code, small, buffer),
+            "random": [rng.uniform(lowest, 1.0, SESSION_STEPS) for _ in range(SESSIONS)],
+        }
+        for name, sessions in rows.items():
+            energy = np.array([np.mean(a**2) for a in sessions])
+            gain = battery_gain(float(energy.mean()), float(np.mean(sessions)))
+            saved = 100.0 * (1.0 - energy)
+            out.append({"participant": code, "controller": name, "saved_percent": saved.mean(), "saved_sd": saved.std(ddof=1),
+                        "mean_amplitude": float(np.mean(sessions)), "battery_low": gain.low, "battery_high": gain.high})  # fmt: skip
+    return out
+
+
+def closed_loop(code: str, policy: MlpPolicy, buffer: ReplayBuffer) -> list[Any]:
+    """Amplitude over cDBS per step of each session, as the bundle's controller decides within its limits, [SESSION_STEPS] each."""
+    window = buffer.settings.window
+    manifest = BundleManifest(
+        participant=code, policy_id=1, policy_name="bench", window=window, beta_unit="uV", beta_source="time_domain", min_ma=0.0,
+        max_ma=3.0, cdbs_ma=3.0, ramp_ma_per_s=1.5, code_version="bench",
+    )  # fmt: skip
+    opened = open_bundle(build_bundle(policy.to_onnx(), manifest, buffer.transitions().states[:8]))
+    signal = Signal(manifest.beta_unit, manifest.beta_source)
+    sessions = []
+    for seed in range(SESSIONS):
+        controller = opened.controller()
+        environment = ParticipantEnv(code, SESSION_STEPS, buffer.settings)
+        before, _ = environment.reset(seed=seed)
+        for i, beta in enumerate(before.tolist()):
+            now = 2.0 * (i - window + 1)
+            decision = controller.decide(now, BetaSample(now, beta, signal))
+        amplitudes = np.empty(SESSION_STEPS)
+        for k in range(SESSION_STEPS):
+            amplitudes[k] = decision.amplitude_ma / manifest.cdbs_ma
+            info = environment.step(np.array([amplitudes[k]], dtype=np.float32))[-1]
+            decision = controller.decide(2.0 * (k + 1), BetaSample(2.0 * (k + 1), float(info["beta"]), signal))
+        sessions.append(amplitudes)
+    return sessions
+
+
 def figures(values: Any) -> dict[str, float]:
     """Mean, standard deviation, median and 99th percentile."""
     return {"mean": values.mean(), "std": values.std(), "median": np.median(values), "p99": np.quantile(values, 0.99)}
@@ -134,9 +196,23 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--passes", type=int, default=2000, help="timed passes, at least 200 as in the paper")
+    parser.add_argument("--energy", action="store_true", help="energy and battery instead of computation time")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
+    if given.energy:
+        found = energies()
+        if given.json:
+            print(json.dumps(found, indent=1))
+            return
+        print(f"{'participant':<13}{'controller':<12}{'mean amplitude':>15}{'energy saved %':>16}{'sd':>6}{'battery, times cDBS':>21}")
+        for row in found:
+            life = f"{row['battery_low']:.2f} to {row['battery_high']:.2f}"
+            print(
+                f"{row['participant']:<13}{row['controller']:<12}{row['mean_amplitude']:>15.2f}{row['saved_percent']:>16.1f}"
+                f"{row['saved_sd']:>6.1f}{life:>21}"
+            )
+        return
     passes = max(given.passes, 200)
     rows = [("timer alone", "", *timed(lambda i: None, passes))]
     for name, hidden in (("full", TEACHER_HIDDEN), ("distilled", STUDENT_HIDDEN)):

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
+import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from numpy.typing import NDArray
 from sqlalchemy import column, select, table
 from sqlalchemy.orm import Session
 
 from app import __version__
+from app.accounts import policy as can
 from app.accounts.policy import Caller
 from app.learning import repository
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.service import probe_windows
 from app.platform import files
+from app.platform.audit import AuditEvent
 from app.platform.database import set_reason
-from app.platform.errors import Invalid
+from app.platform.errors import Forbidden, Invalid
 from app.settings import get_settings
 from app.study import repository as study_repository
 from app.study.models import Hemisphere, Participant, Recording, Visit
-from ml.deploy.bundle import build_bundle, sign
-from ml.deploy.manifest import Approval, BundleError, BundleManifest
+from ml.deploy.bundle import build_bundle, describe, sign
+from ml.deploy.manifest import DEFAULTS, Approval, BundleError, BundleManifest
 from ml.rl.onnx_policy import PolicyFileError
 
 KEY = "bundle-signing"
@@ -70,12 +75,13 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
 
     Raises:
         Invalid: the cDBS amplitude or the unit of beta is not known, limits that contradict each other, or leave the stimulator's own.
+        Forbidden: limits stated by somebody who may only read.
     """
-    manifest, data = _manifest(db, participant, policy, limits, hemisphere, caller)
-    version = study_repository.settings_version(db, policy.settings_version_id)
-    usable = data if data and study_repository.settings_version(db, data.settings_version_id).window == version.window else None
+    if limits.stated and not may_state(participant, caller):
+        raise Forbidden("You may not state the limits of a bundle.", "Ask a clinician or an engineer of the study.")
+    manifest, windows = _manifest(db, participant, policy, limits, hemisphere, caller)
     try:
-        content = build_bundle(files.read(policy.onnx_sha256), manifest, probe_windows(usable, version))
+        content = build_bundle(files.read(policy.onnx_sha256), manifest, windows)
     except (BundleError, PolicyFileError) as error:
         raise _unmade(policy, error) from error
     signed = sign(content, signing_key())
@@ -88,6 +94,29 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
     files.store(db, signed, _ZIP)
     db.flush()
     return signed
+
+
+def preview(
+    db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
+) -> BundleManifest:
+    """What the bundle would say of itself, all but its files; nothing is stored. Raises Invalid as `bundle` does."""
+    manifest, windows = _manifest(db, participant, policy, limits, hemisphere, caller)
+    try:
+        return describe(files.read(policy.onnx_sha256), manifest, windows)
+    except (BundleError, PolicyFileError) as error:
+        raise _unmade(policy, error) from error
+
+
+def may_state(participant: Participant, caller: Caller) -> bool:
+    """Whether somebody may state the limits of a bundle: those who may write into the study."""
+    return caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site.id)
+
+
+def taken(db: Session, participant: Participant, policy: Policy) -> list[AuditEvent]:
+    """The bundles of a policy that left so far, newest first, as the audit trail has them."""
+    named = AuditEvent.reason.startswith(f"controller bundle of {participant.code}, policy {policy.id}", autoescape=True)
+    found = db.scalars(select(AuditEvent).where(AuditEvent.entity == "stored_file", named).order_by(AuditEvent.id.desc()))
+    return [event for event in found if re.match(rf".*, policy {policy.id}[,:]", event.reason or "")]
 
 
 def device_limits(db: Session, participant: Participant, hemisphere: Hemisphere | None) -> DeviceLimits | None:
@@ -134,8 +163,8 @@ def present_cdbs_ma(participant: Participant, hemisphere: Hemisphere | None) -> 
 
 def _manifest(
     db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
-) -> tuple[BundleManifest, BufferSnapshot | None]:
-    """What the bundle says about itself, and the data for its test vectors."""
+) -> tuple[BundleManifest, NDArray[np.float64]]:
+    """What the bundle says about itself, and beta windows for its test vectors: logged ones, where there are any of its length."""
     version = study_repository.settings_version(db, policy.settings_version_id)
     snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id else None
     data = snapshot or repository.newest_snapshot(db, participant.id)
@@ -145,9 +174,10 @@ def _manifest(
         raise Invalid("The unit and source of beta are not known.", "Set beta_unit and beta_source in the participant's settings.")
     cdbs = present_cdbs_ma(participant, hemisphere)
     device = device_limits(db, participant, hemisphere)
+    usable = data if data and study_repository.settings_version(db, data.settings_version_id).window == version.window else None
     teacher = db.get(Policy, policy.teacher_id) if policy.teacher_id else None
     agreement: dict[str, Any] = policy.metrics.get("on_buffer") or {}
-    stated = f"{caller.label}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC" if limits.stated else "nobody: defaults"
+    stated = f"{caller.label}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC" if limits.stated else DEFAULTS
     try:
         manifest = BundleManifest(
             participant=participant.code,
@@ -175,12 +205,15 @@ def _manifest(
             agreement_mean=agreement.get("mean"),
             agreement_p99=agreement.get("p99"),
             agreement_worst=agreement.get("worst"),
+            logged_lower_bound=version.lower_bound,
+            test_windows_from=f"snapshot {usable.id}" if usable else None,
+            taken_by=f"{caller.label}, {datetime.now(UTC):%Y-%m-%d %H:%M:%S.%f} UTC",
             public_key=public_key(),
             approvals=approvals(db, policy.id),
         )
     except BundleError as error:
         raise _unmade(policy, error) from error
-    return manifest, data
+    return manifest, probe_windows(usable, version)
 
 
 def _unmade(policy: Policy, error: Exception) -> Invalid:

@@ -4,7 +4,7 @@
     manifest.json, manifest.sig   whose, for which signal, within which limits; SHA-256 of every file; its Ed25519 signature
     model.onnx                    the network: beta_window [N, W] to amplitude_fraction [N, 1]
     test_vectors.json             what every runtime must answer, and one session with everything that can go wrong with beta
-  and for the networks that betaloop trains:
+  and for plain multi-layer perceptrons, as betaloop trains them and as many a file made elsewhere is one:
     weights.f32, controller/      the reference runner: `python -m controller`, Python and numpy alone
     betaloop_controller.h         the whole controller in C99, float32; selftest.c checks it
     betaloop_controller_int8.h    the same in whole numbers, for small networks; selftest_int8.c checks it
@@ -27,16 +27,18 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from numpy.typing import NDArray
 
-from ml.deploy import vectors
+from ml.deploy import appraisal, vectors
+from ml.deploy.c_envelope import header_tanh
 from ml.deploy.c_header import fixed_point_header, float_header, self_test
 from ml.deploy.fixed_point import CutNetwork, quantise
 from ml.deploy.manifest import BundleError, BundleManifest
+from ml.deploy.onnx_mlp import NoPlainNetwork, mlp_of
 from ml.deploy.runtime.__main__ import check
 from ml.deploy.runtime.envelope import Signal
 from ml.deploy.runtime.loop import Controller, WindowNetwork
 from ml.deploy.runtime.network import MlpNetwork
 from ml.deploy.sheet import render
-from ml.deploy.windows import PolicyWindow, mlp_of
+from ml.deploy.windows import PolicyWindow
 from ml.rl.onnx_policy import MAX_FILE_BYTES, OnnxPolicy, PolicyFileError, PolicyOutputError
 
 SHEET, MANIFEST, SIGNATURE, MODEL, VECTORS = "sheet.html", "manifest.json", "manifest.sig", "model.onnx", "test_vectors.json"
@@ -83,25 +85,16 @@ def build_bundle(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDA
         PolicyFileError: the network is no policy of this window.
         BundleError: test windows of another shape, or not finite.
     """
-    windows = np.asarray(test_windows, dtype=np.float64)
-    if windows.ndim != 2 or windows.shape[1] != manifest.window or len(windows) == 0 or not np.isfinite(windows).all():
-        raise BundleError(f"test windows must be finite and of shape [M, {manifest.window}], M at least 1, not {list(windows.shape)}")
-    policy = OnnxPolicy(policy_onnx, manifest.window, probe=windows)
-    windows = vectors.edge_windows(windows)
-    network = mlp_of(policy_onnx)
+    manifest, network, policy, windows = _described(policy_onnx, manifest, test_windows)
     expected = policy.act(windows)
     steps = vectors.session(manifest, network or PolicyWindow(policy, manifest.window), windows)
     files = {MODEL: policy_onnx, VECTORS: vectors.to_json(windows, expected, steps)}
     if network is not None:
-        mean, std = network.mean, network.std
-        layers = (network.window, *(len(bias) for _, bias in network.layers))
-        manifest = replace(manifest, layers=layers, normalisation_mean=mean, normalisation_std=std)
         files |= {f"controller/{path.name}": path.read_bytes() for path in _RUNTIME.glob("*.py")}
         test = self_test(manifest, HEADER, windows, expected, steps, vectors.TOLERANCE, exact=True)
         files |= {WEIGHTS: network.to_bytes(), HEADER: float_header(manifest, network).encode(), SELF_TEST: test.encode()}
         fixed = quantise(network)
         if fixed is not None:
-            manifest = replace(manifest, int8_bound=fixed.bound, int8_planes=fixed.planes, int8_bytes=fixed.size_bytes)
             expected_cut = policy.act(fixed.cut(windows))  # the bound is against the real network on the window cut to the int16 inputs
             steps = vectors.session(manifest, CutNetwork(network, fixed), windows)
             test = self_test(manifest, HEADER_INT8, windows, expected_cut, steps, fixed.bound, exact=False)
@@ -109,6 +102,53 @@ def build_bundle(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDA
     files[SHEET] = render(manifest, hashlib.sha256(policy_onnx).hexdigest()).encode()
     full = replace(manifest, files={name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
     return _pack(files | {MANIFEST: full.to_bytes()})
+
+
+def describe(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDArray[Any]) -> BundleManifest:
+    """The manifest that `build_bundle` would write, all but the files; arguments and errors as there."""
+    return _described(policy_onnx, manifest, test_windows)[0]
+
+
+def _described(
+    policy_onnx: bytes, manifest: BundleManifest, test_windows: NDArray[Any]
+) -> tuple[BundleManifest, MlpNetwork | None, OnnxPolicy, NDArray[np.float64]]:
+    """The manifest with all that the network itself says, its layers where it is a plain one, the policy, test windows with the edges."""
+    usual = np.asarray(test_windows, dtype=np.float64)
+    if usual.ndim != 2 or usual.shape[1] != manifest.window or len(usual) == 0 or not np.isfinite(usual).all():
+        raise BundleError(f"test windows must be finite and of shape [M, {manifest.window}], M at least 1, not {list(usual.shape)}")
+    policy = OnnxPolicy(policy_onnx, manifest.window, probe=usual)
+    windows = vectors.edge_windows(usual)
+    network, no_header = _plain(policy_onnx, windows, policy.act(windows), usual)
+    manifest = replace(manifest, no_header=no_header, **appraisal.of(policy.act(usual), manifest))
+    if network is None:
+        return manifest, None, policy, windows
+    manifest = replace(
+        manifest,
+        layers=(network.window, *(len(bias) for _, bias in network.layers)),
+        activations=network.activations,
+        normalisation_mean=network.mean,
+        normalisation_std=network.std,
+        **{f"output_{name}": value for name, value in network.output._asdict().items()},
+    )
+    fixed = quantise(network)
+    if fixed is not None:
+        manifest = replace(manifest, int8_bound=fixed.bound, int8_planes=fixed.planes, int8_bytes=fixed.size_bytes)
+    return manifest, network, policy, windows
+
+
+def _plain(
+    policy_onnx: bytes, windows: NDArray[np.float64], expected: NDArray[np.float64], usual: NDArray[np.float64]
+) -> tuple[MlpNetwork | None, str | None]:
+    """The network as layers, if the file is a plain one whose layers give the file's own answers in numpy and with the header's tanh;
+    else why not."""
+    try:
+        network = mlp_of(policy_onnx, usual)
+    except (NoPlainNetwork, ValueError) as error:
+        return None, f"the ONNX file is no plain multi-layer perceptron: {error}"
+    worst = max(float(np.max(np.abs(answers - expected))) for answers in (network.act(windows), network.act(windows, header_tanh)))
+    if not worst <= vectors.TOLERANCE:
+        return None, f"its layers in float32 answer up to {worst:.2g} away from the ONNX file"
+    return network, None
 
 
 def verify_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) -> BundleManifest:
@@ -149,8 +189,11 @@ def open_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) -> O
     if mean is None or std is None:
         raise BundleError(f"the manifest must state the normalisation of {WEIGHTS}")
     try:
-        check(json.loads(raw), MlpNetwork.from_bytes(files[WEIGHTS], manifest.layers, mean, std), json.loads(files[VECTORS]))
-        return OpenBundle(manifest, MlpNetwork.from_bytes(files[WEIGHTS], manifest.layers, mean, std))
+        made = [
+            MlpNetwork.from_bytes(files[WEIGHTS], manifest.layers, mean, std, manifest.activations, manifest.output()) for _ in range(2)
+        ]
+        check(json.loads(raw), made[0], json.loads(files[VECTORS]))  # which moves its window
+        return OpenBundle(manifest, made[1])
     except (ValueError, KeyError, TypeError) as error:
         raise BundleError(f"{WEIGHTS} does not agree with {VECTORS}: {error}") from error
 

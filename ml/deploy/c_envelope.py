@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 TYPES = """\
 /* Why a decision differs from the network's wish: bits of `reasons`. */
 enum {
@@ -46,27 +49,40 @@ typedef struct {
 } betaloop_decision;
 """
 
-TANH = """\
+_LARGEST = 7.90531110763549805  # tanh of it is 1 in float32
+_OVER = (-2.76076847742355e-16, 2.00018790482477e-13, -8.60467152213735e-11, 5.12229709037114e-08, 1.48572235717979e-05,
+         6.37261928875436e-04, 4.89352455891786e-03)  # fmt: skip
+_UNDER = (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4.89352518554385e-03)
+
+
+def _horner(name: str, coefficients: tuple[float, ...]) -> str:
+    first, *others = coefficients
+    return "".join([f"    {name} = {first:.14e}f;\n", *(f"    {name} = {name} * s + {c:.14e}f;\n" for c in others)])
+
+
+TANH = f"""\
 /* tanh as a ratio of polynomials, within 1e-6 of the true value; NaN stays NaN. */
-static inline float betaloop_tanh(float x) {
+static inline float betaloop_tanh(float x) {{
     float s, p, q;
-    if (x > 7.90531110763549805f) x = 7.90531110763549805f;
-    if (x < -7.90531110763549805f) x = -7.90531110763549805f;
+    if (x > {_LARGEST!r}f) x = {_LARGEST!r}f;
+    if (x < -{_LARGEST!r}f) x = -{_LARGEST!r}f;
     s = x * x;
-    p = -2.76076847742355e-16f;
-    p = p * s + 2.00018790482477e-13f;
-    p = p * s - 8.60467152213735e-11f;
-    p = p * s + 5.12229709037114e-08f;
-    p = p * s + 1.48572235717979e-05f;
-    p = p * s + 6.37261928875436e-04f;
-    p = p * s + 4.89352455891786e-03f;
-    q = 1.19825839466702e-06f;
-    q = q * s + 1.18534705686654e-04f;
-    q = q * s + 2.26843463243900e-03f;
-    q = q * s + 4.89352518554385e-03f;
-    return x * p / q;
-}
+{_horner("p", _OVER)}{_horner("q", _UNDER)}    return x * p / q;
+}}
 """
+
+
+def header_tanh(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The tanh of the C header, in float32: for networks with tanh between their layers, where its error may grow."""
+    x = np.clip(x, np.float32(-_LARGEST), np.float32(_LARGEST))
+    s = x * x
+    over, under = (np.float32(0.0) * s, np.float32(0.0) * s)
+    for c in _OVER:
+        over = over * s + np.float32(c)
+    for c in _UNDER:
+        under = under * s + np.float32(c)
+    return np.asarray(x * over / under, dtype=np.float32)
+
 
 ENVELOPE = """\
 static inline int betaloop_same(const char *a, const char *b) {

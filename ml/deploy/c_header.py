@@ -22,7 +22,7 @@ from ml.deploy.c_envelope import ENVELOPE, SELF_TEST, TANH, TYPES
 from ml.deploy.fixed_point import SCORE_LIMIT, FixedPointNetwork
 from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.runtime.envelope import FLAG_MA, SPACING_TOLERANCE
-from ml.deploy.runtime.network import MlpNetwork
+from ml.deploy.runtime.network import MlpNetwork, Output
 from ml.deploy.vectors import Step
 
 _SAFE = set(string.ascii_letters + string.digits + " _.,:;+-()=<>@#%")
@@ -69,8 +69,10 @@ def float_header(manifest: BundleManifest, network: MlpNetwork) -> str:
             f"        for (i = 0; i < {size}; ++i) {target}[i] += betaloop_weights_{index}[j][i] * {source}[j];",
         ]
         if index < len(sizes) - 2:
-            parts.append(f"    for (i = 0; i < {size}; ++i) {target}[i] = {target}[i] < 0.0f ? 0.0f : {target}[i];")
-    parts += [f"    return 0.5f * (betaloop_tanh(hidden_{len(sizes) - 1}[0]) + 1.0f);", "}\n", ENVELOPE]
+            relu = network.activations[index] == "relu"
+            bent = f"{target}[i] < 0.0f ? 0.0f : {target}[i]" if relu else f"betaloop_tanh({target}[i])"
+            parts.append(f"    for (i = 0; i < {size}; ++i) {target}[i] = {bent};")
+    parts += [*_answer(f"hidden_{len(sizes) - 1}[0]", network.output), "}\n", ENVELOPE]
     return "\n".join(parts)
 
 
@@ -85,6 +87,8 @@ def fixed_point_header(manifest: BundleManifest, fixed: FixedPointNetwork) -> st
         parts.append(f"static const int32_t betaloop_bias_{index}[{layer.bias.size}] = {{{_ints(layer.bias)}}};")
         if layer.multiplier.size:
             parts.append(f"static const int32_t betaloop_multiplier_{index}[{layer.bias.size}] = {{{_ints(layer.multiplier)}}};")
+        elif index < len(fixed.layers) - 1:
+            parts.append(f"static const float betaloop_unit_{index}[{layer.bias.size}] = {{{_floats(layer.unit)}}};")
     parts += [
         "",
         f"/* z-score of a beta amplitude in steps of 8/32767, cut at {SCORE_LIMIT:g} standard deviations */",
@@ -98,6 +102,7 @@ def fixed_point_header(manifest: BundleManifest, fixed: FixedPointNetwork) -> st
         "/* Amplitude fraction for a window of scores, oldest first. */",
         "static inline float betaloop_fraction(const int16_t *scores) {",
         *(f"    int16_t hidden_{i + 1}[{layer.bias.size}];" for i, layer in enumerate(fixed.layers[:-1])),
+        *(["    float real;"] if any(not layer.multiplier.size for layer in fixed.layers[:-1]) else []),
         "    int64_t total = 0;",
         "    int32_t " + ", ".join(f"sum_{p}" for p in range(fixed.planes)) + ";",
         "    int i, j;",
@@ -108,18 +113,32 @@ def fixed_point_header(manifest: BundleManifest, fixed: FixedPointNetwork) -> st
         parts += [f"        sum_{p} = 0;" for p in range(fixed.planes)]
         parts += [f"        for (j = 0; j < {layer.planes[0].shape[1]}; ++j) {{"]
         parts += [f"            sum_{p} += (int32_t)betaloop_plane_{index}_{p}[i][j] * {source}[j];" for p in range(fixed.planes)]
-        total = "sum_0" if fixed.planes == 1 else "(int64_t)sum_0 * 256 + sum_1"
-        parts += ["        }", f"        total = (int64_t)({total}) + betaloop_bias_{index}[i];"]
+        finer = "" if fixed.planes == 1 else " * 256 + sum_1"
+        parts += ["        }", f"        total = ((int64_t)sum_0 + betaloop_bias_{index}[i]){finer};"]
         if layer.multiplier.size:
             parts += [
                 "        if (total < 0) total = 0;",
                 f"        total = (total * betaloop_multiplier_{index}[i] + ((int64_t)1 << {layer.shift - 1})) >> {layer.shift};",
                 f"        hidden_{index + 1}[i] = (int16_t)(total > 32767 ? 32767 : total);",
             ]
+        elif index < len(fixed.layers) - 1:
+            parts += [
+                f"        real = betaloop_tanh((float)total * betaloop_unit_{index}[i]) * 32767.0f;",
+                f"        hidden_{index + 1}[i] = (int16_t)(real < 0.0f ? real - 0.5f : real + 0.5f);",
+            ]
         parts.append("    }")
     unit = _float(fixed.layers[-1].unit[0])
-    parts += [f"    return 0.5f * (betaloop_tanh((float)total * {unit}) + 1.0f);", "}\n", ENVELOPE]
+    parts += [*_answer(f"(float)total * {unit}", fixed.output), "}\n", ENVELOPE]
     return "\n".join(parts)
+
+
+def _answer(total: str, output: Output) -> list[str]:
+    """The C lines from the last sum to the fraction; a sum that is no number stays none, for the envelope to see."""
+    bent = f"betaloop_tanh({total})" if output.kind == "tanh" else total
+    lines = [f"    float answer = {_float(output.gain)} * ({bent}) + {_float(output.offset)};"]
+    lines += [] if output.low is None else [f"    if (answer < {_float(output.low)}) answer = {_float(output.low)};"]
+    lines += [] if output.high is None else [f"    if (answer > {_float(output.high)}) answer = {_float(output.high)};"]
+    return ["    {", *(f"    {line}" for line in lines), "        return answer;", "    }"]
 
 
 def self_test(
@@ -198,7 +217,7 @@ def _preamble(manifest: BundleManifest, kind: str) -> str:
 
 #define BETALOOP_WINDOW {limits.window}
 #define BETALOOP_PERIOD_MS {period}
-#define BETALOOP_STALE_AFTER_MS {_whole_ms(limits.stale_after_s)}
+#define BETALOOP_STALE_AFTER_MS {round(1000 * limits.stale_after_s)}
 #define BETALOOP_CLOSEST_MS {round((1 - SPACING_TOLERANCE) * period)}
 #define BETALOOP_FARTHEST_MS {round((1 + SPACING_TOLERANCE) * period)}
 #define BETALOOP_UNIT {string_literal(manifest.beta_unit)}

@@ -2,7 +2,7 @@
 
 Each row of weights has one scale. A row is one plane of int8, or two (a coarse one, and a fine one in steps of 1/256 of the coarse), where
 one cannot keep the guaranteed error small. Between layers a row's sum is brought to int16 by a whole multiplier and a shift; only the last
-sum and its tanh are real numbers.
+sum and its tanh are real numbers (and those of hidden layers with tanh, which files made elsewhere may have).
 
 The error bound is analytical: intervals of the real network's activations over all windows, and through them the errors of inputs, weights,
 biases, multipliers and roundings, each at its worst sign. It holds for every window there can be, not for those that were tried; z-scores
@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.deploy.runtime.network import MlpNetwork
+from ml.deploy.c_envelope import header_tanh
+from ml.deploy.runtime.network import MlpNetwork, Output
 
 SCORE_LIMIT = 8.0
 """Largest z-score that the int16 inputs hold."""
@@ -32,6 +33,8 @@ _INT16, _INT32 = 2**15 - 1, 2**31 - 1
 _MULTIPLIER_BITS = 24
 _FLOAT_SLACK = 5e-6  # float32 roundings of the z-score, the last product and the tanh, all together well below this
 
+_TANH_SLACK = 2e-6  # of the header's tanh, and of the float32 that it is given
+
 Ints = NDArray[np.int64]
 
 
@@ -41,9 +44,9 @@ class FixedLayer:
 
     Attributes:
         planes: weights, one or two arrays [outputs, inputs] within int8.
-        bias: [outputs], in units of a sum.
+        bias: [outputs], in units of a sum of the first plane.
         unit: [outputs], what a sum of 1 is worth.
-        multiplier: [outputs], sums to int16 activations, to be shifted right by `shift`; empty in the last layer.
+        multiplier: [outputs], sums to int16 activations, to be shifted right by `shift`; empty in the last layer and before a tanh.
         shift: bits.
     """
 
@@ -59,8 +62,8 @@ class FixedLayer:
         parts = [activations @ plane.T for plane in self.planes]
         if any(np.abs(part).max(initial=0) > _INT32 for part in parts):
             raise OverflowError("an accumulator leaves int32")
-        total = parts[0] if len(parts) == 1 else parts[0] * _FINE + parts[1]
-        return np.asarray(total + self.bias)
+        total = parts[0] + self.bias
+        return np.asarray(total if len(parts) == 1 else total * _FINE + parts[1])
 
 
 @dataclass(frozen=True)
@@ -71,12 +74,14 @@ class FixedPointNetwork:
         layers: from the window to the output.
         mean, std: of beta.
         bound: no window gives a fraction farther than this from the real network's.
+        output: what follows the last layer.
     """
 
     layers: tuple[FixedLayer, ...]
     mean: float
     std: float
     bound: float
+    output: Output
 
     @property
     def planes(self) -> int:
@@ -85,8 +90,8 @@ class FixedPointNetwork:
 
     @property
     def size_bytes(self) -> int:
-        """Weights as int8, biases and multipliers as int32, and one float32 for the last sum's unit."""
-        return sum(sum(p.size for p in layer.planes) + 4 * layer.bias.size + 4 * layer.multiplier.size for layer in self.layers) + 4
+        """Weights as int8, biases and multipliers as int32, and float32 units of the sums that become real numbers."""
+        return sum(sum(p.size for p in a.planes) + 4 * a.bias.size + 4 * (a.multiplier.size or a.unit.size) for a in self.layers)
 
     def cut(self, states: NDArray[Any]) -> NDArray[np.float64]:
         """Beta windows [N, W] with z-scores beyond the limit cut to it."""
@@ -99,11 +104,15 @@ class FixedPointNetwork:
         scaled = np.clip(scores, -SCORE_LIMIT, SCORE_LIMIT).astype(np.float32) * np.float32(_INT16 / SCORE_LIMIT)
         hidden: Ints = np.where(scaled < 0, np.ceil(scaled - np.float32(0.5)), np.floor(scaled + np.float32(0.5))).astype(np.int64)
         for layer in self.layers[:-1]:
-            sums = np.maximum(layer.sums(hidden), 0)
-            hidden = np.minimum((sums * layer.multiplier + (1 << (layer.shift - 1))) >> layer.shift, _INT16)
-        last = self.layers[-1]
-        total = last.sums(hidden)[:, 0].astype(np.float32) * np.float32(last.unit[0])
-        return np.asarray(0.5 * (np.tanh(total.astype(np.float64)) + 1.0))
+            sums = layer.sums(hidden)
+            if layer.multiplier.size:
+                hidden = np.minimum((np.maximum(sums, 0) * layer.multiplier + (1 << (layer.shift - 1))) >> layer.shift, _INT16)
+            else:
+                hidden = np.rint(header_tanh(sums.astype(np.float32) * layer.unit.astype(np.float32)) * np.float32(_INT16)).astype(np.int64)
+        last, out = self.layers[-1], self.output
+        total = (last.sums(hidden)[:, 0].astype(np.float32) * np.float32(last.unit[0])).astype(np.float64)
+        answer = out.gain * (np.tanh(total) if out.kind == "tanh" else total) + out.offset
+        return np.asarray(np.clip(answer, -np.inf if out.low is None else out.low, np.inf if out.high is None else out.high))
 
 
 class CutNetwork:
@@ -130,6 +139,8 @@ def quantise(network: MlpNetwork) -> FixedPointNetwork | None:
     sums do not fit."""
     if sum(w.size + b.size for w, b in network.layers) > MAX_PARAMETERS:
         return None
+    if network.output.kind == "linear" and (network.output.low is None or network.output.high is None):
+        return None  # a rounded sum could leave [0, 1] where the real one does not, and would count as a fault
     tried = [_quantise(network, planes) for planes in (1, 2)]
     fitting = [fixed for fixed in tried if fixed is not None]
     small = [fixed for fixed in fitting if fixed.bound <= WANTED_BOUND]
@@ -147,19 +158,28 @@ def _quantise(network: MlpNetwork, planes: int) -> FixedPointNetwork | None:
         weights, bias = weights32.astype(np.float64), bias32.astype(np.float64)
         parts, row_scale = _split(weights, planes)
         unit = row_scale * scale / (_FINE if planes == 2 else 1)
-        whole_bias = np.rint(bias / unit)
+        bias_unit = row_scale * scale
+        whole_bias = np.rint(bias / bias_unit)
         kept = row_scale[:, None] * (parts[0] if planes == 1 else parts[0] + parts[1] / _FINE)
-        sums = np.abs(parts[0] * _FINE + parts[1] if planes == 2 else parts[0]) @ reach + np.abs(whole_bias)
+        sums = np.abs(parts[0] * _FINE + parts[1] if planes == 2 else parts[0]) @ reach + np.abs(whole_bias) * (_FINE if planes == 2 else 1)
         if max(np.max(np.abs(p) @ reach) for p in parts) > _INT32 or np.abs(whole_bias).max() > _INT32:
             return None
         if planes == 1 and sums.max() > _INT32:
             return None
-        error = np.abs(kept) @ error + np.abs(weights - kept) @ np.maximum(np.abs(low), np.abs(high)) + np.abs(bias - whole_bias * unit)
+        error = (
+            np.abs(kept) @ error + np.abs(weights - kept) @ np.maximum(np.abs(low), np.abs(high)) + np.abs(bias - whole_bias * bias_unit)
+        )
         positive, negative = np.maximum(weights, 0), np.minimum(weights, 0)
         low, high = positive @ low + negative @ high + bias, positive @ high + negative @ low + bias
         if index == len(network.layers) - 1:
             layers.append(_layer(parts, whole_bias, unit, np.empty(0), 0))
             break
+        if network.activations[index] == "tanh":
+            layers.append(_layer(parts, whole_bias, unit, np.empty(0), 0))
+            low, high, scale = np.tanh(low), np.tanh(high), 1.0 / _INT16
+            error = 2.0 * np.tanh(error / 2.0) + _TANH_SLACK + scale / 2  # |tanh a - tanh b| <= 2 tanh(|a - b| / 2)
+            reach = np.full(len(bias), float(_INT16))
+            continue
         low, high = np.maximum(low, 0), np.maximum(high, 0)
         top = float((high + error).max())
         scale = max(top, 1e-12) / _INT16
@@ -171,8 +191,9 @@ def _quantise(network: MlpNetwork, planes: int) -> FixedPointNetwork | None:
         layers.append(_layer(parts, whole_bias, unit, multiplier, shift))
         error = error + scale / 2 + np.abs(multiplier / 2.0**shift - wanted) / wanted * (high + error)
         reach = np.full(len(bias), float(_INT16))
-    bound = math.tanh(float(error[0]) / 2) + _FLOAT_SLACK  # |tanh a - tanh b| <= 2 tanh(|a - b| / 2), and the fraction is half of it
-    return FixedPointNetwork(tuple(layers), network.mean, network.std, min(bound, 1.0))
+    out, last = network.output, float(error[0])
+    bound = abs(out.gain) * (2.0 * math.tanh(last / 2) if out.kind == "tanh" else last) + _FLOAT_SLACK
+    return FixedPointNetwork(tuple(layers), network.mean, network.std, min(bound, 1.0), out)
 
 
 def _split(weights: NDArray[np.float64], planes: int) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:

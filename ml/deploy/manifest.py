@@ -10,8 +10,11 @@ from itertools import pairwise
 from typing import Any
 
 from ml.deploy.runtime.envelope import EnvelopeLimits
+from ml.deploy.runtime.network import OWN_OUTPUT, Output
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
+DEFAULTS = "nobody: defaults"
+"""In place of who stated the limits."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -58,8 +61,18 @@ class BundleManifest:
         code_version: of the betaloop that made the bundle.
         teacher_name: of the policy that this one was distilled from; None where it was not.
         agreement_mean, agreement_p99, agreement_worst: absolute difference of the fraction from the teacher's over the buffer's states.
-        layers: units from the window to the output; empty where the network is no multi-layer perceptron of betaloop.
+        layers: units from the window to the output; empty where the network is no plain multi-layer perceptron.
+        activations: of each hidden layer, `relu` or `tanh`.
+        output_kind, output_gain, output_offset, output_low, output_high: what follows the last layer, as in `runtime.network.Output`.
+        no_header: why there is neither C header nor reference runner; None where there are.
+        test_windows_from: where the beta windows of the test vectors were logged; None where they are made up.
+        test_windows: how many of them there are, before those at the edges.
+        logged_lower_bound: B, lowest amplitude fraction that the study's random controller draws; None where not known.
+        asked_mean, asked_below_bound, asked_below_minimum: over the logged test windows, the mean fraction that the network asks for, and
+            the shares of windows for which it asks for less than B, and for less than the clinician's minimum.
+        energy_of_cdbs, charge_of_cdbs: mean square and mean of the amplitude over cDBS, over the logged test windows and within limits.
         int8_bound, int8_planes, int8_bytes: of the fixed-point header; None where there is none.
+        taken_by: who took the bundle and when, so that no two that left are the same bytes; None for one made without a service.
         public_key: Ed25519 key that the bundle is signed with, 64 hexadecimal digits; it names the signer and proves nothing by itself.
         approvals: sign-offs, in order.
         files: SHA-256 by file name of everything else in the bundle; filled in when the bundle is built.
@@ -89,7 +102,7 @@ class BundleManifest:
     normalisation_mean: float | None = None
     normalisation_std: float | None = None
     max_beta_age_s: float | None = None
-    limits_stated_by: str = "nobody: defaults"
+    limits_stated_by: str = DEFAULTS
     device_min_ma: float | None = None
     device_max_ma: float | None = None
     snapshot_sha256: str | None = None
@@ -98,9 +111,25 @@ class BundleManifest:
     agreement_p99: float | None = None
     agreement_worst: float | None = None
     layers: tuple[int, ...] = ()
+    activations: tuple[str, ...] = ()
+    output_kind: str = OWN_OUTPUT.kind
+    output_gain: float = OWN_OUTPUT.gain
+    output_offset: float = OWN_OUTPUT.offset
+    output_low: float | None = OWN_OUTPUT.low
+    output_high: float | None = OWN_OUTPUT.high
+    no_header: str | None = None
+    test_windows_from: str | None = None
+    test_windows: int = 0
+    logged_lower_bound: float | None = None
+    asked_mean: float | None = None
+    asked_below_bound: float | None = None
+    asked_below_minimum: float | None = None
+    energy_of_cdbs: float | None = None
+    charge_of_cdbs: float | None = None
     int8_bound: float | None = None
     int8_planes: int | None = None
     int8_bytes: int | None = None
+    taken_by: str | None = None
     public_key: str | None = None
     approvals: tuple[Approval, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
@@ -124,6 +153,8 @@ class BundleManifest:
             raise BundleError(f"the beta band {self.beta_low_hz} to {self.beta_high_hz} Hz or its valid share cannot be used")
         if self.layers and (min(self.layers) < 1 or self.layers[0] != self.window or self.layers[-1] != 1):
             raise BundleError(f"layers {list(self.layers)} do not lead from the window to one output")
+        if len(self.activations) != max(0, len(self.layers) - 2):
+            raise BundleError(f"layers {list(self.layers)} need {max(0, len(self.layers) - 2)} activations, not {list(self.activations)}")
         self.limits()
         self._check_device_limits()
 
@@ -152,6 +183,10 @@ class BundleManifest:
         except ValueError as error:
             raise BundleError(f"the limits in the manifest cannot be used: {error}") from error
 
+    def output(self) -> Output:
+        """What follows the last layer."""
+        return Output(self.output_kind, self.output_gain, self.output_offset, self.output_low, self.output_high)
+
     def to_bytes(self) -> bytes:
         """The manifest as JSON; the same manifest always gives the same bytes."""
         return (json.dumps(asdict(self), sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
@@ -174,7 +209,11 @@ class BundleManifest:
         layers = values.pop("layers", [])
         if not isinstance(layers, list) or not all(isinstance(units, int) and not isinstance(units, bool) for units in layers):
             raise BundleError("layers in manifest.json must be a list of whole numbers")
-        return BundleManifest(**values, layers=tuple(layers), approvals=tuple(Approval(**item) for item in approvals))
+        activations = values.pop("activations", [])
+        if not isinstance(activations, list) or not all(isinstance(name, str) for name in activations):
+            raise BundleError("activations in manifest.json must be a list of names")
+        signed = tuple(Approval(**item) for item in approvals)
+        return BundleManifest(**values, layers=tuple(layers), activations=tuple(activations), approvals=signed)
 
 
 _TEXT, _WHOLE, _NUMBER = (str,), (int,), (int, float)

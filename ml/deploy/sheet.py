@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import re
+from datetime import datetime
 from html import escape
 
-from ml.deploy.manifest import BundleManifest
+from ml.deploy.appraisal import battery_words, warnings
+from ml.deploy.manifest import DEFAULTS, BundleManifest
 
 _STYLE = """
-@page { size: A4; margin: 11mm 14mm; }
+@page { size: A4; margin: 10mm 14mm; }
 * { box-sizing: border-box; }
-body { font: 9.4pt/1.36 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; color: #14202b; max-width: 182mm;
+body { font: 9pt/1.33 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; color: #14202b; max-width: 182mm;
        margin: 0 auto; padding: 8px 0; background: #fff; }
 header { display: flex; justify-content: space-between; align-items: flex-end; border-bottom: 2.5px solid #14202b; padding-bottom: 6px; }
 h1 { font-size: 21pt; line-height: 1.1; margin: 0; letter-spacing: -.01em; overflow-wrap: anywhere; }
-h2 { font-size: 8.4pt; letter-spacing: .07em; text-transform: uppercase; color: #51606d; margin: 10px 0 3px; }
-.kind { color: #51606d; text-align: right; }
+h2 { font-size: 8.4pt; letter-spacing: .07em; text-transform: uppercase; color: #51606d; margin: 9px 0 2px; }
+.kind { color: #51606d; text-align: right; white-space: nowrap; padding-left: 24px; }
 .ban { border: 2px solid #a3261c; color: #8a1c13; padding: 6px 10px; margin-top: 10px; font-weight: 650; }
+.warn { border: 1.5px solid #b7791f; background: #fdf6e7; color: #6b4407; padding: 5px 10px; margin-top: 6px; }
 .signed { border: 1px solid #2f6b46; color: #22523a; padding: 5px 10px; margin-top: 10px; }
 .big { display: grid; grid-template-columns: repeat(4, 1fr); border: 1px solid #c3ccd3; margin-top: 4px; }
 .big div { padding: 6px 10px 7px; border-left: 1px solid #c3ccd3; }
@@ -27,11 +31,13 @@ p { margin: 4px 0; }
 table { border-collapse: collapse; width: 100%; }
 th { text-align: left; font-weight: 400; color: #51606d; padding: 2px 10px 2px 0; vertical-align: top; width: 29%; }
 td { padding: 2px 0; vertical-align: top; font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
+.wide th { width: 18%; white-space: nowrap; }
+@media print { body { padding: 0; } }
 tr + tr > * { border-top: 1px solid #e4e9ed; }
 code { font: 8pt/1.35 ui-monospace, "DejaVu Sans Mono", Consolas, monospace; overflow-wrap: anywhere; }
 ol { margin: 2px 0 0; padding-left: 18px; }
 svg { display: block; width: 100%; height: auto; margin-top: 6px; }
-.lines { display: grid; grid-template-columns: 1fr 1fr; gap: 26px; margin-top: 34px; }
+.lines { display: grid; grid-template-columns: 1fr 1fr; gap: 26px; margin-top: 30px; }
 .lines div { border-top: 1px solid #14202b; padding-top: 3px; color: #51606d; font-size: 8.6pt; }
 footer { margin-top: 10px; color: #51606d; font-size: 8.2pt; }
 """
@@ -52,32 +58,34 @@ def render(manifest: BundleManifest, model_sha256: str) -> str:
 <header><div><h1>{code}</h1>{escape(manifest.policy_name)} <span class="muted">· policy {manifest.policy_id}{side}</span></div>
 <div class="kind">Closed-loop DBS controller<br>one-page sheet of the bundle</div></header>
 {_approval(manifest)}
+{_warned(manifest)}
 <h2>Stimulation limits</h2>
 <div class="big"><div><small>Lowest</small><b>{manifest.min_ma:g} mA</b></div><div><small>Highest</small><b>{manifest.max_ma:g} mA</b></div>
 <div><small>cDBS = fraction 1</small><b>{manifest.cdbs_ma:g} mA</b></div>
 <div><small>Ramp</small><b>{manifest.ramp_ma_per_s:g} mA/s</b></div></div>
 {_scale(manifest)}
-<p class="muted">Stated by {escape(manifest.limits_stated_by)}. {_device(manifest)}</p>
+<p class="muted">{_stated(manifest)} {_device(manifest)}</p>
 <div class="columns"><div>
 <h2>Signal</h2><table>{_rows(_signal(manifest))}</table>
 </div><div>
 <h2>Network</h2><table>{_rows(_network(manifest))}</table>
 </div></div>
+<h2>Amplitude, energy, battery</h2><table class="wide">{_rows(_expected(manifest))}</table>
 <h2>When the controller gives way</h2>
 <p style="margin:2px 0">Every {manifest.period_s:g} s it decides anew. In the same decision, and without a ramp, it returns to the cDBS
-amplitude of <b>{manifest.cdbs_ma:g} mA</b> when beta is missing for more than {manifest.limits().stale_after_s:g} s, is not a number,
-negative, or of another unit or source, when the window has a gap, or when the network fails. It takes over again after {manifest.window}
-valid beta amplitudes in a row ({manifest.window * manifest.period_s:g} s), moving at most
-{manifest.ramp_ma_per_s * manifest.period_s:g} mA per period.</p>
+amplitude of <b>{manifest.cdbs_ma:g}&nbsp;mA</b> when beta has not come when it was due (older than {manifest.limits().stale_after_s:g} s),
+is not a number, negative, or of another unit or source, when the window has a gap, or when the network fails. It takes over again after
+{manifest.window} valid beta amplitudes in a row ({manifest.window * manifest.period_s:g} s), moving at most
+{manifest.ramp_ma_per_s * manifest.period_s:.3g} mA per period.</p>
 <h2>Before use</h2>
-<ol><li>Check the bundle on the tablet: <code>betaloop control --bundle FILE --key KEY</code> verifies signature, every SHA-256 and the test
-vectors.</li>
+<ol><li>Check the bundle on the tablet: <code>betaloop control --bundle FILE --key KEY --participant {code}</code> verifies signature, every
+SHA-256, the test vectors and the participant.</li>
 <li>Compare participant, hemisphere, contacts and cDBS amplitude with the stimulator. For this participant only.</li>
 <li>Keep the clinical settings at hand: the sheet replaces neither the stop rules of the protocol nor the device's own limits.</li></ol>
-<h2>Where it comes from</h2><table>{_rows(_origin(manifest, model_sha256))}</table>
-<div class="lines"><div>Clinician: limits checked against the stimulator. Name, signature, date</div>
-<div>Engineer: bundle verified on the tablet. Name, signature, date</div></div>
-<footer>Made by betaloop {escape(manifest.code_version)}. For research; betaloop is no medical device.</footer>
+<h2>Where it comes from</h2><table class="wide">{_rows(_origin(manifest, model_sha256))}</table>
+<div class="lines"><div>Clinician, date: limits checked against the stimulator</div>
+<div>Engineer, date: bundle verified on the tablet</div></div>
+<footer>{_made(manifest)} For research; betaloop is no medical device.</footer>
 </body></html>
 """
 
@@ -86,9 +94,33 @@ def _approval(m: BundleManifest) -> str:
     if not m.approvals:
         return '<div class="ban">Not approved: not to be used on a participant.</div>'
     lines = "<br>".join(
-        f"Approved by {escape(a.name)} ({escape(a.role)}), {escape(a.approved_at)}: {escape(a.statement)}" for a in m.approvals
+        f"Approved by {escape(a.name)} ({escape(a.role)}), {escape(_when(a.approved_at))}: {escape(a.statement)}" for a in m.approvals
     )
     return f'<div class="signed">{lines}</div>'
+
+
+def _made(m: BundleManifest) -> str:
+    taken = f"Taken by {escape(re.sub(r'[.][0-9]{6} ', ' ', m.taken_by))}. " if m.taken_by else ""
+    return f"{taken}Trained by betaloop {escape(m.policy_code_version)}, bundled by betaloop {escape(m.code_version)}."
+
+
+def _when(text: str) -> str:
+    """An ISO 8601 time as people read it; any other text as it is."""
+    try:
+        return f"{datetime.fromisoformat(text):%Y-%m-%d %H:%M %Z}".strip()
+    except ValueError:
+        return text
+
+
+def _warned(m: BundleManifest) -> str:
+    texts = warnings(m)
+    return f'<div class="warn">{"<br>".join(escape(text) for text in texts)}</div>' if texts else ""
+
+
+def _stated(m: BundleManifest) -> str:
+    if m.limits_stated_by == DEFAULTS:
+        return "Nobody stated these limits: they are defaults, to be confirmed by the clinician."
+    return f"Stated by {escape(m.limits_stated_by)}."
 
 
 def _device(m: BundleManifest) -> str:
@@ -124,7 +156,7 @@ def _signal(m: BundleManifest) -> list[tuple[str, str]]:
     if m.normalisation_mean is not None:
         scale = f"(beta - {m.normalisation_mean:.5g}) / {m.normalisation_std:.5g}, inside"
     return [
-        ("Beta amplitude", f"{m.beta_unit}, from {m.beta_source}"),
+        ("Beta", f"{m.beta_unit}, from {m.beta_source}"),
         ("Band", f"{m.beta_low_hz:g} to {m.beta_high_hz:g} Hz"),
         ("Window", f"{m.window} values, one per {m.period_s:g} s"),
         ("Valid share", f"{100 * m.min_valid_fraction:g} % of a period's samples"),
@@ -134,9 +166,9 @@ def _signal(m: BundleManifest) -> list[tuple[str, str]]:
 
 def _network(m: BundleManifest) -> list[tuple[str, str]]:
     if not m.layers:
-        return [("Form", "ONNX only: made elsewhere, or a baseline; no C header")]
+        return [("Form", f"ONNX only, without C header: {m.no_header or 'no layers are known'}")]
     rows = [
-        ("Units", " → ".join(str(units) for units in m.layers)),
+        ("Units", " → ".join(str(units) for units in m.layers) + ("" if "tanh" not in m.activations else f" ({', '.join(m.activations)})")),
         ("Size", f"{m.parameters} weights, {4 * m.parameters} bytes as float32"),
         ("Work", f"{m.macs} multiply-adds per decision"),
     ]
@@ -145,16 +177,29 @@ def _network(m: BundleManifest) -> list[tuple[str, str]]:
         bound = f"fraction within {m.int8_bound:.2g} ({m.int8_bound * m.cdbs_ma:.2g} mA)"
         rows.append(("Whole numbers", f"{m.int8_bytes} bytes, {planes}; {bound}"))
     if m.agreement_mean is not None:
-        spread = f"99 % within {m.agreement_p99:.3g}, worst {m.agreement_worst:.3g} of the fraction"
-        rows.append(("Agreement", f"with teacher {m.teacher_name or 'unknown'}: mean difference {m.agreement_mean:.3g}, {spread}"))
+        spread = f"mean {m.agreement_mean:.3g}, 99 % within {m.agreement_p99:.3g}, worst {m.agreement_worst:.3g} of the fraction"
+        rows.append(("Difference", f"from teacher {m.teacher_name or 'unknown'}: {spread}"))
     return rows
+
+
+def _expected(m: BundleManifest) -> list[tuple[str, str]]:
+    """What the policy asks for on logged beta, and what follows for energy and battery."""
+    if m.asked_mean is None or m.energy_of_cdbs is None or m.charge_of_cdbs is None:
+        return [("Not known", "no beta of this participant was logged with this window: neither amplitude nor energy can be estimated")]
+    asked = f"{m.asked_mean * m.cdbs_ma:.2f} mA on average over {m.test_windows} logged windows ({m.test_windows_from})"
+    below = f"below {m.min_ma:g} mA (lowest) in {100 * (m.asked_below_minimum or 0):.0f} %"
+    if m.logged_lower_bound is not None and m.asked_below_bound is not None:
+        below += f", below {m.logged_lower_bound * m.cdbs_ma:.3g} mA (B, lowest tried at random) in {100 * m.asked_below_bound:.0f} %"
+    return [
+        ("Asked for", f"{asked}; {below}"),
+        ("Energy", f"{battery_words(m.energy_of_cdbs, m.charge_of_cdbs)}. On logged beta: in closed loop beta answers to the amplitude."),
+    ]
 
 
 def _origin(m: BundleManifest, model_sha256: str) -> list[tuple[str, str]]:
     return [
         ("Network SHA-256", model_sha256),
         ("Snapshot SHA-256", m.snapshot_sha256 or "none: trained outside this study"),
-        ("Trained by", f"betaloop {m.policy_code_version}"),
         ("Signing key", m.public_key or "not signed"),
     ]
 

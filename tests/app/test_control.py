@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import io
 import itertools
@@ -13,39 +12,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from typer.testing import CliRunner
 
 from app.cli import app as command_line
-from app.control import Run, control, drive, verified
+from app.control import Run, Task, control, drive, verified
 from app.control_sources import Row, Source, Wish, open_source
 from app.ingest.formats import decode
 from app.platform.errors import Invalid, NotFound
 from app.settings import get_settings
 from ml.deploy.bundle import build_bundle, sign
-from ml.deploy.manifest import BundleManifest
 from ml.deploy.runtime.envelope import BetaSample, Signal
 from ml.rl.networks import MlpPolicy
-
-KEY = Ed25519PrivateKey.from_private_bytes(b"k" * 32)
-PUBLIC = KEY.public_key().public_bytes_raw().hex()
-MANIFEST = BundleManifest(
-    participant="P1", policy_id=3, policy_name="rl-01", window=10, beta_unit="uV", beta_source="time_domain", min_ma=0.5, max_ma=3.0,
-    cdbs_ma=3.0, ramp_ma_per_s=0.5, code_version="test", public_key=PUBLIC,
-)  # fmt: skip
-
-
-def made(folder: Path, **changes: object) -> Path:
-    policy = MlpPolicy(int(str(changes.get("window", 10))), (20, 10), mean=1.4, std=1.0, seed=3)
-    with torch.no_grad():
-        policy.layers[-1].weight.mul_(200)
-    manifest = dataclasses.replace(MANIFEST, **changes)  # type: ignore[arg-type]
-    path = folder / "bundle.zip"
-    path.write_bytes(
-        sign(build_bundle(policy.to_onnx(), manifest, np.abs(np.random.default_rng(0).normal(1.4, 1, (8, manifest.window)))), KEY)
-    )
-    return path
+from tests.app.control_bundles import MANIFEST, PUBLIC, made, rows_of
 
 
 @pytest.fixture
@@ -53,15 +32,10 @@ def bundle(tmp_path: Path) -> Path:
     return made(tmp_path)
 
 
-def rows_of(log: Path) -> list[dict[str, str]]:
-    with log.open(encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
-
-
 def test_a_synthetic_participant_is_driven_in_closed_loop_and_the_same_seed_gives_the_same(bundle: Path, tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
-    summary = control(bundle, "cohort:P1:3", Wish(steps=60), log=log, key=PUBLIC)
-    again = control(bundle, "cohort:P1:3", Wish(steps=60), log=None, key=PUBLIC)
+    summary = control(bundle, "cohort:P1:3", Wish(steps=60), Task(log=log, key=PUBLIC))
+    again = control(bundle, "cohort:P1:3", Wish(steps=60), Task(log=None, key=PUBLIC))
     assert (summary["decisions"], summary["fallbacks"], summary["deadline_misses"]) == (70, 9, 0)
     assert summary["mean_amplitude_ma"] == again["mean_amplitude_ma"]
     rows = rows_of(log)
@@ -115,7 +89,7 @@ def test_raw_lfp_goes_through_p_beta_to_the_amplitude(bundle: Path, tmp_path: Pa
     table.write_text(
         "t_s,lfp [uV]\n" + "".join(f"{a:.4f},{'' if math.isnan(b) else round(float(b), 4)}\n" for a, b in zip(t, x, strict=True))
     )
-    summary = control(bundle, str(table), Wish(), log=tmp_path / "log.csv", key=PUBLIC)
+    summary = control(bundle, str(table), Wish(), Task(log=tmp_path / "log.csv", key=PUBLIC))
     assert summary["decisions"] == 40
     assert summary["policy"] == 11 + 9, "10 periods to begin with, 10 after the gap of two"
     assert summary["reasons"]["invalid_beta"] == 2
@@ -125,7 +99,7 @@ def test_raw_lfp_goes_through_p_beta_to_the_amplitude(bundle: Path, tmp_path: Pa
     millivolts = tmp_path / "mv.csv"
     body = "".join(f"{a:.4f},{b / 1000:.8f}\n" for a, b in zip(t, x, strict=True) if not math.isnan(b))
     millivolts.write_text("t_s,lfp [mV]\n" + body)
-    again = control(bundle, str(millivolts), Wish(), log=None, key=PUBLIC)
+    again = control(bundle, str(millivolts), Wish(), Task(log=None, key=PUBLIC))
     assert again["mean_amplitude_ma"] == pytest.approx(summary["mean_amplitude_ma"], abs=0.01)
 
 
@@ -135,13 +109,13 @@ TABLE = "t_s,beta [uV],amplitude_fraction\n" + "".join(f"{2 * (k + 1)},{1 + 0.5 
 def test_a_table_of_another_source_is_not_trusted_unless_it_is_said_what_it_holds(bundle: Path, tmp_path: Path) -> None:
     table = tmp_path / "steps.csv"
     table.write_text(TABLE)
-    refused = control(bundle, str(table), Wish(), log=None, key=PUBLIC)
+    refused = control(bundle, str(table), Wish(), Task(log=None, key=PUBLIC))
     assert refused["fallbacks"] == refused["decisions"] == refused["reasons"]["wrong_signal"] == 30
     assert refused["energy_saved_percent"] == pytest.approx(0.0)
-    taken = control(bundle, str(table), Wish(beta_source="time_domain"), log=None, key=PUBLIC)
+    taken = control(bundle, str(table), Wish(beta_source="time_domain"), Task(log=None, key=PUBLIC))
     assert (taken["fallbacks"], taken["policy"]) == (9, 21)
     table.write_text(TABLE.replace("[uV]", "[mV]"))
-    assert control(bundle, str(table), Wish(beta_source="time_domain"), log=None, key=PUBLIC)["policy"] == 0
+    assert control(bundle, str(table), Wish(beta_source="time_domain"), Task(log=None, key=PUBLIC))["policy"] == 0
 
 
 def test_lines_on_standard_input_are_decided_on_and_what_is_no_number_is_said(bundle: Path) -> None:
@@ -149,7 +123,7 @@ def test_lines_on_standard_input_are_decided_on_and_what_is_no_number_is_said(bu
     source = open_source("-", MANIFEST, Wish(), lines)
     run = Run(2.0, 3.0)
     drive(verified(bundle, PUBLIC), source, run, False, None)
-    assert [d.fallback for d in run.decisions] == [True] * 9 + [False] * 4 + [True] * 10 + [False]
+    assert [d.fallback for d in run.decisions] == [True] * 9 + [False] * 3 + [True] * 11 + [False]
 
 
 def test_in_real_time_silence_on_standard_input_is_noticed_within_a_period(tmp_path: Path) -> None:
@@ -243,13 +217,13 @@ def test_unknown_sources_and_files_are_said_by_name(bundle: Path, tmp_path: Path
     (tmp_path / "empty.csv").write_text("")
     for source, message in [("cohort:P9", "synthetic participant"), ("cohort:", "synthetic"), ("nowhere.zip", "no file nowhere.zip")]:
         with pytest.raises(NotFound, match=message):
-            control(bundle, source, Wish(), log=None, key=PUBLIC)
+            control(bundle, source, Wish(), Task(log=None, key=PUBLIC))
     with pytest.raises(Invalid, match="empty"):
-        control(bundle, str(tmp_path / "empty.csv"), Wish(), log=None, key=PUBLIC)
+        control(bundle, str(tmp_path / "empty.csv"), Wish(), Task(log=None, key=PUBLIC))
     with pytest.raises(Invalid, match="cannot be read"):
-        control(tmp_path / "none.zip", None, Wish(), log=None, key=PUBLIC)
+        control(tmp_path / "none.zip", None, Wish(), Task(log=None, key=PUBLIC))
     with pytest.raises(Invalid, match="log"):
-        control(bundle, "cohort:P1", Wish(steps=5), log=tmp_path / "no" / "log.csv", key=PUBLIC)
+        control(bundle, "cohort:P1", Wish(steps=5), Task(log=tmp_path / "no" / "log.csv", key=PUBLIC))
 
 
 def test_a_recording_of_the_other_hemisphere_is_not_used(tmp_path: Path) -> None:
@@ -260,10 +234,10 @@ def test_a_recording_of_the_other_hemisphere_is_not_used(tmp_path: Path) -> None
     (recording,) = decode(tmp_path / "session.zip").recordings
     assert recording.hemisphere is not None
     other = "left" if recording.hemisphere == "right" else "right"
-    summary = control(made(tmp_path, hemisphere=recording.hemisphere), str(tmp_path / "session.zip"), Wish(), log=None, key=PUBLIC)
+    summary = control(made(tmp_path, hemisphere=recording.hemisphere), str(tmp_path / "session.zip"), Wish(), Task(log=None, key=PUBLIC))
     assert summary["decisions"] >= 15
     with pytest.raises(Invalid, match=f"of the {other} hemisphere"):
-        control(made(tmp_path, hemisphere=other), str(tmp_path / "session.zip"), Wish(), log=None, key=PUBLIC)
+        control(made(tmp_path, hemisphere=other), str(tmp_path / "session.zip"), Wish(), Task(log=None, key=PUBLIC))
 
 
 def test_the_command_says_in_words_and_as_json_and_its_exit_code(bundle: Path) -> None:
@@ -309,10 +283,10 @@ def test_a_real_recording_with_packet_loss_is_driven_from_its_raw_lfp(tmp_path: 
 def test_a_real_stimulation_sweep_is_driven_from_the_devices_own_band_power(tmp_path: Path, recordings: Path) -> None:
     sweep = str(recordings / "rcs" / "stim_sweep.zip")
     with pytest.raises(NotFound, match="no channel"):
-        control(made(tmp_path), sweep, Wish(channel="key 9"), log=None, key=PUBLIC)
-    wrong = control(made(tmp_path), sweep, Wish(), log=None, key=PUBLIC)
+        control(made(tmp_path), sweep, Wish(channel="key 9"), Task(log=None, key=PUBLIC))
+    wrong = control(made(tmp_path), sweep, Wish(), Task(log=None, key=PUBLIC))
     assert wrong["fallbacks"] == wrong["decisions"] == 222
-    right = control(made(tmp_path, beta_unit="device units", beta_source="device_power"), sweep, Wish(), log=None, key=PUBLIC)
+    right = control(made(tmp_path, beta_unit="device units", beta_source="device_power"), sweep, Wish(), Task(log=None, key=PUBLIC))
     (recording,) = decode(recordings / "rcs" / "stim_sweep.zip").recordings
     band = max((t for t in recording.traces if t.source == "device_power"), key=lambda t: int(t.valid.sum()))
     assert right["policy"] == valid_runs(np.where(band.valid, band.values, np.nan).tolist()) > 50

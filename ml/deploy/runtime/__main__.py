@@ -16,7 +16,7 @@ import numpy as np
 
 from .envelope import BetaSample, EnvelopeLimits, Signal, reason_names
 from .loop import Controller
-from .network import MlpNetwork
+from .network import MlpNetwork, Output
 
 _LIMITS = ("min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s", "window", "period_s", "max_beta_age_s")
 
@@ -30,7 +30,12 @@ def main(arguments: list[str]) -> int:
             if hashlib.sha256((folder / name).read_bytes()).hexdigest() != digest:
                 raise ValueError(f"{name} is not the file that the manifest names")
         network = MlpNetwork.from_bytes(
-            (folder / "weights.f32").read_bytes(), manifest["layers"], manifest["normalisation_mean"], manifest["normalisation_std"]
+            (folder / "weights.f32").read_bytes(),
+            manifest["layers"],
+            manifest["normalisation_mean"],
+            manifest["normalisation_std"],
+            manifest["activations"],
+            Output(*(manifest[f"output_{name}"] for name in Output._fields)),
         )
         worst, worst_ma = check(manifest, network, json.loads((folder / "test_vectors.json").read_bytes()))
     except (OSError, ValueError, KeyError) as error:
@@ -66,7 +71,7 @@ def run(manifest: dict[str, Any], network: MlpNetwork) -> None:
     controller, signal = _controller(manifest, network), Signal(manifest["beta_unit"], manifest["beta_source"])
     for k, line in enumerate(sys.stdin):
         try:
-            beta = float(line)
+            beta = math.nan if "_" in line else float(line)  # float() alone takes "1_5" for 15
         except ValueError:
             beta = math.nan
         now_s = k * manifest["period_s"]

@@ -5,7 +5,7 @@ It knows nothing of how the fraction was made. Every period it decides on one am
 * amplitudes lie within the clinician's limits, always;
 * from one decision to the next the amplitude moves by no more than the ramp limit times the time between them, and never by more than the
   ramp limit times one period, however late a decision comes;
-* beta that is missing, not a number, negative, of another unit or source, older than one period or not yet a whole window without a gap,
+* beta that has not come when it was due, is not a number, negative, of another unit or source, or not yet a whole window without a gap,
   and a network that fails or answers outside [0, 1], give the cDBS amplitude in the very decision in which that is found. This return to
   the programmed therapy is *not* ramped: a ramp would leave the participant under-treated for some periods on a signal that nobody trusts.
   It is the one exception to the ramp limit;
@@ -21,6 +21,9 @@ from typing import Any, NamedTuple
 
 SPACING_TOLERANCE = 0.5
 """Two beta amplitudes may lie this share of a period closer or farther than one period; beyond, the window has a gap."""
+STALE_AFTER = 0.9
+"""A beta amplitude older than this share of a period is stale: the next one is due, and a decision in time finds that it has not come. A
+tenth of a period is left for the jitter of the decisions."""
 RANGE_TOLERANCE = 1e-4
 """A fraction this far outside [0, 1] is rounding and is cut; farther outside it is a fault."""
 LARGEST_BETA = 3.4028234663852886e38
@@ -66,7 +69,7 @@ class EnvelopeLimits:
         ramp_ma_per_s: fastest change of the amplitude, mA per second.
         window: W, beta amplitudes per decision.
         period_s: m, seconds per decision.
-        max_beta_age_s: age at which a beta amplitude is stale, at most one period; None means one period.
+        max_beta_age_s: age above which a beta amplitude is stale, less than one period; None means `STALE_AFTER` of a period.
 
     Raises:
         ValueError: a value outside its range; the message names it.
@@ -94,15 +97,15 @@ class EnvelopeLimits:
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise ValueError(f"{name} must be positive, not {value}")
-        if self.max_beta_age_s is not None and self.max_beta_age_s > self.period_s:
-            raise ValueError(f"beta is stale after one period ({self.period_s} s) at the latest, not after {self.max_beta_age_s} s")
+        if self.max_beta_age_s is not None and self.max_beta_age_s >= self.period_s:
+            raise ValueError(f"beta is stale before one period ({self.period_s} s) has passed, not after {self.max_beta_age_s} s")
         if self.window < 1:
             raise ValueError(f"window must be at least 1 step, not {self.window}")
 
     @property
     def stale_after_s(self) -> float:
         """Age beyond which a beta amplitude is stale, seconds."""
-        return self.period_s if self.max_beta_age_s is None else self.max_beta_age_s
+        return STALE_AFTER * self.period_s if self.max_beta_age_s is None else self.max_beta_age_s
 
 
 class Signal(NamedTuple):

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from fastapi.testclient import TestClient
@@ -118,12 +119,89 @@ def test_an_approved_plan_is_the_approval_of_its_policies(client: TestClient, po
 
 
 def test_the_page_offers_the_stimulators_limits(client: TestClient, policy: int, db: Session) -> None:
-    page = client.get(f"/participants/P1/policies/{policy}")
+    assert f'href="/participants/P1/policies/{policy}/bundle"' in client.get(f"/participants/P1/policies/{policy}").text
+    page = client.get(f"/participants/P1/policies/{policy}/bundle")
     assert "No recording holds the stimulator&#39;s own limits" in page.text
     record_limits(db, {"group A": {"program 0": {"lower_ma": 0.4, "upper_ma": 3.4}}})
-    page = client.get(f"/participants/P1/policies/{policy}")
+    page = client.get(f"/participants/P1/policies/{policy}/bundle")
     assert "The stimulator itself allows 0.4 to 3.4 mA." in page.text
     assert 'name="min_ma" type="number" value="0.4"' in page.text
+
+
+def test_the_page_gives_the_bundle_and_keeps_what_was_typed_where_it_cannot(client: TestClient, policy: int) -> None:
+    page = f"/participants/P1/policies/{policy}/bundle"
+    assert "Nobody has taken a bundle" in client.get(page).text
+    typed = {"min_ma": "0.5", "max_ma": "3", "ramp_ma_per_s": "0.25"}
+    given = client.post(page, data=typed)
+    assert given.headers["content-type"] == "application/zip"
+    manifest = verify_bundle(given.content)
+    assert (manifest.min_ma, manifest.max_ma, manifest.ramp_ma_per_s) == (0.5, 3.0, 0.25)
+    assert manifest.limits_stated_by.startswith("admin@clinic.example")
+    assert "0.5 to 3 mA, cDBS 3 mA, ramp 0.25 mA/s" in client.get(page).text
+    for change, message in [
+        ({"min_ma": "2.5", "max_ma": "1"}, "the amplitude limits must rise"),
+        ({"ramp_ma_per_s": "0"}, "Fastest change"),
+        ({"ramp_ma_per_s": "nan"}, "Fastest change"),
+        ({"max_ma": "1e3"}, "Highest amplitude"),
+        ({"max_ma": "2.9"}, "cDBS amplitude 3.0 mA must lie within the limits"),
+        ({"hemisphere": "middle"}, "Hemisphere"),
+    ]:
+        refused = client.post(page, data=typed | change)
+        assert refused.status_code == 422, change
+        assert message in refused.text
+        (name,) = change.keys() - {"max_ma"} or change.keys()
+        assert f'value="{change[name]}"' in refused.text or name == "hemisphere", "what was typed is kept"
+
+
+def test_each_side_has_its_own_bundle_and_another_is_refused(client: TestClient, policy: int) -> None:
+    stated = {"number": 9, "cdbs_amplitudes": [{"hemisphere": "left", "amplitude_ma": 2.5}, {"hemisphere": "right", "amplitude_ma": 3.5}]}
+    assert client.post("/api/v1/participants/P1/visits", json=stated).status_code == 201
+    page = f"/participants/P1/policies/{policy}/bundle"
+    assert "<option selected>left</option><option>right</option>" in client.get(page).text
+    typed = {"min_ma": "0.5", "max_ma": "3.5", "ramp_ma_per_s": "0.5", "hemisphere": "right"}
+    manifest = verify_bundle(client.post(page, data=typed).content)
+    assert (manifest.hemisphere, manifest.cdbs_ma) == ("right", 3.5)
+    assert client.post(page, data=typed | {"hemisphere": "middle"}).status_code == 422
+    assert client.post(page, data=typed | {"hemisphere": ""}).status_code == 422
+    assert client.get(f"/api/v1/policies/{policy}/bundle").status_code == 422, "which side must be said"
+
+
+def test_the_same_bundle_taken_twice_stands_twice_in_the_audit_trail(client: TestClient, policy: int, db: Session) -> None:
+    first, second = take(client, policy).content, take(client, policy).content
+    assert verify_bundle(first).files["model.onnx"] == verify_bundle(second).files["model.onnx"]
+    assert verify_bundle(first).taken_by != verify_bundle(second).taken_by
+    assert db.query(AuditEvent).filter(AuditEvent.entity == "stored_file", AuditEvent.reason.like("controller bundle%")).count() == 2
+
+
+def test_who_may_only_read_states_no_limits(client_as: Any, policy: int) -> None:
+    viewer = client_as("viewer")
+    assert take(viewer, policy).status_code == 200
+    assert take(viewer, policy, max_ma=3.2).status_code == 403
+    page = viewer.get(f"/participants/P1/policies/{policy}/bundle")
+    assert page.status_code == 200
+    assert 'name="max_ma"' not in page.text
+    typed = {"min_ma": "0.5", "max_ma": "3", "ramp_ma_per_s": "0.25"}
+    assert viewer.post(f"/participants/P1/policies/{policy}/bundle", data=typed).status_code == 403
+
+
+def test_a_plain_network_made_elsewhere_leaves_with_its_c_header_and_the_page_says_why_another_does_not(
+    client: TestClient, enrolled: str
+) -> None:
+    from app.learning.baselines import constant_onnx
+
+    def added(name: str, content: bytes) -> int:
+        posted = client.post("/api/v1/participants/P1/policies", data={"name": name}, files={"file": ("x.onnx", content)})
+        return int(posted.json()["id"])
+
+    model = onnx.load_model_from_string(MlpPolicy(10, (6,), mean=1.0, std=0.5, seed=4).to_onnx())
+    del model.metadata_props[:]  # nothing says that betaloop wrote it
+    plain, constant = added("plain", model.SerializeToString()), added("constant", constant_onnx(0.7, 10))
+    assert verify_bundle(take(client, plain).content).layers == (10, 6, 1)
+    assert "betaloop_controller.h" in client.get(f"/participants/P1/policies/{plain}/bundle").text
+    assert "its operator Shape is none of a plain network" in str(verify_bundle(take(client, constant).content).no_header)
+    page = client.get(f"/participants/P1/policies/{constant}/bundle").text
+    assert "No C header" in page
+    assert "its operator shape is none of a plain network" in page.lower()
 
 
 def test_the_key_is_told_to_those_signed_in_alone(client: TestClient, service_app: Any) -> None:

@@ -62,7 +62,7 @@ def test_a_bundle_holds_the_network_in_every_form_its_vectors_the_sheet_and_ever
     stated = verify_bundle(bundle)
     assert stated.files == {name: hashlib.sha256(content).hexdigest() for name, content in files.items() if name != "manifest.json"}
     assert (stated.layers, stated.parameters, stated.macs) == ((10, 20, 10, 1), network.parameter_count, network.macs)
-    filled = {"files": {}, "layers": (), "int8_bound": None, "int8_planes": None, "int8_bytes": None}
+    filled = {"files": {}, "layers": (), "activations": (), "test_windows": 0, "int8_bound": None, "int8_planes": None, "int8_bytes": None}
     assert dataclasses.replace(stated, **filled) == manifest
     vectors = json.loads(files["test_vectors.json"])
     np.testing.assert_array_equal(vectors["windows"][: len(test_windows)], test_windows)
@@ -88,7 +88,7 @@ def test_the_test_vectors_reach_saturation_and_every_way_in_which_beta_goes_wron
     assert any(step["t_s"] is not None and step["beta"] is None for step in vectors["session"])
 
 
-def test_a_policy_made_elsewhere_leaves_as_onnx_alone_and_runs_within_the_same_envelope(manifest, test_windows):
+def test_a_policy_without_layers_leaves_as_onnx_alone_and_runs_within_the_same_envelope(manifest, test_windows):
     from app.learning.baselines import constant_onnx
 
     made = build_bundle(
@@ -131,14 +131,20 @@ def test_the_sheet_prints_on_one_page_even_with_long_names(network, manifest, te
     if chromium is None:
         pytest.skip("needs Chromium")
     approval = dataclasses.replace(manifest.approvals[0], statement="plan 12 of visit 7")
-    long = dataclasses.replace(manifest, policy_name="fine-tuned after visit 3, seed 2, distilled " * 2, approvals=(approval, approval))
+    long = dataclasses.replace(
+        manifest, policy_name="fine-tuned after visit 3, seed 2, distilled " * 2, approvals=(approval, approval),
+        test_windows_from="snapshot 4", logged_lower_bound=0.9, min_ma=2.9, public_key="cd" * 32,
+    )  # with both warnings  # fmt: skip
     (tmp_path / "sheet.html").write_bytes(unpack(build_bundle(network.to_onnx(), long, test_windows))["sheet.html"])
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer", f"--user-data-dir={tmp_path / 'profile'}"]
     printed = [chromium, *options, f"--print-to-pdf={tmp_path / 'sheet.pdf'}", (tmp_path / "sheet.html").as_uri()]
     subprocess.run(printed, check=True, capture_output=True, timeout=120)
     pages = PdfReader(tmp_path / "sheet.pdf").pages
     assert len(pages) == 1
-    assert "P-07" in pages[0].extract_text()
+    text = pages[0].extract_text()
+    assert "P-07" in text
+    assert text.count("logged windows") == 3
+    assert "no medical device" in text
 
 
 def test_no_name_can_leave_its_place_in_the_sheet(network, manifest, test_windows):
@@ -237,14 +243,35 @@ def test_a_signed_bundle_is_accepted_with_its_key_and_no_other(bundle):
     assert verify_bundle(sign(signed, other), other.public_key()).policy_id == 41
 
 
-def test_a_signature_covers_the_limits(bundle):
+@pytest.mark.parametrize(
+    "change",
+    [{"max_ma": 3.3}, {"participant": "P-08"}, {"approvals": []}, {"beta_unit": "mV"}, {"ramp_ma_per_s": 2.0}, {"hemisphere": "right"}],
+)
+def test_a_signature_covers_limits_approvals_participant_and_signal(bundle, change):
     key = Ed25519PrivateKey.generate()
     files = unpack(sign(bundle, key))
-    stated = json.loads(files["manifest.json"]) | {"max_ma": 3.3}
+    stated = json.loads(files["manifest.json"]) | change
     forged = pack(files | {"manifest.json": json.dumps(stated).encode()})
-    assert verify_bundle(forged).max_ma == 3.3, "without a key nobody can tell"
     with pytest.raises(BundleError, match="manifest was changed"):
         verify_bundle(forged, key.public_key())
+
+
+def test_an_approval_that_was_added_by_hand_does_not_pass(bundle, manifest):
+    key = Ed25519PrivateKey.generate()
+    files = unpack(sign(bundle, key))
+    stated = json.loads(files["manifest.json"])
+    stated["approvals"].append({"name": "M", "role": "clinician", "approved_at": "2026-03-02T09:00:00+00:00", "statement": "all"})
+    forged = pack(files | {"manifest.json": json.dumps(stated).encode()})
+    assert len(verify_bundle(forged).approvals) == 2, "without a key nobody can tell"
+    with pytest.raises(BundleError, match="manifest was changed"):
+        verify_bundle(forged, key.public_key())
+
+
+def test_a_bundle_of_an_earlier_betaloop_is_not_taken_for_one_of_today(bundle):
+    files = unpack(bundle)
+    stated = json.loads(files["manifest.json"]) | {"schema_version": 2}
+    with pytest.raises(BundleError, match="manifest version 2"):
+        verify_bundle(pack(files | {"manifest.json": json.dumps(stated).encode()}))
 
 
 def test_a_bundle_is_signed_with_the_key_that_it_names(network, manifest, test_windows):
@@ -304,7 +331,7 @@ def test_a_manifest_goes_through_json(manifest):
         ({"hemisphere": "middle"}, "left or right"),
         ({"layers": [10, "20", 1]}, "list of whole numbers"),
         ({"layers": [9, 1]}, "from the window"),
-        ({"max_beta_age_s": 3.0}, "stale after one period"),
+        ({"max_beta_age_s": 2.0}, "stale before one period"),
         ({"beta_low_hz": 40.0}, "beta band"),
         ({"int8_planes": 1.5}, "int8_planes in manifest.json must be int"),
         ({"colour": "red"}, "unknown entries: colour"),

@@ -73,8 +73,8 @@ def test_decisions_in_quick_succession_share_one_periods_ramp():
     controller = Controller(constant(0.0), LIMITS, UV)
     for k in range(3):
         controller.decide(2.0 * k, BetaSample(2.0 * k, 1.0, UV))
-    moved = [controller.decide(4.0 + 0.1 * i, None).amplitude_ma for i in range(1, 21)]
-    assert moved[-1] == pytest.approx(2.5 - 0.25 * 2.0)
+    moved = [controller.decide(4.0 + 0.1 * i, None).amplitude_ma for i in range(1, 18)]
+    assert moved[-1] == pytest.approx(2.5 - 0.25 * 1.7)
     assert np.max(np.abs(np.diff(moved))) <= 0.25 * 0.1 + 1e-9
     assert controller.decide(5.0, None).amplitude_ma == moved[-1], "a clock that runs back moves nothing"
 
@@ -118,15 +118,28 @@ def test_beta_of_another_unit_or_source_gives_cdbs_at_once(signal):
     assert (decision.amplitude_ma, names(decision)) == (3.0, {"wrong_signal", "window_incomplete"})
 
 
-def test_beta_that_stops_coming_gives_cdbs_when_it_is_older_than_one_period():
+def test_beta_that_stops_coming_gives_cdbs_one_period_after_the_last_one():
     decisions = run(constant(0.2), [100.0] * 8 + [None, None, None])
-    assert not decisions[8].fallback, "one period old: still in time"
-    assert [d.amplitude_ma for d in decisions[9:]] == [3.0, 3.0]
-    assert names(decisions[9]) == {"stale_beta"}
+    assert [d.amplitude_ma for d in decisions[8:]] == [3.0, 3.0, 3.0]
+    assert decisions[8].t_s - 7 * 2.0 == LIMITS.period_s
+    assert all(names(d) == {"stale_beta"} for d in decisions[8:])
+    controller = Controller(constant(0.2), LIMITS, UV)
+    for k in range(8):
+        controller.decide(2.0 * k + 0.1, BetaSample(2.0 * k, 1.0, UV))
+    assert not controller.decide(15.7, None).fallback, "1.7 s old: still in time"
     strict = dataclasses.replace(LIMITS, max_beta_age_s=0.5)
     assert names(run(constant(0.2), [100.0] * 8 + [None], strict)[8]) == {"stale_beta"}
-    with pytest.raises(ValueError, match="stale after one period"):
-        dataclasses.replace(LIMITS, max_beta_age_s=2.5)
+    for age in (2.0, 2.5):
+        with pytest.raises(ValueError, match="stale before one period"):
+            dataclasses.replace(LIMITS, max_beta_age_s=age)
+
+
+def test_one_beta_that_comes_late_costs_one_decision_and_not_the_window():
+    controller = Controller(constant(1.0), LIMITS, UV)
+    for k in range(5):
+        controller.decide(2.0 * k, BetaSample(2.0 * k, 1.0, UV))
+    assert names(controller.decide(10.0, None)) == {"stale_beta"}
+    assert not controller.decide(10.3, BetaSample(10.0, 1.0, UV)).fallback
 
 
 def test_before_any_beta_the_amplitude_is_cdbs():
@@ -151,7 +164,8 @@ def test_a_sample_out_of_order_or_from_the_future_is_left_out_and_said(t_s):
     controller.decide(0.0, BetaSample(0.0, 1.0, UV))
     controller.decide(2.0, BetaSample(2.0, 1.0, UV))
     decision = controller.decide(4.0, BetaSample(t_s, 50.0, UV))
-    assert (names(decision), decision.fallback, decision.valid) == ({"late_sample"}, False, 2)
+    assert (names(decision), decision.fallback, decision.valid) == ({"late_sample", "stale_beta"}, True, 2)
+    assert names(controller.decide(4.1, BetaSample(4.0, 1.0, UV))) == set(), "and the window is still whole"
 
 
 @pytest.mark.parametrize(
@@ -201,11 +215,11 @@ def test_a_log_entry_is_json_even_for_numbers_that_json_does_not_have():
 
 
 def whole(limits, taken, now):
-    """Straight from the rule: the newest W samples are valid, one period apart, and the newest is no older than a period."""
+    """Straight from the rule: the newest W samples are valid, one period apart, and the newest is less than a period old."""
     newest = taken[-limits.window :]
     spaced = all(0.5 * limits.period_s <= b.t_s - a.t_s <= 1.5 * limits.period_s for a, b in itertools.pairwise(newest))
     valid = all(s.signal == UV and math.isfinite(s.beta) and s.beta >= 0 for s in newest)
-    return len(newest) == limits.window and spaced and valid and 0 <= now - newest[-1].t_s <= limits.period_s
+    return len(newest) == limits.window and spaced and valid and 0 <= now - newest[-1].t_s < limits.period_s
 
 
 KINDS = ("good", "nan", "negative", "missing", "unit", "again")
@@ -257,6 +271,7 @@ SAMPLES = st.none() | st.tuples(st.floats(-4, 1) | ANYTHING, st.floats(0, 1e4) |
 def test_whatever_comes_the_limits_hold_and_no_number_is_missing(limits, stream):
     network = Answers(0.0, limits.window)
     controller, now, before, last = Controller(network, limits, UV), 0.0, limits.cdbs_ma, None
+    newest = -math.inf  # time of the last beta amplitude that could have been used
     for wait, came, answer in stream:
         now = now + wait if math.isfinite(wait) else wait
         network.answer = answer
@@ -264,6 +279,10 @@ def test_whatever_comes_the_limits_hold_and_no_number_is_missing(limits, stream)
         assert math.isfinite(decision.amplitude_ma)
         assert limits.min_ma <= decision.amplitude_ma <= limits.max_ma
         assert decision.amplitude_ma == controller.envelope.amplitude_ma
+        if came is not None and came[2] == UV and 0 <= came[1] < 3e38 and newest < now + came[0] <= now + 1e-9:
+            newest = now + came[0]
+        if not now - newest < limits.period_s:
+            assert decision.fallback, "one period after the last valid beta at the latest"
         if decision.fallback:
             assert decision.amplitude_ma == limits.cdbs_ma
             assert decision.reasons
