@@ -1,53 +1,39 @@
-"""Off-policy evaluation by a linear autoregressive model of beta with bootstrapped residuals and the known reward.
+"""Off-policy evaluation by replaying every logged session under another policy, in a linear model of beta with the known reward.
 
-The paper did not compare with it. A regression, no network, and hard to beat: every other method must earn its place against it. The
-dynamics, and how they are kept from walking off, are in `linear_dynamics`; residuals are replayed in blocks of one session per trajectory,
-so that what a session has of its own stays with it; the reward is that of sampled beta, never of its mean.
+The paper did not compare with it. A regression, no network, and hard to beat: every other method must earn its place against it. What a
+session had of its own (its level, its innovations in their order, what its outcomes had beyond the regression) stays with it, so that only
+what the amplitude changes has to be modelled: a policy that would have done what was done gets back exactly what was observed. The reward
+is that of the replayed beta, never of its mean. The dynamics are in `linear_dynamics`, the outcomes in `end_outcomes`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.mdp import MdpSettings, step_reward
-from ml.ope.batches import Scale, learn_scale, session_folds
+from ml.mdp import step_reward
+from ml.ope.batches import Scale, learn_scale, outcome_table, session_folds
 from ml.ope.coverage import AmplitudeSupport
 from ml.ope.end_outcomes import EndModel, fit_end_model, summarise
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
-from ml.ope.linear_dynamics import (
-    CANDIDATES,
-    Regression,
-    block_error,
-    choose,
-    day_columns,
-    features,
-    fit_weights,
-    largest_root,
-    noise_features,
-    noise_model,
-    regression,
-    replay_errors,
-    replay_folds,
-)
-from ml.ope.observed import day_noise
+from ml.ope.linear_dynamics import Dynamics, SessionTable, answers, fit_dynamics, largest_root, noise_features
+from ml.ope.linear_held_out import replay_skill
+from ml.ope.observed import MeanOverDays, mean_over_days
 from ml.ope.steps import fresh_memory, remember
 from ml.progress import Report, silent
 from ml.rl.policy import Policy
-from ml.statistics.bootstrap import percentile_interval, resamples
+from ml.statistics.bootstrap import percentile_interval
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
 
-BLOCK = 30
-"""Steps of one session's residuals that are replayed in their order before another start in the same session is drawn."""
-
 BEYOND = 0.25
-"""Sampled beta may leave the logged range by this share of it."""
+"""Replayed beta may leave the logged range by this share of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,14 +41,13 @@ class LinearConfig:
     """Settings of the linear model.
 
     Attributes:
-        refits: bootstrap refits, each on resampled sessions. per_refit: trajectories per policy and refit.
-        rollouts: trajectories per policy of the estimate itself.
-        folds: groups of sessions that choose penalty and shrinkage. seed: of resamples and noise.
+        draws: draws of the coefficients from their posterior; every session is replayed with each.
+        most_rows: replayed sessions per policy at most; a longer record takes fewer draws, though never fewer than 20.
+        folds: groups of sessions for the held-out skill beside the estimates. seed: of draws and of innovations that are missing.
     """
 
-    refits: int = 50
-    per_refit: int = 10
-    rollouts: int = 400
+    draws: int = 60
+    most_rows: int = 1500
     folds: int = 5
     seed: int = 0
 
@@ -75,163 +60,156 @@ class LinearModel:
     method: str = "linear"
 
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedLinear:
-        """Fit the model and its bootstrap refits; takes seconds, so nothing is kept in `checkpoint_dir`.
+        """Fit dynamics and outcomes; takes seconds, so nothing is kept in `checkpoint_dir`.
 
         Raises:
             ValueError: fewer than two sessions with usable steps.
         """
         c, scale = self.config, learn_scale(buffer)
-        data = regression(buffer, scale)
-        if len(data.usable) < 2:
-            raise ValueError(f"the linear model needs at least two sessions with usable steps; the buffer has {len(data.usable)}")
-        ways = replay_folds(buffer, session_folds(buffer.sessions, c.folds, c.seed))
-        errors = []
-        for k, folds in enumerate(ways):
-            errors.append(replay_errors(buffer, scale, data, folds))
-            report(0.8 * (k + 1) / len(ways), "replaying left-out sessions")
-        best = choose(errors, ways)
-        draws = resamples(len(buffer.sessions), c.refits, c.seed)
-        dynamics = _dynamics(data, [np.arange(len(buffer.sessions))], [best])
-        refits = _dynamics(data, list(draws), [choose(errors, ways, pick) for pick in draws])
+        tables = [SessionTable.of(s, scale) for s in buffer.sessions]
+        draws = max(20, min(c.draws, c.most_rows // len(tables)))
+        main, drawn = fit_dynamics(buffer, tables, draws, c.seed)
+        report(0.4, "fitting the linear model")
+        skill = replay_skill(buffer, scale, session_folds(buffer.sessions, c.folds, c.seed))
+        report(0.8, "replaying left-out sessions")
+        severity = main.levels[0]
+        end, ends = fit_end_model(buffer, severity=severity), fit_end_model(buffer, draws=draws, seed=c.seed, severity=severity)
         report(1.0, "fitting the linear model")
-        skill = replay_skill(buffer, scale, errors, best)
-        return FittedLinear(
-            self.method, c, buffer, scale, dynamics, refits, fit_end_model(buffer), fit_end_model(buffer, draws), best, skill
-        )
+        return FittedLinear(self.method, c, buffer, scale, tuple(tables), main, drawn, end, ends, skill)
 
 
 @dataclass(frozen=True)
-class Dynamics:
-    """beta_{k+1} = features weights + scale(features) residual, standardised; D fits.
+class Replayed:
+    """Logged sessions under other policies: P policies, D sets of coefficients, n sessions.
 
     Attributes:
-        weights: [D, F]. noise_weights: of the log of the residual's scale, on (1, a, predicted beta), [D, 3].
-        residuals: standardised residuals of each session in order of time, padded by repetition, [n, L].
-        visits: numbers of the visits, whose own levels are the last V weights.
-        sources: sessions whose residuals a fit may draw, [D, n].
+        step_return, energy, amplitude, beta: discounted step return, mean a^2, mean a and mean beta, [P, D, n].
+        outcomes: r_end and QoCs, [P, D, n, 4]. actions: [P, D, n, H].
     """
 
-    weights: Floats
-    noise_weights: Floats
-    residuals: Floats
-    visits: tuple[int, ...]
-    sources: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class _Simulated:
-    step_return: Floats  # [P, M]
-    outcomes: Floats  # [P, M, 4]
+    step_return: Floats
+    outcomes: Floats
     energy: Floats
     amplitude: Floats
     beta: Floats
-    actions: Floats  # [P, M, T]
+    actions: Floats
 
 
 @dataclass(frozen=True)
 class FittedLinear:
-    """A fitted linear model, its bootstrap refits and its buffer."""
+    """A fitted linear model, draws of its coefficients and its buffer."""
 
     method: str
     config: LinearConfig
     buffer: ReplayBuffer
     scale: Scale
-    dynamics: Dynamics
-    refits: Dynamics
+    tables: tuple[SessionTable, ...]
+    main: Dynamics
+    drawn: Dynamics
     end: EndModel
-    end_refits: EndModel
-    chosen: int
+    ends: EndModel
     skill: float | None
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
-        """Simulate every policy with the fit (the value) and with every refit (the interval), from the sessions' own s_0."""
+        """Replay every session under every policy with the fit (the value) and with draws of its coefficients (the interval)."""
         horizon = checked_horizon(self.buffer, horizon_steps)
         if not policies:
             return {}
-        c, chosen = self.config, list(policies.values())
-        main = self._simulate(chosen, self.dynamics, self.end, c.rollouts, horizon, c.seed + 1)
-        report(0.5, "rolling out policies in the linear model")
-        spread = self._simulate(chosen, self.refits, self.end_refits, c.refits * c.per_refit, horizon, c.seed + 2)
-        report(1.0, "rolling out policies in the linear model")
+        chosen = list(policies.values())
+        main = self.replay(chosen, self.main, self.end, horizon)
+        report(0.3, "replaying sessions in the linear model")
+        spread = self.replay(chosen, self.drawn, self.ends, horizon)
+        report(1.0, "replaying sessions in the linear model")
+        visits = np.array([s.visit for s in self.buffer.sessions])
+        days = mean_over_days(self._returns(main)[:, 0], visits, self.drawn.beta.shape[0], self.config.seed)
         support = AmplitudeSupport(self.buffer)
-        return {name: self._estimate(i, policy, main, spread, support, horizon) for i, (name, policy) in enumerate(policies.items())}
+        return {n: self._estimate(i, p, main, spread, days, support, horizon) for i, (n, p) in enumerate(policies.items())}
 
-    def _simulate(self, policies: list[Policy], dynamics: Dynamics, end: EndModel, rows: int, horizon: int, seed: int) -> _Simulated:
-        """`rows` trajectories per policy; row m uses fit m modulo D and starts like session m modulo n. All policies share the noise."""
-        settings, sessions, scale = self.buffer.settings, self.buffer.sessions, self.scale
-        p, rng = len(policies), np.random.default_rng(seed)
-        fit = np.arange(rows) % len(dynamics.weights)
-        starts = [s for s in sessions if np.isfinite(s.lead_beta).all()] or list(sessions)
-        leads = np.stack([scale.beta(np.where(np.isfinite(s.lead_beta), s.lead_beta, self._middle())) for s in starts])
-        like = rng.integers(0, len(leads), rows)
-        window = np.tile(leads[like], (p, 1))
-        source = dynamics.sources[fit, rng.integers(0, dynamics.sources.shape[1], rows)]
-        common = dynamics.weights.shape[1] - len(dynamics.visits)
-        days = day_columns(dynamics.visits, [starts[k].visit for k in like])
-        day = np.tile(np.einsum("ij,ij->i", dynamics.weights[fit, common:], days), p)
-        weights, noise_weights = np.tile(dynamics.weights[fit, :common], (p, 1)), np.tile(dynamics.noise_weights[fit], (p, 1))
-        offset = np.zeros(rows, dtype=np.int64)
-        low, high = scale.beta(np.array([scale.beta_low, scale.beta_high]))
+    def replay(self, policies: list[Policy], dynamics: Dynamics, end: EndModel, horizon: int) -> Replayed:
+        """Every session under every policy with every set of coefficients."""
+        p, d, n, w = len(policies), len(dynamics.beta), len(self.tables), self.buffer.settings.window
+        noise = self._innovations(dynamics, horizon)  # [D, n, H]
+        level, beta = dynamics.levels, dynamics.beta
+        lead = np.stack([t.beta[:w] for t in self.tables])
+        lead = np.where(np.isfinite(lead), lead, (dynamics.levels[:1] + dynamics.beta[:1, :1] * 0.65).T)
+        window = np.broadcast_to(lead, (p, d, n, w)).copy()
+        eta = np.empty((p, d, n, w))
+        low, high = self.scale.beta(np.array([self.scale.beta_low, self.scale.beta_high]))
+        low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
+        betas, actions = np.empty((horizon, p, d, n)), np.empty((horizon, p, d, n))
         memory: Floats | None = None
-        betas, actions = np.empty((horizon, p * rows)), np.empty((horizon, p * rows))
         for t in range(horizon):
-            raw = scale.raw_beta(window)
-            a = np.concatenate([policy.act(raw[i * rows : (i + 1) * rows]) for i, policy in enumerate(policies)])
-            memory = fresh_memory(a) if memory is None else remember(memory, a)
-            x = features(window, a, memory)
-            predicted = np.einsum("ij,ij->i", x, weights) + day
-            if t % BLOCK == 0:
-                offset = rng.integers(0, dynamics.residuals.shape[1], rows)
-            shock = np.tile(dynamics.residuals[source, (offset + t) % dynamics.residuals.shape[1]], p)
-            newest = predicted + np.exp(np.einsum("ij,ij->i", noise_features(a, predicted), noise_weights)) * shock
-            newest = np.clip(newest, low - BEYOND * (high - low), high + BEYOND * (high - low))
-            window = np.concatenate([window[:, 1:], newest[:, None]], axis=1)
-            betas[t], actions[t] = scale.raw_beta(newest), a
-        return self._simulated(betas, actions, end, fit, settings, p, rows)
+            raw = self.scale.raw_beta(window)
+            a = np.stack([policy.act(raw[k].reshape(-1, w)).reshape(d, n) for k, policy in enumerate(policies)])
+            memory = fresh_memory(a.ravel()) if memory is None else remember(memory, a.ravel())
+            rest = np.einsum("pdnj,dj->pdn", answers(a.ravel(), memory).reshape(p, d, n, -1), beta) + level
+            if t == 0:
+                eta[:] = window - rest[..., None]
+            predicted = rest + eta @ dynamics.phi[::-1]
+            newest = predicted + np.exp(noise_features(a, predicted) @ dynamics.noise_weights) * noise[:, :, t]
+            newest = np.clip(newest, low, high)
+            eta = np.concatenate([eta[..., 1:], (newest - rest)[..., None]], axis=-1)
+            window = np.concatenate([window[..., 1:], newest[..., None]], axis=-1)
+            betas[t], actions[t] = self.scale.raw_beta(newest), a
+        return self._replayed(np.moveaxis(betas, 0, -1), np.moveaxis(actions, 0, -1), end)
 
-    def _simulated(
-        self, betas: Floats, actions: Floats, end: EndModel, fit: NDArray[np.int64], settings: MdpSettings, p: int, rows: int
-    ) -> _Simulated:
-        horizon = len(betas)
-        discount = settings.gamma ** np.arange(horizon)[:, None]
-        returns = (discount * step_reward(settings, betas, actions)).sum(0).reshape(p, rows)
-        summaries = summarise(betas.T, actions.T, settings.xi_beta).reshape(p, rows, -1)
-        model = (
-            end
-            if end.weights.ndim == 2
-            else EndModel(end.weights[fit], end.centre, end.spread, end.penalties, end.seen, end.skill, end.residual)
-        )
-        outcomes = np.stack([model.predict(s) for s in summaries])
-        a = actions.T.reshape(p, rows, horizon)
-        return _Simulated(returns, outcomes, (a**2).mean(2), a.mean(2), betas.T.reshape(p, rows, horizon).mean(2), a)
+    def _innovations(self, dynamics: Dynamics, horizon: int) -> Floats:
+        """Standardised innovations of every session over the horizon, [D, n, H].
 
-    def _middle(self) -> float:
-        return float(self.scale.raw_beta(np.array(0.0)))
+        Steps that a session lacks take a known one of the same session, or of any session where it has none.
+        """
+        found = dynamics.innovations(self.tables)
+        rng = np.random.default_rng([self.config.seed, 0x5E55])
+        every = np.concatenate([f[:, np.isfinite(f[0])] for f in found], axis=1)
+        noise = np.empty((len(dynamics.beta), len(found), horizon))
+        for i, own in enumerate(found):
+            known = np.flatnonzero(np.isfinite(own[0]))
+            source, pick = (own, known) if known.size else (every, np.arange(every.shape[1]))
+            noise[:, i] = source[:, rng.choice(pick, horizon)]
+            within = known[known < horizon]
+            noise[:, i, within] = own[:, within]
+        return noise
 
-    def _estimate(self, i: int, policy: Policy, main: _Simulated, spread: _Simulated, support: AmplitudeSupport, horizon: int) -> Estimate:
+    def _replayed(self, betas: Floats, actions: Floats, end: EndModel) -> Replayed:
+        settings, sessions = self.buffer.settings, self.buffer.sessions
+        discount = settings.gamma ** np.arange(betas.shape[-1])
+        returns = (discount * step_reward(settings, betas, actions)).sum(-1)
+        logged = np.stack([summarise(s.beta, s.amplitude, settings.xi_beta) for s in sessions])
+        model = end.with_weights(end.weights.reshape(-1, 1, *end.weights.shape[-2:]))  # [D, 1, 6, 4] against summaries [P, D, n, 5]
+        change = model.predict(summarise(betas, actions, settings.xi_beta))
+        known, seen = outcome_table(self.buffer), model.predict(logged[None])
+        own = np.where(np.isfinite(known), known - seen, 0.0)
+        return Replayed(returns, model.shifted(change, own), (actions**2).mean(-1), actions.mean(-1), betas.mean(-1), actions)
+
+    def _returns(self, replayed: Replayed) -> Floats:
+        return replayed.step_return + (replayed.outcomes[..., 0] if self.end.seen[0] else 0.0)
+
+    def _estimate(
+        self, i: int, policy: Policy, main: Replayed, spread: Replayed, days: MeanOverDays, support: AmplitudeSupport, horizon: int
+    ) -> Estimate:
+        weights = days.weights
         with_end = self.end.seen[0]
-        end = main.outcomes[i, :, 0].mean() if with_end else 0.0
-        step = float(main.step_return[i].mean())
-        returns = spread.step_return[i] + (spread.outcomes[i, :, 0] if with_end else 0.0)
-        # Rows go fit by fit, so a column of this table is one refit.
-        draws = returns.reshape(self.config.per_refit, self.config.refits).mean(0)
-        value = step + float(end)
-        noise, unknown = day_noise(self.buffer, horizon, len(draws), self.config.seed)
-        # Every pair of a refit and a day: what is common to all policies widens the interval, but is no part of the kept draws.
-        interval = percentile_interval(np.add.outer(draws - draws.mean(), noise).ravel() + value, LEVEL)
-        logged, simulated = support.of_policy(policy), support.look(main.actions[i][:, :: max(1, horizon // 50)])
-        flags = list(logged.flags or simulated.flags)
+        step = float(main.step_return[i, 0] @ weights)
+        end = float(main.outcomes[i, 0, :, 0] @ weights) if with_end else None
+        value = step + (end or 0.0)
+        model = self._returns(spread)[i] @ weights
+        model = model - model.mean()
+        # Every pair of a draw of the model and a draw of the days: what is common to all policies widens the interval, but is no part of
+        # the kept draws.
+        interval = percentile_interval(np.add.outer(model, days.common + days.own[i]).ravel() + value, LEVEL)
+        logged, simulated = support.of_policy(policy), support.look(main.actions[i, 0, :, :: max(1, horizon // 50)])
+        flags = list(dict.fromkeys((*logged.flags, *simulated.flags)))
         if not with_end:
             flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
-        flags += [unknown] if unknown else []
+        flags += [days.unknown] if days.unknown else []
         predicted = {
-            "energy": float(main.energy[i].mean()),
-            "mean_amplitude": float(main.amplitude[i].mean()),
-            "mean_beta": float(main.beta[i].mean()),
+            "energy": float(main.energy[i, 0] @ weights),
+            "mean_amplitude": float(main.amplitude[i, 0] @ weights),
+            "mean_beta": float(main.beta[i, 0] @ weights),
         }
         for j, name in enumerate(OUTCOMES):
             if name != "r_end" and self.end.seen[j]:
-                predicted[name] = float(main.outcomes[i, :, j].mean())
+                predicted[name] = float(main.outcomes[i, 0, :, j] @ weights)
         return Estimate(
             method=self.method,
             value=value,
@@ -240,47 +218,26 @@ class FittedLinear:
             level=LEVEL,
             standard_error=interval.standard_error,
             step_return=step,
-            end_reward=float(end) if with_end else None,
+            end_reward=end,
             predicted=predicted,
             supported=logged.supported and simulated.supported,
             flags=tuple(flags),
-            n=main.step_return.shape[1],
+            n=len(self.buffer.sessions),
             details={
                 "horizon_steps": horizon,
-                "penalty": CANDIDATES[self.chosen][0],
-                "root_shrinkage": CANDIDATES[self.chosen][1],
-                "level_of_each_visit": CANDIDATES[self.chosen][2] < float("inf"),
-                "largest_root": largest_root(self.dynamics.weights[0], self.buffer.settings.window),
+                "largest_root": largest_root(self.main.phi),
+                "level_shares": self.main.shares,
                 "coverage": logged.to_json(),
                 "coverage_simulated": simulated.to_json(),
-                "held_out": {
-                    "replay_skill": self.skill,
-                    "end_skill": float(self.end.skill[0]) if with_end else None,
-                    "sessions": len(self.buffer.sessions),
-                },
-                "draws": [round(float(d + value - draws.mean()), 4) for d in draws],
+                "held_out": self._held_out(),
+                "draws": [round(float(v), 4) for v in value + model + days.own[i]],
             },
         )
 
-
-def replay_skill(buffer: ReplayBuffer, scale: Scale, errors: Sequence[Floats], best: int) -> float | None:
-    """1 - error / error of the overall mean beta, over the replayed left-out sessions (all ways of leaving out); None where none was."""
-    own, plain = [], []
-    constant = np.zeros((len(CANDIDATES), 1))
-    for table in errors:
-        for k in np.flatnonzero(np.isfinite(table[best])):
-            beta = scale.beta(buffer.sessions[k].beta)
-            own.append(table[best, k])
-            plain.append(block_error(beta, np.tile(constant[:1], (1, beta.size)))[0])
-    return 1 - float(np.sum(own) / np.sum(plain)) if own and np.sum(plain) > 0 else None
-
-
-def _dynamics(data: Regression, picks: list[NDArray[np.int64]], candidates: list[int]) -> Dynamics:
-    """One fit per list of sessions with a candidate each; residuals are those of the first candidate's fit to all sessions."""
-    base = fit_weights(data, np.arange(len(data.x)), *CANDIDATES[candidates[0]])
-    noise, residuals = noise_model(data, base)
-    weights = np.stack([fit_weights(data, pick, *CANDIDATES[c]) for pick, c in zip(picks, candidates, strict=True)])
-    rank = {k: r for r, k in enumerate(data.usable)}
-    sources = [[rank[k] for k in pick if k in rank] or [0] for pick in picks]
-    width = max(len(s) for s in sources)
-    return Dynamics(weights, np.tile(noise, (len(picks), 1)), residuals, data.visits, np.stack([np.resize(s, width) for s in sources]))
+    def _held_out(self) -> dict[str, Any]:
+        with_end = self.end.seen[0]
+        return {
+            "replay_skill": self.skill,
+            "end_skill": float(self.end.skill[0]) if with_end else None,
+            "sessions": len(self.buffer.sessions),
+        }

@@ -1,246 +1,195 @@
-"""A linear autoregression of beta whose roots are kept inside the unit circle, chosen by free-running prediction of left-out sessions.
+"""A linear model of beta: the answer to the amplitude, levels of visits and sessions, and an autoregression around them.
 
-A one-step regression on sessions that differ in level learns a root near one: session after session looks like a slow walk. Run freely,
-such a model forgets where the level lies and what the amplitude does to it. So the roots are shrunk (every lag's weight is multiplied by
-kappa^lag, which multiplies every root by kappa), the other weights are fitted again around them, and kappa and the ridge penalty are those
-that predict best when left-out sessions, and whole left-out controllers, are replayed from their first window with their own amplitudes.
+    y_t = mu + visit + session + g(amplitudes up to t) . beta + eta_t,    eta_t = sum over l <= W of phi_l eta_{t-l} + e_t
+
+y is standardised (log) beta. Regressing beta on its own past alone would take sessions of different level for a slow walk and forget what
+the amplitude does; with levels as random effects the answer to the amplitude is read off within sessions, where random amplitudes are
+an experiment, and between sessions as far as sessions of one visit differ little. Estimated by turns: the mixed model on rows filtered
+by phi (Cochrane and Orcutt 1949; generalised least squares), then phi on what it leaves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.batches import Scale
-from ml.ope.behaviour import controllers
-from ml.ope.steps import fresh_memory, held_amplitude, memories, remember
+from ml.ope.steps import fresh_memory, held_amplitude, memories
+from ml.statistics.mixed import MixedFit, MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-PENALTIES = tuple(float(v) for v in 10.0 ** np.arange(-1, 5))
-SHRINKAGES = (1.0, 0.95, 0.85, 0.6, 0.0)
-"""kappa; 0 is a static model of amplitude and its memories."""
-
-DAY_PENALTIES = (30.0, float("inf"))
-"""Ridge penalty of each visit's own level, in steps: finite lets a good day not be taken for a good amplitude, infinite leaves it out."""
-
-CANDIDATES = tuple(product(PENALTIES, SHRINKAGES, DAY_PENALTIES))
+TURNS = 3
 LARGEST_ROOT = 0.98
-"""No fit keeps a root of larger modulus: its memory would outlast 50 steps."""
+"""No autoregression keeps a root of larger modulus: its memory would outlast 50 steps."""
 
-REPLAY_BLOCK = 30
-"""Steps whose mean beta is compared in a replay: single steps are noise, and the reward follows levels."""
+DOSE_RATIO = 1e4
+"""Prior variance of the fall of beta from no stimulation to cDBS, in innovation variances: next to flat."""
 
-DOSE = 6
-"""Column W + this of the features is the amplitude's memory over about 20 steps: the dose."""
-
-NOISE_LIMIT = 3.0
 SATURATION = 0.3
+NOISE_LIMIT = 3.0
+ANSWERS = 7
 
 
-def features(window: Floats, a: Floats, memory: Floats) -> Floats:
-    """Regressors of the next beta, [N, W + 13]: 1, the window, two products with its newest beta, then terms of the amplitude alone.
+def answers(a: Floats, memory: Floats) -> Floats:
+    """What beta answers to, [N, 7]: the dose (average over about 20 steps), three differences in timing from it, three curvatures.
 
     Args:
-        window: standardised, oldest first, [N, W]. a: amplitude, [N]. memory: memories of amplitudes with a in them, [N, 3].
+        a: amplitude, [N]. memory: memories of amplitudes with a in them, [N, 3]; `ml.ope.steps.DECAYS`.
     """
-    newest = window[:, -1:]
-    dose = memory[:, :2]
-    own = [a[:, None], a[:, None] ** 2, memory, memory**2, dose / (dose + SATURATION)]
-    return np.concatenate([np.ones((len(a), 1)), window, a[:, None] * newest, memory[:, 1:2] * newest, *own], axis=1)
+    dose = memory[:, 1]
+    timing = [a - dose, memory[:, 0] - dose, memory[:, 2] - dose]
+    saturating = 4 * (dose / (dose + SATURATION) - dose / (1 + SATURATION))
+    return np.stack([dose, *timing, 4 * (dose**2 - dose), 4 * (a**2 - a), saturating], axis=1)
 
 
 def noise_features(a: Floats, predicted: Floats) -> Floats:
-    """Regressors of the log scale of a residual, [N, 3]."""
-    return np.stack([np.ones_like(a), a, np.clip(predicted, -NOISE_LIMIT, NOISE_LIMIT)], axis=1)
+    """Regressors of the log scale of an innovation, [..., 3], for amplitudes and predicted beta of one shape."""
+    return np.stack([np.ones_like(a), a, np.clip(predicted, -NOISE_LIMIT, NOISE_LIMIT)], axis=-1)
 
 
 @dataclass(frozen=True)
-class Regression:
-    """Sessions as regression tables and their sums.
+class SessionTable:
+    """One session, standardised: beta [W + T] with the window before it first, answers [W + T, 7], amplitude and usable steps [T]."""
+
+    beta: Floats
+    answers: Floats
+    amplitude: Floats
+    usable: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, session: SessionTrajectory, scale: Scale) -> SessionTable:
+        """Tables of a session; before its first step the first amplitude counts as held."""
+        a = held_amplitude(session)
+        own = answers(a, memories(a))
+        lead = answers(a[:1], fresh_memory(a[:1]))
+        window = session.lead_beta.size
+        return cls(scale.beta(session.padded_beta), np.concatenate([np.repeat(lead, window, axis=0), own]), a, session.usable())
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """A fitted model; n sessions, D sets of coefficients.
 
     Attributes:
-        window: W. visits: numbers of the visits, [V]; column F - V + j of the features is 1 in the sessions of the j-th.
-        x, y, a: features [K, F], standardised next beta [K] and amplitude [K] of the usable steps, per session.
-        grams, moments: X^T X [n, F, F] and X^T y [n, F]. spread: variance of every column, [F]. usable: sessions with a usable step.
+        phi: autoregression of eta on lags 1 ... W, [W].
+        beta: answers to the amplitude, [D, 7]. levels: mu + visit + session, [D, n].
+        noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
+        shares: lambda / (1 + lambda) of the visits' and the sessions' levels; how far they stand out of one step's noise.
     """
 
-    window: int
-    visits: tuple[int, ...]
-    x: list[Floats]
-    y: list[Floats]
-    a: list[Floats]
-    grams: Floats
-    moments: Floats
-    spread: Floats
-    usable: list[int]
+    phi: Floats
+    beta: Floats
+    levels: Floats
+    noise_weights: Floats
+    shares: dict[str, float]
+
+    def innovations(self, tables: Sequence[SessionTable]) -> list[Floats]:
+        """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
+        found = []
+        for i, table in enumerate(tables):
+            eta = table.beta - self.beta @ table.answers.T - self.levels[:, i : i + 1]
+            expected = self._expected(eta)
+            predicted = table.beta[self.phi.size :] - (eta[:, self.phi.size :] - expected)
+            scale = np.exp(noise_features(np.broadcast_to(table.amplitude, predicted.shape), predicted) @ self.noise_weights)
+            found.append(np.where(table.usable, (eta[:, self.phi.size :] - expected) / scale, np.nan))
+        return found
+
+    def _expected(self, eta: Floats) -> Floats:
+        """E[eta_t | its past], [D, T], from eta [D, W + T]."""
+        windows = np.lib.stride_tricks.sliding_window_view(eta, self.phi.size, axis=1)[:, :-1]
+        return np.asarray(windows @ self.phi[::-1], dtype=np.float64)
 
 
-def regression(buffer: ReplayBuffer, scale: Scale) -> Regression:
-    """Tables of a buffer."""
-    visits = tuple(sorted({s.visit for s in buffer.sessions}))
-    tables = [_session_table(s, scale, visits) for s in buffer.sessions]
-    x, y, a = ([t[j] for t in tables] for j in range(3))
-    spread = np.concatenate(x).var(axis=0)
-    return Regression(
-        window=buffer.settings.window,
-        visits=visits,
-        x=x,
-        y=y,
-        a=a,
-        grams=np.stack([v.T @ v for v in x]),
-        moments=np.stack([v.T @ w for v, w in zip(x, y, strict=True)]),
-        spread=np.maximum(spread, 1e-9),
-        usable=[k for k, v in enumerate(x) if len(v)],
-    )
+def fit_dynamics(buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: int, seed: int) -> tuple[Dynamics, Dynamics]:
+    """The model at its posterior mean (D = 1), and `draws` of its coefficients from their posterior (phi and noise as in the first).
 
-
-def fit_weights(data: Regression, pick: Indices, penalty: float, shrinkage: float, day_penalty: float = float("inf")) -> Floats:
-    """Weights [F] of the picked sessions with roots shrunk by `shrinkage` and none beyond `LARGEST_ROOT`."""
-    gram, moment = data.grams[pick].sum(0), data.moments[pick].sum(0)
-    ridge = penalty * data.spread
-    # The slope of the dose is not shrunk: without it, stimulating less would look free, and policies be ranked the wrong way round.
-    ridge[[0, data.window + DOSE]] = 1e-6
-    # A level is kept for as long as the roots remember, so the same level of beta is a smaller weight: the penalty is that of the weight.
-    ridge[len(ridge) - len(data.visits) :] = min(day_penalty, 1e12)
-    gram = gram + np.diag(ridge)
-    free = np.linalg.solve(gram, moment)
-    root = largest_root(free, data.window)
-    kappa = min(shrinkage, LARGEST_ROOT / root) if root > 0 else shrinkage
-    if kappa >= 1.0:
-        return np.asarray(free, dtype=np.float64)
-    answers = np.arange(1, data.window + 3)
-    rest = np.setdiff1d(np.arange(len(free)), answers)
-    weights = free.copy()
-    weights[answers] *= kappa ** lags(data.window)
-    weights[rest] = np.linalg.solve(gram[np.ix_(rest, rest)], moment[rest] - gram[np.ix_(rest, answers)] @ weights[answers])
-    return np.asarray(weights, dtype=np.float64)
-
-
-def lags(window: int) -> Floats:
-    """Lag of each column that holds beta: W ... 1 of the window, and 1 of both products, [W + 2]."""
-    return np.concatenate([np.arange(window, 0, -1), [1, 1]]).astype(np.float64)
-
-
-def largest_root(weights: Floats, window: int) -> float:
-    """Largest modulus of a root of the autoregression over all amplitudes and memories in [0, 1]: its corners suffice."""
-    moduli = []
-    for a, m in product((0.0, 1.0), repeat=2):
-        lagged = weights[1 : window + 1][::-1].copy()
-        lagged[0] += a * weights[window + 1] + m * weights[window + 2]
-        roots = np.roots(np.concatenate([[1.0], -lagged]))
-        moduli.append(float(np.abs(roots).max()) if roots.size else 0.0)
-    return max(moduli)
-
-
-def replay_errors(buffer: ReplayBuffer, scale: Scale, data: Regression, folds: Sequence[Sequence[int]]) -> Floats:
-    """Squared error of every candidate on every left-out session, [C, n]: block means of standardised beta in a free run from s_0.
-
-    NaN where a session cannot be replayed (gaps in s_0, or no usable step). The conditional mean is run without noise: the model is linear
-    in beta, so that this is the mean over noise.
+    Raises:
+        ValueError: fewer than two sessions with usable steps.
     """
-    errors = np.full((len(CANDIDATES), len(buffer.sessions)), np.nan)
-    for fold in folds:
-        rest = np.array([k for k in data.usable if k not in set(fold)], dtype=np.int64)
-        held = [k for k in fold if k in data.usable and np.isfinite(buffer.sessions[k].lead_beta).all()]
-        if not len(rest) or not held:
-            continue
-        weights = np.stack([fit_weights(data, rest, *candidate) for candidate in CANDIDATES])
-        sessions = [buffer.sessions[k] for k in held]
-        predicted = mean_path(weights, sessions, scale, data.visits)
-        for j, (k, session) in enumerate(zip(held, sessions, strict=True)):
-            seen = scale.beta(session.beta)
-            errors[:, k] = block_error(seen, predicted[:, j, : session.steps])
-    return errors
+    with_steps = sum(bool(t.usable.any()) for t in tables)
+    if with_steps < 2:
+        raise ValueError(f"the linear model needs at least two sessions with usable steps; the buffer has {with_steps}")
+    window, visits = buffer.settings.window, np.array([s.visit for s in buffer.sessions])
+    own = (visits[:, None] == np.unique(visits)).astype(np.float64)
+    phi = np.zeros(window)
+    for _ in range(TURNS):
+        fit = _mixed(tables, own, phi)
+        beta, levels = _split(fit.coefficients[None], own)
+        phi = _autoregression(tables, beta[0], levels[0], window)
+    fit = _mixed(tables, own, phi)
+    beta, levels = _split(fit.coefficients[None], own)
+    shares = {name: fit.share(name) for name in ("visit", "session")}
+    mean = Dynamics(phi, beta, levels, _noise(tables, beta[0], levels[0], phi), shares)
+    drawn = _split(fit.draws(draws, np.random.default_rng([seed, 0xD7A])), own)
+    return mean, Dynamics(phi, *drawn, mean.noise_weights, shares)
 
 
-def mean_path(weights: Floats, sessions: Sequence[SessionTrajectory], scale: Scale, visits: Sequence[int]) -> Floats:
-    """Free runs of every fit [C, F] from the sessions' first windows under their logged amplitudes, standardised, [C, n, longest T]."""
-    fits, n, longest = len(weights), len(sessions), max(s.steps for s in sessions)
-    amplitude = np.stack([np.append(held, np.full(longest - held.size, held[-1])) for held in map(held_amplitude, sessions)])
-    window = np.tile(np.stack([scale.beta(s.lead_beta) for s in sessions]), (fits, 1))
-    each = np.repeat(weights[:, : weights.shape[1] - len(visits)], n, axis=0)
-    day = (weights[:, weights.shape[1] - len(visits) :] @ day_columns(visits, [s.visit for s in sessions]).T).reshape(-1)
-    memory = fresh_memory(amplitude[:, 0])
-    paths = np.empty((longest, fits * n))
-    limit = 4.0 * (1.0 + float(np.abs(scale.beta(np.array([scale.beta_low, scale.beta_high]))).max()))
-    for t in range(longest):
-        a = amplitude[:, t]
-        memory = memory if t == 0 else remember(memory, a)
-        x = features(window, np.tile(a, fits), np.tile(memory, (fits, 1)))
-        newest = np.clip(np.einsum("ij,ij->i", x, each) + day, -limit, limit)
-        window = np.concatenate([window[:, 1:], newest[:, None]], axis=1)
-        paths[t] = newest
-    return np.asarray(paths.T.reshape(fits, n, longest), dtype=np.float64)
+def largest_root(phi: Floats) -> float:
+    """Largest modulus of a root of the autoregression; 0 where there is none."""
+    roots = np.roots(np.concatenate([[1.0], -phi]))
+    return float(np.abs(roots).max()) if roots.size else 0.0
 
 
-def replay_folds(buffer: ReplayBuffer, random_folds: Sequence[Sequence[int]]) -> list[list[list[int]]]:
-    """Two ways to leave sessions out: groups of all kinds, and, where there are several, whole controllers."""
-    kinds = list(controllers(buffer).values())
-    ways = [[list(fold) for fold in random_folds]]
-    return [*ways, kinds] if len(kinds) > 1 else ways
+def _mixed(tables: Sequence[SessionTable], own: Floats, phi: Floats) -> MixedFit:
+    """Mixed model of rows filtered by phi; columns: 1, answers, visits, sessions."""
+    n, visits = len(tables), own.shape[1]
+    rest, q = 1 - float(phi.sum()), 1 + ANSWERS + visits + n
+    gram, moment, square, rows = np.zeros((q, q)), np.zeros(q), 0.0, 0
+    for i, table in enumerate(tables):
+        y = _filtered(table.beta[:, None], phi)[table.usable, 0]
+        level = np.concatenate([own[i], np.arange(n) == i]) * rest
+        x = np.concatenate([np.full((y.size, 1), rest), _filtered(table.answers, phi)[table.usable], np.tile(level, (y.size, 1))], axis=1)
+        gram, moment, square, rows = gram + x.T @ x, moment + x.T @ y, square + float(y @ y), rows + y.size
+    first = 1 + ANSWERS
+    groups = {
+        "timing": (2, 3, 4),
+        "shape": (5, 6, 7),
+        "visit": tuple(range(first, first + visits)),
+        "session": tuple(range(first + visits, q)),
+    }
+    return MixedModel(q, groups, {1: DOSE_RATIO}).fit(Sums(gram, moment, square, rows))
 
 
-def choose(errors: Sequence[Floats], ways: Sequence[Sequence[Sequence[int]]], pick: Indices | None = None) -> int:
-    """Candidate of the least error over the picked sessions (repeats count), averaged over the ways of leaving out.
-
-    Every fold of a way counts the same, however many sessions it has: a controller that ran once, such as no stimulation, says as much of
-    the answer to the amplitude as one that ran twenty times. Each way counts relative to its best candidate.
-    """
-    total = np.zeros(len(CANDIDATES))
-    for table, folds in zip(errors, ways, strict=True):
-        times = np.ones(table.shape[1]) if pick is None else np.bincount(pick, minlength=table.shape[1]).astype(np.float64)
-        times = np.where(np.isfinite(table).all(axis=0), times, 0.0)
-        values = np.where(times > 0, table, 0.0)
-        means = [values[:, fold] @ times[fold] / times[fold].sum() for fold in map(list, folds) if times[fold].sum() > 0]
-        if means:
-            mean = np.mean(means, axis=0)
-            total += mean / max(float(mean.min()), 1e-12)
-    return int(np.argmin(total))
+def _split(coefficients: Floats, own: Floats) -> tuple[Floats, Floats]:
+    """Answers [D, 7] and levels [D, n] from coefficients [D, q]."""
+    first = 1 + ANSWERS
+    visits = coefficients[:, first : first + own.shape[1]]
+    return coefficients[:, 1:first], coefficients[:, :1] + visits @ own.T + coefficients[:, first + own.shape[1] :]
 
 
-def noise_model(data: Regression, weights: Floats) -> tuple[Floats, Floats]:
-    """Weights of the log scale of residuals, [3], and standardised residuals in order of time, padded by repetition, [n usable, L]."""
-    designs, logs, residuals = [], [], []
-    for k in data.usable:
-        predicted = data.x[k] @ weights
-        residual = data.y[k] - predicted
-        designs.append(noise_features(data.a[k], predicted))
-        logs.append(np.log(np.maximum(np.abs(residual), 1e-6)))
-        residuals.append(residual)
+def _filtered(values: Floats, phi: Floats) -> Floats:
+    """v_t - sum over l of phi_l v_{t-l}, [T, k], from values [W + T, k]; NaN where one of them is."""
+    windows = np.lib.stride_tricks.sliding_window_view(values, phi.size, axis=0)[:-1]
+    return np.asarray(values[phi.size :] - windows @ phi[::-1], dtype=np.float64)
+
+
+def _autoregression(tables: Sequence[SessionTable], beta: Floats, levels: Floats, window: int) -> Floats:
+    """phi [W] by least squares on what levels and answers leave, its roots kept inside `LARGEST_ROOT`."""
+    gram, moment = 1.0 * np.eye(window), np.zeros(window)
+    for i, table in enumerate(tables):
+        eta = table.beta - table.answers @ beta - levels[i]
+        x = np.lib.stride_tricks.sliding_window_view(eta, window)[:-1][table.usable]
+        gram, moment = gram + x.T @ x, moment + x.T @ eta[window:][table.usable]
+    phi = np.asarray(np.linalg.solve(gram, moment)[::-1], dtype=np.float64)
+    root = largest_root(phi)
+    kappa = min(1.0, LARGEST_ROOT / root) if root > 0 else 1.0
+    return np.asarray(phi * kappa ** np.arange(1, window + 1), dtype=np.float64)
+
+
+def _noise(tables: Sequence[SessionTable], beta: Floats, levels: Floats, phi: Floats) -> Floats:
+    """Weights of the log scale of innovations, [3]."""
+    designs, logs = [], []
+    for i, table in enumerate(tables):
+        eta = (table.beta - table.answers @ beta - levels[i])[:, None]
+        innovation = _filtered(eta, phi)[table.usable, 0]
+        predicted = table.beta[phi.size :][table.usable] - innovation
+        designs.append(noise_features(table.amplitude[table.usable], predicted))
+        logs.append(np.log(np.maximum(np.abs(innovation), 1e-6)))
     design, target = np.concatenate(designs), np.concatenate(logs)
-    noise = np.linalg.solve(design.T @ design + np.diag([1e-6, 10.0, 10.0]), design.T @ target)
-    scaled = [r * np.exp(-(d @ noise)) for r, d in zip(residuals, designs, strict=True)]
-    longest = max(len(r) for r in scaled)
-    return noise, np.stack([np.resize(r, longest) for r in scaled])
-
-
-def day_columns(visits: Sequence[int], of: Sequence[int]) -> Floats:
-    """Which of the visits [V] each of some sessions belongs to, [n, V]; all 0 for a visit that is not among them."""
-    return np.asarray(np.asarray(of)[:, None] == np.asarray(visits)[None, :], dtype=np.float64)
-
-
-def _session_table(session: SessionTrajectory, scale: Scale, visits: Sequence[int]) -> tuple[Floats, Floats, Floats]:
-    usable = session.usable()
-    a = held_amplitude(session)
-    windows = scale.beta(session.states()[:-1][usable])
-    own = features(windows, a[usable], memories(a)[usable])
-    day = np.repeat(day_columns(visits, [session.visit]), len(own), axis=0)
-    return np.concatenate([own, day], axis=1), scale.beta(session.beta[usable]), a[usable]
-
-
-def block_error(seen: Floats, predicted: Floats) -> Floats:
-    """Mean over blocks of the squared difference of block means, [C], for beta [T] with gaps and predictions [C, T]."""
-    squares = []
-    for start in range(0, seen.size, REPLAY_BLOCK):
-        known = np.isfinite(seen[start : start + REPLAY_BLOCK])
-        if known.sum() >= REPLAY_BLOCK // 3 or (known.any() and seen.size < REPLAY_BLOCK):
-            block = predicted[:, start : start + REPLAY_BLOCK][:, known]
-            squares.append((block.mean(1) - seen[start : start + REPLAY_BLOCK][known].mean()) ** 2)
-    return np.asarray(np.mean(squares, axis=0) if squares else np.full(len(predicted), np.nan), dtype=np.float64)
+    return np.asarray(np.linalg.solve(design.T @ design + np.diag([1e-6, 10.0, 10.0]), design.T @ target), dtype=np.float64)

@@ -14,6 +14,7 @@ from ml.ope.behaviour import Key, controllers
 from ml.ope.estimate import LEVEL
 from ml.ope.importance import per_trajectory
 from ml.statistics.bootstrap import Interval, session_bootstrap
+from ml.statistics.mixed import MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
@@ -113,6 +114,51 @@ def day_noise(buffer: ReplayBuffer, horizon: int, draws: int, seed: int) -> tupl
     # Three visits or fewer have a Student's t without a variance; what is drawn is then cut to what can be averaged.
     noise = np.random.default_rng([seed, 0xDA7]).standard_t(max(len(days) - 1, 1), draws)
     return np.asarray(error * np.clip(noise, -6.0, 6.0), dtype=np.float64), None
+
+
+@dataclass(frozen=True)
+class MeanOverDays:
+    """Means of returns over sessions of a few days, P policies, n sessions.
+
+    Attributes:
+        weights: of the sessions in the mean, [n]; sessions of one visit share a weight, the smaller their own noise the more nearly equal
+            the visits'.
+        common: draws of the error of the mean that all policies share, [draws]. own: those of each policy's difference from it, [P, draws].
+        unknown: what cannot be told about days, in words; None where it can.
+    """
+
+    weights: Floats
+    common: Floats
+    own: Floats
+    unknown: str | None
+
+
+def mean_over_days(returns: Floats, visits: NDArray[np.int64], draws: int, seed: int) -> MeanOverDays:
+    """Mean over days of returns [P, n] of the same sessions under several policies: a one-way random effect of the visit.
+
+    With few visits the error follows from the posterior of the visits' variance (`ml.statistics.mixed`), not from a point estimate.
+    """
+    n = returns.shape[1]
+    days = np.unique(visits)
+    own = (visits[:, None] == days).astype(np.float64)
+    several = 1 < len(days) < n
+    design = np.concatenate([np.ones((n, 1)), own if several else np.zeros((n, 0))], axis=1)
+    groups = {"visit": tuple(range(1, 1 + len(days)))} if several else {}
+    model = MixedModel(design.shape[1], groups, {})
+    middle = returns.mean(0)
+    shared = model.fit(Sums.of(design, middle))
+    weights = np.full(n, 1 / n)
+    if several:
+        sizes = own.sum(0)
+        each = 1 / (shared.ratios[:, :1] + 1 / sizes)  # [K, V]; inverse variances of the visits' means
+        weights = own @ ((shared.weights @ (each / each.sum(1, keepdims=True))) / sizes)
+
+    def errors(values: Floats, k: int) -> Floats:
+        found = model.fit(Sums.of(design, values)).draws(draws, np.random.default_rng([seed, 0xDA7, k]))[:, 0]
+        return np.asarray(found - found.mean(), dtype=np.float64)
+
+    flag = None if several else "how returns differ from day to day cannot be told from these sessions: the intervals leave it out"
+    return MeanOverDays(weights, errors(middle, 0), np.stack([errors(r - middle, 1 + i) for i, r in enumerate(returns)]), flag)
 
 
 def empirical_bernstein(values: Floats, low: float, high: float, level: float = LEVEL) -> tuple[float, float]:

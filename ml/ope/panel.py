@@ -32,7 +32,7 @@ def estimators(seed: int = 0, *, demo: bool = False) -> dict[str, Estimator]:
 def quick_estimators(seed: int = 0) -> dict[str, Estimator]:
     """The methods that are fitted within seconds, at settings for `skill.choose_default`, which fits each once per controller."""
     return {
-        "linear": LinearModel(LinearConfig(seed=seed, refits=25, per_refit=8, rollouts=200)),
+        "linear": LinearModel(LinearConfig(seed=seed, draws=20)),
         "fqe": Fqe(FqeConfig(seed=seed, refits=25)),
         "wdr": DoublyRobust(FqeConfig(seed=seed, members=1, refits=25)),
         "wis": ImportanceSampling("wis", seed=seed, draws=100),

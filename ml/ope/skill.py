@@ -32,8 +32,8 @@ FEWEST_CONTROLLERS = 3
 NINETY = 1.645
 """Half-width of a normal's 90 % interval, the level of all estimates, in standard deviations."""
 
-LEVEL_WITH = 1.10
-"""A method whose error is at most this many times the least one is level with it; `PREFERENCE` decides among them."""
+NEEDED_LEAD = 1.0
+"""A method takes the place of the first of `PREFERENCE` only where its errors are smaller by more than so many standard errors."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def choose_default(
         buffer: all sessions. estimators: candidates by key; each is fitted once per controller, so give quick settings.
         policies: logged policies by `policy_id`; the others are cloned.
         horizon_steps: H, the buffer's median session length by default.
-        aggregate: let the combination of all compete; it wins only where it predicts better than the best single method.
+        aggregate: let the combination of all compete.
         seed: of clones.
 
     Raises:
@@ -130,19 +130,43 @@ def choose_default(
         reason = f"the data cannot choose: {most} controllers could be left out, {FEWEST_CONTROLLERS} are needed; the usual order decides"
         return Choice(fallback, False, reason, tuple(table), predictions, failed)
     full = [s for s in table if s.controllers == most]
-    singles = [s for s in full if s.method != AGGREGATE]
-    least = singles[0] if singles else full[0]
-    if full[0].method == AGGREGATE:
-        chosen = full[0]
-    else:
-        level = [s for s in singles if s.difference_error <= LEVEL_WITH * least.difference_error]
-        order = {m: k for k, m in enumerate(PREFERENCE)}
-        chosen = min(level, key=lambda s: order.get(s.method, len(order)))
-    reason = (
-        f"{chosen.method} predicted the differences between {most} left-out controllers with a mean error of "
+    order = {m: k for k, m in enumerate(PREFERENCE)}
+    first = min((s for s in full if s.method != AGGREGATE), key=lambda s: order.get(s.method, len(order)), default=full[0])
+    leads = {s.method: lead(predictions, first.method, s.method) for s in full if s is not first}
+    ahead = [s for s in full if s is not first and leads[s.method][0] > NEEDED_LEAD * leads[s.method][1]]
+    chosen = ahead[0] if ahead else first
+    return Choice(chosen.method, True, _reason(chosen, first, full, most), tuple(table), predictions, failed)
+
+
+def lead(predictions: tuple[Prediction, ...], first: str, other: str) -> tuple[float, float]:
+    """By how much `other` predicts differences between left-out controllers better than `first`: mean over pairs, and its standard error.
+
+    The pairs share controllers, so the standard error is the jackknife's over controllers; infinite below three common ones.
+    """
+    tables = [{p.controller: p.predicted - p.observed for p in predictions if p.method == m} for m in (first, other)]
+    common = [c for c in tables[0] if c in tables[1]]
+
+    def gain(names: list[str]) -> float:
+        errors = [np.array([table[c] for c in names]) for table in tables]
+        upper = np.triu_indices(len(names), 1)
+        own, others = (np.abs(np.subtract.outer(e, e))[upper].mean() for e in errors)
+        return float(own - others)
+
+    if len(common) < FEWEST_CONTROLLERS:
+        return 0.0, float("inf")
+    left = np.array([gain([c for c in common if c != out]) for out in common])
+    k = len(common)
+    return gain(common), float(np.sqrt((k - 1) / k * np.sum((left - left.mean()) ** 2)))
+
+
+def _reason(chosen: Skill, first: Skill, full: list[Skill], controllers: int) -> str:
+    text = (
+        f"{chosen.method} predicted the differences between {controllers} left-out controllers with a mean error of "
         f"{100 * chosen.difference_error:.0f} % of their range (least of all: {100 * full[0].difference_error:.0f} %)"
     )
-    return Choice(chosen.method, True, reason, tuple(table), predictions, failed)
+    if chosen is not first:
+        return f"{text}, by more than a standard error better than {first.method}, the first of the usual order"
+    return text if full[0] is first else f"{text}; none was better by more than a standard error than this first of the usual order"
 
 
 def with_held_out_error(estimate: Estimate, skill: Skill) -> Estimate:

@@ -12,7 +12,7 @@ from ml.ope.estimate import Estimate
 from ml.ope.fqe import Fqe, FqeConfig
 from ml.ope.importance import ImportanceSampling
 from ml.ope.linear import LinearConfig, LinearModel
-from ml.ope.skill import Prediction, choose_default, skills, with_held_out_error
+from ml.ope.skill import Prediction, choose_default, lead, skills, with_held_out_error
 from ml.qoc import Qoc
 from ml.rl.policy import ConstantPolicy
 
@@ -74,7 +74,7 @@ def test_a_method_that_supports_no_policy_takes_no_part():
 
 
 def test_the_aggregate_is_an_estimator_like_any_other(small_buffer):
-    parts = {"linear": LinearModel(LinearConfig(refits=20, rollouts=40)), "fqe": Fqe(FqeConfig(members=1, refits=20))}
+    parts = {"linear": LinearModel(LinearConfig(draws=20)), "fqe": Fqe(FqeConfig(members=1, refits=20))}
     policies = {"half": ConstantPolicy(0.5), "full": ConstantPolicy(1.0)}
     found = Aggregate(parts).fit(small_buffer).evaluate(policies, 30)
     single = [p.fit(small_buffer).evaluate(policies, 30)["half"].value for p in parts.values()]
@@ -105,7 +105,7 @@ def test_the_method_that_predicts_left_out_controllers_is_chosen_and_the_table_s
         method = "fqe"
 
         def fit(self, buffer, report=None, checkpoint_dir=None):
-            self.inner = LinearModel(LinearConfig(refits=4, rollouts=60)).fit(buffer)
+            self.inner = LinearModel(LinearConfig(draws=20)).fit(buffer)
             return self
 
         def evaluate(self, policies, horizon_steps=None, report=None):
@@ -113,7 +113,7 @@ def test_the_method_that_predicts_left_out_controllers_is_chosen_and_the_table_s
             return {n: replace(e, value=-e.value, step_return=-e.step_return) for n, e in found.items()}
 
     buffer = linear_simulator.buffer(seed=0, n=16, steps=100)
-    candidates = {"fqe": Backwards(), "linear": LinearModel(LinearConfig(refits=4, rollouts=60))}
+    candidates = {"fqe": Backwards(), "linear": LinearModel(LinearConfig(draws=20))}
     choice = choose_default(buffer, candidates, aggregate=False)
     assert choice.method == "linear"
     assert choice.chosen_by_data
@@ -123,10 +123,49 @@ def test_the_method_that_predicts_left_out_controllers_is_chosen_and_the_table_s
     json.dumps(choice.to_json())
 
 
+def test_the_lead_over_the_usual_first_is_the_mean_over_pairs_with_a_jackknife_over_controllers():
+    errors = {"linear": [0.0, 4.0, -2.0, 1.0], "fqe": [0.0, 1.0, 0.0, 1.0]}
+    rows = tuple(Prediction(m, str(c), 2, 10.0 * c + e, 10.0 * c, 1.0, True) for m, own in errors.items() for c, e in enumerate(own))
+
+    def by_hand(names):
+        pairs = [(i, j) for i in names for j in names if i < j]
+        return np.mean([abs(errors["linear"][i] - errors["linear"][j]) - abs(errors["fqe"][i] - errors["fqe"][j]) for i, j in pairs])
+
+    left = np.array([by_hand([c for c in range(4) if c != out]) for out in range(4)])
+    gain, error = lead(rows, "linear", "fqe")
+    assert gain == pytest.approx(by_hand(range(4)))
+    assert error == pytest.approx(np.sqrt(3 / 4 * np.sum((left - left.mean()) ** 2)))
+    assert lead(rows[:2] + rows[4:], "linear", "fqe") == (0.0, float("inf"))
+
+
+def test_a_method_takes_the_place_of_the_usual_first_only_by_more_than_a_standard_error(linear_simulator):
+    class Said:
+        """Predictions by the mean amplitude of the policy: exact to a slope and an offset of one controller."""
+
+        def __init__(self, method, slope, wrong):
+            self.method, self.slope, self.wrong = method, slope, wrong
+
+        def fit(self, buffer, report=None, checkpoint_dir=None):
+            self.kinds = {s.controller for s in buffer.sessions}
+            return self
+
+        def evaluate(self, policies, horizon_steps=None, report=None):
+            found = LinearModel(LinearConfig(draws=20)).fit(full).evaluate(policies, horizon_steps)
+            shift = self.wrong if "cdbs" not in self.kinds else 0.0
+            return {n: replace(e, value=self.slope * e.value + shift, step_return=self.slope * e.step_return) for n, e in found.items()}
+
+    full = linear_simulator.buffer(seed=0, n=16, steps=100)
+    clear = choose_default(full, {"linear": Said("linear", -1.0, 0.0), "fqe": Said("fqe", 1.0, 0.0)}, aggregate=False)
+    assert clear.method == "fqe"
+    assert "by more than a standard error better than linear" in clear.reason
+    hardly = choose_default(full, {"linear": Said("linear", 1.0, 0.4), "fqe": Said("fqe", 1.0, 0.0)}, aggregate=False)
+    assert hardly.method == "linear"
+
+
 def test_too_few_controllers_leave_the_choice_to_the_usual_order(linear_simulator):
     sessions = tuple(s for s in linear_simulator.buffer(seed=0, n=10, steps=40).sessions if s.controller in ("random", "cdbs"))
     buffer = replace(linear_simulator.buffer(seed=0, n=10, steps=40), sessions=sessions)
-    candidates = {"wis": ImportanceSampling("wis", draws=20), "linear": LinearModel(LinearConfig(refits=2, rollouts=10))}
+    candidates = {"wis": ImportanceSampling("wis", draws=20), "linear": LinearModel(LinearConfig(draws=20))}
     choice = choose_default(buffer, candidates)
     assert (choice.method, choice.chosen_by_data) == ("linear", False)
     assert "the data cannot choose" in choice.reason
@@ -140,7 +179,7 @@ def test_a_method_that_cannot_work_is_named_with_its_reason(small_buffer):
             raise ValueError("needs more sessions")
 
     bare = replace(small_buffer, sessions=tuple(replace(s, qoc=Qoc()) for s in small_buffer.sessions))
-    choice = choose_default(bare, {"dlsm": Broken(), "linear": LinearModel(LinearConfig(refits=2, rollouts=10))})
+    choice = choose_default(bare, {"dlsm": Broken(), "linear": LinearModel(LinearConfig(draws=20))})
     assert choice.failed == {"dlsm": "needs more sessions"}
     assert choice.method == "linear"
 

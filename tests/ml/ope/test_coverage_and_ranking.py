@@ -64,7 +64,8 @@ def test_two_normals_have_the_probability_of_the_closed_form():
 def test_the_ranking_rests_on_the_first_method_that_supports_a_policy():
     supported, not_supported = {"a": estimate(1.0)}, {"a": estimate(1.0, supported=False)}
     assert default_method({"pdis": supported, "dlsm": supported}) == "dlsm"
-    assert default_method({"dlsm": not_supported, "linear": supported}) == "linear"
+    assert default_method({"dlsm": supported, "linear": supported}) == "linear"
+    assert default_method({"dlsm": supported, "linear": not_supported}) == "dlsm"
     assert default_method({"dlsm": not_supported, "pdis": not_supported}) == "dlsm"
     with pytest.raises(ValueError, match="at least one method"):
         default_method({"dlsm": {}})

@@ -1,4 +1,4 @@
-"""The autoregression's roots, its free runs, and the choice of its shrinkage by left-out sessions."""
+"""The linear model of beta: levels, answer to the amplitude and autoregression against known systems."""
 
 from __future__ import annotations
 
@@ -10,78 +10,124 @@ import pytest
 from ml.mdp import MdpSettings
 from ml.ope.batches import learn_scale, session_folds
 from ml.ope.linear import LinearConfig, LinearModel
-from ml.ope.linear_dynamics import (
-    CANDIDATES,
-    LARGEST_ROOT,
-    choose,
-    features,
-    fit_weights,
-    lags,
-    largest_root,
-    mean_path,
-    noise_model,
-    regression,
-    replay_errors,
-    replay_folds,
-)
+from ml.ope.linear_dynamics import ANSWERS, LARGEST_ROOT, SessionTable, answers, fit_dynamics, noise_features
+from ml.ope.linear_held_out import block_error, mean_path, replay_skill
+from ml.ope.steps import memories
 from ml.rl.policy import ConstantPolicy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 W = 10
+SETTINGS = MdpSettings(xi_beta=2.0, c2=0.0, c3=0.0, c4=0.0)
 
 
-@pytest.fixture(scope="module")
-def fitted(linear_simulator):
-    buffer = linear_simulator.buffer(seed=0)
+def known_system(seed, n=16, steps=400, phi=(0.5, 0.2), fall=0.8, day=0.3, session=0.2):
+    """beta = 3 + day + session - fall x dose + AR(2); the dose is the average over about 20 steps. Random sessions, and cDBS."""
+    rng = np.random.default_rng(seed)
+    days, sessions, levels = day * rng.standard_normal(4), [], []
+    for i in range(n):
+        a = np.full(steps, 1.0) if i % 4 == 3 else rng.uniform(0.3, 1.0, steps)
+        level = 3.0 + days[i // 4] + session * rng.standard_normal()
+        eta = np.zeros(W + steps + 50)
+        for t in range(2, eta.size):
+            eta[t] = phi[0] * eta[t - 1] + phi[1] * eta[t - 2] + 0.15 * rng.standard_normal()
+        dose = np.concatenate([np.full(W, memories(a)[0, 1]), memories(a)[:, 1]])
+        beta = level - fall * dose + eta[50:]
+        lower = None if i % 4 == 3 else 0.3
+        kind = "cdbs" if lower is None else "random"
+        sessions.append(SessionTrajectory(i, 1 + i // 4, kind, beta[:W], beta[W:], a, random_lower_bound=lower))
+        levels.append(level)
+    return ReplayBuffer(SETTINGS, tuple(sessions), "uV", "table"), np.array(levels)
+
+
+def fitted(buffer, draws=20):
     scale = learn_scale(buffer)
-    return buffer, scale, regression(buffer, scale)
+    tables = [SessionTable.of(s, scale) for s in buffer.sessions]
+    return scale, tables, *fit_dynamics(buffer, tables, draws, 0)
 
 
-def test_shrinking_multiplies_every_root_by_kappa(fitted):
-    _, _, data = fitted
-    every = np.arange(len(data.x))
-    free = fit_weights(data, every, 1.0, 1.0)
-    half = fit_weights(data, every, 1.0, 0.5)
-    np.testing.assert_allclose(half[1 : W + 3], free[1 : W + 3] * 0.5 ** lags(W))
-    assert largest_root(half, W) == pytest.approx(0.5 * largest_root(free, W))
-    assert largest_root(fit_weights(data, every, 1.0, 0.0), W) == 0.0
+def linear_scale(buffer):
+    """The scale without the logarithm, so that the known constants can be read off."""
+    return replace(learn_scale(buffer), log=False, beta_mean=0.0, beta_std=1.0)
 
 
-def test_without_shrinkage_the_weights_are_those_of_ridge_regression(fitted):
-    _, _, data = fitted
-    x, y = np.concatenate(data.x), np.concatenate(data.y)
-    days = len(data.visits)
-    dose = W + 6
-    ridge = np.diag(np.r_[1e-6, 10.0 * data.spread[1:-days], np.full(days, 30.0)])
-    ridge[dose, dose] = 1e-6
-    np.testing.assert_allclose(
-        fit_weights(data, np.arange(len(data.x)), 10.0, 1.0, 30.0), np.linalg.solve(x.T @ x + ridge, x.T @ y), rtol=1e-6
-    )
+def test_autoregression_answer_to_the_amplitude_and_levels_of_a_known_system_are_found():
+    buffer, levels = known_system(0)
+    tables = [SessionTable.of(s, linear_scale(buffer)) for s in buffer.sessions]
+    main, drawn = fit_dynamics(buffer, tables, 300, 0)
+    np.testing.assert_allclose(main.phi[:2], [0.5, 0.2], atol=0.05)
+    assert np.abs(main.phi[2:]).max() < 0.06
+    curve = np.array([0.4, 0.7, 1.0])
+    said = answers(curve, np.tile(curve[:, None], (1, 3))) @ main.beta[0]
+    assert said[0] - said[2] == pytest.approx(0.8 * 0.6, abs=0.1)
+    assert np.corrcoef(main.levels[0], levels)[0, 1] > 0.95
+    at_a_level = answers(np.array([0.4, 1.0]), np.array([[0.4] * 3, [1.0] * 3])) @ drawn.beta.T
+    low, high = np.quantile(at_a_level[0] - at_a_level[1], (0.025, 0.975))
+    assert low < 0.48 < high
+    assert high - low < 0.5
 
 
-def test_the_other_weights_are_fitted_again_around_shrunk_roots_so_that_the_level_stays_right(fitted):
-    _, _, data = fitted
-    x, y = np.concatenate(data.x), np.concatenate(data.y)
-    weights = fit_weights(data, np.arange(len(data.x)), 0.1, 0.5)
-    assert abs(float((y - x @ weights).mean())) < 1e-3
+def test_intervals_of_the_fall_of_beta_cover_it_as_often_as_they_say():
+    hits = []
+    for seed in range(40):
+        buffer, _ = known_system(100 + seed, n=12, steps=150)
+        tables = [SessionTable.of(s, linear_scale(buffer)) for s in buffer.sessions]
+        _, drawn = fit_dynamics(buffer, tables, 200, seed)
+        ends = answers(np.array([0.4, 1.0]), np.array([[0.4] * 3, [1.0] * 3])) @ drawn.beta.T
+        low, high = np.quantile(ends[0] - ends[1], (0.05, 0.95))
+        hits.append(low <= 0.48 <= high)
+    assert np.mean(hits) >= 0.8
 
 
-def test_a_free_run_of_all_fits_and_sessions_is_that_of_each_alone(fitted):
-    buffer, scale, data = fitted
-    weights = np.stack([fit_weights(data, np.arange(len(data.x)), 1.0, k, 30.0) for k in (1.0, 0.6)])
-    common = weights.shape[1] - len(data.visits)
-    sessions = [buffer.sessions[0], buffer.sessions[-1]]
-    fast = mean_path(weights, sessions, scale, data.visits)
-    for c in range(2):
-        for j, s in enumerate(sessions):
-            window, memory = scale.beta(s.lead_beta), np.full(3, s.amplitude[0])
-            for t in range(40):
-                if t:
-                    memory = memory * np.array([0.8, 0.95, 0.985]) + (1 - np.array([0.8, 0.95, 0.985])) * s.amplitude[t]
-                newest = float(features(window[None], s.amplitude[t : t + 1], memory[None])[0] @ weights[c, :common])
-                newest += weights[c, common + data.visits.index(s.visit)]
-                assert fast[c, j, t] == pytest.approx(newest, abs=1e-9)
-                window = np.r_[window[1:], newest]
+def test_innovations_of_a_fit_put_its_sessions_together_again():
+    buffer, _ = known_system(1, n=4, steps=60)
+    _, tables, main, _ = fitted(buffer)
+    for i, (table, noise) in enumerate(zip(tables, main.innovations(tables), strict=True)):
+        rest = table.answers @ main.beta[0] + main.levels[0, i]
+        eta = list(table.beta[:W] - rest[:W])
+        for t in range(60):
+            predicted = rest[W + t] + np.dot(main.phi, eta[-1 : -W - 1 : -1])
+            scale = np.exp(noise_features(table.amplitude[t : t + 1], np.array([predicted]))[0] @ main.noise_weights)
+            eta.append(predicted + scale * noise[0, t] - rest[W + t])
+        np.testing.assert_allclose(rest + eta, table.beta, atol=1e-9)
+
+
+def test_steps_without_a_known_window_have_no_innovation_and_the_others_keep_theirs():
+    buffer, _ = known_system(2, n=4, steps=80)
+    gap = buffer.sessions[0].beta.copy()
+    gap[30] = np.nan
+    holed = replace(buffer, sessions=(replace(buffer.sessions[0], beta=gap), *buffer.sessions[1:]))
+    tables = [SessionTable.of(s, learn_scale(holed)) for s in holed.sessions]
+    noise = fit_dynamics(holed, tables, 3, 0)[1].innovations(tables)[0]
+    assert noise.shape == (3, 80)
+    assert np.isnan(noise[:, 30 : 30 + W + 1]).all()
+    assert np.isfinite(noise[:, :30]).all()
+    assert np.isfinite(noise[:, 30 + W + 1 :]).all()
+
+
+def test_a_free_run_is_the_recursion_written_out():
+    buffer, _ = known_system(3, n=4, steps=50)
+    _, tables, main, _ = fitted(buffer)
+    path = mean_path(main, tables[0], 0.3)
+    rest = tables[0].answers @ main.beta[0] + 0.3
+    window = list(tables[0].beta[:W])
+    for t in range(50):
+        expected = rest[W + t] + sum(main.phi[k] * (window[-1 - k] - rest[W + t - 1 - k]) for k in range(W))
+        assert path[t] == pytest.approx(expected, abs=1e-9)
+        window.append(expected)
+
+
+def test_held_out_skill_is_that_of_block_means_of_sessions_that_were_not_learnt_from():
+    strong, _ = known_system(4, fall=2.0, day=0.05, session=0.05)
+    weak, _ = known_system(4, fall=0.0, day=0.05, session=0.6)
+    folds = session_folds(strong.sessions, 4, 0)
+    assert replay_skill(strong, learn_scale(strong), folds) > 0.5
+    assert replay_skill(weak, learn_scale(weak), folds) < 0.3
+    assert block_error(np.r_[np.ones(30), np.full(30, np.nan)], np.zeros(60)) == pytest.approx(1.0)
+
+
+def test_the_answer_has_as_many_columns_as_the_model_says():
+    assert answers(np.array([0.5]), np.array([[0.5, 0.5, 0.5]])).shape == (1, ANSWERS)
+    np.testing.assert_allclose(answers(np.array([1.0]), np.ones((1, 3)))[0, 1:], 0.0, atol=1e-12)
 
 
 def walking(seed, n=14, steps=200):
@@ -105,7 +151,7 @@ def test_a_root_near_one_is_kept_away_from_it_and_the_fall_of_beta_with_amplitud
     falls = []
     for seed in range(3):
         buffer = walking(seed)
-        fitted = LinearModel(LinearConfig(refits=10, rollouts=200)).fit(buffer)
+        fitted = LinearModel(LinearConfig(draws=20)).fit(buffer)
         found = fitted.evaluate({"low": ConstantPolicy(0.4), "high": ConstantPolicy(0.9)}, 200)
         assert found["low"].details["largest_root"] <= LARGEST_ROOT + 1e-9
         falls.append(found["low"].predicted["mean_beta"] - found["high"].predicted["mean_beta"])
@@ -113,38 +159,11 @@ def test_a_root_near_one_is_kept_away_from_it_and_the_fall_of_beta_with_amplitud
     assert min(falls) > 0.0
 
 
-def test_the_candidate_is_the_one_that_predicts_left_out_sessions(fitted):
-    buffer, scale, data = fitted
-    ways = replay_folds(buffer, session_folds(buffer.sessions, 5, 0))
-    assert len(ways) == 2
-    assert sorted(len(fold) for fold in ways[1]) == [1, 2, 3, 14]
-    errors = [replay_errors(buffer, scale, data, folds) for folds in ways]
-    best = choose(errors, ways)
-    means = [np.mean([e[:, fold].mean(1) for fold in folds], axis=0) for e, folds in zip(errors, ways, strict=True)]
-    shares = [sum(float(m[c] / m.min()) for m in means) for c in range(len(CANDIDATES))]
-    assert shares[best] == pytest.approx(min(shares))
-    weights = fit_weights(data, np.setdiff1d(np.arange(len(data.x)), ways[0][0]), *CANDIDATES[best])[None]
-    k = ways[0][0][0]
-    path = mean_path(weights, [buffer.sessions[k]], scale, data.visits)[0, 0]
-    seen = scale.beta(buffer.sessions[k].beta)
-    blocks = [float(path[i : i + 30].mean() - seen[i : i + 30].mean()) ** 2 for i in range(0, seen.size, 30) if seen[i : i + 30].size >= 10]
-    assert errors[0][best, k] == pytest.approx(np.mean(blocks))
-
-
-def test_residuals_keep_their_order_and_have_unit_scale(fitted):
-    _, _, data = fitted
-    weights = fit_weights(data, np.arange(len(data.x)), 1.0, 1.0)
-    noise, residuals = noise_model(data, weights)
-    first = data.y[0] - data.x[0] @ weights
-    scale = np.exp(noise[0] + noise[1] * data.a[0] + noise[2] * np.clip(data.x[0] @ weights, -3, 3))
-    np.testing.assert_allclose(residuals[0][: len(first)] * scale, first)
-
-
 def test_the_reward_is_that_of_sampled_beta_never_of_its_mean(linear_simulator):
     # Mean beta at 0.65 lies under the threshold; the share of steps above it does not vanish, and the step return must say so.
     buffer = linear_simulator.buffer(seed=1)
     quiet = tuple(replace(s, qoc=type(s.qoc)()) for s in buffer.sessions)
-    fitted = LinearModel(LinearConfig(refits=4)).fit(replace(buffer, sessions=quiet))
+    fitted = LinearModel(LinearConfig(draws=20)).fit(replace(buffer, sessions=quiet))
     estimate = fitted.evaluate({"x": ConstantPolicy(0.65)}, 300)["x"]
     of_the_mean = -0.3 * 0.65 * float(np.sum(0.99 ** np.arange(300)))
     truth = linear_simulator.truth()["constant 0.65"][0]
@@ -167,14 +186,6 @@ def test_a_bad_day_is_not_taken_for_a_bad_amplitude():
         lower = 0.3 if kind == "random" else None
         sessions.append(SessionTrajectory(i, visit, kind, beta[:W], beta[W:], a, random_lower_bound=lower))
     buffer = ReplayBuffer(MdpSettings(xi_beta=2.0, c2=0.0, c3=0.0, c4=0.0), tuple(sessions), "uV", "table")
-    found = (
-        LinearModel(LinearConfig(refits=4, rollouts=200))
-        .fit(buffer)
-        .evaluate({"low": ConstantPolicy(0.4), "high": ConstantPolicy(0.9)}, 200)
-    )
+    found = LinearModel(LinearConfig(draws=20)).fit(buffer).evaluate({"low": ConstantPolicy(0.4), "high": ConstantPolicy(0.9)}, 200)
     fall = found["low"].predicted["mean_beta"] - found["high"].predicted["mean_beta"]
     assert fall == pytest.approx(0.25, abs=0.12)
-    scale = learn_scale(buffer)
-    data = regression(buffer, scale)
-    with_days, without = (fit_weights(data, np.arange(16), 0.1, 0.0, penalty) for penalty in (30.0, float("inf")))
-    assert np.abs(without[-2:]).max() < 1e-6 < np.abs(with_days[-2:]).max()
