@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from ml.mdp import step_reward
 from ml.ope.batches import Batch, Scale, learn_scale, make_batch, session_folds
 from ml.ope.coverage import AmplitudeSupport
-from ml.ope.dlsm_networks import GaussianHead, gaussian_kl, gaussian_log_prob
+from ml.ope.dlsm_heads import GaussianHead, gaussian_kl, gaussian_log_prob
 from ml.ope.end_outcomes import EndModel, fit_end_model, summarise
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.progress import Report, part_of, silent
@@ -249,7 +249,7 @@ class FittedDlmm:
         reach = float(norm.ppf((1 + LEVEL) / 2)) * error
         every = max(1, horizon // 50)
         logged, simulated = support.of_policy(policy), support.look(np.concatenate([r.actions[i][:, ::every] for r in runs]))
-        flags = list(logged.flags or simulated.flags)
+        flags = list(dict.fromkeys((*logged.flags, *simulated.flags)))
         if not with_end:
             flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
         predicted = {

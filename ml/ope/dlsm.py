@@ -17,13 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from ml.ope.batches import Batch, Scale, learn_scale, make_batch, session_folds
+from ml.ope.batches import Batch, Scale, learn_scale, make_batch
+from ml.ope.behaviour import controller_key
 from ml.ope.coverage import AmplitudeSupport, Coverage
 from ml.ope.dlsm_config import DlsmConfig
-from ml.ope.dlsm_held_out import HeldOut
+from ml.ope.dlsm_held_out import HeldOut, shares
 from ml.ope.dlsm_rollout import Rollouts, roll_out
+from ml.ope.dlsm_selection import Selection, SelectionRun, usable_folds
 from ml.ope.dlsm_training import Member, MemberTraining
+from ml.ope.end_outcomes import EndModel, fit_end_model
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.observed import day_noise
 from ml.progress import Report, part_of, silent
 from ml.rl.policy import Policy
 from ml.trajectories import ReplayBuffer, content_hash, to_parquet
@@ -48,50 +52,67 @@ class _Data:
 
 @dataclass(frozen=True)
 class Dlsm:
-    """The estimator; `fit` trains the ensemble."""
+    """The estimator; `fit` trains the ensemble, after a choice among `config.candidates()` where the settings ask for one."""
 
     config: DlsmConfig = field(default_factory=DlsmConfig)
     method: str = "dlsm"
 
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedDlsm:
-        """Train every member; members that a checkpoint in `checkpoint_dir` calls finished are not trained again.
+        """Train every member; what a checkpoint in `checkpoint_dir` calls finished is not trained again.
 
         Raises:
             ValueError: fewer than four sessions, no usable step, or a checkpoint of another buffer or other settings.
         """
-        c = self.config
         data = self._prepare(buffer)
-        members = tuple(self._train(data, k, part_of(report, k, c.members), checkpoint_dir) for k in range(c.members))
-        return FittedDlsm(self.method, c, buffer, data.batch, data.scale, members)
+        parts = self.config.members + (1 if self.config.select else 0)
+        selection = self._select(data, part_of(report, 0, parts), checkpoint_dir)
+        c = self._chosen(selection)
+        first = parts - c.members
+        members = tuple(self._train(data, c, k, part_of(report, first + k, parts), checkpoint_dir) for k in range(c.members))
+        return FittedDlsm(self.method, c, buffer, data.batch, data.scale, members, fit_end_model(buffer), selection)
 
     def fit_member(self, buffer: ReplayBuffer, k: int, report: Report = silent, checkpoint_dir: Path | None = None) -> Member:
         """Train member `k` alone, for ensembles whose members learn side by side: `fit` finds its checkpoint finished.
+
+        With `config.select` the choice among candidates comes first; members that share no checkpoint folder each make it, alike.
 
         Raises:
             ValueError: as `fit`, or no such member.
         """
         if not 0 <= k < self.config.members:
             raise ValueError(f"this ensemble has members 0 to {self.config.members - 1}, not {k}")
-        return self._train(self._prepare(buffer), k, report, checkpoint_dir)
+        data = self._prepare(buffer)
+        parts = 2 if self.config.select else 1
+        chosen = self._chosen(self._select(data, part_of(report, 0, parts), checkpoint_dir))
+        return self._train(data, chosen, k, part_of(report, parts - 1, parts), checkpoint_dir)
 
     def _prepare(self, buffer: ReplayBuffer) -> _Data:
-        n, c = len(buffer.sessions), self.config
+        n, c = sum(bool(s.usable().any()) for s in buffer.sessions), self.config
         if n < FEWEST_SESSIONS:
-            raise ValueError(f"the DLSM needs at least {FEWEST_SESSIONS} sessions, of which it holds some out; the buffer has {n}")
+            raise ValueError(f"the DLSM needs at least {FEWEST_SESSIONS} sessions with usable steps and holds some out; the buffer has {n}")
         scale = learn_scale(buffer)
-        folds = session_folds(buffer.sessions, max(2, round(1 / c.held_out)), c.seed)
+        folds = usable_folds(buffer, c.held_out, c.seed)
         named = content_hash(to_parquet(buffer)) + json.dumps(c.to_json(), sort_keys=True)
         return _Data(buffer, make_batch(buffer, scale), scale, folds, hashlib.sha256(named.encode()).hexdigest())
 
-    def _train(self, data: _Data, k: int, report: Report, checkpoint_dir: Path | None) -> Member:
+    def _select(self, data: _Data, report: Report, checkpoint_dir: Path | None) -> Selection | None:
+        if not self.config.select:
+            return None
+        run = SelectionRun(data.buffer, data.batch, data.scale, self.config.candidates(), self.config.seed, data.fingerprint)
+        return run.run(checkpoint_dir, report)
+
+    def _chosen(self, selection: Selection | None) -> DlsmConfig:
+        return self.config if selection is None else self.config.candidates()[selection.chosen]
+
+    def _train(self, data: _Data, config: DlsmConfig, k: int, report: Report, checkpoint_dir: Path | None) -> Member:
         held = data.folds[k % len(data.folds)]
-        training = MemberTraining(data.buffer, data.batch, data.scale, held, self.config, self.config.seed + k, data.fingerprint)
+        training = MemberTraining(data.buffer, data.batch, data.scale, held, config, config.seed + k, data.fingerprint)
         return training.run(None if checkpoint_dir is None else checkpoint_dir / f"dlsm-member-{k}.pt", report)
 
 
 @dataclass(frozen=True)
 class FittedDlsm:
-    """A trained ensemble and the buffer it came from."""
+    """A trained ensemble and the buffer it came from; `config` is what was chosen where there was a choice."""
 
     method: str
     config: DlsmConfig
@@ -99,6 +120,8 @@ class FittedDlsm:
     batch: Batch
     scale: Scale
     members: tuple[Member, ...]
+    end: EndModel
+    selection: Selection | None = None
 
     @property
     def checks(self) -> tuple[HeldOut, ...]:
@@ -112,6 +135,34 @@ class FittedDlsm:
             return self.config.reward_source
         head, known = (sum(getattr(c, name) for c in self.checks) for name in ("error_head", "error_known"))
         return "head" if head < known else "known"
+
+    @property
+    def end_source(self) -> str:
+        """`latent` or `summaries`: what r_end and the QoCs are read from, by r_end of left-out sessions unless the settings say."""
+        if self.config.end_source != "held_out":
+            return self.config.end_source
+        residuals = np.concatenate([np.asarray(c.residual_end) for c in self.checks])
+        if not residuals.size or not self.end.seen[0]:
+            return "latent"
+        return "latent" if float(np.mean(residuals**2)) <= self.end.residual[0] ** 2 else "summaries"
+
+    def held_out_skill(self) -> dict[str, Any]:
+        """Held-out free-running skill of the members together: 1 is perfect, 0 no better than the mean of the learnt sessions.
+
+        `answer_skill` is that of the differences in mean beta between controllers; None while some session was left out by no member.
+        """
+        sessions = {e.session for c in self.checks for e in c.errors}
+        whole = len(sessions) == sum(bool(s.usable().any()) for s in self.buffer.sessions)
+        kinds = {k: controller_key(s) for k, s in enumerate(self.buffer.sessions)}
+        found = shares([c.errors for c in self.checks], kinds if whole else None)
+        return {
+            "beta_skill": 1 - found.beta,
+            "reward_skill": 1 - (found.head if self.reward_source == "head" else found.known),
+            "end_skill": None if found.outcomes is None else 1 - found.outcomes,
+            "answer_skill": None if found.contrast is None else 1 - found.contrast,
+            "score": found.score,
+            "sessions": len(sessions),
+        }
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
         """Roll every policy out in every member and join what they say."""
@@ -127,7 +178,7 @@ class FittedDlsm:
         support = AmplitudeSupport(self.buffer)
         parts = [self._parts(run) for run in main]
         values = np.stack([step + end for step, end in parts])  # [members, P]
-        draws, errors = self._uncertainty(values, main)
+        draws, errors = self._uncertainty(values, main, horizon)
         coverage = [self._coverage(support, policy, main, i) for i, policy in enumerate(policies.values())]
         return {
             name: self._estimate(i, main, second, parts, values, draws[:, i], float(errors[i]), coverage[i], horizon)
@@ -155,34 +206,56 @@ class FittedDlsm:
     def _parts(self, run: Rollouts) -> tuple[Floats, Floats]:
         """Step return and r_end per policy, [P] each; r_end is 0 where the buffer has none."""
         step = run.return_head if self.reward_source == "head" else run.return_known
-        end = run.outcomes[:, :, 0] if self.scale.outcome_seen[0] else np.zeros_like(step)
+        end = self._outcomes(run)[:, :, 0] if self.scale.outcome_seen[0] else np.zeros_like(step)
         return step.mean(1), end.mean(1)
 
-    def _uncertainty(self, values: Floats, runs: list[Rollouts]) -> tuple[Floats, Floats]:
+    def _outcomes(self, run: Rollouts) -> Floats:
+        """r_end and QoCs of the simulated sessions, [P, M, 4]."""
+        return run.outcomes if self.end_source == "latent" else self.end.predict(run.summaries)
+
+    def _uncertainty(self, values: Floats, runs: list[Rollouts], horizon: int) -> tuple[Floats, Floats]:
         """Draws around the values, [DRAWS, P], and standard errors, [P].
 
-        Spread of the ensemble (correlated over policies), error of the level from held-out sessions (common to all policies),
-        Monte-Carlo error (of each policy).
+        Spread of the ensemble (correlated over policies), error of the level from held-out sessions and from few days (common to all
+        policies), slopes of the regression of r_end where it is used (correlated), Monte-Carlo error (of each policy).
         """
         rng = np.random.default_rng(self.config.seed + 2000)
         members, p = values.shape
         centred = values - values.mean(0)
         spread = rng.standard_normal((DRAWS, members)) @ centred / np.sqrt(max(1, members - 1))
-        level = self.level_error()
-        monte_carlo = np.sqrt(np.mean([self._returns(r).var(1) / r.energy.shape[1] for r in runs], axis=0) / members)
-        draws = values.mean(0) + spread + level * rng.standard_normal((DRAWS, 1)) + monte_carlo * rng.standard_normal((DRAWS, p))
-        variance = (centred**2).sum(0) / max(1, members - 1) + level**2 + monte_carlo**2
+        monte_carlo = np.sqrt(np.mean([self._returns(r).var(1) / r.sessions for r in runs], axis=0) / members)
+        ends = self._end_draws(runs)
+        draws = values.mean(0) + spread + ends + monte_carlo * rng.standard_normal((DRAWS, p))
+        days, _ = day_noise(self.buffer, horizon, DRAWS, self.config.seed)
+        common = self.level_error() ** 2 + float(days.var())
+        draws = draws + np.sqrt(common) * rng.standard_normal((DRAWS, 1))
+        variance = (centred**2).sum(0) / max(1, members - 1) + ends.var(0) + common + monte_carlo**2
         return draws, np.sqrt(variance)
+
+    def _end_draws(self, runs: list[Rollouts]) -> Floats:
+        """Errors of r_end's differences between policies by the regression on summaries, [DRAWS, P]; its level is in `level_error`."""
+        if self.end_source == "latent" or not self.scale.outcome_seen[0]:
+            return np.zeros((DRAWS, runs[0].outcomes.shape[0]))
+        drawn = fit_end_model(self.buffer, draws=DRAWS, seed=self.config.seed)
+        means = np.mean([r.summaries.mean(1) for r in runs], axis=0)  # [P, 5]
+        ends = drawn.with_weights(drawn.weights[:, None]).predict(means[None])[:, :, 0]
+        ends = ends - ends.mean(1, keepdims=True)
+        return np.asarray(ends - ends.mean(0), dtype=np.float64)
 
     def _returns(self, run: Rollouts) -> Floats:
         step = run.return_head if self.reward_source == "head" else run.return_known
-        return step + (run.outcomes[:, :, 0] if self.scale.outcome_seen[0] else 0.0)
+        return step + (self._outcomes(run)[:, :, 0] if self.scale.outcome_seen[0] else 0.0)
 
     def level_error(self) -> float:
         """Standard error of the mean held-out residual of the return: how far the level of all estimates may be off."""
         name = f"residual_{self.reward_source}"
         total = 0.0
-        for parts in ([getattr(c, name) for c in self.checks], [c.residual_end for c in self.checks]):
+        if self.end_source == "summaries":
+            total += float(self.end.residual[0]) ** 2 / len(self.buffer.sessions)
+        ends = [c.residual_end for c in self.checks] if self.end_source == "latent" else []
+        for parts in ([getattr(c, name) for c in self.checks], ends):
+            if not parts:
+                continue
             residuals = np.concatenate([np.asarray(r) for r in parts])
             if residuals.size > 1:
                 # Around zero, not around their mean: a bias found on held-out sessions widens the interval.
@@ -208,9 +281,11 @@ class FittedDlsm:
         reach = float(norm.ppf((1 + LEVEL) / 2)) * error
         seen = self.scale.outcome_seen
         logged, simulated = coverage
-        flags = list(dict.fromkeys((*logged.flags, *(() if logged.flags else simulated.flags))))
+        flags = list(dict.fromkeys((*logged.flags, *simulated.flags)))
         if not seen[0]:
             flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+        skill = self.held_out_skill()
+        flags += _warnings(skill)
         other_step, other_end = zip(*(self._parts(run) for run in others), strict=True)
         return Estimate(
             method=self.method,
@@ -224,20 +299,22 @@ class FittedDlsm:
             predicted=self._predicted(runs, i),
             supported=logged.supported and simulated.supported,
             flags=tuple(flags),
-            n=sum(run.energy.shape[1] for run in runs),
+            n=sum(run.sessions for run in runs),
             details={
                 "horizon_steps": horizon,
                 "start": self.config.start,
                 "value_from_other_start": float(np.mean(other_step, axis=0)[i] + np.mean(other_end, axis=0)[i]),
                 "reward_source": self.reward_source,
+                "end_source": self.end_source,
                 "step_return_head": float(np.mean([run.return_head[i].mean() for run in runs])),
                 "step_return_known": float(np.mean([run.return_known[i].mean() for run in runs])),
                 "members": [float(v) for v in values[:, i]],
                 "level_error": self.level_error(),
                 "coverage": logged.to_json(),
                 "coverage_simulated": simulated.to_json(),
-                "held_out": held_out_skill(self.checks, self.scale, self.reward_source),
+                "held_out": skill,
                 "objective": self.config.objective,
+                "selection": None if self.selection is None else self.selection.to_json(),
                 "draws": [round(float(d), 4) for d in draws],
             },
         )
@@ -251,18 +328,15 @@ class FittedDlsm:
         ranges = {"grasp_hz": (0.0, np.inf), "rating": (1.0, 10.0), "tremor_percent": (0.0, 100.0)}
         for j, name in enumerate(OUTCOMES):
             if name in ranges and self.scale.outcome_seen[j]:
-                predicted[name] = float(np.mean([np.clip(run.outcomes[i, :, j], *ranges[name]).mean() for run in runs]))
+                predicted[name] = float(np.mean([np.clip(self._outcomes(run)[i, :, j], *ranges[name]).mean() for run in runs]))
         return predicted
 
 
-def held_out_skill(checks: tuple[HeldOut, ...], scale: Scale, source: str) -> dict[str, Any]:
-    """Held-out free-running skill, averaged over members: 1 is perfect, 0 no better than the sessions' mean."""
-    error = float(np.mean([getattr(c, f"error_{source}") for c in checks]))
-    ends = [c.outcome_error[0] for c in checks if c.outcome_error[0] is not None]
-    return {
-        "reward_error": error,
-        "reward_skill": 1 - error / scale.reward_std**2,
-        "beta_nll": float(np.mean([c.beta_nll for c in checks])),
-        "end_skill": 1 - float(np.mean(ends)) if ends else None,
-        "sessions": len({i for c in checks for i in c.sessions}),
-    }
+def _warnings(skill: dict[str, Any]) -> list[str]:
+    """What the held-out sessions hold against the model, in words."""
+    found = []
+    if skill["score"] >= 1:
+        found.append(f"left-out sessions are predicted no better than by the mean of the others (error {skill['score']:.2f} of that one's)")
+    if skill["answer_skill"] is not None and skill["answer_skill"] <= 0:
+        found.append("the model's answer to the amplitude is no better than none: in left-out sessions it misses how controllers differ")
+    return found

@@ -1,7 +1,7 @@
 """Networks and evidence lower bound of the deep latent sequential model (DLSM).
 
-Source: Gao et al. 2023, section 5 (eq:encoder, eq:decoder, eq:elbo) and Algorithm 1. Every density is a diagonal Gaussian over
-standardised variables with bounded log standard deviation. What differs from the paper is switchable in `DlsmConfig`.
+Source: Gao et al. 2023, section 5 (eq:encoder, eq:decoder, eq:elbo) and Algorithm 1. What differs from the paper is switchable in
+`DlsmConfig`.
 """
 
 from __future__ import annotations
@@ -14,49 +14,9 @@ from torch import Tensor, nn
 
 from ml.ope.batches import Batch
 from ml.ope.dlsm_config import DlsmConfig
+from ml.ope.dlsm_heads import GaussianHead, gaussian_kl, gaussian_log_prob
 from ml.ope.dlsm_recurrence import LatentWeights, bounded, lstm, lstm_loop, stochastic_lstm, stochastic_lstm_loop
 from ml.ope.estimate import OUTCOMES
-
-_HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
-
-
-def gaussian_log_prob(x: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
-    """log N(x; mean, exp(log_std)^2), elementwise."""
-    return -0.5 * ((x - mean) * torch.exp(-log_std)).square() - log_std - _HALF_LOG_TWO_PI
-
-
-def gaussian_kl(mean_q: Tensor, log_std_q: Tensor, mean_p: Tensor, log_std_p: Tensor) -> Tensor:
-    """KL(q || p) = E_q[log q - log p] of diagonal Gaussians, elementwise; at least 0 (the paper's appendix has the sign reversed)."""
-    ratio = torch.exp(2 * (log_std_q - log_std_p))
-    shift = ((mean_q - mean_p) * torch.exp(-log_std_p)).square()
-    return 0.5 * (ratio + shift - 1) - (log_std_q - log_std_p)
-
-
-class GaussianHead(nn.Module):
-    """Mean and bounded log standard deviation as an affine map plus a feed-forward network that starts at zero."""
-
-    def __init__(self, n_in: int, n_out: int, hidden: tuple[int, ...]) -> None:
-        super().__init__()
-        self.affine = nn.Linear(n_in, 2 * n_out)
-        layers: list[nn.Module] = []
-        width = n_in
-        for size in hidden:
-            layers += [nn.Linear(width, size), nn.ELU()]
-            width = size
-        self.body: nn.Module | None = None
-        if layers:
-            last = nn.Linear(width, 2 * n_out)
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
-            self.body = nn.Sequential(*layers, last)
-
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log standard deviation, each [..., n_out], for x [..., n_in]."""
-        raw = self.affine(x)
-        if self.body is not None:
-            raw = raw + self.body(x)
-        mean, log_std = raw.chunk(2, dim=-1)
-        return mean, bounded(log_std)
 
 
 class LatentRecurrence(nn.Module):
@@ -87,16 +47,18 @@ class LatentRecurrence(nn.Module):
 
     def follow(self, x: Tensor, z: Tensor, fast: bool = True) -> tuple[Tensor, Tensor]:
         """Means and log standard deviations of z_t given the z_{t-1} of another path, [T, B, Z]; z is z_0 ... z_{T-1}."""
-        h = (lstm if fast else lstm_loop)(torch.cat([x, z], dim=2), torch.cat([self.w_x, self.w_z]), self.bias, self.w_h)
+        given = torch.cat([x, z], dim=2)
+        h = (lstm if fast else lstm_loop)(given, torch.cat([self.w_x, self.w_z]), self.bias, self.w_h)
         head, raw = (h @ self.w_out + self.b_out).chunk(2, dim=2)
-        return x @ self.a_x + z @ self.a_z + head, bounded(raw)
+        return given @ torch.cat([self.a_x, self.a_z]) + head, bounded(raw)
 
     def step(self, x: Tensor, z: Tensor, h: Tensor, c: Tensor, eps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """One step of a roll-out: z_t, h_t, c_t."""
-        g, i, f, o = (x @ self.w_x + self.bias + z @ self.w_z + h @ self.w_h).chunk(4, dim=1)
-        c = torch.sigmoid(f) * c + torch.sigmoid(i) * torch.tanh(g)
-        h = torch.sigmoid(o) * torch.tanh(c)
-        head, raw = (h @ self.w_out + self.b_out).chunk(2, dim=1)
+        gates = torch.addmm(self.bias, x, self.w_x).addmm_(z, self.w_z).addmm_(h, self.w_h)
+        i, f, o = torch.sigmoid(gates[:, self.hidden :]).chunk(3, dim=1)
+        c = torch.addcmul(i * torch.tanh(gates[:, : self.hidden]), f, c)
+        h = o * torch.tanh(c)
+        head, raw = torch.addmm(self.b_out, h, self.w_out).chunk(2, dim=1)
         return x @ self.a_x + z @ self.a_z + head + bounded(raw).exp() * eps, h, c
 
 
@@ -164,7 +126,7 @@ class DlsmNetworks(nn.Module):
         z, mean_q, log_std_q = self.encoder.run(torch.cat([a, batch.states[1:]], dim=2), z0, noise.encoder, fast)
         mean_p, log_std_p = self.decoder.follow(a, torch.cat([z0.unsqueeze(0), z[:-1]]), fast)
         kl_path = (gaussian_kl(mean_q, log_std_q, mean_p, log_std_p).sum(2) * batch.alive).sum(0)
-        states, rewards, outcomes = self._reconstruct(batch, z)
+        states, rewards, outcomes = self._reconstruct(batch, z, fast)
         return Terms(first_states + states, rewards, outcomes, kl_first, kl_path)
 
     def free_running_terms(self, batch: Batch, noise: Noise, fast: bool = True) -> Terms:
@@ -176,7 +138,7 @@ class DlsmNetworks(nn.Module):
         z0, kl_first, first_states = self._first(batch, noise)
         start = noise.first if self.config.start == "prior" else z0
         z, _, _ = self.decoder.run(batch.actions.unsqueeze(-1), start, noise.decoder, fast)
-        states, rewards, outcomes = self._reconstruct(batch, z)
+        states, rewards, outcomes = self._reconstruct(batch, z, fast)
         return Terms(first_states + states, rewards, outcomes, kl_first, torch.zeros_like(kl_first))
 
     def loss(self, batch: Batch, noise: Noise, fast: bool = True) -> Tensor:
@@ -197,12 +159,11 @@ class DlsmNetworks(nn.Module):
         log_prob = gaussian_log_prob(batch.states[0], *self.first_state(z0)).sum(1) * batch.first_known
         return z0, kl, log_prob
 
-    def _reconstruct(self, batch: Batch, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _reconstruct(self, batch: Batch, z: Tensor, fast: bool) -> tuple[Tensor, Tensor, Tensor]:
         """log p of s_1 ... s_T, of r_0 ... r_{T-1} and of the outcomes along z_1 ... z_T, [B] each."""
         seen = self.head_input(z, batch.actions)
-        states = gaussian_log_prob(batch.states[1:, :, -self.state_width :], *self.state(seen)).sum(2)
-        mean, log_std = self.reward(seen)
-        rewards = gaussian_log_prob(batch.rewards, mean.squeeze(2), log_std.squeeze(2))
+        states = self.state.log_prob(seen, batch.states[1:, :, -self.state_width :], fast)
+        rewards = self.reward.log_prob(seen, batch.rewards.unsqueeze(2), fast)
         outcomes = gaussian_log_prob(batch.outcomes, *self.outcome(self.end_input(z, batch.lengths, batch.alive))) * batch.outcome_mask
         return (states * batch.usable).sum(0), (rewards * batch.usable).sum(0), outcomes.sum(1)
 

@@ -12,9 +12,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 
-from ml.ope.lstm_kernels import cell_backward, cell_forward, latent_backward, latent_forward
+from ml.ope.lstm_kernels import lstm_backward, lstm_forward, stochastic_backward, stochastic_forward
 
 LOG_STD_BOUNDS = (-4.0, 1.0)
 """Bounds of every log standard deviation, of variables that are standardised: no collapse to zero, no escape."""
@@ -92,7 +94,7 @@ def lstm_loop(x: Tensor, w_x: Tensor, bias: Tensor, w_h: Tensor) -> Tensor:
 
 
 def stochastic_lstm(x: Tensor, z0: Tensor, eps: Tensor, weights: LatentWeights) -> tuple[Tensor, Tensor, Tensor]:
-    """`stochastic_lstm_loop` at a fraction of its cost: no graph per step, elementwise work compiled, one product less per direction."""
+    """`stochastic_lstm_loop` at a fraction of its cost: no graph per step, the loop compiled, one product less per direction."""
     result: tuple[Tensor, Tensor, Tensor] = _StochasticLstm.apply(x, z0, eps, *weights)
     return result
 
@@ -103,9 +105,14 @@ def lstm(x: Tensor, w_x: Tensor, bias: Tensor, w_h: Tensor) -> Tensor:
     return result
 
 
-def _project(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """x W + b of all steps in one product; a fresh [T, B, n] that may be overwritten."""
-    return torch.addmm(bias, x.reshape(-1, x.shape[2]), weight).view(x.shape[0], x.shape[1], -1)
+CHUNK = 1 << 18
+"""Numbers per piece of a [T, B, n] array that is worked on at once, so that it is still in the cache when it is read again."""
+
+
+def _pieces(steps: int, per_step: int) -> list[slice]:
+    """Steps in pieces of about `CHUNK` numbers."""
+    length = max(1, CHUNK // per_step)
+    return [slice(first, min(first + length, steps)) for first in range(0, steps, length)]
 
 
 def _starting_at_zero(steps: int, batch: int, width: int, like: Tensor) -> Tensor:
@@ -115,73 +122,86 @@ def _starting_at_zero(steps: int, batch: int, width: int, like: Tensor) -> Tenso
     return states
 
 
+def _arrays(*tensors: Tensor) -> list[NDArray[Any]]:
+    """The same memory, as the compiled loops take it."""
+    return [t.detach().numpy() for t in tensors]
+
+
+def _states(t: slice) -> slice:
+    """States before and after the steps of a piece."""
+    return slice(t.start, t.stop + 1)
+
+
+def _flat(values: Tensor) -> Tensor:
+    """[T, B, n] as [T B, n]."""
+    return values.reshape(-1, values.shape[2])
+
+
 class _StochasticLstm(torch.autograd.Function):
-    """`stochastic_lstm_loop` with hand-written derivatives: loops hold only what is sequential, weight gradients are one product."""
+    """`stochastic_lstm_loop` with hand-written derivatives: loops hold only what is sequential, weight gradients are large products."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        x, z0, eps = inputs[:3]
+        x, z0, eps = inputs[0].contiguous(), inputs[1], inputs[2].contiguous()
         w_x, bias, a_x, w_z, w_h, a_z, w_out, b_out = inputs[3:]
         steps, batch, latent = eps.shape
         hidden = w_h.shape[0]
+        width = 4 * hidden + latent
         low, high = LOG_STD_BOUNDS
         # One product serves gates and skip path: [z, h] @ [[w_z, a_z], [w_h, 0]].
-        joint = torch.cat([torch.cat([w_z, a_z], dim=1), torch.nn.functional.pad(w_h, (0, latent))], dim=0)
+        joint = torch.cat([torch.cat([w_z, a_z], dim=1), pad(w_h, (0, latent))], dim=0)
+        w_in = torch.cat([w_x, a_x], dim=1)
         carry = _starting_at_zero(steps, batch, latent + hidden, like=eps)
         carry[0, :, :latent] = z0
-        w_in = torch.cat([w_x, a_x], dim=1)
-        acts = _project(x, w_in, torch.nn.functional.pad(bias, (0, latent)))
+        acts = eps.new_empty(steps, batch, width)
         c, tanh_c = _starting_at_zero(steps, batch, hidden, like=eps), eps.new_empty(steps, batch, hidden)
-        heads, std = eps.new_empty(steps, batch, 2 * latent), eps.new_empty(steps, batch, latent)
-        arrays = acts.numpy(), c.numpy(), tanh_c.numpy(), carry.numpy()
-        latents = heads.numpy(), arrays[0], eps.contiguous().numpy(), std.numpy(), arrays[3]
-        rows = zip(acts.unbind(0), carry[:-1].unbind(0), carry[1:, :, latent:].unbind(0), heads.unbind(0), strict=True)
-        for t, (act, now, h, head) in enumerate(rows):
-            act.addmm_(now, joint)
-            cell_forward(t, *arrays, latent)
-            torch.addmm(b_out, h, w_out, out=head)
-            latent_forward(t, *latents, low, high)
-        ctx.save_for_backward(x, carry, acts, c, tanh_c, heads, std, eps, w_in, joint, w_out)
-        ctx.sizes = (latent, hidden)
-        return carry[1:, :, :latent].clone(), heads[:, :, :latent].clone(), heads[:, :, latent:] * (high - low) + low
+        z, mean, log_std, share, std = (torch.empty_like(eps) for _ in range(5))
+        weights = _arrays(joint, pad(bias, (0, latent)), w_out.contiguous(), b_out)
+        for t in _pieces(steps, batch * width):
+            torch.mm(_flat(x[t]), w_in, out=_flat(acts[t]))
+            states = _arrays(acts[t], carry[_states(t)], c[_states(t)], tanh_c[t], eps[t], z[t], mean[t], log_std[t], share[t], std[t])
+            stochastic_forward(*states, *weights, low, high - low)
+        ctx.save_for_backward(x, carry, acts, c, tanh_c, eps, share, std, w_in, joint, w_out)
+        return z, mean, log_std
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        x, carry, acts, c, tanh_c, heads, std, eps, w_in, joint, w_out = ctx.saved_tensors
-        latent, hidden = ctx.sizes
+        x, carry, acts, c, tanh_c, eps, share, std, w_in, joint, w_out = ctx.saved_tensors
+        (steps, batch, latent), hidden, width = eps.shape, tanh_c.shape[2], acts.shape[2]
+        pieces = _pieces(steps, batch * width)
         low, high = LOG_STD_BOUNDS
-        batch = eps.shape[1]
-        d_head, d_acts = torch.empty_like(heads), torch.empty_like(acts)
-        joint_t, out_t = joint.t().contiguous(), w_out.t().contiguous()
-        d_carry = eps.new_zeros(batch, latent + hidden)
-        d_h_next = d_carry[:, latent:]
-        d_c, d_h = eps.new_zeros(batch, hidden), eps.new_empty(batch, hidden)
-        from_above = [g.contiguous().numpy() for g in grads]
-        latents = *from_above, heads.numpy(), std.numpy(), eps.contiguous().numpy(), d_carry.numpy(), d_head.numpy(), d_acts.numpy()
-        cells = d_h.numpy(), acts.numpy(), c.numpy(), tanh_c.numpy(), d_c.numpy(), d_acts.numpy()
-        for t, (head, act) in reversed(list(enumerate(zip(d_head.unbind(0), d_acts.unbind(0), strict=True)))):
-            latent_backward(t, *latents, high - low)
-            torch.addmm(d_h_next, head, out_t, out=d_h)
-            cell_backward(t, *cells)
-            torch.mm(act, joint_t, out=d_carry)
-        flat_acts, flat_head = d_acts.reshape(-1, 4 * hidden + latent), d_head.reshape(-1, 2 * latent)
-        d_joint = carry[:-1].reshape(-1, latent + hidden).t() @ flat_acts
-        d_out = carry[1:, :, latent:].reshape(-1, hidden).t() @ flat_head
-        d_in = x.reshape(-1, x.shape[2]).t() @ flat_acts
-        d_x = (flat_acts @ w_in.t()).view(x.shape) if ctx.needs_input_grad[0] else None
-        gates = slice(0, 4 * hidden), slice(4 * hidden, None)
+        room = eps.new_empty(pieces[0].stop, batch, width), eps.new_empty(pieces[0].stop, batch, 2 * latent)
+        d_carry, d_c = torch.zeros_like(carry[0]), torch.zeros_like(c[0])
+        d_in, d_joint, d_out = torch.zeros_like(w_in), torch.zeros_like(joint), eps.new_zeros(latent + hidden, 2 * latent)
+        d_bias, d_b_out = eps.new_zeros(width), eps.new_zeros(2 * latent)
+        d_x = torch.empty_like(x) if ctx.needs_input_grad[0] else None
+        above = [g.contiguous() for g in grads]
+        transposed = _arrays(joint.t().contiguous(), w_out.t().contiguous())
+        for t in reversed(pieces):
+            d_acts, d_heads = (r[: t.stop - t.start] for r in room)
+            given = _arrays(*(g[t] for g in above), acts[t], c[_states(t)], tanh_c[t], eps[t], share[t], std[t])
+            stochastic_backward(*given, *transposed, *_arrays(d_acts, d_heads, d_carry, d_c), high - low)
+            flat, flat_heads, states = _flat(d_acts), _flat(d_heads), carry[_states(t)]
+            d_joint.addmm_(_flat(states[:-1]).t(), flat)
+            d_out.addmm_(_flat(states[1:]).t(), flat_heads)
+            d_in.addmm_(_flat(x[t]).t(), flat)
+            d_bias += flat.sum(0)
+            d_b_out += flat_heads.sum(0)
+            if d_x is not None:
+                torch.mm(flat, w_in.t(), out=_flat(d_x[t]))
+        gates, skip = slice(0, 4 * hidden), slice(4 * hidden, None)
         return (
             d_x,
-            d_carry[:, :latent].clone(),
+            d_carry[:, :latent],
             None,
-            d_in[:, gates[0]],
-            flat_acts[:, gates[0]].sum(0),
-            d_in[:, gates[1]],
-            d_joint[:latent, gates[0]],
-            d_joint[latent:, gates[0]],
-            d_joint[:latent, gates[1]],
-            d_out,
-            flat_head.sum(0),
+            d_in[:, gates],
+            d_bias[gates],
+            d_in[:, skip],
+            d_joint[:latent, gates],
+            d_joint[latent:, gates],
+            d_joint[:latent, skip],
+            d_out[latent:],
+            d_b_out,
         )
 
 
@@ -190,31 +210,36 @@ class _Lstm(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, w_x: Tensor, bias: Tensor, w_h: Tensor) -> Tensor:
+        x = x.contiguous()
         steps, batch, _ = x.shape
         hidden = w_h.shape[0]
-        acts = _project(x, w_x, bias)
+        acts = x.new_empty(steps, batch, 4 * hidden)
         hs, c = _starting_at_zero(steps, batch, hidden, like=x), _starting_at_zero(steps, batch, hidden, like=x)
         tanh_c = x.new_empty(steps, batch, hidden)
-        arrays = acts.numpy(), c.numpy(), tanh_c.numpy(), hs.numpy()
-        for t, (act, before) in enumerate(zip(acts.unbind(0), hs[:-1].unbind(0), strict=True)):
-            act.addmm_(before, w_h)
-            cell_forward(t, *arrays, 0)
+        weights = _arrays(w_h.contiguous(), bias)
+        for t in _pieces(steps, batch * 4 * hidden):
+            torch.mm(_flat(x[t]), w_x, out=_flat(acts[t]))
+            lstm_forward(*_arrays(acts[t], hs[_states(t)], c[_states(t)], tanh_c[t]), *weights)
         ctx.save_for_backward(x, acts, hs, c, tanh_c, w_x, w_h)
-        return hs[1:].clone()
+        return hs[1:]
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         x, acts, hs, c, tanh_c, w_x, w_h = ctx.saved_tensors
-        _, batch, hidden = tanh_c.shape
-        d_acts = torch.empty_like(acts)
-        back = w_h.t().contiguous()
-        d_c, d_h = c.new_zeros(batch, hidden), c.new_zeros(batch, hidden)
-        cells = d_h.numpy(), acts.numpy(), c.numpy(), tanh_c.numpy(), d_c.numpy(), d_acts.numpy()
-        rows = zip(grads[0].unbind(0), d_acts.unbind(0), strict=True)
-        for t, (grad, act) in reversed(list(enumerate(rows))):
-            d_h.add_(grad)
-            cell_backward(t, *cells)
-            torch.mm(act, back, out=d_h)
-        flat = d_acts.view(-1, 4 * hidden)
-        d_x = (flat @ w_x.t()).view(x.shape) if ctx.needs_input_grad[0] else None
-        return d_x, x.reshape(-1, x.shape[2]).t() @ flat, flat.sum(0), hs[:-1].reshape(-1, hidden).t() @ flat
+        (steps, batch, hidden), above = tanh_c.shape, grads[0].contiguous()
+        pieces = _pieces(steps, batch * 4 * hidden)
+        room = acts.new_empty(pieces[0].stop, batch, 4 * hidden)
+        d_h, d_c = torch.zeros_like(c[0]), torch.zeros_like(c[0])
+        d_in, d_bias, d_w_h = torch.zeros_like(w_x), acts.new_zeros(4 * hidden), torch.zeros_like(w_h)
+        d_x = torch.empty_like(x) if ctx.needs_input_grad[0] else None
+        (back,) = _arrays(w_h.t().contiguous())
+        for t in reversed(pieces):
+            d_acts = room[: t.stop - t.start]
+            lstm_backward(*_arrays(above[t], acts[t], c[_states(t)], tanh_c[t]), back, *_arrays(d_acts, d_h, d_c))
+            flat = _flat(d_acts)
+            d_w_h.addmm_(_flat(hs[t]).t(), flat)
+            d_in.addmm_(_flat(x[t]).t(), flat)
+            d_bias += flat.sum(0)
+            if d_x is not None:
+                torch.mm(flat, w_x.t(), out=_flat(d_x[t]))
+        return d_x, d_in, d_bias, d_w_h

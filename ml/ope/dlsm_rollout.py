@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ml.mdp import MdpSettings, step_reward
 from ml.ope.batches import Scale
 from ml.ope.dlsm_networks import DlsmNetworks
+from ml.ope.end_outcomes import LATE_STEPS, SUMMARIES
 from ml.progress import Report, silent
 from ml.rl.policy import Policy
 
@@ -27,17 +28,35 @@ class Rollouts:
         return_known: discounted step return by the known reward on sampled beta (never on its mean: a policy whose mean beta lies just
             under the threshold would look perfect).
         outcomes: r_end, grasp, rating, tremor in their units, [P, M, 4].
-        energy: mean a^2. amplitude: mean a. beta: mean sampled beta, participant's unit.
+        summaries: `end_outcomes.SUMMARIES` of every simulated session, [P, M, 5].
         actions: one in `keep_every` of all actions, [P, K], for the coverage of the policy's own states.
     """
 
     return_head: Floats
     return_known: Floats
     outcomes: Floats
-    energy: Floats
-    amplitude: Floats
-    beta: Floats
+    summaries: Floats
     actions: Floats
+
+    @property
+    def sessions(self) -> int:
+        """M."""
+        return self.outcomes.shape[1]
+
+    @property
+    def amplitude(self) -> Floats:
+        """Mean a."""
+        return self.summaries[:, :, 0]
+
+    @property
+    def energy(self) -> Floats:
+        """Mean a^2."""
+        return self.summaries[:, :, 1]
+
+    @property
+    def beta(self) -> Floats:
+        """Mean sampled beta, participant's unit."""
+        return self.summaries[:, :, 2]
 
 
 def roll_out(
@@ -77,7 +96,7 @@ def roll_out(
         report((first + count) / per_policy, "rolling out policies")
     joined = {
         name: np.concatenate([getattr(p, name) for p in parts], axis=1)
-        for name in ("return_head", "return_known", "outcomes", "energy", "amplitude", "beta", "actions")
+        for name in ("return_head", "return_known", "outcomes", "summaries", "actions")
     }
     return Rollouts(**joined)
 
@@ -111,7 +130,8 @@ def _roll_block(
     h = torch.zeros(p * m, config.hidden, dtype=dtype)
     c = torch.zeros_like(h)
     pooled = torch.zeros_like(z)
-    sums = {name: np.zeros(p * m) for name in ("return_head", "return_known", "energy", "amplitude", "beta")}
+    sums = {name: np.zeros(p * m) for name in ("return_head", "return_known")}
+    summed, late = np.zeros((p * m, len(SUMMARIES))), min(LATE_STEPS, horizon)
     kept, keep_every = [], max(1, horizon // 50)
     for t in range(horizon):
         a = np.concatenate([policy.act(window[i * m : (i + 1) * m]) for i, policy in enumerate(policies)])
@@ -130,15 +150,16 @@ def _roll_block(
         head = networks.reward(seen)[0].squeeze(1).numpy().astype(np.float64)
         sums["return_head"] += discount * (head * scale.reward_std + scale.reward_mean)
         sums["return_known"] += discount * step_reward(settings, window[:, -1], a)
-        sums["energy"] += a**2 / horizon
-        sums["amplitude"] += a / horizon
-        sums["beta"] += window[:, -1] / horizon
+        in_the_end = a / late if t >= horizon - late else np.zeros_like(a)
+        above = window[:, -1] >= settings.xi_beta
+        summed += np.stack([a / horizon, a**2 / horizon, window[:, -1] / horizon, above / horizon, in_the_end], axis=1)
         if t % keep_every == 0:
             kept.append(a)
     end_input = z if config.end_features == "final" else torch.cat([z, pooled / horizon], dim=1)
     outcomes = networks.outcome(end_input)[0].numpy().astype(np.float64) * np.array(scale.outcome_std) + np.array(scale.outcome_mean)
     return Rollouts(
         outcomes=outcomes.reshape(p, m, -1),
+        summaries=summed.reshape(p, m, -1),
         actions=np.stack(kept, axis=1).reshape(p, -1),
         **{name: values.reshape(p, m) for name, values in sums.items()},
     )

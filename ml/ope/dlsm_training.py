@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import torch
 
 from ml.ope.batches import Batch, Scale
 from ml.ope.dlsm_config import DlsmConfig
-from ml.ope.dlsm_held_out import HeldOut, held_out
+from ml.ope.dlsm_held_out import Constant, HeldOut, held_out
 from ml.ope.dlsm_networks import DlsmNetworks
 from ml.progress import Report, silent
 from ml.trajectories import ReplayBuffer
@@ -34,19 +35,29 @@ class MemberTraining:
 
     Args:
         buffer: the sessions. batch: all of them as tensors. scale: their standardisation.
-        held: indices of the sessions that are not learnt from.
+        held: indices of the sessions that are not learnt from and say when to stop.
         config: settings. seed: of initial weights, noise and batches.
         fingerprint: names buffer and settings; a checkpoint of another one is refused.
+        left_out: indices of sessions that are neither learnt from nor looked at.
     """
 
     def __init__(
-        self, buffer: ReplayBuffer, batch: Batch, scale: Scale, held: list[int], config: DlsmConfig, seed: int, fingerprint: str
+        self,
+        buffer: ReplayBuffer,
+        batch: Batch,
+        scale: Scale,
+        held: Sequence[int],
+        config: DlsmConfig,
+        seed: int,
+        fingerprint: str,
+        left_out: Sequence[int] = (),
     ) -> None:
         self.config, self.scale, self.settings, self.seed = config, scale, buffer.settings, seed
         self.fingerprint = fingerprint
         self.held = tuple(held)
-        self.learnt = [i for i in range(len(buffer.sessions)) if i not in set(held)]
+        self.learnt = [i for i in range(len(buffer.sessions)) if i not in {*held, *left_out}]
         self.batch, self.held_batch = batch, batch.select(held)
+        self.constant = Constant.of(batch.select(self.learnt))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.networks = DlsmNetworks(buffer.settings.window, config)
@@ -104,7 +115,7 @@ class MemberTraining:
     def check(self) -> None:
         """Score held-out sessions along free runs and remember the best weights."""
         steps_since = self.step - (self.course[-1][0] if self.course else 0)
-        scored = held_out(self.networks, self.held_batch, self.held, self.scale, self.settings, self.config.replay_draws, seed=self.seed)
+        scored = self.score(self.held_batch, self.held)
         self.course.append((self.step, self.loss_sum / steps_since, scored.score))
         self.loss_sum = 0.0
         if math.isfinite(scored.score) and (self.best is None or scored.score < self.best.score):
@@ -112,6 +123,11 @@ class MemberTraining:
             self.best_weights = {k: v.detach().clone() for k, v in self.networks.state_dict().items()}
         else:
             self.stale += 1
+
+    def score(self, batch: Batch, sessions: tuple[int, ...]) -> HeldOut:
+        """Free runs of sessions that were not learnt from."""
+        draws = self.config.replay_draws
+        return held_out(self.networks, batch, sessions, self.constant, self.scale, self.settings, draws, seed=self.seed)
 
     def save(self, path: Path) -> None:
         """Write everything that training goes on from; the file appears whole or not at all."""

@@ -59,6 +59,27 @@ def test_policies_that_act_alike_get_the_same_roll_outs_whatever_stands_beside_t
     assert beside.value == pytest.approx(alone.value, rel=1e-6)
 
 
+class TwoFaced:
+    """0.5 in the logged states, next to nothing in simulated ones."""
+
+    def __init__(self, logged_states):
+        self.logged_states = logged_states
+
+    def act(self, states):
+        return np.full(len(states), 0.5) if len(states) == self.logged_states else np.linspace(0.0, 0.08, len(states))
+
+
+def test_a_check_that_fails_in_simulated_sessions_is_shown_beside_a_flag_of_the_logged_ones(small_buffer):
+    policies = {"two-faced": TwoFaced(len(small_buffer.transitions().states)), "half": ConstantPolicy(0.5)}
+    found = Dlmm(TINY).fit(small_buffer).evaluate(policies, 20)
+    flags = " | ".join(found["two-faced"].flags)
+    assert "no closed loop: about 50 %" in flags
+    assert "as good as no stimulation in 100 %" in flags
+    assert "not supported by the data" in flags
+    assert not found["two-faced"].supported
+    assert sum("no closed loop" in flag for flag in found["half"].flags) == 1
+
+
 def test_without_any_qoc_the_estimate_is_the_step_return_and_says_so(small_buffer):
     bare = ReplayBuffer(small_buffer.settings, tuple(replace(s, qoc=Qoc()) for s in small_buffer.sessions), "uV", "table")
     estimate = Dlmm(TINY).fit(bare).evaluate({"half": ConstantPolicy(0.5)}, 20)["half"]

@@ -11,7 +11,8 @@ import torch
 
 from ml.ope.batches import Batch, learn_scale, make_batch
 from ml.ope.dlsm_config import DlsmConfig
-from ml.ope.dlsm_networks import DlsmNetworks, Noise, gaussian_kl, gaussian_log_prob
+from ml.ope.dlsm_heads import gaussian_kl, gaussian_log_prob
+from ml.ope.dlsm_networks import DlsmNetworks, Noise
 from ml.ope.dlsm_recurrence import LOG_STD_BOUNDS
 
 LINEAR = DlsmConfig(latent=1, hidden=2, heads=(), action_emission=False, end_features="final", objective="posterior")

@@ -115,6 +115,27 @@ def test_an_estimate_carries_its_parts_and_predictions(small_buffer):
     assert estimate.details["horizon_steps"] == 20
 
 
+class TwoFaced:
+    """0.5 in the logged states, next to nothing in simulated ones."""
+
+    def __init__(self, logged_states):
+        self.logged_states = logged_states
+
+    def act(self, states):
+        return np.full(len(states), 0.5) if len(states) == self.logged_states else np.linspace(0.0, 0.08, len(states))
+
+
+def test_a_check_that_fails_in_simulated_sessions_is_shown_beside_a_flag_of_the_logged_ones(small_buffer):
+    policies = {"two-faced": TwoFaced(len(small_buffer.transitions().states)), "half": ConstantPolicy(0.5)}
+    found = Dlsm(TINY).fit(small_buffer).evaluate(policies, 20)
+    flags = " | ".join(found["two-faced"].flags)
+    assert "no closed loop: about 50 %" in flags
+    assert "as good as no stimulation in 100 %" in flags
+    assert "not supported by the data" in flags
+    assert not found["two-faced"].supported
+    assert sum("no closed loop" in flag for flag in found["half"].flags) == 1
+
+
 def test_without_any_qoc_the_estimate_is_the_step_return_and_says_so(small_buffer):
     bare = tuple(replace(s, qoc=type(s.qoc)()) for s in small_buffer.sessions)
     estimate = Dlsm(TINY).fit(ReplayBuffer(small_buffer.settings, bare, "uV", "table")).evaluate(POLICIES, 20)["low"]
@@ -165,6 +186,25 @@ def test_a_rolled_out_window_shifts_by_one_beta_unless_the_whole_window_is_drawn
         assert np.array_equal(seen[1][:, :-1], seen[0][:, 1:]) == (not config.decode_all_window)
     with pytest.raises(ValueError, match="decode_all_window needs"):
         replace(TINY, decode_all_window=True)
+
+
+def test_a_model_that_predicts_left_out_sessions_no_better_than_their_mean_says_so(small_buffer):
+    unlearnt = Dlsm(replace(TINY, steps=1, learning_rate=1e-9)).fit(small_buffer).evaluate(POLICIES, 20)["low"]
+    assert unlearnt.details["held_out"]["score"] > 1
+    assert any("no better than by the mean" in flag for flag in unlearnt.flags)
+
+
+@pytest.mark.parametrize(("answer", "said"), [(-0.5, True), (0.5, False)])
+def test_a_model_that_answers_the_wrong_way_round_in_left_out_sessions_says_so(small_buffer, answer, said):
+    fitted = Dlsm(replace(TINY, members=5, steps=5)).fit(small_buffer)  # each session is left out by one member
+
+    def answering(check):
+        return replace(check, errors=tuple(replace(e, beta_predicted=answer * e.beta_seen) for e in check.errors))
+
+    members = tuple(replace(m, check=answering(m.check)) for m in fitted.members)
+    estimate = replace(fitted, members=members).evaluate(POLICIES, 20)["low"]
+    assert estimate.details["held_out"]["answer_skill"] == pytest.approx(1 - (1 - answer) ** 2)
+    assert any("answer to the amplitude" in flag for flag in estimate.flags) == said
 
 
 @pytest.mark.slow

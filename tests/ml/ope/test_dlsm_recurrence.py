@@ -5,6 +5,7 @@ import pytest
 import torch
 from numba import njit
 
+from ml.ope import dlsm_recurrence
 from ml.ope.dlsm_recurrence import LOG_STD_BOUNDS, LatentWeights, bounded, lstm, lstm_loop, stochastic_lstm, stochastic_lstm_loop
 from ml.ope.lstm_kernels import squash
 
@@ -39,6 +40,18 @@ def both(inputs):
 def test_the_fused_stochastic_recurrence_has_the_values_and_gradients_of_the_loop(steps, batch, latent, hidden):
     for fast, slow in both(tensors(steps, batch, latent, hidden)):
         torch.testing.assert_close(fast, slow, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("numbers", [1, 200])
+def test_the_steps_may_be_worked_through_in_pieces_of_any_size(numbers, monkeypatch):
+    monkeypatch.setattr(dlsm_recurrence, "CHUNK", numbers)
+    for fast, slow in both(tensors(23, 3, 4, 5)):
+        torch.testing.assert_close(fast, slow, rtol=1e-9, atol=1e-11)
+    x, _, _, w_x, bias, _, _, w_h, *_ = tensors(23, 3, 2, 5)
+    wanted = [x, w_x, bias, w_h]
+    grads = [torch.autograd.grad((way(*wanted) ** 2).sum(), wanted) for way in (lstm, lstm_loop)]
+    for a, b in zip(*grads, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-11)
 
 
 def test_single_precision_with_its_fitted_tanh_stays_within_a_millionth_per_step():
