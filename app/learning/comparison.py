@@ -8,6 +8,8 @@ from typing import Any
 
 from app.learning.models import Policy, Sweep
 from app.platform.charts import Chart, axis, figure
+from ml.rl.selection import Gain, surest
+from ml.rl.support import LARGEST_SHARE_BELOW
 
 PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")
 DASHES = ("solid", "dash", "dot")
@@ -32,6 +34,8 @@ class Candidate:
         mean_amplitude: over the buffer's states, fraction.
         best_update: the update whose state was kept; None: the last.
         rate: the policy's learning rate. seed: of its training.
+        gain: estimated return less that of cDBS, with its lower bound; None where it was not estimated.
+        below: the lower bound B of the buffer's random sessions, and the share of its states answered with less; None where unknown.
     """
 
     policy: Policy
@@ -43,6 +47,13 @@ class Candidate:
     best_update: int | None
     rate: float | None
     seed: int | None
+    gain: Gain | None
+    below: tuple[float, float] | None
+
+    @property
+    def leaves_the_logged_range(self) -> bool:
+        """Whether it asks for less than the random controller was allowed to more often than `LARGEST_SHARE_BELOW`."""
+        return self.below is not None and self.below[1] > LARGEST_SHARE_BELOW
 
 
 def candidates(sweep: Sweep) -> list[Candidate]:
@@ -58,6 +69,18 @@ def better_without_learning(found: Sequence[Candidate], yardsticks: Sequence[dic
     return str(best["controller"]) if best is not None and scores and best["score"] > max(scores) else None
 
 
+def surely_above_cdbs(found: Sequence[Candidate]) -> Candidate | None:
+    """The policy with the largest lower bound of its gain over cDBS; None where no bound lies above 0."""
+    name = surest({str(k): c.gain for k, c in enumerate(found) if c.gain is not None})
+    return None if name is None else found[int(name)]
+
+
+def below_bound(policy: Policy) -> tuple[float, float] | None:
+    """The lower bound of the random sessions that a policy learned from, and how often it asks for less; None where that is not known."""
+    told = policy.metrics.get("below_bound")
+    return None if told is None else (float(told["bound"]), float(told["share"]))
+
+
 def _candidate(policy: Policy) -> Candidate:
     held, last = policy.metrics.get("held_out", {}), policy.metrics.get("last", {})
     at = _kept(held, policy.metrics.get("best_update"))
@@ -71,6 +94,8 @@ def _candidate(policy: Policy) -> Candidate:
         best_update=policy.metrics.get("best_update"),
         rate=policy.config.get("actor_lr"),
         seed=policy.seed,
+        gain=Gain(**gained) if (gained := policy.metrics.get("gain_over_cdbs")) else None,
+        below=below_bound(policy),
     )
 
 

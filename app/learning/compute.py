@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,12 +73,13 @@ def train(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, An
         results = method.train_many(learnt, configs, told_to, workdir / "checkpoint.pt", initial, held_out)
     except (TrainingDiverged, CheckpointError, ValueError) as error:
         raise JobError(f"The policies cannot be trained: {error}.") from error
-    states = buffer.transitions().states
+    gains = gains_over_cdbs(buffer, [result.policy for result in results])
     members = []
-    for k, result in enumerate(results):
+    for k, (result, gain) in enumerate(zip(results, gains, strict=True)):
         write_atomically(workdir / policy_file(k), result.policy.to_onnx())
         write_atomically(workdir / training_file(k), result.to_bytes())
-        members.append({"config": result.config.to_json(), "metrics": _metrics(result, states) | _share_of_end(learnt, result.config)})
+        metrics = _metrics(result, buffer) | _share_of_end(learnt, result.config) | {"gain_over_cdbs": gain}
+        members.append({"config": result.config.to_json(), "metrics": metrics})
     return {"members": members, "held_out_sessions": [s.session_id for s in held_out.sessions.sessions] if held_out else []}
 
 
@@ -141,6 +144,7 @@ def _hold_out(buffer: ReplayBuffer, wanted: bool, every: int) -> tuple[ReplayBuf
     """Sessions to learn from, and those that watch; all and none where they are too few to spare any."""
     from ml.ope.fqe_score import fqe_value
     from ml.rl.held_out import HeldOut, split_sessions
+    from ml.rl.support import stays_in_range
 
     if not wanted or len(buffer.sessions) < FEWEST_TO_HOLD_OUT:
         return buffer, None
@@ -149,7 +153,12 @@ def _hold_out(buffer: ReplayBuffer, wanted: bool, every: int) -> tuple[ReplayBuf
     if not any(s.usable().any() for s in left.sessions) or not learnt.transitions().states.size:
         return buffer, None
     watching = HeldOut(
-        sessions=left, score=lambda policy: fqe_value(learnt, policy, left.sessions).value, score_name="fqe", every=every, patience=6
+        sessions=left,
+        score=lambda policy: fqe_value(learnt, policy, left.sessions).value,
+        score_name="fqe",
+        eligible=lambda policy: stays_in_range(policy, learnt),
+        every=every,
+        patience=6,
     )
     return learnt, watching
 
@@ -164,7 +173,33 @@ def _share_of_end(learnt: ReplayBuffer, config: TrainConfig) -> dict[str, Any]:
     return {"end_reward": {"skill": share.skill, "sessions": share.sessions} if share else None}
 
 
-def _metrics(result: TrainedPolicy, states: Any) -> dict[str, Any]:
+def gains_over_cdbs(buffer: ReplayBuffer, policies: Sequence[Policy]) -> list[dict[str, float] | None]:
+    """Gain of each policy over cDBS by fitted Q evaluation of the whole buffer, with its lower bound over resampled sessions.
+
+    The policies have seen most of these sessions, which flatters them; the resamples are the same for all. None where the sessions allow
+    no such estimate.
+    """
+    from ml.ope.fqe import Fqe
+    from ml.rl.policy import ConstantPolicy
+    from ml.rl.selection import gains_over
+
+    named = {str(k): policy for k, policy in enumerate(policies)}
+    try:
+        gains = gains_over(Fqe().fit(buffer), named, ConstantPolicy(1.0))
+    except ValueError:  # what the method says of sessions that it cannot start from
+        return [None] * len(policies)
+    return [asdict(gains[name]) for name in named]
+
+
+def _below_bound(policy: Policy, buffer: ReplayBuffer) -> dict[str, Any]:
+    """How often a policy asks for less, on the buffer's states, than the random controller was allowed to; null without such a session."""
+    from ml.rl.support import random_bound, share_below_bound
+
+    bound = random_bound(buffer)
+    return {"below_bound": None if bound is None else {"bound": bound, "share": share_below_bound(policy, buffer)}}
+
+
+def _metrics(result: TrainedPolicy, buffer: ReplayBuffer) -> dict[str, Any]:
     """What a trained policy is stored with."""
     held = {name: values.tolist() for name, values in result.held_out.items()}
     return {
@@ -172,10 +207,10 @@ def _metrics(result: TrainedPolicy, states: Any) -> dict[str, Any]:
         "last": {name: float(values[-1]) for name, values in result.curve.items()},
         "held_out": held,
         "best_update": result.best_update,
-        "mean_amplitude_on_buffer": float(result.policy.act(states).mean()),
+        "mean_amplitude_on_buffer": float(result.policy.act(buffer.transitions().states).mean()),
         "parameters": result.policy.parameter_count,
         "macs": result.policy.macs,
-    } | _scale_of(result.policy)
+    } | (_below_bound(result.policy, buffer) | _scale_of(result.policy))
 
 
 @compute("distil")
@@ -200,14 +235,14 @@ def distil(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, A
     except (TrainingDiverged, ValueError) as error:
         raise JobError(f"The policy cannot be distilled: {error}.") from error
     write_atomically(workdir / POLICY, result.policy.to_onnx())
-    states = buffer.transitions().states
     return {
         "config": config.to_json(),
         "metrics": result.report()
         | {
             "curve": {name: _thinned(values.tolist()) for name, values in result.curve.items()},
-            "mean_amplitude_on_buffer": float(result.policy.act(states).mean()),
+            "mean_amplitude_on_buffer": float(result.policy.act(buffer.transitions().states).mean()),
         }
+        | _below_bound(result.policy, buffer)
         | _scale_of(result.policy),
     }
 

@@ -18,6 +18,9 @@ TRAINING: dict[str, dict[str, Any]] = {
 CONSTRAINED = {"low": 1e-4, "high": 1e-3}
 """Learning rates of the other algorithms: around the 3e-4 of their publications."""
 
+ANCHORED = ("td3_bc", "rebrac")
+"""Algorithms whose policies are held near an amplitude."""
+
 FINE_TUNING = {"low": 1e-7, "high": 1e-5}
 """The paper's learning rates when going on from a tested policy."""
 
@@ -27,8 +30,9 @@ DISTILLATION: dict[str, dict[str, Any]] = {"full": {"updates": 5_000, "sigma": 0
 def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]) -> list[dict[str, Any]]:
     """The policies of a sweep in groups that are trained side by side, each in a child process of its own.
 
-    From scratch the policies are dealt to the algorithms (and aims) in turn; those of one algorithm have learning rates spread evenly
-    in the logarithm and fill two groups, one for each core. Seeds count up over all. A fine-tuned policy is a group of its own.
+    From scratch the policies are dealt to the algorithms (with their aims and anchors) in turn; those of one kind have learning rates
+    spread evenly in the logarithm and fill two groups, one for each core. Seeds count up over all. A fine-tuned policy is a group of its
+    own.
 
     Args:
         params: what was asked for.
@@ -41,12 +45,14 @@ def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]
         return [_fine_tuning(params, k, start) for k, start in enumerate(starts) if start is not None]
     groups: list[dict[str, Any]] = []
     aims = ("steps", "return") if params.aim == "both" else (params.aim,)
-    kinds = [(algorithm, aim) for algorithm in params.algorithms for aim in aims]
-    for which, (algorithm, aim) in enumerate(kinds):
+    kinds = [
+        (algorithm, {"aim": aim} | anchor) for algorithm in params.algorithms for aim in aims for anchor in _anchors(params, algorithm)
+    ]
+    for which, (algorithm, changes) in enumerate(kinds):
         numbers = list(range(which, params.count, len(kinds)))
         low, high = _rates(params, algorithm)
         configs = [
-            _config(params, algorithm, actor_lr=_between(low, high, k, len(numbers)), seed=params.seed + number) | {"aim": aim}
+            _config(params, algorithm, actor_lr=_between(low, high, k, len(numbers)), seed=params.seed + number) | changes
             for k, number in enumerate(numbers)
         ]
         half = -(-len(configs) // 2)
@@ -57,10 +63,18 @@ def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]
 def _fine_tuning(params: TrainParams, k: int, start: dict[str, Any]) -> dict[str, Any]:
     low, high = _rates(params, start["algorithm"])
     rate = _between(low, high, k, len(params.policies))
-    config = _config(params, start["algorithm"], actor_lr=rate, seed=params.seed + k) | {
-        "aim": "return" if params.aim == "return" else "steps"
-    }
+    config = _config(params, start["algorithm"], actor_lr=rate, seed=params.seed + k)
+    config |= {"aim": "return" if params.aim == "return" else "steps"} | _anchors(params, start["algorithm"])[0]
     return {"key": f"train/{k}", "algorithm": start["algorithm"], "configs": [config], "start": start}
+
+
+def _anchors(params: TrainParams, algorithm: str) -> list[dict[str, Any]]:
+    """What the policies of an algorithm are held near, as members of its configuration; the logged amplitudes first."""
+    logged: dict[str, Any] = {"anchor": "logged"}
+    cdbs: dict[str, Any] = {"anchor": "constant", "anchor_amplitude": 1.0}
+    if algorithm not in ANCHORED:
+        return [{}]
+    return {"logged": [logged], "cdbs": [cdbs], "both": [logged, cdbs]}[params.anchor]
 
 
 def _rates(params: TrainParams, algorithm: str) -> tuple[float, float]:

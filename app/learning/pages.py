@@ -12,8 +12,9 @@ from sqlalchemy.orm import Session
 from app.accounts import policy as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.policy import Caller
-from app.learning import bundles, repository, service
+from app.learning import repository, service
 from app.learning.api import CurrentPolicy, CurrentSnapshot, read_limited
+from app.learning.comparison import below_bound
 from app.learning.coverage import describe
 from app.learning.models import Policy
 from app.learning.schemas import ALGORITHM_NAMES, PolicyChange, PolicyLabel
@@ -26,6 +27,7 @@ from app.platform.templates import render
 from app.study import repository as study_repository
 from app.study.api import CurrentParticipant
 from app.study.models import Participant
+from ml.rl.support import LARGEST_SHARE_BELOW
 
 router = APIRouter()
 
@@ -83,11 +85,9 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
         teacher=related.get(policy.teacher_id or 0),
         parent=related.get(policy.parent_id or 0),
         settings=version,
+        below=below if (below := below_bound(policy)) and below[1] > LARGEST_SHARE_BELOW else None,
         curves=curve_charts(policy.metrics.get("curve", {}), f"policy {policy.name}"),
         config={k: v for k, v in policy.config.items() if not k.endswith("_every")},
-        cdbs_ma=participant.current_settings.cdbs_amplitude_ma,
-        device=bundles.device_limits(db, participant, None),
-        sides=sorted({a.hemisphere for visit in participant.visits for a in visit.cdbs_amplitudes}),
         may_write=_may(caller, can.WRITE_POLICIES, participant),
     )
     return HTMLResponse(page)

@@ -52,6 +52,11 @@ class SweepParams(Model):
         "steps",
         description="What the critics sum: step rewards, as in the paper; each step's share of r_end besides; or one and the other.",
     )
+    anchor: Literal["logged", "cdbs", "both"] = Field(
+        "logged",
+        description="What TD3+BC and ReBRAC hold the policy near: the logged amplitudes, as published; the cDBS amplitude, so that it "
+        "leaves the standard of care only where the values speak for it; or by turns one and the other. The others have no such bond.",
+    )
     policies: PolicyIds = Field(default_factory=list, description="Fine-tune from each of these; empty: train from scratch.")
     count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch; the paper trains 6.")
     held_out: bool = Field(
@@ -191,6 +196,13 @@ class SweepCandidateOut(Model):
     action_distance: float | None = Field(description="Mean absolute difference from the logged amplitudes, fraction.")
     saturated: float | None = Field(description="Share of states answered with next to 0 or 1.")
     mean_amplitude: float | None
+    gain_over_cdbs: float | None = Field(
+        description="Estimated return less that of cDBS, by fitted Q evaluation of the whole buffer; null where it was not estimated."
+    )
+    gain_low: float | None = Field(description="Its one-sided lower 95 % bound over resampled sessions.")
+    below_bound: float | None = Field(
+        description="Share of the buffer's states answered with less than the lower bound of its random sessions; null without those."
+    )
 
 
 class YardstickOut(Model):

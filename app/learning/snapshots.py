@@ -22,12 +22,13 @@ from app.accounts.policy import SYSTEM, Caller
 from app.learning import repository
 from app.learning.gate import LEARNED, Gate, gate
 from app.learning.models import BufferSnapshot, SnapshotSession
+from app.learning.trajectories import trajectory_of
 from app.platform import files
 from app.platform.errors import Invalid
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.models import Controller, Participant, SettingsVersion, StudySession
+from app.study.models import Participant, SettingsVersion, StudySession
 from app.study.traces import StepTable
 from ml.mdp import MdpSettings
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
@@ -106,16 +107,17 @@ def collect(db: Session, participant: Participant) -> Collection:
     """The buffer of the participant as the data are now; nothing is stored.
 
     Raises:
-        Invalid: no beta threshold yet (with a suggestion from the data), or no session with a usable step (with the reasons).
+        Invalid: no beta threshold yet (with a suggestion from the data), one without a unit and source, or no session with a usable step
+            (with the reasons).
     """
     version = participant.current_settings
     suggestion = study.suggest_xi_beta(db, participant, SYSTEM) if version.xi_beta is None else None
     settings = study.mdp_settings(version, suggestion)
     sessions = [s for s in study_repository.sessions_of_participant(db, participant.id) if s.status == "confirmed"]
     read = [_read(db, session, settings) for session in sessions]
-    unit, source, chosen_by = _signal(version, read)
+    unit, source = _signal(version, read)
     barrier = gate(db, participant, sessions)
-    members = tuple(_pass_gate(_admit(m, unit, source, chosen_by), barrier) for m in read)
+    members = tuple(_pass_gate(_admit(m, unit, source), barrier) for m in read)
     if not any(m.trajectory for m in members):
         reasons = Counter(m.left_out for m in members)
         listed = "; ".join(f"{n} x {reason}" for reason, n in reasons.most_common(4))
@@ -124,8 +126,6 @@ def collect(db: Session, participant: Participant) -> Collection:
             + (f": {listed}." if listed else ": no confirmed session at all."),
             "Upload sessions with a beta trace and an amplitude trace, or mend what is named.",
         )
-    assert unit is not None
-    assert source is not None
     return Collection(version, settings, members, unit, source)
 
 
@@ -175,40 +175,12 @@ def _read(db: Session, session: StudySession, settings: MdpSettings) -> Member:
         table = study.session_data(db, session).table
     except Invalid as error:
         return Member(session, None, None, str(error))
-    reason = _own_reason(session, table)
-    if reason:
-        return Member(session, table, None, reason)
-    arm = blinding.arm(session, SYSTEM)
-    lead = settings.window
-    trajectory = SessionTrajectory(
-        session_id=session.id,
-        visit=session.visit.number,
-        controller=arm.controller.value,
-        policy_id=arm.policy_id,
-        lead_beta=table.beta[:lead],
-        beta=table.beta[lead:],
-        amplitude=table.fraction[lead:],
-        qoc=study.qoc_of(session),
-        random_lower_bound=settings.lower_bound if arm.controller is Controller.RANDOM else None,
-    )
+    trajectory = trajectory_of(session, table, blinding.arm(session, SYSTEM), settings.window, settings.lower_bound)
+    if isinstance(trajectory, str):
+        return Member(session, table, None, trajectory)
     if not trajectory.usable().any():
         return Member(session, table, None, _why_unusable(trajectory, table))
     return Member(session, table, trajectory, None)
-
-
-def _own_reason(session: StudySession, table: StepTable) -> str | None:
-    if session.excluded_reason:
-        return f"excluded by a person: {session.excluded_reason}"
-    if table.beta_trace is None:
-        channel = f"'{session.control_stream}'" + (f" on channel '{session.control_channel}'" if session.control_channel else "")
-        return f"no beta trace {channel} in its recordings"
-    if table.amplitude_trace is None:
-        return "no amplitude trace in its recordings"
-    if np.isnan(table.fraction).all():
-        return "the cDBS amplitude is not known, so that milliamperes give no fraction" if table.cdbs_ma is None else "no valid amplitude"
-    if not (table.t_s > 0).any():
-        return "shorter than one step"
-    return None
 
 
 def _why_unusable(trajectory: SessionTrajectory, table: StepTable) -> str:
@@ -221,34 +193,32 @@ def _why_unusable(trajectory: SessionTrajectory, table: StepTable) -> str:
     )
 
 
-def _signal(version: SettingsVersion, read: list[Member]) -> tuple[str | None, str | None, str]:
-    """The one unit and source of beta for the buffer: the settings', or what most sessions have (then their steps, then the name)."""
-    unit, source = version.beta_unit, version.beta_source
-    if unit is not None and source is not None:
-        return unit, source, "the participant's settings say"
-    sessions: Counter[tuple[str, str]] = Counter()
-    steps: Counter[tuple[str, str]] = Counter()
-    for m in read:
-        if m.trajectory is None or m.table is None or m.table.beta_trace is None:
-            continue
-        key = (m.table.beta_trace.unit, m.table.beta_trace.source)
-        if unit in (None, key[0]) and source in (None, key[1]):
-            sessions[key] += 1
-            steps[key] += m.steps or 0
-    if not sessions:
-        return unit, source, "the participant's settings say"
-    best = max(sessions, key=lambda key: (sessions[key], steps[key], key))
-    return *best, "the participant's settings do not name both, and most sessions have"
+def _signal(version: SettingsVersion, read: list[Member]) -> tuple[str, str]:
+    """The one unit and source of beta for the buffer, as the settings state them.
+
+    Raises:
+        Invalid: they do not. A threshold without a unit judges no trace, and every reward rests on it.
+    """
+    unstated = [name for name, value in (("unit", version.beta_unit), ("source", version.beta_source)) if not value]
+    if not unstated:
+        return str(version.beta_unit), str(version.beta_source)
+    kinds = Counter(f"{m.table.beta_trace.unit} from {m.table.beta_trace.source}" for m in read if m.table and m.table.beta_trace)
+    raise Invalid(
+        f"Nobody has stated the {' and the '.join(unstated)} of the threshold of {version.xi_beta:g} of participant "
+        f"{version.participant.code}, so that no reward can be computed.",
+        "State unit and source of beta in the participant's settings."
+        + (f" The confirmed sessions have beta in {', '.join(f'{kind} ({n})' for kind, n in kinds.most_common(4))}." if kinds else ""),
+    )
 
 
-def _admit(m: Member, unit: str | None, source: str | None, chosen_by: str) -> Member:
+def _admit(m: Member, unit: str, source: str) -> Member:
     """Leave out what is in another unit or from another source: beta amplitudes of two kinds are never mixed."""
     if m.trajectory is None or m.table is None or m.table.beta_trace is None:
         return m
     trace = m.table.beta_trace
     if (trace.unit, trace.source) == (unit, source):
         return m
-    reason = f"its beta is in {trace.unit} from {trace.source}; {chosen_by} {unit or 'another unit'} from {source or 'another source'}"
+    reason = f"its beta is in {trace.unit} from {trace.source}; the participant's settings say {unit} from {source}"
     return Member(m.session, m.table, None, reason)
 
 

@@ -53,6 +53,9 @@ def sweep_out(db: Session, sweep: Sweep) -> SweepOut:
                 action_distance=c.action_distance,
                 saturated=c.saturated,
                 mean_amplitude=c.mean_amplitude,
+                gain_over_cdbs=c.gain.value if c.gain else None,
+                gain_low=c.gain.low if c.gain else None,
+                below_bound=c.below[1] if c.below else None,
             )
             for c in comparison.candidates(sweep)
         ],

@@ -40,8 +40,8 @@ class Preset:
     pipeline: dict[str, Any]
 
 
-LEARNING: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both"}
-"""The paper's algorithm and one that keeps closer to what was logged, each with and without a share of r_end: a sweep that can differ."""
+LEARNING: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "both"}
+"""The paper's algorithm, and one held near what was logged or near cDBS, each with and without a share of r_end: a sweep that can differ."""
 
 PRESETS: Final = {
     "quick": Preset(

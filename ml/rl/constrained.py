@@ -11,12 +11,17 @@ One update on a batch (s, a, r, s', a'), where a' is the action logged after a:
 TD3+BC has c = 0, b = 1 / alpha, Q = Q_1 and plain critics; ReBRAC has c and b of their own, Q = min(Q_1, Q_2) and normalised critics.
 Actions in penalties and noise are 2a - 1 in [-1, 1], so that published coefficients keep their meaning; rewards are scaled to returns of
 deviation 1. ReBRAC's third hidden layer is left out: the actor keeps the paper's shape.
+
+Ours: with `anchor: constant` the actor's a is a constant amplitude, by default 1, the participant's cDBS, instead of the logged one. Logged
+amplitudes of the random controller are draws that nobody prefers: their pull is one to the middle of [B, 1], away from the standard of
+care. Held near cDBS instead, the policy departs from it where the critic says so, in proportion to what it says. The critic's penalty
+stays with the logged actions: it is about where values are known, not about what is good.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
@@ -26,6 +31,8 @@ from ml.rl.configs import CriticConfig, setting
 from ml.rl.learners import CriticLearner, Networks, fresh_critic
 from ml.rl.networks import MlpPolicy
 
+ANCHORS = ("logged", "constant")
+
 _TINY = 1e-6  # keeps the actor's step finite where every value is 0
 
 
@@ -34,6 +41,21 @@ class _Td3Config(CriticConfig):
     smoothing: float = setting(0.2, "Standard deviation of the noise on target actions, in actions of [-1, 1].", low=0, high=2)
     smoothing_clip: float = setting(0.5, "Largest such noise.", low=0, high=2)
     actor_every: int = setting(2, "Critic updates per update of the actor and the targets.", low=1)
+    anchor: str = field(
+        default="logged",
+        metadata={
+            "doc": "What the actor is held near: `logged`, the logged action (the publications'), or `constant`, `anchor_amplitude` in "
+            "every state, so that the policy leaves the standard of care only where the values speak for it (ours)."
+        },
+    )
+    anchor_amplitude: float = setting(
+        1.0, "Amplitude fraction that a `constant` anchor holds the actor near; 1 is cDBS, the standard of care.", low=0, high=1
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.anchor not in ANCHORS:
+            raise ValueError(f"anchor must be one of {', '.join(ANCHORS)}, not {self.anchor!r}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +63,7 @@ class Td3BcConfig(_Td3Config):
     """Hyper-parameters of TD3+BC; `field_docs` says what each one means."""
 
     algorithm: ClassVar[str] = "td3_bc"
-    per_member: ClassVar[tuple[str, ...]] = (*CriticConfig.per_member, "alpha")
+    per_member: ClassVar[tuple[str, ...]] = (*CriticConfig.per_member, "alpha", "anchor_amplitude")
 
     alpha: float = setting(2.5, "Weight of the value against staying near the logged actions; larger trusts the critic more.", above=0)
 
@@ -51,7 +73,7 @@ class RebracConfig(_Td3Config):
     """Hyper-parameters of ReBRAC; `field_docs` says what each one means."""
 
     algorithm: ClassVar[str] = "rebrac"
-    per_member: ClassVar[tuple[str, ...]] = (*CriticConfig.per_member, "actor_penalty", "critic_penalty")
+    per_member: ClassVar[tuple[str, ...]] = (*CriticConfig.per_member, "actor_penalty", "critic_penalty", "anchor_amplitude")
 
     actor_penalty: float = setting(0.05, "b: price of the actor's squared distance from the logged action, in actions of [-1, 1].", low=0)
     critic_penalty: float = setting(
@@ -107,8 +129,9 @@ class _Td3Learner(CriticLearner[Any]):
     def _actor_step(self, batch: Batch) -> None:
         actions = self.policy_stack.act(batch.states)
         uphill, size = self._value_slope(batch.states, actions)
+        anchor = batch.actions if self.config.anchor == "logged" else self.member_setting("anchor_amplitude")
         # b (2 pi - 2 a)^2 - Q / mean |Q|, its slope by pi averaged over the batch; mean |Q| counts as a constant.
-        slope = (8.0 * self._actor_penalty) * (actions - batch.actions) - uphill / size.clamp_(min=_TINY)
+        slope = (8.0 * self._actor_penalty) * (actions - anchor) - uphill / size.clamp_(min=_TINY)
         self.policy_stack.backward_from_actions(slope.div_(self.config.batch), actions)
         self.adams["policy"].step()
 

@@ -33,6 +33,8 @@ class HeldOut:
         sessions: the sessions left out.
         score: estimate by which the best state is kept; None keeps the last.
         score_name: names the estimate; part of what a checkpoint belongs to.
+        eligible: whether a state may be kept for its score (`ml.rl.support.stays_in_range`, say: beyond the data an estimate is free to be
+            large, and the best score would find that state); None keeps whichever scores best. Where no state is eligible, the last stays.
         is_step_return: whether `score` estimates the discounted sum of step rewards without end, from the sessions' first states; only
             then is Q's distance from it an over-estimation.
         end_reward: what every step adds where the critic's sum holds a share of r_end too; set by the trainer.
@@ -46,6 +48,7 @@ class HeldOut:
     sessions: ReplayBuffer
     score: Score | None = None
     score_name: str = ""
+    eligible: Callable[[Policy], bool] | None = None
     is_step_return: bool = False
     end_reward: EndReward | None = None
     every: int = 500
@@ -83,7 +86,7 @@ class HeldOut:
     def name(self) -> str:
         """Names the sessions and the rule, for checkpoints."""
         digest = hashlib.sha256(to_parquet(self.sessions)).hexdigest()
-        return f"{digest} {self.score_name} {self.score is not None} {self.every} {self.patience}"
+        return f"{digest} {self.score_name} {self.score is not None} {self.eligible is not None} {self.every} {self.patience}"
 
 
 def split_sessions(buffer: ReplayBuffer, share: float = 0.2, seed: int = 0) -> tuple[ReplayBuffer, ReplayBuffer]:

@@ -183,7 +183,7 @@ def _record(numbers: list[dict[str, float]], outcomes: list[Outcome], done: int,
 
 
 def _score(learner: Learner, held_out: HeldOut, starts: tuple[NDArray[np.float64], float], outcomes: list[Outcome], done: int) -> None:
-    """A point on the held-out sessions for each policy; keeps the state of the best score, the earlier one of equals."""
+    """A point on the held-out sessions for each policy; keeps the eligible state of the best score, the earlier one of equals."""
     states, logged = starts
     values = learner.start_values(states)
     for k, outcome in enumerate(outcomes):
@@ -191,12 +191,14 @@ def _score(learner: Learner, held_out: HeldOut, starts: tuple[NDArray[np.float64
         if values is not None:
             point |= {"start_q": values[k], "over_logged": values[k] - logged}
         if held_out.score is not None:
-            score = float(held_out.score(learner.policy(k)))
+            policy = learner.policy(k)
+            score = float(held_out.score(policy))
             _require_finite({"the held-out score": score}, done, f" of policy {k + 1}" if len(outcomes) > 1 else "")
             point["score"] = score
             if values is not None and held_out.is_step_return:
                 point["over_estimate"] = values[k] - score
-            if outcome.best_score is None or score > outcome.best_score:
+            eligible = held_out.eligible is None or held_out.eligible(policy)
+            if eligible and (outcome.best_score is None or score > outcome.best_score):
                 outcome.best_score, outcome.best_update, outcome.best_rows = score, done, learner.rows(k)
         outcome.held_out.append(point)
 

@@ -95,17 +95,31 @@ def test_beta_of_another_unit_is_never_mixed_in(upload: Upload, db: Session) -> 
     assert "settings say uV" in reasons(snapshot)[other]
 
 
-def test_without_a_unit_in_the_settings_the_majority_counts_and_that_is_said(upload: Upload, client: TestClient, db: Session) -> None:
+@pytest.mark.parametrize(
+    ("change", "unstated"),
+    [
+        ({"beta_unit": None}, "the unit of the threshold of 1 "),
+        ({"beta_source": None}, "the source of the threshold of 1 "),
+        ({"beta_unit": None, "beta_source": None}, "the unit and the source of the threshold of 1 "),
+    ],
+)
+def test_a_threshold_whose_unit_or_source_nobody_stated_judges_no_session(
+    upload: Upload, client: TestClient, db: Session, change: dict[str, None], unstated: str
+) -> None:
     ids = [upload("random") for _ in range(3)]
-    client.put("/api/v1/participants/P1/settings", json={"settings": {"beta_unit": None, "beta_source": None}})
     traces = db.scalars(select(Trace).where(Trace.stream == "beta").order_by(Trace.id)).all()
-    for trace in traces[1:]:
-        trace.unit = "mV"
+    traces[0].unit = "mV"
     db.commit()
+    client.put("/api/v1/participants/P1/settings", json={"settings": change})
+    db.rollback()
+    with pytest.raises(Invalid, match=unstated) as refused:
+        take_snapshot(db, participant_by_code(db, "P1", SYSTEM), SYSTEM)
+    assert "uV from table (2), mV from table (1)" in refused.value.mend
+    stated = {"beta_unit": "uV", "beta_source": "table"}
+    client.put("/api/v1/participants/P1/settings", json={"settings": stated})
     snapshot, buffer = taken(db)
-    assert buffer.beta_unit == "mV"
-    assert [s.session_id for s in buffer.sessions] == ids[1:]
-    assert "most sessions have mV" in reasons(snapshot)[ids[0]]
+    assert (buffer.beta_unit, buffer.beta_source) == ("uV", "table")
+    assert set(reasons(snapshot)) == {ids[0]}
 
 
 def test_steps_above_the_cdbs_amplitude_are_kept_but_not_usable(upload: Upload, db: Session) -> None:

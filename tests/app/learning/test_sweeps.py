@@ -12,7 +12,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.learning.comparison import Candidate, better_without_learning
-from app.learning.configs import training_groups
+from app.learning.configs import ANCHORED, training_groups
 from app.learning.models import Policy
 from app.learning.schemas import ALGORITHM_NAMES, AlgorithmName, TrainParams
 from app.platform import files
@@ -52,6 +52,21 @@ def test_policies_are_dealt_to_the_algorithms_in_turn_and_only_those_with_a_crit
         for config in group["configs"]:
             assert ("critic_lr" in config) == (group["algorithm"] != "cloning")
             ALGORITHMS[group["algorithm"]].config.from_json(config)  # every name is one of its hyper-parameters
+
+
+def test_what_holds_a_policy_is_offered_to_the_algorithms_that_have_it_and_logged_is_the_default() -> None:
+    assert set(ANCHORED) == {name for name, kind in ALGORITHMS.items() if "anchor" in kind.config.field_docs()}
+    for group in training_groups(TrainParams(algorithms=["ddpg", "rebrac"]), [None] * 6):
+        assert group["configs"][0].get("anchor", "logged") == "logged"
+    params = TrainParams(algorithms=["ddpg", "rebrac"], anchor="both", count=6)
+    groups = training_groups(params, [None] * 6)
+    held = sorted((c["seed"], g["algorithm"], c.get("anchor")) for g in groups for c in g["configs"])
+    assert [h[1:] for h in held] == [("ddpg", None), ("rebrac", "logged"), ("rebrac", "constant")] * 2
+    for group in groups:
+        made = [ALGORITHMS[group["algorithm"]].config.from_json(config) for config in group["configs"]]
+        assert len({getattr(config, "anchor", None) for config in made}) == 1
+    (tuned,) = training_groups(TrainParams(policies=[3], anchor="cdbs"), [{"policy_id": 3, "algorithm": "td3_bc"}])
+    assert (tuned["configs"][0]["anchor"], tuned["configs"][0]["anchor_amplitude"]) == ("constant", 1.0)
 
 
 def test_every_fine_tuned_policy_goes_on_with_its_parents_algorithm_at_the_papers_rates() -> None:
@@ -100,7 +115,13 @@ def test_a_sweep_stores_its_policies_and_compares_them_on_sessions_that_they_did
     for row in db.scalars(select(Policy).where(Policy.job_id == job["id"])):
         assert row.sweep_id == sweep["id"]
         held = row.metrics["held_out"]
-        assert row.metrics["best_update"] == held["update"][held["score"].index(max(held["score"]))]
+        best = held["update"][held["score"].index(max(held["score"]))]
+        # the best score, or the best of those within the range of the random controller
+        assert row.metrics["best_update"] in held["update"]
+        assert row.metrics["best_update"] == best or max(held["score"]) > held["score"][held["update"].index(row.metrics["best_update"])]
+        assert row.metrics["below_bound"]["bound"] == 0.3
+        assert row.metrics["below_bound"]["share"] < 0.2, "at most 5 % of the steps that it was scored with"
+        assert row.metrics["gain_over_cdbs"]["low"] < row.metrics["gain_over_cdbs"]["value"]
         trained = TrainedPolicy.from_bytes(files.read(row.checkpoint_sha256 or ""))
         windows = [[1.0 + 0.01 * k for k in range(10)], [0.9] * 10]
         assert OnnxPolicy(files.read(row.onnx_sha256), 10).act(windows) == pytest.approx(trained.policy.act(windows), abs=1e-5)
@@ -115,7 +136,7 @@ def test_a_sweep_stores_its_policies_and_compares_them_on_sessions_that_they_did
 
 def test_a_sweep_below_its_yardsticks_is_told_so() -> None:
     def scored(*scores: float | None) -> list[Candidate]:
-        return [Candidate(Policy(name=str(s)), s, None, None, None, None, None, None, None) for s in scores]
+        return [Candidate(Policy(name=str(s)), s, None, None, None, None, None, None, None, None, None) for s in scores]
 
     rows = [{"controller": "cDBS", "score": 5.0}, {"controller": "no DBS", "score": -3.0}]
     assert better_without_learning(scored(4.0, 2.0), rows) == "cDBS"

@@ -239,6 +239,51 @@ def test_a_training_that_diverges_says_so(name, buffer):
         algorithm(name).train(buffer, small(name), initial=broken)
 
 
+# --- held near a constant amplitude -------------------------------------------------------------------------------------------------
+
+HELD = {"td3_bc": {"alpha": 1e30}, "rebrac": {"actor_penalty": 0.0}}
+"""Algorithms whose actor is held near an anchor, with a bond of no strength."""
+
+
+def test_every_algorithm_that_is_held_near_an_anchor_is_known_here():
+    assert set(HELD) == {name for name, kind in ALGORITHMS.items() if "anchor" in kind.config.field_docs()}
+
+
+@pytest.mark.parametrize("name", sorted(HELD))
+def test_without_a_bond_the_anchor_changes_nothing_bit_for_bit(name, buffer):
+    kind = algorithm(name)
+    free, held = (kind.train(buffer, small(name, updates=60, anchor=anchor, **HELD[name])) for anchor in ("logged", "constant"))
+    assert_same(free, held)
+    bound = kind.train(buffer, small(name, updates=60, anchor="constant"))
+    assert bound.policy.to_onnx() != kind.train(buffer, small(name, updates=60)).policy.to_onnx()
+
+
+@pytest.mark.parametrize("name", sorted(HELD))
+def test_anchors_of_policies_side_by_side_are_their_own_and_a_training_at_one_resumes(name, buffer, tmp_path):
+    kind, file = algorithm(name), tmp_path / "training.ckpt"
+    strong = {"alpha": 0.02} if name == "td3_bc" else {"actor_penalty": 50.0}
+    configs = [small(name, anchor="constant", anchor_amplitude=level, seed=3, **strong) for level in (1.0, 0.4)]
+    high, low = kind.train_many(buffer, configs)
+    states = buffer.transitions().states
+    np.testing.assert_allclose(low.policy.act(states), kind.train(buffer, configs[1]).policy.act(states), atol=1e-4)
+    assert high.policy.act(states).mean() > low.policy.act(states).mean() + 0.1
+    with pytest.raises(StoppedHere):
+        kind.train_many(buffer, configs, stop_at(200), file)
+    resumed = kind.train_many(buffer, configs, checkpoint=file)
+    assert_same(resumed[0], high)
+    assert_same(resumed[1], low)
+    assert TrainedPolicy.from_bytes(low.to_bytes()).config == configs[1]
+
+
+@pytest.mark.parametrize("name", sorted(HELD))
+def test_the_publications_anchor_is_the_default_and_an_unknown_one_is_refused(name, buffer):
+    assert algorithm(name).config().anchor == "logged"
+    with pytest.raises(ValueError, match="anchor must be one of logged, constant"):
+        small(name, anchor="best")
+    with pytest.raises(ValueError, match="may differ in actor_lr"):
+        algorithm(name).train_many(buffer, [small(name), small(name, anchor="constant")])
+
+
 # --- devices ------------------------------------------------------------------------------------------------------------------------
 
 

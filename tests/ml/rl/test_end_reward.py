@@ -48,6 +48,37 @@ def test_shares_and_step_rewards_stand_in_the_proportion_of_the_return():
     assert end_for_critic / steps_for_critic == pytest.approx(1 / steps_in_return)
 
 
+def told_at(share, level):
+    """r_end that the share tells of a session at a constant amplitude, beta at 0.5."""
+    session = SessionTrajectory(0, 1, "other", np.full(10, 0.5), np.full(20, 0.5), np.full(20, float(level)))
+    return float(share.per_step(session).mean()) / share.factor
+
+
+def test_a_good_day_that_chanced_upon_low_amplitudes_is_not_taken_for_their_merit():
+    # within a day every tenth of amplitude brings 1 of r_end; the first day, with most of the low amplitudes, is 8 better than the last
+    data = buffer(lambda a, beta: 1.0 + a.mean(), sessions=18)
+    visits = [1, 1, 1, 2, 1, 1, 2, 1, 2, 2, 3, 2, 3, 3, 2, 3, 3, 3]
+    good, rng = {1: 0.8, 2: 0.4, 3: 0.0}, np.random.default_rng(2)
+    moved = [
+        replace(s, visit=v, qoc=replace(s.qoc, grasp_hz=s.qoc.grasp_hz + good[v] + 0.1 * rng.standard_normal()))
+        for s, v in zip(data.sessions, visits, strict=True)
+    ]
+    share = fit_end_reward(replace(data, sessions=tuple(moved)))
+    assert share is not None
+    assert told_at(share, 0.8) - told_at(share, 0.2) == pytest.approx(6.0, abs=3.0)
+    as_one_day = fit_end_reward(replace(data, sessions=tuple(replace(s, visit=1) for s in moved)))
+    assert as_one_day is None, "over all days together the good day hides what the amplitude brings"
+
+
+def test_a_noisy_rating_does_not_drown_what_the_grasp_tells():
+    rng = np.random.default_rng(8)
+    data = buffer(lambda a, beta: 1.0 + 2.0 * a.mean(), sessions=24)
+    noisy = tuple(replace(s, qoc=replace(s.qoc, rating=int(rng.integers(4, 8)))) for s in data.sessions)
+    share = fit_end_reward(replace(data, sessions=noisy))
+    assert share is not None
+    assert told_at(share, 0.8) - told_at(share, 0.2) == pytest.approx(12.0, abs=4.0)
+
+
 def test_without_enough_sessions_or_without_any_relation_nothing_is_shared():
     few = buffer(lambda a, beta: a.mean(), sessions=7)
     assert fit_end_reward(few) is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from ml.rl.algorithms import ALGORITHMS
 from ml.rl.trainer import train_on
@@ -72,3 +73,39 @@ def test_a_strong_bond_to_the_logged_actions_makes_it_clone_them(name):
     policy = train_on(kind.learner, transitions, gamma, (0.0, 0.46), [config])[0].policy
     answers = policy.act(np.c_[np.zeros(21), np.linspace(-0.5, 0.5, 21)])
     assert np.abs(answers - 0.5).mean() < 0.05, "the logged actions are uniform: their mean is 0.5 everywhere"
+
+
+@pytest.mark.parametrize("name", ["td3_bc", "rebrac"])
+def test_a_strong_bond_to_a_constant_amplitude_makes_it_that_constant(name):
+    transitions, _, gamma = linear_quadratic()
+    kind = ALGORITHMS[name]
+    bond = {"alpha": 1e-4} if name == "td3_bc" else {"actor_penalty": 1e4}
+    base = SHARED | {"updates": 1200, "actor_lr": 1e-3, "anchor": "constant"} | bond
+    levels = (0.8, 0.35)
+    configs = [kind.config(**base, anchor_amplitude=level) for level in levels]
+    for level, trained in zip(levels, train_on(kind.learner, transitions, gamma, (0.0, 0.46), configs), strict=True):
+        answers = trained.policy.act(np.c_[np.zeros(21), np.linspace(-0.5, 0.5, 21)])
+        assert np.abs(answers - level).max() < 0.03
+
+
+@pytest.mark.parametrize("name", ["td3_bc", "rebrac"])
+@pytest.mark.parametrize("strength", [1.0, 3.0])
+def test_a_bond_between_lets_it_leave_the_constant_as_far_as_the_values_pay_for(name, strength):
+    # one step, reward -(a - 0.2)^2 whatever the state: the value is the reward, known in closed form
+    rng = np.random.default_rng(6)
+    states, action, rows = rng.normal(size=(4000, 2)), rng.uniform(0, 1, 4000), np.arange(4000)
+    reward = -((action - 0.2) ** 2)
+    transitions = Transitions(states, action, reward, states, rows, rows * 0)
+    anchor = 0.6
+
+    def slope(pi):
+        """Of b (2 pi - 2 anchor)^2 - Q / |Q| with |Q| held fast, Q in deviations of the reward."""
+        return 8 * strength * (pi - anchor) + 2 * (pi - 0.2) / abs(-((pi - 0.2) ** 2) - reward.mean())
+
+    expected = brentq(slope, 0.2, 0.55)
+    assert 0.25 < expected < 0.55, "neither the constant nor the optimum"
+    kind = ALGORITHMS[name]
+    bond = {"alpha": 1 / strength} if name == "td3_bc" else {"actor_penalty": strength, "critic_penalty": 0.0}
+    config = kind.config(**(SHARED | {"actor_lr": 1e-3, "anchor": "constant", "anchor_amplitude": anchor} | bond))
+    policy = train_on(kind.learner, transitions, 0.0, (0.0, 1.0), [config])[0].policy
+    assert policy.act(states[:200]).mean() == pytest.approx(expected, abs=0.04)

@@ -1,13 +1,13 @@
 """Six policies from three visits of a synthetic participant, against controllers without learning.
 
-The six, their hyper-parameters and their training times are fixed here from the publications' defaults, not from what they reach. Nothing
-in training or selection sees a true return: the best state of each training and the selected one of the six are chosen by fitted Q
-evaluation on left-out sessions. True returns are the yardstick alone, and all controllers meet the same days and noise.
+Coefficients are the publications'. Three of the six are of an earlier six that was measured on these data sets; in the other three cDBS
+holds the actor instead of the logged action (`anchor`), because logged actions of the random controller are draws that nobody prefers:
+they, and everything else here, were fixed before their true returns were seen, but for one rule. That a state may be kept only where it
+stays in the random controller's range was added after a data set of another seed had gone wrong; it changes none of these three here.
 
-The aims are printed as met or missed: above cDBS, above the random controller, level with the best constant amplitude within one standard
-error, a fifth of the energy saved. Asserted are the second and the fourth, and that the first and the third are missed by three standard
-errors at most: `docs/learning.md` says where they fall short. Two learn from step rewards alone, as in the paper; four from each step's
-share of r_end besides (`ml.rl.end_reward`), for the best constant is that of the whole return.
+Nothing in training or selection sees a true return: the best state of each training is chosen by fitted Q evaluation on left-out sessions
+among those in range (`ml.rl.support`); the policy to prefer by the lower bound of its estimated gain over cDBS (`ml.rl.selection`), and
+none is where no bound lies above 0. True returns are the yardstick alone, and all controllers meet the same days and noise.
 """
 
 from __future__ import annotations
@@ -19,21 +19,25 @@ import numpy as np
 import pytest
 
 from ml.cohort import random_controller_buffer, true_return
+from ml.ope.fqe import Fqe
 from ml.ope.fqe_score import fqe_value
 from ml.rl.algorithms import ALGORITHMS
 from ml.rl.baselines import best_constant
 from ml.rl.end_reward import fit_end_reward
 from ml.rl.held_out import HeldOut, split_sessions
 from ml.rl.policy import ConstantPolicy
+from ml.rl.selection import gains_over, surest
+from ml.rl.support import stays_in_range
 from ml.rl.trainer import TrainedPolicy
 
+AT_CDBS = {"anchor": "constant", "anchor_amplitude": 1.0}
 SIX = (
     ("ddpg", {"actor_lr": 1e-4}),
-    ("ddpg", {"actor_lr": 1e-4, "aim": "return"}),
-    ("td3_bc", {"actor_lr": 3e-4}),
+    ("rebrac", {"actor_lr": 3e-4, "actor_penalty": 0.1} | AT_CDBS),
     ("td3_bc", {"actor_lr": 3e-4, "aim": "return"}),
+    ("td3_bc", {"actor_lr": 3e-4, "aim": "return"} | AT_CDBS),
     ("rebrac", {"actor_lr": 3e-4, "actor_penalty": 0.1, "aim": "return"}),
-    ("iql", {"actor_lr": 3e-4, "aim": "return"}),
+    ("rebrac", {"actor_lr": 3e-4, "actor_penalty": 0.1, "aim": "return"} | AT_CDBS),
 )
 SHARED = {"updates": 5000, "batch": 64, "record_every": 500}
 VISITS, SESSIONS_PER_VISIT, STEPS = 3, 6, 300
@@ -48,7 +52,6 @@ class Learned:
 
     label: str
     training: TrainedPolicy
-    score: float
     returns: np.ndarray
     energy: float
     step_return: float
@@ -57,16 +60,21 @@ class Learned:
     def over_estimate(self, gamma):
         """Q(s_0, pi(s_0)) of the state that was kept, less the true value of what its critic sums, continued for ever at its own rate."""
         watched = self.training.held_out
-        kept = watched["update"] == self.training.best_update
+        kept = watched["update"] == (self.training.best_update or watched["update"][-1])
         true = float(self.returns.mean()) if self.shares else self.step_return
         return float(watched["start_q"][kept][0]) - true / (1 - gamma**STEPS)
 
 
+def kind(changes):
+    """What policies trained side by side must share."""
+    return changes.get("aim", "steps"), changes.get("anchor", "logged")
+
+
 def six_policies(train, watch):
-    """The six trainings in the order of `SIX`; those of one algorithm and aim side by side."""
+    """The six trainings in the order of `SIX`; those of one algorithm, aim and anchor side by side."""
     trained = [None] * len(SIX)
-    for name, aim in dict.fromkeys((name, changes.get("aim")) for name, changes in SIX):
-        places = [k for k, (own, changes) in enumerate(SIX) if (own, changes.get("aim")) == (name, aim)]
+    for name, shared in dict.fromkeys((name, kind(changes)) for name, changes in SIX):
+        places = [k for k, (own, changes) in enumerate(SIX) if (own, kind(changes)) == (name, shared)]
         algorithm = ALGORITHMS[name]
         configs = [algorithm.config(**SHARED, **SIX[k][1], seed=k) for k in places]
         for k, result in zip(places, algorithm.train_many(train, configs, held_out=watch), strict=True):
@@ -87,7 +95,7 @@ def test_the_best_of_six_against_continuous_random_and_constant_stimulation(part
     def score(policy):
         return fqe_value(train, policy, held.sessions).value
 
-    watch = HeldOut(sessions=held, score=score, score_name="fqe", every=1000)
+    watch = HeldOut(sessions=held, score=score, score_name="fqe", eligible=lambda policy: stays_in_range(policy, train), every=1000)
     trained = six_policies(train, watch)
     shared = fit_end_reward(train) is not None
 
@@ -96,40 +104,52 @@ def test_the_best_of_six_against_continuous_random_and_constant_stimulation(part
         return result.returns, result.energy.mean, result.step_return.mean
 
     six = [
-        Learned(f"{name} {changes}", result, score(result.policy), *truth(result.policy), shared and changes.get("aim") == "return")
+        Learned(f"{name} {' '.join(kind(changes))}", result, *truth(result.policy), shared and kind(changes)[0] == "return")
         for (name, changes), result in zip(SIX, trained, strict=True)
     ]
     cdbs, random = truth("cdbs")[0], truth("random")[0]
     constants = {level: truth(ConstantPolicy(level))[0] for level in CONSTANTS}
     level = max(constants, key=lambda a: constants[a].mean())
     chosen_constant = best_constant(score, CONSTANTS).policy.amplitude
+    gains = gains_over(Fqe().fit(buffer), {str(k): one.training.policy for k, one in enumerate(six)}, ConstantPolicy(1.0))
+    name = surest(gains)
+    preferred = None if name is None else six[int(name)]
+    best = max(six, key=lambda one: one.returns.mean())
 
-    best, selected = max(six, key=lambda one: one.returns.mean()), max(six, key=lambda one: one.score)
+    def meets_every_aim(one):
+        over = one.returns - constants[level]
+        above = one.returns.mean() > max(cdbs.mean(), random.mean())
+        return bool(above and over.mean() >= -standard_error(over) and 1 - one.energy >= 0.2)
+
     lines = [
         f"{participant}: cDBS {cdbs.mean():.1f}, random {random.mean():.1f}, best constant {level} {constants[level].mean():.1f}, "
         f"constant chosen from the data {chosen_constant} {constants[chosen_constant].mean():.1f}; "
         f"{'r_end falls apart into steps' if shared else 'no share of r_end could be learnt: all six learn from step rewards'}"
     ]
-    for one in six:
-        gain = one.returns - constants[level]
+    for k, one in enumerate(six):
+        over, estimated = one.returns - constants[level], gains[str(k)]
         lines.append(
-            f"  {one.label:<52} true {one.returns.mean():6.1f}, above best constant {gain.mean():5.1f} +- {standard_error(gain):.1f}, "
-            f"energy {one.energy:.2f}, estimate {one.score:6.1f}, update {one.training.best_update}, "
-            f"Q above truth {one.over_estimate(buffer.settings.gamma):5.1f}"
-            f"{' oracle-best' * (one is best)}{' selected' * (one is selected)}"
+            f"  {one.label:<22} true {one.returns.mean():6.1f}, above best constant {over.mean():5.1f} +- {standard_error(over):.1f}, "
+            f"energy {one.energy:.2f}, update {one.training.best_update}, estimated above cDBS {estimated.value:5.1f} (at least "
+            f"{estimated.low:.1f}), Q above truth {one.over_estimate(buffer.settings.gamma):5.1f}"
+            f"{' best by truth' * (one is best)}{' preferred from the data' * (one is preferred)}{' all aims' * meets_every_aim(one)}"
         )
     over_cdbs, over_constant = best.returns - cdbs, best.returns - constants[level]
     aims = {
-        "above cDBS": over_cdbs.mean() > 0,
-        "above random": best.returns.mean() > random.mean(),
-        "level with the best constant": over_constant.mean() >= -standard_error(over_constant),
-        "a fifth of the energy saved": 1 - best.energy >= 0.2,
-        "selected one above cDBS": selected.returns.mean() > cdbs.mean(),
+        "best above cDBS": over_cdbs.mean() > 0,
+        "best above random": best.returns.mean() > random.mean(),
+        "best level with the best constant": over_constant.mean() >= -standard_error(over_constant),
+        "best saves a fifth of the energy": 1 - best.energy >= 0.2,
+        "one of the six meets all of these": any(meets_every_aim(one) for one in six),
+        "preferred from the data is not below cDBS": preferred is None or preferred.returns.mean() >= cdbs.mean(),
     }
     lines.append("  aims: " + ", ".join(f"{name} {'met' if met else 'MISSED'}" for name, met in aims.items()))
+    if preferred is None:
+        lines.append("  from the data alone no policy is preferred to cDBS")
     with capsys.disabled():
         sys.stdout.write("\n" + "\n".join(lines) + "\n")
-    assert aims["above random"]
-    assert aims["a fifth of the energy saved"]
-    assert over_cdbs.mean() >= -3 * standard_error(over_cdbs)
-    assert over_constant.mean() >= -3 * standard_error(over_constant)
+    assert aims["best above cDBS"]
+    assert aims["best above random"]
+    assert aims["best level with the best constant"]
+    assert aims["one of the six meets all of these"]
+    assert aims["preferred from the data is not below cDBS"]

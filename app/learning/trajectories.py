@@ -1,0 +1,53 @@
+"""A session's steps as the science reads them, or the reason of its own why they cannot be read."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from app.study import service as study
+from app.study.blinding import Arm
+from app.study.models import Controller, StudySession
+from app.study.traces import StepTable
+from ml.trajectories import SessionTrajectory
+
+
+def trajectory_of(
+    session: StudySession, table: StepTable, arm: Arm, window: int, random_bound: float | None = None
+) -> SessionTrajectory | str:
+    """The session's steps after its start, with the window of beta before it; or why there are none.
+
+    Args:
+        session: its QoCs are taken in their newest revision. table: its steps, [window + T].
+        arm: what drove it, as far as the asker may know.
+        window: W, steps of the state. random_bound: B in force, kept for a session of the random controller.
+    """
+    reason = own_reason(session, table)
+    if reason is not None:
+        return reason
+    return SessionTrajectory(
+        session_id=session.id,
+        visit=session.visit.number,
+        controller=arm.controller.value,
+        policy_id=arm.policy_id,
+        lead_beta=table.beta[:window],
+        beta=table.beta[window:],
+        amplitude=table.fraction[window:],
+        qoc=study.qoc_of(session),
+        random_lower_bound=random_bound if arm.controller is Controller.RANDOM else None,
+    )
+
+
+def own_reason(session: StudySession, table: StepTable) -> str | None:
+    """The first reason of the session's own against reading its steps; None where there is none."""
+    if session.excluded_reason:
+        return f"excluded by a person: {session.excluded_reason}"
+    if table.beta_trace is None:
+        channel = f"'{session.control_stream}'" + (f" on channel '{session.control_channel}'" if session.control_channel else "")
+        return f"no beta trace {channel} in its recordings"
+    if table.amplitude_trace is None:
+        return "no amplitude trace in its recordings"
+    if np.isnan(table.fraction).all():
+        return "the cDBS amplitude is not known, so that milliamperes give no fraction" if table.cdbs_ma is None else "no valid amplitude"
+    if not (table.t_s > 0).any():
+        return "shorter than one step"
+    return None
