@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 from app import __version__
 from app.accounts import policy as can
 from app.accounts.policy import Caller
+from app.evaluation.coverage import coverage_by_policy
 from app.evaluation.models import EstimateRow, Evaluation
 from app.learning.models import Policy
 from app.platform.errors import BetaloopError
@@ -33,6 +34,7 @@ _ESTIMATE_COLUMNS = (
     "evaluation_id", "snapshot_id", "settings_version_id", "horizon_steps", "gamma", "policy_id", "method", "value", "low", "high", "level",
     "supported", "flags",
 )  # fmt: skip
+_COVERAGE_COLUMNS = ("evaluation_id", "policy_id", "supported", "check", "value", "limit", "limit_is", "verdict")
 
 
 def export_participant(db: Session, participant: Participant, caller: Caller) -> bytes:
@@ -68,6 +70,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
         "steps.csv": _csv(_STEP_COLUMNS, steps),
         "policies.csv": _csv(_POLICY_COLUMNS, [_policy_row(p) for p in policies]),
         "estimates.csv": _csv(_ESTIMATE_COLUMNS, _estimate_rows(db, participant)),
+        "coverage.csv": _csv(_COVERAGE_COLUMNS, _coverage_rows(db, participant)),
     }
     sink = io.BytesIO()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -92,6 +95,16 @@ def _estimate_rows(db: Session, participant: Participant) -> list[tuple[Any, ...
          r.supported, "; ".join(map(str, r.flags)))
         for e, r in db.execute(query)
     ]  # fmt: skip
+
+
+def _coverage_rows(db: Session, participant: Participant) -> list[tuple[Any, ...]]:
+    query = select(Evaluation).where(Evaluation.participant_id == participant.id).order_by(Evaluation.id)
+    return [
+        (e.id, policy_id, found.supported, c.name, c.value, c.limit, "least" if c.at_least else "greatest", c.verdict)
+        for e in db.scalars(query)
+        for policy_id, found in sorted(coverage_by_policy(e).items())
+        for c in found.checks
+    ]
 
 
 def _blank_nan(value: float) -> float | str:
@@ -120,5 +133,6 @@ def _readme(participant: Participant) -> str:
         "steps.csv      2 s rows: t_s is the end of the window after the session's start (t_s <= 0: before it); empty cells are invalid\n"
         "policies.csv   every policy of the participant\n"
         "estimates.csv  every estimate: E[r_end + sum over t < H of gamma^t r_t] with its interval\n"
+        "coverage.csv   what the data can say about each policy, checked before it was estimated\n"
         "settings.json  every settings version\n"
     )

@@ -15,13 +15,14 @@ import json
 import sys
 import tempfile
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from figure import draw
+from ope_policies import fixed_policies, trained_policies
 from simulators import STEPS, WORLDS, World
 
 from ml.ope.aggregate import METHOD as AGGREGATE
@@ -29,10 +30,8 @@ from ml.ope.aggregate import combine
 from ml.ope.estimate import Estimate
 from ml.ope.metrics import accuracy
 from ml.ope.panel import estimators, quick_estimators
-from ml.ope.skill import choose_default
-from ml.rl.actor_critic import DdpgConfig, train
-from ml.rl.distillation import DistilConfig, distil
-from ml.rl.policy import ConstantPolicy, Policy, ProportionalPolicy
+from ml.ope.skill import NINETY, choose_default
+from ml.rl.policy import Policy
 from ml.trajectories import ReplayBuffer
 
 PARTICIPANT_WORLDS, OTHER_WORLDS = ("P1", "P2", "P3", "P4"), ("saturating", "switching")
@@ -66,41 +65,49 @@ class Cells:
         return [cell for key, cell in self._cells.items() if key.startswith(prefix)]
 
 
-def policies(buffer: ReplayBuffer, seed: int, quick: bool) -> dict[str, Policy]:
-    """Policies of varying quality, none of which made the data: constants, proportional, trained with different settings, distilled."""
-    xi = buffer.settings.xi_beta
-    simple: dict[str, Policy] = {
-        "constant 0.40": ConstantPolicy(0.40),
-        "constant 0.70": ConstantPolicy(0.70),
-        "proportional fast": ProportionalPolicy(0.7 * xi, 1.2 * xi, 0.35, 2),
-        "proportional late": ProportionalPolicy(xi, 1.5 * xi, 0.1, 1),
-    }
-    if quick:
-        return simple
-    short = DdpgConfig(hidden=(64, 48), updates=1500, actor_lr=1e-3, seed=seed)
-    long = DdpgConfig(hidden=(64, 48), updates=4000, actor_lr=3e-4, seed=seed + 1)
-    teacher = train(buffer, long).policy
-    return simple | {
-        "constant 0.85": ConstantPolicy(0.85),
-        "trained briefly": train(buffer, short).policy,
-        "trained longer": teacher,
-        "distilled": distil(teacher, buffer, DistilConfig(updates=800, sigma=0.6, seed=seed)).policy,
-    }
+@dataclass(frozen=True)
+class Run:
+    """What one call of the benchmark measures."""
+
+    cells: Cells
+    out: Path
+    quick: bool
+    skip: frozenset[str]
+    sessions: int
 
 
-def measure(world: World, seed: int, visits: int, cells: Cells, quick: bool, skip: set[str], sessions: int) -> None:
-    """All cells of one world and seed: truth, every method, the aggregate, and the choice by held-out skill."""
-    prefix = f"{world.name}/{seed}"
-    panel = {m: e for m, e in estimators(seed, demo=quick).items() if m not in skip}
-    wanted = [f"{prefix}/{m}" for m in (*panel, AGGREGATE, "choice")]
-    if all(cells.get(k) for k in wanted):
-        return
+def prepare(world: World, seed: int, visits: int, run: Run) -> tuple[ReplayBuffer, dict[str, Policy]]:
+    """Data and policies of one world and seed, and their true returns as a cell; fixed policies are measured once."""
     buffer = world.data(seed, visits)
-    chosen = policies(buffer, seed, quick)
-    truth = cells.get(f"{prefix}/truth")
-    if truth is None:
-        found = {name: asdict(world.truth(policy, sessions)) for name, policy in chosen.items()}
-        truth = cells.add(f"{prefix}/truth", policies=found, sessions=len(buffer.sessions))
+    fixed = fixed_policies(buffer.settings.xi_beta, quick=run.quick)
+    chosen = dict(fixed)
+    if not run.quick:
+        chosen |= trained_policies(buffer, seed, run.out / "policies" / f"{world.name}-{seed}")
+    if run.cells.get(f"{world.name}/{seed}/truth") is None:
+        found, on_days = {}, {}
+        for name, policy in chosen.items():
+            key = f"{world.name}/fixed/{name}"
+            known = run.cells.get(key) if name in fixed else None
+            if known is None:
+                known = {"truth": asdict(world.truth(policy, run.sessions))}
+                if name in fixed:
+                    run.cells.add(key, **known)
+            found[name] = known["truth"]
+            there = world.truth_on_days(policy, seed, visits, max(20, run.sessions // 2))
+            if there is not None:
+                on_days[name] = asdict(there)
+        run.cells.add(f"{world.name}/{seed}/truth", policies=found, on_days=on_days, sessions=len(buffer.sessions))
+        told(f"{world.name}/{seed}: true returns")
+    return buffer, chosen
+
+
+def measure(world: World, seed: int, visits: int, run: Run) -> None:
+    """All cells of one world and seed: truth, every method, the aggregate, and the choice by held-out skill."""
+    cells, prefix = run.cells, f"{world.name}/{seed}"
+    panel = {m: e for m, e in estimators(seed, demo=run.quick).items() if m not in run.skip}
+    if all(cells.get(f"{prefix}/{m}") for m in (*panel, AGGREGATE, "choice")):
+        return
+    buffer, chosen = prepare(world, seed, visits, run)
     estimates: dict[str, dict[str, Estimate]] = {}
     for method, estimator in panel.items():
         if cells.get(f"{prefix}/{method}"):
@@ -111,22 +118,27 @@ def measure(world: World, seed: int, visits: int, cells: Cells, quick: bool, ski
         except ValueError as error:
             cells.add(f"{prefix}/{method}", failed=str(error), seconds=time.process_time() - start)
             continue
-        cells.add(
-            f"{prefix}/{method}", estimates=_kept(estimates[method]), draws=_draws(estimates[method]), seconds=time.process_time() - start
-        )
-        sys.stdout.write(f"{prefix} {method}: {time.process_time() - start:.0f} s\n")
-        sys.stdout.flush()
-    start = time.process_time()
-    choice = choose_default(buffer, {m: e for m, e in quick_estimators(seed).items() if m not in skip}, seed=seed)
-    cells.add(f"{prefix}/choice", method=choice.method, reason=choice.reason, table=[s.to_json() for s in choice.table],
-              seconds=time.process_time() - start)  # fmt: skip
+        seconds = time.process_time() - start
+        cells.add(f"{prefix}/{method}", estimates=_kept(estimates[method]), draws=_draws(estimates[method]), seconds=seconds)
+        told(f"{prefix} {method}: {seconds:.0f} s")
+    if cells.get(f"{prefix}/choice") is None:
+        start = time.process_time()
+        choice = choose_default(buffer, {m: e for m, e in quick_estimators(seed).items() if m not in run.skip}, seed=seed)
+        cells.add(f"{prefix}/choice", method=choice.method, reason=choice.reason, table=[s.to_json() for s in choice.table],
+                  seconds=time.process_time() - start)  # fmt: skip
     tables = {m: estimates.get(m) or _restored(m, cells.get(f"{prefix}/{m}")) for m in panel}
-    bias = {s.method: s.bias for s in choice.table}
+    bias = {s["method"]: s["bias"] for s in cells.get(f"{prefix}/choice")["table"]}
     parts = {m: t for m, t in tables.items() if t and m in bias}
-    if parts:
+    if parts and cells.get(f"{prefix}/{AGGREGATE}") is None:
         combined = combine(parts, bias)
         cells.add(f"{prefix}/{AGGREGATE}", estimates=_kept(combined), draws={}, seconds=0.0,
                   weights=next(iter(combined.values())).details["weights"])  # fmt: skip
+
+
+def told(text: str) -> None:
+    """Progress, at once."""
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
 
 
 def _kept(estimates: dict[str, Estimate]) -> dict[str, dict[str, Any]]:
@@ -147,34 +159,63 @@ def _restored(method: str, cell: dict[str, Any] | None) -> dict[str, Estimate] |
 
 
 def summary(names: list[str], cells: Cells) -> dict[str, dict[str, dict[str, list[float]]]]:
-    """world -> method -> metric -> one number per seed."""
+    """world -> method -> metric -> one number per seed.
+
+    Two rows are no methods: `ranking` is the one that was chosen by held-out skill, its intervals widened as the service widens them, and
+    `days alone` is what a perfect method would say that knew everything about the days of the data and nothing about others.
+    """
     result: dict[str, dict[str, dict[str, list[float]]]] = {}
     for name in names:
         for cell in cells.all(f"{name}/"):
             _, seed, method = cell["key"].split("/")
-            if method in ("truth", "choice") or "failed" in cell:
+            if not seed.isdigit() or "failed" in cell:
                 continue
-            truth = cells.get(f"{name}/{seed}/truth")["policies"]
-            v = [truth[p]["total"] for p in truth]
-            found = [cell["estimates"][p] for p in truth]
-            a = accuracy(v, [e["value"] for e in found])
-            inside = [e["low"] <= t <= e["high"] for e, t in zip(found, v, strict=True)]
-            steps = accuracy([truth[p]["step_return"] for p in truth], [e["step_return"] for e in found])
-            row = {
-                "rank correlation": a.rank_correlation if a.rank_correlation is not None else 0.0,
-                "p": a.rank_p if a.rank_p is not None else 1.0,
-                "regret, paper": a.regret_as_paper or 0.0,
-                "regret": a.regret,
-                "regret, % of range": 100 * (a.regret_of_range or 0.0),
-                "MAE, % of range": 100 * (a.mae_of_range or 0.0),
-                "step MAE, % of range": 100 * (steps.mae_of_range or 0.0),
-                "covered, %": 100 * float(np.mean(inside)),
-                "seconds": cell["seconds"],
-            }
-            into = result.setdefault(name, {}).setdefault(method, {})
-            for metric, value in row.items():
-                into.setdefault(metric, []).append(float(value))
+            truth = cells.get(f"{name}/{seed}/truth")
+            if method == "truth":
+                rows = {"days alone": _days_alone(truth)} if truth["on_days"] else {}
+            elif method == "choice":
+                rows = {"ranking": _widened(cells.get(f"{name}/{seed}/{cell['method']}"), cell)}
+            else:
+                rows = {method: cell["estimates"]}
+            for row, estimates in rows.items():
+                if estimates:
+                    into = result.setdefault(name, {}).setdefault(row, {})
+                    for metric, value in scores(truth, estimates).items():
+                        into.setdefault(metric, []).append(value)
+                    into.setdefault("seconds", []).append(float(cell.get("seconds", 0.0)))
     return result
+
+
+def scores(truth: dict[str, Any], estimates: dict[str, dict[str, Any]]) -> dict[str, float]:
+    """The metrics of one method on one data set."""
+    names = list(truth["policies"])
+    v = np.array([truth["policies"][p]["total"] for p in names])
+    found = [estimates[p] for p in names]
+    said = np.array([e["value"] for e in found])
+    a, spread = accuracy(v, said), float(np.ptp(v))
+    on_days = np.array([truth["on_days"][p]["total"] for p in names]) if truth["on_days"] else v
+    inside = [e["low"] <= t <= e["high"] for e, t in zip(found, v, strict=True)]
+    return {
+        "rank correlation": a.rank_correlation if a.rank_correlation is not None else 0.0,
+        "p": a.rank_p if a.rank_p is not None else 1.0,
+        "regret, paper": a.regret_as_paper or 0.0,
+        "regret, % of range": 100 * (a.regret_of_range or 0.0),
+        "MAE, % of range": 100 * (a.mae_of_range or 0.0),
+        "its days' MAE, %": 100 * float(np.abs(said - on_days).mean()) / spread,
+        "differences' MAE, %": 100 * float(np.abs((said - said.mean()) - (v - v.mean())).mean()) / spread,
+        "covered, %": 100 * float(np.mean(inside)),
+    }
+
+
+def _days_alone(truth: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {n: {"value": t["total"], "low": t["total"], "high": t["total"]} for n, t in truth["on_days"].items()}
+
+
+def _widened(chosen: dict[str, Any] | None, choice: dict[str, Any]) -> dict[str, dict[str, Any]] | None:
+    if chosen is None or "failed" in chosen:
+        return None
+    excess = next((NINETY * s["excess"] for s in choice["table"] if s["method"] == choice["method"]), 0.0)
+    return {n: e | {"low": e["low"] - excess, "high": e["high"] + excess} for n, e in chosen["estimates"].items()}
 
 
 def show(found: dict[str, dict[str, dict[str, list[float]]]], cells: Cells) -> None:
@@ -185,13 +226,13 @@ def show(found: dict[str, dict[str, dict[str, list[float]]]], cells: Cells) -> N
         first = next(c for c in truth if c["key"].endswith("/truth"))
         error = np.mean([p["standard_error"] for p in first["policies"].values()])
         spread = np.ptp([p["total"] for p in first["policies"].values()])
-        seeds = len(next(iter(methods.values()))["p"])
+        seeds = max(len(row["p"]) for row in methods.values())
         out(f"\n{name}: {first['sessions']} sessions, {len(first['policies'])} policies, {seeds} seeds; ")
         out(f"true returns span {spread:.0f}, standard error {100 * error / spread:.1f} % of that\n")
         metrics = list(next(iter(methods.values())))
-        out(f"{'':<10}" + "".join(f"{m:>21}" for m in metrics) + "\n")
+        out(f"{'':<11}" + "".join(f"{m:>21}" for m in metrics) + "\n")
         for method, row in sorted(methods.items(), key=lambda item: -float(np.mean(item[1]["rank correlation"]))):
-            out(f"{method:<10}" + "".join(f"{np.mean(row[m]):>21.2f}" for m in metrics) + "\n")
+            out(f"{method:<11}" + "".join(f"{np.mean(row[m]):>21.2f}" for m in metrics) + "\n")
         for cell in (c for c in truth if c["key"].endswith("/choice")):
             out(f"chosen by held-out skill, seed {cell['key'].split('/')[1]}: {cell['method']} ({cell['reason']})\n")
     if not found:
@@ -206,6 +247,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--without", default="", help="methods to leave out, with commas")
     parser.add_argument("--truth", type=int, help="simulated sessions behind each true return; 300 by default, 100 with --quick")
+    parser.add_argument("--only-truth", action="store_true", help="train the policies, measure their true returns, and no more")
     parser.add_argument("--minutes", type=float, default=1e9, help="start no further world and seed after so many minutes")
     parser.add_argument("--out", type=Path, help="folder of cells.jsonl and ope.svg; a temporary one by default")
     chosen = parser.parse_args()
@@ -218,10 +260,11 @@ def main() -> None:
     names = names[:1] if chosen.quick else names
     sessions = chosen.truth or (100 if chosen.quick else 300)
     start = time.monotonic()
+    run = Run(cells, out, chosen.quick, frozenset(chosen.without.split(",")), sessions)
     for seed in range(1 if chosen.quick else chosen.seeds):
         for name in names:
             if time.monotonic() - start < 60 * chosen.minutes:
-                measure(WORLDS[name](), seed, VISITS[name], cells, chosen.quick, set(chosen.without.split(",")), sessions)
+                (prepare if chosen.only_truth else measure)(WORLDS[name](), seed, VISITS[name], run)
     found = summary(names, cells)
     show(found, cells)
     figure = out / "ope.svg"

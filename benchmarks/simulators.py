@@ -16,7 +16,7 @@ import numpy as np
 
 from ml.cohort import PARTICIPANTS, true_return
 from ml.cohort.sessions import run_sessions
-from ml.mdp import MdpSettings, step_reward
+from ml.mdp import MdpSettings, end_reward, step_reward
 from ml.qoc import Qoc
 from ml.rl.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -59,6 +59,9 @@ class World(Protocol):
     def truth(self, policy: Policy, sessions: int) -> Truth:
         """True return of a policy."""
 
+    def truth_on_days(self, policy: Policy, seed: int, visits: int, sessions: int) -> Truth | None:
+        """What a policy would have returned on the very days of `data(seed, visits)`; None where days are all alike."""
+
 
 def plan(xi: float, visits: int) -> Iterator[Planned]:
     """First a visit of random sessions; later ones with cDBS between adaptive controllers, one new one per visit."""
@@ -67,6 +70,11 @@ def plan(xi: float, visits: int) -> Iterator[Planned]:
         adaptive = ProportionalPolicy(xi * (0.65 + 0.05 * visit), xi * 1.25, 0.2 + 0.08 * visit, 2 + visit)
         ran = Planned("rl", visit, adaptive, visit)
         yield from [ran, Planned("cdbs", visit), ran, Planned("random", visit), Planned("random", visit)]
+
+
+def _hour(i: int) -> float:
+    """Hour of the day of the i-th session of the data."""
+    return 0.4 + 0.9 * (i % 6)
 
 
 class CohortWorld:
@@ -84,7 +92,7 @@ class CohortWorld:
                 self.code,
                 planned.policy if planned.policy is not None else planned.controller,
                 visits=planned.visit,
-                hours=0.4 + 0.9 * (i % 6),
+                hours=_hour(i),
                 seeds=1000 * (seed + 1) + i,
                 study_seed=seed + 1,
                 steps=planned.steps,
@@ -98,6 +106,25 @@ class CohortWorld:
     def truth(self, policy: Policy, sessions: int) -> Truth:
         found = true_return(policy, self.code, self.settings, sessions=sessions, seed=77, steps=STEPS)
         return Truth(found.mean, found.standard_error, found.step_return.mean, found.end_reward.mean)
+
+    def truth_on_days(self, policy: Policy, seed: int, visits: int, sessions: int) -> Truth | None:
+        planned = list(plan(self.settings.xi_beta, visits))
+        of = np.arange(sessions) % len(planned)
+        batch = run_sessions(
+            self.code,
+            policy,
+            visits=np.array([p.visit for p in planned])[of],
+            hours=np.array([_hour(i) for i in range(len(planned))])[of],
+            seeds=500_000 + np.arange(sessions, dtype=np.uint64),
+            study_seed=seed + 1,
+            steps=STEPS,
+            lower_bound=self.settings.lower_bound,
+        )
+        s = self.settings
+        steps = (step_reward(s, batch.beta, batch.amplitude) * s.gamma ** np.arange(STEPS)).sum(1)
+        ends = np.array([end_reward(s, outcome.qoc) for outcome in batch.outcomes], dtype=np.float64)
+        error = float((steps + ends).std(ddof=1) / math.sqrt(sessions))
+        return Truth(float((steps + ends).mean()), error, float(steps.mean()), float(ends.mean()))
 
 
 class OtherWorld:
@@ -146,6 +173,9 @@ class OtherWorld:
         ends = s.c2 * grasp + s.c3 * rating - s.c4 * tremor / (100 if s.tremor_as_fraction else 1)
         total = steps + ends
         return Truth(float(total.mean()), float(total.std(ddof=1) / math.sqrt(sessions)), float(steps.mean()), float(ends.mean()))
+
+    def truth_on_days(self, policy: Policy, seed: int, visits: int, sessions: int) -> Truth | None:
+        return None
 
 
 class SaturatingWorld(OtherWorld):

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Response
 from app.accounts.deps import CurrentCaller
 from app.evaluation import calibration, jobs_api, ranking
 from app.evaluation.calibration_schemas import CalibrationOut
-from app.evaluation.export import to_csv
+from app.evaluation.export import calibration_to_csv, to_csv
 from app.evaluation.schemas import Kind, Method, RankingFilter, RankingOut
 from app.platform.database import Db
 from app.platform.schemas import problems
@@ -43,13 +43,32 @@ def read_ranking(
     return csv_of(found) if format == "csv" else found
 
 
-@router.get("/participants/{code}/calibration", tags=["evaluation"])
-def read_calibration(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> CalibrationOut:
+@router.get(
+    "/participants/{code}/calibration",
+    tags=["evaluation"],
+    response_model=CalibrationOut,
+    responses={200: {"content": {"text/csv": {"schema": {"type": "string"}}}}},
+)
+def read_calibration(
+    participant: CurrentParticipant,
+    db: Db,
+    caller: CurrentCaller,
+    format: Annotated[Literal["json", "csv"], Query(description="csv: one row per visit, policy and method.")] = "json",
+) -> CalibrationOut | Response:
     """Estimates made before each visit against what the visit brought, and the metrics of every method."""
-    return calibration.calibration(db, participant, caller)
+    found = calibration.calibration(db, participant, caller)
+    return calibration_csv_of(found) if format == "csv" else found
 
 
 def csv_of(found: RankingOut) -> Response:
     """A ranking as a CSV download."""
-    name = f"{found.participant}-ranking-{found.evaluation_id}.csv"
-    return Response(to_csv(found), media_type=CSV, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+    return _download(to_csv(found), f"{found.participant}-ranking-{found.evaluation_id}.csv")
+
+
+def calibration_csv_of(found: CalibrationOut) -> Response:
+    """A calibration as a CSV download."""
+    return _download(calibration_to_csv(found), f"{found.participant}-calibration.csv")
+
+
+def _download(content: str, name: str) -> Response:
+    return Response(content, media_type=CSV, headers={"Content-Disposition": f'attachment; filename="{name}"'})

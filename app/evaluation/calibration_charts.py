@@ -117,6 +117,69 @@ def metrics(found: CalibrationOut) -> Chart:
     )
 
 
+def over_visits(found: CalibrationOut, method: str) -> Chart | None:
+    """The three metrics of every method at each visit, side by side; None where there are not two visits to compare.
+
+    The shown method is drawn strongly with its intervals, the others thinly beside it.
+    """
+    rows = [m for m in found.metrics if m.visit is not None]
+    visits = sorted({m.visit for m in rows if m.visit is not None})
+    if len(visits) < 2:
+        return None
+    data: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {}
+    for k, (metric, (title, unit)) in enumerate(METRIC_NAMES.items()):
+        suffix = "" if k == 0 else str(k + 1)
+        for name in sorted(found.methods, key=lambda m: m == method):
+            own = [m for m in rows if m.method == name]
+            values, style, chosen = [getattr(m, metric) for m in own], METHOD_STYLES[name], name == method
+            data.append(
+                {
+                    "type": "scatter",
+                    "mode": "lines+markers",
+                    "name": METHOD_SHORT[name],
+                    "legendgroup": name,
+                    "showlegend": k == 0,
+                    "opacity": 1.0 if chosen else 0.45,
+                    "x": [m.visit for m in own],
+                    "y": [v.value for v in values],
+                    "xaxis": f"x{suffix}",
+                    "yaxis": f"y{suffix}",
+                    "line": {"color": style["color"], "width": 2.5 if chosen else 1.2},
+                    "marker": {"size": 9 if chosen else 6, "color": style["color"], "symbol": style["symbol"]},
+                    "hovertemplate": "visit %{x}: %{y:.3g}<extra>" + METHOD_NAMES[name] + "</extra>",
+                }
+                | ({"error_y": _error_bars(values)} if chosen else {})
+            )
+        ticks = {"tickvals": visits, "range": [visits[0] - 0.3, visits[-1] + 0.3]}
+        layout[f"xaxis{suffix}"] = axis(
+            "Visit", "", domain=[k / 3 + (0.05 if k else 0.0), (k + 1) / 3 - 0.02], anchor=f"y{suffix}", **ticks
+        )
+        more = {"range": [-1.1, 1.1]} if metric == "rank_correlation" else {"rangemode": "tozero"}
+        layout[f"yaxis{suffix}"] = axis(title, unit, anchor=f"x{suffix}", **more)
+    level = f"{100 * found.level:.0f} %"
+    columns = ["Visit", "Method", "n policies", "n sessions"]
+    for title, unit in METRIC_NAMES.values():
+        columns += [f"{title} ({unit})", f"Low ({level})", f"High ({level})"]
+    return Chart(
+        id="over-visits",
+        title="Metrics visit by visit",
+        subtitle=f"strong: {METHOD_NAMES[method]}, {level} session bootstrap \u00b7 n = {len(visits)} visits, "
+        f"{sum(m.sessions for m in rows if m.method == method)} sessions \u00b7 a gap: too few policies at that visit",
+        figure=figure(
+            data,
+            showlegend=True,
+            legend={"orientation": "h", "y": -0.24, "yanchor": "top", "x": 0, "font": {"color": MUTED, "size": 11}},
+            **layout,
+        ),
+        columns=columns,
+        rows=[
+            [m.visit, METHOD_NAMES[m.method], m.policies, m.sessions, *(v for name in METRIC_NAMES for v in _cells(m, name))] for m in rows
+        ],
+        height=340,
+    )
+
+
 def quantities(found: CalibrationOut, method: str) -> list[Chart]:
     """Actual against predicted, of every outcome that the method predicts."""
     points = [(p, q) for p in found.policies for q in p.predictions if q.method == method]

@@ -42,6 +42,8 @@ class PredictionOut(Model):
 class TestedPolicyOut(Model):
     """One policy at one visit, and the evaluation that had been made of it before."""
 
+    __test__ = False
+
     visit: int
     visit_date: date | None
     evaluation_id: int

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-from app.evaluation.methods import METHOD_NAMES
+from app.evaluation.methods import METHOD_NAMES, METHOD_SHORT
 from app.evaluation.schemas import RankedPolicy, RankingOut
 from app.platform.charts import MUTED, Chart, axis, figure
 from app.platform.jobs.models import Job, JobEvent
@@ -38,6 +38,9 @@ JOB_CURVES = {
 }
 """Learning curves by the name that the computations give them: title and unit."""
 
+SHARE_CURVES = {"dlmm_loss", "dlmm_held_out_bound", "dual_dice_dice_objective"}
+"""Curves that methods draw while they estimate, over the share of their work instead of their updates."""
+
 
 def shown_references(ranking: RankingOut) -> list[RankedPolicy]:
     """References for the page: cDBS, the best constant, proportional control, the behaviour clone; the API has every constant."""
@@ -67,7 +70,7 @@ def forest(ranking: RankingOut) -> Chart:
             {
                 "type": "scatter",
                 "mode": "markers",
-                "name": METHOD_NAMES[method],
+                "name": METHOD_SHORT[method],
                 "visible": True if method == ranking.default_method else "legendonly",
                 "x": [e.value for e in estimates],
                 "y": [label(p) for p in have],
@@ -100,12 +103,12 @@ def forest(ranking: RankingOut) -> Chart:
         figure=figure(
             data,
             xaxis=axis("Estimated return", "reward"),
-            yaxis=axis("", categoryorder="array", categoryarray=[label(p) for p in reversed(shown)]),
+            yaxis=axis("", categoryorder="array", categoryarray=[label(p) for p in reversed(shown)], dtick=1),
             margin={"l": 150, "r": 16, "t": 12, "b": 44},
         ),
         columns=["Policy", "Rank", "Method", "Value (reward)", f"Low ({100 * level:.0f} %)", f"High ({100 * level:.0f} %)", "Supported"],
         rows=rows,
-        height=110 + 30 * len(shown),
+        height=140 + 30 * len(shown),
     )
 
 
@@ -118,7 +121,8 @@ def job_curves(job: Job, events: Sequence[JobEvent]) -> list[Chart]:
                 curve, member = _of_member(name)
                 curves[curve][(event.step_key or "") + member][point["x"]] = value
     titles = {s.key: s.title for s in job.steps}
-    return [_curve_chart(name, curves[name], titles) for name in JOB_CURVES if name in curves]
+    unnamed = sorted(curves.keys() - JOB_CURVES.keys())
+    return [_curve_chart(name, curves[name], titles) for name in (*(n for n in JOB_CURVES if n in curves), *unnamed)]
 
 
 def _of_member(name: str) -> tuple[str, str]:
@@ -127,8 +131,9 @@ def _of_member(name: str) -> tuple[str, str]:
     return (curve, f" · {number}") if number.isdigit() and curve in JOB_CURVES else (name, "")
 
 
-def _curve_chart(name: str, by_step: dict[str, dict[float, float]], titles: dict[str, str]) -> Chart:
-    title, unit = JOB_CURVES[name]
+def _curve_chart(curve: str, by_step: dict[str, dict[float, float]], titles: dict[str, str]) -> Chart:
+    title, unit = JOB_CURVES.get(curve, (curve.replace("_", " ").capitalize(), "as the computation gives it"))
+    x_title = "Share of the fit (%)" if curve in SHARE_CURVES else "Update"
     data: list[dict[str, Any]] = []
     rows: list[list[Any]] = []
     for k, (step, points) in enumerate(sorted(by_step.items())):
@@ -139,17 +144,17 @@ def _curve_chart(name: str, by_step: dict[str, dict[float, float]], titles: dict
         data.append({"type": "scatter", "mode": "lines", "name": name, "x": x, "y": [points[v] for v in x], "line": line})
         rows += [[name, v, points[v]] for v in x]
     return Chart(
-        id=f"job-{name}",
+        id=f"job-{curve.replace('_', '-')}",
         title=title,
-        subtitle=f"{unit} · n = {len(rows)} points of {len(by_step)} steps",
+        subtitle=f"{unit} · n = {len(rows)} points of {len(by_step)} {'step' if len(by_step) == 1 else 'steps'}",
         figure=figure(
             data,
-            xaxis=axis("Update"),
+            xaxis=axis(x_title),
             yaxis=axis(""),
             showlegend=True,
             legend={"orientation": "h", "y": -0.34, "yanchor": "top", "x": 0, "font": {"color": MUTED, "size": 11}},
         ),
-        columns=["Step", "Update", title],
+        columns=["Step", x_title, title],
         rows=rows,
         height=400,
     )

@@ -1,8 +1,9 @@
-"""What the child processes of evaluation run: fit one DLSM ensemble member, estimate policies by one method, choose the method."""
+"""What the child processes of evaluation run: check coverage, fit one DLSM ensemble member, estimate by one method, choose the method."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +38,7 @@ def fit_dlsm(params: dict[str, Any], workdir: Path, report: Report) -> dict[str,
         report: loss and held-out score over gradient steps.
 
     Returns:
-        `held_out` of the best check, or `failed` with the reason where these data cannot be fitted.
+        `held_out_score` of the best check and the number of `checks`, or `failed` with the reason where these data cannot be fitted.
     """
     import torch
 
@@ -50,7 +51,15 @@ def fit_dlsm(params: dict[str, Any], workdir: Path, report: Report) -> dict[str,
         member = estimator.fit_member(buffer, params["member"], told(report, estimator.config.steps, "dlsm_"), workdir)
     except ValueError as error:
         return {"failed": str(error)}
+    report.log(f"member {params['member'] + 1} {_ended(member.course, estimator.config.steps)}")
     return {"held_out_score": float(member.check.score), "checks": len(member.course)}
+
+
+def _ended(course: Sequence[tuple[int, float, float]], steps: int) -> str:
+    """How a member's training ended, from its (update, loss, held-out score) and the updates that it might have taken."""
+    last, (best, _, score) = course[-1][0], min(course, key=lambda check: check[2] if math.isfinite(check[2]) else math.inf)
+    end = "ran to its last update" if last >= steps else f"was stopped early, at update {last} of {steps}"
+    return f"{end}: the best held-out score, {score:.4g}, was that of update {best}, which is kept"
 
 
 @compute("evaluate_method")
@@ -70,18 +79,23 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: Report) -> di
         return {"failed": params["failed"]}
     import torch
 
+    from ml.ope.dlmm import Dlmm
+
     torch.set_num_threads(1)
     buffer = read_buffer(params["snapshot_sha256"])
     estimator = _estimator(params)
     for k, sha256 in enumerate(params.get("members", [])):
         write_atomically(workdir / member_file(k), files.read(sha256))
     policies = _policies(params["policies"], buffer)
+    # its members learn one after the other, those of DualDICE side by side
+    members = estimator.config.members if isinstance(estimator, Dlmm) else 1
 
     def part(first: float, share: float, what: str, curves: bool) -> progress.Report:
         def tell(fraction: float, message: str = "", **numbers: float) -> None:
             report.progress(first + share * fraction, message or what)
             if curves and numbers:
-                report.point(round(100 * fraction, 3), **{f"{params['method']}_{name}": value for name, value in numbers.items()})
+                at, suffix = _of_member(fraction, members)
+                report.point(round(100 * at, 3), **{f"{params['method']}_{name}{suffix}": value for name, value in numbers.items()})
 
         return tell
 
@@ -94,6 +108,31 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: Report) -> di
     except ValueError as error:
         return {"failed": str(error)}
     return {"estimates": {policy_id: _finite(e.to_json()) for policy_id, e in estimates.items()}}
+
+
+@compute("check_coverage")
+def check_coverage(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+    """Check what the data can say about every policy, whatever the methods say of it.
+
+    Args:
+        params: `snapshot_sha256`, `horizon_steps`, `policies` as [{`id`, `sha256`}].
+        workdir: not used. report: progress over policies.
+
+    Returns:
+        `policies`, by policy id what `ml.ope.diagnostics.Diagnostics` holds; or `failed` with the reason where these data cannot be
+        checked.
+    """
+    import torch
+
+    from ml.ope.diagnostics import diagnose
+
+    torch.set_num_threads(1)
+    buffer = read_buffer(params["snapshot_sha256"])
+    try:
+        found = diagnose(buffer, _policies(params["policies"], buffer), params["horizon_steps"], told(report, 1.0))
+    except ValueError as error:
+        return {"failed": str(error)}
+    return {"policies": {policy_id: _finite(d.to_json()) for policy_id, d in found.items()}}
 
 
 @compute("choose_method")
@@ -159,6 +198,14 @@ def _policies(named: list[dict[str, Any]], buffer: ReplayBuffer) -> dict[str, Po
     from ml.rl.onnx_policy import OnnxPolicy
 
     return {str(p["id"]): OnnxPolicy(files.read(p["sha256"]), buffer.settings.window) for p in named}
+
+
+def _of_member(fraction: float, members: int) -> tuple[float, str]:
+    """A fraction of the whole fit as a fraction of one member's, and the ending of its curve's name."""
+    if members == 1:
+        return fraction, ""
+    k = min(max(math.ceil(fraction * members - 1e-9) - 1, 0), members - 1)
+    return fraction * members - k, f"_{k + 1}"
 
 
 def _finite(value: Any) -> Any:

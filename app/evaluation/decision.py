@@ -30,7 +30,8 @@ FEWEST_TESTED = 3
 
 RULES = (
     "Reject: it was retired, or the whole interval of its gain over cDBS lies below 0.",
-    "Needs more data: the data do not support its estimate, or that of cDBS; or its gain over cDBS may be 0 or less (lower 95 % bound).",
+    "Needs more data: the data do not support its estimate, or that of cDBS; or what they cover could not be checked; or its gain over "
+    "cDBS may be 0 or less (lower 95 % bound).",
     f"Needs more data, although the gain is above 0: its rating is predicted more than {RATING_POINTS:g} point lower than under cDBS, its "
     f"tremor more than {TREMOR_POINTS:g} percentage points higher or its grasp more than {100 * GRASP_SHARE:.0f} % slower; or another "
     f"method sees a loss; or at least {FEWEST_TESTED} sessions of it returned less than the estimate's lower bound.",
@@ -74,6 +75,7 @@ def decide(
     *,
     retired_reason: str | None = None,
     tested: TestedBefore | None = None,
+    unchecked: str | None = None,
 ) -> tuple[Decision, str]:
     """The decision on one candidate and its reason.
 
@@ -81,6 +83,7 @@ def decide(
         estimates: of the candidate, by method. cdbs: of the cDBS reference, by method; empty where it has none.
         method: the ranking's.
         retired_reason: why a person withdrew it. tested: what its sessions returned.
+        unchecked: why what the data cover could not be checked; None where it was.
     """
     if retired_reason:
         return "reject", f"retired: {retired_reason}"
@@ -90,6 +93,8 @@ def decide(
         return "needs_data", f"{name} has no estimate of it"
     if not own.supported:
         return "needs_data", failing_check(own)
+    if unchecked is not None:
+        return "needs_data", f"what the data cover could not be checked: {unchecked}"
     if reference is None or not reference.supported:
         why = "has no estimate" if reference is None else f"is itself {failing_check(reference)}"
         return "needs_data", f"the cDBS reference, which it is held against, {why}"
@@ -155,4 +160,5 @@ def _experience(own: Estimate, tested: TestedBefore | None) -> list[str]:
 
 
 def _signed(value: float) -> str:
-    return f"{value:+.1f}".replace("-", "\N{MINUS SIGN}")
+    shown = round(value, 1)
+    return f"{shown:+.1f}".replace("-", "\N{MINUS SIGN}") if shown else "0.0"

@@ -20,6 +20,8 @@ from app.platform import files
 from app.platform.jobs import JobContext, Priority, job_kind
 
 FIT_WEIGHT = 15.0
+COVERAGE_STEP = "coverage"
+COVERAGE_WEIGHT = 1.0
 SKILL_STEP = "choose-method"
 SKILL_WEIGHT = 2.0
 _TORCH_FILE = "application/x-pytorch"
@@ -30,6 +32,7 @@ def declare_evaluation(job: JobContext, params: EvaluateParams, *, fit: bool) ->
     if fit:
         _declare_fit(job, params)
     job.step("choose-policies", "Choose policies and references", weight=learning.STORE_WEIGHT)
+    job.step(COVERAGE_STEP, "Check what the data can say about each policy", weight=COVERAGE_WEIGHT)
     for method in _fitted(params):
         job.step(f"estimate/{method}", f"Estimate every policy: {METHOD_NAMES[method]}", weight=METHOD_WEIGHTS[method])
     job.step(SKILL_STEP, "Hold the methods against controllers that were left out", weight=SKILL_WEIGHT)
@@ -56,7 +59,7 @@ def store_members(job: JobContext, results: Sequence[dict[str, Any]]) -> dict[st
 
 
 def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, Any], models: dict[str, Any]) -> dict[str, Any]:
-    """Estimate the candidates and references by every method, choose the default one by left-out controllers, store and rank."""
+    """Check coverage, estimate candidates and references by every method, choose the default one by left-out controllers, rank."""
 
     def choose(db: Session) -> dict[str, Any]:
         row = db.get_one(BufferSnapshot, snapshot["id"])
@@ -80,11 +83,12 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
         "policies": chosen["policies"],
     }
     methods = _fitted(params)
-    calls: list[learning.Call] = [
+    calls: list[learning.Call] = [(COVERAGE_STEP, "check_coverage", common)]
+    calls += [
         (f"estimate/{method}", "evaluate_method", common | {"method": method} | (models if method == "dlsm" else {})) for method in methods
     ]
     calls.append((SKILL_STEP, "choose_method", common | {"methods": params.methods, "policies": chosen["ran"]}))
-    *estimates, skill = job.compute_all(calls)
+    coverage, *estimates, skill = job.compute_all(calls)
     results = dict(zip(methods, estimates, strict=True))
 
     def store(db: Session) -> dict[str, Any]:
@@ -98,6 +102,7 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
             results=results,
             config=params.model_dump(mode="json") | {"dlsm_members": models.get("members", [])},
             skill=skill,
+            coverage=coverage,
         )
         return {"evaluation_id": row.id, "default_method": row.default_method}
 

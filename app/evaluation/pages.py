@@ -11,9 +11,10 @@ from sqlalchemy.orm import Session
 from app.accounts import policy as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.policy import Caller
-from app.evaluation import calibration_charts, charts, ranking, repository, service
-from app.evaluation.api import csv_of
+from app.evaluation import calibration_charts, charts, coverage, ranking, repository, service
+from app.evaluation.api import calibration_csv_of, csv_of
 from app.evaluation.calibration import calibration
+from app.evaluation.calibration_words import in_sentences
 from app.evaluation.decision import RULES
 from app.evaluation.jobs_api import CurrentJob
 from app.evaluation.methods import METHOD_NAMES, METHOD_SHORT, METHODS, QUICK_METHODS
@@ -77,6 +78,7 @@ def ranking_page(
         method_names=METHOD_NAMES,
         method_short=METHOD_SHORT,
         decision_names=DECISION_NAMES,
+        coverage=coverage,
         rules=RULES,
         shown=shown,
         live=_live_jobs(db, participant),
@@ -114,13 +116,20 @@ def calibration_page(
         calibration=found,
         method=chosen,
         method_names=METHOD_NAMES,
-        label=calibration_charts.label,
+        sentences=in_sentences(found, chosen) if chosen else [],
+        over_visits=calibration_charts.over_visits(found, chosen) if chosen else None,
         returns=calibration_charts.returns(found, chosen) if chosen else None,
         metrics=calibration_charts.metrics(found) if found.metrics else None,
         outcomes=calibration_charts.quantities(found, chosen) if chosen else [],
         quantity_names=calibration_charts.QUANTITY_NAMES,
     )
     return HTMLResponse(page)
+
+
+@router.get("/participants/{code}/calibration.csv")
+def calibration_csv(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
+    """The calibration as CSV."""
+    return calibration_csv_of(calibration(db, participant, caller))
 
 
 @router.get("/participants/{code}/jobs")
@@ -161,7 +170,7 @@ def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller)
         live=not JobStatus(found.job.status).ended,
         curves=charts.job_curves(found.job, [e for e in events if e.kind == "points"]),
         log=[e for e in events if e.kind == "log"][-LOG_LINES:],
-        params={k: v for k, v in found.job.params.items() if v not in (None, [])},
+        params=_in_words({k: v for k, v in found.job.params.items() if v not in (None, [])}),
         refresh_s=REFRESH_S,
         workers=len(jobs.live_workers(db, job_service.STALE_S)),
         may_run=_may(caller, can.RUN_JOBS, found.participant),
@@ -220,6 +229,12 @@ def _jobs(
         may_run=_may(caller, can.RUN_JOBS, participant),
     )
     return HTMLResponse(page, status)
+
+
+def _in_words(params: dict[str, Any]) -> dict[str, Any]:
+    """What was asked for, with methods and algorithms by their names."""
+    names = {"methods": METHOD_NAMES, "algorithms": ALGORITHM_NAMES}
+    return {k: [str(names[k].get(one, one)) for one in v] if k in names else v for k, v in params.items()}
 
 
 def _readiness(db: Session, participant: Participant, request: Request) -> dict[str, Any] | None:

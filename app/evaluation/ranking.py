@@ -10,13 +10,25 @@ from sqlalchemy.orm import Session
 from app.accounts import policy as can
 from app.accounts.policy import Caller
 from app.evaluation import repository
+from app.evaluation.coverage import coverage_by_policy, coverage_failed
 from app.evaluation.decision import decide, gain_over
 from app.evaluation.estimates import estimate_of
-from app.evaluation.methods import METHODS
+from app.evaluation.methods import METHODS, in_words
 from app.evaluation.models import Evaluation
 from app.evaluation.notes import ranking_notes
 from app.evaluation.results import results_by_policy, sessions_that_ran
-from app.evaluation.schemas import ChoiceOut, EstimateOut, GainOut, RankedPolicy, RankedSnapshot, RankingFilter, RankingOut, TestedBefore
+from app.evaluation.schemas import (
+    ChoiceOut,
+    CoverageOut,
+    Decision,
+    EstimateOut,
+    GainOut,
+    RankedPolicy,
+    RankedSnapshot,
+    RankingFilter,
+    RankingOut,
+    TestedBefore,
+)
 from app.evaluation.staleness import stale_reasons
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.snapshots import Collection, collect
@@ -66,13 +78,14 @@ def current_ranking(
     settings = study.mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
     cdbs = next((i for i, p in policies.items() if is_cdbs(p)), None)
     tested = results_by_policy(sessions_that_ran(db, snapshot, caller), settings, evaluation.horizon_steps, cdbs)
-    rows = _rows(table, policies, chosen, tested)
+    rows = _rows(evaluation, table, policies, chosen, tested)
     candidates, references = [r for r in rows if r.reference is None], [r for r in rows if r.reference is not None]
     reasons = [trouble] if trouble else []
     reasons += stale_reasons(db, participant, evaluation, present)
     return RankingOut(
         participant=participant.code,
         evaluation_id=evaluation.id,
+        job_id=evaluation.job_id,
         created_at=evaluation.created_at,
         default_method=chosen,
         methods=methods,
@@ -86,7 +99,8 @@ def current_ranking(
         notes=ranking_notes(candidates, references, chosen),
         policies=[p for p in candidates if _passes(p, shown)],
         references=references,
-        choice=ChoiceOut.model_validate(choice) if (choice := evaluation.diagnostics.get("choice")) else None,
+        coverage_failed=coverage_failed(evaluation),
+        choice=_choice_out(evaluation),
         hidden=sum(not _passes(p, shown) for p in candidates),
     )
 
@@ -102,7 +116,7 @@ def _passes(policy: RankedPolicy, shown: RankingFilter | None) -> bool:
 def evaluation_notes(db: Session, evaluation: Evaluation) -> list[str]:
     """The notes of an evaluation's ranking by its own method, whether or not it is the newest."""
     table = _table(evaluation)
-    rows = _rows(table, repository.policies_by_id(db, list(table)), evaluation.default_method, {})
+    rows = _rows(evaluation, table, repository.policies_by_id(db, list(table)), evaluation.default_method, {})
     candidates, references = [r for r in rows if r.reference is None], [r for r in rows if r.reference is not None]
     return ranking_notes(candidates, references, evaluation.default_method)
 
@@ -114,7 +128,10 @@ def _table(evaluation: Evaluation) -> Table:
     return table
 
 
-def _rows(table: Table, policies: Mapping[int, Policy], method: str, tested: Mapping[int, TestedBefore]) -> list[RankedPolicy]:
+def _rows(
+    evaluation: Evaluation, table: Table, policies: Mapping[int, Policy], method: str, tested: Mapping[int, TestedBefore]
+) -> list[RankedPolicy]:
+    coverage, unchecked = coverage_by_policy(evaluation), coverage_failed(evaluation)
     references = {i: _reference(p) for i, p in policies.items() if p.kind == "baseline"}
     by_method = {i: by[method] for i, by in table.items() if method in by}
     constants = {i: by_method[i] for i, r in references.items() if r in ("cdbs", "constant") and i in by_method and by_method[i].supported}
@@ -132,7 +149,9 @@ def _rows(table: Table, policies: Mapping[int, Policy], method: str, tested: Map
     for i in order:
         policy, place, chosen = policies[i], places.get(i), by_method.get(i)
         gain = gain_over(chosen, cdbs[method]) if chosen and method in cdbs and table[i] is not cdbs else None
-        decided = decide(table[i], cdbs, method, retired_reason=policy.retired_reason, tested=tested.get(i)) if i in places else (None, "")
+        decided: tuple[Decision | None, str] = (None, "")
+        if i in places:
+            decided = decide(table[i], cdbs, method, retired_reason=policy.retired_reason, tested=tested.get(i), unchecked=unchecked)
         rows.append(
             RankedPolicy(
                 policy_id=i,
@@ -147,7 +166,8 @@ def _rows(table: Table, policies: Mapping[int, Policy], method: str, tested: Map
                 retired=policy.retired_reason is not None,
                 estimates={m: _estimate_out(table[i][m]) for m in METHODS if m in table[i]},
                 predicted=chosen.predicted if chosen else {},
-                flags=_flags(chosen, i in references),
+                flags=_flags(chosen, coverage.get(i), i in references),
+                coverage=coverage.get(i),
                 tested=tested.get(i),
                 gain=GainOut.model_validate(gain) if gain else None,
                 decision=decided[0],
@@ -157,11 +177,10 @@ def _rows(table: Table, policies: Mapping[int, Policy], method: str, tested: Map
     return rows
 
 
-def _flags(estimate: Estimate | None, is_reference: bool) -> list[str]:
+def _flags(estimate: Estimate | None, coverage: CoverageOut | None, is_reference: bool) -> list[str]:
     """What to know of a policy. That a reference holds one amplitude is its purpose and no warning."""
-    if estimate is None:
-        return []
-    return [f for f in estimate.flags if not (is_reference and f.startswith(NO_CLOSED_LOOP))]
+    flags = [*(estimate.flags if estimate else ()), *(coverage.notes if coverage else ())]
+    return [f for f in dict.fromkeys(flags) if not (is_reference and f.startswith(NO_CLOSED_LOOP))]
 
 
 def _reference(policy: Policy) -> str:
@@ -189,6 +208,12 @@ def _estimate_out(e: Estimate) -> EstimateOut:
         predicted=e.predicted,
         n=e.n,
     )
+
+
+def _choice_out(evaluation: Evaluation) -> ChoiceOut | None:
+    """The stored choice; its reason comes from the science, which knows methods by their keys."""
+    choice = evaluation.diagnostics.get("choice")
+    return ChoiceOut.model_validate(choice | {"reason": in_words(choice["reason"])}) if choice else None
 
 
 def _snapshot_out(db: Session, row: BufferSnapshot) -> RankedSnapshot:

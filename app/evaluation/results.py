@@ -11,10 +11,10 @@ from app.accounts.policy import Caller
 from app.evaluation.actual import Actual, actual, mean_of
 from app.evaluation.schemas import TestedBefore
 from app.learning.models import BufferSnapshot
+from app.learning.trajectories import trajectory_of
 from app.platform.errors import Invalid
 from app.study import blinding
 from app.study import repository as study_repository
-from app.study import service as study
 from app.study.blinding import Arm
 from app.study.models import Controller, SettingsVersion, StudySession
 from app.study.traces import step_table
@@ -86,24 +86,11 @@ def results_by_policy(ran: list[Ran], settings: MdpSettings, horizon_steps: int,
 
 def _read(db: Session, session: StudySession, arm: Arm, version: SettingsVersion, snapshot: BufferSnapshot) -> SessionTrajectory | str:
     """The session's steps, or why they cannot be held against estimates."""
-    if session.excluded_reason:
-        return f"excluded by a person: {session.excluded_reason}"
     try:
         table = step_table(db, session, version)
     except Invalid as error:
         return str(error)
-    trace = table.beta_trace
-    if trace is None or table.amplitude_trace is None or not (table.t_s > 0).any():
-        return "it has no beta trace, no amplitude trace, or no step"
-    if (trace.unit, trace.source) != (snapshot.beta_unit, snapshot.beta_source):
+    read, trace = trajectory_of(session, table, arm, version.window), table.beta_trace
+    if not isinstance(read, str) and trace is not None and (trace.unit, trace.source) != (snapshot.beta_unit, snapshot.beta_source):
         return f"its beta is in {trace.unit} from {trace.source}, the estimates are in {snapshot.beta_unit} from {snapshot.beta_source}"
-    return SessionTrajectory(
-        session_id=session.id,
-        visit=session.visit.number,
-        controller=arm.controller.value,
-        policy_id=arm.policy_id,
-        lead_beta=table.beta[: version.window],
-        beta=table.beta[version.window :],
-        amplitude=table.fraction[version.window :],
-        qoc=study.qoc_of(session),
-    )
+    return read

@@ -160,6 +160,34 @@ class GainOut(Model):
     level: float
 
 
+class CheckOut(Model):
+    """One check of what the data cover, with the limit that was in force."""
+
+    model_config = ConfigDict(extra="ignore")  # stored with the evaluation: an older or newer one may hold more
+
+    name: str = Field(
+        description="`outside_range`, `thin`, `far`, `below_random_bound`, `unseen_dose` (shares of steps), `distance`, "
+        "`effective_sessions`, `largest_weight_share`, `horizon_of_ten` (steps)."
+    )
+    value: float | None = Field(description="Null where the data cannot tell.")
+    limit: float | None = Field(description="Null where the value is only told.")
+    at_least: bool = Field(description="Whether the limit is the least value that passes; else it is the greatest.")
+    verdict: Literal["passed", "refused", "weights", "noted", "told"] = Field(
+        description="`refused`: no method may speak about the policy; `weights`: importance sampling may not; `noted`: to be known."
+    )
+
+
+class CoverageOut(Model):
+    """What the data can say about one policy, checked before it was estimated."""
+
+    supported: bool
+    sessions: int = Field(description="Sessions that have importance weights.")
+    checks: list[CheckOut]
+    failing: list[str] = Field(description="Checks that refuse the policy, in words.")
+    notes: list[str] = Field(description="To be known before it is picked; no refusal.")
+    weights_failing: list[str] = Field(description="Why importance sampling cannot speak about it.")
+
+
 class RankedPolicy(Model):
     """A policy in the ranking."""
 
@@ -178,6 +206,7 @@ class RankedPolicy(Model):
         description="By the ranking's method: energy, mean_amplitude, mean_beta, grasp_hz, rating, tremor_percent."
     )
     flags: list[str]
+    coverage: CoverageOut | None = Field(description="Null for an evaluation that did not check it, and where it could not be checked.")
     tested: TestedBefore | None
     gain: GainOut | None = Field(description="Over cDBS by the ranking's method; null where one of the two has no estimate.")
     decision: Decision | None = Field(description="By stated rules, in `decision_reason`; null for references.")
@@ -245,6 +274,7 @@ class RankingOut(Model):
 
     participant: str
     evaluation_id: int
+    job_id: str | None = Field(description="The job that made it, with its learning curves.")
     created_at: datetime
     default_method: str
     methods: list[str]
@@ -260,6 +290,7 @@ class RankingOut(Model):
     )
     policies: list[RankedPolicy]
     references: list[RankedPolicy]
+    coverage_failed: str | None = Field(description="Why what the data cover could not be checked.")
     choice: ChoiceOut | None = Field(description="Null for an evaluation from before methods were held against left-out controllers.")
     hidden: int = Field(0, description="Candidates that the filter leaves out.")
 

@@ -12,8 +12,9 @@ from app.accounts import policy as can
 from app.accounts.policy import Caller
 from app.evaluation import repository
 from app.evaluation.choice import choose, combined, widened
+from app.evaluation.coverage import STORED, refused, told_apart
 from app.evaluation.estimates import as_estimate
-from app.evaluation.methods import AGGREGATE
+from app.evaluation.methods import AGGREGATE, METHOD_NAMES
 from app.evaluation.models import EstimateRow, Evaluation
 from app.evaluation.ranking import current_ranking as current_ranking
 from app.evaluation.schemas import EvaluateParams, PipelineParams
@@ -94,6 +95,7 @@ def store_evaluation(
     results: Mapping[str, Mapping[str, Any]],
     config: Mapping[str, Any],
     skill: Mapping[str, Any] | None = None,
+    coverage: Mapping[str, Any] | None = None,
 ) -> Evaluation:
     """Store every method's estimates of every policy; a job that has stored its evaluation gets that one.
 
@@ -104,6 +106,7 @@ def store_evaluation(
         results: by method `{"estimates": {policy id: Estimate.to_json()}}`, or `{"failed": reason}`.
         config: how the methods ran; where its `methods` name the combination, that is computed here from the others.
         skill: what `choose_method` found out on left-out controllers; without it a stated order chooses the default method.
+        coverage: what `check_coverage` found out; a policy that it refuses is not supported by the data, whatever a method says of it.
 
     Raises:
         Invalid: no method could speak; lists why.
@@ -117,6 +120,7 @@ def store_evaluation(
     estimates: dict[str, dict[str, Estimate]] = {
         m: {i: as_estimate(e) for i, e in r["estimates"].items()} for m, r in results.items() if r.get("estimates")
     }
+    estimates = told_apart(estimates)
     failed = {m: str(r["failed"]) for m, r in results.items() if "failed" in r}
     if AGGREGATE in config.get("methods", []):
         made = combined(estimates, skill)
@@ -124,9 +128,9 @@ def store_evaluation(
             failed[AGGREGATE] = made["failed"]
         else:
             estimates[AGGREGATE] = made["estimates"]
-    estimates = widened(estimates, skill)
+    estimates = refused(widened(estimates, skill), coverage)
     if not estimates:
-        reasons = "; ".join(f"{m}: {reason}" for m, reason in failed.items())
+        reasons = "; ".join(f"{METHOD_NAMES.get(m, m)}: {reason}" for m, reason in failed.items())
         raise Invalid(f"No method could estimate these policies: {reasons}.", "Collect more sessions, then evaluate again.")
     ranked = {m: {i: e for i, e in table.items() if int(i) in set(candidates)} for m, table in estimates.items()}
     choice = choose({m: table for m, table in ranked.items() if table}, skill)
@@ -139,7 +143,7 @@ def store_evaluation(
         gamma=study_repository.settings_version(db, snapshot.settings_version_id).gamma,
         default_method=choice["method"],
         config=dict(config),
-        diagnostics={"failed": failed, "candidates": list(candidates), "choice": choice},
+        diagnostics={"failed": failed, "candidates": list(candidates), "choice": choice, STORED: dict(coverage or {})},
         code_version=jobs.code_version(),
         created_by=created_by,
     )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from ml.ope.coverage import (
     NEIGHBOUR_SHARE,
     NEIGHBOURHOOD,
     NOTICE_SHARE,
+    UNSUPPORTED_SHARE,
     AmplitudeSupport,
     Coverage,
     effective_sample_size,
@@ -22,6 +23,7 @@ from ml.ope.coverage import (
 from ml.ope.estimate import checked_horizon
 from ml.ope.importance import ImportanceSampling, horizon_of_ten
 from ml.ope.steps import StepTable, memories, step_table
+from ml.progress import Report, silent
 from ml.rl.policy import Policy
 from ml.trajectories import ReplayBuffer
 
@@ -39,15 +41,41 @@ LEAVES_SHARE = 0.20
 MOST_PAIRS = 4000
 
 
+Verdict = Literal["passed", "refused", "weights", "noted", "told"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check of one policy, with the limit that was in force.
+
+    Attributes:
+        name: `outside_range`, `thin`, `far`, `below_random_bound`, `unseen_dose` (shares of steps), `distance` (95 % of the logged pairs
+            are within 1), `effective_sessions`, `largest_weight_share` (share), `horizon_of_ten` (steps).
+        value: None where the data cannot tell.
+        limit: what the value is held against; None where it is only told.
+        at_least: whether the limit is the least value that passes; else it is the greatest.
+        verdict: `refused`: the data cannot speak about the policy. `weights`: importance weights cannot, models may. `noted`: to be known
+            before a policy is picked, and no refusal. `told`: a number without a limit.
+    """
+
+    name: str
+    value: float | None
+    limit: float | None
+    at_least: bool
+    verdict: Verdict
+
+
 @dataclass(frozen=True)
 class Diagnostics:
     """Coverage of one policy.
 
     Attributes:
         amplitudes: shares of steps outside the logged amplitudes and where they are thin.
+        sessions, horizon_steps: sessions with importance weights, and the H that these are over.
         effective_sessions, largest_weight_share: of the importance weights over the horizon.
         horizon_of_ten: steps until the running weights fall below ten effective sessions.
-        below_random_bound: share of steps that ask for less than B, the random controller's lower bound; None without random sessions.
+        random_bound: B, the random controller's lower bound; None without random sessions.
+        below_random_bound: share of steps that ask for less than B; None without random sessions.
         distance: median distance of (s, pi(s)) to the nearest logged pair of another session; 95 % of the logged pairs are within 1.
         far: share of pairs beyond `FAR`.
         unseen_dose: share of steps whose average amplitude of the last minute no session has come near. Random amplitudes
@@ -57,9 +85,12 @@ class Diagnostics:
     """
 
     amplitudes: Coverage
+    sessions: int
+    horizon_steps: int
     effective_sessions: float
     largest_weight_share: float
     horizon_of_ten: int
+    random_bound: float | None
     below_random_bound: float | None
     distance: float
     far: float
@@ -68,14 +99,38 @@ class Diagnostics:
     weights_failing: tuple[str, ...]
 
     @property
+    def checks(self) -> tuple[Check, ...]:
+        """Every check with its limit, those that can refuse a policy first."""
+        thin = _refusal("thin", self.amplitudes.thin, UNSUPPORTED_SHARE)
+        if thin.verdict == "passed" and self.amplitudes.thin > NOTICE_SHARE:
+            thin = replace(thin, verdict="noted")
+        return (
+            _refusal("outside_range", self.amplitudes.outside_range, LEAVES_SHARE),
+            thin,
+            _refusal("far", self.far, FAR_SHARE),
+            _note("below_random_bound", self.below_random_bound),
+            _note("unseen_dose", self.unseen_dose),
+            Check("distance", self.distance, None, False, "told"),
+            _weights("effective_sessions", self.effective_sessions, FEW_EFFECTIVE),
+            Check("largest_weight_share", self.largest_weight_share, None, False, "told"),
+            _weights("horizon_of_ten", self.horizon_of_ten, self.horizon_steps),
+        )
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What is to be said though it makes no policy unsupported."""
-        if self.unseen_dose <= NOTICE_SHARE:
-            return ()
-        return (
-            f"in {100 * self.unseen_dose:.0f} % of steps the policy's average amplitude over the last minute is one that no session held: "
-            "what it does there is a model's guess",
-        )
+        found = []
+        if self.below_random_bound is not None and self.below_random_bound > NOTICE_SHARE:
+            found.append(
+                f"in {100 * self.below_random_bound:.0f} % of steps the policy asks for less than {self.random_bound:.2f}, the least that "
+                "the random controller gave: only sessions of other controllers speak there"
+            )
+        if self.unseen_dose > NOTICE_SHARE:
+            found.append(
+                f"in {100 * self.unseen_dose:.0f} % of steps the policy's average amplitude over the last minute is one that no session "
+                "held: what it does there is a model's guess"
+            )
+        return tuple(found)
 
     @property
     def supported(self) -> bool:
@@ -83,11 +138,25 @@ class Diagnostics:
         return not self.failing
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers, by name."""
-        return asdict(self) | {"supported": self.supported, "notes": list(self.notes)}
+        """All numbers, by name, and every check."""
+        return asdict(self) | {"supported": self.supported, "notes": list(self.notes), "checks": [asdict(c) for c in self.checks]}
 
 
-def diagnose(buffer: ReplayBuffer, policies: Mapping[str, Policy], horizon_steps: int | None = None) -> dict[str, Diagnostics]:
+def _refusal(name: str, value: float, limit: float) -> Check:
+    return Check(name, value, limit, False, "refused" if value > limit else "passed")
+
+
+def _note(name: str, value: float | None) -> Check:
+    return Check(name, value, NOTICE_SHARE, False, "told" if value is None else "noted" if value > NOTICE_SHARE else "passed")
+
+
+def _weights(name: str, value: float, limit: float) -> Check:
+    return Check(name, float(value), float(limit), True, "passed" if value >= limit else "weights")
+
+
+def diagnose(
+    buffer: ReplayBuffer, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent
+) -> dict[str, Diagnostics]:
     """Every check of every policy. Raises ValueError when the buffer has no usable step or no session with a complete s_0."""
     horizon = checked_horizon(buffer, horizon_steps)
     support, table = AmplitudeSupport(buffer), step_table(buffer)
@@ -95,7 +164,8 @@ def diagnose(buffer: ReplayBuffer, policies: Mapping[str, Policy], horizon_steps
     near = _Neighbours(table)
     bounds = [s.random_lower_bound for s in buffer.sessions if s.random_lower_bound is not None]
     result = {}
-    for name, policy in policies.items():
+    for k, (name, policy) in enumerate(policies.items()):
+        report(k / len(policies), "checking what the data cover")
         log_ratio, mask, _ = weights.log_ratios(policy, horizon)
         effective, largest = effective_sample_size(np.where(mask, log_ratio, 0.0).sum(1))
         amplitudes = support.of_policy(policy)
@@ -104,9 +174,12 @@ def diagnose(buffer: ReplayBuffer, policies: Mapping[str, Policy], horizon_steps
         below = float(np.mean(policy.act(table.states) < min(bounds) - 1e-9)) if bounds else None
         result[name] = Diagnostics(
             amplitudes=amplitudes,
+            sessions=len(mask),
+            horizon_steps=horizon,
             effective_sessions=effective,
             largest_weight_share=largest,
             horizon_of_ten=horizon_of_ten(log_ratio, mask),
+            random_bound=min(bounds) if bounds else None,
             below_random_bound=below,
             distance=float(np.median(distances)),
             far=far,

@@ -15,6 +15,7 @@ from app.accounts.policy import SYSTEM
 from app.evaluation.choice import choose, combined, difference_errors, no_difference_error, widened
 from app.evaluation.decision import gain_over
 from app.evaluation.estimates import as_estimate
+from app.evaluation.methods import in_words
 from app.evaluation.models import Evaluation
 from app.evaluation.service import store_evaluation
 from app.learning.snapshots import take_snapshot
@@ -79,7 +80,7 @@ def test_the_method_with_the_best_skill_is_the_default() -> None:
 )
 def test_where_the_data_cannot_choose_the_stated_order_does_and_says_so(given: dict[str, Any] | None, named: str) -> None:
     found = choose(tables(dlsm=True, linear=True, fqe=True, wis=False), given)
-    assert (found["method"], found["chosen_by_data"]) == ("dlsm", False)
+    assert (found["method"], found["chosen_by_data"]) == ("linear", False)
     assert named in found["reason"]
     assert "usual order" in found["reason"]
 
@@ -160,6 +161,35 @@ def test_the_choice_is_stored_and_shown_with_its_table(client: TestClient, polic
     assert "Fitted Q evaluation ranks by default. It erred least." in page
     assert "Which method to believe" in page
     assert "best on left-out controllers" in page
+
+
+@pytest.mark.parametrize(
+    ("said", "read"),
+    [
+        ("fqe predicted 4 left-out controllers", "Fitted Q evaluation predicted 4 left-out controllers"),
+        ("linear and cwpdis are level", "Linear model and Consistent weighted per-decision importance sampling are level"),
+        ("a linear model of beta", "a linear model of beta"),
+        ("the data cannot choose: 2 controllers", "the data cannot choose: 2 controllers"),
+    ],
+)
+def test_methods_stand_by_their_names_in_what_the_science_says(said: str, read: str) -> None:
+    assert in_words(said) == read
+    assert in_words(read) == read
+
+
+def test_the_reason_on_the_page_names_the_method(client: TestClient, policies: list[int], db: Session) -> None:
+    participant = participant_by_code(db, "P1", SYSTEM)
+    results = {m: {"estimates": {str(i): estimate(m, 1.0) for i in policies}} for m in ("fqe", "linear")}
+    reason = "fqe predicted the differences between 4 left-out controllers with a mean error of 12 % of their range"
+    store_evaluation(
+        db, job_id=None, created_by="test", snapshot=take_snapshot(db, participant, SYSTEM), horizon_steps=60, candidates=policies,
+        results=results, config={}, skill=outcome("fqe", skill("fqe", 0.12), skill("linear", 0.34), reason=reason),
+    )  # fmt: skip
+    db.commit()
+    assert client.get("/api/v1/participants/P1/ranking").json()["choice"]["reason"].startswith("Fitted Q evaluation predicted")
+    page = client.get("/participants/P1/ranking").text
+    assert "Fitted Q evaluation ranks by default. Fitted Q evaluation predicted the differences" in page
+    assert "fqe predicted" not in page
 
 
 def test_an_evaluation_without_a_choice_is_still_shown(

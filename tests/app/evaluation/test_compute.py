@@ -83,3 +83,14 @@ def test_the_choice_names_its_table_or_why_there_is_none(db: Session, tmp_path: 
     assert {p["controller"] for p in found["predictions"]} == {"random", "cdbs", "no_dbs"}
     one = params | {"methods": ["dlsm", "pdis"]}
     assert "none of the methods asked for" in choose_method(one, tmp_path, Report(lambda _: None))["failed"]
+
+
+@pytest.mark.parametrize("method", ["linear", "fqe", "wdr", "dual_dice", "dlmm"])
+def test_a_study_without_end_of_session_rewards_still_sees_the_outcomes_predicted(method: str, db: Session, tmp_path: Path) -> None:
+    without = MdpSettings(xi_beta=1.0, c2=0.0, c3=0.0, c4=0.0)
+    buffer = ReplayBuffer(without, sessions(), "uV", "table")
+    estimate = evaluate_method(call(db, buffer, method=method), tmp_path, Report(lambda _: None))["estimates"]["7"]
+    assert {"energy", "mean_beta", "grasp_hz", "rating", "tremor_percent"} <= set(estimate["predicted"])
+    assert estimate["end_reward"] == pytest.approx(0.0, abs=1e-9)
+    assert estimate["value"] == pytest.approx(estimate["step_return"], abs=1e-9)
+    assert 1.0 <= estimate["predicted"]["rating"] <= 10.0

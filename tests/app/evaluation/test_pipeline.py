@@ -18,6 +18,7 @@ from app.learning.models import BufferSnapshot, Policy
 from app.platform import files
 from app.study.repository import participant_by_code
 from ml.deploy.bundle import verify_bundle
+from ml.ope.diagnostics import diagnose
 from ml.ope.panel import estimators, quick_estimators
 from ml.ope.skill import choose_default
 from ml.rl.onnx_policy import OnnxPolicy
@@ -58,13 +59,17 @@ def test_an_evaluation_gives_the_numbers_that_the_estimators_give(
     done = ended(client.post(JOBS, json=body).json()["id"], 300)
     assert done["status"] == "succeeded", done
     assert {s["status"] for s in done["steps"]} == {"succeeded"}
-    assert {f"estimate/{m}" for m in CHEAP} | {"choose-method"} <= {s["key"] for s in done["steps"]}
+    assert {f"estimate/{m}" for m in CHEAP} | {"coverage", "choose-method"} <= {s["key"] for s in done["steps"]}
     ranking = client.get("/api/v1/participants/P1/ranking").json()
     assert ranking["evaluation_id"] == done["result"]["evaluation_id"]
     (policy,) = ranking["policies"]
     assert (policy["policy_id"], policy["rank"], policy["kind"]) == (added["id"], 1, "external")
     buffer = read_buffer(db.get_one(BufferSnapshot, done["result"]["snapshot_id"]).file_sha256)
     panel, held = estimators(0, demo=True), OnnxPolicy(constant_onnx(0.6, 10), 10)
+    checked = diagnose(buffer, {"x": held}, buffer.median_steps())["x"]
+    assert {c["name"]: c["verdict"] for c in policy["coverage"]["checks"]} == {c.name: c.verdict for c in checked.checks}
+    assert policy["coverage"]["supported"] is checked.supported
+    assert all(r["coverage"] for r in ranking["references"])
     for method in CHEAP:
         direct = panel[method].fit(buffer).evaluate({"x": held}, buffer.median_steps())["x"]
         shown = policy["estimates"][method]

@@ -340,3 +340,17 @@ def test_notes_say_how_the_best_candidate_stands_to_cdbs(
     assert ranked(client)["notes"] == sentences
     page = client.get("/participants/P1/ranking").text
     assert all(sentence in page for sentence in sentences)
+
+
+def test_without_end_of_session_rewards_the_predicted_outcomes_stand_beside_the_return(
+    client: TestClient, policies: list[int], evaluate: Callable[..., int]
+) -> None:
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"c2": 0.0, "c3": 0.0, "c4": 0.0}})
+    evaluate({policies[0]: estimate("dlsm", -30.0) | {"step_return": -30.0, "end_reward": 0.0}})
+    shown = ranked(client)["policies"][0]
+    assert (shown["estimates"]["dlsm"]["end_reward"], shown["predicted"]["rating"], shown["predicted"]["grasp_hz"]) == (0.0, 7.5, 2.1)
+    page = client.get("/participants/P1/ranking").text
+    row = page[page.index(f'name="policy_ids" value="{policies[0]}"') :].split("</tr>")[0]
+    cells = [cell.split("<")[0] for cell in row.split('<td class="num">')[1:]]
+    for value in ("\N{MINUS SIGN}30.00", "0.00", "40 %", "0.9", "2.1", "7.5", "12"):
+        assert any(cell.strip().startswith(value) for cell in cells), (value, cells)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ml.ope.diagnostics import diagnose
+from ml.ope.diagnostics import FAR_SHARE, LEAVES_SHARE, diagnose
 from ml.rl.policy import ConstantPolicy, ProportionalPolicy
 
 
@@ -65,3 +65,38 @@ def test_a_lasting_low_amplitude_is_unseen_where_random_sessions_only_passed_thr
     assert found["low"].unseen_dose > 0.9
     assert "no session held" in found["low"].notes[0]
     assert found["middle"].notes == ()
+
+
+def test_every_check_has_its_limit_and_only_refusals_make_a_policy_unsupported(seen):
+    for found in seen.values():
+        checks = {c.name: c for c in found.checks}
+        assert len(checks) == len(found.checks) == 9
+        assert found.supported == all(c.verdict != "refused" for c in found.checks)
+        for c in found.checks:
+            if c.limit is None or c.value is None:
+                assert c.verdict == "told"
+            else:
+                within = c.value >= c.limit if c.at_least else c.value <= c.limit
+                # of the two limits of thinly covered amplitudes the stricter one only notes
+                assert (c.verdict == "passed") == (within and not (c.name == "thin" and c.value > 0.05))
+    off = {c.name: c for c in seen["none"].checks}
+    assert (off["outside_range"].value, off["outside_range"].limit, off["outside_range"].verdict) == (1.0, LEAVES_SHARE, "refused")
+    assert (off["far"].limit, off["far"].verdict) == (FAR_SHARE, "refused")
+    half = {c.name: c for c in seen["half"].checks}
+    assert {half[n].verdict for n in ("effective_sessions", "horizon_of_ten")} == {"weights"}
+    assert half["effective_sessions"].at_least
+    assert (half["horizon_of_ten"].limit, seen["half"].sessions) == (seen["half"].horizon_steps, 20)
+
+
+def test_amplitudes_below_the_random_controllers_are_noted_with_the_bound(seen):
+    assert seen["low"].below_random_bound == 1.0
+    assert any("less than 0.30, the least that the random controller gave" in note for note in seen["low"].notes)
+    assert not any("random controller" in note for note in seen["half"].notes)
+
+
+def test_without_random_sessions_the_share_below_their_bound_is_not_known(linear_simulator):
+    buffer = linear_simulator.buffer(seed=0)
+    others = replace(buffer, sessions=tuple(s for s in buffer.sessions if s.controller != "random"))
+    found = diagnose(others, {"half": ConstantPolicy(0.55)})["half"]
+    check = next(c for c in found.checks if c.name == "below_random_bound")
+    assert (check.value, check.verdict, found.random_bound) == (None, "told", None)
