@@ -30,7 +30,7 @@ from ml.ope.aggregate import combine
 from ml.ope.estimate import Estimate
 from ml.ope.metrics import accuracy
 from ml.ope.panel import estimators, quick_estimators
-from ml.ope.skill import NINETY, choose_default
+from ml.ope.skill import choose_default, reach_with
 from ml.rl.policy import Policy
 from ml.trajectories import ReplayBuffer
 
@@ -214,8 +214,13 @@ def _days_alone(truth: dict[str, Any]) -> dict[str, dict[str, Any]]:
 def _widened(chosen: dict[str, Any] | None, choice: dict[str, Any]) -> dict[str, dict[str, Any]] | None:
     if chosen is None or "failed" in chosen:
         return None
-    excess = next((NINETY * s["excess"] for s in choice["table"] if s["method"] == choice["method"]), 0.0)
-    return {n: e | {"low": e["low"] - excess, "high": e["high"] + excess} for n, e in chosen["estimates"].items()}
+    error = next((s["excess"] for s in choice["table"] if s["method"] == choice["method"]), 0.0)
+
+    def wide(e: dict[str, Any]) -> dict[str, Any]:
+        below, above = (reach_with(abs(e["value"] - e[end]), error) for end in ("low", "high"))
+        return e | {"low": e["value"] - below, "high": e["value"] + above}
+
+    return {n: wide(e) for n, e in chosen["estimates"].items()}
 
 
 def show(found: dict[str, dict[str, dict[str, list[float]]]], cells: Cells) -> None:

@@ -15,7 +15,7 @@ from app.evaluation.methods import AGGREGATE, METHOD_NAMES
 from ml.ope.aggregate import combine
 from ml.ope.estimate import Estimate
 from ml.ope.ranking import PREFERENCE, default_method
-from ml.ope.skill import NINETY
+from ml.ope.skill import with_held_out_error
 
 Tables = Mapping[str, Mapping[str, Estimate]]
 
@@ -99,13 +99,8 @@ def widened(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, d
         if not shares or any(m not in excess or m not in apart for m in shares):
             return e
         more, between = (sum(w * known[m] for m, w in shares.items()) for known in (excess, apart))
-        return replace(
-            e,
-            low=e.low - NINETY * more,
-            high=e.high + NINETY * more,
-            standard_error=math.hypot(e.standard_error, more),
-            details={**e.details, "held_out_error": more, "held_out_difference_error": between},
-        )
+        wide = with_held_out_error(e, more)
+        return replace(wide, details={**wide.details, "held_out_difference_error": between})
 
     return {m: {name: wider(m, e) for name, e in table.items()} for m, table in estimates.items()}
 

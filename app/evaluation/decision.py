@@ -17,7 +17,7 @@ from app.evaluation.methods import METHOD_NAMES
 from app.evaluation.schemas import Decision, TestedBefore
 from ml.ope.coverage import UNSUPPORTED_SHARE
 from ml.ope.estimate import Estimate
-from ml.ope.skill import NINETY
+from ml.ope.skill import reach_with
 
 FEWEST_DRAWS = 20
 """Aligned draws below which a gain's interval comes from the two standard errors as if they were independent, which is wider."""
@@ -56,15 +56,16 @@ def gain_over(policy: Estimate, reference: Estimate) -> Gain:
     The interval is widened by the method's error of differences between controllers that it had not seen, where that is known.
     """
     value = policy.value - reference.value
-    unseen = NINETY * float(policy.details.get("held_out_difference_error", 0.0))
+    unseen = float(policy.details.get("held_out_difference_error", 0.0))
     ours, theirs = (np.asarray(e.details.get("draws") or [], dtype=np.float64) for e in (policy, reference))
     tail = (1 - policy.level) / 2
     if ours.size == theirs.size >= FEWEST_DRAWS:
         differences = ours - theirs
         low, high = np.quantile(differences - differences.mean(), [tail, 1 - tail]) + value
-        return Gain(value, min(float(low), value) - unseen, max(float(high), value) + unseen, policy.level)
+        below, above = max(value - float(low), 0.0), max(float(high) - value, 0.0)
+        return Gain(value, value - reach_with(below, unseen), value + reach_with(above, unseen), policy.level)
     errors = [math.sqrt(max(0.0, e.standard_error**2 - e.details.get("held_out_error", 0.0) ** 2)) for e in (policy, reference)]
-    reach = float(norm.ppf(1 - tail)) * math.hypot(*errors) + unseen
+    reach = reach_with(float(norm.ppf(1 - tail)) * math.hypot(*errors), unseen)
     return Gain(value, value - reach, value + reach, policy.level)
 
 

@@ -41,7 +41,7 @@ class Preset:
 
 
 LEARNING: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "both"}
-"""The paper's algorithm, and one held near what was logged or near cDBS, each with and without a share of r_end: a sweep that can differ."""
+"""The paper's algorithm, and one held near what was logged or near cDBS, each with and without a share of r_end: sweeps that differ."""
 
 PRESETS: Final = {
     "quick": Preset(

@@ -169,18 +169,24 @@ def _reason(chosen: Skill, first: Skill, full: list[Skill], controllers: int) ->
     return text if full[0] is first else f"{text}; none was better by more than a standard error than this first of the usual order"
 
 
-def with_held_out_error(estimate: Estimate, skill: Skill) -> Estimate:
-    """The estimate with its interval widened by what left-out controllers showed of the method's errors.
+def with_held_out_error(estimate: Estimate, error: float) -> Estimate:
+    """The estimate with its interval widened by what left-out controllers showed of the method's errors (`Skill.excess`).
 
     Resampled sessions see how uncertain a model's numbers are, not that the model is wrong; a controller that it has not seen shows that.
+    The two are independent, so their reaches add up as the sides of a right angle, like their standard errors.
     """
     return replace(
         estimate,
-        low=estimate.low - NINETY * skill.excess,
-        high=estimate.high + NINETY * skill.excess,
-        standard_error=float(np.hypot(estimate.standard_error, skill.excess)),
-        details={**estimate.details, "held_out_error": skill.excess},
+        low=estimate.value - reach_with(estimate.value - estimate.low, error),
+        high=estimate.value + reach_with(estimate.high - estimate.value, error),
+        standard_error=float(np.hypot(estimate.standard_error, error)),
+        details={**estimate.details, "held_out_error": error},
     )
+
+
+def reach_with(reach: float, error: float) -> float:
+    """Half of a 90 % interval that has an independent error of standard deviation `error` besides."""
+    return float(np.hypot(reach, NINETY * error))
 
 
 def held_out_predictions(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -102,7 +103,9 @@ def test_the_error_without_skill_is_that_of_saying_that_all_controllers_are_alik
     better["choice"]["predictions"] = predictions
     assert choose(tables(fqe=True, linear=True), better)["chosen_by_data"] is True
     # what is next in skill is not taken when it has none
-    assert choose(tables(dlsm=True, fqe=False, linear=True), better)["method"] == "dlsm"
+    worse = outcome("fqe", skill("fqe", 0.6), skill("wdr", 0.9))
+    worse["choice"]["predictions"] = predictions
+    assert choose(tables(linear=True, fqe=False, wdr=True), worse)["method"] == "linear"
 
 
 def test_only_methods_of_known_bias_are_combined() -> None:
@@ -131,12 +134,12 @@ def test_intervals_are_widened_by_the_errors_on_left_out_controllers() -> None:
     assert found["dlsm"] == raw["dlsm"]
     assert (found["linear"]["1"].low, found["linear"]["1"].high) == (raw["linear"]["1"].low, raw["linear"]["1"].high)
     fqe = found["fqe"]["1"]
-    assert (fqe.low, fqe.high) == (pytest.approx(49.0 - 16.45), pytest.approx(51.0 + 16.45))
+    assert (fqe.low, fqe.high) == (pytest.approx(50.0 - math.hypot(1.0, 16.45)), pytest.approx(50.0 + math.hypot(1.0, 16.45)))
     gain = gain_over(found["fqe"]["2"], fqe)
     own = gain_over(raw["fqe"]["2"], raw["fqe"]["1"])  # the common error of level cancels, that of differences does not
-    assert (gain.value, gain.high - own.high) == (10.0, pytest.approx(1.645 * 4.0, abs=1e-6))
+    assert (gain.value, gain.high) == (10.0, pytest.approx(10.0 + math.hypot(own.high - 10.0, 1.645 * 4.0), abs=1e-6))
     parts = {"1": replace(raw["fqe"]["1"], details={"weights": {"fqe": 0.25, "linear": 0.75}})}
-    assert widened({"aggregate": parts}, given)["aggregate"]["1"].low == pytest.approx(49.0 - 1.645 * 2.5)
+    assert widened({"aggregate": parts}, given)["aggregate"]["1"].low == pytest.approx(50.0 - math.hypot(1.0, 1.645 * 2.5))
     assert widened(raw, None) == raw
 
 
