@@ -244,6 +244,44 @@ def show(found: dict[str, dict[str, dict[str, list[float]]]], cells: Cells) -> N
         out("no cell yet\n")
 
 
+def show_targets(found: dict[str, dict[str, dict[str, list[float]]]]) -> None:
+    """How far the ranking's estimates on the cohort are from what was aimed at, and by how much each aim is missed."""
+    tables = {world: found[world] for world in PARTICIPANT_WORLDS if world in found and "ranking" in found[world]}
+    if not tables:
+        return
+
+    def mean(method: str, metric: str) -> float:
+        return float(np.mean([np.mean(t[method][metric]) for t in tables.values() if method in t]))
+
+    least = min(float(np.mean(t["ranking"]["rank correlation"])) for t in tables.values())
+    covered = mean("ranking", "covered, %")
+    aims = [
+        ("mean rank correlation", mean("ranking", "rank correlation"), 0.93, 1),
+        ("least rank correlation of a participant", least, 0.85, 1),
+        ("regret@1, % of range", mean("ranking", "regret, % of range"), 2.0, -1),
+        ("mean error, % of range", mean("ranking", "MAE, % of range"), 8.0, -1),
+        ("truths inside the intervals, %, at least", covered, 80.0, 1),
+        ("truths inside the intervals, %, at most", covered, 97.0, -1),
+    ]
+    others = [m for m in ("wis", "pdis", "cwpdis", "dual_dice", "dlmm", "fqe") if all(m in t for t in tables.values())]
+    if others and all("dlsm" in t for t in tables.values()):
+        for metric, sign in (("rank correlation", 1), ("regret, % of range", -1)):
+            best = max(sign * mean(m, metric) for m in others) * sign
+            aims.append((f"dlsm: {metric}, against the best of {', '.join(others)}", mean("dlsm", metric), best, sign))
+    told("\nAims on the cohort (means over participants):")
+    for name, value, aim, sign in aims:
+        short = sign * (aim - value)
+        told(f"  {name:<86}{value:>8.2f}   aim {aim:>6.2f}   {'met' if short <= 0 else f'missed by {short:.2f}'}")
+    if all("dlsm" in t and "linear" in t for t in tables.values()):
+        pairs = [
+            (a, b) for t in tables.values() for a, b in zip(t["dlsm"]["rank correlation"], t["linear"]["rank correlation"], strict=True)
+        ]
+        lead = np.array([a - b for a, b in pairs])
+        error = float(lead.std(ddof=1) / np.sqrt(lead.size)) if lead.size > 1 else float("inf")
+        verdict = "met" if lead.mean() >= -error else f"missed by {-lead.mean() - error:.2f}"
+        told(f"  dlsm less linear, rank correlation: {lead.mean():.2f} +- {error:.2f}; not worse within one standard error: {verdict}")
+
+
 def main() -> None:
     """Print a table per world and, as the last line, one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -272,6 +310,7 @@ def main() -> None:
                 (prepare if chosen.only_truth else measure)(WORLDS[name](), seed, VISITS[name], run)
     found = summary(names, cells)
     show(found, cells)
+    show_targets(found)
     figure = out / "ope.svg"
     figure.write_text(draw(found, ("rank correlation", "regret, % of range", "MAE, % of range")))
     sys.stdout.write(f"\nfigure: {figure}\n")

@@ -228,3 +228,37 @@ def test_more_stimulation_lowers_the_beta_that_a_free_running_model_draws(linear
     assert estimates["a"].predicted["mean_beta"] > estimates["b"].predicted["mean_beta"] > estimates["c"].predicted["mean_beta"]
     # The linear system rests at 0.55 / 0.45 - (0.25 / 0.45) a.
     assert estimates["a"].predicted["mean_beta"] == pytest.approx((0.55 - 0.25 * 0.35) / 0.45, abs=0.05)
+
+
+def test_outcomes_are_read_from_what_predicts_r_end_of_left_out_sessions_better(small_buffer):
+    fitted = Dlsm(TINY).fit(small_buffer)
+    latent = float(np.mean(np.concatenate([np.asarray(c.residual_end) for c in fitted.checks]) ** 2))
+    assert fitted.end_source == ("latent" if latent <= fitted.end.residual[0] ** 2 else "summaries")
+    exact = replace(fitted, end=replace(fitted.end, residual=np.zeros(4)))
+    useless = replace(fitted, end=replace(fitted.end, residual=np.full(4, 1e6)))
+    assert (exact.end_source, useless.end_source) == ("summaries", "latent")
+
+
+def test_outcomes_from_summaries_are_the_regressions_at_the_simulated_sessions(small_buffer):
+    config = replace(TINY, end_source="summaries")
+    fitted = Dlsm(config).fit(small_buffer)
+    found = fitted.evaluate(POLICIES, 30)
+    starts = fitted.batch.states[0].numpy().astype(np.float64)
+    ends = []
+    for k, member in enumerate(fitted.members):
+        run = roll_out(
+            member.networks,
+            list(POLICIES.values()),
+            starts,
+            scale=fitted.scale,
+            settings=small_buffer.settings,
+            horizon=30,
+            per_policy=config.rollouts,
+            seed=config.seed + 1000 + k,
+        )
+        np.testing.assert_allclose(run.summaries[0, :, 0], 0.9)
+        np.testing.assert_allclose(run.summaries[0, :, 4], 0.9)
+        ends.append(fitted.end.predict(run.summaries)[:, :, 0].mean(1))
+    for i, name in enumerate(POLICIES):
+        assert found[name].end_reward == pytest.approx(np.mean(ends, axis=0)[i])
+        assert found[name].details["end_source"] == "summaries"

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ml.ope.observed import day_noise, empirical_bernstein, hoeffding, observed, session_returns
+from ml.ope.observed import day_noise, empirical_bernstein, hoeffding, mean_over_days, observed, session_returns
 from ml.qoc import Qoc
 
 
@@ -92,3 +92,45 @@ def test_days_that_do_not_differ_add_nothing_and_a_single_day_is_flagged(small_b
     noise, flag = day_noise(one, 30, 50, 0)
     assert not noise.any()
     assert "day to day" in flag
+
+
+def test_the_mean_over_days_weighs_a_crowded_day_less_the_more_days_differ():
+    visits = np.array([1] * 10 + [2, 3, 4])
+    rng = np.random.default_rng(0)
+    apart = mean_over_days((10.0 * visits + 0.01 * rng.standard_normal(13))[None], visits, 50, 0).weights
+    alike = mean_over_days(rng.standard_normal((1, 13)), visits, 50, 0).weights
+    for weights in (apart, alike):
+        assert weights.sum() == pytest.approx(1.0)
+        assert np.ptp(weights[:10]) == pytest.approx(0.0, abs=1e-12)
+    assert 10 * apart[0] == pytest.approx(0.25, abs=0.01)
+    assert 0.35 < 10 * alike[0] < 10 / 13
+
+
+def test_what_all_policies_share_of_a_day_is_common_and_what_they_do_not_is_their_own():
+    rng = np.random.default_rng(1)
+    visits = np.repeat(np.arange(5), 4)
+    day = 8.0 * rng.standard_normal(5)[visits]
+    own = rng.standard_normal((2, 20))
+    found = mean_over_days(np.stack([50.0 + day, 60.0 + day]) + own, visits, 4000, 0)
+    assert found.unknown is None
+    assert 2.0 < found.common.std() < 12.0
+    assert found.own.shape == (2, 4000)
+    assert found.own.std(axis=1).max() < 1.0
+
+
+def test_intervals_of_a_mean_over_few_days_cover_it_as_often_as_they_say():
+    hits = []
+    for seed in range(200):
+        rng = np.random.default_rng(100 + seed)
+        visits = np.repeat(np.arange(4), 5)
+        returns = 6.0 * rng.standard_normal(4)[visits] + 5.0 * rng.standard_normal(20)
+        found = mean_over_days(returns[None], visits, 400, seed)
+        low, high = np.quantile(returns @ found.weights + found.common, (0.05, 0.95))
+        hits.append(low <= 0.0 <= high)
+    assert 0.82 <= np.mean(hits) <= 0.97
+
+
+def test_one_day_tells_nothing_of_days_and_says_so():
+    found = mean_over_days(np.arange(6.0)[None], np.ones(6, dtype=int), 30, 0)
+    assert "from day to day" in found.unknown
+    np.testing.assert_allclose(found.weights, 1 / 6)
