@@ -158,11 +158,12 @@ def _restored(method: str, cell: dict[str, Any] | None) -> dict[str, Estimate] |
     }
 
 
-def summary(names: list[str], cells: Cells) -> dict[str, dict[str, dict[str, list[float]]]]:
-    """world -> method -> metric -> one number per seed.
+def summary(names: list[str], cells: Cells, sessions: int) -> dict[str, dict[str, dict[str, list[float]]]]:
+    """world -> method -> metric -> one number per seed; `sessions` simulated ones are behind each true return.
 
-    Two rows are no methods: `ranking` is the one that was chosen by held-out skill, its intervals widened as the service widens them, and
-    `days alone` is what a perfect method would say that knew everything about the days of the data and nothing about others.
+    Three rows are no methods: `ranking` is the one that was chosen by held-out skill, its intervals widened as the service widens them;
+    `days alone` is what a perfect method would say that knew everything about the days of the data and nothing about others; `tested` is
+    what testing the policies themselves would tell, each in its share of as many sessions as the data hold, each on a day of its own.
     """
     result: dict[str, dict[str, dict[str, list[float]]]] = {}
     for name in names:
@@ -173,6 +174,8 @@ def summary(names: list[str], cells: Cells) -> dict[str, dict[str, dict[str, lis
             truth = cells.get(f"{name}/{seed}/truth")
             if method == "truth":
                 rows = {"days alone": _days_alone(truth)} if truth["on_days"] else {}
+                for metric, value in _tested(truth, sessions).items():
+                    result.setdefault(name, {}).setdefault("tested", {}).setdefault(metric, []).append(value)
             elif method == "choice":
                 rows = {"ranking": _widened(cells.get(f"{name}/{seed}/{cell['method']}"), cell)}
             else:
@@ -209,6 +212,21 @@ def scores(truth: dict[str, Any], estimates: dict[str, dict[str, Any]]) -> dict[
 
 def _days_alone(truth: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return {n: {"value": t["total"], "low": t["total"], "high": t["total"]} for n, t in truth["on_days"].items()}
+
+
+def _tested(truth: dict[str, Any], sessions: int, draws: int = 200) -> dict[str, float]:
+    """Metrics, averaged over draws, of the means of n / P sessions of each policy; the truth's error tells how sessions scatter."""
+    rng, policies = np.random.default_rng(0), truth["policies"]
+    each = truth["sessions"] / len(policies)
+    found = []
+    for _ in range(draws):
+        drawn = {}
+        for name, t in policies.items():
+            error = t["standard_error"] * np.sqrt(sessions / each)
+            value = t["total"] + error * rng.standard_normal()
+            drawn[name] = {"value": value, "low": value - reach_with(0.0, error), "high": value + reach_with(0.0, error)}
+        found.append(scores(truth, drawn) | {"seconds": 0.0})
+    return {metric: float(np.mean([f[metric] for f in found])) for metric in found[0]}
 
 
 def _widened(chosen: dict[str, Any] | None, choice: dict[str, Any]) -> dict[str, dict[str, Any]] | None:
@@ -308,7 +326,7 @@ def main() -> None:
         for name in names:
             if time.monotonic() - start < 60 * chosen.minutes:
                 (prepare if chosen.only_truth else measure)(WORLDS[name](), seed, VISITS[name], run)
-    found = summary(names, cells)
+    found = summary(names, cells, sessions)
     show(found, cells)
     show_targets(found)
     figure = out / "ope.svg"
