@@ -92,9 +92,9 @@ def ranking_page(
 
 
 @router.get("/participants/{code}/ranking.csv")
-def ranking_csv(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
-    """The ranking as CSV."""
-    return csv_of(ranking.current_ranking(db, participant, caller))
+def ranking_csv(participant: CurrentParticipant, db: Db, caller: CurrentCaller, method: str | None = None) -> Response:
+    """The ranking as CSV, by the method that the page ranks by."""
+    return csv_of(ranking.current_ranking(db, participant, caller, method))
 
 
 @router.get("/participants/{code}/calibration")

@@ -22,6 +22,7 @@ from app.learning import repository as learning
 from app.learning.jobs import teachers, training_starts
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.schemas import DistilParams, TrainParams
+from app.learning.service import require_window, window_of
 from app.learning.snapshots import collect
 from app.platform.errors import Invalid
 from app.platform.jobs import service as jobs
@@ -70,15 +71,23 @@ def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams) -
     """The candidates of an evaluation.
 
     Raises:
-        NotFound: no such policy. Invalid: there is none, or a retired one is named.
+        NotFound: no such policy. Invalid: there is none, or a retired one or one of another window is named.
     """
+    window = db.get_one(Participant, participant_id).current_settings.window
     if not params.policies:
         found = list(learning.candidates(db, participant_id))
         if not found:
             raise Invalid("There is no policy to rank.", "Train policies, or upload one made elsewhere as an ONNX file.")
-        return found
+        fitting = [p for p in found if window_of(p) == window]
+        if not fitting:
+            raise Invalid(
+                f"None of the {len(found)} policies takes windows of {window} beta amplitudes, as the settings say now.",
+                "Train policies with these settings, or set the window back.",
+            )
+        return fitting
     chosen = learning.policies_named(db, participant_id, params.policies)
     for policy in chosen:
+        require_window(policy, window)
         if policy.retired_reason:
             raise Invalid(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", "Leave it out, or take it back first.")
     return [p for p in chosen if p.kind != "baseline"]

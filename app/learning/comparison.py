@@ -29,8 +29,8 @@ class Candidate:
     Attributes:
         score: estimated return on the held-out sessions at the state that was kept; None where none were held out.
         over_logged: mean Q of the held-out sessions' first states less the return logged from them, at the same state.
-        action_distance: mean absolute difference from the logged amplitudes at the end of training, fraction.
-        saturated: share of states answered with next to 0 or 1 at the end of training.
+        action_distance: mean absolute difference from the logged amplitudes over the buffer's states, fraction.
+        saturated: share of these states answered with next to 0 or 1.
         mean_amplitude: over the buffer's states, fraction.
         best_update: the update whose state was kept; None: the last.
         rate: the policy's learning rate. seed: of its training.
@@ -82,14 +82,16 @@ def below_bound(policy: Policy) -> tuple[float, float] | None:
 
 
 def _candidate(policy: Policy) -> Candidate:
-    held, last = policy.metrics.get("held_out", {}), policy.metrics.get("last", {})
+    held = policy.metrics.get("held_out", {})
+    # Policies of before the state that was kept was looked at have the figures of their last state.
+    kept = policy.metrics.get("kept") or policy.metrics.get("last", {})
     at = _kept(held, policy.metrics.get("best_update"))
     return Candidate(
         policy=policy,
         score=_at(held, "score", at),
         over_logged=_at(held, "over_logged", at),
-        action_distance=last.get("action_distance"),
-        saturated=last.get("saturated"),
+        action_distance=kept.get("action_distance"),
+        saturated=kept.get("saturated"),
         mean_amplitude=policy.metrics.get("mean_amplitude_on_buffer"),
         best_update=policy.metrics.get("best_update"),
         rate=policy.config.get("actor_lr"),

@@ -201,13 +201,21 @@ def _below_bound(policy: Policy, buffer: ReplayBuffer) -> dict[str, Any]:
 
 def _metrics(result: TrainedPolicy, buffer: ReplayBuffer) -> dict[str, Any]:
     """What a trained policy is stored with."""
+    from ml.rl.learners import SATURATION_MARGIN
+
     held = {name: values.tolist() for name, values in result.held_out.items()}
+    steps = buffer.transitions()
+    actions = result.policy.act(steps.states)
     return {
         "curve": {name: _thinned(values.tolist()) for name, values in result.curve.items()},
         "last": {name: float(values[-1]) for name, values in result.curve.items()},
         "held_out": held,
         "best_update": result.best_update,
-        "mean_amplitude_on_buffer": float(result.policy.act(buffer.transitions().states).mean()),
+        "mean_amplitude_on_buffer": float(actions.mean()),
+        "kept": {
+            "action_distance": float(abs(actions - steps.actions).mean()),
+            "saturated": float((abs(actions - 0.5) > 0.5 - SATURATION_MARGIN).mean()),
+        },
         "parameters": result.policy.parameter_count,
         "macs": result.policy.macs,
     } | (_below_bound(result.policy, buffer) | _scale_of(result.policy))

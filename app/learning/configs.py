@@ -30,9 +30,9 @@ DISTILLATION: dict[str, dict[str, Any]] = {"full": {"updates": 5_000, "sigma": 0
 def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]) -> list[dict[str, Any]]:
     """The policies of a sweep in groups that are trained side by side, each in a child process of its own.
 
-    From scratch the policies are dealt to the algorithms (with their aims and anchors) in turn; those of one kind have learning rates
-    spread evenly in the logarithm and fill two groups, one for each core. Seeds count up over all. A fine-tuned policy is a group of its
-    own.
+    From scratch the policies are dealt to the algorithms in turn, each of which goes through its aims and anchors; those of one kind have
+    learning rates spread evenly in the logarithm and fill two groups, one for each core. Seeds count up over all. A fine-tuned policy is a
+    group of its own.
 
     Args:
         params: what was asked for.
@@ -44,10 +44,7 @@ def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]
     if params.policies:
         return [_fine_tuning(params, k, start) for k, start in enumerate(starts) if start is not None]
     groups: list[dict[str, Any]] = []
-    aims = ("steps", "return") if params.aim == "both" else (params.aim,)
-    kinds = [
-        (algorithm, {"aim": aim} | anchor) for algorithm in params.algorithms for aim in aims for anchor in _anchors(params, algorithm)
-    ]
+    kinds = _kinds(params)
     for which, (algorithm, changes) in enumerate(kinds):
         numbers = list(range(which, params.count, len(kinds)))
         low, high = _rates(params, algorithm)
@@ -58,6 +55,18 @@ def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]
         half = -(-len(configs) // 2)
         groups += [{"algorithm": algorithm, "configs": part, "start": None} for part in (configs[:half], configs[half:]) if part]
     return [{"key": f"train/{k}"} | group for k, group in enumerate(groups)]
+
+
+def _kinds(params: TrainParams) -> list[tuple[str, dict[str, Any]]]:
+    """Kinds of policies in the order of dealing: every algorithm once before any has a second aim or anchor."""
+    aims = ("steps", "return") if params.aim == "both" else (params.aim,)
+    # Cloning knows no reward, so that its aims would be twins.
+    each = {
+        a: [{"aim": aim} | anchor for aim in (aims if a != "cloning" else ("steps",)) for anchor in _anchors(params, a)]
+        for a in dict.fromkeys(params.algorithms)
+    }
+    most = max(len(variants) for variants in each.values())
+    return [(a, variants[turn]) for turn in range(most) for a, variants in each.items() if turn < len(variants)]
 
 
 def _fine_tuning(params: TrainParams, k: int, start: dict[str, Any]) -> dict[str, Any]:

@@ -49,7 +49,7 @@ def training_starts(db: Session, participant_id: int, params: TrainParams) -> li
     """Where each training starts: None from scratch, else the parent's id, algorithm and files.
 
     Raises:
-        NotFound: no such policy. Invalid: a policy that cannot be trained further.
+        NotFound: no such policy. Invalid: a policy that cannot be trained further, or takes other windows than the settings say.
     """
     if not params.policies:
         return [None] * params.count
@@ -59,6 +59,7 @@ def training_starts(db: Session, participant_id: int, params: TrainParams) -> li
             raise Invalid(
                 f"Policy '{policy.name}' is {policy.kind}: only policies trained here can be trained further.", "Choose a trained policy."
             )
+        service.require_window(policy, db.get_one(Participant, participant_id).current_settings.window)
         known = {"checkpoint_sha256": policy.checkpoint_sha256} if policy.checkpoint_sha256 else {"onnx_sha256": policy.onnx_sha256}
         # a student has no critic: the sweep's own algorithm goes on from it
         algorithm = policy.algorithm if policy.checkpoint_sha256 else params.algorithms[0]

@@ -31,6 +31,21 @@ BUNDLE_TEST_WINDOWS = 64
 UPLOAD_LIMIT = MAX_FILE_BYTES
 
 
+def window_of(policy: Policy) -> int:
+    """W that a policy takes: what an uploaded one was tried with, else what its file says."""
+    own = policy.config.get("window") if policy.kind == "external" else None
+    return int(own) if own else OnnxPolicy(files.read(policy.onnx_sha256)).window
+
+
+def require_window(policy: Policy, window: int) -> None:
+    """Raise Invalid where a policy takes other windows than the participant's settings say now."""
+    if (own := window_of(policy)) != window:
+        raise Invalid(
+            f"Policy '{policy.name}' takes windows of {own} beta amplitudes; the participant's settings say {window}.",
+            "Leave it out, or set the window back.",
+        )
+
+
 def add_external(db: Session, participant: Participant, name: str, content: bytes, file_name: str, caller: Caller) -> Policy:
     """Store a policy made elsewhere. It is run on beta windows of many scales, and on the participant's own where there are some.
 

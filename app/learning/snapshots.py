@@ -211,12 +211,18 @@ def _signal(version: SettingsVersion, read: list[Member]) -> tuple[str, str]:
     )
 
 
+UNSTATED = "unstated"
+"""Unit of a table's beta that neither the table nor the settings of its time named."""
+
+
 def _admit(m: Member, unit: str, source: str) -> Member:
     """Leave out what is in another unit or from another source: beta amplitudes of two kinds are never mixed."""
     if m.trajectory is None or m.table is None or m.table.beta_trace is None:
         return m
     trace = m.table.beta_trace
-    if (trace.unit, trace.source) == (unit, source):
+    # A table that came before anyone had stated a unit is in the one that the settings state for tables now.
+    stated = unit if (trace.unit, trace.source, source) == (UNSTATED, "table", "table") else trace.unit
+    if (stated, trace.source) == (unit, source):
         return m
     reason = f"its beta is in {trace.unit} from {trace.source}; the participant's settings say {unit} from {source}"
     return Member(m.session, m.table, None, reason)

@@ -138,7 +138,7 @@ class FittedDoublyRobust:
         own = np.isin(table.first_session, pick)
         first = view.start[own if own.any() else slice(None)] @ weights[-1]
         sums = [weighted_doubly_robust(first[:, k], share, errors[pick][:, :, k], float(discount[k])) for k in range(len(discount))]
-        reachable = within_reach(np.array(sums), fqe.buffer.settings, horizon, (table.scale.beta_low, table.scale.beta_high))
+        reachable = within_reach(np.array(sums), fqe.buffer.settings, horizon, (table.scale.beta_low, table.scale.beta_high), view.span)
         known = np.isfinite(self.end_errors[pick])
         if not known.any():
             return reachable, 0.0
@@ -152,7 +152,7 @@ class _View:
 
     def __init__(self, member: QMember, fqe: FittedFqe, target: TargetActions) -> None:
         table = fqe.table
-        self.member, self.table = member, table
+        self.member, self.table, self.span = member, table, target.span
         self.start = member.features(table.first_states, target.first, fresh_memory(target.first))
         self.then = member.features(table.next_states, target.then, target.memory)
         self.products = member.grams.product(self.then)

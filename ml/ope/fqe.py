@@ -202,12 +202,16 @@ def summaries_of(sums: Floats, horizon: int) -> Floats:
     return np.stack(parts, axis=-1)
 
 
-def within_reach(sums: Floats, settings: MdpSettings, horizon: int, beta_range: tuple[float, float]) -> Floats:
-    """Sums of `HEADS` [..., 6] cut to what H steps can hold at all."""
+def within_reach(
+    sums: Floats, settings: MdpSettings, horizon: int, beta_range: tuple[float, float], span: tuple[float, float] = (0.0, 1.0)
+) -> Floats:
+    """Sums of `HEADS` [..., 6] cut to what H steps can hold at all of a policy whose amplitudes lie within `span`."""
+    least, most = span
     discounted = float(np.sum(settings.gamma ** np.arange(horizon)))
     late = min(LATE_STEPS, horizon)
-    low = np.array([(settings.r_b - settings.c1) * discounted, 0.0, 0.0, beta_range[0] * horizon, 0.0, 0.0])
-    high = np.array([settings.r_a * discounted, horizon, horizon, beta_range[1] * horizon, horizon, late])
+    beta = beta_range[0] * horizon, beta_range[1] * horizon
+    low = [(settings.r_b - settings.c1 * most) * discounted, least * horizon, least**2 * horizon, beta[0], 0.0, least * late]
+    high = [(settings.r_a - settings.c1 * least) * discounted, most * horizon, most**2 * horizon, beta[1], horizon, most * late]
     return np.asarray(np.clip(sums, low, high), dtype=np.float64)
 
 
@@ -275,8 +279,8 @@ class FittedFqe:
             own = np.isin(table.first_session, pick)
             refits[d] = starts[k][own if own.any() else slice(None)].mean(0) @ weights[-1]
         beta_range = (table.scale.beta_low, table.scale.beta_high)
-        main = within_reach(np.mean(mains, axis=0), settings, horizon, beta_range)
-        refits = within_reach(refits, settings, horizon, beta_range)
+        main = within_reach(np.mean(mains, axis=0), settings, horizon, beta_range, target.span)
+        refits = within_reach(refits, settings, horizon, beta_range, target.span)
         extra = {
             "penalty": penalties,
             "member_values": [float(m[0]) for m in mains],

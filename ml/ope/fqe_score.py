@@ -63,7 +63,7 @@ def fqe_value(
     first = np.stack(own) if own else table.first_states
     actions = np.clip(policy.act(first.copy()), 0.0, 1.0)
     sums = member.features(first, actions, fresh_memory(actions)).mean(0) @ weights[-1]
-    sums = within_reach(sums, settings, horizon, (scale.beta_low, scale.beta_high))
+    sums = within_reach(sums, settings, horizon, (scale.beta_low, scale.beta_high), target.span)
     end_model = fit_end_model(buffer_train)
     end = float(end_model.predict(summaries_of(sums, horizon))[0]) if end_model.seen[0] else 0.0
     return FqeScore(float(sums[0]) + end, float(sums[0]), end, _residual(buffer_train, sessions, policy, member, weights))

@@ -200,6 +200,7 @@ def held_out_predictions(
 ) -> tuple[tuple[Prediction, ...], dict[str, str]]:
     """Predictions of every method for every controller that can be left out, and the methods that failed."""
     groups, stand_ins, truth = controllers(buffer), clones(buffer, seed), observed(buffer, horizon, seed)
+    groups, whole = _comparable(groups, truth)
     predictions: list[Prediction] = []
     failed: dict[str, str] = {}
     for k, (key, indices) in enumerate(groups.items()):
@@ -212,7 +213,7 @@ def held_out_predictions(
             found = _predict(part, estimators, policy, horizon, failed)
             if aggregate and len(found) > 1:
                 found |= _combined(found)
-            predictions += [_prediction(method, key, estimate, truth[key]) for method, estimate in found.items()]
+            predictions += [_prediction(method, key, estimate, truth[key], whole) for method, estimate in found.items()]
         report((k + 1) / len(groups), "predicting left-out controllers")
     return tuple(predictions), failed
 
@@ -264,9 +265,19 @@ def _combined(found: Mapping[str, Estimate]) -> dict[str, Estimate]:
     return {AGGREGATE: combine(tables)["left out"]} if len(tables) > 1 else {}
 
 
-def _prediction(method: str, key: Key, estimate: Estimate, truth: Observed) -> Prediction:
+def _comparable(groups: Mapping[Key, list[int]], truth: Mapping[Key, Observed]) -> tuple[dict[Key, list[int]], bool]:
+    """Controllers that can be held against each other, and whether by whole returns.
+
+    A return with r_end and one without differ by r_end alone. Where enough controllers have it, the others are left out; else all are
+    compared by their steps.
+    """
+    complete = {k: i for k, i in groups.items() if k in truth and truth[k].end_reward is not None}
+    return (complete, True) if len(complete) >= FEWEST_CONTROLLERS else (dict(groups), len(complete) == len(groups))
+
+
+def _prediction(method: str, key: Key, estimate: Estimate, truth: Observed, whole: bool) -> Prediction:
     # Held against the same parts: a method without r_end is compared by its steps.
-    with_end = estimate.end_reward is not None and truth.end_reward is not None
+    with_end = whole and estimate.end_reward is not None and truth.end_reward is not None
     name = key[0] if key[1] is None else f"{key[0]} {key[1]}"
     return Prediction(
         method,

@@ -168,6 +168,12 @@ class TargetActions:
         then = _act(policy, table.next_states)
         return cls(_act(policy, table.states), then, remember(table.memory, then), _act(policy, table.first_states))
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """Least and largest amplitude that the policy asks for in a logged state."""
+        asked = np.concatenate([self.at, self.then, self.first])
+        return float(asked.min()), float(asked.max())
+
 
 def _act(policy: Policy, states: NDArray[Any]) -> Floats:
     return np.clip(np.asarray(policy.act(states.copy()), dtype=np.float64), 0.0, 1.0)

@@ -7,9 +7,14 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy.orm import Session
 
+from app.accounts.policy import SYSTEM
 from app.evaluation.methods import METHODS, QUICK_METHODS
+from app.evaluation.schemas import EvaluateParams
+from app.evaluation.service import policies_to_rank
 from app.learning.baselines import constant_onnx
+from app.study.repository import participant_by_code
 
 Upload = Callable[..., int]
 JOBS = "/api/v1/participants/P1/jobs"
@@ -162,3 +167,20 @@ def test_the_form_runs_the_ticked_methods_and_the_preset_those_of_its_size(clien
     refused = client.post("/participants/P1/jobs", data={"kind": "pipeline", "methods": ["wis", "aggregate"]})
     assert refused.status_code == 422
     assert "at least two other methods" in refused.text
+
+
+def test_policies_of_another_window_are_left_out_or_refused_by_name_before_the_job_waits(
+    client: TestClient, policies: list[int], db: Session
+) -> None:
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"window": 12}})
+    answer = client.post("/api/v1/participants/P1/jobs", json={"kind": "evaluate", "policies": policies[:1]})
+    assert answer.status_code == 422
+    assert "windows of 10 beta amplitudes; the participant's settings say 12" in answer.text
+    none = client.post("/api/v1/participants/P1/jobs", json={"kind": "evaluate"})
+    assert none.status_code == 422
+    assert "None of the 3 policies takes windows of 12" in none.text
+    fitting = client.post("/api/v1/participants/P1/policies", data={"name": "wide"}, files={"file": ("w.onnx", constant_onnx(0.5, 12))})
+    assert fitting.status_code == 201
+    db.rollback()
+    participant = participant_by_code(db, "P1", SYSTEM)
+    assert [p.name for p in policies_to_rank(db, participant.id, EvaluateParams())] == ["wide"]

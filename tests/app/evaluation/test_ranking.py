@@ -354,3 +354,16 @@ def test_without_end_of_session_rewards_the_predicted_outcomes_stand_beside_the_
     cells = [cell.split("<")[0] for cell in row.split('<td class="num">')[1:]]
     for value in ("\N{MINUS SIGN}30.00", "0.00", "40 %", "0.9", "2.1", "7.5", "12"):
         assert any(cell.strip().startswith(value) for cell in cells), (value, cells)
+
+
+def test_the_pages_csv_is_of_the_method_that_the_page_ranks_by(
+    client: TestClient, policies: list[int], evaluate: Callable[..., int]
+) -> None:
+    a, b, c = policies
+    other = {"estimates": {str(a): estimate("linear", 9.0), str(b): estimate("linear", 1.0), str(c): estimate("linear", 5.0)}}
+    evaluate({a: estimate("dlsm", 1.0), b: estimate("dlsm", 3.0), c: estimate("dlsm", 2.0)}, linear=other)
+    for method, best in (("dlsm", b), ("linear", a)):
+        page = client.get("/participants/P1/ranking", params={"method": method}).text
+        assert f"/participants/P1/ranking.csv?method={method}" in page
+        rows = list(csv.DictReader(io.StringIO(client.get("/participants/P1/ranking.csv", params={"method": method}).text)))
+        assert next(r for r in rows if r["rank"] == "1")["policy_id"] == str(best)

@@ -177,3 +177,14 @@ def test_the_snapshot_page_tells_what_the_buffer_covers(upload: Upload, client: 
     for text in ("fell asleep", "Logged amplitudes", "Visit 1", "60"):
         assert text in page
     assert db.scalar(select(func.count()).select_from(Participant)) == 1
+
+
+def test_a_table_that_came_before_its_unit_was_stated_is_in_the_unit_stated_for_tables(upload: Upload, db: Session) -> None:
+    kept, other = upload("random"), upload("random")
+    traces = db.scalars(select(Trace).where(Trace.stream == "beta").order_by(Trace.id)).all()
+    traces[0].unit = "unstated"
+    traces[-1].unit, traces[-1].source = "unstated", "power"
+    db.commit()
+    snapshot, buffer = taken(db)
+    assert [s.session_id for s in buffer.sessions] == [kept]
+    assert "unstated from power" in reasons(snapshot)[other]

@@ -150,3 +150,12 @@ def test_aims_by_turns_are_groups_of_their_own() -> None:
         ("return", 1), ("return", 3), ("return", 5), ("steps", 0), ("steps", 2), ("steps", 4),
     ]  # fmt: skip
     assert all(len({c["aim"] for c in g["configs"]}) == 1 for g in groups)
+
+
+def test_every_algorithm_gets_a_policy_before_any_gets_a_second_aim_or_anchor() -> None:
+    params = TrainParams(algorithms=["ddpg", "td3_bc", "rebrac", "iql", "cloning"], aim="both", anchor="both", count=6)
+    dealt = sorted((c["seed"], g["algorithm"], c["aim"]) for g in training_groups(params, [None] * 6) for c in g["configs"])
+    assert [d[1] for d in dealt] == ["ddpg", "td3_bc", "rebrac", "iql", "cloning", "ddpg"]
+    assert [d[2] for d in dealt] == ["steps"] * 5 + ["return"]
+    alone = training_groups(TrainParams(algorithms=["cloning"], aim="both", count=2), [None] * 2)
+    assert {c["aim"] for g in alone for c in g["configs"]} == {"steps"}

@@ -193,3 +193,15 @@ def test_intervals_are_widened_by_errors_on_left_out_controllers_that_chance_doe
     assert wider.value - wider.low == pytest.approx(np.hypot(base.value - base.low, 1.645 * 3.0))
     assert wider.high - wider.value == pytest.approx(np.hypot(base.high - base.value, 1.645 * 3.0))
     assert wider.details["held_out_error"] == pytest.approx(3.0)
+
+
+def test_a_controller_without_r_end_is_left_out_of_the_comparison_where_enough_others_have_it(linear_simulator):
+    buffer = linear_simulator.buffer(seed=0, n=16, steps=60)
+    bare = replace(buffer, sessions=tuple(replace(s, qoc=Qoc()) if s.controller == "other" else s for s in buffer.sessions))
+    linear = {"linear": LinearModel(LinearConfig(draws=20))}
+    found = choose_default(bare, linear, aggregate=False).predictions
+    assert {p.controller for p in found} == {"random", "cdbs", "rl"}
+    few = replace(bare, sessions=tuple(s for s in bare.sessions if s.controller != "rl"))
+    steps = choose_default(few, linear, aggregate=False).predictions
+    assert {p.controller for p in steps} == {"random", "cdbs", "other"}
+    assert all(p.observed < 0 for p in steps)  # step returns, every one of them; r_end is positive here

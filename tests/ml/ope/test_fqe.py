@@ -151,3 +151,12 @@ def test_padding_a_session_with_unusable_steps_changes_no_value(small_buffer):
         for sessions in (small_buffer.sessions, padded)
     )
     assert one.step_return == pytest.approx(two.step_return)
+
+
+def test_nothing_is_estimated_that_the_steps_of_the_policy_cannot_hold(small_buffer):
+    found = Fqe(FqeConfig(members=1, refits=10)).fit(small_buffer).evaluate({"all": ConstantPolicy(1.0), "half": ConstantPolicy(0.5)}, 30)
+    discounted = float(np.sum(small_buffer.settings.gamma ** np.arange(30)))
+    for name, a in (("all", 1.0), ("half", 0.5)):
+        assert found[name].predicted["mean_amplitude"] == pytest.approx(a)
+        assert found[name].predicted["energy"] == pytest.approx(a**2)
+        assert found[name].step_return <= -small_buffer.settings.c1 * a * discounted + 1e-9
