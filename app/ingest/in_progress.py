@@ -22,7 +22,12 @@ def in_progress(upload_id: int) -> Iterator[None]:
     with engine.connect() as connection:
         connection.execute(text("select pg_advisory_lock(:space, :upload)"), {"space": LOCKS, "upload": upload_id})
         connection.commit()
-        yield
+        try:
+            yield
+        finally:
+            # The server frees it too once it notices that the connection is gone, which on a busy machine is a moment later.
+            connection.execute(text("select pg_advisory_unlock(:space, :upload)"), {"space": LOCKS, "upload": upload_id})
+            connection.commit()
 
 
 def interrupted(db: Session) -> list[int]:
