@@ -226,8 +226,7 @@ class FittedDlsm:
         monte_carlo = np.sqrt(np.mean([self._returns(r).var(1) / r.sessions for r in runs], axis=0) / members)
         ends = self._end_draws(runs)
         draws = values.mean(0) + spread + ends + monte_carlo * rng.standard_normal((DRAWS, p))
-        days, _ = day_noise(self.buffer, horizon, DRAWS, self.config.seed)
-        common = self.level_error() ** 2 + float(days.var())
+        common = self.level_error() ** 2 + float(day_noise(self.buffer, horizon, DRAWS, self.config.seed)[0].var())
         draws = draws + np.sqrt(common) * rng.standard_normal((DRAWS, 1))
         variance = (centred**2).sum(0) / max(1, members - 1) + ends.var(0) + common + monte_carlo**2
         return draws, np.sqrt(variance)
@@ -249,17 +248,16 @@ class FittedDlsm:
     def level_error(self) -> float:
         """Standard error of the mean held-out residual of the return: how far the level of all estimates may be off."""
         name = f"residual_{self.reward_source}"
+        residuals = [np.concatenate([np.asarray(getattr(c, name)) for c in self.checks])]
         total = 0.0
         if self.end_source == "summaries":
-            total += float(self.end.residual[0]) ** 2 / len(self.buffer.sessions)
-        ends = [c.residual_end for c in self.checks] if self.end_source == "latent" else []
-        for parts in ([getattr(c, name) for c in self.checks], ends):
-            if not parts:
-                continue
-            residuals = np.concatenate([np.asarray(r) for r in parts])
-            if residuals.size > 1:
+            total = float(self.end.residual[0]) ** 2 / len(self.buffer.sessions)
+        else:
+            residuals.append(np.concatenate([np.asarray(c.residual_end) for c in self.checks]))
+        for found in residuals:
+            if found.size > 1:
                 # Around zero, not around their mean: a bias found on held-out sessions widens the interval.
-                total += float(np.mean(residuals**2)) / min(residuals.size, len(self.buffer.sessions))
+                total += float(np.mean(found**2)) / min(found.size, len(self.buffer.sessions))
         return float(np.sqrt(total))
 
     def _coverage(self, support: AmplitudeSupport, policy: Policy, runs: list[Rollouts], i: int) -> tuple[Coverage, Coverage]:
@@ -284,6 +282,7 @@ class FittedDlsm:
         flags = list(dict.fromkeys((*logged.flags, *simulated.flags)))
         if not seen[0]:
             flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+        flags += [unknown] if (unknown := day_noise(self.buffer, horizon, 1, 0)[1]) else []
         skill = self.held_out_skill()
         flags += _warnings(skill)
         other_step, other_end = zip(*(self._parts(run) for run in others), strict=True)

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 SMALLEST, LARGEST = 1e-6, 1e3
 """Bounds of every lambda."""
@@ -112,11 +111,6 @@ class MixedFit:
     def coefficients(self) -> Floats:
         """Posterior mean, [q]."""
         return np.asarray(self.weights @ self.means, dtype=np.float64)
-
-    @property
-    def noise_variance(self) -> float:
-        """Posterior mean of sigma^2 (its mode where the mean does not exist)."""
-        return float(self.weights @ self.squares) / max(self.degrees - 2, 1)
 
     @property
     def covariance(self) -> Floats:

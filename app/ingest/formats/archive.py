@@ -14,8 +14,8 @@ from app.ingest.formats.log import UndecodableFile
 from app.ingest.formats.options import ArchiveLimits
 
 NESTED = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".bz2", ".xz")
-READ_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError, ValueError)
-"""What zipfile raises for damaged members, wrong sizes, and (NotImplementedError) a compression that it does not know."""
+READ_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError)
+"""What zipfile raises for damaged members, wrong sizes, a password, and (a kind of RuntimeError) a compression that it does not know."""
 
 
 class Files(Protocol):
