@@ -25,13 +25,13 @@ from figure import draw
 from ope_policies import fixed_policies, trained_policies
 from simulators import STEPS, WORLDS, World
 
-from ml.ope.aggregate import METHOD as AGGREGATE
-from ml.ope.aggregate import combine
+from ml.ope.compare.aggregate import METHOD as AGGREGATE
+from ml.ope.compare.aggregate import combine
+from ml.ope.compare.metrics import accuracy
+from ml.ope.compare.skill import choose_default, reach_with
 from ml.ope.estimate import Estimate
-from ml.ope.metrics import accuracy
-from ml.ope.panel import estimators, quick_estimators
-from ml.ope.skill import choose_default, reach_with
-from ml.rl.policy import Policy
+from ml.ope.registry import estimators, quick_estimators
+from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer
 
 PARTICIPANT_WORLDS, OTHER_WORLDS = ("P1", "P2", "P3", "P4"), ("saturating", "switching")

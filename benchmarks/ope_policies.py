@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ml.rl.algorithms import ALGORITHMS
+from ml.policies.onnx_policy import OnnxPolicy
+from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
+from ml.rl.algorithms.registry import ALGORITHMS
 from ml.rl.distillation import DistilConfig, distil
-from ml.rl.onnx_policy import OnnxPolicy
-from ml.rl.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 
 SMALL = {"hidden": (64, 48), "updates": 3000, "batch": 64, "actor_lr": 3e-4}

@@ -7,12 +7,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field
 
-from app.evaluation.methods import METHOD_NAMES as METHOD_NAMES
-from app.evaluation.methods import METHODS as METHODS
-from app.evaluation.methods import Method as Method
-from app.evaluation.methods import Methods
+from app.evaluation.estimates.methods import METHOD_NAMES as METHOD_NAMES
+from app.evaluation.estimates.methods import METHODS as METHODS
+from app.evaluation.estimates.methods import Method as Method
+from app.evaluation.estimates.methods import Methods
 from app.learning.schemas import DistilParams, PolicyIds, Preset, SweepParams, TrainParams
-from app.platform.schemas import Int, Model, Number
+from app.platform.web.schemas import Int, Model, Number
 
 
 class EvaluateParams(Model):

@@ -8,22 +8,22 @@ from typing import Any
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
-from app.accounts import policy as can
-from app.accounts.policy import Caller
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
 from app.evaluation import repository
-from app.evaluation.choice import choose, combined, widened
-from app.evaluation.coverage import STORED, refused, told_apart
-from app.evaluation.estimates import as_estimate
-from app.evaluation.methods import AGGREGATE, METHOD_NAMES
+from app.evaluation.estimates.choice import choose, combined, widened
+from app.evaluation.estimates.coverage import STORED, refused, told_apart
+from app.evaluation.estimates.methods import AGGREGATE, METHOD_NAMES
+from app.evaluation.estimates.rows import as_estimate
 from app.evaluation.models import EstimateRow, Evaluation
-from app.evaluation.ranking import current_ranking as current_ranking
+from app.evaluation.ranking.service import current_ranking as current_ranking
 from app.evaluation.schemas import EvaluateParams, PipelineParams
 from app.learning import repository as learning
-from app.learning.jobs import teachers, training_starts
 from app.learning.models import BufferSnapshot, Policy
+from app.learning.policies.service import require_window, window_of
 from app.learning.schemas import DistilParams, TrainParams
-from app.learning.service import require_window, window_of
-from app.learning.snapshots import collect
+from app.learning.snapshots.service import collect
+from app.pipeline.learning import teachers, training_starts
 from app.platform.errors import Invalid
 from app.platform.jobs import service as jobs
 from app.platform.jobs.models import Job

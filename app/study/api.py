@@ -9,11 +9,13 @@ from fastapi import APIRouter, Depends, Path
 from numpy.typing import NDArray
 
 from app.accounts.deps import CurrentCaller
-from app.accounts.policy import Caller
+from app.accounts.permissions import Caller
 from app.platform.database import Db
-from app.platform.schemas import Page, PagingQuery, RowId, problems
-from app.study import blinding, outcome_values, outcomes, repository, service
+from app.platform.web.schemas import Page, PagingQuery, RowId, problems
+from app.study import blinding, repository, service
 from app.study.models import Participant, StudySession, Visit
+from app.study.outcomes import service as outcomes
+from app.study.outcomes import values as outcome_values
 from app.study.schemas import (
     DerivedChoice,
     OutcomeOut,

@@ -11,18 +11,21 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
 from starlette.datastructures import FormData
 
-from app.accounts import policy as can
+from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
-from app.accounts.policy import Caller
+from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.forms import FormValues, parse
-from app.platform.templates import render
-from app.study import outcome_values, outcomes, repository, service, session_pages, settings_form, visit_form
+from app.platform.web.forms import FormValues, parse
+from app.platform.web.templates import render
+from app.study import repository, service, settings_form, visit_form
 from app.study.api import CurrentParticipant, CurrentVisit
 from app.study.blinding import arm
 from app.study.models import Participant, StudySession, Visit
+from app.study.outcomes import service as outcomes
+from app.study.outcomes import values as outcome_values
 from app.study.schemas import CdbsAmplitudeModel, ParticipantIn, SettingsIn, VisitIn
+from app.study.sessions import pages as session_pages
 from app.study.settings_form import Shown, own_changes
 
 log = structlog.get_logger()

@@ -18,14 +18,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from ml.cohort import random_controller_buffer, true_return
-from ml.ope.fqe import Fqe
-from ml.ope.fqe_score import fqe_value
-from ml.rl.algorithms import ALGORITHMS
+from ml.ope.fqe.estimator import Fqe
+from ml.ope.fqe.score import fqe_value
+from ml.policies.policy import ConstantPolicy
+from ml.population import random_controller_buffer, true_return
+from ml.rl.algorithms.registry import ALGORITHMS
 from ml.rl.baselines import best_constant
 from ml.rl.end_reward import fit_end_reward
 from ml.rl.held_out import HeldOut, split_sessions
-from ml.rl.policy import ConstantPolicy
 from ml.rl.selection import gains_over, surest
 from ml.rl.support import stays_in_range
 from ml.rl.trainer import TrainedPolicy
