@@ -230,7 +230,7 @@ def pipeline(
     as_json: AsJson = False,
 ) -> None:
     """Train, distil, evaluate and rank: the work between two visits. A worker must be running."""
-    from app.evaluation.service import start_job
+    from app.pipeline.service import start_job
     from app.platform.jobs.models import JobStatus
     from app.platform.jobs.watch import show_progress
     from app.study import repository as study

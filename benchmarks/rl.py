@@ -2,7 +2,8 @@
 
     python benchmarks/rl.py [--steps N] [--repeats N] [--six]
 
-`ddpg_vs_eager`: one DDPG update of `ml.rl.algorithms.ddpg` against the loop as usually written in PyTorch (below), 400x300, batch 64 and 256.
+`ddpg_vs_eager`: one DDPG update of `ml.rl.algorithms.ddpg` against the loop as usually written in PyTorch (below), 400x300, batches of
+64 and 256.
 `six_vs_eager`: six policies side by side against six such loops, batch 64.
 `ddpg_vs_d3rlpy`: one update against d3rlpy's DDPG at batch 256, where d3rlpy is installed (the `bench` extra).
 `ddpg_of_products`: share of the update's time that its matrix products alone take, in their own shapes, batch 256.

@@ -15,8 +15,8 @@ from app.overview import queries
 from app.platform.database import Db
 from app.platform.web.templates import render
 from app.study import repository as study
-from app.study.api import CurrentParticipant
 from app.study.blinding import arm
+from app.study.deps import CurrentParticipant
 
 router = APIRouter()
 

@@ -4,43 +4,22 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Path, Query
+from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
 
-from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
-from app.evaluation import service
-from app.evaluation.schemas import JobIn, JobOut, JobStepOut
+from app.pipeline import service
+from app.pipeline.deps import CurrentJob
+from app.pipeline.schemas import JobIn, JobOut
+from app.pipeline.serializers import job_out
 from app.platform.database import Db
-from app.platform.errors import NotFound
 from app.platform.jobs import repository as jobs
 from app.platform.jobs import stream
-from app.platform.jobs.models import Job, JobStatus
+from app.platform.jobs.models import JobStatus
 from app.platform.web.schemas import Page, PagingQuery, problems
-from app.study.api import CurrentParticipant
-from app.study.models import Participant
+from app.study.deps import CurrentParticipant
 
 router = APIRouter(tags=["jobs"], responses=problems(401, 403, 404, 422))
-
-
-class ParticipantJob:
-    """A job and the participant it works for."""
-
-    def __init__(self, job: Job, participant: Participant) -> None:
-        self.job, self.participant = job, participant
-
-
-def current_job(job_id: Annotated[str, Path(pattern=r"^[0-9a-fA-F-]{1,36}$")], db: Db, caller: CurrentCaller) -> ParticipantJob:
-    """The job that the path names. Raises NotFound for a job of a participant that the caller may not see."""
-    job = jobs.get(db, job_id)
-    participant = db.get(Participant, job.participant_id) if job.participant_id is not None else None
-    if participant is None:
-        raise NotFound(f"There is no job {job_id}.")
-    caller.require(can.READ, participant.site.study_id, participant.site_id)
-    return ParticipantJob(job, participant)
-
-
-CurrentJob = Annotated[ParticipantJob, Depends(current_job)]
 
 
 @router.post("/participants/{code}/jobs", status_code=202)
@@ -96,37 +75,3 @@ def retry_job(found: CurrentJob, db: Db, caller: CurrentCaller) -> JobOut:
     job = service.retry_job(db, found.participant, found.job, caller)
     db.commit()
     return job_out(job, found.participant)
-
-
-def job_out(job: Job, participant: Participant) -> JobOut:
-    """A job for the API."""
-    return JobOut(
-        id=job.id,
-        kind=job.kind,
-        participant=participant.code,
-        status=str(job.status),
-        progress=job.progress,
-        message=job.message,
-        params=job.params,
-        result=job.result,
-        error=job.error,
-        code_version=job.code_version,
-        created_at=job.created_at,
-        created_by=job.created_by,
-        started_at=job.started_at,
-        finished_at=job.finished_at,
-        cancel_requested_at=job.cancel_requested_at,
-        steps=[
-            JobStepOut(
-                key=s.key,
-                title=s.title,
-                status=str(s.status),
-                progress=s.progress,
-                message=s.message,
-                attempts=s.attempts,
-                started_at=s.started_at,
-                finished_at=s.finished_at,
-            )
-            for s in job.steps
-        ],
-    )

@@ -10,13 +10,14 @@ from sqlalchemy.orm import Session
 from app.evaluation import repository, service
 from app.evaluation.estimates import compute
 from app.evaluation.estimates.methods import AGGREGATE, METHOD_NAMES, METHOD_WEIGHTS, Method
-from app.evaluation.schemas import EvaluateParams, PipelineParams
+from app.evaluation.schemas import EvaluateParams
 from app.learning.models import BufferSnapshot
 from app.learning.policies.baselines import ensure_baselines
 from app.learning.schemas import DistilParams
 from app.learning.training.compute import read_buffer
 from app.learning.training.configs import training_groups
 from app.pipeline import learning
+from app.pipeline.schemas import PipelineParams
 from app.platform import files
 from app.platform.jobs import JobContext, Priority, job_kind
 

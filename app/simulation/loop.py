@@ -14,9 +14,9 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.evaluation.ranking.service import current_ranking
 from app.evaluation.schemas import RankedPolicy
-from app.evaluation.service import start_job
 from app.learning import repository as learning
 from app.learning.models import Policy
+from app.pipeline.service import start_job
 from app.planning.plans import repository as plans
 from app.planning.plans import service as planning
 from app.planning.plans.schedule import total_minutes

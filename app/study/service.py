@@ -278,6 +278,11 @@ def require(caller: Caller, permission: str, participant: Participant) -> None:
     caller.require(permission, participant.site.study_id, participant.site_id)
 
 
+def may(caller: Caller, permission: str, participant: Participant) -> bool:
+    """Whether the caller holds the permission for this participant: for pages that leave out what would be refused."""
+    return caller.may(permission, participant.site.study_id, participant.site_id)
+
+
 def _add_settings(db: Session, participant: Participant, values: dict[str, Any], caller: Caller, reason: str | None) -> SettingsVersion:
     try:
         MdpSettings(xi_beta=values["xi_beta"] if values["xi_beta"] is not None else 0.0, **{n: values[n] for n in MDP_FIELDS})

@@ -1,8 +1,8 @@
 """The paper's metrics of estimates against actual returns, with session-bootstrap intervals.
 
-A pair is a policy at a visit: an estimate made before, and the mean return of its sessions there. Sessions are what is resampled, so that a
-policy of one session, whose resampled mean never varies, still drops out of some resamples. `ml.ope.compare.metrics` gives the values, the arrays
-here the same metrics of every resample at once. Source: Gao et al. 2023, appendix on the metrics of off-policy evaluation.
+A pair is a policy at a visit: an estimate made before, and the mean return of its sessions there. Sessions are what is resampled, so that
+a policy of one session, whose resampled mean never varies, still drops out of some resamples. `ml.ope.compare.metrics` gives the values,
+the arrays here the same metrics of every resample at once. Source: Gao et al. 2023, appendix on the metrics of off-policy evaluation.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from app.analysis.metrics import service
 from app.analysis.metrics.schemas import FiveMetricsOut
 from app.platform.database import Db
 from app.platform.web.schemas import problems
-from app.study.api import CurrentParticipant
+from app.study.deps import CurrentParticipant
 
 router = APIRouter(tags=["analysis"], responses=problems(401, 403, 404, 422))
 

@@ -12,7 +12,7 @@ from app.analysis.trial_time.service import trial_time
 from app.platform.database import Db
 from app.platform.web.templates import render
 from app.study import repository as study
-from app.study.api import CurrentParticipant
+from app.study.deps import CurrentParticipant
 
 router = APIRouter()
 

@@ -1,4 +1,4 @@
-"""REST routes of evaluation: the ranking, and the jobs of every kind."""
+"""REST routes of the ranking."""
 
 from __future__ import annotations
 
@@ -7,20 +7,15 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query, Response
 
 from app.accounts.deps import CurrentCaller
-from app.analysis.calibration import service as calibration
-from app.analysis.calibration.schemas import CalibrationOut
 from app.evaluation.ranking import service as ranking
-from app.evaluation.ranking.export import calibration_to_csv, to_csv
+from app.evaluation.ranking.export import to_csv
 from app.evaluation.schemas import Kind, Method, RankingFilter, RankingOut
-from app.pipeline import api as jobs_api
 from app.platform.database import Db
+from app.platform.web.csv_files import download
 from app.platform.web.schemas import problems
-from app.study.api import CurrentParticipant
+from app.study.deps import CurrentParticipant
 
 router = APIRouter(responses=problems(401, 403, 404, 422))
-router.include_router(jobs_api.router)
-
-CSV = "text/csv; charset=utf-8"
 
 
 @router.get(
@@ -45,32 +40,6 @@ def read_ranking(
     return csv_of(found) if format == "csv" else found
 
 
-@router.get(
-    "/participants/{code}/calibration",
-    tags=["evaluation"],
-    response_model=CalibrationOut,
-    responses={200: {"content": {"text/csv": {"schema": {"type": "string"}}}}},
-)
-def read_calibration(
-    participant: CurrentParticipant,
-    db: Db,
-    caller: CurrentCaller,
-    format: Annotated[Literal["json", "csv"], Query(description="csv: one row per visit, policy and method.")] = "json",
-) -> CalibrationOut | Response:
-    """Estimates made before each visit against what the visit brought, and the metrics of every method."""
-    found = calibration.calibration(db, participant, caller)
-    return calibration_csv_of(found) if format == "csv" else found
-
-
 def csv_of(found: RankingOut) -> Response:
     """A ranking as a CSV download."""
-    return _download(to_csv(found), f"{found.participant}-ranking-{found.evaluation_id}.csv")
-
-
-def calibration_csv_of(found: CalibrationOut) -> Response:
-    """A calibration as a CSV download."""
-    return _download(calibration_to_csv(found), f"{found.participant}-calibration.csv")
-
-
-def _download(content: str, name: str) -> Response:
-    return Response(content, media_type=CSV, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+    return download(to_csv(found), f"{found.participant}-ranking-{found.evaluation_id}.csv")

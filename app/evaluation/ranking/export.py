@@ -1,14 +1,13 @@
-"""The ranking and the calibration as tables for other programs: every column that the pages and the REST interface have."""
+"""The ranking as a table for other programs: every column that the page and the REST interface have."""
 
 from __future__ import annotations
 
 import csv
 import io
 
-from app.analysis.calibration.schemas import CalibrationOut
 from app.evaluation.estimates.coverage import CHECKS
-from app.evaluation.ranking.actual import QUANTITIES
 from app.evaluation.schemas import RankedPolicy, RankingOut, TestedBefore
+from app.platform.web.csv_files import safe_cell
 
 _PREDICTED = ("energy", "mean_amplitude", "mean_beta", "grasp_hz", "rating", "tremor_percent")
 _NUMBERS = ("value", "low", "high", "level", "standard_error", "n", "step_return", "end_reward")
@@ -17,10 +16,6 @@ _OF_POLICY = ("rank", "policy_id", "name", "kind", "algorithm", "reference", "re
 _GAIN = ("value", "low", "high")
 _TESTED = tuple(TestedBefore.model_fields)
 _COVERAGE = tuple(CHECKS)
-_OF_POLICY_AT_VISIT = (
-    "visit", "visit_date", "evaluation_id", "evaluated_at", "policy_id", "name", "kind", "reference", "horizon_steps", "gamma"
-)  # fmt: skip
-_OF_PREDICTION = ("method", "supported", "parts", "predicted", "low", "high", "level", "actual", "actual_low", "actual_high", "sessions")
 
 
 def to_csv(ranking: RankingOut) -> str:
@@ -40,24 +35,7 @@ def to_csv(ranking: RankingOut) -> str:
         results = [getattr(p.tested, n) if p.tested else (0 if n.startswith("sessions") else None) for n in _TESTED]
         for method, e in p.estimates.items():
             numbers = [method, e.supported, *(getattr(e, n) for n in _NUMBERS), *(e.predicted.get(n) for n in _PREDICTED)]
-            out.writerow([_safe(cell) for cell in (*of_ranking, *of_policy, *numbers, "; ".join(e.flags), *results)])
-    return sink.getvalue()
-
-
-def calibration_to_csv(found: CalibrationOut) -> str:
-    """One row per visit, policy and method: what had been predicted, and what the sessions brought."""
-    sink = io.StringIO()
-    out = csv.writer(sink, lineterminator="\n")
-    shown = [f"{name}_{part}" for name in QUANTITIES for part in ("predicted", "actual")]
-    out.writerow(["participant", *_OF_POLICY_AT_VISIT, *_OF_PREDICTION, "session_returns", "beta_unit", *shown])
-    for p in found.policies:
-        whole = [found.participant, *(getattr(p, n) for n in _OF_POLICY_AT_VISIT)]
-        for q in p.predictions:
-            returns = " ".join(f"{value:.6g}" for value in q.session_returns)
-            known = {v.name: (v.predicted, v.actual) for v in q.quantities}
-            values = [value for name in QUANTITIES for value in known.get(name, (None, None))]
-            cells = (*whole, *(getattr(q, n) for n in _OF_PREDICTION), returns, found.beta_unit, *values)
-            out.writerow([_safe(cell) for cell in cells])
+            out.writerow([safe_cell(cell) for cell in (*of_ranking, *of_policy, *numbers, "; ".join(e.flags), *results)])
     return sink.getvalue()
 
 
@@ -71,8 +49,3 @@ def _coverage(p: RankedPolicy) -> list[object]:
         return [None] * len(_coverage_columns())
     values = {c.name: c.value for c in p.coverage.checks}
     return [p.coverage.supported, "; ".join(p.coverage.failing), "; ".join(p.coverage.notes), *(values.get(n) for n in _COVERAGE)]
-
-
-def _safe(value: object) -> object:
-    """A cell that spreadsheets do not run as a formula."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in set("=+-@\t\r") else value

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from fastapi import APIRouter, Depends
+from fastapi import APIRouter
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.ingest import repository
-from app.ingest.models import SessionProposal
+from app.ingest.deps import CurrentProposal
 from app.ingest.proposals import service as proposals
+from app.ingest.proposals.serializers import proposal_out, proposals_out
 from app.ingest.schemas import (
     AttachedOut,
     AttachIn,
     ConfirmedOut,
     DiscardIn,
-    PartOut,
     ProposalChange,
     ProposalOut,
     SplitIn,
@@ -29,19 +27,11 @@ from app.platform.errors import NotFound
 from app.platform.web.schemas import RowId, problems
 from app.study import repository as study
 from app.study import service as study_service
-from app.study.api import CurrentParticipant, session_out
+from app.study.deps import CurrentParticipant
 from app.study.models import StudySession
+from app.study.serializers import session_out
 
 router = APIRouter(tags=["proposals"], responses=problems(401, 403, 404, 422))
-
-
-def current_proposal(session_id: RowId, db: Db, caller: CurrentCaller) -> StudySession:
-    """The session, once or still proposed, that the path names."""
-    repository.proposal(db, session_id, caller)
-    return study.session(db, session_id, caller)
-
-
-CurrentProposal = Annotated[StudySession, Depends(current_proposal)]
 
 
 @router.get("/participants/{code}/proposals")
@@ -99,38 +89,7 @@ def attach_file(file_id: RowId, target: AttachIn, db: Db, caller: CurrentCaller)
     return AttachedOut(session=session_out(study.session(db, session.id, caller), caller), notes=notes)
 
 
-def proposals_out(db: Session, participant_id: int, caller: Caller) -> list[ProposalOut]:
-    """All proposals of a participant for the API."""
-    rows = study.proposals_of_participant(db, participant_id)
-    behind = repository.proposals(db, [s.id for s in rows])
-    return [proposal_out(s, behind[s.id], caller) for s in rows if s.id in behind]
-
-
 def _one(db: Session, session: StudySession, caller: Caller) -> ProposalOut:
     if session.status != "proposed":
         raise NotFound(f"Session {session.id} is confirmed; it is no proposal any more.", "Read it as a session.")
     return proposal_out(session, repository.proposal(db, session.id, caller), caller)
-
-
-def proposal_out(session: StudySession, row: SessionProposal, caller: Caller) -> ProposalOut:
-    """A proposal for the API."""
-    return ProposalOut(
-        session=session_out(session, caller),
-        version=row.version,
-        upload_id=row.upload_id,
-        visit_open=row.visit_open,
-        evidence=row.evidence,
-        changed_by=row.changed_by,
-        parts=[
-            PartOut(
-                recording_id=s.recording_id,
-                hemisphere=s.recording.hemisphere,
-                recording_started_at=s.recording.started_at,
-                recording_s=s.recording.duration_s,
-                start_s=s.start_s,
-                stop_s=s.stop_s,
-                is_control=s.is_control,
-            )
-            for s in session.segments
-        ],
-    )

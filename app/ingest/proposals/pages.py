@@ -13,9 +13,9 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.ingest import repository
+from app.ingest.deps import CurrentProposal
 from app.ingest.models import SessionProposal
 from app.ingest.proposals import service as proposals
-from app.ingest.proposals.api import CurrentProposal
 from app.ingest.proposals.forms import ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
 from app.ingest.uploads import service
 from app.platform.database import Db
@@ -25,8 +25,8 @@ from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.study import repository as study
 from app.study import service as study_service
-from app.study.api import CurrentParticipant
 from app.study.blinding import CONTROLLER_NAMES
+from app.study.deps import CurrentParticipant
 from app.study.models import Participant, StudySession
 from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions

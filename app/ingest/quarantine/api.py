@@ -6,13 +6,12 @@ from fastapi import APIRouter, Response
 
 from app.accounts.deps import CurrentCaller
 from app.ingest import repository
-from app.ingest.models import UploadFile
 from app.ingest.quarantine import service as quarantine
+from app.ingest.quarantine.serializers import original, quarantined_out
 from app.ingest.schemas import QuarantineDiscardIn, QuarantinedOut, ReleaseIn
-from app.ingest.uploads import service
 from app.platform.database import Db
 from app.platform.web.schemas import RowId, problems
-from app.study.api import CurrentParticipant
+from app.study.deps import CurrentParticipant
 
 router = APIRouter(tags=["quarantine"], responses=problems(401, 403, 404, 422))
 
@@ -47,39 +46,3 @@ def release(file_id: RowId, decision: ReleaseIn, db: Db, caller: CurrentCaller) 
 def discard(file_id: RowId, decision: QuarantineDiscardIn, db: Db, caller: CurrentCaller) -> QuarantinedOut:
     """Erase the bytes of a quarantined file; its row stays."""
     return quarantined_out(quarantine.discard(db, file_id, decision.reason, caller))
-
-
-def original(content: bytes, file_id: int) -> Response:
-    """Bytes for a person to look at; no browser may run them."""
-    headers = {
-        "Content-Disposition": f'attachment; filename="file-{file_id}.bin"',
-        "X-Content-Type-Options": "nosniff",
-        "Cache-Control": "no-store",
-    }
-    return Response(content, media_type="application/octet-stream", headers=headers)
-
-
-def problem_of(file: UploadFile) -> str:
-    """Why a file could not be read, in the words that may be stored."""
-    reports = service.stored_reports(file)
-    found = [f"{r.problem.what} ({r.problem.where})" for r in reports if r.problem]
-    return "; ".join(found or [s for r in reports for s in r.flagged if s.startswith("kept encrypted")])
-
-
-def quarantined_out(file: UploadFile) -> QuarantinedOut:
-    """A quarantined file for the API."""
-    return QuarantinedOut(
-        id=file.id,
-        upload_id=file.upload_id,
-        kind=file.kind,
-        size=file.size,
-        sha256=file.original_sha256,
-        status=file.status,
-        held=file.quarantine_sha256 is not None,
-        problem=problem_of(file),
-        reviewed_by=file.reviewed_by,
-        reviewed_at=file.reviewed_at,
-        decided_by=file.decided_by,
-        decided_at=file.decided_at,
-        decision_reason=file.decision_reason,
-    )

@@ -11,13 +11,13 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.ingest import repository
 from app.ingest.quarantine import service as quarantine
-from app.ingest.quarantine.api import original, problem_of
+from app.ingest.quarantine.serializers import original, problem_of
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
-from app.study.api import CurrentParticipant
+from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 
 router = APIRouter()

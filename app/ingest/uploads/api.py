@@ -11,7 +11,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.ingest import repository
 from app.ingest.models import UploadFile as UploadFileRow
-from app.ingest.proposals.api import proposal_out
+from app.ingest.proposals.serializers import proposal_out
 from app.ingest.schemas import FileReportOut, UploadedFileOut, UploadOut
 from app.ingest.uploads import service
 from app.ingest.uploads.early_refusal import UploadRoute
@@ -20,9 +20,9 @@ from app.platform.database import Db
 from app.platform.errors import Invalid
 from app.platform.web.schemas import Moment, RowId, Text, problems
 from app.study import repository as study
-from app.study.api import session_out
 from app.study.models import Controller, Hemisphere
 from app.study.schemas import BetaSource
+from app.study.serializers import session_out
 from ml.formats.tables.numbers import unit_name
 
 router = APIRouter(route_class=UploadRoute, tags=["uploads"], responses=problems(401, 403, 404, 422))

@@ -24,8 +24,8 @@ from app.platform.web.templates import render
 from app.settings import get_settings
 from app.study import repository as study
 from app.study import service as study_service
-from app.study.api import CurrentParticipant
 from app.study.blinding import CONTROLLER_NAMES
+from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.schemas import BetaSource
 from app.study.settings_form import SOURCES

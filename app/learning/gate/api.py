@@ -6,11 +6,12 @@ from fastapi import APIRouter
 
 from app.accounts.deps import CurrentCaller
 from app.learning.gate import service as gates
-from app.learning.schemas import GateChange, GateDecisionOut, GateOut, QocTestOut
+from app.learning.schemas import GateChange, GateOut
+from app.learning.serializers import gate_out
 from app.platform.database import Db
 from app.platform.web.schemas import problems
 from app.study import repository as study_repository
-from app.study.api import CurrentParticipant
+from app.study.deps import CurrentParticipant
 
 router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
 
@@ -27,21 +28,3 @@ def decide_gate(participant: CurrentParticipant, change: GateChange, db: Db, cal
     gates.decide(db, participant, change.choice, change.reason, caller)
     db.commit()
     return read_gate(participant, db)
-
-
-def gate_out(found: gates.Gate) -> GateOut:
-    """The gate for the API."""
-    decision = found.decision
-    return GateOut(
-        open=found.is_open,
-        grounds=found.grounds,
-        opened_by_test=found.opened_by_test,
-        tests=[
-            QocTestOut(qoc=t.field, **{name: getattr(t, name) for name in QocTestOut.model_fields if name != "qoc"}) for t in found.tests
-        ],
-        decision=None
-        if decision is None
-        else GateDecisionOut(
-            choice=decision.choice, reason=decision.reason, created_at=decision.created_at, created_by=decision.created_by
-        ),
-    )

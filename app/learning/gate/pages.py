@@ -18,7 +18,7 @@ from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
 from app.study import repository as study_repository
-from app.study.api import CurrentParticipant
+from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 
 router = APIRouter()

@@ -13,9 +13,10 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning import repository
+from app.learning.deps import CurrentPolicy, CurrentSnapshot
 from app.learning.models import Policy
 from app.learning.policies import service
-from app.learning.policies.api import CurrentPolicy, CurrentSnapshot, read_limited
+from app.learning.policies.uploads import read_limited
 from app.learning.schemas import ALGORITHM_NAMES, PolicyChange, PolicyLabel
 from app.learning.snapshots.coverage import describe
 from app.learning.sweeps.comparison import below_bound
@@ -26,8 +27,9 @@ from app.platform.web.forms import FormValues, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
 from app.study import repository as study_repository
-from app.study.api import CurrentParticipant
+from app.study.deps import CurrentParticipant
 from app.study.models import Participant
+from app.study.service import may
 from ml.rl.support import LARGEST_SHARE_BELOW
 
 router = APIRouter()
@@ -89,7 +91,7 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
         below=below if (below := below_bound(policy)) and below[1] > LARGEST_SHARE_BELOW else None,
         curves=curve_charts(policy.metrics.get("curve", {}), f"policy {policy.name}"),
         config={k: v for k, v in policy.config.items() if not k.endswith("_every")},
-        may_write=_may(caller, can.WRITE_POLICIES, participant),
+        may_write=may(caller, can.WRITE_POLICIES, participant),
     )
     return HTMLResponse(page)
 
@@ -163,7 +165,7 @@ def _policies(
         problem=problem,
         name=name,
         window=participant.current_settings.window,
-        may_write=_may(caller, can.WRITE_POLICIES, participant),
+        may_write=may(caller, can.WRITE_POLICIES, participant),
     )
     return HTMLResponse(page, status)
 
@@ -171,7 +173,3 @@ def _policies(
 def _belongs(policy: Policy, participant: Participant) -> None:
     if policy.participant_id != participant.id:
         raise NotFound(f"Participant {participant.code} has no policy {policy.id}.")
-
-
-def _may(caller: Caller, permission: str, participant: Participant) -> bool:
-    return caller.may(permission, participant.site.study_id, participant.site_id)

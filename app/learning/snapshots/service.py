@@ -129,6 +129,15 @@ def collect(db: Session, participant: Participant) -> Collection:
     return Collection(version, settings, members, unit, source)
 
 
+def not_ready(db: Session, participant: Participant) -> Invalid | None:
+    """Why nothing can be learned or estimated yet; None when it can."""
+    try:
+        collect(db, participant)
+    except Invalid as error:
+        return error
+    return None
+
+
 def take_snapshot(db: Session, participant: Participant, caller: Caller) -> BufferSnapshot:
     """Store the buffer as it is now; when nothing it depends on has changed, the snapshot that already pins it.
 

@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 
-from app.accounts.deps import CurrentCaller
-from app.learning import repository
-from app.learning.models import Sweep
+from app.learning.deps import CurrentSweep
 from app.learning.schemas import ALGORITHM_NAMES
 from app.learning.sweeps import comparison
 from app.platform.database import Db
-from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.study.models import Participant
 
 router = APIRouter()
-
-
-def current_sweep(sweep_id: RowId, db: Db, caller: CurrentCaller) -> Sweep:
-    """The sweep that the path names."""
-    return repository.sweep(db, sweep_id, caller)
-
-
-CurrentSweep = Annotated[Sweep, Depends(current_sweep)]
 
 
 @router.get("/sweeps/{sweep_id}")

@@ -12,14 +12,14 @@ from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
+from app.learning.deps import CurrentPolicy
 from app.learning.models import Policy
-from app.learning.policies.api import CurrentPolicy
 from app.planning.bundles import service as bundles
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, NotFound
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
-from app.study.api import CurrentParticipant
+from app.study.deps import CurrentParticipant
 from app.study.models import Hemisphere, Participant
 from ml.deploy.appraisal import battery_words, warnings
 

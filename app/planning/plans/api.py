@@ -12,7 +12,7 @@ from app.planning.plans.schemas import Approval, PlanEstimateOut, PlanEvaluation
 from app.planning.plans.service import PlanLine, PlanView
 from app.platform.database import Db, now
 from app.platform.web.schemas import problems
-from app.study.api import CurrentVisit
+from app.study.deps import CurrentVisit
 
 router = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 422))
 

@@ -26,7 +26,7 @@ from app.platform.errors import BetaloopError, Invalid, NotFound
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.schemas import Int, Model, PagingQuery
 from app.platform.web.templates import render
-from app.study.api import CurrentParticipant, CurrentVisit
+from app.study.deps import CurrentParticipant, CurrentVisit
 from app.study.models import Participant, Visit
 
 router = APIRouter()

@@ -18,8 +18,8 @@ from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
 from app.study import repository, service
-from app.study.api import CurrentSession
 from app.study.blinding import CONTROLLER_NAMES, arm
+from app.study.deps import CurrentSession
 from app.study.models import QocRevision, Recording, StudySession
 from app.study.schemas import DerivedChoice, QocIn, SessionChange
 from app.study.service import SessionData

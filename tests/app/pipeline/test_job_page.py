@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.evaluation.estimates.compute import evaluate_method, fit_dlsm
-from app.evaluation.ranking.charts import job_curves
+from app.pipeline.charts import job_curves
 from app.platform.jobs import Report
 from app.platform.jobs.models import Job, JobEvent, JobStep
 from ml.ope.dlmm import DlmmConfig

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.evaluation.models import Evaluation
 from app.study.models import StudySession, Visit
-from tests.app.evaluation.conftest import estimate
+from tests.app.evaluations import estimate
 
 Upload = Callable[..., int]
 CALIBRATION = "/api/v1/participants/P1/calibration"

@@ -12,9 +12,9 @@ import pytest
 
 from app.analysis.calibration.accuracy import Pair, accuracies
 from app.analysis.calibration.charts import over_visits
+from app.analysis.calibration.export import calibration_to_csv
 from app.analysis.calibration.schemas import CalibrationOut, PredictionOut, TestedPolicyOut
 from app.analysis.calibration.wording import in_sentences
-from app.evaluation.ranking.export import calibration_to_csv
 
 
 def at_visit(visit: int, policy: int, predicted: float, actual: float, **more: Any) -> TestedPolicyOut:

@@ -21,7 +21,7 @@ from app.evaluation.models import Evaluation
 from app.evaluation.service import store_evaluation
 from app.learning.snapshots.service import take_snapshot
 from app.study.repository import participant_by_code
-from tests.app.evaluation.conftest import estimate
+from tests.app.evaluations import estimate
 
 
 def skill(method: str, error: float, bias: float = 1.0) -> dict[str, Any]:

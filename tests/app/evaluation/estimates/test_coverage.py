@@ -34,8 +34,8 @@ from app.study.repository import participant_by_code
 from ml.ope.support.coverage import AmplitudeSupport
 from ml.ope.support.diagnostics import diagnose
 from ml.policies.onnx_policy import OnnxPolicy
-from tests.app.evaluation.conftest import estimate
 from tests.app.evaluation.estimates.test_compute import buffer_of, call, sessions
+from tests.app.evaluations import estimate
 
 RANKING = "/api/v1/participants/P1/ranking"
 REFUSED = "not supported by the data: in 40 % of steps the policy leaves the logged amplitudes (0.30 to 1.00)"

@@ -21,7 +21,7 @@ from app.learning.policies.baselines import constant_onnx
 from app.learning.snapshots.service import take_snapshot
 from app.platform.errors import Invalid
 from app.study.repository import participant_by_code
-from tests.app.evaluation.conftest import estimate
+from tests.app.evaluations import estimate
 
 Upload = Callable[..., int]
 RANKING = "/api/v1/participants/P1/ranking"
