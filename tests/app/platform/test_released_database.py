@@ -8,16 +8,12 @@ proposals, a quarantine, a cancelled job. Its people are the demo's, its passwor
 from __future__ import annotations
 
 import lzma
-import os
 import re
-import zipfile
 from collections.abc import Iterator
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import psycopg
-import pytest
 from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 from sqlalchemy import text
@@ -27,15 +23,9 @@ from app.accounts import repository as accounts_repository
 from app.accounts import service as accounts
 from app.main import create_app
 from app.platform.database import Base
-from app.platform.embedded_postgres import EmbeddedPostgres
-from app.platform.files import path_of
-from app.platform.migrate import migrate
 from app.platform.tables import load_tables
-from app.settings import get_settings
+from tests.conftest import RELEASED_DUMP
 
-DATA = Path(__file__).resolve().parents[2] / "data"
-DUMP = DATA / "released-0.1.0.sql.xz"
-FILES = DATA / "released-0.1.0-files.zip"
 PERSON = "admin@demo.example"
 PASSWORD = "a password of the test"
 
@@ -65,33 +55,6 @@ ABSENT = {
 ELSEWHERE = {"/sessions/{session_id}": "select id from session where status = 'proposed'"}
 # pages for who is not signed in
 SIGNED_OUT = {"/sign-in"}
-
-
-@pytest.fixture
-def released(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """The released database with its files, migrated to the present."""
-    name = f"released_{os.getpid()}"
-    admin = server.url("postgres").replace("+psycopg", "")
-    url = server.url(name)
-    with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f"create database {name} template template0")
-    with psycopg.connect(url.replace("+psycopg", ""), autocommit=True) as connection:
-        connection.execute(lzma.decompress(DUMP.read_bytes()).decode())
-    monkeypatch.setenv("BETALOOP_DATABASE_URL", url)
-    monkeypatch.setenv("BETALOOP_DATA_DIR", str(tmp_path / "data"))
-    get_settings.cache_clear()
-    with zipfile.ZipFile(FILES) as archive:
-        for sha256 in archive.namelist():
-            path_of(sha256).parent.mkdir(parents=True, exist_ok=True)
-            path_of(sha256).write_bytes(archive.read(sha256))
-    migrate()
-    yield url
-    for engine in database._engines.values():
-        engine.dispose()
-    database._engines.clear()
-    get_settings.cache_clear()
-    with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f"drop database {name} with (force)")
 
 
 def rows(query: str) -> list[Any]:
@@ -146,15 +109,15 @@ def unexpected(client: TestClient, paths: set[str]) -> dict[str, int]:
     return found
 
 
-def test_every_table_of_the_release_has_rows(released: str) -> None:
+def test_every_table_of_the_release_has_rows(released_database: str) -> None:
     load_tables()
-    with psycopg.connect(released.replace("+psycopg", "")) as connection:
-        dumped = set(re.findall(r"^CREATE TABLE public\.(\w+)", lzma.decompress(DUMP.read_bytes()).decode(), re.MULTILINE))
+    with psycopg.connect(released_database.replace("+psycopg", "")) as connection:
+        dumped = set(re.findall(r"^CREATE TABLE public\.(\w+)", lzma.decompress(RELEASED_DUMP.read_bytes()).decode(), re.MULTILINE))
         empty = {t for t in dumped & set(Base.metadata.tables) if not connection.execute(f"select 1 from {t} limit 1").fetchone()}
     assert empty == set()
 
 
-def test_every_page_of_a_released_study_opens(released: str) -> None:
+def test_every_page_of_a_released_study_opens(released_database: str) -> None:
     app = create_app()
     pages = {path for path in readable(app) if not path.startswith("/api/")}
     with TestClient(app, base_url="http://testserver") as client:
@@ -167,7 +130,7 @@ def test_every_page_of_a_released_study_opens(released: str) -> None:
         assert unexpected(client, pages) == {}
 
 
-def test_every_route_of_the_interface_reads_a_released_study(released: str) -> None:
+def test_every_route_of_the_interface_reads_a_released_study(released_database: str) -> None:
     app = create_app()
     with database.transaction("test") as db:
         token = accounts.create_token(db, PERSON, "tests")
