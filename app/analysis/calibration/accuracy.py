@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from app.analysis.calibration.schemas import AccuracyOut, MetricOut
+from app.analysis.calibration.schemas import AccuracyOut, MethodMetricOut
 from ml.ope.compare.metrics import accuracy
 from ml.ope.estimate import LEVEL
 from ml.statistics.bootstrap import percentile_interval, resamples
@@ -107,9 +107,9 @@ def _over_visits(method: str, pairs: Sequence[Pair]) -> AccuracyOut:
 
         return of
 
-    def regret(over: Callable[[Floats], Floats] | None, reason: str = "") -> MetricOut:
+    def regret(over: Callable[[Floats], Floats] | None, reason: str = "") -> MethodMetricOut:
         if none:
-            return MetricOut(value=None, low=None, high=None, missing=none)
+            return MethodMetricOut(value=None, low=None, high=None, missing=none)
         return metric(_finite(mean_regret(over)(now)[0]), mean_regret(over), reason, _repeated(pairs))
 
     return AccuracyOut(
@@ -155,21 +155,21 @@ def _resampled(pairs: Sequence[Pair]) -> Floats:
     return np.asarray(np.divide((counts * returns) @ member, drawn, out=np.full(drawn.shape, np.nan), where=drawn > 0), dtype=np.float64)
 
 
-def _metric(means: Floats, sessions: int) -> Callable[..., MetricOut]:
+def _metric(means: Floats, sessions: int) -> Callable[..., MethodMetricOut]:
     """Makes a metric of its value and of the function that gives it for every resample."""
 
-    def make(value: float | None, of: Callable[[Floats], Floats], missing: str = "", spread_known: bool = True) -> MetricOut:
+    def make(value: float | None, of: Callable[[Floats], Floats], missing: str = "", spread_known: bool = True) -> MethodMetricOut:
         if value is None:
-            return MetricOut(value=None, low=None, high=None, missing=missing)
+            return MethodMetricOut(value=None, low=None, high=None, missing=missing)
         if not spread_known:
-            return MetricOut(value=value, low=None, high=None)
+            return MethodMetricOut(value=value, low=None, high=None)
         with np.errstate(divide="ignore", invalid="ignore"):
             draws = of(means[1:])
         draws = draws[np.isfinite(draws)]
         if sessions < FEWEST_SESSIONS or draws.size < DEFINED_SHARE * (len(means) - 1):
-            return MetricOut(value=value, low=None, high=None)
+            return MethodMetricOut(value=value, low=None, high=None)
         interval = percentile_interval(draws, LEVEL)
-        return MetricOut(value=value, low=interval.low, high=interval.high)
+        return MethodMetricOut(value=value, low=interval.low, high=interval.high)
 
     return make
 
@@ -179,8 +179,8 @@ def _repeated(pairs: Sequence[Pair]) -> bool:
     return sum(len(p.returns) > 1 for p in pairs) > 0.5 * len(pairs)
 
 
-def _covered(pairs: Sequence[Pair]) -> MetricOut:
-    return MetricOut(value=float(np.mean([p.low <= p.actual <= p.high for p in pairs])), low=None, high=None)
+def _covered(pairs: Sequence[Pair]) -> MethodMetricOut:
+    return MethodMetricOut(value=float(np.mean([p.low <= p.actual <= p.high for p in pairs])), low=None, high=None)
 
 
 def _ranks(values: Floats, there: NDArray[np.bool_]) -> Floats:

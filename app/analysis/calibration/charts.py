@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from app.analysis.calibration.schemas import AccuracyOut, CalibrationOut, MetricOut, PredictionOut, TestedPolicyOut
+from app.analysis.calibration.schemas import AccuracyOut, CalibrationOut, MethodMetricOut, PredictionOut, TestedPolicyOut
 from app.evaluation.estimates.methods import METHOD_NAMES, METHOD_SHORT
 from app.evaluation.ranking.charts import METHOD_STYLES
 from app.platform.web.charts import MUTED, Chart, axis, figure
@@ -269,7 +269,7 @@ def _trace(method: str, points: Sequence[Point], *, visible: bool) -> dict[str, 
     }
 
 
-def _error_bars(values: Sequence[MetricOut]) -> dict[str, Any]:
+def _error_bars(values: Sequence[MethodMetricOut]) -> dict[str, Any]:
     return {
         "type": "data",
         "symmetric": False,
@@ -281,5 +281,5 @@ def _error_bars(values: Sequence[MetricOut]) -> dict[str, Any]:
 
 
 def _cells(m: AccuracyOut, name: str) -> list[float | None]:
-    metric: MetricOut = getattr(m, name)
+    metric: MethodMetricOut = getattr(m, name)
     return [metric.value, metric.low, metric.high]

@@ -59,7 +59,7 @@ class TestedPolicyOut(Model):
     predictions: list[PredictionOut]
 
 
-class MetricOut(Model):
+class MethodMetricOut(Model):
     """One metric with the ends of its session bootstrap; null with the reason in `missing`."""
 
     value: float | None
@@ -75,14 +75,14 @@ class AccuracyOut(Model):
     visit: int | None
     policies: int = Field(description="Pairs of a policy and a visit.")
     sessions: int
-    mae: MetricOut
-    mae_of_range: MetricOut
-    rank_correlation: MetricOut
+    mae: MethodMetricOut
+    mae_of_range: MethodMetricOut
+    rank_correlation: MethodMetricOut
     rank_p: float | None = Field(description="Two-sided permutation p-value of the rank correlation.")
-    regret: MetricOut = Field(description="Raw regret@1: the best actual return less that of the policy with the best estimate.")
-    regret_of_range: MetricOut
-    regret_as_paper: MetricOut = Field(description="Regret over the best actual return: turns its sign where that is negative.")
-    coverage: MetricOut = Field(description="Share of actual means within the estimate's interval.")
+    regret: MethodMetricOut = Field(description="Raw regret@1: the best actual return less that of the policy with the best estimate.")
+    regret_of_range: MethodMetricOut
+    regret_as_paper: MethodMetricOut = Field(description="Regret over the best actual return: turns its sign where that is negative.")
+    coverage: MethodMetricOut = Field(description="Share of actual means within the estimate's interval.")
 
 
 class QuantityErrorOut(Model):
