@@ -31,11 +31,12 @@ from app.demo_study import DemoVisit, demo_visits, participant_body
 from app.platform.database import now, transaction
 from app.platform.errors import BetaloopError, Conflict
 from app.platform.migrate import migrate
-from app.settings import get_settings
+from app.settings import get_settings, private_folder, written_once
 
 ACCOUNTS = {"admin@demo.example": Role.ADMIN, "clinician@demo.example": Role.CLINICIAN, "engineer@demo.example": Role.ENGINEER}
 PARTICIPANTS = ("P1", "P2", "P3", "P4")
 START_TIMEOUT_S = 60.0
+STOP_TIMEOUT_S = 20.0
 _POLL_S = 0.5
 
 console = Console()
@@ -48,7 +49,6 @@ class DemoFailed(BetaloopError):
 def run_demo(host: str, port: int) -> None:
     """Start the database, the web service and a worker, load the study, run the first pipelines, and serve until Ctrl-C."""
     settings = get_settings()
-    settings.data_dir.mkdir(parents=True, exist_ok=True)
     os.environ["BETALOOP_DATA_DIR"] = str(settings.data_dir.resolve())
     url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"
     _refuse_taken_port(url)
@@ -69,12 +69,7 @@ def run_demo(host: str, port: int) -> None:
 
 def _accounts(data_dir: Path) -> str:
     """The demo's users, all with one random password that is kept in the data folder."""
-    path = data_dir / "secrets" / "demo-password"
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        path.touch(mode=0o600)
-        path.write_text(f"beta-{secrets.token_hex(4)}")
-    password = path.read_text()
+    password = written_once(data_dir / "secrets" / "demo-password", lambda: f"beta-{secrets.token_hex(4)}")
     with transaction("demo") as db:
         for email, role in ACCOUNTS.items():
             if accounts_repository.user_by_email(db, email) is None:
@@ -90,29 +85,35 @@ def _token() -> str:
 @contextmanager
 def _children(logs: Path, host: str, port: int) -> Iterator[list[subprocess.Popen[bytes]]]:
     """The web service and the worker as child processes with log files; both are stopped at the end."""
-    logs.mkdir(parents=True, exist_ok=True)
+    private_folder(logs)
     commands = {"web": ["serve", "--host", host, "--port", str(port)], "worker": ["worker"]}
-    children = []
-    for name, arguments in commands.items():
-        log = (logs / f"{name}.log").open("ab")
-        # a session of its own: Ctrl-C reaches this process alone, which then stops the others in order
-        children.append(subprocess.Popen([sys.executable, "-m", "app.cli", *arguments], stdout=log, stderr=log, start_new_session=True))
-        log.close()
-    previous = signal.signal(signal.SIGTERM, _interrupt)
+    children: list[subprocess.Popen[bytes]] = []
+    previous = [(number, signal.signal(number, _interrupt)) for number in (signal.SIGTERM, signal.SIGHUP)]
     try:
+        for name, arguments in commands.items():
+            with (logs / f"{name}.log").open("ab") as log:
+                # a session of its own: Ctrl-C reaches this process alone, which then stops the others in order
+                command = [sys.executable, "-m", "app.cli", *arguments]
+                children.append(subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True))
         yield children
     except KeyboardInterrupt:
         console.print("\n  Stopping …")
     finally:
-        signal.signal(signal.SIGTERM, previous)
-        for child in reversed(children):
-            child.terminate()
-        for child in children:
-            try:
-                child.wait(timeout=10)
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait()
+        impatient = [(number, signal.signal(number, signal.SIG_IGN)) for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)]
+        _stop(children)
+        for number, handler in (*impatient, *previous):
+            signal.signal(number, handler)
+
+
+def _stop(children: list[subprocess.Popen[bytes]]) -> None:
+    for child in reversed(children):
+        child.terminate()
+    for child in children:
+        try:
+            child.wait(timeout=STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
 
 
 def _interrupt(_number: int, _frame: Any) -> None:

@@ -44,7 +44,7 @@ def recordings() -> Path:
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedPostgres]:
     """A PostgreSQL of this test run with a migrated template database."""
-    server = EmbeddedPostgres(tmp_path_factory.mktemp("database") / "postgres", durable=False)
+    server = EmbeddedPostgres(tmp_path_factory.mktemp("database") / "postgres", durable=False, server_user=get_settings().server_user)
     server.start()
     engine = create_engine(server.url("betaloop"))
     with engine.begin() as connection:
@@ -65,9 +65,9 @@ _counter = iter(range(10**9))
 def fresh_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A database and data folder of the test's own, named in the environment too, so that child processes find them."""
     name = f"test_{os.getpid()}_{next(_counter)}"
-    admin = f"host='{server._sockets}' user=postgres dbname=postgres"
+    admin = server.admin_conninfo()
     with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f"create database {name} template betaloop")
+        connection.execute(f"create database {name} template betaloop owner betaloop")
     url = server.url(name)
     monkeypatch.setenv("BETALOOP_DATABASE_URL", url)
     monkeypatch.setenv("BETALOOP_DATA_DIR", str(tmp_path / "data"))
