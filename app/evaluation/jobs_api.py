@@ -11,7 +11,7 @@ from app.accounts import policy as can
 from app.accounts.deps import CurrentCaller
 from app.evaluation import service
 from app.evaluation.schemas import JobIn, JobOut, JobStepOut
-from app.platform.database import Db
+from app.platform.database import Db, now
 from app.platform.errors import NotFound
 from app.platform.jobs import repository as jobs
 from app.platform.jobs import stream
@@ -106,6 +106,7 @@ def job_out(job: Job, participant: Participant) -> JobOut:
         participant=participant.code,
         status=str(job.status),
         progress=job.progress,
+        seconds_left=job.seconds_left(now()),
         message=job.message,
         params=job.params,
         result=job.result,

@@ -18,7 +18,7 @@ from app.evaluation.calibration_words import in_sentences
 from app.evaluation.decision import RULES
 from app.evaluation.jobs_api import CurrentJob
 from app.evaluation.methods import METHOD_NAMES, METHOD_SHORT, METHODS, QUICK_METHODS
-from app.evaluation.schemas import DECISION_NAMES, EvaluateParams, PipelineParams, RankingFilter, RankingOut
+from app.evaluation.schemas import DECISION_NAMES, RANKING_KINDS, EvaluateParams, PipelineParams, RankingFilter, RankingOut
 from app.learning import repository as learning
 from app.learning.schemas import ALGORITHM_NAMES, AlgorithmName, DistilParams, TrainParams
 from app.learning.snapshots import collect
@@ -82,6 +82,9 @@ def ranking_page(
         rules=RULES,
         shown=shown,
         live=_live_jobs(db, participant),
+        kinds={kind: title for kind, (title, _) in KINDS.items()},
+        ranking_kinds=RANKING_KINDS,
+        refresh_s=REFRESH_S,
         may_run=_may(caller, can.RUN_JOBS, participant),
         may_plan=_may(caller, can.DRAFT_PLAN, participant),
         may_write=_may(caller, can.WRITE_POLICIES, participant),

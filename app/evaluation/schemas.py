@@ -93,6 +93,10 @@ class JobStepOut(Model):
     finished_at: datetime | None
 
 
+RANKING_KINDS = ("pipeline", "evaluate")
+"""Kinds of job that end with a ranking."""
+
+
 class JobOut(Model):
     """A job."""
 
@@ -101,6 +105,7 @@ class JobOut(Model):
     participant: str | None
     status: str
     progress: float
+    seconds_left: float | None
     message: str
     params: dict[str, Any]
     result: dict[str, Any] | None
