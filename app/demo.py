@@ -61,11 +61,7 @@ def run_demo(host: str, port: int) -> None:
     with _children(settings.data_dir / "log", host, port) as children:
         with console.status("Starting the web service and a worker …"):
             _wait_until_up(url, children)
-        _say(f"\n  [bold]betaloop is up[/bold] after {time.monotonic() - started:.0f} s")
-        _say(f"  address:  [bold underline]{url}[/]")
-        _say("  sign in:  [bold]clinician@demo.example[/], engineer@demo.example or admin@demo.example")
-        _say(f"  password: [bold]{password}[/]")
-        _say("  The four participants are synthetic: simulated, and not fitted to patients.\n")
+        say_welcome(url, time.monotonic() - started, password)
         _load_and_rank(url, settings.data_dir / "demo.json", children)
         _say("\n  Ready. Ctrl-C stops the demo and keeps its data; `make demo` starts it again.")
         _wait(children)
@@ -74,6 +70,15 @@ def run_demo(host: str, port: int) -> None:
 def _say(line: str) -> None:
     """A line for the terminal or a log; never wrapped, so that an address or a password stays beside its label."""
     console.print(line, soft_wrap=True, highlight=False)
+
+
+def say_welcome(url: str, seconds: float, password: str) -> None:
+    """Print address, accounts and password, each on a line of its own."""
+    _say(f"\n  [bold]betaloop is up[/bold] after {seconds:.0f} s")
+    _say(f"  address:  [bold underline]{url}[/]")
+    _say("  sign in:  [bold]clinician@demo.example[/], engineer@demo.example or admin@demo.example")
+    _say(f"  password: [bold]{password}[/]")
+    _say("  The four participants are synthetic: simulated, and not fitted to patients.\n")
 
 
 def _accounts(data_dir: Path) -> str:

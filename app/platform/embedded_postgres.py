@@ -17,6 +17,8 @@ import tempfile
 import threading
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from urllib.parse import quote
@@ -30,6 +32,7 @@ from app.platform.embedded.system_user import system_user
 from app.settings import stored_secret
 
 _START_TIMEOUT_S = 60
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class EmbeddedPostgres:
@@ -68,6 +71,10 @@ class EmbeddedPostgres:
         Raises:
             RuntimeError: it does not come up, or its data cannot be reached.
         """
+        with _signals_wait():  # stopped in the middle of a start, the process would leave a server behind that it does not know yet
+            return self._start()
+
+    def _start(self) -> str:
         self._asked.parent.mkdir(parents=True, exist_ok=True)
         guard = _exclusive(self._asked.with_name(f"{self._asked.name}.start"))  # one process at a time decides whether to start or stop
         try:
@@ -216,7 +223,7 @@ class EmbeddedPostgres:
 
     def _leave_at_exit(self) -> None:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            for number in _ENDING:
                 signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C must not leave the server behind
         self.leave()
 
@@ -241,6 +248,23 @@ class EmbeddedPostgres:
         if check and done.returncode != 0:
             raise RuntimeError(f"{program} failed: {done.stderr}")
         return done
+
+
+@contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Have signals that end the process wait until the block is through."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are handled in the main thread alone
+        return
+    came: list[int] = []
+    before = [(number, signal.signal(number, lambda arrived, _frame: came.append(arrived))) for number in _ENDING]
+    try:
+        yield
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
+        for arrived in came:
+            signal.raise_signal(arrived)
 
 
 def _exclusive(path: Path) -> int:
