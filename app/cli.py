@@ -47,10 +47,7 @@ def main() -> None:
     load_tables()
     try:
         app(standalone_mode=True)
-    except BetaloopError as error:
-        _say(f"betaloop: {error}")
-        sys.exit(1)
-    except RuntimeError as error:
+    except (BetaloopError, RuntimeError) as error:
         _say(f"betaloop: {error}")
         sys.exit(1)
 
@@ -124,12 +121,8 @@ def migrate() -> None:
 def where(as_json: AsJson = False) -> None:
     """Tell where the database, the stored files and the keys of this installation lie; nothing is started."""
     data_dir = get_settings().data_dir.resolve()
-    result = {
-        "data_folder": str(data_dir),
-        "database": database_place(),
-        "files": str(data_dir / "files"),
-        "keys": str(data_dir / "secrets"),
-    }
+    result = {"data_folder": str(data_dir), "database": database_place()}
+    result |= {"files": str(data_dir / "files"), "keys": str(data_dir / "secrets")}
     _print(result, as_json, "\n".join(f"{name.replace('_', ' ')}: {value}" for name, value in result.items()))
 
 
