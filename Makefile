@@ -26,8 +26,8 @@ demo: install ## Start betaloop with a synthetic study at http://127.0.0.1:8000.
 test: install ## Run the test suite.
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow"
 
-test-slow: install ## Run learning curves and fault rounds (up to 40 minutes).
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow
+test-slow: install ## Run learning curves and fault rounds (about 25 minutes on two cores).
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow
 
 check: install ## Lint, types and the import contract.
 	$(BIN)/ruff check .

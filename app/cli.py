@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from app.accounts import service as accounts
 from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM
 from app.platform import logs
-from app.platform.database import transaction
+from app.platform.database import database_place, transaction
 from app.platform.errors import BetaloopError
 from app.platform.tables import load_tables
 from app.settings import get_settings
@@ -42,13 +43,11 @@ ACTOR = "command line"
 
 def main() -> None:
     """Entry point: runs a command and turns errors into one line and an exit code."""
+    _end_in_order_on_signals()
     load_tables()
     try:
         app(standalone_mode=True)
-    except BetaloopError as error:
-        _say(f"betaloop: {error}")
-        sys.exit(1)
-    except RuntimeError as error:
+    except (BetaloopError, RuntimeError) as error:
         _say(f"betaloop: {error}")
         sys.exit(1)
 
@@ -67,6 +66,7 @@ def serve(
     logs.configure()
     bring_up_to_date()
     settings = get_settings()
+    structlog.get_logger().info("database", lies_in=database_place())
     service = create_app()
     # beside the service, for reading what a crash left behind may take minutes
     threading.Thread(target=_take_up_uploads, daemon=True).start()
@@ -115,6 +115,15 @@ def migrate() -> None:
 
     bring_up_to_date()
     print("The database is up to date.")  # noqa: T201
+
+
+@app.command(epilog="Example: betaloop where")
+def where(as_json: AsJson = False) -> None:
+    """Tell where the database, the stored files and the keys of this installation lie; nothing is started."""
+    data_dir = get_settings().data_dir.resolve()
+    result = {"data_folder": str(data_dir), "database": database_place()}
+    result |= {"files": str(data_dir / "files"), "keys": str(data_dir / "secrets")}
+    _print(result, as_json, "\n".join(f"{name.replace('_', ' ')}: {value}" for name, value in result.items()))
 
 
 @user_app.command("add", epilog="Example: betaloop user add ada@clinic.example --role clinician")
@@ -377,12 +386,20 @@ def _reason(error: Exception) -> str:
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
-def _stop_on_signals(stop: threading.Event) -> None:
-    import signal
+def _end_in_order_on_signals() -> None:
+    """Have a stop from outside end the process as any other end does, so that the embedded PostgreSQL is stopped and not left behind."""
 
+    def end(number: int, _frame: Any) -> None:
+        raise SystemExit(128 + number)
+
+    signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGHUP, end)
+
+
+def _stop_on_signals(stop: threading.Event) -> None:
     handler: Callable[[int, Any], None] = lambda _number, _frame: stop.set()  # noqa: E731
-    signal.signal(signal.SIGTERM, handler)
-    signal.signal(signal.SIGINT, handler)
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, handler)
 
 
 def _print(result: dict[str, Any], as_json: bool, text: str) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import secrets
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,6 +19,9 @@ class Settings(BaseSettings):
 
     data_dir: Path = Field(Path("var"), description="Folder of the embedded database, stored files and job folders.")
     database_url: str | None = Field(None, description="PostgreSQL URL; without one an embedded PostgreSQL runs in the data folder.")
+    server_user: str = Field(
+        "pgserver", description="System user of the embedded PostgreSQL where root starts betaloop; made at the first start."
+    )
     host: str = Field("127.0.0.1", description="Address the web service listens on.")
     port: int = Field(8000, description="Port the web service listens on.")
     upload_limit_mb: int = Field(2048, ge=1, description="Largest accepted upload, MiB.")
@@ -40,20 +45,51 @@ class Settings(BaseSettings):
 
     def secret(self, name: str) -> bytes:
         """A random key of this installation, made at first use and kept in the data folder, readable by the owner only."""
-        path = self.data_dir / "secrets" / name
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            draft = path.with_name(f"{name}.{secrets.token_hex(4)}")
-            draft.touch(mode=0o600)
-            draft.write_text(secrets.token_hex(32))
-            try:
-                # a hard link fails when another process made the key first, so that all processes agree on one
-                path.hardlink_to(draft)
-            except FileExistsError:
-                pass
-            finally:
-                draft.unlink()
-        return bytes.fromhex(path.read_text())
+        return stored_secret(self.data_dir / "secrets", name)
+
+
+def stored_secret(folder: Path, name: str) -> bytes:
+    """A random key of 32 bytes in a folder of secrets; made at first use, also when several processes ask at once.
+
+    Raises:
+        RuntimeError: the file does not hold such a key.
+    """
+    text = written_once(folder / name, lambda: secrets.token_hex(32))
+    try:
+        key = bytes.fromhex(text)
+    except ValueError:
+        key = b""
+    if len(key) != 32:
+        raise RuntimeError(f"{folder / name} does not hold a key of 32 bytes in hexadecimal. Restore it from a backup of the data folder.")
+    return key
+
+
+def written_once(path: Path, make: Callable[[], str]) -> str:
+    """The text of a file that only its owner reads. The first process writes it, all others read the same."""
+    if not path.exists():
+        private_folder(path.parent)
+        draft = path.with_name(f"{path.name}.{secrets.token_hex(4)}")
+        with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as out:
+            out.write(make())
+            out.flush()
+            os.fsync(out.fileno())
+        try:
+            # a hard link fails when another process was first, so that all processes agree on one text
+            path.hardlink_to(draft)
+        except FileExistsError:
+            pass
+        finally:
+            draft.unlink()
+    return path.read_text()
+
+
+def private_folder(path: Path) -> Path:
+    """Make a folder that only its owner may enter, and return it; one that stands open to others is closed."""
+    path.mkdir(parents=True, exist_ok=True, mode=0o700)
+    info = path.stat()
+    if info.st_mode & 0o077 and info.st_uid == os.geteuid():
+        path.chmod(0o700)
+    return path
 
 
 @lru_cache(maxsize=1)

@@ -51,7 +51,7 @@ def recordings() -> Path:
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedPostgres]:
     """A PostgreSQL of this test run with a migrated template database."""
-    server = EmbeddedPostgres(tmp_path_factory.mktemp("database") / "postgres", durable=False)
+    server = EmbeddedPostgres(tmp_path_factory.mktemp("database") / "postgres", durable=False, server_user=get_settings().server_user)
     server.start()
     engine = create_engine(server.url("betaloop"))
     with engine.begin() as connection:
@@ -72,9 +72,9 @@ _counter = iter(range(10**9))
 def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.MonkeyPatch, template: str) -> Iterator[str]:
     """A database and data folder of one test, named in the environment too, so that child processes find them."""
     name = f"test_{os.getpid()}_{next(_counter)}"
-    admin = f"host='{server._sockets}' user=postgres dbname=postgres"
+    admin = server.admin_conninfo()
     with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f"create database {name} template {template}")
+        connection.execute(f"create database {name} template {template} owner betaloop strategy file_copy")
     url = server.url(name)
     monkeypatch.setenv("BETALOOP_DATABASE_URL", url)
     monkeypatch.setenv("BETALOOP_DATA_DIR", str(data))
@@ -139,12 +139,18 @@ def make_token(fresh_database: str) -> Callable[[str], str]:
     return make
 
 
-@pytest.fixture
-def service_app(fresh_database: str):  # type: ignore[no-untyped-def]
-    """The web service on the test's database."""
+@pytest.fixture(scope="session")
+def _application():  # type: ignore[no-untyped-def]
+    """The web service, built once: it holds no state, and building it with its first request costs half a second of a processor."""
     from app.main import create_app
 
     return create_app()
+
+
+@pytest.fixture
+def service_app(_application, fresh_database: str):  # type: ignore[no-untyped-def]
+    """The web service on the test's database."""
+    return _application
 
 
 @pytest.fixture

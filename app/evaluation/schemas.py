@@ -25,6 +25,10 @@ class EvaluateParams(Model):
     seed: Int = Field(0, ge=0, le=10**6)
 
 
+RANKING_KINDS = ("pipeline", "evaluate")
+"""Kinds of job that end with a ranking."""
+
+
 class EstimateOut(Model):
     """One method's estimate of E[r_end + sum over t < H of gamma^t r_t], unnormalised."""
 

@@ -26,6 +26,7 @@ from app.study import repository as study
 
 router = APIRouter()
 
+REFRESH_S = 5
 _ARM_COLUMNS = ("controller", "policy_id")
 _HIDDEN = "hidden from you"
 
@@ -42,6 +43,7 @@ def overview(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuer
         total=total,
         paging=paging,
         phases=queries.PHASES,
+        refresh_s=REFRESH_S,
         studies=[s for s in studies(db) if caller.may(can.READ, s.id)],
     )
     return HTMLResponse(page)

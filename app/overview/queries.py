@@ -10,6 +10,7 @@ from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
 from app.evaluation.models import Evaluation
+from app.evaluation.schemas import RANKING_KINDS
 from app.learning.models import BufferSnapshot, Policy
 from app.planning.plans.models import Plan
 from app.platform.audit import AuditEvent
@@ -32,6 +33,7 @@ class State:
         evaluated_at, snapshot_at: of the last evaluation, and of the buffer snapshot that it used.
         plan: status of the plan of the latest visit that has one.
         running, failed: jobs; the latter of the last 7 days.
+        ranking_job: the live job that will bring the first ranking; None where there is a ranking or no such job.
         attention: sentences with the page where the matter is mended.
     """
 
@@ -48,6 +50,7 @@ class State:
     snapshot_at: dt.datetime | None = None
     plan: str | None = None
     running: int = 0
+    ranking_job: Job | None = None
     failed: int = 0
     attention: list[tuple[str, str]] = field(default_factory=list)
 
@@ -167,6 +170,10 @@ def _results(db: Session, ids: list[int], found: dict[int, State]) -> None:
     for owner, running, failed in db.execute(jobs.group_by(Job.participant_id)):
         if owner is not None:
             found[owner].running, found[owner].failed = running, failed
+    first = select(Job).where(Job.participant_id.in_(ids), live, Job.kind.in_(RANKING_KINDS)).order_by(Job.created_at.desc())
+    for job in db.scalars(first):
+        if job.participant_id is not None and found[job.participant_id].evaluated_at is None:
+            found[job.participant_id].ranking_job = job
 
 
 def _n(count: int, noun: str) -> str:

@@ -92,6 +92,7 @@ class JobOut(Model):
     participant: str | None
     status: str
     progress: float
+    seconds_left: float | None
     message: str
     params: dict[str, Any]
     result: dict[str, Any] | None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from app.pipeline.schemas import JobOut, JobStepOut
+from app.platform.database import now
 from app.platform.jobs.models import Job
 from app.study.models import Participant
 
@@ -15,6 +16,7 @@ def job_out(job: Job, participant: Participant) -> JobOut:
         participant=participant.code,
         status=str(job.status),
         progress=job.progress,
+        seconds_left=job.seconds_left(now()),
         message=job.message,
         params=job.params,
         result=job.result,

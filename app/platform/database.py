@@ -9,10 +9,11 @@ from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from fastapi import Depends
-from sqlalchemy import Connection, DateTime, Engine, MetaData, create_engine, event, text
+from sqlalchemy import Connection, DateTime, Engine, MetaData, create_engine, event, make_url, text
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 
+from app.platform.embedded import place
 from app.platform.embedded_postgres import EmbeddedPostgres
 from app.settings import Settings, get_settings
 
@@ -50,14 +51,22 @@ def database_url(settings: Settings | None = None) -> str:
         if scheme not in {"postgres", "postgresql", "postgresql+psycopg"}:
             raise RuntimeError(f"BETALOOP_DATABASE_URL must start with postgresql://, not {scheme}://: betaloop runs on PostgreSQL alone")
         return f"postgresql+psycopg://{rest}"
-    settings.data_dir.mkdir(parents=True, exist_ok=True)
     key = str(settings.data_dir.resolve())
     with _lock:
         if key not in _embedded:
-            server = EmbeddedPostgres(settings.data_dir / "postgres")
+            server = EmbeddedPostgres(settings.data_dir / "postgres", server_user=settings.server_user)
             server.start()
             _embedded[key] = server
         return _embedded[key].url("betaloop")
+
+
+def database_place(settings: Settings | None = None) -> str:
+    """Where the database lies, for people: a folder, or the address of a PostgreSQL of one's own without its password. Starts nothing."""
+    settings = settings or get_settings()
+    if settings.database_url:
+        return make_url(database_url(settings)).render_as_string()
+    asked = settings.data_dir.resolve() / "postgres"
+    return str(place.recorded(asked) or f"{asked} (made at the first start, outside if PostgreSQL's user cannot enter this folder)")
 
 
 def get_engine() -> Engine:

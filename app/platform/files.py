@@ -1,4 +1,4 @@
-"""Files by content: a folder `sha256[:2]/sha256`, written once, fsynced, never changed."""
+"""Files by content: a folder `sha256[:2]/sha256`, written once, fsynced, never changed, readable by the service's user alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from app.platform.database import Base
-from app.settings import get_settings
+from app.settings import get_settings, private_folder
 
 CHUNK = 1 << 20
 
@@ -42,8 +42,7 @@ def path_of(sha256: str) -> Path:
 
 def draft_path() -> Path:
     """A fresh path inside the store's folder, on the same file system, for bytes whose hash is not yet known."""
-    folder = get_settings().files_dir / "incoming"
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = private_folder(private_folder(get_settings().files_dir) / "incoming")
     return folder / secrets.token_hex(16)
 
 
@@ -60,8 +59,9 @@ def store(db: Session, content: bytes | Path, media_type: str) -> StoredFile:
     if target.exists():
         draft.unlink()
     else:
+        draft.chmod(0o600)
         _sync(draft)
-        target.parent.mkdir(parents=True, exist_ok=True)
+        private_folder(target.parent)
         draft.rename(target)
         _sync(target.parent)
     db.execute(insert(StoredFile).values(sha256=sha256, size=size, media_type=media_type).on_conflict_do_nothing())
@@ -90,7 +90,7 @@ def receive(stream: BinaryIO, limit: int) -> tuple[Path, str, int]:
         OverflowError: more than `limit` bytes; the draft is removed.
     """
     path, digest, size = draft_path(), hashlib.sha256(), 0
-    with path.open("wb") as out:
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as out:
         while chunk := stream.read(CHUNK):
             size += len(chunk)
             if size > limit:
@@ -99,6 +99,17 @@ def receive(stream: BinaryIO, limit: int) -> tuple[Path, str, int]:
             digest.update(chunk)
             out.write(chunk)
     return path, digest.hexdigest(), size
+
+
+def close_to_others() -> None:
+    """Close what an earlier version left readable by every user of the machine: stored files, job folders, the demo's logs."""
+    settings = get_settings()
+    for folder in (settings.files_dir, settings.jobs_dir, settings.data_dir / "log", settings.data_dir / "secrets"):
+        if folder.is_dir() and folder.stat().st_mode & 0o077:
+            for path in folder.rglob("*"):
+                if not path.is_symlink():
+                    path.chmod(0o700 if path.is_dir() else 0o600)
+            folder.chmod(0o700)  # last: an interrupted run is done again
 
 
 def hash_file(path: Path) -> tuple[str, int]:

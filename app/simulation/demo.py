@@ -30,13 +30,16 @@ from app.accounts.models import Role
 from app.platform.database import now, transaction
 from app.platform.errors import BetaloopError, Conflict
 from app.platform.migrate import migrate
-from app.settings import get_settings
+from app.platform.web.templates import minutes_left
+from app.settings import get_settings, private_folder, written_once
 from app.simulation.demo_study import DemoVisit, demo_visits, participant_body
 
 ACCOUNTS = {"admin@demo.example": Role.ADMIN, "clinician@demo.example": Role.CLINICIAN, "engineer@demo.example": Role.ENGINEER}
 PARTICIPANTS = ("P1", "P2", "P3", "P4")
 START_TIMEOUT_S = 60.0
+STOP_TIMEOUT_S = 20.0
 _POLL_S = 0.5
+_LINE_S = 15.0
 
 console = Console()
 
@@ -48,7 +51,6 @@ class DemoFailed(BetaloopError):
 def run_demo(host: str, port: int) -> None:
     """Start the database, the web service and a worker, load the study, run the first pipelines, and serve until Ctrl-C."""
     settings = get_settings()
-    settings.data_dir.mkdir(parents=True, exist_ok=True)
     os.environ["BETALOOP_DATA_DIR"] = str(settings.data_dir.resolve())
     url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"
     _refuse_taken_port(url)
@@ -59,22 +61,29 @@ def run_demo(host: str, port: int) -> None:
     with _children(settings.data_dir / "log", host, port) as children:
         with console.status("Starting the web service and a worker …"):
             _wait_until_up(url, children)
-        console.print(f"\n  [bold]betaloop is up[/bold] after {time.monotonic() - started:.0f} s: [bold underline]{url}[/]")
-        console.print(f"  sign in as [bold]clinician@demo.example[/] (or engineer@, admin@), password [bold]{password}[/]")
-        console.print("  The four participants are synthetic: simulated, and not fitted to patients.\n")
+        say_welcome(url, time.monotonic() - started, password)
         _load_and_rank(url, settings.data_dir / "demo.json", children)
-        console.print("\n  Ready. Ctrl-C stops the demo and keeps its data; `make demo` starts it again.")
+        _say("\n  Ready. Ctrl-C stops the demo and keeps its data; `make demo` starts it again.")
         _wait(children)
+
+
+def _say(line: str) -> None:
+    """A line for the terminal or a log; never wrapped, so that an address or a password stays beside its label."""
+    console.print(line, soft_wrap=True, highlight=False)
+
+
+def say_welcome(url: str, seconds: float, password: str) -> None:
+    """Print address, accounts and password, each on a line of its own."""
+    _say(f"\n  [bold]betaloop is up[/bold] after {seconds:.0f} s")
+    _say(f"  address:  [bold underline]{url}[/]")
+    _say("  sign in:  [bold]clinician@demo.example[/], engineer@demo.example or admin@demo.example")
+    _say(f"  password: [bold]{password}[/]")
+    _say("  The four participants are synthetic: simulated, and not fitted to patients.\n")
 
 
 def _accounts(data_dir: Path) -> str:
     """The demo's users, all with one random password that is kept in the data folder."""
-    path = data_dir / "secrets" / "demo-password"
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        path.touch(mode=0o600)
-        path.write_text(f"beta-{secrets.token_hex(4)}")
-    password = path.read_text()
+    password = written_once(data_dir / "secrets" / "demo-password", lambda: f"beta-{secrets.token_hex(4)}")
     with transaction("demo") as db:
         for email, role in ACCOUNTS.items():
             if accounts_repository.user_by_email(db, email) is None:
@@ -90,29 +99,35 @@ def _token() -> str:
 @contextmanager
 def _children(logs: Path, host: str, port: int) -> Iterator[list[subprocess.Popen[bytes]]]:
     """The web service and the worker as child processes with log files; both are stopped at the end."""
-    logs.mkdir(parents=True, exist_ok=True)
+    private_folder(logs)
     commands = {"web": ["serve", "--host", host, "--port", str(port)], "worker": ["worker"]}
-    children = []
-    for name, arguments in commands.items():
-        log = (logs / f"{name}.log").open("ab")
-        # a session of its own: Ctrl-C reaches this process alone, which then stops the others in order
-        children.append(subprocess.Popen([sys.executable, "-m", "app.cli", *arguments], stdout=log, stderr=log, start_new_session=True))
-        log.close()
-    previous = signal.signal(signal.SIGTERM, _interrupt)
+    children: list[subprocess.Popen[bytes]] = []
+    previous = [(number, signal.signal(number, _interrupt)) for number in (signal.SIGTERM, signal.SIGHUP)]
     try:
+        for name, arguments in commands.items():
+            with (logs / f"{name}.log").open("ab") as log:
+                # a session of its own: Ctrl-C reaches this process alone, which then stops the others in order
+                command = [sys.executable, "-m", "app.cli", *arguments]
+                children.append(subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True))
         yield children
     except KeyboardInterrupt:
-        console.print("\n  Stopping …")
+        _say("\n  Stopping …")
     finally:
-        signal.signal(signal.SIGTERM, previous)
-        for child in reversed(children):
-            child.terminate()
-        for child in children:
-            try:
-                child.wait(timeout=10)
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait()
+        impatient = [(number, signal.signal(number, signal.SIG_IGN)) for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)]
+        _stop(children)
+        for number, handler in (*impatient, *previous):
+            signal.signal(number, handler)
+
+
+def _stop(children: list[subprocess.Popen[bytes]]) -> None:
+    for child in reversed(children):
+        child.terminate()
+    for child in children:
+        try:
+            child.wait(timeout=STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
 
 
 def _interrupt(_number: int, _frame: Any) -> None:
@@ -173,8 +188,8 @@ def _load_and_rank(url: str, state_path: Path, children: list[subprocess.Popen[b
                 loader.submit(code)
             if i == 0:  # the first ranking has the machine to itself; the others follow in the background
                 _follow(client, state["jobs"][code], children)
-    console.print(f"  Ranked policies of {PARTICIPANTS[0]}: [underline]{url}/participants/{PARTICIPANTS[0]}/ranking[/]")
-    console.print(f"  The other participants are ranked in the background: [underline]{url}/participants/{PARTICIPANTS[1]}/jobs[/]")
+    _say(f"  Ranked policies of {PARTICIPANTS[0]}: [underline]{url}/participants/{PARTICIPANTS[0]}/ranking[/]")
+    _say(f"  The other participants are ranked in the background: [underline]{url}/participants/{PARTICIPANTS[1]}/jobs[/]")
 
 
 @dataclass
@@ -234,24 +249,55 @@ def _save(path: Path, state: dict[str, Any]) -> None:
 
 
 def _follow(client: httpx.Client, job_id: str, children: list[subprocess.Popen[bytes]]) -> None:
-    """A progress bar for every step of a job, until it has ended."""
-    columns = (TextColumn("  {task.description:<42}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
-        known: dict[str, TaskID] = {}
-        while True:
+    """Say how far the first ranking is until it is there: bars in a terminal, lines from time to time in a log file."""
+    job: dict[str, Any] = {}
+
+    def jobs() -> Iterator[dict[str, Any]]:
+        while job.get("status") not in {"succeeded", "failed", "cancelled"}:
             _check(children)
-            job = client.get(f"/jobs/{job_id}").json()
-            for step in job["steps"]:
-                if not console.is_terminal and step["status"] == "succeeded" and step["key"] not in known:
-                    console.print(f"  {step['title']}: done")  # bars need a terminal; a log file gets lines
-                if step["key"] not in known and (console.is_terminal or step["status"] == "succeeded"):
-                    known[step["key"]] = bars.add_task(step["title"], total=1.0, start=False)
-                if (task := known.get(step["key"])) is not None:
-                    if step["status"] != "queued":
-                        bars.start_task(task)
-                    bars.update(task, completed=step["progress"])
-            if job["status"] in {"succeeded", "failed", "cancelled"}:
-                break
+            job.update(client.get(f"/jobs/{job_id}").json())
+            yield job
             time.sleep(_POLL_S)
+
+    (_draw if console.is_terminal else _print)(jobs())
     if job["status"] != "succeeded":
-        console.print(f"  [bold red]The pipeline {job['status']}:[/] {job.get('error') or ''} See the Jobs page.")
+        _say(f"  [bold red]The pipeline {job['status']}:[/] {job.get('error') or ''} See the Jobs page.")
+
+
+def _draw(jobs: Iterator[dict[str, Any]]) -> None:
+    columns = (
+        TextColumn("  {task.description:<42}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.fields[left]}"),
+    )
+    with Progress(*columns, console=console) as bars:
+        whole = bars.add_task("First ranking", total=1.0, left="")
+        known: dict[str, TaskID] = {}
+        for job in jobs:
+            bars.update(whole, completed=job["progress"], left=_left(job))
+            for step in job["steps"]:
+                if step["key"] not in known:
+                    known[step["key"]] = bars.add_task(f"· {step['title']}", total=1.0, left="")
+                bars.update(known[step["key"]], completed=step["progress"])
+
+
+def _print(jobs: Iterator[dict[str, Any]]) -> None:
+    done: set[str] = set()
+    due = 0.0
+    for job in jobs:
+        for step in job["steps"]:
+            if step["status"] == "succeeded" and step["key"] not in done:
+                done.add(step["key"])
+                _say(f"  {step['title']}: done")
+        if time.monotonic() >= due and job["status"] in {"queued", "running"}:
+            due = time.monotonic() + _LINE_S
+            _say(f"  First ranking: {100 * job['progress']:.0f} %, {_left(job)}")
+
+
+def _left(job: dict[str, Any]) -> str:
+    if job["status"] == "queued":
+        return "waits for the worker"
+    if job["status"] != "running":
+        return ""
+    return "time left not known yet" if job["seconds_left"] is None else f"about {minutes_left(job['seconds_left'])} left"

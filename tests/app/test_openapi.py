@@ -23,6 +23,8 @@ INTENDED: dict[str, str] = {
         ),
         "The two schemas `MetricOut` of the OpenAPI document have names without module paths: `MetricOut` and `MethodMetricOut`.",
     ),
+    "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",
+    "components > schemas > JobOut > required": "API: a job has `seconds_left`.",
 }
 
 

@@ -16,10 +16,11 @@ from app.evaluation.estimates.methods import METHOD_NAMES, METHOD_SHORT
 from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.api import csv_of
-from app.evaluation.schemas import DECISION_NAMES, RankingFilter, RankingOut
+from app.evaluation.schemas import DECISION_NAMES, RANKING_KINDS, RankingFilter, RankingOut
 from app.learning.snapshots.service import not_ready
 from app.platform.database import Db
 from app.platform.errors import NotFound
+from app.platform.jobs import registry
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.models import JobStatus
 from app.platform.web.forms import parse
@@ -29,6 +30,8 @@ from app.study.models import Participant
 from app.study.service import may
 
 router = APIRouter()
+
+REFRESH_S = 4
 
 
 @router.get("/participants/{code}/ranking")
@@ -50,6 +53,7 @@ def ranking_page(
         found = ranking.current_ranking(db, participant, caller, method or None, shown)
     except NotFound as error:
         missing = error.problem(request.url.path)
+    live = _live_jobs(db, participant)
     blocked = not_ready(db, participant) if found is None else None
     page = render(
         request,
@@ -66,7 +70,10 @@ def ranking_page(
         coverage=coverage,
         rules=RULES,
         shown=shown,
-        live=_live_jobs(db, participant),
+        live=live,
+        kinds={job.kind: registry.kind(job.kind).title for job in live},
+        ranking_kinds=RANKING_KINDS,
+        refresh_s=REFRESH_S,
         may_run=may(caller, can.RUN_JOBS, participant),
         may_plan=may(caller, can.DRAFT_PLAN, participant),
         may_write=may(caller, can.WRITE_POLICIES, participant),

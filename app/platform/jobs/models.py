@@ -27,6 +27,7 @@ class JobStatus(StrEnum):
         return self in {JobStatus.SUCCEEDED, JobStatus.FAILED, JobStatus.CANCELLED}
 
 
+_LEAST_PROGRESS = 0.05
 _STATUS_CHECK = "status in ('queued', 'running', 'succeeded', 'failed', 'cancelled')"
 
 
@@ -58,6 +59,12 @@ class Job(Base):
     cancel_requested_at: Mapped[datetime | None]
     cancel_requested_by: Mapped[str | None] = mapped_column(String(254))
     steps: Mapped[list[JobStep]] = relationship(back_populates="job", order_by="JobStep.position")
+
+    def seconds_left(self, present: datetime) -> float | None:
+        """Time until the end, if the rest takes as long per share as what is done; None while there is too little to say it from."""
+        if self.started_at is None or self.status != JobStatus.RUNNING or self.progress < _LEAST_PROGRESS:
+            return None
+        return (present - self.started_at).total_seconds() * (1 - self.progress) / self.progress
 
 
 class JobStep(Base):

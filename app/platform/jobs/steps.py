@@ -23,7 +23,7 @@ from app.platform.jobs.context import JobContext, Outcome
 from app.platform.jobs.errors import JobCancelled, WorkerStopping
 from app.platform.jobs.ledger import Ledger, persist
 from app.platform.jobs.models import Job, JobStatus
-from app.settings import get_settings
+from app.settings import get_settings, private_folder
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ class JobSteps:
 
     def workdir(self, key: str) -> Path:
         """Folder of a step; the parts of a key are joined so that no step's folder lies within another's."""
-        return get_settings().jobs_dir / self.ledger.job_id / key.replace("/", "__")
+        return private_folder(private_folder(get_settings().jobs_dir) / self.ledger.job_id) / key.replace("/", "__")
 
 
 class JobRunner:

@@ -13,7 +13,10 @@ import plotly
 from fastapi import Request
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
+from app.platform.database import now
+
 ROOT = Path(__file__).resolve().parents[3]
+
 STATIC = ROOT / "static"
 
 _environment = Environment(
@@ -75,6 +78,11 @@ def minutes(seconds: float | None) -> str:
     return f"{whole // 60} min" + (f" {whole % 60} s" if whole % 60 else "") if whole >= 60 else f"{whole} s"
 
 
+def minutes_left(seconds: float) -> str:
+    """A remaining time for people, no finer than it can be known."""
+    return "less than a minute" if seconds < 60 else f"{math.ceil(seconds / 60)} min"
+
+
 def size(value: int) -> str:
     """Bytes for people."""
     amount, unit = float(value), "B"
@@ -91,5 +99,5 @@ def when(value: datetime | date | None) -> str:
     return value.strftime("%Y-%m-%d %H:%M UTC") if isinstance(value, datetime) else value.isoformat()
 
 
-_environment.filters.update(number=number, fixed=fixed, minutes=minutes, size=size, when=when)
-_environment.globals.update(static_url=static_url, plotly_url=plotly_url)
+_environment.filters.update(number=number, fixed=fixed, minutes=minutes, minutes_left=minutes_left, size=size, when=when)
+_environment.globals.update(static_url=static_url, plotly_url=plotly_url, now=now)

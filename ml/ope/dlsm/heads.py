@@ -9,9 +9,9 @@ import math
 from typing import Any
 
 import torch
-from numba import njit
 from torch import Tensor, nn
 
+from ml.compiled import compiled
 from ml.ope.dlsm.kernels import FAST_MATH, squash
 from ml.ope.dlsm.recurrence import LOG_STD_BOUNDS, bounded
 
@@ -140,7 +140,7 @@ def _rows(n: int) -> list[slice]:
     return [slice(first, min(first + ROWS, n)) for first in range(0, n, ROWS)]
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def _elu(values: Any, bias: Any) -> None:
     """ELU of values [N, n] plus bias, in place: exp(x) - 1 = 2 t / (1 - t) with t = tanh(x / 2), which a compiler can vectorise."""
     half, one, zero = values.dtype.type(0.5), values.dtype.type(1), values.dtype.type(0)
@@ -152,7 +152,7 @@ def _elu(values: Any, bias: Any) -> None:
             row[j] = max(x, zero) + (t + t) / (one - t)
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def _elu_backward(grad: Any, activated: Any) -> None:
     """`grad` times the slope of ELU, in place, [N, n]: 1 above zero, activation + 1 below."""
     one, zero = grad.dtype.type(1), grad.dtype.type(0)
@@ -162,7 +162,7 @@ def _elu_backward(grad: Any, activated: Any) -> None:
             row[j] *= one + min(value[j], zero)
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def _density(raw: Any, bias: Any, target: Any, residual: Any, share: Any, inverse: Any, log_prob: Any, low: float, span: float) -> None:
     """Log density of rows [N] from mean and raw log sigma [N, 2n] plus bias; residual / sigma, squashed raw and 1 / sigma are kept."""
     n = target.shape[1]
@@ -179,7 +179,7 @@ def _density(raw: Any, bias: Any, target: Any, residual: Any, share: Any, invers
         log_prob[i] = total - n * _HALF_LOG_TWO_PI
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def _density_backward(grad: Any, residual: Any, share: Any, inverse: Any, d_raw: Any, span: float) -> None:
     """Gradients of mean and raw log sigma, into `d_raw` [N, 2n], from those of the log densities [N]."""
     n = residual.shape[1]

@@ -10,8 +10,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import overload
+
+from ml.compiled import compiled
 
 # No `nnan`: what is not a number must stay visible. `error_model="numpy"` below: a check for division by zero would bar vectorisation.
 FAST_MATH = {"contract", "reassoc", "arcp", "nsz"}
@@ -46,13 +48,13 @@ def _rational_tanh(x: Any) -> Any:
     return y * above / (_Q[0] + u * (_Q[1] + u * (_Q[2] + u * (_Q[3] + u * _Q[4]))))
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def _quarters(row: Any, hidden: int) -> Any:
     """Views of the four gates: an index like `hidden + j` could be negative for all the compiler knows, which bars vectorisation."""
     return row[:hidden], row[hidden : 2 * hidden], row[2 * hidden : 3 * hidden], row[3 * hidden : 4 * hidden]
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def _cell_forward(acts: Any, carried: Any, bias: Any, c: Any, c_next: Any, tanh_c: Any, h: Any) -> None:
     """One LSTM cell: gates [B, >= 4H], what is carried [B, >= 4H] and bias are added and squashed in place; the rest [B, H] is written."""
     batch, hidden = tanh_c.shape
@@ -76,7 +78,7 @@ def _cell_forward(acts: Any, carried: Any, bias: Any, c: Any, c_next: Any, tanh_
             out[j] = o[j] * squashed[j]
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def _cell_backward(d_h: Any, acts: Any, c: Any, tanh_c: Any, d_c: Any, d_acts: Any) -> None:
     """Gradients of a cell's gates before squashing, into the first 4H columns of `d_acts` [B, >= 4H]; `d_c` [B, H] is moved on to c."""
     batch, hidden = d_c.shape
@@ -98,7 +100,7 @@ def _cell_backward(d_h: Any, acts: Any, c: Any, tanh_c: Any, d_c: Any, d_acts: A
             cell[j] *= f[j]
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def _latent_forward(
     heads: Any, b_out: Any, acts: Any, eps: Any, z: Any, mean: Any, log_std: Any, share: Any, std: Any, low: float, span: float
 ) -> None:
@@ -117,7 +119,7 @@ def _latent_forward(
             z[b, k] = mean[b, k] + std[b, k] * eps[b, k]
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def _latent_backward(
     grad_z: Any, grad_mean: Any, grad_log_std: Any, share: Any, std: Any, eps: Any, d_carry: Any, d_head: Any, d_acts: Any, span: float
 ) -> None:
@@ -136,7 +138,7 @@ def _latent_backward(
             d_acts[b, skip + k] = d_mean
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def stochastic_forward(
     acts: Any, carry: Any, c: Any, tanh_c: Any, eps: Any, z: Any, mean: Any, log_std: Any, share: Any, std: Any,
     joint: Any, bias: Any, w_out: Any, b_out: Any, low: float, span: float,
@@ -161,7 +163,7 @@ def stochastic_forward(
         carry[t + 1, :, latent:] = h
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def stochastic_backward(
     grad_z: Any, grad_mean: Any, grad_log_std: Any, acts: Any, c: Any, tanh_c: Any, eps: Any, share: Any, std: Any,
     joint_t: Any, out_t: Any, d_acts: Any, d_heads: Any, d_carry: Any, d_c: Any, span: float,
@@ -187,7 +189,7 @@ def stochastic_backward(
         np.dot(d_acts[t], joint_t, d_carry)
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def lstm_forward(acts: Any, h: Any, c: Any, tanh_c: Any, w_h: Any, bias: Any) -> None:
     """All steps of an LSTM: acts [T, B, 4H] holds the input's share and is squashed; h, c [T + 1, B, H] have row 0; tanh_c [T, B, H]."""
     product = np.empty_like(acts[0])
@@ -196,7 +198,7 @@ def lstm_forward(acts: Any, h: Any, c: Any, tanh_c: Any, w_h: Any, bias: Any) ->
         _cell_forward(acts[t], product, bias, c[t], c[t + 1], tanh_c[t], h[t + 1])
 
 
-@njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+@compiled(fastmath=FAST_MATH, error_model="numpy")
 def lstm_backward(grad_h: Any, acts: Any, c: Any, tanh_c: Any, back: Any, d_acts: Any, d_h: Any, d_c: Any) -> None:
     """Gradients of `lstm_forward`: `d_acts` [T, B, 4H] is written from `grad_h` [T, B, H] and the transposed weights `back` [4H, H].
 

@@ -22,9 +22,9 @@ from functools import cache
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ml.compiled import compiled
 from ml.population.participants import ParticipantModel
 
 LFP_RATE_HZ: Final = 250
@@ -72,14 +72,14 @@ _GAIN_AT_ONCE = 1 - math.exp(-4e-3 / _TAU_AT_ONCE_S)
 _GAIN_ON, _GAIN_OFF = 1 - math.exp(-4e-3 / _TAU_ON_S), 1 - math.exp(-4e-3 / _TAU_OFF_S)
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def _mix(z: Any) -> Any:
     z = (z ^ (z >> _SHIFT_30)) * _MIX_1
     z = (z ^ (z >> _SHIFT_27)) * _MIX_2
     return z ^ (z >> _SHIFT_31)
 
 
-@njit(cache=True)
+@compiled()
 def seed_streams(seeds: Any, salt: Any) -> Any:
     """Counters of all random streams, shape [N, STREAMS], from session seeds and the participant's salt, both uint64 of shape [N]."""
     counters = np.empty((seeds.shape[0], STREAMS), dtype=np.uint64)
@@ -89,14 +89,14 @@ def seed_streams(seeds: Any, salt: Any) -> Any:
     return counters
 
 
-@njit(cache=True)
+@compiled()
 def uniform(counters: Any, stream: int) -> float:
     """Next draw from (0, 1) of a stream; `counters` is the row of one session and is advanced in place."""
     counters[stream] += _GOLDEN
     return (float(_mix(counters[stream]) >> _SHIFT_11) + 0.5) * 1.1102230246251565e-16
 
 
-@njit(cache=True)
+@compiled()
 def gauss_pair(counters: Any, stream: int) -> Any:
     """Next two independent standard normal draws of a stream (Box and Muller)."""
     radius = math.sqrt(-2.0 * math.log(uniform(counters, stream)))
@@ -104,12 +104,12 @@ def gauss_pair(counters: Any, stream: int) -> Any:
     return radius * math.cos(angle), radius * math.sin(angle)
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def _rate(x: float, maximum: float, base: float) -> float:
     return maximum / (1.0 + math.exp(-4.0 * x / maximum) * (maximum - base) / base)
 
 
-@njit(cache=True)
+@compiled()
 def saturation(a: float, a50: float, hill: float) -> float:
     """Share of the full DBS effect at amplitude fraction a: a Hill curve scaled to 1 at a = 1."""
     if a <= 0.0:
@@ -117,7 +117,7 @@ def saturation(a: float, a50: float, hill: float) -> float:
     return (1.0 + a50**hill) * a**hill / (a**hill + a50**hill)
 
 
-@njit(cache=True)
+@compiled()
 def _filtered(sample: float, state: Any, sos: Any) -> float:
     for j in range(sos.shape[0]):
         out = sos[j, 0] * sample + state[_FILTER + 2 * j]
@@ -127,7 +127,7 @@ def _filtered(sample: float, state: Any, sos: Any) -> float:
     return sample
 
 
-@njit(cache=True)
+@compiled()
 def _one_period(state: Any, counters: Any, c: Any, amplitude: float, k_period: float, sos: Any, lfp: Any) -> float:
     """500 LFP samples of one session in place; returns their beta RMS in uV. `lfp` (mV) is filled where it is not empty."""
     e_inf = saturation(amplitude, c[_A50], c[_HILL])
@@ -177,7 +177,7 @@ def _one_period(state: Any, counters: Any, c: Any, amplitude: float, k_period: f
     return math.sqrt(power / SAMPLES_PER_PERIOD)
 
 
-@njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def advance(state: Any, counters: Any, constants: Any, amplitude: Any, medication: Any, gain: float, sos: Any, beta: Any, lfp: Any) -> None:
     """Advance N sessions by one period of 2 s, in place.
 
@@ -195,7 +195,7 @@ def advance(state: Any, counters: Any, constants: Any, amplitude: Any, medicatio
         beta[i] = _one_period(state[i], counters[i], c, amplitude[i], k, sos, lfp[i])
 
 
-@njit(cache=True)
+@compiled()
 def initial_state(counters: Any, constants: Any, amplitude: float) -> Any:
     """State of N sessions long under one constant amplitude, shape [N, STATE_SIZE]; the fast part still has to settle."""
     state = np.zeros((counters.shape[0], STATE_SIZE))

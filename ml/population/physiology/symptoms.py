@@ -11,9 +11,9 @@ import math
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ml.compiled import compiled
 from ml.population.participants import ParticipantModel
 from ml.population.physiology.brain import PERIOD_S, STREAM_SYMPTOMS, gauss_pair, saturation, uniform
 
@@ -31,7 +31,7 @@ _BURDEN_TAU_S = 60.0
 _OVER_TOLERANCE, _OVER_MEDICATION, _OVER_ACTIVITY, _OVER_TAU_S = 0.70, 0.30, 0.55, 20.0
 
 
-@njit(cache=True)
+@compiled()
 def advance(state: Any, counters: Any, constants: Any, amplitude: Any, medication: Any, activity: Any, beta: Any, brady: Any) -> None:
     """Advance N participants by 2 s, in place.
 

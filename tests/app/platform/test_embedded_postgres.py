@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -77,21 +76,3 @@ def test_a_closed_home_stays_closed(tmp_path: Path) -> None:
         assert home.stat().st_mode & 0o077 == 0
     finally:
         server.remove()
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root has another user's server to keep out of its home")
-def test_a_data_folder_made_anew_does_not_find_the_old_rows(tmp_path: Path) -> None:
-    home = tmp_path / "home"
-    home.mkdir(mode=0o700)
-    for again in (False, True):
-        (home / "data").mkdir()
-        server = EmbeddedPostgres(home / "data" / "postgres")
-        server.start()
-        with connect(server) as connection:
-            assert connection.execute("select to_regclass('kept')").fetchone() == (None,)
-            connection.execute("create table kept (n int)")
-        server.leave()
-        if not again:
-            shutil.rmtree(home / "data")
-    server.remove()
-    assert not server.data.parent.exists()

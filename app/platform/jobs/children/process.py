@@ -63,6 +63,7 @@ def main(arguments: list[str]) -> int:
         return 2
     name, workdir = arguments[0], Path(arguments[1])
     _be_modest()
+    os.umask(0o077)  # checkpoints and results are of participants
     call = json.loads((workdir / "params.json").read_bytes())
     outcome: dict[str, Any] = {"params_sha256": call["params_sha256"]}
     lock = None

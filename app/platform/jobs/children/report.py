@@ -88,9 +88,9 @@ def pipe_sender(fd: int) -> Callable[[dict[str, Any]], None]:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a kill at any moment leaves the old file or the whole new one: fsync, then rename."""
+    """Write a file so that a kill at any moment leaves the old file or the whole new one; only its owner reads it."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
-    with draft.open("wb") as out:
+    with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as out:
         out.write(content)
         out.flush()
         os.fsync(out.fileno())

@@ -24,6 +24,7 @@ from app.platform.jobs.children.process import params_hash, stored_result, too_m
 from app.platform.jobs.children.report import write_atomically
 from app.platform.jobs.context import Outcome
 from app.platform.jobs.registry import ComputeFunction
+from app.settings import private_folder
 
 LISTEN_S = 0.1
 """Longest time between two looks at a child, and so the longest that it outlives a cancel."""
@@ -156,7 +157,7 @@ def _prepare(call: Call) -> None:
     params = call.workdir / "params.json"
     if call.workdir.exists() and (not params.exists() or json.loads(params.read_bytes())["params_sha256"] != call.sha256):
         shutil.rmtree(call.workdir)
-    call.workdir.mkdir(parents=True, exist_ok=True)
+    private_folder(call.workdir)
     content = {"module": call.function.module, "params": call.params, "params_sha256": call.sha256, "memory_mb": call.memory_mb}
     write_atomically(params, json.dumps(content, allow_nan=False).encode())
     result = call.workdir / "result.json"

@@ -1,0 +1,1 @@
+"""What the embedded PostgreSQL needs once per machine or data folder: a system user, a place, roles with passwords."""

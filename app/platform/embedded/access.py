@@ -1,0 +1,132 @@
+"""Who may use the embedded database: two roles with generated passwords, and no one else.
+
+`postgres` is the superuser of the server's own upkeep; `betaloop` owns the database, and with it the service and the migrations work. A
+data folder of version 0.1.0 (no passwords, everything owned by the superuser) is converted at its next start.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import psycopg
+from psycopg import sql
+
+ADMIN, OWNER, DATABASE = "postgres", "betaloop", "betaloop"
+_RULES = "# Written by betaloop: passwords only, see the data folder's secrets.\nlocal all all scram-sha-256\n"
+_SETTING_UP = (
+    "# Written by betaloop: for the moment in which passwords are set; the socket's folder is closed to others.\nlocal all postgres trust\n"
+)
+_RELOAD_TIMEOUT_S = 20.0
+_HAND_OVER = """
+do $$
+declare statement text;
+begin
+  for statement in
+    select format('alter schema %I owner to betaloop', nspname) from pg_namespace
+      where nspowner = 'postgres'::regrole and nspname !~ '^pg_' and nspname <> 'information_schema'
+    union all
+    select format('alter table %s owner to betaloop', c.oid::regclass) from pg_class c join pg_namespace n on n.oid = c.relnamespace
+      where c.relowner = 'postgres'::regrole and c.relkind in ('r', 'p', 'v', 'm', 'f', 'S')
+        and n.nspname !~ '^pg_' and n.nspname <> 'information_schema'
+        and not exists (select from pg_depend d where d.objid = c.oid and d.classid = 'pg_class'::regclass and d.deptype in ('a', 'i', 'e'))
+    union all
+    select format('alter routine %s owner to betaloop', p.oid::regprocedure) from pg_proc p join pg_namespace n on n.oid = p.pronamespace
+      where p.proowner = 'postgres'::regrole and n.nspname !~ '^pg_' and n.nspname <> 'information_schema'
+        and not exists (select from pg_depend d where d.objid = p.oid and d.classid = 'pg_proc'::regclass and d.deptype = 'e')
+    union all
+    select format('alter type %s owner to betaloop', t.oid::regtype) from pg_type t join pg_namespace n on n.oid = t.typnamespace
+      where t.typowner = 'postgres'::regrole and t.typtype in ('e', 'd') and n.nspname !~ '^pg_' and n.nspname <> 'information_schema'
+  loop
+    execute statement;
+  end loop;
+end $$
+"""
+
+
+@dataclass(frozen=True)
+class Passwords:
+    """Of the two roles."""
+
+    admin: str
+    owner: str
+
+
+class Access:
+    """The rules and roles of one running server.
+
+    Args:
+        data: its data folder. sockets: where it listens. passwords: of both roles. reload: has the server read its rules again.
+    """
+
+    def __init__(self, data: Path, sockets: Path, passwords: Passwords, reload: Callable[[], object]) -> None:
+        self._rules, self._sockets, self._passwords, self._reload = data / "pg_hba.conf", sockets, passwords, reload
+
+    def conninfo(self, database: str, role: str = ADMIN) -> str:
+        """What libpq connects with."""
+        password = self._passwords.admin if role == ADMIN else self._passwords.owner
+        return f"host='{self._sockets}' user={role} password={password} dbname={database} connect_timeout=5"
+
+    def ensure(self) -> None:
+        """Have passwords asked for, both roles and the database; what is there already is left as it is.
+
+        Raises:
+            RuntimeError: the server does not take the new rules.
+        """
+        if self._rules.read_text() != _RULES or not self._may("postgres", ADMIN):
+            # a new or older server, or lost secrets: whoever owns the data folder may set new passwords
+            self._apply(_SETTING_UP, lambda: self._may("postgres", ADMIN))
+            self._set_passwords()
+            self._apply(_RULES, lambda: self._may("postgres", ADMIN) and not self._may("postgres", ADMIN, password="wrong"))
+        self._ensure_database()
+        if not self._may(DATABASE, OWNER):
+            self._set_passwords()
+
+    def _may(self, database: str, role: str, **other: str) -> bool:
+        try:
+            with psycopg.connect(self.conninfo(database, role), **other):  # type: ignore[arg-type]
+                return True
+        except psycopg.OperationalError:
+            return False
+
+    def _apply(self, rules: str, in_force: Callable[[], bool]) -> None:
+        draft = self._rules.with_name("pg_hba.conf.part")
+        before = self._rules.stat()
+        fd = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with open(fd, "w") as out:
+            out.write(rules)
+            out.flush()
+            os.fsync(out.fileno())
+        os.chown(draft, before.st_uid, before.st_gid)
+        draft.replace(self._rules)
+        self._reload()
+        deadline = time.monotonic() + _RELOAD_TIMEOUT_S
+        while not in_force():
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"The embedded PostgreSQL does not take the rules in {self._rules}. Look into server.log beside them.")
+            time.sleep(0.05)
+
+    def _set_passwords(self) -> None:
+        with psycopg.connect(self.conninfo("postgres"), autocommit=True) as connection:
+            # the passwords are random and 256 bits long: hashing them many times protects nothing and costs at every connection
+            connection.execute("set scram_iterations = 1")
+            connection.execute("set log_statement = 'none'")
+            if connection.execute("select 1 from pg_roles where rolname = %s", (OWNER,)).fetchone() is None:
+                connection.execute(sql.SQL("create role {}").format(sql.Identifier(OWNER)))
+            for role, password in ((ADMIN, self._passwords.admin), (OWNER, self._passwords.owner)):
+                connection.execute(sql.SQL("alter role {} login password {}").format(sql.Identifier(role), sql.Literal(password)))
+            connection.execute(sql.SQL("alter role {} nosuperuser nocreatedb nocreaterole").format(sql.Identifier(OWNER)))
+
+    def _ensure_database(self) -> None:
+        with psycopg.connect(self.conninfo("postgres"), autocommit=True) as connection:
+            row = connection.execute("select pg_get_userbyid(datdba) from pg_database where datname = %s", (DATABASE,)).fetchone()
+            if row is None:
+                connection.execute(sql.SQL("create database {} owner {}").format(sql.Identifier(DATABASE), sql.Identifier(OWNER)))
+            elif row[0] != OWNER:
+                with psycopg.connect(self.conninfo(DATABASE), autocommit=True) as inside:
+                    inside.execute(_HAND_OVER)
+                # last: an interrupted conversion is begun again
+                connection.execute(sql.SQL("alter database {} owner to {}").format(sql.Identifier(DATABASE), sql.Identifier(OWNER)))

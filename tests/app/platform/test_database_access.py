@@ -1,0 +1,174 @@
+"""Who may use the embedded database and the stored files: the service, and no other user of the machine."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+from sqlalchemy.orm import Session
+
+from app.platform import files
+from app.platform.database import database_url, get_engine
+from app.platform.embedded.system_user import system_user
+from app.platform.embedded_postgres import EmbeddedPostgres
+from app.platform.migrate import migrate
+from app.settings import get_settings
+from tests.system_users import require_root
+
+NOBODY = 65534
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture
+def data(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty data folder in which every user may look around, and which the settings name."""
+    folder = Path("/tmp") / f"betaloop-access-{os.getpid()}-{os.urandom(4).hex()}"
+    folder.mkdir()
+    folder.chmod(0o755)
+    monkeypatch.delenv("BETALOOP_DATABASE_URL", raising=False)
+    monkeypatch.setenv("BETALOOP_DATA_DIR", str(folder))
+    get_settings.cache_clear()
+    yield folder
+    get_settings.cache_clear()
+    EmbeddedPostgres(folder / "postgres", server_user=get_settings().server_user).remove()
+    shutil.rmtree(folder)
+
+
+def server_of(data: Path) -> EmbeddedPostgres:
+    return EmbeddedPostgres(data / "postgres", durable=False, server_user=get_settings().server_user)
+
+
+def run_as_postgres(data: Path, program: str, *arguments: str) -> None:
+    """One of PostgreSQL's own programs, under the server's user where we are root."""
+    server = server_of(data)
+    server._run(program, *arguments)
+
+
+def old_data_folder(data: Path) -> None:
+    """What version 0.1.0 left behind: no passwords, everything the superuser's, readable files."""
+    folder, sockets = data / "postgres", data / "postgres.socket"
+    folder.mkdir(mode=0o700)
+    sockets.mkdir(mode=0o777)
+    if os.geteuid() == 0:
+        for path in (folder, sockets):
+            shutil.chown(path, get_settings().server_user)
+    run_as_postgres(data, "initdb", "--auth=trust", "--encoding=utf8", "--locale=C.UTF-8", "-U", "postgres", "-D", str(folder))
+    run_as_postgres(data, "pg_ctl", "-D", str(folder), "-l", str(folder / "server.log"), "-o", f"-h '' -k {sockets}", "-w", "start")
+    with psycopg.connect(f"host={sockets} user=postgres dbname=postgres", autocommit=True) as connection:
+        connection.execute("create database betaloop")
+    url = f"postgresql://postgres@/betaloop?host={sockets}"
+    code = "from app.platform.migrate import migrate; migrate()"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, env=os.environ | {"BETALOOP_DATABASE_URL": url})
+    with psycopg.connect(url) as connection:
+        connection.execute("create type colour as enum ('red')")
+        connection.execute("insert into study (code, name) values ('KEPT', 'A study of before')")
+    run_as_postgres(data, "pg_ctl", "-D", str(folder), "-w", "stop")
+    stored = data / "files" / "ab"
+    stored.mkdir(parents=True)
+    (stored / "abcd").write_text("a recording")
+    for path in (data / "files", stored):
+        path.chmod(0o755)
+    (stored / "abcd").chmod(0o644)
+
+
+def test_no_other_user_gets_into_the_database(data: Path) -> None:
+    require_root("only root can try as another user")
+    server = server_of(data)
+    server.start()
+    service = server.url("betaloop").replace("+psycopg", "")
+    psycopg.connect(service).close()
+    for conninfo in (f"host={server._sockets} user=postgres dbname=postgres", server.admin_conninfo(), service):
+        assert "Permission denied" in said_to(NOBODY, conninfo)
+    assert server.data.stat().st_uid == system_user(get_settings().server_user).uid
+
+
+def said_to(uid: int, conninfo: str) -> str:
+    """What a connection by another user of the machine is answered; forked, for that user need not be able to start our Python."""
+    reader, writer = os.pipe()
+    if (child := os.fork()) == 0:
+        os.setgroups([])
+        os.setgid(uid)
+        os.setuid(uid)
+        try:
+            psycopg.connect(conninfo)
+            os.write(writer, b"connected")
+        except psycopg.OperationalError as error:
+            os.write(writer, str(error).encode())
+        finally:
+            os._exit(0)
+    os.close(writer)
+    with open(reader) as answer:
+        said = answer.read()
+    os.waitpid(child, 0)
+    return said
+
+
+def test_without_a_password_nobody_gets_in(data: Path) -> None:
+    server = server_of(data)
+    server.start()
+    for user in ("postgres", "betaloop"):
+        with pytest.raises(psycopg.OperationalError, match="password"):
+            psycopg.connect(f"host={server._sockets} user={user} dbname=betaloop")
+        with pytest.raises(psycopg.OperationalError, match="password authentication failed"):
+            psycopg.connect(f"host={server._sockets} user={user} dbname=betaloop password=guessed")
+
+
+def test_the_service_is_no_superuser_and_can_migrate(data: Path) -> None:
+    migrate()
+    with get_engine().connect() as connection:
+        rights = "select rolsuper, rolcreaterole, rolcreatedb, rolbypassrls, rolreplication from pg_roles where rolname = current_user"
+        assert connection.exec_driver_sql(rights).fetchone() == (False,) * 5
+        foreign = "select count(*) from pg_tables where schemaname in ('public', 'dbos') and tableowner <> current_user"
+        assert connection.exec_driver_sql(foreign).scalar() == 0
+    get_engine().dispose()
+
+
+def test_a_data_folder_of_0_1_0_opens_with_its_rows_and_is_closed_to_others(data: Path) -> None:
+    old_data_folder(data)
+    migrate()
+    with get_engine().begin() as connection:
+        assert connection.exec_driver_sql("select name from study where code = 'KEPT'").scalar() == "A study of before"
+        assert connection.exec_driver_sql("select rolsuper from pg_roles where rolname = current_user").scalar() is False
+        connection.exec_driver_sql("alter table participant add column added int")
+        connection.exec_driver_sql("alter type colour add value 'green'")
+        owners = """select distinct pg_get_userbyid(o) from (select relowner, relnamespace from pg_class union all
+          select proowner, pronamespace from pg_proc) as t(o, n) join pg_namespace s on s.oid = n where s.nspname in ('public', 'dbos')"""
+        assert connection.exec_driver_sql(owners).fetchall() == [("betaloop",)]
+    get_engine().dispose()
+    with pytest.raises(psycopg.OperationalError):
+        psycopg.connect(f"host={data / 'postgres.socket'} user=postgres dbname=postgres")
+    assert "password=" not in database_url()
+    assert (data / "postgres.socket").stat().st_mode & 0o777 == 0o700
+    assert (data / "postgres.location").read_text() == "postgres\n"
+    for path, mode in (("files", 0o700), ("files/ab", 0o700), ("files/ab/abcd", 0o600)):
+        assert (data / path).stat().st_mode & 0o777 == mode
+
+
+def test_lost_secrets_are_made_anew_by_the_owner_of_the_data_folder(data: Path) -> None:
+    server = server_of(data)
+    server.start()
+    old = server.url("betaloop")
+    server.leave()
+    shutil.rmtree(data / "secrets")
+    again = server_of(data)
+    again.start()
+    assert again.url("betaloop") != old
+    with psycopg.connect(again.url("betaloop").replace("+psycopg", "")) as connection:
+        assert connection.execute("select 1").fetchone() == (1,)
+    with pytest.raises(psycopg.OperationalError, match="password"):
+        psycopg.connect(old.replace("+psycopg", ""))
+    again.leave()
+
+
+def test_stored_files_are_the_services_alone(db: Session) -> None:
+    row = files.store(db, b"a recording", "text/plain")
+    path = files.path_of(row.sha256)
+    assert path.stat().st_mode & 0o777 == 0o600
+    for folder in (path.parent, path.parent.parent, path.parent.parent / "incoming"):
+        assert folder.stat().st_mode & 0o777 == 0o700
