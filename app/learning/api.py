@@ -16,6 +16,7 @@ from app.platform.database import Db
 from app.platform.errors import TooLarge
 from app.platform.schemas import Page, PagingQuery, RowId, problems
 from app.study import repository as study_repository
+from app.study import service as study
 from app.study.api import CurrentParticipant
 from app.study.models import Hemisphere, Participant
 
@@ -34,7 +35,15 @@ def current_snapshot(snapshot_id: RowId, db: Db, caller: CurrentCaller) -> Buffe
     return repository.snapshot(db, snapshot_id, caller)
 
 
+def current_own_policy(participant: CurrentParticipant, policy_id: RowId, db: Db, caller: CurrentCaller) -> Policy:
+    """The policy that the path names after its participant. Raises NotFound for another participant's."""
+    policy = repository.policy(db, policy_id, caller)
+    study.require_own(participant, policy, f"policy {policy_id}")
+    return policy
+
+
 CurrentPolicy = Annotated[Policy, Depends(current_policy)]
+CurrentOwnPolicy = Annotated[Policy, Depends(current_own_policy)]
 CurrentSnapshot = Annotated[BufferSnapshot, Depends(current_snapshot)]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from sqlalchemy import select
@@ -275,6 +275,27 @@ def qoc_of(session: StudySession) -> Qoc:
 def require(caller: Caller, permission: str, participant: Participant) -> None:
     """Raises NotFound or Forbidden unless the caller holds the permission for this participant."""
     caller.require(permission, participant.site.study_id, participant.site_id)
+
+
+class Owned(Protocol):
+    """A row of one participant."""
+
+    @property
+    def participant_id(self) -> int | None:
+        """Whose it is."""
+
+
+def require_own(participant: Participant, row: Owned, name: str) -> None:
+    """Objects that are named together belong together.
+
+    Args:
+        participant: whose object it should be. row: the object. name: what to call it, e.g. "policy 7".
+
+    Raises:
+        NotFound: it is another participant's.
+    """
+    if row.participant_id != participant.id:
+        raise NotFound(f"Participant {participant.code} has no {name}.", "Choose one from the participant's own list.")
 
 
 def _add_settings(db: Session, participant: Participant, values: dict[str, Any], caller: Caller, reason: str | None) -> SettingsVersion:
