@@ -55,7 +55,11 @@ def start_job(db: Session, participant: Participant, kind: str, params: Mapping[
 
 
 def retry_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
-    """A new job with the same params. Raises Conflict while the job has not ended, or another one repeats it, NotFound for another participant's."""
+    """A new job with the same params.
+
+    Raises:
+        Conflict: the job has not ended, or another one repeats it. NotFound: it is another participant's.
+    """
     study.require(caller, can.RUN_JOBS, participant)
     study.require_own(participant, job, f"job {job.id}")
     job = jobs.repeatable(db, job)

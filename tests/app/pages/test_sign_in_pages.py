@@ -51,6 +51,19 @@ def test_six_failures_lock_the_address_for_a_while(anonymous: TestClient, sign_i
     assert anonymous.post("/sign-in", data={"email": ADMIN, "password": PASSWORD}).status_code == 429
 
 
+def test_a_padded_address_neither_passes_the_limit_nor_tells_the_right_password(
+    anonymous: TestClient, sign_in: Callable[[str], TestClient]
+) -> None:
+    sign_in("admin")
+    padding = [" ", "  ", "\0", " \0 ", "\0\0 ", " \0\0"]
+    codes = {anonymous.post("/sign-in", data={"email": ADMIN + pad, "password": PASSWORD}).status_code for pad in padding if "\0" in pad}
+    assert codes == {401}, "no address has a zero character, with whatever password"
+    codes_of_spaces = [anonymous.post("/sign-in", data={"email": ADMIN + " " * n, "password": "wrong"}).status_code for n in range(6)]
+    assert codes_of_spaces == [401] * 5 + [429]
+    for pad in padding:
+        assert anonymous.post("/sign-in", data={"email": ADMIN + pad, "password": PASSWORD}).status_code in (401, 429)
+
+
 @pytest.mark.parametrize(
     "target",
     ["https://evil.example", "//evil.example", "/\\evil.example", "\\\\evil.example", "/\t/evil.example", "javascript:alert(1)", "", "/é"],
