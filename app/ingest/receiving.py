@@ -108,15 +108,12 @@ class Receiver:
         name = Path(one.name.replace("\\", "/")).name[:255] or "file"
         limit_mb = get_settings().upload_limit_mb
         try:
-            draft, sha256, size = files.receive(one.stream, limit_mb * 1024 * 1024)
+            with files.received(one.stream, limit_mb * 1024 * 1024) as (raw, sha256, size):
+                if known := self._known(name, sha256):
+                    return known
+                kept = self._keep(raw) if size else Kept("unreadable", None, None, Redaction(), EMPTY)
         except OverflowError as error:
             raise TooLarge(f"'{name}' is larger than {limit_mb} MiB.", "Split it, or have BETALOOP_UPLOAD_LIMIT_MB raised.") from error
-        try:
-            if known := self._known(name, sha256):
-                return known
-            kept = self._keep(draft) if size else Kept("unreadable", None, None, Redaction(), EMPTY)
-        finally:
-            draft.unlink(missing_ok=True)
         row = UploadFile(
             upload_id=self.upload.id,
             participant_id=self.participant.id,
@@ -158,35 +155,35 @@ class Receiver:
             store_reports(row, outcome.reports, known_recordings(row))
         return outcome
 
-    def _keep(self, draft: Path) -> Kept:
+    def _keep(self, raw: Path) -> Kept:
         """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted.
 
         A table is cleaned by reading it with the participant's options: one that cannot be decoded is kept encrypted too.
         """
         clean = files.draft_path()
         try:
-            kind = formats.sniff(draft)
-            redaction = formats.redact(draft, clean, kind, get_settings().secret("pseudonyms"), self.options)
+            kind = formats.sniff(raw)
+            redaction = formats.redact(raw, clean, kind, get_settings().secret("pseudonyms"), self.options)
         except UndecodableFile as error:
-            return self._quarantined(draft, clean, error)
+            return self._quarantined(raw, clean, error)
         except Exception as fault:
             # a fault of ours must not take the other files of the upload with it, and what it left behind may still name a person
             log.exception("file could not be cleaned", upload=self.upload.id, fault=repr(fault))
             mend = f"It is kept encrypted; tell your administrator: upload {self.upload.id}."
             return self._quarantined(
-                draft, clean, UndecodableFile("the service failed while it took identity out of this file", "file", mend)
+                raw, clean, UndecodableFile("the service failed while it took identity out of this file", "file", mend)
             )
-        sealed = self._seal(draft) if redaction.unreadable else None
+        sealed = self._seal(raw) if redaction.unreadable else None
         return Kept(kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, redaction, None)
 
-    def _quarantined(self, draft: Path, clean: Path, problem: UndecodableFile) -> Kept:
+    def _quarantined(self, raw: Path, clean: Path, problem: UndecodableFile) -> Kept:
         clean.unlink(missing_ok=True)
-        left_out = _left_out(draft, self.options.archive)
-        sealed = self._seal(draft)
+        left_out = _left_out(raw, self.options.archive)
+        sealed = self._seal(raw)
         return Kept("unreadable", sealed, sealed, Redaction(ignored=left_out), problem)
 
-    def _seal(self, draft: Path) -> str:
-        return files.store(self.db, encryption.encrypt(draft), MEDIA_TYPE).sha256
+    def _seal(self, raw: Path) -> str:
+        return files.store(self.db, encryption.encrypt(raw), MEDIA_TYPE).sha256
 
     def decode(self, name: str, row: UploadFile, kept: Kept) -> FileOutcome:
         """Decode a stored file; whatever is wrong with it becomes its report."""
