@@ -20,7 +20,7 @@ from app.ingest import encryption, formats, repository, service
 from app.ingest.formats.log import UndecodableFile
 from app.ingest.formats.redaction import REDACTOR_VERSION
 from app.ingest.models import UploadFile
-from app.ingest.receiving import MEDIA_TYPE, BetaStated, Kept, Receiver
+from app.ingest.receiving import ASIDE, MEDIA_TYPE, BetaStated, Kept, Receiver
 from app.ingest.service import UploadOutcome
 from app.platform import files
 from app.platform.database import now, set_reason
@@ -139,7 +139,7 @@ def _original(file: UploadFile) -> Iterator[Path]:
         except (InvalidToken, OSError) as error:
             mend = "Restore the data folder, with its keys, from a backup."
             raise Conflict(f"The encrypted bytes of file {file.id} are missing or damaged.", mend) from error
-        if files.hash_file(raw)[0] != file.original_sha256:
+        if files.hash_file(raw)[0] != file.report.get(ASIDE, file.original_sha256):
             raise Conflict(f"The bytes of file {file.id} are not those that came: their hash differs.", "Restore a backup.")
         yield raw
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import zipfile
 from collections import Counter
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import cast
@@ -36,7 +37,18 @@ EMPTY = UndecodableFile("the file is empty", "0 bytes", "Send the file again fro
 CUT_SHORT = UndecodableFile(
     "the service was stopped while it took this file", "file", "Read it again on the page of the quarantine, or send it again."
 )
+LETHAL = 2
+"""So many times a process may end while it reads a file, or makes sessions of an upload; then that is not tried again by itself."""
+ENDED_THE_SERVICE = UndecodableFile(
+    f"the service ended {LETHAL} times while it read this file: it may ask for more memory than there is",
+    "file",
+    "Look at it on the page of the quarantine. Send it again with what is wrong mended, or read it again when the service was mended.",
+)
 TAKEN_UP = "The service was stopped while it read this file and has read it from the kept bytes since; what was removed is not told again."
+BEGUN = "begun"
+"""Member of a file's report: how often reading it was begun, while it is being read."""
+ASIDE = "aside_sha256"
+"""Member of a file's report: hash of its bytes without identity, where these are what the quarantine holds, and not the original."""
 TABLES = ("csv", "parquet")
 MEDIA_TYPE = "application/octet-stream"
 
@@ -124,7 +136,7 @@ class Receiver:
             stored_sha256=kept.stored_sha256,
             quarantine_sha256=kept.quarantine_sha256,
             redactor_version=REDACTOR_VERSION,
-            report={},
+            report={BEGUN: 1},
         )
         self.db.add(row)
         self.db.commit()  # the bytes are safe from here on, whatever the decoder does with them
@@ -147,6 +159,11 @@ class Receiver:
         if row.status != "received":
             return FileOutcome(row.name, row, stored_reports(row), recordings=self._recordings(row))
         sealed = row.stored_sha256 is None or row.stored_sha256 == row.quarantine_sha256
+        if not sealed and row.report.get(BEGUN, 0) >= LETHAL:
+            return self._put_aside(row)
+        # committed before the file is read, so that it is known whom to blame when that ends the process
+        row.report = {BEGUN: row.report.get(BEGUN, 0) + 1}
+        self.db.commit()
         outcome = self.decode(
             row.name, row, Kept(row.kind, row.stored_sha256, row.quarantine_sha256, Redaction(), CUT_SHORT if sealed else None)
         )
@@ -154,6 +171,15 @@ class Receiver:
             outcome.reports[0].understood.append(TAKEN_UP)
             store_reports(row, outcome.reports, known_recordings(row))
         return outcome
+
+    def _put_aside(self, row: UploadFile) -> FileOutcome:
+        """Into quarantine with a file that ends the process which reads it; a person decides on it there."""
+        assert row.stored_sha256 is not None
+        log.error("file put aside: reading it ended the service", upload_file=row.id, times=row.report[BEGUN])
+        stored = row.stored_sha256
+        if row.quarantine_sha256 is None:
+            row.quarantine_sha256, row.report = self._seal(files.path_of(stored)), {ASIDE: stored}
+        return self._failed(row.name, row, Kept(row.kind, stored, row.quarantine_sha256, Redaction(), None), ENDED_THE_SERVICE)
 
     def _keep(self, raw: Path) -> Kept:
         """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted.
@@ -277,12 +303,15 @@ def _stated_by_a_person(trace: TraceLog) -> bool:
 
 def store_reports(row: UploadFile, reports: Sequence[FileReport], known: Sequence[int] = ()) -> None:
     """Keep a file's reports, and which of its recordings had come before in other files."""
-    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known)}
+    aside = {ASIDE: row.report[ASIDE]} if ASIDE in (row.report or {}) else {}
+    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known), **aside}
 
 
 def stored_reports(row: UploadFile) -> list[FileReport]:
     """The reports of a file as they were stored."""
-    return [FileReport(**{**r, "problem": Problem(**r["problem"]) if r["problem"] else None}) for r in row.report.get("reports", [])]
+    # a copy: sentences appended to the stored lists themselves would not be seen as a change, and not be written
+    stored = deepcopy(row.report.get("reports", []))
+    return [FileReport(**{**r, "problem": Problem(**r["problem"]) if r["problem"] else None}) for r in stored]
 
 
 def known_recordings(row: UploadFile) -> list[int]:

@@ -28,6 +28,8 @@ MDP_FIELDS = (
 )  # fmt: skip
 
 RESERVED_CODES = {"new"}
+SIGNED_UNITS = {"dB", "z"}
+"""Units in which a beta may be negative: logarithms and standard scores."""
 POLICY_CONTROLLERS = {Controller.RL, Controller.DISTILLED, Controller.OTHER}
 """Controllers that a policy can stand behind."""
 
@@ -303,6 +305,12 @@ def _add_settings(db: Session, participant: Participant, values: dict[str, Any],
         MdpSettings(xi_beta=values["xi_beta"] if values["xi_beta"] is not None else 0.0, **{n: values[n] for n in MDP_FIELDS})
     except ValueError as error:
         raise Invalid(f"{error}.", "Correct the settings.") from error
+    xi_beta, unit = values["xi_beta"], values["beta_unit"]
+    if xi_beta is not None and xi_beta <= 0 and unit not in SIGNED_UNITS:
+        raise Invalid(
+            f"A beta threshold of {xi_beta:g} {unit or ''} cannot be: an amplitude or a power is positive.".replace("  ", " "),
+            f"Give one above 0, or state the unit of a beta that may be negative: {', '.join(sorted(SIGNED_UNITS))}.",
+        )
     if values["beta_low_hz"] >= values["beta_high_hz"]:
         raise Invalid(
             f"The beta band {values['beta_low_hz']:g}-{values['beta_high_hz']:g} Hz is empty.", "Set beta_low_hz below beta_high_hz."

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from app.ingest.formats.log import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
 from app.ingest.formats.numbers import shown, unit_name
 from app.ingest.formats.options import DecodeOptions
-from app.ingest.formats.table_columns import TIME_SCALE, Columns, checked_amplitude, compare_amplitudes, read_csv, read_parquet
+from app.ingest.formats.table_columns import TIME_SCALE, Columns, check_reach, checked_amplitude, compare_amplitudes, read_csv, read_parquet
 from app.ingest.formats.table_lfp import decode_lfp
 
 GRID_TOLERANCE = 0.01
@@ -65,6 +65,7 @@ def _times(columns: Columns, options: DecodeOptions) -> NDArray[np.float64]:
         i = int(back[0]) + 1
         what = "appears twice" if t_s[i] == t_s[i - 1] else f"comes after {t_s[i - 1]:g} s"
         raise columns.error(f"times must increase: {t_s[i]:g} s {what}", "t_s", "Sort the rows by t_s; keep one row per time.", i)
+    check_reach(t_s, columns)
     if not np.any(t_s > GRID_TOLERANCE * options.period_s):
         raise columns.error("no row with t_s > 0", "t_s", "Rows with t_s <= 0 are the window before the session; add the session.")
     return t_s
