@@ -95,7 +95,7 @@ def test_unix_times_are_refused_with_what_to_do(send: Send, factor: int, unit: s
     assert "Give t_s in seconds from the session's start" in repr(problem)
 
 
-@pytest.mark.parametrize("first", [-1e6, 1e6, 5e12, 1e300])
+@pytest.mark.parametrize("first", [-1e6, 1e6, 2e11, 1e300])
 def test_times_far_from_the_start_are_refused(send: Send, first: float) -> None:
     rows: list[Any] = sorted([(first, 1.0, 1.0), (2.0, 1.0, 1.0)])
     answer = send(("t.csv", table(rows)), visit=1, controller="cdbs")
