@@ -97,6 +97,37 @@ def test_posts_from_another_site_are_refused(browser: TestClient) -> None:
     assert browser.get("/participants/EVIL").status_code == 404
 
 
+@pytest.mark.parametrize("authorization", ["Basic x", "Bearer x", "Bearer ", "x"])
+def test_an_authorization_header_beside_the_cookie_lets_no_other_site_in(browser: TestClient, authorization: str) -> None:
+    headers = {"Sec-Fetch-Site": "cross-site", "Origin": "https://evil.example", "Authorization": authorization}
+    for path in ("/participants", "/sign-out", "/account/tokens"):
+        assert browser.post(path, data={"code": "EVIL", "name": "evil"}, headers=headers).status_code == 403, path
+    assert browser.get("/").status_code == 200
+
+
+def test_a_server_error_has_every_header_and_logs_no_values(
+    service_app,
+    sign_in: Callable[[str], TestClient],
+    capsys: pytest.CaptureFixture[str],  # type: ignore[no-untyped-def]
+) -> None:
+    from sqlalchemy import text
+
+    from app.platform.database import new_session
+
+    @service_app.get("/broken")
+    def broken() -> None:
+        with new_session() as db:
+            db.execute(text("select 1 / cast(:zero as integer), cast(:name as text)"), {"zero": 0, "name": "NAME-OF-THE-PATIENT"})
+
+    answer = TestClient(service_app, raise_server_exceptions=False).get("/broken")
+    assert answer.status_code == 500
+    assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
+    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    assert answer.headers["X-Request-ID"] in answer.json()["mend"]
+    printed = capsys.readouterr()
+    assert "NAME-OF-THE-PATIENT" not in printed.out + printed.err
+
+
 def test_a_token_is_shown_once_works_and_can_be_revoked(browser: TestClient, service_app) -> None:  # type: ignore[no-untyped-def]
     page = browser.post("/account/tokens", data={"name": "upload <tablet>"}).text
     token = re.search(r"blp_[\w-]+", page)
