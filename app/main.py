@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from importlib import import_module
 from typing import Any
 
 import plotly
+import structlog
 from fastapi import APIRouter, FastAPI, Response
 from fastapi.openapi.utils import get_openapi
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from sqlalchemy import text
+from starlette.concurrency import run_in_threadpool
 
 from app import __version__
 from app.platform.database import Db
+from app.platform.files import remove_abandoned
 from app.platform.tables import load_tables
 from app.platform.web import middleware as web
 from app.platform.web.compressed import CompressedFiles
 from app.platform.web.templates import STATIC
+
+log = structlog.get_logger()
 
 API_MODULES = (
     "app.study.api",
@@ -68,7 +75,9 @@ class _Static(StaticFiles):
 def create_app() -> FastAPI:
     """Build the service. The database is reached at the first request, not here."""
     load_tables()
-    app = FastAPI(title="betaloop", version=__version__, openapi_url="/api/v1/openapi.json", docs_url=None, redoc_url=None)
+    app = FastAPI(
+        title="betaloop", version=__version__, openapi_url="/api/v1/openapi.json", docs_url=None, redoc_url=None, lifespan=_lifespan
+    )  # fmt: skip
     web.install(app)
     api = APIRouter(prefix="/api/v1")
     for name in API_MODULES:
@@ -81,6 +90,15 @@ def create_app() -> FastAPI:
     app.mount("/static", _Static(directory=STATIC))
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
+
+
+@asynccontextmanager
+async def _lifespan(_: FastAPI) -> AsyncIterator[None]:
+    """At the start of the service: what killed processes left of incoming files goes, also so that it cannot keep a full disk full."""
+    removed = await run_in_threadpool(remove_abandoned)
+    if removed:
+        log.info("abandoned incoming files removed", files=removed)
+    yield
 
 
 def _service_routes() -> APIRouter:

@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts import repository, service
+from app.accounts.addresses import normal_address
 from app.accounts.deps import COOKIE, CurrentCaller
 from app.accounts.models import Role, User
 from app.accounts.permissions import Caller
@@ -37,10 +38,9 @@ def sign_in(request: Request, db: Db, values: FormValues) -> Response:
     """Open a browser session."""
     email, target = str(values.get("email", "")), local_path(str(values.get("next", "/")))
     try:
+        set_actor(db, normal_address(email) or "unknown", request_id=request.state.request_id)
         token = service.sign_in(db, email, str(values.get("password", "")))
-        set_actor(db, email.strip().lower(), request_id=request.state.request_id)
     except BetaloopError as error:
-        db.commit()  # failures count
         page = render(request, "accounts/sign_in.html", problem=error.problem(request.url.path), email=email, next=target)
         return HTMLResponse(page, error.status)
     db.commit()

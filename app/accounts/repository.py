@@ -5,16 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import datetime, timedelta
 
-from sqlalchemy import delete, func, select
+from sqlalchemy import delete, func, select, text
 from sqlalchemy.orm import Session, selectinload
 
+from app.accounts.addresses import normal_address
 from app.accounts.models import ApiToken, SignIn, SignInAttempt, Study, User
 from app.platform.database import now
 
 
 def user_by_email(db: Session, email: str) -> User | None:
-    """The user of an address, in any case of letters."""
-    return db.scalar(select(User).where(User.email == email.strip().lower()))
+    """The user of an address, however it is typed; None for what no address can be."""
+    address = normal_address(email)
+    if address is None:
+        return None
+    # users of earlier versions were stored with small letters alone
+    spellings = {address, email.strip().lower()}
+    return db.scalar(select(User).where(User.email.in_(spellings)).order_by(User.email != address).limit(1))
 
 
 def users(db: Session) -> Sequence[User]:
@@ -62,6 +68,17 @@ def recent_failures(db: Session, email: str, within: timedelta) -> int:
     return db.scalar(select(func.count()).select_from(SignInAttempt).where(recent)) or 0
 
 
-def forget_failures(db: Session, email: str) -> None:
-    """Drop the failures of an address after a good sign-in."""
-    db.execute(delete(SignInAttempt).where(SignInAttempt.email == email))
+def lock_address(db: Session, email: str) -> None:
+    """Let one transaction at a time count the tries of an address."""
+    db.execute(text("select pg_advisory_xact_lock(hashtextextended(:key, 0))"), {"key": f"sign-in:{email}"})
+
+
+def prune_failures(db: Session, older_than: timedelta) -> None:
+    """Remove tries of every address that count no more; those that another transaction removes are left to it."""
+    old = select(SignInAttempt.id).where(SignInAttempt.at <= now() - older_than).with_for_update(skip_locked=True)
+    db.execute(delete(SignInAttempt).where(SignInAttempt.id.in_(old)))
+
+
+def forget_failures(db: Session, attempt: SignInAttempt) -> None:
+    """Drop a try that was right, and the failures of its address before it."""
+    db.execute(delete(SignInAttempt).where(SignInAttempt.email == attempt.email, SignInAttempt.id <= attempt.id))

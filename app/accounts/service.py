@@ -13,6 +13,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts import repository
+from app.accounts.addresses import LONGEST_ADDRESS, normal_address
 from app.accounts.models import ApiToken, Membership, Role, SignIn, SignInAttempt, Study, User
 from app.accounts.permissions import MANAGE_ACCOUNTS, PERMISSIONS, READ_AUDIT, Caller, Grant
 from app.platform.database import now
@@ -36,9 +37,10 @@ def _decoy() -> str:
 
 def add_user(db: Session, email: str, role: Role, password: str, study_code: str | None = None, name: str = "") -> User:
     """Make a user with a role in a study (the only one, unless named)."""
-    email = email.strip().lower()
-    if not re.fullmatch(r"[^@\s]+@[^@\s]+", email) or len(email) > 254:
-        raise Invalid(f"'{email}' is no e-mail address.", "Give one like name@clinic.example.")
+    address = normal_address(email)
+    if address is None or not re.fullmatch(r"[^@\s]+@[^@\s]+", address):
+        raise Invalid(f"{email.strip()[:LONGEST_ADDRESS]!r} is no e-mail address.", "Give one like name@clinic.example.")
+    email = address
     if repository.user_by_email(db, email):
         raise Conflict(f"There is already a user {email}.")
     check_password(password)
@@ -100,24 +102,36 @@ def set_active(db: Session, user: User, active: bool, caller: Caller) -> None:
 def sign_in(db: Session, email: str, password: str) -> str:
     """Check a password and open a browser session; returns the cookie's token.
 
-    The caller commits also when this raises, so that failures count.
+    Every try is counted, and committed, before its password is looked at, and taken back when it was right: however many come at once,
+    no more than FAILURES_ALLOWED of an address are judged within FAILURE_WINDOW. The caller commits the session.
 
     Raises:
         TooMany: too many failures of this address lately. Unauthorized: wrong address or password.
     """
-    email = email.strip().lower().replace("\0", "")[:254]
-    if repository.recent_failures(db, email, FAILURE_WINDOW) >= FAILURES_ALLOWED:
-        raise TooMany(f"Too many failed sign-ins for {email}.", f"Wait {FAILURE_WINDOW.seconds // 60} minutes and try again.")
+    address = normal_address(email)
     user = repository.user_by_email(db, email)
+    attempt = _count_attempt(db, user.email if user else address) if address else None
     # an unknown address costs the same time as a wrong password, so that addresses cannot be guessed by the clock
     ok = _hasher.verify(password, user.password_hash if user else _decoy())
-    if not (ok and user and user.active):
-        db.add(SignInAttempt(email=email))
+    if not (ok and user and user.active and attempt):
         raise Unauthorized("The e-mail address or the password is wrong.")
-    repository.forget_failures(db, email)
+    repository.forget_failures(db, attempt)
     token = secrets.token_urlsafe(32)
     db.add(SignIn(token_sha256=_hash(token), user_id=user.id))
     return token
+
+
+def _count_attempt(db: Session, address: str) -> SignInAttempt:
+    """Count a try of an address, and commit. Raises TooMany where it has used up its tries; such a try is not counted."""
+    repository.lock_address(db, address)
+    repository.prune_failures(db, FAILURE_WINDOW)
+    if repository.recent_failures(db, address, FAILURE_WINDOW) >= FAILURES_ALLOWED:
+        db.commit()
+        raise TooMany(f"Too many failed sign-ins for {address}.", f"Wait {FAILURE_WINDOW.seconds // 60} minutes and try again.")
+    attempt = SignInAttempt(email=address)
+    db.add(attempt)
+    db.commit()
+    return attempt
 
 
 def sign_out(db: Session, token: str) -> None:

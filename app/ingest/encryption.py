@@ -19,9 +19,13 @@ def _cipher() -> Fernet:
 def encrypt(path: Path) -> Path:
     """A draft file with the encrypted bytes of `path`, one line per MiB; the original is left where it is."""
     cipher, sealed = _cipher(), draft_path()
-    with path.open("rb") as source, sealed.open("wb") as out:
-        while chunk := source.read(CHUNK):
-            out.write(cipher.encrypt(chunk) + b"\n")
+    try:
+        with path.open("rb") as source, sealed.open("wb") as out:
+            while chunk := source.read(CHUNK):
+                out.write(cipher.encrypt(chunk) + b"\n")
+    except BaseException:
+        sealed.unlink(missing_ok=True)
+        raise
     return sealed
 
 

@@ -11,6 +11,8 @@ from app.learning import repository
 from app.learning.models import BufferSnapshot, Policy, Sweep
 from app.platform.database import Db
 from app.platform.web.schemas import RowId
+from app.study import service as study
+from app.study.deps import CurrentParticipant
 
 
 def current_policy(policy_id: RowId, db: Db, caller: CurrentCaller) -> Policy:
@@ -23,7 +25,15 @@ def current_snapshot(snapshot_id: RowId, db: Db, caller: CurrentCaller) -> Buffe
     return repository.snapshot(db, snapshot_id, caller)
 
 
+def current_own_policy(participant: CurrentParticipant, policy_id: RowId, db: Db, caller: CurrentCaller) -> Policy:
+    """The policy that the path names after its participant. Raises NotFound for another participant's."""
+    policy = repository.policy(db, policy_id, caller)
+    study.require_own(participant, policy, f"policy {policy_id}")
+    return policy
+
+
 CurrentPolicy = Annotated[Policy, Depends(current_policy)]
+CurrentOwnPolicy = Annotated[Policy, Depends(current_own_policy)]
 
 
 CurrentSnapshot = Annotated[BufferSnapshot, Depends(current_snapshot)]

@@ -44,13 +44,19 @@ def start_job(db: Session, participant: Participant, kind: str, params: Mapping[
 
 
 def retry_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
-    """A new job with the same params. Raises Conflict while the job has not ended, or another one repeats it."""
+    """A new job with the same params.
+
+    Raises:
+        Conflict: the job has not ended, or another one repeats it. NotFound: it is another participant's.
+    """
     study.require(caller, can.RUN_JOBS, participant)
+    study.require_own(participant, job, f"job {job.id}")
     job = jobs.repeatable(db, job)
     return start_job(db, participant, job.kind, job.params, caller)
 
 
 def cancel_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
-    """Cancel a job. Raises Conflict when it has ended."""
+    """Cancel a job. Raises Conflict when it has ended, NotFound for another participant's."""
     study.require(caller, can.RUN_JOBS, participant)
+    study.require_own(participant, job, f"job {job.id}")
     return jobs.cancel(db, job, caller.label)

@@ -74,7 +74,7 @@ def get_engine() -> Engine:
     url = database_url()
     with _lock:
         if url not in _engines:
-            _engines[url] = create_engine(url, pool_pre_ping=True, pool_size=10, max_overflow=20)
+            _engines[url] = create_engine(url, pool_pre_ping=True, pool_size=10, max_overflow=20, hide_parameters=True)
         return _engines[url]
 
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import secrets
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO
@@ -17,6 +22,8 @@ from app.platform.database import Base
 from app.settings import get_settings, private_folder
 
 CHUNK = 1 << 20
+_LOCK = ".lock"
+_OPEN_FILES = Path("/proc/self/fd")
 
 
 class StoredFile(Base):
@@ -40,10 +47,97 @@ def path_of(sha256: str) -> Path:
     return get_settings().files_dir / sha256[:2] / sha256
 
 
+_own_folder: list[tuple[Path, int]] = []
+"""This process's folder of drafts, once it has one, and the descriptor that holds its lock until the process ends."""
+_folder_guard = threading.Lock()
+
+
 def draft_path() -> Path:
-    """A fresh path inside the store's folder, on the same file system, for bytes whose hash is not yet known."""
-    folder = private_folder(private_folder(get_settings().files_dir) / "incoming")
-    return folder / secrets.token_hex(16)
+    """A fresh, empty file inside the store's folder, on the same file system, for bytes whose hash is not yet known.
+
+    It lies in a folder of this process, both readable by the owner only; what a killed process leaves there, `remove_abandoned` removes.
+    Bytes that may name a person do not belong here, but into `nameless_file`.
+    """
+    path = _draft_folder() / secrets.token_hex(16)
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+    return path
+
+
+def _incoming() -> Path:
+    return get_settings().files_dir / "incoming"
+
+
+def _draft_folder() -> Path:
+    """This process's folder of drafts, locked as long as the process lives."""
+    incoming = _incoming().resolve()
+    with _folder_guard:
+        if _own_folder:
+            folder, lock = _own_folder[0]
+            if folder.parent == incoming and folder.exists():
+                return folder
+            os.close(lock)
+            _own_folder.clear()
+        private_folder(private_folder(get_settings().files_dir) / "incoming")
+        while True:
+            folder = incoming / secrets.token_hex(8)
+            folder.mkdir(mode=0o700)
+            # somebody who clears up may look between any two of these lines: then this folder is theirs, and another one is made
+            if (taken := _locked(folder)) is not None:
+                _own_folder.append((folder, taken))
+                return folder
+
+
+def _locked(folder: Path) -> int | None:
+    """A descriptor that holds the folder's lock; None where another process holds it, or has removed the folder."""
+    try:
+        lock = os.open(folder / _LOCK, os.O_CREAT | os.O_RDWR, 0o600)
+    except FileNotFoundError:
+        return None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(lock).st_ino == (folder / _LOCK).stat().st_ino:
+            return lock
+    except (BlockingIOError, FileNotFoundError):
+        pass
+    os.close(lock)
+    return None
+
+
+def remove_abandoned() -> int:
+    """Remove the drafts of processes that live no more, and those of earlier versions; how many files that were."""
+    incoming, removed = _incoming(), 0
+    for entry in sorted(incoming.iterdir()) if incoming.is_dir() else []:
+        if not entry.is_dir():
+            # earlier versions wrote straight into the folder; none of them runs on the same data folder any more
+            entry.unlink(missing_ok=True)
+            removed += 1
+            continue
+        lock = _locked(entry)
+        if lock is None:
+            continue
+        try:
+            removed += sum(1 for f in entry.iterdir() if f.name != _LOCK)
+            shutil.rmtree(entry)
+        finally:
+            os.close(lock)
+    return removed
+
+
+@contextmanager
+def nameless_file() -> Iterator[tuple[BinaryIO, Path]]:
+    """A file without a name for raw bytes, and a path by which this process, and no other user, can open it again.
+
+    It is gone when the context ends and when the process is killed, at whatever moment: nobody has to clear up.
+    """
+    draft = draft_path()
+    with draft.open("w+b", buffering=0) as file:
+        named = not (_OPEN_FILES / str(file.fileno())).exists()
+        if not named:
+            draft.unlink()
+        try:
+            yield file, draft if named else _OPEN_FILES / str(file.fileno())
+        finally:
+            draft.unlink(missing_ok=True)
 
 
 def store(db: Session, content: bytes | Path, media_type: str) -> StoredFile:
@@ -52,18 +146,20 @@ def store(db: Session, content: bytes | Path, media_type: str) -> StoredFile:
     The bytes are on disk, fsynced, before the row exists, so that a committed row always has its file.
     """
     draft = content if isinstance(content, Path) else draft_path()
-    if isinstance(content, bytes):
-        draft.write_bytes(content)
-    sha256, size = hash_file(draft)
-    target = path_of(sha256)
-    if target.exists():
-        draft.unlink()
-    else:
-        draft.chmod(0o600)
-        _sync(draft)
-        private_folder(target.parent)
-        draft.rename(target)
-        _sync(target.parent)
+    try:
+        if isinstance(content, bytes):
+            draft.write_bytes(content)
+        sha256, size = hash_file(draft)
+        target = path_of(sha256)
+        if not target.exists():
+            draft.chmod(0o600)
+            _sync(draft)
+            private_folder(target.parent)
+            draft.rename(target)
+            _sync(target.parent)
+    finally:
+        # also where the disk is full: what cannot be stored must not keep it full
+        draft.unlink(missing_ok=True)
     db.execute(insert(StoredFile).values(sha256=sha256, size=size, media_type=media_type).on_conflict_do_nothing())
     return db.get_one(StoredFile, sha256)
 
@@ -83,22 +179,29 @@ def read(sha256: str) -> bytes:
     return content
 
 
-def receive(stream: BinaryIO, limit: int) -> tuple[Path, str, int]:
-    """Copy a stream to a draft file without holding it in memory; returns path, SHA-256 and size.
+@contextmanager
+def received(stream: BinaryIO, limit: int) -> Iterator[tuple[Path, str, int]]:
+    """Copy a stream to a `nameless_file` without holding it in memory; gives path, SHA-256 and size, valid inside the context.
 
     Raises:
-        OverflowError: more than `limit` bytes; the draft is removed.
+        OverflowError: more than `limit` bytes.
     """
-    path, digest, size = draft_path(), hashlib.sha256(), 0
-    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as out:
+    digest, size = hashlib.sha256(), 0
+    with nameless_file() as (out, path):
         while chunk := stream.read(CHUNK):
             size += len(chunk)
             if size > limit:
-                path.unlink()
                 raise OverflowError(f"more than {limit} bytes")
             digest.update(chunk)
-            out.write(chunk)
-    return path, digest.hexdigest(), size
+            write_all(out, chunk)
+        yield path, digest.hexdigest(), size
+
+
+def write_all(out: BinaryIO, content: bytes) -> None:
+    """Write all bytes to an unbuffered file. Raises OSError, e.g. where the disk is full."""
+    left = memoryview(content)
+    while left:
+        left = left[out.write(left) :]
 
 
 def close_to_others() -> None:

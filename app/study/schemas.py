@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import datetime as dt
 from datetime import datetime
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, Field, StringConstraints
+from pydantic import AfterValidator, ConfigDict, Field, StringConstraints, ValidationInfo, field_validator
+from pydantic_core import PydanticCustomError
 
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
@@ -23,33 +24,89 @@ BetaSource = Literal["time_domain", "device_power", "percept_lfp", "table"]
 Code = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$")]
 
 
-class SettingsIn(Model):
-    """Settings of a participant; what is left out keeps its present value (for a new participant: its default)."""
+class Bound(NamedTuple):
+    """What a number may be: from `low` to `high` in `unit`, both allowed; where it is not 0, its magnitude is `least` at the least."""
 
-    xi_beta: Number | None = Field(None, ge=-1e9, le=1e9, description="Beta threshold in the unit of the beta trace; jobs need it.")
+    low: float
+    high: float
+    unit: str = ""
+    least: float = 0.0
+
+    def check(self, value: float) -> float:
+        """The value. Raises PydanticCustomError, which a form and the interface tell as it stands, outside the bounds."""
+        if self.low <= value <= self.high and (value == 0 or abs(value) >= self.least):
+            return value
+        words = f"must lie between {self.low:g} and {self.high:g} {self.unit}".rstrip()
+        if self.low <= value <= self.high:
+            words = f"must be 0, or at least {self.least:g} {self.unit} in magnitude".replace("  ", " ")
+        raise PydanticCustomError("out_of_bounds", "{value} {words}", {"value": f"{value:g}", "words": words})
+
+
+CDBS_MA = Bound(0.1, 25.5, "mA")
+"""25.5 mA is the most that a stimulator like RC+S or Percept gives, and 0.1 mA its smallest step."""
+SETTING_BOUNDS = {
+    "xi_beta": Bound(-1e9, 1e9, "in the unit of beta", 1e-12),
+    "window": Bound(1, 500, "steps"),
+    "period_s": Bound(0.1, 600, "s"),
+    "r_a": Bound(-1e6, 1e6, "", 1e-6),
+    "r_b": Bound(-1e6, 1e6, "", 1e-6),
+    "c1": Bound(0, 1e6, "", 1e-6),
+    "c2": Bound(0, 1e6, "", 1e-6),
+    "c3": Bound(0, 1e6, "", 1e-6),
+    "c4": Bound(0, 1e6, "", 1e-6),
+    "gamma": Bound(0, 0.9999, "per step", 1e-6),
+    "lower_bound": Bound(0.01, 0.99, "of the cDBS amplitude"),
+    "cdbs_amplitude_ma": CDBS_MA,
+    "beta_low_hz": Bound(1, 500, "Hz"),
+    "beta_high_hz": Bound(1, 500, "Hz"),
+    "min_valid_fraction": Bound(0.01, 1),
+}
+"""Clinical bounds of what may be set from now on; versions of before may lie outside of them, and are shown as they are."""
+
+
+def _publish_bounds(schema: dict[str, Any]) -> None:
+    for name, bound in SETTING_BOUNDS.items():
+        schema["properties"][name] |= {"minimum": bound.low, "maximum": bound.high}
+
+
+class SettingsFields(Model):
+    """Settings of a participant."""
+
+    xi_beta: Number | None = Field(None, description="Beta threshold in the unit of the beta trace; jobs need it.")
     beta_unit: Unit | None = Field(None, min_length=1, max_length=40, description="Unit of the beta trace, e.g. uV or 'device units'.")
     beta_source: BetaSource | None = Field(None, description="Where beta comes from; sources are never mixed.")
-    window: Int = Field(10, ge=1, le=500, description="W, beta amplitudes in a state.")
-    period_s: Number = Field(2.0, ge=0.1, le=600, description="m, seconds per step.")
-    r_a: Number = Field(0.0, ge=-1e6, le=1e6, description="Reward below the threshold.")
-    r_b: Number = Field(-1.0, ge=-1e6, le=1e6, description="Reward at or above the threshold.")
-    c1: Number = Field(0.3, ge=0, le=1e6, description="Price of amplitude, C1.")
-    c2: Number = Field(10.0, ge=0, le=1e6, description="Weight of the grasp frequency in r_end, C2; 0 drops it.")
-    c3: Number = Field(10.0, ge=0, le=1e6, description="Weight of the rating, C3; 0 drops it.")
-    c4: Number = Field(10.0, ge=0, le=1e6, description="Weight of tremor, C4; 0 drops it.")
-    gamma: Number = Field(0.99, ge=0, lt=1, description="Discount per step.")
-    lower_bound: Number = Field(0.3, ge=0, lt=1, description="B, lowest fraction of the random controller; never bounds a policy.")
+    window: Int = Field(10, description="W, beta amplitudes in a state.")
+    period_s: Number = Field(2.0, description="m, seconds per step.")
+    r_a: Number = Field(0.0, description="Reward below the threshold.")
+    r_b: Number = Field(-1.0, description="Reward at or above the threshold.")
+    c1: Number = Field(0.3, description="Price of amplitude, C1.")
+    c2: Number = Field(10.0, description="Weight of the grasp frequency in r_end, C2; 0 drops it.")
+    c3: Number = Field(10.0, description="Weight of the rating, C3; 0 drops it.")
+    c4: Number = Field(10.0, description="Weight of tremor, C4; 0 drops it.")
+    gamma: Number = Field(0.99, description="Discount per step.")
+    lower_bound: Number = Field(0.3, description="B, lowest fraction of the random controller; never bounds a policy.")
     tremor_as_fraction: Bool = Field(True, description="Tremor enters r_end as 0-1 instead of per cent.")
-    cdbs_amplitude_ma: Number | None = Field(None, gt=0, le=25.5, description="cDBS amplitude where a visit states none, mA.")
-    beta_low_hz: Number = Field(13.0, gt=0, description="Lower edge of the beta band, Hz.")
-    beta_high_hz: Number = Field(35.0, gt=0, description="Upper edge of the beta band, Hz.")
-    min_valid_fraction: Number = Field(0.7, gt=0, le=1, description="Share of its samples that a 2 s window needs to be valid.")
+    cdbs_amplitude_ma: Number | None = Field(None, description="cDBS amplitude where a visit states none, mA.")
+    beta_low_hz: Number = Field(13.0, description="Lower edge of the beta band, Hz.")
+    beta_high_hz: Number = Field(35.0, description="Upper edge of the beta band, Hz.")
+    min_valid_fraction: Number = Field(0.7, description="Share of its samples that a 2 s window needs to be valid.")
     beta_measure: BetaMeasure = Field(
         "rms", description="Beta from time-domain LFP: 'rms' amplitude (in its unit) or 'power' (unit squared)."
     )
 
 
-class SettingsOut(SettingsIn):
+class SettingsIn(SettingsFields):
+    """Settings of a participant; what is left out keeps its present value (for a new participant: its default)."""
+
+    model_config = ConfigDict(json_schema_extra=_publish_bounds)
+
+    @field_validator(*SETTING_BOUNDS)
+    @classmethod
+    def _within_bounds(cls, value: float | None, info: ValidationInfo) -> float | None:
+        return value if value is None else SETTING_BOUNDS[str(info.field_name)].check(value)
+
+
+class SettingsOut(SettingsFields):
     """A settings version."""
 
     version: int
@@ -83,12 +140,20 @@ class ParticipantOut(Model):
     settings: SettingsOut
 
 
-class CdbsAmplitudeModel(Model):
+class CdbsAmplitudeOut(Model):
     """cDBS amplitude in force at a visit."""
 
     hemisphere: Hemisphere
     program: Int = Field(0, ge=0, le=3)
-    amplitude_ma: Number = Field(gt=0, le=25.5)
+    amplitude_ma: Number
+
+
+class CdbsAmplitudeModel(CdbsAmplitudeOut):
+    """cDBS amplitude to state for a visit."""
+
+    amplitude_ma: Annotated[
+        Number, AfterValidator(CDBS_MA.check), Field(json_schema_extra={"minimum": CDBS_MA.low, "maximum": CDBS_MA.high})
+    ]
 
 
 class VisitIn(Model):
@@ -117,7 +182,7 @@ class VisitOut(Model):
     number: int
     date: dt.date | None
     note: str
-    cdbs_amplitudes: list[CdbsAmplitudeModel]
+    cdbs_amplitudes: list[CdbsAmplitudeOut]
 
 
 class QocIn(Model):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from sqlalchemy import select
@@ -29,6 +29,8 @@ MDP_FIELDS = (
 )  # fmt: skip
 
 RESERVED_CODES = {"new"}
+SIGNED_UNITS = {"dB", "z"}
+"""Units in which a beta may be negative: logarithms and standard scores."""
 POLICY_CONTROLLERS = {Controller.RL, Controller.DISTILLED, Controller.OTHER}
 """Controllers that a policy can stand behind."""
 
@@ -283,11 +285,38 @@ def may(caller: Caller, permission: str, participant: Participant) -> bool:
     return caller.may(permission, participant.site.study_id, participant.site_id)
 
 
+class Owned(Protocol):
+    """A row of one participant."""
+
+    @property
+    def participant_id(self) -> int | None:
+        """Whose it is."""
+
+
+def require_own(participant: Participant, row: Owned, name: str) -> None:
+    """Objects that are named together belong together.
+
+    Args:
+        participant: whose object it should be. row: the object. name: what to call it, e.g. "policy 7".
+
+    Raises:
+        NotFound: it is another participant's.
+    """
+    if row.participant_id != participant.id:
+        raise NotFound(f"Participant {participant.code} has no {name}.", "Choose one from the participant's own list.")
+
+
 def _add_settings(db: Session, participant: Participant, values: dict[str, Any], caller: Caller, reason: str | None) -> SettingsVersion:
     try:
         MdpSettings(xi_beta=values["xi_beta"] if values["xi_beta"] is not None else 0.0, **{n: values[n] for n in MDP_FIELDS})
     except ValueError as error:
         raise Invalid(f"{error}.", "Correct the settings.") from error
+    xi_beta, unit = values["xi_beta"], values["beta_unit"]
+    if xi_beta is not None and xi_beta <= 0 and unit not in SIGNED_UNITS:
+        raise Invalid(
+            f"A beta threshold of {xi_beta:g} {unit or ''} cannot be: an amplitude or a power is positive.".replace("  ", " "),
+            f"Give one above 0, or state the unit of a beta that may be negative: {', '.join(sorted(SIGNED_UNITS))}.",
+        )
     if values["beta_low_hz"] >= values["beta_high_hz"]:
         raise Invalid(
             f"The beta band {values['beta_low_hz']:g}-{values['beta_high_hz']:g} Hz is empty.", "Set beta_low_hz below beta_high_hz."

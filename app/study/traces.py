@@ -11,9 +11,13 @@ from sqlalchemy.orm import Session
 from app.platform.errors import Invalid
 from app.study import repository
 from app.study.models import Hemisphere, SettingsVersion, StudySession, Trace, Visit
+from app.study.schemas import CDBS_MA
 from ml.mdp import AMPLITUDE_TOLERANCE
 
 AMPLITUDE_STREAM = "amplitude"
+
+MOST_STEPS = 1_000_000
+"""Steps of a session that are laid out: at 2 s three weeks. A session of more has a wrong begin or end."""
 
 
 @dataclass(frozen=True)
@@ -66,22 +70,33 @@ def cdbs_in_force(visit: Visit, hemisphere: Hemisphere | None, settings: Setting
     A program of which the visit says nothing has the amplitude of program 0, under which an amplitude without a program is kept.
 
     Raises:
-        Invalid: the visit states both hemispheres, and it is not known which one is meant.
+        Invalid: the visit states both hemispheres, and it is not known which one is meant; an amplitude that no stimulator gives.
     """
     sides = [a for a in visit.cdbs_amplitudes if hemisphere in (None, a.hemisphere)]
     rows = [a for a in sides if a.program == program] or [a for a in sides if a.program == 0]
     if len(rows) == 1:
-        return rows[0].amplitude_ma
+        return _plausible(rows[0].amplitude_ma, f"Visit {visit.number} states")
     if len(rows) > 1:
         raise Invalid(f"No hemisphere is named, and visit {visit.number} has cDBS amplitudes for both.", "Set the session's hemisphere.")
-    return settings.cdbs_amplitude_ma
+    return _plausible(settings.cdbs_amplitude_ma, "The participant's settings state")
+
+
+def _plausible(amplitude_ma: float | None, who: str) -> float | None:
+    """A stated cDBS amplitude, mA. Raises Invalid for one that earlier versions let in: fractions of it would be no numbers."""
+    if amplitude_ma is None or CDBS_MA.low <= amplitude_ma <= CDBS_MA.high:
+        return amplitude_ma
+    raise Invalid(
+        f"{who} a cDBS amplitude of {amplitude_ma:g} mA, outside {CDBS_MA.low:g} to {CDBS_MA.high:g} mA: no fraction can be told.",
+        "Correct the amplitude.",
+    )
 
 
 def step_table(db: Session, session: StudySession, settings: SettingsVersion) -> StepTable:
     """Beta and amplitude of a session's control channel, with up to W rows before its start.
 
     Raises:
-        Invalid: traces of one recording that do not share a grid, or two segments that claim the same rows.
+        Invalid: a session of more than MOST_STEPS, traces of one recording that do not share a grid, or two segments that claim the same
+            rows.
     """
     period, t_s = settings.period_s, _grid(session, settings)
     beta, amount = np.full(t_s.size, np.nan), np.full(t_s.size, np.nan)
@@ -129,8 +144,14 @@ def amplitude_program(trace: Trace) -> int:
 
 
 def _grid(session: StudySession, settings: SettingsVersion) -> NDArray[np.float64]:
-    """Ends of the session's rows, with W rows before its start, s."""
+    """Ends of the session's rows, with W rows before its start, s. Raises Invalid for a session of more than MOST_STEPS."""
     steps = int(np.floor(session.duration_s / settings.period_s + 1e-6))
+    if steps > MOST_STEPS:
+        raise Invalid(
+            f"Session {session.id} is said to last {session.duration_s:.9g} s: {steps} steps of {settings.period_s:g} s, "
+            f"where {MOST_STEPS} are the most.",
+            "Exclude it, or drop its proposal. Send a table whose times are Unix times again, with seconds from the session's start.",
+        )
     return settings.period_s * np.arange(-settings.window + 1, steps + 1, dtype=np.float64)
 
 

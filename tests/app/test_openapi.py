@@ -23,6 +23,16 @@ INTENDED: dict[str, str] = {
         ),
         "The two schemas `MetricOut` of the OpenAPI document have names without module paths: `MetricOut` and `MethodMetricOut`.",
     ),
+    **dict.fromkeys(
+        (
+            "components > schemas > CdbsAmplitudeModel",
+            "components > schemas > CdbsAmplitudeOut",
+            "components > schemas > SettingsIn",
+            "components > schemas > SettingsOut",
+            "components > schemas > VisitOut > properties > cdbs_amplitudes",
+        ),
+        "Settings and cDBS amplitudes have clinical bounds",
+    ),
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",
     "components > schemas > JobOut > required": "API: a job has `seconds_left`.",
 }

@@ -6,6 +6,7 @@ row and in the audit trail.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ from app.accounts.permissions import Caller
 from app.ingest import encryption, repository
 from app.ingest.models import UploadFile
 from app.ingest.uploads import service
-from app.ingest.uploads.receiving import MEDIA_TYPE, BetaStated, Kept, Receiver
+from app.ingest.uploads.receiving import ASIDE, MEDIA_TYPE, BetaStated, Kept, Receiver
 from app.ingest.uploads.service import UploadOutcome
 from app.platform import files
 from app.platform.database import now, set_reason
@@ -63,8 +64,10 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
         try:
             kind = formats.sniff(original)
             redaction = formats.redact(original, clean, kind, get_settings().secret("pseudonyms"), options)
-        except UndecodableFile as error:
+        except BaseException as error:
             clean.unlink(missing_ok=True)
+            if not isinstance(error, UndecodableFile):
+                raise
             raise Invalid(f"It still cannot be read: {error.stored_what} ({error.stored_where}).", error.mend) from error
     sealed = file.quarantine_sha256
     stored = files.store(db, clean, MEDIA_TYPE).sha256
@@ -87,7 +90,9 @@ def release_as_is(db: Session, file_id: int, reason: str, caller: Caller) -> Upl
     if file.reviewed_at is None:
         raise Conflict(f"Nobody has looked at file {file.id} yet.", "Review its content first: it may name the participant.")
     with _original(file) as path:
-        file.released_sha256 = files.store(db, path, MEDIA_TYPE).sha256
+        draft = files.draft_path()
+        shutil.copyfile(path, draft)
+        file.released_sha256 = files.store(db, draft, MEDIA_TYPE).sha256
     file.status = "released" if file.status == "failed" else file.status
     _decide(db, file, reason, caller)
     _erase(db, file)
@@ -123,25 +128,22 @@ def _decide(db: Session, file: UploadFile, reason: str, caller: Caller) -> None:
 
 @contextmanager
 def _original(file: UploadFile) -> Iterator[Path]:
-    """The decrypted original as a draft file that goes when it was used.
+    """The decrypted original as a file without a name, which goes when it was used.
 
     Raises:
         Conflict: its bytes cannot be decrypted, or are not those that came.
     """
     assert file.quarantine_sha256 is not None
-    draft = files.draft_path()
-    try:
+    with files.nameless_file() as (out, raw):
         try:
-            with draft.open("wb") as out:
-                out.writelines(encryption.decrypt(files.path_of(file.quarantine_sha256)))
+            for chunk in encryption.decrypt(files.path_of(file.quarantine_sha256)):
+                files.write_all(out, chunk)
         except (InvalidToken, OSError) as error:
             mend = "Restore the data folder, with its keys, from a backup."
             raise Conflict(f"The encrypted bytes of file {file.id} are missing or damaged.", mend) from error
-        if files.hash_file(draft)[0] != file.original_sha256:
+        if files.hash_file(raw)[0] != file.report.get(ASIDE, file.original_sha256):
             raise Conflict(f"The bytes of file {file.id} are not those that came: their hash differs.", "Restore a backup.")
-        yield draft
-    finally:
-        draft.unlink(missing_ok=True)
+        yield raw
 
 
 def _erase(db: Session, file: UploadFile) -> None:

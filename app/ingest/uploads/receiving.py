@@ -8,6 +8,7 @@ from __future__ import annotations
 import zipfile
 from collections import Counter
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import cast
@@ -39,7 +40,18 @@ EMPTY = UndecodableFile("the file is empty", "0 bytes", "Send the file again fro
 CUT_SHORT = UndecodableFile(
     "the service was stopped while it took this file", "file", "Read it again on the page of the quarantine, or send it again."
 )
+LETHAL = 2
+"""So many times a process may end while it reads a file, or makes sessions of an upload; then that is not tried again by itself."""
+ENDED_THE_SERVICE = UndecodableFile(
+    f"the service ended {LETHAL} times while it read this file: it may ask for more memory than there is",
+    "file",
+    "Look at it on the page of the quarantine. Send it again with what is wrong mended, or read it again when the service was mended.",
+)
 TAKEN_UP = "The service was stopped while it read this file and has read it from the kept bytes since; what was removed is not told again."
+BEGUN = "begun"
+"""Member of a file's report: how often reading it was begun, while it is being read."""
+ASIDE = "aside_sha256"
+"""Member of a file's report: hash of its bytes without identity, where these are what the quarantine holds, and not the original."""
 TABLES = ("csv", "parquet")
 MEDIA_TYPE = "application/octet-stream"
 
@@ -111,15 +123,12 @@ class Receiver:
         name = Path(one.name.replace("\\", "/")).name[:255] or "file"
         limit_mb = get_settings().upload_limit_mb
         try:
-            draft, sha256, size = files.receive(one.stream, limit_mb * 1024 * 1024)
+            with files.received(one.stream, limit_mb * 1024 * 1024) as (raw, sha256, size):
+                if known := self._known(name, sha256):
+                    return known
+                kept = self._keep(raw) if size else Kept("unreadable", None, None, Redaction(), EMPTY)
         except OverflowError as error:
             raise TooLarge(f"'{name}' is larger than {limit_mb} MiB.", "Split it, or have BETALOOP_UPLOAD_LIMIT_MB raised.") from error
-        try:
-            if known := self._known(name, sha256):
-                return known
-            kept = self._keep(draft) if size else Kept("unreadable", None, None, Redaction(), EMPTY)
-        finally:
-            draft.unlink(missing_ok=True)
         row = UploadFile(
             upload_id=self.upload.id,
             participant_id=self.participant.id,
@@ -130,7 +139,7 @@ class Receiver:
             stored_sha256=kept.stored_sha256,
             quarantine_sha256=kept.quarantine_sha256,
             redactor_version=REDACTOR_VERSION,
-            report={},
+            report={BEGUN: 1},
         )
         self.db.add(row)
         self.db.commit()  # the bytes are safe from here on, whatever the decoder does with them
@@ -153,6 +162,11 @@ class Receiver:
         if row.status != "received":
             return FileOutcome(row.name, row, stored_reports(row), recordings=self._recordings(row))
         sealed = row.stored_sha256 is None or row.stored_sha256 == row.quarantine_sha256
+        if not sealed and row.report.get(BEGUN, 0) >= LETHAL:
+            return self._put_aside(row)
+        # committed before the file is read, so that it is known whom to blame when that ends the process
+        row.report = {BEGUN: row.report.get(BEGUN, 0) + 1}
+        self.db.commit()
         outcome = self.decode(
             row.name, row, Kept(row.kind, row.stored_sha256, row.quarantine_sha256, Redaction(), CUT_SHORT if sealed else None)
         )
@@ -161,35 +175,44 @@ class Receiver:
             store_reports(row, outcome.reports, known_recordings(row))
         return outcome
 
-    def _keep(self, draft: Path) -> Kept:
+    def _put_aside(self, row: UploadFile) -> FileOutcome:
+        """Into quarantine with a file that ends the process which reads it; a person decides on it there."""
+        assert row.stored_sha256 is not None
+        log.error("file put aside: reading it ended the service", upload_file=row.id, times=row.report[BEGUN])
+        stored = row.stored_sha256
+        if row.quarantine_sha256 is None:
+            row.quarantine_sha256, row.report = self._seal(files.path_of(stored)), {ASIDE: stored}
+        return self._failed(row.name, row, Kept(row.kind, stored, row.quarantine_sha256, Redaction(), None), ENDED_THE_SERVICE)
+
+    def _keep(self, raw: Path) -> Kept:
         """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted.
 
         A table is cleaned by reading it with the participant's options: one that cannot be decoded is kept encrypted too.
         """
         clean = files.draft_path()
         try:
-            kind = formats.sniff(draft)
-            redaction = formats.redact(draft, clean, kind, get_settings().secret("pseudonyms"), self.options)
+            kind = formats.sniff(raw)
+            redaction = formats.redact(raw, clean, kind, get_settings().secret("pseudonyms"), self.options)
         except UndecodableFile as error:
-            return self._quarantined(draft, clean, error)
+            return self._quarantined(raw, clean, error)
         except Exception as fault:
             # a fault of ours must not take the other files of the upload with it, and what it left behind may still name a person
             log.exception("file could not be cleaned", upload=self.upload.id, fault=repr(fault))
             mend = f"It is kept encrypted; tell your administrator: upload {self.upload.id}."
             return self._quarantined(
-                draft, clean, UndecodableFile("the service failed while it took identity out of this file", "file", mend)
+                raw, clean, UndecodableFile("the service failed while it took identity out of this file", "file", mend)
             )
-        sealed = self._seal(draft) if redaction.unreadable else None
+        sealed = self._seal(raw) if redaction.unreadable else None
         return Kept(kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, redaction, None)
 
-    def _quarantined(self, draft: Path, clean: Path, problem: UndecodableFile) -> Kept:
+    def _quarantined(self, raw: Path, clean: Path, problem: UndecodableFile) -> Kept:
         clean.unlink(missing_ok=True)
-        left_out = _left_out(draft, self.options.archive)
-        sealed = self._seal(draft)
+        left_out = _left_out(raw, self.options.archive)
+        sealed = self._seal(raw)
         return Kept("unreadable", sealed, sealed, Redaction(ignored=left_out), problem)
 
-    def _seal(self, draft: Path) -> str:
-        return files.store(self.db, encryption.encrypt(draft), MEDIA_TYPE).sha256
+    def _seal(self, raw: Path) -> str:
+        return files.store(self.db, encryption.encrypt(raw), MEDIA_TYPE).sha256
 
     def decode(self, name: str, row: UploadFile, kept: Kept) -> FileOutcome:
         """Decode a stored file; whatever is wrong with it becomes its report."""
@@ -283,12 +306,15 @@ def _stated_by_a_person(trace: TraceLog) -> bool:
 
 def store_reports(row: UploadFile, reports: Sequence[FileReport], known: Sequence[int] = ()) -> None:
     """Keep a file's reports, and which of its recordings had come before in other files."""
-    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known)}
+    aside = {ASIDE: row.report[ASIDE]} if ASIDE in (row.report or {}) else {}
+    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known), **aside}
 
 
 def stored_reports(row: UploadFile) -> list[FileReport]:
     """The reports of a file as they were stored."""
-    return [FileReport(**{**r, "problem": Problem(**r["problem"]) if r["problem"] else None}) for r in row.report.get("reports", [])]
+    # a copy: sentences appended to the stored lists themselves would not be seen as a change, and not be written
+    stored = deepcopy(row.report.get("reports", []))
+    return [FileReport(**{**r, "problem": Problem(**r["problem"]) if r["problem"] else None}) for r in stored]
 
 
 def known_recordings(row: UploadFile) -> list[int]:

@@ -20,7 +20,15 @@ from app.ingest.sessions import StatedSession
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads.in_progress import in_progress
 from app.ingest.uploads.incoming import Incoming, arrange
-from app.ingest.uploads.receiving import BetaStated, FileOutcome, Receiver, known_recordings, store_reports, stored_reports
+from app.ingest.uploads.receiving import (
+    LETHAL,
+    BetaStated,
+    FileOutcome,
+    Receiver,
+    known_recordings,
+    store_reports,
+    stored_reports,
+)
 from app.platform import files
 from app.platform.errors import BetaloopError, Conflict, Invalid, TooLarge
 from app.platform.web.schemas import sensible_time
@@ -35,6 +43,9 @@ from ml.formats.recording import FileReport, Problem, UndecodableFile
 __all__ = ["BetaStated", "FileOutcome", "Incoming", "UploadOutcome", "receive", "state_session", "stored_reports"]
 
 log = structlog.get_logger()
+
+SESSIONS_BEGUN = "sessions_begun"
+"""Member of what an upload states: how often its sessions were begun to be made."""
 
 
 @dataclass
@@ -165,14 +176,33 @@ def receive(
 def finish(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
     """What is done once all files of an upload are in: sessions, grasp tests, the report. Commits."""
     upload = outcome.upload
-    make_sessions(db, outcome, stated)
-    _attach_grasps(db, outcome, stated)
+    begun = upload.stated.get(SESSIONS_BEGUN, 0)
+    if begun < LETHAL:
+        # committed before, so that sessions which end the process that makes them are not tried for ever
+        upload.stated = {**upload.stated, SESSIONS_BEGUN: begun + 1}
+        db.commit()
+        make_sessions(db, outcome, stated)
+        _attach_grasps(db, outcome, stated)
+    else:
+        _leave_without_sessions(outcome)
     # a file that came before has its row in another upload; this one only points at it
     earlier = [o.row.id for o in outcome.files if o.same_bytes]
     upload.stated = {**upload.stated, "duplicates": earlier}
     upload.report = [asdict(r) for o in outcome.files for r in o.reports]
     upload.status = "decoded" if outcome.usable else "failed"
     db.commit()
+
+
+def _leave_without_sessions(outcome: UploadOutcome) -> None:
+    """Say of the files of an upload that its sessions ended the process which made them, and that they are not made any more."""
+    log.error("upload left without sessions: making them ended the service", upload=outcome.upload.id)
+    for file in outcome.files:
+        if file.recordings and not file.same_bytes:
+            file.reports[0].flagged.append(
+                f"The service ended {LETHAL} times while it made sessions of this upload: its recordings are kept, no session was made. "
+                f"Send the file again with what is wrong in it mended, or tell your administrator: upload {outcome.upload.id}."
+            )
+            _keep_reports(file)
 
 
 def _said(stated: StatedSession, beta: BetaStated) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning import repository
-from app.learning.deps import CurrentPolicy, CurrentSnapshot
+from app.learning.deps import CurrentOwnPolicy, CurrentSnapshot
 from app.learning.models import Policy
 from app.learning.policies import service
 from app.learning.policies.uploads import read_limited
@@ -21,7 +21,7 @@ from app.learning.schemas import ALGORITHM_NAMES, PolicyChange, PolicyLabel
 from app.learning.snapshots.coverage import describe
 from app.learning.sweeps.comparison import below_bound
 from app.platform.database import Db
-from app.platform.errors import BetaloopError, Invalid, NotFound
+from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.charts import ACCENT, Chart, axis, figure
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.schemas import PagingQuery
@@ -75,9 +75,8 @@ def add_policy(
 
 
 @router.get("/participants/{code}/policies/{policy_id}")
-def policy_page(request: Request, participant: CurrentParticipant, policy: CurrentPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
+def policy_page(request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """One policy: where it comes from, its learning curves, its bundle."""
-    _belongs(policy, participant)
     related = {p.id: p for p in (db.get(Policy, i) for i in (policy.teacher_id, policy.parent_id) if i) if p}
     version = study_repository.settings_version(db, policy.settings_version_id)
     page = render(
@@ -97,9 +96,8 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
 
 
 @router.post("/participants/{code}/policies/{policy_id}/retire")
-def retire_policy(participant: CurrentParticipant, policy: CurrentPolicy, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+def retire_policy(participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Retire a policy with a reason, or take it back."""
-    _belongs(policy, participant)
     reason = parse(PolicyChange, {"retired_reason": values.get("reason", "")}, LABELS).retired_reason
     service.retire(db, participant, policy, reason, caller)
     db.commit()
@@ -168,8 +166,3 @@ def _policies(
         may_write=may(caller, can.WRITE_POLICIES, participant),
     )
     return HTMLResponse(page, status)
-
-
-def _belongs(policy: Policy, participant: Participant) -> None:
-    if policy.participant_id != participant.id:
-        raise NotFound(f"Participant {participant.code} has no policy {policy.id}.")

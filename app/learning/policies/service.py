@@ -89,8 +89,13 @@ def add_external(db: Session, participant: Participant, name: str, content: byte
 
 
 def retire(db: Session, participant: Participant, policy: Policy, reason: str | None, caller: Caller) -> Policy:
-    """Take a policy out of rankings and plans, or (no reason) back in; the policy itself stays as it is."""
+    """Take a policy out of rankings and plans, or (no reason) back in; the policy itself stays as it is.
+
+    Raises:
+        NotFound: the policy is another participant's. Forbidden: the caller may not change policies.
+    """
     study.require(caller, can.WRITE_POLICIES, participant)
+    study.require_own(participant, policy, f"policy {policy.id}")
     policy.retired_reason = (reason or "").strip() or None
     set_reason(db, policy.retired_reason)
     db.flush()

@@ -12,11 +12,11 @@ from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
-from app.learning.deps import CurrentPolicy
+from app.learning.deps import CurrentOwnPolicy
 from app.learning.models import Policy
 from app.planning.bundles import service as bundles
 from app.platform.database import Db
-from app.platform.errors import BetaloopError, Invalid, NotFound
+from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
@@ -40,14 +40,14 @@ class StatedLimits(BaseModel):
 
 
 @router.get("/participants/{code}/policies/{policy_id}/bundle")
-def bundle_page(request: Request, participant: CurrentParticipant, policy: CurrentPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
+def bundle_page(request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """What the bundle would hold under the default limits."""
     return _page(request, participant, policy, db, caller)
 
 
 @router.post("/participants/{code}/policies/{policy_id}/bundle")
 def take_bundle(
-    request: Request, participant: CurrentParticipant, policy: CurrentPolicy, db: Db, caller: CurrentCaller, values: FormValues
+    request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller, values: FormValues
 ) -> Response:
     """The signed ZIP under the limits of the form; the page again, with what was typed, where they cannot be used."""
     typed = {name: str(values.get(name, "")) for name in LABELS}
@@ -72,8 +72,6 @@ def _page(
     error: BetaloopError | None = None,
     typed: Mapping[str, str] | None = None,
 ) -> HTMLResponse:
-    if policy.participant_id != participant.id:
-        raise NotFound("There is no such policy of this participant.", "Choose one from the participant's policies.")
     sides = sorted({Hemisphere(a.hemisphere) for visit in participant.visits for a in visit.cdbs_amplitudes})
     facts: dict[str, Any] = {"manifest": None, "warnings": [], "energy": None, "unmade": None}
     try:

@@ -25,6 +25,7 @@ from app.platform.database import set_reason
 from app.platform.errors import Forbidden, Invalid
 from app.settings import get_settings
 from app.study import repository as study_repository
+from app.study import service as study
 from app.study.models import Hemisphere, Participant, Recording, Visit
 from ml.deploy.bundle import build_bundle, describe, sign
 from ml.deploy.manifest import DEFAULTS, Approval, BundleError, BundleManifest
@@ -74,6 +75,7 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
     """The controller bundle of a policy, signed. It is stored, so that the audit trail says who took which limits out when.
 
     Raises:
+        NotFound: the policy is another participant's.
         Invalid: the cDBS amplitude or the unit of beta is not known, limits that contradict each other, or leave the stimulator's own.
         Forbidden: limits stated by somebody who may only read.
     """
@@ -99,7 +101,7 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
 def preview(
     db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
 ) -> BundleManifest:
-    """What the bundle would say of itself, all but its files; nothing is stored. Raises Invalid as `bundle` does."""
+    """What the bundle would say of itself, all but its files; nothing is stored. Raises as `bundle` does."""
     manifest, windows = _manifest(db, participant, policy, limits, hemisphere, caller)
     try:
         return describe(files.read(policy.onnx_sha256), manifest, windows)
@@ -131,14 +133,18 @@ def device_limits(db: Session, participant: Participant, hemisphere: Hemisphere 
     return None
 
 
-def approvals(db: Session, policy_id: int) -> tuple[Approval, ...]:
-    """Sign-offs of the approved visit plans that this policy stands in. Plans belong to a later phase; their tables are asked by name."""
+def approvals(db: Session, participant_id: int, policy_id: int) -> tuple[Approval, ...]:
+    """Sign-offs of the participant's approved visit plans that this policy stands in.
+
+    Plans belong to a later phase; their tables are asked by name.
+    """
     plan = table("plan", *(column(name) for name in ("id", "visit_id", "status", "approved_at", "approved_by")))
     item = table("plan_item", column("plan_id"), column("policy_id"))
     rows = db.execute(
         select(plan.c.id, plan.c.approved_by, plan.c.approved_at, Visit.number)
         .join_from(plan, Visit, Visit.id == plan.c.visit_id)
-        .where(plan.c.status == "approved", plan.c.id.in_(select(item.c.plan_id).where(item.c.policy_id == policy_id)))
+        .where(Visit.participant_id == participant_id, plan.c.status == "approved")
+        .where(plan.c.id.in_(select(item.c.plan_id).where(item.c.policy_id == policy_id)))
         .order_by(plan.c.id)
     )
     return tuple(
@@ -165,6 +171,7 @@ def _manifest(
     db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
 ) -> tuple[BundleManifest, NDArray[np.float64]]:
     """What the bundle says about itself, and beta windows for its test vectors: logged ones, where there are any of its length."""
+    study.require_own(participant, policy, f"policy {policy.id}")
     version = study_repository.settings_version(db, policy.settings_version_id)
     snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id else None
     data = snapshot or repository.newest_snapshot(db, participant.id)
@@ -209,7 +216,7 @@ def _manifest(
             test_windows_from=f"snapshot {usable.id}" if usable else None,
             taken_by=f"{caller.label}, {datetime.now(UTC):%Y-%m-%d %H:%M:%S.%f} UTC",
             public_key=public_key(),
-            approvals=approvals(db, policy.id),
+            approvals=approvals(db, participant.id, policy.id),
         )
     except BundleError as error:
         raise _unmade(policy, error) from error

@@ -49,7 +49,12 @@ async def _around(request: Request, call_next: RequestResponseEndpoint) -> Respo
     route = getattr(request.scope.get("route"), "path", "none")
     _requests.labels(request.method, route, response.status_code).inc()
     _seconds.labels(route).observe(time.perf_counter() - started)
-    response.headers["X-Request-ID"] = request.state.request_id
+    return _secured(request, response)
+
+
+def _secured(request: Request, response: Response) -> Response:
+    """The answer with the headers that every answer has, a server error's among them."""
+    response.headers["X-Request-ID"] = getattr(request.state, "request_id", "")
     response.headers["Content-Security-Policy"] = CONTENT_SECURITY_POLICY
     response.headers["X-Content-Type-Options"] = "nosniff"
     response.headers["Referrer-Policy"] = "same-origin"
@@ -59,8 +64,13 @@ async def _around(request: Request, call_next: RequestResponseEndpoint) -> Respo
 
 
 def _cross_site(request: Request) -> BetaloopError | None:
-    """A browser tells where a request comes from; what changes data must come from our own pages. Tokens are not sent by browsers."""
-    if request.method in _SAFE or "authorization" in request.headers:
+    """A browser tells where a request comes from; what changes data must come from our own pages.
+
+    A request with a bearer token and no cookie has no rights but the token's, which no other site can know: it may come from anywhere.
+    """
+    scheme, _, token = request.headers.get("authorization", "").partition(" ")
+    by_token_alone = scheme.lower() == "bearer" and bool(token.strip()) and not request.cookies
+    if request.method in _SAFE or by_token_alone:
         return None
     site, origin = request.headers.get("sec-fetch-site"), request.headers.get("origin")
     if site in ("same-origin", "none") or (site is None and origin is None):
@@ -119,5 +129,6 @@ async def _http_error(request: Request, error: Exception) -> Response:
 async def _unknown_error(request: Request, error: Exception) -> Response:
     log.error("request failed", path=request.url.path, request_id=getattr(request.state, "request_id", None), exc_info=error)
     problem: Any = _PlainError(500, "Something went wrong on our side.")
-    problem.mend = f"Nothing was changed. Tell your administrator the request id {getattr(request.state, 'request_id', '?')}."
-    return _answer(request, problem)
+    number = getattr(request.state, "request_id", "?")
+    problem.mend = f"Tell your administrator the request id {number}. Look at what is stored before you send anything again."
+    return _secured(request, _answer(request, problem))

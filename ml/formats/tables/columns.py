@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,10 @@ RATIO_SPREAD = 0.05
 """mA per fraction may vary by this share, for rounded cells, and still be one cDBS amplitude."""
 LEAST_FRACTION = 0.05
 """Below this fraction rounding alone moves the ratio."""
+LONGEST_TABLE_S = 7 * 86_400.0
+"""No session's table reaches further from the session's start, before it or after it."""
+_UNIX_SPAN_S = (datetime(1990, 1, 1, tzinfo=UTC).timestamp(), datetime(2200, 1, 1, tzinfo=UTC).timestamp())
+_UNIX_UNITS = (("seconds", 1.0), ("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
 NEEDED = "t_s, beta and amplitude_fraction (or amplitude_ma), or t_s and lfp with its unit"
 
 
@@ -59,6 +64,32 @@ class Columns:
         """An error at a column, and at the line of a row; `stored` is the text without the file's own words."""
         line = "" if row is None else f"line {self.lines[row]}, "
         return UndecodableFile(what, f"{line}column {self.names[role]}", mend, stored, f"{line}column {role}")
+
+
+def check_reach(t_s: NDArray[np.float64], columns: Columns) -> None:
+    """Raise where times lie days away from the session's start, before anything is made whose size follows from them.
+
+    Args:
+        t_s: times in s from the session's start, [n], increasing, none missing, n >= 1.
+        columns: the table, for the error.
+
+    Raises:
+        UndecodableFile: Unix times, named as such, or times of more than a week before or after the start.
+    """
+    far = np.flatnonzero(np.abs(t_s) > LONGEST_TABLE_S)
+    if far.size == 0:
+        return
+    row, mend = int(far[0]), "Give t_s in seconds from the session's start, one session per table: rows before the start are negative."
+    written = float(columns.values["t_s"][row])
+    for unit, per_second in _UNIX_UNITS:
+        seconds = written / per_second
+        if _UNIX_SPAN_S[0] <= seconds <= _UNIX_SPAN_S[1]:
+            when = f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
+            what = f"the times are Unix {unit} ({written:.15g} is {when}), not seconds from the session's start"
+            mend = f"{mend} Subtract the time at which the controller was started, and state that time as the start of the session."
+            raise columns.error(what, "t_s", mend, row)
+    what = f"{t_s[row]:.9g} s lies more than a week from the session's start, t_s 0"
+    raise columns.error(what, "t_s", mend, row)
 
 
 def match_columns(headers: Sequence[str]) -> tuple[dict[str, int], dict[str, str | None], list[str], list[str]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ml.formats.beta import Stretch, channel_spectrum, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
-from ml.formats.tables.columns import LFP_SCALE, TIME_SCALE, Columns, checked_amplitude, compare_amplitudes
+from ml.formats.tables.columns import LFP_SCALE, TIME_SCALE, Columns, check_reach, checked_amplitude, compare_amplitudes
 from ml.formats.tables.numbers import known_unit
 from ml.signals import row_means
 
@@ -94,12 +94,9 @@ def _times(columns: Columns) -> NDArray[np.float64]:
         i = int(back[0]) + 1
         what = f"times must increase: {t_s[i]:g} s comes after {t_s[i - 1]:g} s"
         raise columns.error(what, "t_s", "Sort the rows; write the times with enough decimals to tell samples apart.", i)
+    check_reach(t_s, columns)
     if t_s[-1] <= 0:
         raise columns.error("no row with t_s > 0", "t_s", "The session starts at 0; rows before it are its lead.")
-    if t_s[-1] - t_s[0] > 7 * 86_400:
-        raise columns.error(
-            f"the times span {t_s[-1] - t_s[0]:g} s, more than a week", "t_s", "Give t_s in seconds from the session's start."
-        )
     return t_s
 
 

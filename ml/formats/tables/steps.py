@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
-from ml.formats.tables.columns import TIME_SCALE, Columns, checked_amplitude, compare_amplitudes, read_csv, read_parquet
+from ml.formats.tables.columns import (
+    TIME_SCALE,
+    Columns,
+    check_reach,
+    checked_amplitude,
+    compare_amplitudes,
+    read_csv,
+    read_parquet,
+)
 from ml.formats.tables.lfp import decode_lfp
 from ml.formats.tables.numbers import shown, unit_name
 
@@ -65,6 +73,7 @@ def _times(columns: Columns, options: DecodeOptions) -> NDArray[np.float64]:
         i = int(back[0]) + 1
         what = "appears twice" if t_s[i] == t_s[i - 1] else f"comes after {t_s[i - 1]:g} s"
         raise columns.error(f"times must increase: {t_s[i]:g} s {what}", "t_s", "Sort the rows by t_s; keep one row per time.", i)
+    check_reach(t_s, columns)
     if not np.any(t_s > GRID_TOLERANCE * options.period_s):
         raise columns.error("no row with t_s > 0", "t_s", "Rows with t_s <= 0 are the window before the session; add the session.")
     return t_s

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
+from threading import Barrier
 
 import pytest
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts import service
+from app.accounts.addresses import normal_address
 from app.accounts.models import Role
 from app.accounts.permissions import APPROVE_PLAN, MANAGE_ACCOUNTS, PERMISSIONS, READ, WRITE_STUDY, Caller, Grant
+from app.platform.database import new_session
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 
 EMAIL, PASSWORD = "ada@clinic.example", "correct horse battery"
@@ -142,3 +146,85 @@ def test_a_zero_character_in_an_address_is_a_failed_sign_in_and_no_fault(db: Ses
     with pytest.raises(Unauthorized):
         service.sign_in(db, "a\x00b@x", PASSWORD)
     db.commit()
+
+
+PADDED = (
+    EMAIL, f" {EMAIL}", f"{EMAIL} \t", EMAIL.upper(), f"{EMAIL}\u00a0", "\uff41da@clinic.example", "ada\uff20clinic.example",
+    f"{EMAIL}\r\n",
+)  # fmt: skip
+NO_ADDRESS = (
+    f"{EMAIL} \0 \0",
+    f"\0{EMAIL}",
+    "ada\u200b@clinic.example",
+    "ada\x07@clinic.example",
+    "ada\ud800@clinic.example",
+    "",
+    "x" * 300,
+)
+
+
+def test_padded_and_look_alike_spellings_are_one_address(db: Session, ada: str) -> None:
+    assert {normal_address(spelling) for spelling in PADDED} == {EMAIL}
+    for i in range(service.FAILURES_ALLOWED):
+        with pytest.raises(Unauthorized):
+            service.sign_in(db, PADDED[i], "wrong password")
+    for spelling in PADDED:
+        with pytest.raises(TooMany):
+            service.sign_in(db, spelling, PASSWORD)
+    assert db.execute(text("select distinct email from sign_in_attempt")).scalars().all() == [EMAIL]
+
+
+@pytest.mark.parametrize("address", NO_ADDRESS)
+def test_what_no_address_can_be_fails_like_a_wrong_password(db: Session, ada: str, address: str) -> None:
+    for password in ("wrong password", PASSWORD):
+        with pytest.raises(Unauthorized, match=r"^The e-mail address or the password is wrong\.$"):
+            service.sign_in(db, address, password)
+    assert service.sign_in(db, EMAIL, PASSWORD)
+
+
+def test_guesses_at_the_same_moment_are_judged_no_more_often_than_allowed(db: Session, ada: str) -> None:
+    tries = 24
+    start = Barrier(tries)
+
+    def guess(number: int) -> str:
+        with new_session() as own:
+            start.wait()
+            try:
+                service.sign_in(own, PADDED[number % 5], f"wrong password {number}")
+            except (Unauthorized, TooMany) as refused:
+                own.commit()
+                return type(refused).__name__
+        return "let in"
+
+    with ThreadPoolExecutor(tries) as pool:
+        answers = list(pool.map(guess, range(tries)))
+    assert sorted(answers) == sorted(["Unauthorized"] * service.FAILURES_ALLOWED + ["TooMany"] * (tries - service.FAILURES_ALLOWED))
+    with pytest.raises(TooMany):
+        service.sign_in(db, ada, PASSWORD)
+
+
+def test_a_right_password_takes_the_failures_before_it_back(db: Session, ada: str) -> None:
+    for _ in range(3):
+        for _ in range(service.FAILURES_ALLOWED - 1):
+            with pytest.raises(Unauthorized):
+                service.sign_in(db, ada, "wrong password")
+        assert service.sign_in(db, ada, PASSWORD)
+        db.commit()
+    assert db.execute(text("select count(*) from sign_in_attempt")).scalar_one() == 0
+
+
+def test_tries_that_count_no_more_are_removed(db: Session, ada: str) -> None:
+    for email in ("one@clinic.example", "two@clinic.example"):
+        with pytest.raises(Unauthorized):
+            service.sign_in(db, email, "wrong password")
+    db.execute(text("update sign_in_attempt set at = at - interval '16 minutes'"))
+    db.commit()
+    with pytest.raises(Unauthorized):
+        service.sign_in(db, ada, "wrong password")
+    assert db.execute(text("select email from sign_in_attempt")).scalars().all() == [ada]
+
+
+def test_a_user_of_an_earlier_version_still_signs_in(db: Session, ada: str) -> None:
+    db.execute(text("update app_user set email = 'stra\u00dfe@clinic.example'"))
+    db.commit()
+    assert service.sign_in(db, "Stra\u00dfe@clinic.example", PASSWORD)

@@ -51,6 +51,19 @@ def test_six_failures_lock_the_address_for_a_while(anonymous: TestClient, sign_i
     assert anonymous.post("/sign-in", data={"email": ADMIN, "password": PASSWORD}).status_code == 429
 
 
+def test_a_padded_address_neither_passes_the_limit_nor_tells_the_right_password(
+    anonymous: TestClient, sign_in: Callable[[str], TestClient]
+) -> None:
+    sign_in("admin")
+    padding = [" ", "  ", "\0", " \0 ", "\0\0 ", " \0\0"]
+    codes = {anonymous.post("/sign-in", data={"email": ADMIN + pad, "password": PASSWORD}).status_code for pad in padding if "\0" in pad}
+    assert codes == {401}, "no address has a zero character, with whatever password"
+    codes_of_spaces = [anonymous.post("/sign-in", data={"email": ADMIN + " " * n, "password": "wrong"}).status_code for n in range(6)]
+    assert codes_of_spaces == [401] * 5 + [429]
+    for pad in padding:
+        assert anonymous.post("/sign-in", data={"email": ADMIN + pad, "password": PASSWORD}).status_code in (401, 429)
+
+
 @pytest.mark.parametrize(
     "target",
     ["https://evil.example", "//evil.example", "/\\evil.example", "\\\\evil.example", "/\t/evil.example", "javascript:alert(1)", "", "/é"],
@@ -82,6 +95,46 @@ def test_posts_from_another_site_are_refused(browser: TestClient) -> None:
     for headers in ({"Sec-Fetch-Site": "cross-site"}, {"Sec-Fetch-Site": "", "Origin": "https://evil.example"}):
         assert browser.post("/participants", data={"code": "EVIL"}, headers=headers).status_code == 403
     assert browser.get("/participants/EVIL").status_code == 404
+
+
+@pytest.mark.parametrize("authorization", ["Basic x", "Bearer x", "Bearer ", "x"])
+def test_an_authorization_header_beside_the_cookie_lets_no_other_site_in(browser: TestClient, authorization: str) -> None:
+    headers = {"Sec-Fetch-Site": "cross-site", "Origin": "https://evil.example", "Authorization": authorization}
+    for path in ("/participants", "/sign-out", "/account/tokens"):
+        assert browser.post(path, data={"code": "EVIL", "name": "evil"}, headers=headers).status_code == 403, path
+    assert browser.get("/").status_code == 200
+
+
+def test_a_server_error_has_every_header_and_logs_no_values(
+    service_app,
+    sign_in: Callable[[str], TestClient],
+    capsys: pytest.CaptureFixture[str],  # type: ignore[no-untyped-def]
+) -> None:
+    import structlog
+    from sqlalchemy import text
+
+    from app.platform import logs
+    from app.platform.database import new_session
+
+    patient = "-".join(("NAME", "OF", "PATIENT"))  # put together, for a traceback quotes lines of source
+
+    @service_app.get("/broken")
+    def broken() -> None:
+        with new_session() as db:
+            db.execute(text("select 1 / cast(:zero as integer), cast(:name as text)"), {"zero": 0, "name": patient})
+
+    logs.configure()
+    try:
+        answer = TestClient(service_app, raise_server_exceptions=False).get("/broken")
+    finally:
+        structlog.reset_defaults()
+    assert answer.status_code == 500
+    assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
+    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    assert answer.headers["X-Request-ID"] in answer.json()["mend"]
+    printed = capsys.readouterr()
+    assert "division by zero" in printed.err
+    assert patient not in printed.out + printed.err
 
 
 def test_a_token_is_shown_once_works_and_can_be_revoked(browser: TestClient, service_app) -> None:  # type: ignore[no-untyped-def]

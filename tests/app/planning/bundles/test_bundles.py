@@ -105,12 +105,12 @@ def test_the_audit_trail_says_who_took_which_limits_out(
 
 
 def test_an_approved_plan_is_the_approval_of_its_policies(client: TestClient, policy: int, db: Session) -> None:
-    assert approvals(db, policy) == ()
+    assert approvals(db, participant_by_code(db, "P1", SYSTEM).id, policy) == ()
     visit = client.get("/api/v1/participants/P1/visits").json()
     visit_id = (visit["items"] if isinstance(visit, dict) else visit)[0]["id"]
     drafted = client.post(f"/api/v1/visits/{visit_id}/plan", json={"policy_ids": [policy]})
     assert drafted.status_code == 201, drafted.text
-    assert approvals(db, policy) == (), "a draft approves nothing"
+    assert approvals(db, participant_by_code(db, "P1", SYSTEM).id, policy) == (), "a draft approves nothing"
     approved = client.post(f"/api/v1/visits/{visit_id}/plan/approve", json={})
     assert approved.status_code in (200, 201), approved.text
     (approval,) = verify_bundle(take(client, policy).content).approvals

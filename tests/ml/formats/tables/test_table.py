@@ -223,7 +223,7 @@ def test_columns_of_no_use_are_named(write):
         ("t_s;beta;a\n2;1.234,5;1\n", "decimal points and commas", "line 2"),
         ("t_s,beta,Beta,a\n2,1,1,1\n", "two columns both give beta", "line 1"),
         ("t (h),beta,a\n2,1,1\n", "unknown unit 'h'", "column"),
-        (HEADER + "2,1,1\n9e9,1,1\n", "span", "column t_s"),
+        (HEADER + "2,1,1\n9e9,1,1\n", "more than a week", "column t_s"),
         (HEADER + "2," + "9" * 200_000 + ",1\n", "not readable as a table", "line 2"),
         (HEADER + "2" * 1_100_000, "a line of more than", "line 2"),
     ],

@@ -143,7 +143,7 @@ def test_a_decimal_comma_is_read(write):
         ("t_s,lfp_uV\n", "no signal"),
         ("t_s,lfp_uV\n" + "".join(f"{0.1 * k * k:.3f},1\n" for k in range(1, 60)), "evenly"),
         ("t_s,lfp_uV\n" + "".join(f"{k - 100}.0,1\n" for k in range(50)), "no row with t_s > 0"),
-        ("t_s,lfp_uV\n" + "".join(f"{k / 250 if k < 99 else 1e9},1\n" for k in range(100)), "more than a week"),
+        ("t_s,lfp_uV\n" + "".join(f"{k / 250 if k < 99 else 1e9},1\n" for k in range(100)), "Unix seconds"),
         (lfp_csv().replace(",", ",=", 5).replace(",=lfp", ",lfp", 1), "is text"),
         (lfp_csv("lfp_uV,level"), "missing column t_s"),
     ],

@@ -1,0 +1,132 @@
+"""Bytes on their way in: a killed process leaves none behind, no other user can read them, and a full disk does not stay full."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from app.platform import files
+from app.settings import get_settings
+
+ROOT = Path(__file__).resolve().parents[4]
+NAME = b"NAME-OF-THE-PATIENT"
+UPLOAD = """
+import io, sys, time
+from app.accounts.permissions import SYSTEM
+from app.ingest.uploads import service
+from ml import formats
+from app.ingest.sessions import StatedSession
+from app.platform.database import new_session
+from app.platform.tables import load_tables
+from app.study.repository import participant_by_code
+
+def stay(*_):
+    print("here", flush=True)
+    time.sleep(600)
+
+class Slow(io.BytesIO):
+    def read(self, n=-1):
+        if sys.argv[1] == "coming" and self.tell() > 3 << 20:
+            stay()
+        return super().read(n)
+
+load_tables()
+if sys.argv[1] == "cleaning":
+    formats.redact = stay
+raw = b"t_s,beta,amplitude_fraction,note\\n" + b"".join(b"%d,1,1,NAME-OF-THE-PATIENT\\n" % (2 * k) for k in range(1, 250_000))
+with new_session() as db:
+    service.receive(db, participant_by_code(db, "P1", SYSTEM), StatedSession(), [service.Incoming("t.csv", Slow(raw))], SYSTEM)
+"""
+
+
+def stored() -> list[Path]:
+    return [p for p in get_settings().files_dir.rglob("*") if p.is_file()]
+
+
+def incoming() -> Path:
+    return get_settings().files_dir / "incoming"
+
+
+@pytest.mark.parametrize("moment", ["coming", "cleaning"])
+def test_a_process_killed_in_mid_upload_leaves_no_raw_bytes(enrolled: str, moment: str) -> None:
+    with subprocess.Popen([sys.executable, "-c", UPLOAD, moment], cwd=ROOT, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"here\n", "the upload is in its middle"
+        (folder,) = incoming().iterdir()
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+        assert {stat.S_IMODE(p.stat().st_mode) for p in folder.iterdir()} == {0o600}
+        assert files.remove_abandoned() == 0
+        assert folder.is_dir(), "a live process keeps what it writes"
+        os.kill(process.pid, signal.SIGKILL)
+    assert [p for p in stored() if NAME in p.read_bytes()] == []
+    assert sum(p.stat().st_size for p in stored()) == 0, "nothing of it keeps the disk full"
+    files.remove_abandoned()
+    assert list(incoming().iterdir()) == []
+
+
+def test_the_start_of_the_service_removes_what_killed_processes_left(service_app: FastAPI) -> None:
+    own = files.draft_path()
+    own.write_bytes(b"being written")
+    dead = incoming() / "0123456789abcdef"
+    dead.mkdir()
+    (dead / ".lock").touch()
+    (dead / "draft").write_bytes(NAME)
+    (incoming() / "draft-of-an-earlier-version").write_bytes(NAME)
+    with TestClient(service_app) as client:
+        assert client.get("/healthz").status_code == 200
+    assert [p for p in incoming().rglob("*") if p.is_file() and p.name != ".lock"] == [own]
+    assert not dead.exists()
+
+
+FULL = """
+import io, resource, sys
+from app.ingest import encryption
+from app.platform import files
+resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
+source = sys.argv[1]
+big = bytes(5 << 20)
+for action in (
+    lambda: files.store(None, big, "text/plain"),
+    lambda: encryption.encrypt(__import__("pathlib").Path(source)),
+    lambda: files.received(io.BytesIO(big), 1 << 30).__enter__(),
+):
+    try:
+        action()
+    except OSError as error:
+        print(error.errno)
+"""
+
+
+def test_what_does_not_fit_on_the_disk_leaves_nothing_there(fresh_database: str, tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    source.write_bytes(bytes(5 << 20))
+    done = subprocess.run([sys.executable, "-c", FULL, str(source)], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert len(done.stdout.split()) == 3, done.stderr
+    assert [p for p in stored() if p.name != ".lock"] == []
+
+
+def test_without_a_list_of_open_files_the_bytes_have_a_name_that_only_the_owner_reads(
+    fresh_database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "_OPEN_FILES", Path("/nowhere"))
+    with files.received(io.BytesIO(NAME), 100) as (path, _, size):
+        assert (path.read_bytes(), size) == (NAME, len(NAME))
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert not path.exists()
+
+
+def test_raw_bytes_have_no_name_and_can_be_read_by_their_path(fresh_database: str) -> None:
+    with files.received(io.BytesIO(NAME), 100) as (path, _, _):
+        assert path.read_bytes() == NAME
+        assert [p for p in incoming().rglob("*") if p.is_file() and p.name != ".lock"] == []
+    with pytest.raises(OverflowError), files.received(io.BytesIO(NAME), 3):
+        pass
