@@ -205,7 +205,7 @@ class SweepCandidateOut(Model):
     )
 
 
-class YardstickOut(Model):
+class BaselineScoreOut(Model):
     """A controller that learns nothing, or only to imitate, scored as the policies are."""
 
     controller: str
@@ -224,7 +224,7 @@ class SweepOut(Model):
     config: dict[str, Any]
     held_out_sessions: list[int]
     candidates: list[SweepCandidateOut]
-    yardsticks: list[YardstickOut]
+    baselines: list[BaselineScoreOut]
     code_version: str
     created_at: datetime
     created_by: str

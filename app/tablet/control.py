@@ -22,10 +22,11 @@ from app.platform.errors import Invalid
 from app.settings import get_settings
 from app.tablet.battery import Implant, read_implant
 from app.tablet.sources import Row, Source, Wish, open_source
-from ml.deploy.appraisal import battery_gain, battery_words, warnings
+from ml.deploy.appraisal import battery_gain
 from ml.deploy.bundle import OpenBundle, open_bundle
 from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.runtime.envelope import Decision, Reason, Signal, reason_names
+from ml.deploy.wording import battery_words, warning_sentences
 from ml.energy import relative_energy, saving_percent
 
 COLUMNS = (
@@ -96,7 +97,7 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
             f"{bundle.name} is of participant {manifest.participant}, not {task.participant}.", "A bundle is for its participant alone."
         )
     facts: dict[str, Any] = {"bundle": bundle.name, "participant": manifest.participant, "policy_name": manifest.policy_name}
-    facts |= {"policy_id": manifest.policy_id, "approved": bool(manifest.approvals), "warnings": warnings(manifest)}
+    facts |= {"policy_id": manifest.policy_id, "approved": bool(manifest.approvals), "warnings": warning_sentences(manifest)}
     if source is None:
         return facts | {"verified": True, "files": len(manifest.files)}
     if source == "-" and wish.realtime and not manifest.approvals and not task.bench:

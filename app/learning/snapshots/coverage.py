@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.learning.models import BufferSnapshot
-from app.learning.training.compute import read_buffer
+from app.learning.snapshots.buffers import read_buffer
 from app.platform.web.charts import ACCENT, CONTROLLERS, WARN, Chart, axis, figure
 from app.study import blinding
 from app.study import repository as study_repository

@@ -8,8 +8,8 @@ from typing import Any
 
 from app.learning.models import Policy, Sweep
 from app.platform.web.charts import Chart, axis, figure
-from ml.rl.selection import Gain, surest
-from ml.rl.support import LARGEST_SHARE_BELOW
+from ml.ope.compare.selection import Gain, surest
+from ml.policies.logged_range import LARGEST_SHARE_BELOW
 
 PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")
 DASHES = ("solid", "dash", "dot")
@@ -62,10 +62,10 @@ def candidates(sweep: Sweep) -> list[Candidate]:
     return sorted(found, key=lambda c: -c.score if c.score is not None else float("inf"))
 
 
-def better_without_learning(found: Sequence[Candidate], yardsticks: Sequence[dict[str, Any]]) -> str | None:
+def better_without_learning(found: Sequence[Candidate], baselines: Sequence[dict[str, Any]]) -> str | None:
     """The best controller without learning where it scores above every policy of the sweep, else None; None too where nothing scored."""
     scores = [c.score for c in found if c.score is not None]
-    best = max(yardsticks, key=lambda row: row["score"], default=None)
+    best = max(baselines, key=lambda row: row["score"], default=None)
     return str(best["controller"]) if best is not None and scores and best["score"] > max(scores) else None
 
 
@@ -77,8 +77,8 @@ def surely_above_cdbs(found: Sequence[Candidate]) -> Candidate | None:
 
 def below_bound(policy: Policy) -> tuple[float, float] | None:
     """The lower bound of the random sessions that a policy learned from, and how often it asks for less; None where that is not known."""
-    told = policy.metrics.get("below_bound")
-    return None if told is None else (float(told["bound"]), float(told["share"]))
+    stored = policy.metrics.get("below_bound")
+    return None if stored is None else (float(stored["bound"]), float(stored["share"]))
 
 
 def _candidate(policy: Policy) -> Candidate:

@@ -20,7 +20,7 @@ from ml.deploy.bundle import RUNNER, build_bundle, model_of, open_bundle, sign, 
 from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.runtime.envelope import BetaSample, EnvelopeLimits, Signal
 from ml.policies.onnx_policy import PolicyFileError
-from ml.rl.networks import MlpPolicy
+from ml.rl import MlpPolicy
 
 
 @pytest.fixture(scope="module")

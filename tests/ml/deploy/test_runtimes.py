@@ -29,7 +29,7 @@ from ml.deploy.runtime.network import MlpNetwork
 from ml.deploy.vectors import Step, edge_windows, session
 from ml.deploy.windows import PolicyWindow
 from ml.policies.onnx_policy import OnnxPolicy
-from ml.rl.networks import MlpPolicy
+from ml.rl import MlpPolicy
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion", "-O2")
 SANITISED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
