@@ -190,7 +190,7 @@ class SweepCandidateOut(Model):
     algorithm: str
     actor_lr: float | None
     seed: int | None
-    best_update: int | None = Field(description="The update whose state was kept; null: the last.")
+    best_update: int | None = Field(description="The update whose state was chosen; null: the last.")
     score: float | None = Field(description="Estimated return on the held-out sessions by fitted Q evaluation; null where none were.")
     over_logged: float | None = Field(description="Q of the held-out first states less the return logged from them.")
     action_distance: float | None = Field(description="Mean absolute difference from the logged amplitudes, fraction.")

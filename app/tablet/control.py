@@ -181,7 +181,8 @@ class DecisionLog:
     def _unwritten(self, error: OSError) -> Invalid:
         done = f" The run ended after {self._rows} decisions." if self._rows >= 0 else ""
         return Invalid(
-            f"The log {self._path} cannot be written: {error.strerror}.{done}", "Name a file where there is room and leave to write."
+            f"The log {self._path} cannot be written: {error.strerror}.{done}",
+            "Name a file on a disk with free space, in a folder that may be written.",
         )
 
 
@@ -293,7 +294,7 @@ def _public_key(key: str | None) -> Ed25519PublicKey:
         path = get_settings().data_dir / "secrets" / _KEY
         if not path.exists():
             raise Invalid(
-                "This machine does not know the key that bundles are signed with.", "Give it with --key: GET /api/v1/bundle-key tells it."
+                "This machine does not know the key that bundles are signed with.", "Give it with --key: GET /api/v1/bundle-key gives it."
             )
         return Ed25519PrivateKey.from_private_bytes(get_settings().secret(_KEY)).public_key()
     text = key.strip()
@@ -305,7 +306,7 @@ def _public_key(key: str | None) -> Ed25519PublicKey:
     try:
         return Ed25519PublicKey.from_public_bytes(bytes.fromhex(text))
     except ValueError as error:
-        raise Invalid("The key is not 64 hexadecimal digits.", "GET /api/v1/bundle-key tells it.") from error
+        raise Invalid("The key is not 64 hexadecimal digits.", "GET /api/v1/bundle-key gives it.") from error
 
 
 def _log_row(row: Row, decision: Decision, window: list[float], latency_us: float, late_s: float, missed: bool) -> list[Any]:
@@ -342,7 +343,7 @@ def _spread(values: Any) -> dict[str, float] | None:
 
 
 def _foreign(run: Run, manifest: BundleManifest) -> dict[str, Any]:
-    """Said where every beta amplitude that came was of another unit or source than the bundle's."""
+    """A warning where every beta amplitude that came was of another unit or source than the bundle's."""
     came = [d for d in run.decisions if not d.reasons & (Reason.NO_BETA | Reason.STALE_BETA)]
     if not came or not all(d.reasons & Reason.WRONG_SIGNAL for d in came):
         return {}

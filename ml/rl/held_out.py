@@ -112,6 +112,6 @@ def split_sessions(buffer: ReplayBuffer, share: float = 0.2, seed: int = 0) -> t
         out |= {members[i] for i in rng.permutation(len(members))[:count]}
     if not out:
         out = {int(rng.integers(len(buffer.sessions)))}
-    kept = tuple(s for i, s in enumerate(buffer.sessions) if i not in out)
+    learnt = tuple(s for i, s in enumerate(buffer.sessions) if i not in out)
     left = tuple(s for i, s in enumerate(buffer.sessions) if i in out)
-    return replace(buffer, sessions=kept), replace(buffer, sessions=left)
+    return replace(buffer, sessions=learnt), replace(buffer, sessions=left)

@@ -27,12 +27,12 @@ class Candidate:
     """One policy of a sweep.
 
     Attributes:
-        score: estimated return on the held-out sessions at the state that was kept; None where none were held out.
+        score: estimated return on the held-out sessions at the state that was chosen; None where none were held out.
         over_logged: mean Q of the held-out sessions' first states less the return logged from them, at the same state.
         action_distance: mean absolute difference from the logged amplitudes over the buffer's states, fraction.
         saturated: share of these states answered with next to 0 or 1.
         mean_amplitude: over the buffer's states, fraction.
-        best_update: the update whose state was kept; None: the last.
+        best_update: the update whose state was chosen; None: the last.
         rate: the policy's learning rate. seed: of its training.
         gain: estimated return less that of cDBS, with its lower bound; None where it was not estimated.
         below: the lower bound B of the buffer's random sessions, and the share of its states answered with less; None where unknown.
@@ -83,15 +83,15 @@ def below_bound(policy: Policy) -> tuple[float, float] | None:
 
 def _candidate(policy: Policy) -> Candidate:
     held = policy.metrics.get("held_out", {})
-    # Policies of before the state that was kept was looked at have the figures of their last state.
-    kept = policy.metrics.get("kept") or policy.metrics.get("last", {})
-    at = _kept(held, policy.metrics.get("best_update"))
+    # Policies stored before the chosen state was measured have the figures of their last state.
+    measured = policy.metrics.get("kept") or policy.metrics.get("last", {})
+    at = _chosen(held, policy.metrics.get("best_update"))
     return Candidate(
         policy=policy,
         score=_at(held, "score", at),
         over_logged=_at(held, "over_logged", at),
-        action_distance=kept.get("action_distance"),
-        saturated=kept.get("saturated"),
+        action_distance=measured.get("action_distance"),
+        saturated=measured.get("saturated"),
         mean_amplitude=policy.metrics.get("mean_amplitude_on_buffer"),
         best_update=policy.metrics.get("best_update"),
         rate=policy.config.get("actor_lr"),
@@ -101,8 +101,8 @@ def _candidate(policy: Policy) -> Candidate:
     )
 
 
-def _kept(held: dict[str, list[float]], best_update: int | None) -> int:
-    """Index of the scoring whose state was kept."""
+def _chosen(held: dict[str, list[float]], best_update: int | None) -> int:
+    """Index of the scoring whose state was chosen."""
     updates = held.get("update", [])
     return updates.index(best_update) if best_update in updates else len(updates) - 1
 

@@ -1,4 +1,4 @@
-"""What an orchestration holds in its hands: steps, compute, fan-out, transactions."""
+"""What an orchestration works with: steps, compute, fan-out, transactions."""
 
 from __future__ import annotations
 
