@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field
 
 from app.learning.models import GateChoice
 from app.platform.web.schemas import Int, Model, Number, Text
+from ml.rl import ALGORITHMS
 
 Preset = Literal["full", "quick"]
 _CONTROL = r"\x00-\x1f\x7f-\x9f"
@@ -33,11 +34,10 @@ AlgorithmName = Literal["ddpg", "td3_bc", "rebrac", "iql", "cloning"]
 PolicyIds = Annotated[list[Annotated[Int, Field(ge=1)]], Field(max_length=50)]
 
 
-ALGORITHM_NAMES: dict[str, str] = {
-    "ddpg": "DDPG", "td3_bc": "TD3+BC", "rebrac": "ReBRAC", "iql": "IQL", "cloning": "behaviour cloning", "distillation": "distillation",
-    "constant": "constant", "proportional": "proportional", "external": "made elsewhere",
+ALGORITHM_NAMES: dict[str, str] = {name: algorithm.title for name, algorithm in ALGORITHMS.items()} | {
+    "distillation": "distillation", "constant": "constant", "proportional": "proportional", "external": "made elsewhere",
 }  # fmt: skip
-"""What pages call an algorithm; a test holds those that train against the registry of the learners."""
+"""What pages call the algorithm of a policy: those that train, by the table of the learners, and where the others come from."""
 
 
 class SweepParams(Model):

@@ -34,7 +34,7 @@ def starts_of_the_training(db: Session, participant_id: int, params: PipelinePar
     training_starts(db, participant_id, params.training())
 
 
-PIPELINE = register(
+register(
     JobKind(
         name="pipeline",
         title="Between-visit pipeline",
@@ -44,7 +44,7 @@ PIPELINE = register(
         requires=(usable_sessions, starts_of_the_training),
     )
 )
-EVALUATE = register(
+register(
     JobKind(
         name="evaluate",
         title="Evaluate and rank policies",
@@ -54,7 +54,7 @@ EVALUATE = register(
         requires=(usable_sessions, policies_to_rank),
     )
 )
-TRAIN = register(
+register(
     JobKind(
         name="train",
         title="Train policies",
@@ -64,7 +64,7 @@ TRAIN = register(
         requires=(usable_sessions, training_starts),
     )
 )
-DISTILL = register(
+register(
     JobKind(
         name="distill",
         title="Distil policies",

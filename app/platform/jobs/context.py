@@ -41,9 +41,6 @@ class Steps(Protocol):
     def transact(self, key: str, fn: Callable[[Session], dict[str, Any]]) -> StepOutcome:
         """Run a function in a database transaction together with its record."""
 
-    def say(self, text: str) -> None:
-        """Add a line to the job's log."""
-
     def workdir(self, key: str) -> Path:
         """Folder of a step."""
 
@@ -141,10 +138,6 @@ class JobContext:
     def workdir(self, key: str) -> Path:
         """Folder of a compute step, for files that its function left there."""
         return self._steps.workdir(key)
-
-    def say(self, text: str) -> None:
-        """Add a line to the job's log; repeated when the orchestration is replayed."""
-        self._steps.say(text)
 
     def _use(self, key: str) -> None:
         if key in self._used:

@@ -134,16 +134,6 @@ class Ledger:
 
         self._persist(write)
 
-    def say(self, text: str) -> None:
-        """Add a line to the job's log."""
-
-        def write() -> None:
-            with self._locked() as (db, job):
-                job.message = text
-                repository.add_event(db, job.id, "log", {"text": text})
-
-        self._persist(write)
-
     def close(self, status: JobStatus, result: dict[str, Any] | None = None, error: str | None = None, trace: str = "") -> None:
         """End the job; steps that did not end are cancelled."""
 

@@ -82,10 +82,6 @@ class JobSteps:
             self.ledger.fail_step(key, message, _trace(error))
             return {"ok": False, "message": message}
 
-    def say(self, text: str) -> None:
-        """Add a line to the job's log."""
-        self.ledger.say(text)
-
     def workdir(self, key: str) -> Path:
         """Folder of a step; the parts of a key are joined so that no step's folder lies within another's."""
         return get_settings().jobs_dir / self.ledger.job_id / key.replace("/", "__")

@@ -1,4 +1,7 @@
-"""Behaviour cloning: the policy that imitates the logged amplitudes. One that does not beat it has learnt nothing of rewards."""
+"""Behaviour cloning: the policy that imitates the logged amplitudes. One that does not beat it has learnt nothing of rewards.
+
+Source: Pomerleau 1989. Its stored key is `cloning`.
+"""
 
 from __future__ import annotations
 

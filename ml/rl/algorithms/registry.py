@@ -21,14 +21,11 @@ class Algorithm:
 
     Attributes:
         name: its key, as stored with every policy. title: its name for people.
-        summary: one sentence on what it does with logged data. source: where it was published.
         implementation: its learner, as `module:class`; imported when it is first asked for.
     """
 
     name: str
     title: str
-    summary: str
-    source: str
     implementation: str
 
     @property
@@ -45,41 +42,11 @@ class Algorithm:
 
 
 _TABLE = (
-    Algorithm(
-        "ddpg",
-        "DDPG",
-        "Climbs the critic without a bond to the logged actions, as in the paper; with little data its values climb too.",
-        "Lillicrap et al. 2016; Gao et al. 2023",
-        "ml.rl.algorithms.ddpg:DdpgLearner",
-    ),
-    Algorithm(
-        "td3_bc",
-        "TD3+BC",
-        "Two critics, the smaller one counts; the actor is held near the logged actions.",
-        "Fujimoto and Gu 2021",
-        "ml.rl.algorithms.td3_bc:Td3BcLearner",
-    ),
-    Algorithm(
-        "rebrac",
-        "ReBRAC",
-        "As TD3+BC, with penalties in actor and critic apart and normalised critics.",
-        "Tarasov et al. 2023",
-        "ml.rl.algorithms.rebrac:RebracLearner",
-    ),
-    Algorithm(
-        "iql",
-        "IQL",
-        "Never asks for the value of an action that was not logged; imitates the better logged actions.",
-        "Kostrikov et al. 2022",
-        "ml.rl.algorithms.iql:IqlLearner",
-    ),
-    Algorithm(
-        "cloning",
-        "Behaviour cloning",
-        "Imitates the logged amplitudes and knows no rewards: what the others have to beat.",
-        "Pomerleau 1989",
-        "ml.rl.algorithms.bc:CloningLearner",
-    ),
+    Algorithm("ddpg", "DDPG", "ml.rl.algorithms.ddpg:DdpgLearner"),
+    Algorithm("td3_bc", "TD3+BC", "ml.rl.algorithms.td3_bc:Td3BcLearner"),
+    Algorithm("rebrac", "ReBRAC", "ml.rl.algorithms.rebrac:RebracLearner"),
+    Algorithm("iql", "IQL", "ml.rl.algorithms.iql:IqlLearner"),
+    Algorithm("cloning", "behaviour cloning", "ml.rl.algorithms.bc:CloningLearner"),
 )
 ALGORITHMS: Final[Mapping[str, Algorithm]] = MappingProxyType({item.name: item for item in _TABLE})
 
