@@ -37,9 +37,7 @@ from ml.deploy.runtime.envelope import BetaSample, Signal
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.population import PARTICIPANTS, random_controller_buffer
 from ml.population.env import ParticipantEnv
-from ml.rl.algorithms.registry import ALGORITHMS
-from ml.rl.distillation import DistilConfig, distil
-from ml.rl.networks import STUDENT_HIDDEN, TEACHER_HIDDEN, MlpPolicy
+from ml.rl import ALGORITHMS, STUDENT_HIDDEN, TEACHER_HIDDEN, DistilConfig, MlpPolicy, distil, train
 from ml.trajectories import ReplayBuffer
 
 WINDOW, MEAN, STD = 10, 120.0, 35.0
@@ -144,7 +142,7 @@ def energies() -> list[dict[str, Any]]:
         buffer = random_controller_buffer(code, visits=3, sessions_per_visit=6, steps=SESSION_STEPS, seed=2026)
         learner = ALGORITHMS["rebrac"]
         config = learner.config(updates=5000, batch=64, actor_lr=3e-4, actor_penalty=0.1, aim="return", record_every=500, seed=0)
-        full = learner.train(buffer, config).policy
+        full = train(buffer, config).policy
         small = distil(full, buffer, DistilConfig()).policy
         lowest, rng = buffer.settings.lower_bound, np.random.default_rng(5)
         rows = {

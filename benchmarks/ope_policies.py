@@ -6,8 +6,7 @@ from pathlib import Path
 
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
-from ml.rl.algorithms.registry import ALGORITHMS
-from ml.rl.distillation import DistilConfig, distil
+from ml.rl import ALGORITHMS, DistilConfig, distil, train
 from ml.trajectories import ReplayBuffer
 
 SMALL = {"hidden": (64, 48), "updates": 3000, "batch": 64, "actor_lr": 3e-4}
@@ -31,7 +30,7 @@ def trained_policies(buffer: ReplayBuffer, seed: int, folder: Path) -> dict[str,
     if not all(f.exists() for f in files.values()):
         for k, (name, changes) in enumerate((("ddpg", {}), ("rebrac", {"aim": "return"}), ("td3_bc", {"aim": "return"}))):
             algorithm = ALGORITHMS[name]
-            policy = algorithm.train(buffer, algorithm.config(**SMALL, **changes, seed=seed + k)).policy
+            policy = train(buffer, algorithm.config(**SMALL, **changes, seed=seed + k)).policy
             if name == "td3_bc":
                 policy = distil(policy, buffer, DistilConfig(updates=1000, sigma=0.6, seed=seed)).policy
                 name = "td3_bc distilled"

@@ -28,11 +28,10 @@ from torch import nn
 
 from ml.mdp import MdpSettings
 from ml.policies.onnx_policy import OnnxPolicy
+from ml.rl import STUDENT_HIDDEN, TEACHER_HIDDEN, DistilConfig, MlpPolicy, distil, train_many
 from ml.rl.algorithms.ddpg import DdpgConfig, DdpgLearner
-from ml.rl.algorithms.registry import algorithm
-from ml.rl.batches import BLOCK, PackedTransitions, RewardScale, batch_indices
-from ml.rl.distillation import DistilConfig, distil
-from ml.rl.networks import STUDENT_HIDDEN, TEACHER_HIDDEN, Critic, MlpPolicy
+from ml.rl.kernels.batches import BLOCK, PackedTransitions, RewardScale, batch_indices
+from ml.rl.kernels.networks import Critic
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 WINDOW, ROWS, GAMMA, TAU = 10, 100_000, 0.99, 0.005
@@ -204,7 +203,7 @@ def train_and_distil(seeds: tuple[int, ...]) -> float:
     """Train policies of these seeds side by side, then distil each; CPU seconds of this process."""
     buffer = random_sessions()
     configs = [DdpgConfig(updates=SIX_UPDATES, batch=SIX_BATCH, seed=seed, actor_lr=10.0 ** -(3 + seed / 5)) for seed in seeds]
-    for trained in algorithm("ddpg").train_many(buffer, configs):
+    for trained in train_many(buffer, configs):
         distil(trained.policy, buffer, DistilConfig(seed=trained.seed))
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_utime + usage.ru_stime

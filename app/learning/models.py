@@ -90,7 +90,7 @@ class Sweep(Base):
     snapshot_id: Mapped[int] = mapped_column(ForeignKey("buffer_snapshot.id"))
     job_id: Mapped[str] = mapped_column(ForeignKey("job.id"), unique=True)
     config: Mapped[dict[str, Any]]
-    yardsticks: Mapped[dict[str, Any]]
+    baselines: Mapped[dict[str, Any]]
     code_version: Mapped[str] = mapped_column(String(80))
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field
 
 from app.learning.models import GateChoice
 from app.platform.web.schemas import Int, Model, Number, Text
+from ml.rl import ALGORITHMS
 
 Preset = Literal["full", "quick"]
 _CONTROL = r"\x00-\x1f\x7f-\x9f"
@@ -33,11 +34,10 @@ AlgorithmName = Literal["ddpg", "td3_bc", "rebrac", "iql", "cloning"]
 PolicyIds = Annotated[list[Annotated[Int, Field(ge=1)]], Field(max_length=50)]
 
 
-ALGORITHM_NAMES: dict[str, str] = {
-    "ddpg": "DDPG", "td3_bc": "TD3+BC", "rebrac": "ReBRAC", "iql": "IQL", "cloning": "behaviour cloning", "distillation": "distillation",
-    "constant": "constant", "proportional": "proportional", "external": "made elsewhere",
+ALGORITHM_NAMES: dict[str, str] = {name: algorithm.title for name, algorithm in ALGORITHMS.items()} | {
+    "distillation": "distillation", "constant": "constant", "proportional": "proportional", "external": "made elsewhere",
 }  # fmt: skip
-"""What pages call an algorithm; a test holds those that train against the registry of the learners."""
+"""What pages call the algorithm of a policy: those that train, by the table of the learners, and where the others come from."""
 
 
 class SweepParams(Model):
@@ -190,7 +190,7 @@ class SweepCandidateOut(Model):
     algorithm: str
     actor_lr: float | None
     seed: int | None
-    best_update: int | None = Field(description="The update whose state was kept; null: the last.")
+    best_update: int | None = Field(description="The update whose state was chosen; null: the last.")
     score: float | None = Field(description="Estimated return on the held-out sessions by fitted Q evaluation; null where none were.")
     over_logged: float | None = Field(description="Q of the held-out first states less the return logged from them.")
     action_distance: float | None = Field(description="Mean absolute difference from the logged amplitudes, fraction.")
@@ -205,7 +205,7 @@ class SweepCandidateOut(Model):
     )
 
 
-class YardstickOut(Model):
+class BaselineScoreOut(Model):
     """A controller that learns nothing, or only to imitate, scored as the policies are."""
 
     controller: str
@@ -224,7 +224,7 @@ class SweepOut(Model):
     config: dict[str, Any]
     held_out_sessions: list[int]
     candidates: list[SweepCandidateOut]
-    yardsticks: list[YardstickOut]
+    baselines: list[BaselineScoreOut]
     code_version: str
     created_at: datetime
     created_by: str

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from sqlalchemy.orm import Session
 
+from app.learning import wording
 from app.learning.gate import service as gates
 from app.learning.models import BufferSnapshot, Policy, Sweep
 from app.learning.schemas import (
+    BaselineScoreOut,
     GateDecisionOut,
     GateOut,
     PolicyOut,
@@ -15,7 +17,6 @@ from app.learning.schemas import (
     SnapshotSessionOut,
     SweepCandidateOut,
     SweepOut,
-    YardstickOut,
 )
 from app.learning.sweeps import comparison
 from app.study import repository as study_repository
@@ -70,10 +71,15 @@ def gate_out(found: gates.Gate) -> GateOut:
     decision = found.decision
     return GateOut(
         open=found.is_open,
-        grounds=found.grounds,
+        grounds=wording.gate_grounds(found),
         opened_by_test=found.opened_by_test,
         tests=[
-            QocTestOut(qoc=t.field, **{name: getattr(t, name) for name in QocTestOut.model_fields if name != "qoc"}) for t in found.tests
+            QocTestOut(
+                qoc=t.field,
+                note=wording.gate_test_note(t),
+                **{name: getattr(t, name) for name in QocTestOut.model_fields if name not in ("qoc", "note")},
+            )
+            for t in found.tests
         ],
         decision=None
         if decision is None
@@ -92,7 +98,7 @@ def sweep_out(db: Session, sweep: Sweep) -> SweepOut:
         snapshot_id=sweep.snapshot_id,
         job_id=sweep.job_id,
         config=sweep.config,
-        held_out_sessions=sweep.yardsticks["held_out_sessions"],
+        held_out_sessions=sweep.baselines["held_out_sessions"],
         candidates=[
             SweepCandidateOut(
                 policy_id=c.policy.id,
@@ -112,7 +118,7 @@ def sweep_out(db: Session, sweep: Sweep) -> SweepOut:
             )
             for c in comparison.candidates(sweep)
         ],
-        yardsticks=[YardstickOut(**row) for row in sweep.yardsticks["rows"]],
+        baselines=[BaselineScoreOut(**row) for row in sweep.baselines["rows"]],
         code_version=sweep.code_version,
         created_at=sweep.created_at,
         created_by=sweep.created_by,

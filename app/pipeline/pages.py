@@ -12,20 +12,19 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.evaluation.estimates.methods import METHOD_NAMES, METHODS, QUICK_METHODS
-from app.evaluation.schemas import EvaluateParams
 from app.learning import repository as learning
-from app.learning.schemas import ALGORITHM_NAMES, AlgorithmName, DistilParams, TrainParams
+from app.learning.schemas import ALGORITHM_NAMES, AlgorithmName
 from app.learning.snapshots.service import not_ready
 from app.pipeline import charts, service
 from app.pipeline.deps import CurrentJob
-from app.pipeline.schemas import PipelineParams
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
+from app.platform.jobs import registry
 from app.platform.jobs import repository as jobs
 from app.platform.jobs import service as job_service
 from app.platform.jobs.models import JobStatus
 from app.platform.web.forms import FormValues, parse
-from app.platform.web.schemas import Model, PagingQuery
+from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
@@ -33,23 +32,9 @@ from app.study.service import may
 
 router = APIRouter()
 
-KINDS: dict[str, tuple[str, type[Model]]] = {
-    "pipeline": ("Between-visit pipeline", PipelineParams),
-    "evaluate": ("Evaluate and rank policies", EvaluateParams),
-    "train": ("Train policies", TrainParams),
-    "distill": ("Distil policies", DistilParams),
-}
-
-
 TRAINABLE = [(name, ALGORITHM_NAMES[name]) for name in get_args(AlgorithmName)]
-
-
 SHOWN_EVENTS = 20_000
-
-
 LOG_LINES = 200
-
-
 REFRESH_S = 4
 
 
@@ -67,10 +52,11 @@ def start_job(request: Request, participant: CurrentParticipant, db: Db, caller:
     if methods := [str(v) for v in values.getlist("methods")]:
         given["methods"] = methods
     try:
-        if given.get("kind") not in KINDS:
-            raise Invalid("The form names no kind of job.", f"Choose one of {', '.join(KINDS)}.")
-        params = parse(KINDS[given["kind"]][1], given).model_dump(mode="json")
-        job = service.start_job(db, participant, given["kind"], params, caller)
+        kinds = registry.kinds()
+        kind = kinds.get(given.get("kind", ""))
+        if kind is None:
+            raise Invalid("The form names no kind of job.", f"Choose one of {', '.join(kinds)}.")
+        job = service.start_job(db, participant, kind.name, parse(kind.params, given).model_dump(mode="json"), caller)
         db.commit()
     except BetaloopError as error:
         db.rollback()
@@ -87,7 +73,7 @@ def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller)
         "pipeline/job.html",
         participant=found.participant,
         job=found.job,
-        title=KINDS[found.job.kind][0] if found.job.kind in KINDS else found.job.kind,
+        title=_titles().get(found.job.kind, found.job.kind),
         live=not JobStatus(found.job.status).ended,
         curves=charts.job_curves(found.job, [e for e in events if e.kind == "points"]),
         log=[e for e in events if e.kind == "log"][-LOG_LINES:],
@@ -136,8 +122,8 @@ def _jobs(
         total=total,
         limit=limit,
         offset=offset,
-        kinds=[(kind, title) for kind, (title, _) in KINDS.items()],
-        titles={kind: title for kind, (title, _) in KINDS.items()},
+        kinds=list(_titles().items()),
+        titles=_titles(),
         live=any(not JobStatus(j.status).ended for j in rows),
         refresh_s=REFRESH_S,
         problem=problem or (blocked.problem(request.url.path) if blocked else None),
@@ -151,6 +137,10 @@ def _jobs(
         may_run=may(caller, can.RUN_JOBS, participant),
     )
     return HTMLResponse(page, status)
+
+
+def _titles() -> dict[str, str]:
+    return {kind.name: kind.title for kind in registry.kinds().values()}
 
 
 def _in_words(params: dict[str, Any]) -> dict[str, Any]:

@@ -9,13 +9,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.evaluation.ranking.service import current_ranking as current_ranking
-from app.evaluation.schemas import EvaluateParams
-from app.evaluation.service import policies_to_rank
-from app.learning.schemas import DistilParams, TrainParams
-from app.learning.snapshots.service import collect
-from app.pipeline.learning import teachers, training_starts
-from app.pipeline.schemas import PipelineParams
+from app.platform.jobs import registry
 from app.platform.jobs import service as jobs
 from app.platform.jobs.models import Job
 from app.study import service as study
@@ -26,20 +20,15 @@ def start_job(db: Session, participant: Participant, kind: str, params: Mapping[
     """Put a job of this participant on the queue.
 
     Raises:
-        Invalid: params that break the kind's schema; no beta threshold yet; no usable session; nothing to train from, distil or rank.
+        UnknownKind: there is no such kind. Invalid: params that break its schema, or something that it requires is not there.
         Forbidden: the caller may not run jobs.
     """
     study.require(caller, can.RUN_JOBS, participant)
-    collect(db, participant)
     job = jobs.submit(db, kind, participant.id, dict(params), caller.label)
-    if kind == "train":
-        training_starts(db, participant.id, TrainParams.model_validate(job.params))
-    elif kind == "pipeline":
-        training_starts(db, participant.id, PipelineParams.model_validate(job.params).training())
-    elif kind == "distill":
-        teachers(db, participant.id, DistilParams.model_validate(job.params))
-    elif kind == "evaluate":
-        policies_to_rank(db, participant.id, EvaluateParams.model_validate(job.params))
+    wanted = registry.kind(kind)
+    checked = wanted.params.model_validate(job.params)
+    for requirement in wanted.requires:
+        requirement(db, participant.id, checked)
     return job
 
 

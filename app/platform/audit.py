@@ -62,6 +62,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "estimate": ("details",),
     "plan": (),
     "plan_item": (),
+    "bundle_release": (),
     "job": ("progress", "message", "updated_at"),
 }
 """Audited tables and the columns left out of what is shown: secrets, bulk arrays and live progress. Every change makes a row, except of

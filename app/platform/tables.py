@@ -17,6 +17,7 @@ TABLE_MODULES = (
     "app.learning.models",
     "app.evaluation.models",
     "app.planning.plans.models",
+    "app.planning.bundles.models",
 )
 
 

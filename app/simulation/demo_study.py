@@ -64,7 +64,7 @@ class DemoSession:
 
     @property
     def started_at(self) -> dt.datetime | None:
-        """Start of the session proper: a device's recording begins with the window before it; a table tells it by its times."""
+        """Start of the session proper: a device's recording begins with the window before it; a table states it by its times."""
         return self.begins if device_session(self.code) else None
 
     def file(self) -> tuple[str, bytes]:

@@ -40,7 +40,7 @@ _WASHOUT_MINUTES = 5.0
 
 
 class Progress(Protocol):
-    """Where the loop tells how far it is."""
+    """Called with how far the loop is."""
 
     def say(self, code: str, what: str) -> None:
         """What is going on."""
@@ -68,7 +68,7 @@ class ParticipantLoop:
 
     Args:
         design: the study. remembered: its seed and its first day. caller: the simulated clinician who uploads, drafts and approves.
-        progress: where to tell. check_worker: raises when nobody works on jobs any more.
+        progress: called with how far the loop is. check_worker: raises when nobody works on jobs any more.
     """
 
     code: str
@@ -154,10 +154,10 @@ class ParticipantLoop:
         """The full-sized policies that did best in the clinic, by the mean actual return of their sessions."""
         returns: dict[int, list[float]] = {}
         for session in study_repository.sessions_of_participant(db, person.id):
-            ran = arm(session, self.caller)
-            value = sessions.actual_return(db, session) if ran.controller is Controller.RL else None
-            if ran.policy_id is not None and value is not None:
-                returns.setdefault(ran.policy_id, []).append(value)
+            assigned = arm(session, self.caller)
+            value = sessions.actual_return(db, session) if assigned.controller is Controller.RL else None
+            if assigned.policy_id is not None and value is not None:
+                returns.setdefault(assigned.policy_id, []).append(value)
         usable = {p.id for p in learning.candidates(db, person.id) if p.kind == "trained"}
         ordered = sorted(usable & returns.keys(), key=lambda i: (-sum(returns[i]) / len(returns[i]), i))
         return ordered[: self.design.preset.policies_per_kind]

@@ -22,10 +22,11 @@ from app.platform.errors import Invalid
 from app.settings import get_settings
 from app.tablet.battery import Implant, read_implant
 from app.tablet.sources import Row, Source, Wish, open_source
-from ml.deploy.appraisal import battery_gain, battery_words, warnings
+from ml.deploy.appraisal import battery_gain
 from ml.deploy.bundle import OpenBundle, open_bundle
 from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.runtime.envelope import Decision, Reason, Signal, reason_names
+from ml.deploy.wording import battery_words, warning_sentences
 from ml.energy import relative_energy, saving_percent
 
 COLUMNS = (
@@ -96,7 +97,7 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
             f"{bundle.name} is of participant {manifest.participant}, not {task.participant}.", "A bundle is for its participant alone."
         )
     facts: dict[str, Any] = {"bundle": bundle.name, "participant": manifest.participant, "policy_name": manifest.policy_name}
-    facts |= {"policy_id": manifest.policy_id, "approved": bool(manifest.approvals), "warnings": warnings(manifest)}
+    facts |= {"policy_id": manifest.policy_id, "approved": bool(manifest.approvals), "warnings": warning_sentences(manifest)}
     if source is None:
         return facts | {"verified": True, "files": len(manifest.files)}
     if source == "-" and wish.realtime and not manifest.approvals and not task.bench:
@@ -180,7 +181,8 @@ class DecisionLog:
     def _unwritten(self, error: OSError) -> Invalid:
         done = f" The run ended after {self._rows} decisions." if self._rows >= 0 else ""
         return Invalid(
-            f"The log {self._path} cannot be written: {error.strerror}.{done}", "Name a file where there is room and leave to write."
+            f"The log {self._path} cannot be written: {error.strerror}.{done}",
+            "Name a file on a disk with free space, in a folder that may be written.",
         )
 
 
@@ -292,7 +294,7 @@ def _public_key(key: str | None) -> Ed25519PublicKey:
         path = get_settings().data_dir / "secrets" / _KEY
         if not path.exists():
             raise Invalid(
-                "This machine does not know the key that bundles are signed with.", "Give it with --key: GET /api/v1/bundle-key tells it."
+                "This machine does not know the key that bundles are signed with.", "Give it with --key: GET /api/v1/bundle-key gives it."
             )
         return Ed25519PrivateKey.from_private_bytes(get_settings().secret(_KEY)).public_key()
     text = key.strip()
@@ -304,7 +306,7 @@ def _public_key(key: str | None) -> Ed25519PublicKey:
     try:
         return Ed25519PublicKey.from_public_bytes(bytes.fromhex(text))
     except ValueError as error:
-        raise Invalid("The key is not 64 hexadecimal digits.", "GET /api/v1/bundle-key tells it.") from error
+        raise Invalid("The key is not 64 hexadecimal digits.", "GET /api/v1/bundle-key gives it.") from error
 
 
 def _log_row(row: Row, decision: Decision, window: list[float], latency_us: float, late_s: float, missed: bool) -> list[Any]:
@@ -341,7 +343,7 @@ def _spread(values: Any) -> dict[str, float] | None:
 
 
 def _foreign(run: Run, manifest: BundleManifest) -> dict[str, Any]:
-    """Said where every beta amplitude that came was of another unit or source than the bundle's."""
+    """A warning where every beta amplitude that came was of another unit or source than the bundle's."""
     came = [d for d in run.decisions if not d.reasons & (Reason.NO_BETA | Reason.STALE_BETA)]
     if not came or not all(d.reasons & Reason.WRONG_SIGNAL for d in came):
         return {}

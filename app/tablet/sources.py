@@ -305,8 +305,8 @@ def _lfp_columns(path: Path) -> list[Stretch]:
         raise UndecodableFile(f"LFP in '{unit}'", "line 1, column lfp", f"Give it in one of {', '.join(LFP_UNITS)}.")
     decimal = table.decimal_mark([time_columns[0], column])
     t_s, values = table.numbers(time_columns[0], decimal), table.numbers(column, decimal) * LFP_UNITS[known]
-    kept = np.isfinite(t_s) & np.isfinite(values)
-    t_s, values = t_s[kept], values[kept]
+    finite = np.isfinite(t_s) & np.isfinite(values)
+    t_s, values = t_s[finite], values[finite]
     steps = np.diff(t_s)
     if t_s.size < 2 or np.any(steps <= 0):
         raise UndecodableFile("times that do not increase", "column t_s", "Sort the rows by time, each time once.")

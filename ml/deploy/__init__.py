@@ -1,4 +1,4 @@
-"""What leaves the building: the controller bundle (network, C header, runner, limits, sheet) and the safety envelope around its network.
+"""What leaves the service: the controller bundle (network, C header, runner, limits, sheet) and the safety envelope around its network.
 
 Source: Gao et al. 2023, sections 3 (the research tablet), 4.2 (distillation) and 6.1 (computation time). Guide: docs/deployment.md.
 """

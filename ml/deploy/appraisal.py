@@ -10,13 +10,15 @@ With that share as an assumption, the life against cDBS is 1 / (1 - share * (1 -
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.deploy.manifest import BundleManifest
-from ml.energy import Range, saving_percent
+from ml.energy import Range
 
 MANY = 0.05
 """Share of windows from which a sheet warns."""
@@ -46,21 +48,37 @@ def of(fractions: NDArray[np.float64], manifest: BundleManifest) -> dict[str, An
     }
 
 
-def warnings(manifest: BundleManifest) -> list[str]:
-    """What the clinician must know of the policy before it is used; empty where nothing stands out."""
+class WarningCode(StrEnum):
+    """What a clinician must know of a policy before it is used."""
+
+    UNTRIED = "untried"
+    BELOW_LOGGED = "below_logged"
+    BELOW_MINIMUM = "below_minimum"
+
+
+@dataclass(frozen=True)
+class BundleWarning:
+    """One warning.
+
+    Attributes:
+        value: share of the logged test windows for which the policy asks for less than `limit`; None where it could not be tried.
+        limit: amplitude, mA; None where it could not be tried.
+    """
+
+    code: WarningCode
+    value: float | None = None
+    limit: float | None = None
+
+
+def warnings(manifest: BundleManifest) -> list[BundleWarning]:
+    """What stands out in a policy's answers; `wording` makes sentences of it."""
     m, out = manifest, []
     if m.test_windows_from is None:
-        return ["Nobody knows what this policy asks for on this participant's beta: no logged beta of its window was there to try it on."]
+        return [BundleWarning(WarningCode.UNTRIED)]
     if m.asked_below_bound is not None and m.logged_lower_bound is not None and m.asked_below_bound >= MANY:
-        out.append(
-            f"Asks for less than was tried at random (B = {m.logged_lower_bound:g} of cDBS, {m.logged_lower_bound * m.cdbs_ma:.3g} mA) "
-            f"in {100 * m.asked_below_bound:.0f} % of {m.test_windows} logged windows: no data there."
-        )
+        out.append(BundleWarning(WarningCode.BELOW_LOGGED, m.asked_below_bound, m.logged_lower_bound * m.cdbs_ma))
     if m.asked_below_minimum is not None and m.asked_below_minimum >= MANY:
-        out.append(
-            f"Asks for less than the lowest amplitude ({m.min_ma:g} mA) in {100 * m.asked_below_minimum:.0f} % of {m.test_windows} "
-            "logged windows: there the limit decides."
-        )
+        out.append(BundleWarning(WarningCode.BELOW_MINIMUM, m.asked_below_minimum, m.min_ma))
     return out
 
 
@@ -78,17 +96,3 @@ def battery_gain(energy_of_cdbs: float, charge_of_cdbs: float, share: Range = ST
         raise ValueError(f"shares lie in [0, 1) and amplitudes are 0 or more, not {share}, {energy_of_cdbs} and {charge_of_cdbs}")
     gains = [1.0 / (1.0 - part * (1.0 - r)) for part in (share.low, share.high) for r in (energy_of_cdbs, charge_of_cdbs)]
     return Range(min(gains), max(gains))
-
-
-def battery_words(energy_of_cdbs: float, charge_of_cdbs: float) -> str:
-    """Saving and battery life in one sentence that carries its assumption."""
-    gain = battery_gain(energy_of_cdbs, charge_of_cdbs)
-    share = f"{100 * STIMULATION_SHARE.low:.0f} to {100 * STIMULATION_SHARE.high:.0f} %"
-    saved = saving_percent(energy_of_cdbs, 1.0)
-    energy = f"{abs(saved):.0f} % {'less' if saved >= 0 else 'more'} stimulation energy than cDBS"
-    if abs(saved) < 0.5:
-        energy = "as much stimulation energy as cDBS"
-    return (
-        f"{energy}; battery life {gain.low:.2f} to {gain.high:.2f} times that of cDBS, if stimulation draws {share} of the implant's power "
-        "(assumed: no recording holds it)"
-    )

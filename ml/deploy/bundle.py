@@ -35,7 +35,7 @@ from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.onnx_mlp import NoPlainNetwork, mlp_of
 from ml.deploy.runtime.__main__ import check
 from ml.deploy.runtime.envelope import Signal
-from ml.deploy.runtime.loop import Controller, WindowNetwork
+from ml.deploy.runtime.loop import BoundedController, WindowNetwork
 from ml.deploy.runtime.network import MlpNetwork
 from ml.deploy.sheet import render
 from ml.deploy.windows import PolicyWindow
@@ -65,9 +65,9 @@ class OpenBundle:
     manifest: BundleManifest
     network: WindowNetwork
 
-    def controller(self) -> Controller:
+    def controller(self) -> BoundedController:
         """The network within the clinician's limits; one per session."""
-        return Controller(self.network, self.manifest.limits(), Signal(self.manifest.beta_unit, self.manifest.beta_source))
+        return BoundedController(self.network, self.manifest.limits(), Signal(self.manifest.beta_unit, self.manifest.beta_source))
 
 
 def build_bundle(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDArray[Any]) -> bytes:
@@ -219,14 +219,6 @@ def sign(content: bytes, private_key: Ed25519PrivateKey) -> bytes:
         raise BundleError("the manifest names another key than the one to sign with")
     files = _unpack(content)
     return _pack(files | {SIGNATURE: private_key.sign(files[MANIFEST])})
-
-
-def model_of(content: bytes) -> bytes:
-    """The ONNX file of a bundle. Raises BundleError when there is none."""
-    files = _unpack(content)
-    if MODEL not in files:
-        raise BundleError(f"the bundle lacks {MODEL}")
-    return files[MODEL]
 
 
 def _check_signature(manifest: bytes, signature: bytes | None, public_key: Ed25519PublicKey) -> None:

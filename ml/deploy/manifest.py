@@ -13,8 +13,6 @@ from ml.deploy.runtime.envelope import EnvelopeLimits
 from ml.deploy.runtime.network import OWN_OUTPUT, Output
 
 SCHEMA_VERSION = 3
-DEFAULTS = "nobody: defaults"
-"""In place of who stated the limits."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -54,7 +52,7 @@ class BundleManifest:
         normalisation_mean, normalisation_std: z-scoring constants inside the network; None where the file does not show them.
         min_ma, max_ma, cdbs_ma, ramp_ma_per_s: the clinician's limits, as in `EnvelopeLimits`.
         max_beta_age_s: as in `EnvelopeLimits`.
-        limits_stated_by: who stated the limits, or how they came about.
+        limits_stated_by: who stated the limits, and when; None where nobody did and they are defaults.
         device_min_ma, device_max_ma: amplitude limits read from the participant's stimulator; None where no recording held them.
         snapshot_sha256: of the buffer snapshot that the policy was trained on; None for a policy made elsewhere.
         policy_code_version: of the betaloop that trained the policy.
@@ -102,7 +100,7 @@ class BundleManifest:
     normalisation_mean: float | None = None
     normalisation_std: float | None = None
     max_beta_age_s: float | None = None
-    limits_stated_by: str = DEFAULTS
+    limits_stated_by: str | None = None
     device_min_ma: float | None = None
     device_max_ma: float | None = None
     snapshot_sha256: str | None = None

@@ -33,7 +33,7 @@ def mlp_of(policy_onnx: bytes, windows: NDArray[Any] | None = None) -> MlpNetwor
     Args:
         policy_onnx: a file that `OnnxPolicy` takes.
         windows: the participant's beta windows [M, W], whose mean and standard deviation are used where the file has none of its own,
-            so that whole numbers have room for beta.
+            so that the fixed-point inputs cover the range of beta.
 
     Raises:
         NoPlainNetwork: the graph holds more than a plain network.

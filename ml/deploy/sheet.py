@@ -6,8 +6,8 @@ import re
 from datetime import datetime
 from html import escape
 
-from ml.deploy.appraisal import battery_words, warnings
-from ml.deploy.manifest import DEFAULTS, BundleManifest
+from ml.deploy.manifest import BundleManifest
+from ml.deploy.wording import battery_words, warning_sentences
 
 _STYLE = """
 @page { size: A4; margin: 10mm 14mm; }
@@ -113,12 +113,12 @@ def _when(text: str) -> str:
 
 
 def _warned(m: BundleManifest) -> str:
-    texts = warnings(m)
+    texts = warning_sentences(m)
     return f'<div class="warn">{"<br>".join(escape(text) for text in texts)}</div>' if texts else ""
 
 
 def _stated(m: BundleManifest) -> str:
-    if m.limits_stated_by == DEFAULTS:
+    if m.limits_stated_by is None:
         return "Nobody stated these limits: they are defaults, to be confirmed by the clinician."
     return f"Stated by {escape(m.limits_stated_by)}."
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ml.deploy.manifest import BundleManifest
 from ml.deploy.runtime.envelope import BetaSample, Signal, reason_names
-from ml.deploy.runtime.loop import Controller, WindowNetwork
+from ml.deploy.runtime.loop import BoundedController, WindowNetwork
 
 TOLERANCE = 1e-5
 """Largest difference between two runtimes on a test vector, amplitude fraction; times the cDBS amplitude, of a decision."""
@@ -48,7 +48,7 @@ def edge_windows(windows: NDArray[np.float64]) -> NDArray[np.float64]:
 def session(manifest: BundleManifest, network: WindowNetwork, windows: NDArray[np.float64]) -> list[Step]:
     """Run the session through the Python controller; what it decides is what others must decide."""
     signal = Signal(manifest.beta_unit, manifest.beta_source)
-    controller = Controller(network, manifest.limits(), signal)
+    controller = BoundedController(network, manifest.limits(), signal)
     steps = []
     for now_s, sample in _script(manifest, signal, np.abs(windows).ravel()):
         decision = controller.decide(now_s, sample)
@@ -64,12 +64,12 @@ def _script(manifest: BundleManifest, signal: Signal, betas: NDArray[np.float64]
     values = iter(np.resize(betas, 40 * (w + 8)).tolist())
     k = 0
 
-    def take(count: int, beta: float | None = None, said: Signal = signal) -> Iterator[tuple[float, BetaSample | None]]:
+    def take(count: int, beta: float | None = None, stated: Signal = signal) -> Iterator[tuple[float, BetaSample | None]]:
         nonlocal k
         for _ in range(count):
             now = k * period
             value = next(values) if beta is None else beta
-            yield now, BetaSample(now, value, said)
+            yield now, BetaSample(now, value, stated)
             k += 1
 
     yield 0.0, None

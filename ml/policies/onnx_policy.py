@@ -1,4 +1,4 @@
-"""Policies kept as ONNX files, from here or from anywhere else.
+"""Policies as ONNX files, made here or elsewhere.
 
 The contract of such a file: one input [N, W] of beta windows, oldest first, in the participant's unit; one output [N, 1] of amplitude
 fractions in [0, 1]; float32 or float64; everything inside the file; the same answer each time. Names are free, N is dynamic or fixed.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +14,10 @@ class Policy(Protocol):
 
     def act(self, states: NDArray[Any]) -> NDArray[np.float64]:
         """Amplitude fractions in [0, 1], shape [N], for beta windows in the beta unit of the participant, shape [N, W], oldest first."""
+
+
+Score = Callable[[Policy], float]
+"""Estimate of a policy's worth, from sessions that the policy did not learn from, say; larger is better."""
 
 
 class ConstantPolicy:

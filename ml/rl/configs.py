@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 
 import torch
 
-from ml.rl.networks import TEACHER_HIDDEN
+from ml.rl.kernels.networks import TEACHER_HIDDEN
 
 DEVICES = ("auto", "cpu", "cuda")
 AIMS = ("steps", "return")

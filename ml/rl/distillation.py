@@ -7,7 +7,7 @@ states: buffer states with Gaussian noise on every element.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
-from ml.rl.networks import STUDENT_HIDDEN, MlpPolicy
-from ml.rl.training import TrainingDiverged, single_thread
+from ml.rl.kernels.networks import STUDENT_HIDDEN, MlpPolicy
+from ml.rl.loop import TrainingDiverged, single_thread
 from ml.trajectories import ReplayBuffer
 
 Agreement = Callable[[Policy, Policy], dict[str, float]]
@@ -144,7 +144,7 @@ def distil(
         teacher: any policy of the participant's beta windows.
         buffer: sessions whose states the student learns on, whatever controller they had.
         config: hyper-parameters.
-        report: told of the progress.
+        report: called with the progress.
         agreement: compares student and teacher once, at the end.
 
     Returns:
@@ -168,25 +168,6 @@ def distil(
             on_noise = ActionError.between(student.act(noisy), teacher.act(noisy))
     agreed = {} if agreement is None else agreement(student, teacher)
     return DistilledPolicy(student, on_buffer, on_noise, student.parameter_count, student.macs, curve, config, agreed)
-
-
-def distil_sizes(
-    teacher: Policy,
-    buffer: ReplayBuffer,
-    sizes: Sequence[tuple[int, ...]],
-    config: DistilConfig,
-    report: Report = silent,
-    agreement: Agreement | None = None,
-) -> list[DistilledPolicy]:
-    """Students of several sizes, all else as in `config`: how small may it be? Arguments and errors as in `distil`."""
-
-    def part(done: int) -> Report:
-        def tell(fraction: float, message: str = "", **numbers: float) -> None:
-            report((done + fraction) / len(sizes), f"student {' x '.join(map(str, sizes[done]))}: {message}", **numbers)
-
-        return tell
-
-    return [distil(teacher, buffer, replace(config, hidden=tuple(size)), part(i), agreement) for i, size in enumerate(sizes)]
 
 
 def _fit(

@@ -1,4 +1,4 @@
-"""Sessions that a training does not see: what they say of the policy on its way, and which of its states is kept.
+"""Sessions that a training does not see: what they say of the policy on its way, and which of its states is chosen.
 
 Nothing here knows a true return. A score is an estimate from held-out sessions that the caller brings (fitted Q evaluation, for
 example: `ml.ope` uses this package, so this package cannot use it). Choosing by a score uses the sessions up: an estimate from the same
@@ -15,26 +15,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.policies.policy import Policy
+from ml.policies.policy import Policy, Score
 from ml.rl.end_reward import EndReward
 from ml.trajectories import ReplayBuffer, to_parquet
-
-Score = Callable[[Policy], float]
-"""Estimate of a policy's worth from held-out sessions; larger is better."""
 
 _SPLIT_STREAM = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeldOut:
+class HeldOutSessions:
     """What watches a training from outside its data.
 
     Attributes:
         sessions: the sessions left out.
-        score: estimate by which the best state is kept; None keeps the last.
+        score: estimate by which the best state is chosen; None takes the last.
         score_name: names the estimate; part of what a checkpoint belongs to.
-        eligible: whether a state may be kept for its score (`ml.rl.support.stays_in_range`, say: beyond the data an estimate is free to be
-            large, and the best score would find that state); None keeps whichever scores best. Where no state is eligible, the last stays.
+        eligible: whether a state may be chosen for its score, such as `ml.policies.logged_range.stays_in_range`: beyond the data an
+            estimate is free to be large, and the best score would find that state. None allows every state; where none is eligible, the
+            last stays.
         is_step_return: whether `score` estimates the discounted sum of step rewards without end, from the sessions' first states; only
             then is Q's distance from it an over-estimation.
         end_reward: what every step adds where the critic's sum holds a share of r_end too; set by the trainer.
@@ -114,6 +112,6 @@ def split_sessions(buffer: ReplayBuffer, share: float = 0.2, seed: int = 0) -> t
         out |= {members[i] for i in rng.permutation(len(members))[:count]}
     if not out:
         out = {int(rng.integers(len(buffer.sessions)))}
-    kept = tuple(s for i, s in enumerate(buffer.sessions) if i not in out)
+    learnt = tuple(s for i, s in enumerate(buffer.sessions) if i not in out)
     left = tuple(s for i, s in enumerate(buffer.sessions) if i in out)
-    return replace(buffer, sessions=kept), replace(buffer, sessions=left)
+    return replace(buffer, sessions=learnt), replace(buffer, sessions=left)

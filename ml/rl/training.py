@@ -1,283 +1,251 @@
-"""The training loop that every offline learner shares: reproducible batches, learning curves, checkpoints.
-
-A learner knows one gradient step of K policies side by side; the loop knows when to measure, report and save. Batches are drawn from a
-counter, not from a running generator: block b of a run with seed s always holds the same rows. The state of the random numbers is
-therefore the update number alone, and a run resumed from a checkpoint goes on bit for bit as if it had not been interrupted (same
-machine, one thread).
-"""
+"""Training with any of the algorithms: one policy, or K side by side; the configuration names the algorithm."""
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import io
-import json
-import math
-import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from ml.progress import Report
-from ml.rl.batches import BLOCK, Batch, PackedTransitions, batch_indices, batch_noise
-from ml.rl.held_out import HeldOut
-from ml.rl.networks import MlpPolicy
+from ml.progress import Report, silent
+from ml.rl.algorithms._learner import StackedLearner
+from ml.rl.algorithms.registry import algorithm
+from ml.rl.configs import TrainConfig
+from ml.rl.end_reward import fit_end_reward
+from ml.rl.held_out import HeldOutSessions
+from ml.rl.kernels.batches import RewardScale, packed
+from ml.rl.kernels.networks import MlpPolicy
+from ml.rl.loop import (
+    Curve,
+    MemberRecord,
+    Schedule,
+    as_curve,
+    fingerprint_of,
+    run,
+    single_thread,
+    tensors_from_bytes,
+    tensors_to_bytes,
+)
+from ml.trajectories import ReplayBuffer, Transitions
 
-_CHECKPOINT_FORMAT = 2
-
-Curve = dict[str, NDArray[np.float64]]
-
-
-class TrainingDiverged(ArithmeticError):
-    """A loss or value is no longer a finite number."""
-
-
-class CheckpointError(ValueError):
-    """The checkpoint file cannot be read, or belongs to another run."""
-
-
-class Learner(Protocol):
-    """One algorithm: its networks and one gradient step, for K policies side by side."""
-
-    members: int
-    uses_noise: bool
-
-    def update(self, batch: Batch) -> None:
-        """One update of the networks; leaves the batch as it is."""
-
-    def measure(self, probe: Batch) -> list[dict[str, float]]:
-        """Points of the learning curves of each policy: means since the last call, and values on the probe."""
-
-    def policy(self, member: int) -> MlpPolicy:
-        """A copy of one policy as it is now."""
-
-    def start_values(self, states: NDArray[np.float64]) -> list[float] | None:
-        """Mean Q(s, pi(s)) over beta windows [n, W] for each policy, in reward units; None for an algorithm without a critic."""
-
-    def rows(self, member: int) -> dict[str, Any]:
-        """One member's weights by network, copies."""
-
-    def state(self) -> dict[str, Any]:
-        """Everything that the next update depends on (weights, targets, optimisers): tensors, numbers, lists, dictionaries."""
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Put `state` back."""
+_UNSHARED = {"checkpoint_every"}
+"""Hyper-parameters that change no result and are left out of a checkpoint's name."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """How long to train, on which random numbers, and when to look.
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """What a training leaves behind; with its critics, so that fine-tuning can go on from it.
 
     Attributes:
-        updates, batch, record_every, checkpoint_every: as in `TrainConfig`. seeds: one per policy. device: of the tensors.
+        policy: the actor.
+        networks: what its algorithm learnt beside it, by name (`critic`, `critic_2`, `value`); on z-scored windows and scaled rewards.
+        reward_scale: how the critics' rewards were scaled.
+        curve: learning curves by name, arrays of one length: `update`; `critic_loss` (mean squared temporal-difference error since the last
+            point, in squared reward units); `mean_q` (mean Q(s, pi(s)) over a probe of the buffer, in reward units: an unbounded climb is
+            over-estimation); `action_distance` (mean |pi(s) - a| to the logged actions of the probe); `saturated` (share of the probe's
+            states answered within 0.01 of 0 or 1: at 1 the tanh has no slope left, and the policy is cDBS or no-DBS by another name);
+            and the algorithm's own losses.
+        config: the hyper-parameters, with the seed.
+        held_out: curves on the held-out sessions, empty without them: `update`; `score`, the caller's estimate; `start_q`, mean
+            Q(s_0, pi(s_0)); `over_logged`, that less the return logged from s_0 under whatever controller was in force; `over_estimate`,
+            that less `score`, where the score is a step return.
+        best_update: the update whose state this is, chosen by `score`; None means the last.
     """
 
-    updates: int
-    batch: int
-    seeds: tuple[int, ...]
-    record_every: int
-    checkpoint_every: int
-    device: str = "cpu"
-
-
-@dataclass
-class Outcome:
-    """What the loop leaves of one policy.
-
-    Attributes:
-        points: of the learning curves. held_out: points on held-out sessions.
-        best_score, best_update, best_rows: the state with the best held-out score; None where nothing scored.
-    """
-
-    points: list[dict[str, float]] = field(default_factory=list)
-    held_out: list[dict[str, float]] = field(default_factory=list)
-    best_score: float | None = None
+    policy: MlpPolicy
+    networks: dict[str, Any]
+    reward_scale: RewardScale
+    curve: Curve
+    config: TrainConfig
+    held_out: Curve = field(default_factory=dict)
     best_update: int | None = None
-    best_rows: dict[str, Any] | None = None
 
-    def scorings_since_best(self) -> int:
-        """Scorings after the best one."""
-        return sum(point["update"] > (self.best_update or 0) for point in self.held_out)
+    @property
+    def seed(self) -> int:
+        """Seed of the initial weights and of the batches."""
+        return self.config.seed
+
+    @property
+    def algorithm(self) -> str:
+        """Key in `ml.rl.algorithms.registry.ALGORITHMS`."""
+        return self.config.algorithm
+
+    @property
+    def critic(self) -> Any:
+        """Q(s, a). Raises KeyError for an algorithm without a critic."""
+        return self.networks["critic"]
+
+    def to_bytes(self) -> bytes:
+        """Everything as bytes, for the file store."""
+        return tensors_to_bytes(
+            {
+                "algorithm": self.algorithm,
+                "config": self.config.to_json(),
+                "reward_scale": list(self.reward_scale),
+                "shape": [self.policy.window, list(self.policy.hidden)],
+                "policy": self.policy.state_dict(),
+                "networks": {name: network.state_dict() for name, network in self.networks.items()},
+                "curve": {name: values.tolist() for name, values in self.curve.items()},
+                "held_out": {name: values.tolist() for name, values in self.held_out.items()},
+                "best_update": self.best_update,
+            }
+        )
+
+    @staticmethod
+    def from_bytes(content: bytes) -> TrainedPolicy:
+        """The inverse of `to_bytes`. Raises ValueError when the bytes are no such training."""
+        saved = tensors_from_bytes(content)
+        try:
+            learner = algorithm(saved["algorithm"]).learner
+            config = learner.config_type.from_json(saved["config"])
+            window, hidden = saved["shape"]
+            policy = MlpPolicy(window, hidden)
+            policy.load_state_dict(saved["policy"])
+            # Files from before there were several algorithms hold one critic by its own name.
+            stored = saved["networks"] if "networks" in saved else {"critic": saved["critic"]}
+            networks = learner.networks(config, policy, [0] * (len(stored) + 1))
+            for name, weights in stored.items():
+                networks[name].load_state_dict(weights)
+            del networks["policy"]
+            curve, held_out = ({n: np.array(v) for n, v in saved.get(part, {}).items()} for part in ("curve", "held_out"))
+            scale = RewardScale(*saved["reward_scale"])
+            return TrainedPolicy(policy, networks, scale, curve, config, held_out, saved.get("best_update"))
+        except (KeyError, TypeError, RuntimeError) as error:
+            raise ValueError(f"these bytes are no stored training: {error}") from error
 
 
-class _Draws:
-    """Batches by update number, drawn in blocks."""
-
-    def __init__(self, learner: Learner, data: PackedTransitions, plan: Plan) -> None:
-        self._uses_noise, self._data, self._plan = learner.uses_noise, data, plan
-        self._block = -1
-        self._index: Any = None
-        self._noise: Any = None
-
-    def batch(self, update: int) -> Batch:
-        """The batch of update 0, 1, ..."""
-        block, row = divmod(update, BLOCK)
-        if block != self._block:
-            p = self._plan
-            index = torch.stack([batch_indices(seed, block, len(self._data), p.batch) for seed in p.seeds], dim=1)
-            self._block, self._index = block, index.to(p.device)
-            if self._uses_noise:
-                self._noise = torch.stack([batch_noise(seed, block, p.batch) for seed in p.seeds], dim=1).to(p.device)
-        return self._data.take(self._index[row], self._noise[row] if self._uses_noise else None)
+Start = TrainedPolicy | MlpPolicy | None
 
 
-def run(
-    learner: Learner,
-    data: PackedTransitions,
-    plan: Plan,
-    *,
-    fingerprint: str,
-    report: Report,
+def train(
+    buffer: ReplayBuffer,
+    config: TrainConfig,
+    report: Report = silent,
     checkpoint: Path | None = None,
-    held_out: HeldOut | None = None,
-) -> list[Outcome]:
-    """Train for `plan.updates` updates, from the checkpoint where there is one.
+    initial: Start = None,
+    held_out: HeldOutSessions | None = None,
+) -> TrainedPolicy:
+    """Train one policy; arguments and errors as in `train_many`."""
+    return train_many(buffer, [config], report, checkpoint, initial, held_out)[0]
+
+
+def train_many(
+    buffer: ReplayBuffer,
+    configs: Sequence[TrainConfig],
+    report: Report = silent,
+    checkpoint: Path | None = None,
+    initial: Start = None,
+    held_out: HeldOutSessions | None = None,
+) -> list[TrainedPolicy]:
+    """Train K policies side by side on a participant's replay buffer, whatever controllers its sessions had; gamma comes from its settings.
+
+    Args:
+        buffer: the sessions; where some are held out, the others.
+        configs: hyper-parameters of each policy, all of one algorithm, which they name; only those in `TrainConfig.per_member` may differ.
+        report: called with the progress and the learning curves' points (with `_1`, `_2`, ... behind the names where K is above 1).
+        checkpoint: file that holds the state of the training; where it exists, the training goes on from it. Not removed at the end.
+        initial: start of a fine-tuning, left as it is: a training (all its networks and scales) or a policy alone, whose critics then
+            start afresh (set `critic_warmup`). The beta scale stays the initial policy's, or it would be another function.
+        held_out: sessions that watch the training, and the score by which its best state is chosen.
 
     Returns:
-        Points and best state of each policy.
+        The trained policies in the order of `configs`; the same bit for bit on one machine for the same arguments.
 
     Raises:
-        TrainingDiverged: a measured number is not finite.
-        CheckpointError: the checkpoint is of another run, or damaged.
+        ValueError: no usable step; configurations that cannot be trained together; an initial policy of another window, other hidden
+            layers or another algorithm; CUDA asked for where there is none.
+        TrainingDiverged: a loss or value is not finite.
+        CheckpointError: the checkpoint belongs to another run, or is damaged.
     """
-    probe, draws = data.probe(learner.members), _Draws(learner, data, plan)
-    starts = held_out.starts() if held_out else None
-    done, stopped, outcomes = 0, False, [Outcome() for _ in range(learner.members)]
-    if checkpoint is not None and checkpoint.exists():
-        done, stopped, outcomes = _resume(learner, checkpoint, fingerprint)
-    while done < plan.updates and not stopped:
-        learner.update(draws.batch(done))
-        done += 1
-        last = done == plan.updates
-        if held_out and starts and (done % held_out.every == 0 or last):
-            _score(learner, held_out, starts, outcomes, done)
-            stopped = 0 < held_out.patience <= min(outcome.scorings_since_best() for outcome in outcomes)
-        if done % plan.record_every == 0 or last or stopped:
-            _record(learner.measure(probe), outcomes, done, plan, report)
-        if checkpoint is not None and (done % plan.checkpoint_every == 0 or last or stopped):
-            saved = [vars(outcome) for outcome in outcomes]
-            _save(
-                checkpoint, {"fingerprint": fingerprint, "update": done, "stopped": stopped, "outcomes": saved, "learner": learner.state()}
-            )
-    return outcomes
+    share = fit_end_reward(buffer) if configs and configs[0].aim == "return" else None
+    data = buffer.transitions()
+    if share is not None:
+        # usable steps have a known amplitude and beta, so that every one has a share
+        shares = np.concatenate([share.per_step(s)[s.usable()] for s in buffer.sessions])
+        data = replace(data, rewards=data.rewards + shares)
+        held_out = replace(held_out, end_reward=share) if held_out else None
+    return train_on(data, buffer.settings.gamma, buffer.beta_scale(), configs, report, checkpoint, initial, held_out)
 
 
-def as_curve(points: Sequence[dict[str, float]]) -> Curve:
-    """Points as arrays by name, all of one length; `update` holds the update numbers."""
-    return {name: np.array([point[name] for point in points]) for name in points[0]} if points else {}
-
-
-def _record(numbers: list[dict[str, float]], outcomes: list[Outcome], done: int, plan: Plan, report: Report) -> None:
-    told: dict[str, float] = {}
-    for k, (outcome, own) in enumerate(zip(outcomes, numbers, strict=True)):
-        of = f" of policy {k + 1}" if len(outcomes) > 1 else ""
-        _require_finite(own, done, of)
-        outcome.points.append({"update": float(done)} | own)
-        told |= own if len(outcomes) == 1 else {f"{name}_{k + 1}": value for name, value in own.items()}
-    report(done / plan.updates, f"update {done} of {plan.updates}", **told)
-
-
-def _score(learner: Learner, held_out: HeldOut, starts: tuple[NDArray[np.float64], float], outcomes: list[Outcome], done: int) -> None:
-    """A point on the held-out sessions for each policy; keeps the eligible state of the best score, the earlier one of equals."""
-    states, logged = starts
-    values = learner.start_values(states)
-    for k, outcome in enumerate(outcomes):
-        point = {"update": float(done)}
-        if values is not None:
-            point |= {"start_q": values[k], "over_logged": values[k] - logged}
-        if held_out.score is not None:
-            policy = learner.policy(k)
-            score = float(held_out.score(policy))
-            _require_finite({"the held-out score": score}, done, f" of policy {k + 1}" if len(outcomes) > 1 else "")
-            point["score"] = score
-            if values is not None and held_out.is_step_return:
-                point["over_estimate"] = values[k] - score
-            eligible = held_out.eligible is None or held_out.eligible(policy)
-            if eligible and (outcome.best_score is None or score > outcome.best_score):
-                outcome.best_score, outcome.best_update, outcome.best_rows = score, done, learner.rows(k)
-        outcome.held_out.append(point)
-
-
-def fingerprint_of(data: PackedTransitions, config: Any, start: dict[str, Any]) -> str:
-    """A name for a run: data, configuration (anything JSON holds) and the weights it starts from."""
-    digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
-    digest.update(data.digest().encode())
-    for tensor in _tensors(start):
-        digest.update(tensor.numpy().tobytes())
-    return digest.hexdigest()
-
-
-@contextlib.contextmanager
-def single_thread() -> Iterator[None]:
-    """One torch thread inside the block: sums then have one order, and two trainings on two cores do not fight."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def tensors_to_bytes(state: dict[str, Any]) -> bytes:
-    """A nest of dictionaries, lists, numbers and tensors as bytes."""
-    sink = io.BytesIO()
-    torch.save(state, sink)
-    return sink.getvalue()
-
-
-def tensors_from_bytes(content: bytes) -> dict[str, Any]:
-    """The inverse of `tensors_to_bytes`; runs no code from the bytes. Raises ValueError when they are something else."""
-    try:
-        state = torch.load(io.BytesIO(content), weights_only=True)
-    except Exception as error:  # torch raises pickle, zip, runtime and EOF errors for damaged files
-        raise ValueError(f"these bytes hold no stored weights: {error}") from error
-    if not isinstance(state, dict):
-        raise ValueError("these bytes hold no stored weights: they are not a dictionary of tensors")
-    return state
-
-
-def _resume(learner: Learner, checkpoint: Path, fingerprint: str) -> tuple[int, bool, list[Outcome]]:
-    try:
-        saved = tensors_from_bytes(checkpoint.read_bytes())
-        format_, owner = saved["format"], saved["fingerprint"]
-    except (ValueError, KeyError) as error:
-        raise CheckpointError(f"the checkpoint {checkpoint.name} cannot be read; delete it to train from the start ({error})") from error
-    if format_ != _CHECKPOINT_FORMAT or owner != fingerprint:
-        raise CheckpointError(
-            f"the checkpoint {checkpoint.name} belongs to a run with other data, another configuration or another start; "
-            "delete it to train from the start, or name another file"
+def train_on(
+    transitions: Transitions,
+    gamma: float,
+    beta_scale: tuple[float, float],
+    configs: Sequence[TrainConfig],
+    report: Report = silent,
+    checkpoint: Path | None = None,
+    initial: Start = None,
+    held_out: HeldOutSessions | None = None,
+) -> list[TrainedPolicy]:
+    """`train_many` on transitions of any source, with gamma and the mean and standard deviation of beta."""
+    _require_together(configs)
+    config, device = configs[0], configs[0].resolved_device()
+    learner_type = algorithm(config.algorithm).learner
+    scale = RewardScale.of(transitions.rewards, gamma)
+    if isinstance(initial, TrainedPolicy):
+        # Stored critics go on in their own reward scale; any affine scale is right for any buffer.
+        scale = initial.reward_scale._replace(gamma=gamma)
+    with single_thread():
+        starts = [_start(learner_type, transitions.states.shape[1], beta_scale, own, initial) for own in configs]
+        learner = learner_type(starts, configs, scale, device)
+        data = packed(transitions, starts[0]["policy"].normalise, scale)
+        named = [{n: v for n, v in own.to_json().items() if n not in _UNSHARED} for own in configs]
+        owner = {"algorithm": config.algorithm, "configs": named, "gamma": gamma, "device": device}
+        fingerprint = fingerprint_of(data, owner | {"held_out": held_out.name() if held_out else None}, learner.state())
+        schedule = Schedule(
+            updates=config.updates,
+            batch=config.batch,
+            seeds=tuple(own.seed for own in configs),
+            record_every=config.record_every,
+            checkpoint_every=config.checkpoint_every,
+            device=device,
         )
-    learner.load_state(saved["learner"])
-    return int(saved["update"]), bool(saved["stopped"]), [Outcome(**outcome) for outcome in saved["outcomes"]]
+        records = run(learner, data.to(device), schedule, fingerprint=fingerprint, report=report, checkpoint=checkpoint, held_out=held_out)
+        return [_finished(learner, k, record) for k, record in enumerate(records)]
 
 
-def _save(checkpoint: Path, content: dict[str, Any]) -> None:
-    """Replace the checkpoint in one step: a kill at any moment leaves the old one or the new one, whole."""
-    part = checkpoint.with_name(checkpoint.name + ".part")
-    with part.open("wb") as sink:
-        sink.write(tensors_to_bytes({"format": _CHECKPOINT_FORMAT} | content))
-        sink.flush()
-        os.fsync(sink.fileno())
-    part.replace(checkpoint)
+def _finished(learner: StackedLearner[Any], member: int, record: MemberRecord) -> TrainedPolicy:
+    networks = learner.modules(record.best_rows or learner.rows(member))
+    policy = networks.pop("policy")
+    curve, held_out = as_curve(record.points), as_curve(record.held_out)
+    return TrainedPolicy(policy, networks, learner.scale, curve, learner.configs[member], held_out, record.best_update)
 
 
-def _require_finite(numbers: dict[str, float], update: int, of: str = "") -> None:
-    for name, value in numbers.items():
-        if not math.isfinite(value):
-            raise TrainingDiverged(f"{name}{of} is {value} after update {update}: the training diverged; lower the learning rates")
+def _require_together(configs: Sequence[TrainConfig]) -> None:
+    if not configs:
+        raise ValueError("a training needs one configuration or more")
+    first = configs[0]
+    for config in configs:
+        if type(config) is not type(first):
+            raise ValueError(f"policies trained side by side have one algorithm, not {first.algorithm} and {config.algorithm}")
+        own, others = config.to_json(), first.to_json()
+        apart = [name for name in own if own[name] != others[name] and name not in first.per_member]
+        if apart:
+            raise ValueError(
+                f"policies trained side by side may differ in {', '.join(first.per_member)}, not in {', '.join(apart)}; train them apart"
+            )
 
 
-def _tensors(state: Any) -> Iterator[Any]:
-    if isinstance(state, torch.Tensor):
-        yield state.detach().cpu().contiguous()
-    elif isinstance(state, dict):
-        for key in sorted(state, key=str):
-            yield from _tensors(state[key])
-    elif isinstance(state, list | tuple):
-        for item in state:
-            yield from _tensors(item)
+def _start(
+    learner_type: type[StackedLearner[Any]], window: int, beta_scale: tuple[float, float], config: TrainConfig, initial: Start
+) -> dict[str, Any]:
+    """The networks of one member."""
+    actor_seed, *seeds = (int(s.generate_state(1)[0]) for s in np.random.SeedSequence(config.seed).spawn(4))
+    policy = initial.policy if isinstance(initial, TrainedPolicy) else initial
+    if policy is None:
+        policy = MlpPolicy(window, config.hidden, mean=beta_scale[0], std=beta_scale[1], seed=actor_seed)
+    if policy.window != window or policy.hidden != config.hidden:
+        raise ValueError(
+            f"the initial policy has a window of {policy.window} and hidden layers {policy.hidden}; "
+            f"the buffer has a window of {window} and the configuration hidden layers {config.hidden}"
+        )
+    if not isinstance(initial, TrainedPolicy):
+        return learner_type.networks(config, policy, seeds)
+    if initial.algorithm != config.algorithm:
+        raise ValueError(
+            f"the initial training is of {initial.algorithm}, whose critics {config.algorithm} cannot go on with; "
+            "start from its policy alone, with a critic_warmup"
+        )
+    return {"policy": policy, **initial.networks}

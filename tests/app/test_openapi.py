@@ -33,6 +33,14 @@ INTENDED: dict[str, str] = {
         ),
         "Settings and cDBS amplitudes have clinical bounds",
     ),
+    **dict.fromkeys(
+        (
+            "components > schemas > BaselineScoreOut",
+            "components > schemas > SweepOut",
+            "components > schemas > YardstickOut",
+        ),
+        "API: sweeps call their scores of controllers without learning `baselines` (was `yardsticks`).",
+    ),
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",
     "components > schemas > JobOut > required": "API: a job has `seconds_left`.",
 }
@@ -54,7 +62,8 @@ def differences(old: Any, new: Any, place: tuple[str, ...] = ()) -> Iterator[tup
         # parameters: their order says nothing
         yield from differences({f"{v['in']} {v['name']}": v for v in old}, {f"{v['in']} {v['name']}": v for v in new}, place)
     elif isinstance(old, list) and isinstance(new, list) and any(isinstance(v, dict) for v in old + new) and len(old) == len(new):
-        for i, (a, b) in enumerate(zip(old, new, strict=True)):
+        # alternatives: their order says nothing either
+        for i, (a, b) in enumerate(zip(*(sorted(v, key=lambda one: json.dumps(one, sort_keys=True)) for v in (old, new)), strict=True)):
             yield from differences(a, b, (*place, str(i)))
     elif sorted(old, key=repr) != sorted(new, key=repr) if isinstance(old, list) and isinstance(new, list) else old != new:
         yield " > ".join(place), f"was {json.dumps(old)}, is {json.dumps(new)}"

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app.evaluation.estimates.methods import AGGREGATE
-from app.learning.training.compute import read_buffer, told
+from app.learning.snapshots.buffers import read_buffer
 from app.platform import files
-from app.platform.jobs import Report, compute, write_atomically
+from app.platform.jobs import StepReport, write_atomically
 from ml import progress
 
 if TYPE_CHECKING:
@@ -28,8 +28,7 @@ def member_file(k: int) -> str:
     return f"dlsm-member-{k}.pt"
 
 
-@compute("fit_dlsm")
-def fit_dlsm(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+def fit_dlsm(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """Train one member of the DLSM ensemble; its file stays in the working folder, where an interrupted training goes on from it.
 
     Args:
@@ -48,7 +47,7 @@ def fit_dlsm(params: dict[str, Any], workdir: Path, report: Report) -> dict[str,
     buffer = read_buffer(params["snapshot_sha256"])
     estimator = Dlsm(_dlsm_config(params))
     try:
-        member = estimator.fit_member(buffer, params["member"], told(report, estimator.config.steps, "dlsm_"), workdir)
+        member = estimator.fit_member(buffer, params["member"], report.curves(estimator.config.steps, "dlsm_"), workdir)
     except ValueError as error:
         return {"failed": str(error)}
     report.log(f"member {params['member'] + 1} {_ended(member.course, estimator.config.steps)}")
@@ -62,8 +61,7 @@ def _ended(course: Sequence[tuple[int, float, float]], steps: int) -> str:
     return f"{end}: the best held-out score, {score:.4g}, was that of update {best}, which is kept"
 
 
-@compute("evaluate_method")
-def evaluate_method(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """Estimate every policy by one method.
 
     Args:
@@ -110,8 +108,7 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: Report) -> di
     return {"estimates": {policy_id: _finite(e.to_json()) for policy_id, e in estimates.items()}}
 
 
-@compute("check_coverage")
-def check_coverage(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+def check_coverage(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """Check what the data can say about every policy, whatever the methods say of it.
 
     Args:
@@ -129,14 +126,13 @@ def check_coverage(params: dict[str, Any], workdir: Path, report: Report) -> dic
     torch.set_num_threads(1)
     buffer = read_buffer(params["snapshot_sha256"])
     try:
-        found = diagnose(buffer, _policies(params["policies"], buffer), params["horizon_steps"], told(report, 1.0))
+        found = diagnose(buffer, _policies(params["policies"], buffer), params["horizon_steps"], report.curves(1.0))
     except ValueError as error:
         return {"failed": str(error)}
     return {"policies": {policy_id: _finite(d.to_json()) for policy_id, d in found.items()}}
 
 
-@compute("choose_method")
-def choose_method(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+def choose_method(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """Hold the methods that are fitted within seconds against controllers that were left out of their fits.
 
     Args:
@@ -166,7 +162,7 @@ def choose_method(params: dict[str, Any], workdir: Path, report: Report) -> dict
             horizon_steps=params["horizon_steps"],
             aggregate=AGGREGATE in params["methods"],
             seed=params["seed"],
-            report=told(report, 1.0),
+            report=report.curves(1.0),
         )
     except ValueError as error:
         return {"failed": str(error)}

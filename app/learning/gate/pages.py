@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
+from app.learning import wording
 from app.learning.gate import service as gates
 from app.learning.schemas import GateChange
 from app.platform.database import Db
@@ -55,11 +56,14 @@ def _page(
     typed: Mapping[str, str] | None = None,
 ) -> HTMLResponse:
     site = participant.site
+    gate = gates.gate(db, participant, study_repository.sessions_of_participant(db, participant.id))
     page = render(
         request,
         "learning/gate.html",
         participant=participant,
-        gate=gates.gate(db, participant, study_repository.sessions_of_participant(db, participant.id)),
+        gate=gate,
+        grounds=wording.gate_grounds(gate),
+        notes={t.field: wording.gate_test_note(t) for t in gate.tests},
         alpha=gates.ALPHA,
         typed=typed or dict.fromkeys(LABELS, ""),
         may_decide=caller.may(can.APPROVE_PLAN, site.study_id, site.id),

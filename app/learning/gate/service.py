@@ -39,7 +39,6 @@ class QocTest:
     Attributes:
         n_learned, n_random: sessions with a value. median_learned, median_random: None without one.
         p_better, p_worse: one-sided, Holm-adjusted over the QoCs tested; None where there is not enough data.
-        note: the check that failed; empty where the test was made.
     """
 
     field: str
@@ -51,7 +50,11 @@ class QocTest:
     median_random: float | None
     p_better: float | None = None
     p_worse: float | None = None
-    note: str = ""
+
+    @property
+    def tested(self) -> bool:
+        """Whether there were enough sessions for a test."""
+        return self.p_better is not None
 
 
 @dataclass(frozen=True)
@@ -74,23 +77,6 @@ class Gate:
         if self.decision is None or self.decision.choice == GateChoice.TEST:
             return self.opened_by_test
         return self.decision.choice == GateChoice.OPEN
-
-    @property
-    def grounds(self) -> str:
-        """Why it is open or shut, in one sentence."""
-        if self.decision is not None and self.decision.choice != GateChoice.TEST:
-            return f"decided by {self.decision.created_by}: {self.decision.reason}"
-        if self.opened_by_test:
-            better = [t.name.lower() for t in self.tests if t.p_better is not None and t.p_better < ALPHA]
-            return f"{' and '.join(better)} significantly better than under the random controller (Holm-adjusted p < {ALPHA})"
-        worse = [t.name.lower() for t in self.tests if t.p_worse is not None and t.p_worse < ALPHA]
-        if worse:
-            return f"{' and '.join(worse)} significantly worse than under the random controller"
-        if not self.tests:
-            return "no QoC counts in r_end (C2 = C3 = C4 = 0), so nothing can be tested"
-        if all(t.note for t in self.tests):
-            return self.tests[0].note
-        return "no QoC is significantly better than under the random controller"
 
 
 def gate(db: Session, participant: Participant, sessions: Sequence[StudySession]) -> Gate:
@@ -132,11 +118,7 @@ def _compare(qoc: tuple[str, str, str, bool], learned: Sequence[StudySession], r
     x, y = _values(learned, field), _values(random, field)
     medians = (median(x) if x else None, median(y) if y else None)
     if not x or not y or 1 / comb(len(x) + len(y), len(x)) >= ALPHA:
-        note = (
-            f"not enough sessions with {name.lower()}: {len(x)} of learned policies and {len(y)} of the random controller "
-            "(3 against 4, 2 against 5 or 1 against 20 are the fewest that can show a difference)"
-        )
-        return QocTest(field, name, unit, len(x), len(y), *medians, note=note)
+        return QocTest(field, name, unit, len(x), len(y), *medians)
     sign = 1 if more_is_better else -1
     a, b = [sign * v for v in x], [sign * v for v in y]
     return QocTest(field, name, unit, len(x), len(y), *medians, p_better=p_greater(a, b), p_worse=p_greater(b, a))
@@ -149,6 +131,6 @@ def _values(sessions: Sequence[StudySession], field: str) -> list[float]:
 
 def _adjusted(tests: Sequence[QocTest]) -> tuple[QocTest, ...]:
     """Both families of p-values by Holm's method, over the QoCs that could be tested."""
-    made = [t for t in tests if not t.note]
-    better, worse = (iter(holm([getattr(t, name) for t in made])) for name in ("p_better", "p_worse"))
-    return tuple(t if t.note else replace(t, p_better=next(better), p_worse=next(worse)) for t in tests)
+    tested = [t for t in tests if t.tested]
+    better, worse = (iter(holm([getattr(t, name) for t in tested])) for name in ("p_better", "p_worse"))
+    return tuple(t if not t.tested else replace(t, p_better=next(better), p_worse=next(worse)) for t in tests)

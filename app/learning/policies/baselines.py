@@ -18,8 +18,8 @@ from app.learning import repository
 from app.learning.models import BufferSnapshot, Policy
 from app.platform import files
 from app.study.models import Participant
+from ml.policies.from_buffer import proportional_from_buffer
 from ml.policies.policy import ProportionalPolicy
-from ml.rl.baselines import proportional_from_buffer
 from ml.trajectories import ReplayBuffer
 
 ONNX = "application/onnx"

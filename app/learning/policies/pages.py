@@ -30,7 +30,7 @@ from app.study import repository as study_repository
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.service import may
-from ml.rl.support import LARGEST_SHARE_BELOW
+from ml.policies.logged_range import LARGEST_SHARE_BELOW
 
 router = APIRouter()
 

@@ -17,7 +17,8 @@ from app.accounts.permissions import Caller
 from app.learning import repository
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies.baselines import ONNX
-from app.learning.training.compute import POLICY, read_buffer
+from app.learning.snapshots.buffers import read_buffer
+from app.learning.training.results import POLICY
 from app.platform import files
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.learning.models import BufferSnapshot
-from app.learning.training.compute import read_buffer
+from app.learning.snapshots.buffers import read_buffer
 from app.platform.web.charts import ACCENT, CONTROLLERS, WARN, Chart, axis, figure
 from app.study import blinding
 from app.study import repository as study_repository
@@ -60,7 +60,7 @@ class SnapshotView:
 
 
 def describe(db: Session, snapshot: BufferSnapshot, caller: Caller) -> SnapshotView:
-    """Read a snapshot's file and tell what it covers."""
+    """Read a snapshot's file and say what it covers."""
     buffer = read_buffer(snapshot.file_sha256)
     sessions = {s.id: s for s in study_repository.sessions_of_participant(db, snapshot.participant_id)}
     by_visit: dict[int, Counter[str]] = {}

@@ -19,7 +19,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
-from app.learning import repository
+from app.learning import repository, wording
 from app.learning.gate.service import LEARNED, Gate, gate
 from app.learning.models import BufferSnapshot, SnapshotSession
 from app.learning.snapshots.trajectories import trajectory_of
@@ -241,7 +241,7 @@ def _pass_gate(m: Member, barrier: Gate) -> Member:
     """Leave out sessions of learned policies while the gate is shut."""
     if m.trajectory is None or barrier.is_open or blinding.arm(m.session, SYSTEM).controller not in LEARNED:
         return m
-    return Member(m.session, m.table, None, f"session of a learned policy, and the buffer's gate is shut: {barrier.grounds}")
+    return Member(m.session, m.table, None, f"session of a learned policy, and the buffer's gate is shut: {wording.gate_grounds(barrier)}")
 
 
 def _row(snapshot_id: int, m: Member) -> SnapshotSession:

@@ -8,8 +8,8 @@ from typing import Any
 
 from app.learning.models import Policy, Sweep
 from app.platform.web.charts import Chart, axis, figure
-from ml.rl.selection import Gain, surest
-from ml.rl.support import LARGEST_SHARE_BELOW
+from ml.ope.compare.selection import Gain, surest
+from ml.policies.logged_range import LARGEST_SHARE_BELOW
 
 PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")
 DASHES = ("solid", "dash", "dot")
@@ -27,12 +27,12 @@ class Candidate:
     """One policy of a sweep.
 
     Attributes:
-        score: estimated return on the held-out sessions at the state that was kept; None where none were held out.
+        score: estimated return on the held-out sessions at the state that was chosen; None where none were held out.
         over_logged: mean Q of the held-out sessions' first states less the return logged from them, at the same state.
         action_distance: mean absolute difference from the logged amplitudes over the buffer's states, fraction.
         saturated: share of these states answered with next to 0 or 1.
         mean_amplitude: over the buffer's states, fraction.
-        best_update: the update whose state was kept; None: the last.
+        best_update: the update whose state was chosen; None: the last.
         rate: the policy's learning rate. seed: of its training.
         gain: estimated return less that of cDBS, with its lower bound; None where it was not estimated.
         below: the lower bound B of the buffer's random sessions, and the share of its states answered with less; None where unknown.
@@ -62,10 +62,10 @@ def candidates(sweep: Sweep) -> list[Candidate]:
     return sorted(found, key=lambda c: -c.score if c.score is not None else float("inf"))
 
 
-def better_without_learning(found: Sequence[Candidate], yardsticks: Sequence[dict[str, Any]]) -> str | None:
+def better_without_learning(found: Sequence[Candidate], baselines: Sequence[dict[str, Any]]) -> str | None:
     """The best controller without learning where it scores above every policy of the sweep, else None; None too where nothing scored."""
     scores = [c.score for c in found if c.score is not None]
-    best = max(yardsticks, key=lambda row: row["score"], default=None)
+    best = max(baselines, key=lambda row: row["score"], default=None)
     return str(best["controller"]) if best is not None and scores and best["score"] > max(scores) else None
 
 
@@ -77,21 +77,21 @@ def surely_above_cdbs(found: Sequence[Candidate]) -> Candidate | None:
 
 def below_bound(policy: Policy) -> tuple[float, float] | None:
     """The lower bound of the random sessions that a policy learned from, and how often it asks for less; None where that is not known."""
-    told = policy.metrics.get("below_bound")
-    return None if told is None else (float(told["bound"]), float(told["share"]))
+    stored = policy.metrics.get("below_bound")
+    return None if stored is None else (float(stored["bound"]), float(stored["share"]))
 
 
 def _candidate(policy: Policy) -> Candidate:
     held = policy.metrics.get("held_out", {})
-    # Policies of before the state that was kept was looked at have the figures of their last state.
-    kept = policy.metrics.get("kept") or policy.metrics.get("last", {})
-    at = _kept(held, policy.metrics.get("best_update"))
+    # Policies stored before the chosen state was measured have the figures of their last state.
+    measured = policy.metrics.get("kept") or policy.metrics.get("last", {})
+    at = _chosen(held, policy.metrics.get("best_update"))
     return Candidate(
         policy=policy,
         score=_at(held, "score", at),
         over_logged=_at(held, "over_logged", at),
-        action_distance=kept.get("action_distance"),
-        saturated=kept.get("saturated"),
+        action_distance=measured.get("action_distance"),
+        saturated=measured.get("saturated"),
         mean_amplitude=policy.metrics.get("mean_amplitude_on_buffer"),
         best_update=policy.metrics.get("best_update"),
         rate=policy.config.get("actor_lr"),
@@ -101,8 +101,8 @@ def _candidate(policy: Policy) -> Candidate:
     )
 
 
-def _kept(held: dict[str, list[float]], best_update: int | None) -> int:
-    """Index of the scoring whose state was kept."""
+def _chosen(held: dict[str, list[float]], best_update: int | None) -> int:
+    """Index of the scoring whose state was chosen."""
     updates = held.get("update", [])
     return updates.index(best_update) if best_update in updates else len(updates) - 1
 

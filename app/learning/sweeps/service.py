@@ -12,7 +12,7 @@ from app.learning import repository
 from app.learning.models import BufferSnapshot, Policy, Sweep
 from app.learning.policies.baselines import ONNX
 from app.learning.policies.service import free_name
-from app.learning.training.compute import CLONE, policy_file, training_file
+from app.learning.training.results import CLONE, policy_file, training_file
 from app.platform import files
 from app.platform.jobs.service import code_version
 from app.study import repository as study_repository
@@ -32,7 +32,7 @@ def store(
     groups: Sequence[Group],
     results: Sequence[dict[str, Any]],
     workdirs: Sequence[Path],
-    yardsticks: tuple[dict[str, Any], Path],
+    baselines: tuple[dict[str, Any], Path],
 ) -> list[Policy]:
     """Store a sweep and its policies; a job that has stored its sweep already gets those policies again.
 
@@ -43,7 +43,7 @@ def store(
         name: of the sweep; numbered where None or taken.
         config: what was asked for.
         groups, results, workdirs: one for each child process, in one order.
-        yardsticks: result and folder of the step that scored controllers without learning.
+        baselines: result and folder of the step that scored controllers without learning.
     """
     repository.lock_participant(db, snapshot.participant_id)
     known = repository.sweep_of_job(db, job_id)
@@ -55,7 +55,7 @@ def store(
         snapshot_id=snapshot.id,
         job_id=job_id,
         config=config,
-        yardsticks=yardsticks[0],
+        baselines=baselines[0],
         code_version=code_version(),
         created_by=created_by,
     )
@@ -66,7 +66,7 @@ def store(
         for group, result, workdir in zip(groups, results, workdirs, strict=True)
         for member in range(len(group["configs"]))
     ]
-    _store_clone(db, sweep, snapshot, yardsticks[1])
+    _store_clone(db, sweep, snapshot, baselines[1])
     return rows
 
 

@@ -14,6 +14,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning.deps import CurrentOwnPolicy
 from app.learning.models import Policy
+from app.planning.bundles import repository
 from app.planning.bundles import service as bundles
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
@@ -21,7 +22,7 @@ from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.models import Hemisphere, Participant
-from ml.deploy.appraisal import battery_words, warnings
+from ml.deploy.wording import battery_life_words, energy_words, warning_sentences
 
 router = APIRouter()
 
@@ -78,9 +79,11 @@ def _page(
         wished = (typed or {}).get("hemisphere")
         side = next((side for side in sides if side == wished), sides[0] if sides else None)
         m = bundles.preview(db, participant, policy, bundles.Limits(), side, caller)
-        energy = None if m.energy_of_cdbs is None or m.charge_of_cdbs is None else battery_words(m.energy_of_cdbs, m.charge_of_cdbs)
+        energy = None
+        if m.energy_of_cdbs is not None and m.charge_of_cdbs is not None:
+            energy = [energy_words(m.energy_of_cdbs), battery_life_words(m.energy_of_cdbs, m.charge_of_cdbs)]
         shown = {"min_ma": f"{m.min_ma:g}", "max_ma": f"{m.max_ma:g}", "ramp_ma_per_s": f"{m.ramp_ma_per_s:.4g}"}
-        facts |= {"manifest": m, "warnings": warnings(m), "energy": energy, "shown": shown | {"hemisphere": m.hemisphere or ""}}
+        facts |= {"manifest": m, "warnings": warning_sentences(m), "energy": energy, "shown": shown | {"hemisphere": m.hemisphere or ""}}
     except Invalid as reason:
         facts["unmade"] = reason.problem(request.url.path)
     page = render(
@@ -91,7 +94,7 @@ def _page(
         typed=typed,
         sides=sides,
         device=bundles.device_limits(db, participant, None),
-        taken=bundles.taken(db, participant, policy),
+        releases=repository.releases(db, policy.id),
         may_state=bundles.may_state(participant, caller),
         key=bundles.public_key(),
         problem=error.problem(request.url.path) if error else None,

@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from numpy.typing import NDArray
-from sqlalchemy import column, select, table
 from sqlalchemy.orm import Session
 
 from app import __version__
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.learning import repository
+from app.learning import repository as learning
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies.service import probe_windows
+from app.planning import wording
+from app.planning.bundles import repository
+from app.planning.bundles.models import BundleRelease
 from app.platform import files
-from app.platform.audit import AuditEvent
 from app.platform.database import set_reason
 from app.platform.errors import Forbidden, Invalid
 from app.settings import get_settings
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.models import Hemisphere, Participant, Recording, Visit
+from app.study.models import Hemisphere, Participant, Visit
 from ml.deploy.bundle import build_bundle, describe, sign
-from ml.deploy.manifest import DEFAULTS, Approval, BundleError, BundleManifest
+from ml.deploy.manifest import Approval, BundleError, BundleManifest
 from ml.policies.onnx_policy import PolicyFileError
 
 KEY = "bundle-signing"
@@ -72,7 +72,7 @@ def public_key() -> str:
 
 
 def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller) -> bytes:
-    """The controller bundle of a policy, signed. It is stored, so that the audit trail says who took which limits out when.
+    """The controller bundle of a policy, signed. It is stored, and its release is recorded.
 
     Raises:
         NotFound: the policy is another participant's.
@@ -87,13 +87,20 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
     except (BundleError, PolicyFileError) as error:
         raise _unmade(policy, error) from error
     signed = sign(content, signing_key())
-    side = f", {hemisphere}" if hemisphere else ""
-    set_reason(
-        db,
-        f"controller bundle of {participant.code}, policy {policy.id}{side}: {manifest.min_ma:g} to {manifest.max_ma:g} mA, "
-        f"cDBS {manifest.cdbs_ma:g} mA, ramp {manifest.ramp_ma_per_s:g} mA/s",
+    set_reason(db, wording.release_reason(manifest))
+    release = BundleRelease(
+        participant_id=participant.id,
+        policy_id=policy.id,
+        sha256=files.store(db, signed, _ZIP).sha256,
+        hemisphere=hemisphere,
+        min_ma=manifest.min_ma,
+        max_ma=manifest.max_ma,
+        cdbs_ma=manifest.cdbs_ma,
+        ramp_ma_per_s=manifest.ramp_ma_per_s,
+        approvals=[asdict(approval) for approval in manifest.approvals],
+        created_by=caller.label,
     )
-    files.store(db, signed, _ZIP)
+    db.add(release)
     db.flush()
     return signed
 
@@ -114,19 +121,9 @@ def may_state(participant: Participant, caller: Caller) -> bool:
     return caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site.id)
 
 
-def taken(db: Session, participant: Participant, policy: Policy) -> list[AuditEvent]:
-    """The bundles of a policy that left so far, newest first, as the audit trail has them."""
-    named = AuditEvent.reason.startswith(f"controller bundle of {participant.code}, policy {policy.id}", autoescape=True)
-    found = db.scalars(select(AuditEvent).where(AuditEvent.entity == "stored_file", named).order_by(AuditEvent.id.desc()))
-    return [event for event in found if re.match(rf".*, policy {policy.id}[,:]", event.reason or "")]
-
-
 def device_limits(db: Session, participant: Participant, hemisphere: Hemisphere | None) -> DeviceLimits | None:
     """Limits of the newest recording that holds any, of this side where one is named; None where no recording does."""
-    query = select(Recording).where(Recording.participant_id == participant.id)
-    if hemisphere is not None:
-        query = query.where((Recording.hemisphere == hemisphere) | Recording.hemisphere.is_(None))
-    for recording in db.scalars(query.order_by(Recording.started_at.desc().nulls_last(), Recording.id.desc())):
+    for recording in repository.recordings_newest_first(db, participant.id, hemisphere):
         programs = [p for group in (recording.details.get("limits") or {}).values() for p in group.values()]
         if programs:
             return DeviceLimits(max(p["lower_ma"] for p in programs), min(p["upper_ma"] for p in programs))
@@ -134,22 +131,16 @@ def device_limits(db: Session, participant: Participant, hemisphere: Hemisphere 
 
 
 def approvals(db: Session, participant_id: int, policy_id: int) -> tuple[Approval, ...]:
-    """Sign-offs of the participant's approved visit plans that this policy stands in.
-
-    Plans belong to a later phase; their tables are asked by name.
-    """
-    plan = table("plan", *(column(name) for name in ("id", "visit_id", "status", "approved_at", "approved_by")))
-    item = table("plan_item", column("plan_id"), column("policy_id"))
-    rows = db.execute(
-        select(plan.c.id, plan.c.approved_by, plan.c.approved_at, Visit.number)
-        .join_from(plan, Visit, Visit.id == plan.c.visit_id)
-        .where(Visit.participant_id == participant_id, plan.c.status == "approved")
-        .where(plan.c.id.in_(select(item.c.plan_id).where(item.c.policy_id == policy_id)))
-        .order_by(plan.c.id)
-    )
+    """Sign-offs of the participant's approved visit plans that this policy stands in."""
     return tuple(
-        Approval(name=by, role="approver of plans", approved_at=at.isoformat(timespec="seconds"), statement=f"plan {id_} of visit {number}")
-        for id_, by, at, number in rows
+        Approval(
+            name=plan.approved_by,
+            role="approver of plans",
+            approved_at=plan.approved_at.isoformat(timespec="seconds"),
+            statement=f"plan {plan.id} of visit {number}",
+        )
+        for plan, number in repository.approved_plans(db, participant_id, policy_id)
+        if plan.approved_by is not None and plan.approved_at is not None
     )
 
 
@@ -174,7 +165,7 @@ def _manifest(
     study.require_own(participant, policy, f"policy {policy.id}")
     version = study_repository.settings_version(db, policy.settings_version_id)
     snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id else None
-    data = snapshot or repository.newest_snapshot(db, participant.id)
+    data = snapshot or learning.newest_snapshot(db, participant.id)
     unit = data.beta_unit if data else version.beta_unit
     source = data.beta_source if data else version.beta_source
     if unit is None or source is None:
@@ -184,7 +175,7 @@ def _manifest(
     usable = data if data and study_repository.settings_version(db, data.settings_version_id).window == version.window else None
     teacher = db.get(Policy, policy.teacher_id) if policy.teacher_id else None
     agreement: dict[str, Any] = policy.metrics.get("on_buffer") or {}
-    stated = f"{caller.label}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC" if limits.stated else DEFAULTS
+    stated = f"{caller.label}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC" if limits.stated else None
     try:
         manifest = BundleManifest(
             participant=participant.code,

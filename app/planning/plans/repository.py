@@ -1,4 +1,4 @@
-"""Every query of visit plans. Visits and policies reach this room already scoped to what the caller may see."""
+"""Every query of visit plans. Visits and policies come already scoped to what the caller may see."""
 
 from __future__ import annotations
 

@@ -134,11 +134,11 @@ def _too_long(policies: int, needed: float, rules: Rules) -> Invalid:
     extras = (["the no-DBS session"] if rules.no_dbs else []) + (["random sessions"] if rules.random_sessions else [])
     ways = ["shorten sessions or washout", "give the visit more minutes"] + ([f"leave out {' and '.join(extras)}"] if extras else [])
     tested = _policies(policies) if policies else "The random sessions"
-    said = f"{tested} with the sessions around them take {needed:g} minutes; the visit has {rules.total_minutes:g}."
+    detail = f"{tested} with the sessions around them take {needed:g} minutes; the visit has {rules.total_minutes:g}."
     if not policies:
-        return Invalid(said, f"Plan fewer random sessions, or {', or '.join(ways[:2])}.", minutes_needed=needed, policies_that_fit=0)
+        return Invalid(detail, f"Plan fewer random sessions, or {', or '.join(ways[:2])}.", minutes_needed=needed, policies_that_fit=0)
     return Invalid(
-        said,
+        detail,
         f"{'Choose ' + ('at most ' if most > 1 else '') + _policies(most) if most else 'Not even one policy fits'}, "
         f"or {', or '.join(ways)}.",
         minutes_needed=needed,

@@ -26,7 +26,7 @@ class PlanOptions(Model):
     evaluation_id: Id | None = Field(None, description="Ranking that the choice rests on; the participant's newest where not given.")
     note: Text = Field("", max_length=4000)
     reason: Text | None = Field(
-        None, max_length=1000, description="Why an approved plan is replaced; needed then, kept in the audit trail."
+        None, max_length=1000, description="Why an approved plan is replaced; needed then, recorded in the audit trail."
     )
 
 
@@ -45,7 +45,7 @@ class Approval(Model):
 
 
 class PlanEstimateOut(Model):
-    """What the pinned ranking said about a policy."""
+    """What the pinned ranking states of a policy."""
 
     method: str
     value: float

@@ -3,15 +3,14 @@
 How to add a job kind
 ---------------------
 A kind has two parts. The *orchestration* runs in a worker and says which steps there are and in which order; the *compute functions* do
-the work, each call in a child process of its own (true cancel, memory returned, one crash harms nobody else). A room registers kinds in its
-`jobs.py` and compute functions in its `compute.py`, by being imported; both names stand in `registry`::
+the work, each call in a child process of its own (true cancel, memory returned, one crash harms nobody else). One record registers a kind,
+in a module that `registry.KIND_MODULES` names; API, pages and form derive from it::
 
     class TrainParams(BaseModel):                          # what POST .../jobs accepts besides `kind`; checked on submit
         policies: list[int]
         iterations: int = 1000
 
-    @compute("train")                                      # child process: JSON in, JSON out
-    def train(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+    def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:   # child process: JSON in, JSON out
         buffer = read_buffer(files.path_of(params["snapshot_sha256"]))      # stored files are read by their hash
         start = load_checkpoint(workdir / "checkpoint.pt")                  # workdir survives restarts: resume from it
         for i in range(start, params["iterations"]):
@@ -21,7 +20,6 @@ the work, each call in a child process of its own (true cancel, memory returned,
         (workdir / "policy.onnx").write_bytes(...)                          # big results are files in workdir
         return {"final_loss": loss}                                         # small results are JSON
 
-    @job_kind("train", title="Train policies", params_schema=TrainParams)
     def run_train(job: JobContext) -> dict[str, Any]:
         jobs = [(f"train/{i}", "train", {**job.params, "seed": i}) for i in job.params["policies"]]
         for key, _, _ in jobs:
@@ -29,6 +27,17 @@ the work, each call in a child process of its own (true cancel, memory returned,
         job.step("store", title="Store the policies", weight=0.1)
         results = job.compute_all(jobs)                                     # fan-out, results in the same order
         return job.transact("store", lambda db: service.store_policies(db, job.id, results, job.workdir("train/0")))
+
+    register(
+        JobKind(
+            name="train",
+            title="Train policies",
+            params=TrainParams,
+            orchestration="app.pipeline.training:run_train",                # imported by workers
+            compute={"train": "app.learning.training.compute:train"},       # imported by children
+            requires=(usable_sessions,),                                    # called before the job is put on the queue
+        )
+    )
 
 Rules
 -----
@@ -43,8 +52,8 @@ Rules
 * Raise `JobError("what, where, how to mend it")` for errors that a person can mend; its text is shown as it is. Any other exception shows
   its last line and keeps the traceback in the step's log. A failed step raises `StepFailed` in the orchestration, which fails the job.
 * Do not catch `BaseException` in an orchestration: cancelling and stopping travel as such.
-* Put compute functions into the room's `compute.py` (found by convention, see `registry.COMPUTE_MODULES`), not into `jobs.py`: the web
-  service imports every `jobs.py` to check params and must not load torch for it. The child imports only the module of its function.
+* Records name functions by strings, so that the web service, which knows every kind, never loads torch; a compute module imports what it
+  needs at its top, and the child imports only the module of its function.
 
 Everybody else
 --------------
@@ -55,9 +64,9 @@ terminal's progress bar; `worker.run_worker(slots, stop_event)` is the worker. `
 
 from __future__ import annotations
 
-from app.platform.jobs.children.report import Report, write_atomically
+from app.platform.jobs.children.report import StepReport, write_atomically
 from app.platform.jobs.context import JobContext
 from app.platform.jobs.errors import JobError, StepFailed
-from app.platform.jobs.registry import Priority, compute, job_kind
+from app.platform.jobs.registry import JobKind, Priority, register
 
-__all__ = ["JobContext", "JobError", "Priority", "Report", "StepFailed", "compute", "job_kind", "write_atomically"]
+__all__ = ["JobContext", "JobError", "JobKind", "Priority", "StepFailed", "StepReport", "register", "write_atomically"]

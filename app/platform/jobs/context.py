@@ -1,4 +1,4 @@
-"""What an orchestration holds in its hands: steps, compute, fan-out, transactions."""
+"""What an orchestration works with: steps, compute, fan-out, transactions."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 _KEY = re.compile(r"[a-z0-9][a-z0-9_.\-]*(/[a-z0-9][a-z0-9_.\-]*)*")
 _KEY_LENGTH = 100
 
-Outcome = dict[str, Any]
+StepOutcome = dict[str, Any]
 """`{"ok": True, "result": {...}}`, `{"ok": False, "message": "..."}` or, never started, `{"ok": False, "skipped": True}`."""
 
 
 class Durable(Protocol):
     """Runs a body once and gives its recorded result after a crash."""
 
-    def durable(self, name: str, body: Callable[[], Outcome]) -> Outcome:
+    def durable(self, name: str, body: Callable[[], StepOutcome]) -> StepOutcome:
         """One step."""
 
-    def durable_all(self, steps: Sequence[tuple[str, Callable[[], Outcome]]]) -> list[Outcome]:
+    def durable_all(self, steps: Sequence[tuple[str, Callable[[], StepOutcome]]]) -> list[StepOutcome]:
         """Steps side by side; results in the order given."""
 
 
@@ -35,14 +35,11 @@ class Steps(Protocol):
     def declare(self, key: str, title: str, weight: float) -> None:
         """Make the step's row unless it is there."""
 
-    def compute(self, key: str, name: str, params: dict[str, Any], skip: Callable[[], bool]) -> Outcome:
+    def compute(self, key: str, name: str, params: dict[str, Any], skip: Callable[[], bool]) -> StepOutcome:
         """Run a compute function in a child process, unless `skip()` holds when its turn comes."""
 
-    def transact(self, key: str, fn: Callable[[Session], dict[str, Any]]) -> Outcome:
+    def transact(self, key: str, fn: Callable[[Session], dict[str, Any]]) -> StepOutcome:
         """Run a function in a database transaction together with its record."""
-
-    def say(self, text: str) -> None:
-        """Add a line to the job's log."""
 
     def workdir(self, key: str) -> Path:
         """Folder of a step."""
@@ -108,8 +105,8 @@ class JobContext:
             self._use(key)
         failed: list[str] = []
 
-        def body(key: str, name: str, params: dict[str, Any]) -> Callable[[], Outcome]:
-            def run() -> Outcome:
+        def body(key: str, name: str, params: dict[str, Any]) -> Callable[[], StepOutcome]:
+            def run() -> StepOutcome:
                 outcome = self._steps.compute(key, name, params, lambda: bool(failed))
                 if not outcome["ok"]:
                     failed.append(key)
@@ -141,10 +138,6 @@ class JobContext:
     def workdir(self, key: str) -> Path:
         """Folder of a compute step, for files that its function left there."""
         return self._steps.workdir(key)
-
-    def say(self, text: str) -> None:
-        """Add a line to the job's log; repeated when the orchestration is replayed."""
-        self._steps.say(text)
 
     def _use(self, key: str) -> None:
         if key in self._used:

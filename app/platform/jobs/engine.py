@@ -23,7 +23,7 @@ from dbos._serialization import Serializer
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
-PROTOCOL = "2"
+PROTOCOL = "3"
 """Version of the job protocol: raise it when orchestrations change the order of their steps or the meaning of recorded results."""
 
 MAX_RECOVERIES = 3

@@ -21,7 +21,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.database import now, set_actor, transaction
 from app.platform.jobs import repository
-from app.platform.jobs.children.supervisor import Heard
+from app.platform.jobs.children.supervisor import ChildMessages
 from app.platform.jobs.errors import JobCancelled
 from app.platform.jobs.models import Job, JobStatus, JobStep
 
@@ -82,27 +82,27 @@ class Ledger:
                 step.status, step.message, step.progress = JobStatus.RUNNING, "", 0.0
                 step.attempts += 1
                 step.worker, step.started_at, step.finished_at = self.worker, now(), None
-                self._tell_step(db, job, step)
+                self._step_event(db, job, step)
                 return None
 
         return self._persist(write)
 
-    def hear(self, key: str, heard: Heard) -> None:
-        """Record what a step's process said."""
+    def record(self, key: str, messages: ChildMessages) -> None:
+        """Record what a step's process reported."""
 
         def write() -> None:
             with self._locked() as (db, job):
                 step = repository.step(db, job.id, key)
-                if heard.progress is not None:
-                    step.progress = heard.progress
-                if heard.message is not None:
-                    step.message = heard.message
-                for text in heard.logs or ():
+                if messages.progress is not None:
+                    step.progress = messages.progress
+                if messages.message is not None:
+                    step.message = messages.message
+                for text in messages.logs or ():
                     repository.add_event(db, job.id, "log", {"text": text}, key)
-                if heard.points:
-                    repository.add_event(db, job.id, "points", {"points": heard.points}, key)
-                if heard.progress is not None or heard.message is not None:
-                    self._tell_progress(db, job, step)
+                if messages.points:
+                    repository.add_event(db, job.id, "points", {"points": messages.points}, key)
+                if messages.progress is not None or messages.message is not None:
+                    self._progress_event(db, job, step)
 
         self._persist(write)
 
@@ -116,7 +116,7 @@ class Ledger:
                     return step.result
                 step.result = fn(db)
                 step.status, step.progress, step.finished_at = JobStatus.SUCCEEDED, 1.0, now()
-                self._tell_step(db, job, step)
+                self._step_event(db, job, step)
                 return step.result
 
         return self._persist(write)
@@ -130,17 +130,7 @@ class Ledger:
                 step.status, step.message, step.finished_at = JobStatus.FAILED, message, now()
                 if trace:
                     repository.add_event(db, job.id, "log", {"text": trace}, key)
-                self._tell_step(db, job, step)
-
-        self._persist(write)
-
-    def say(self, text: str) -> None:
-        """Add a line to the job's log."""
-
-        def write() -> None:
-            with self._locked() as (db, job):
-                job.message = text
-                repository.add_event(db, job.id, "log", {"text": text})
+                self._step_event(db, job, step)
 
         self._persist(write)
 
@@ -167,12 +157,12 @@ class Ledger:
     def _persist(self, write: Callable[[], Value]) -> Value:
         return persist(write, self.check)
 
-    def _tell_step(self, db: Session, job: Job, step: JobStep) -> None:
+    def _step_event(self, db: Session, job: Job, step: JobStep) -> None:
         data = {"status": step.status, "title": step.title, "message": step.message, "attempt": step.attempts}
         repository.add_event(db, job.id, "step", data, step.key)
-        self._tell_progress(db, job, step)
+        self._progress_event(db, job, step)
 
-    def _tell_progress(self, db: Session, job: Job, step: JobStep) -> None:
+    def _progress_event(self, db: Session, job: Job, step: JobStep) -> None:
         db.flush()
         # never backwards: a step that is resumed from its checkpoint starts to report from there
         mean = select(func.sum(JobStep.weight * JobStep.progress) / func.sum(JobStep.weight)).where(JobStep.job_id == job.id)

@@ -1,4 +1,4 @@
-"""Tables of background jobs: our own record of what ran; the engine's tables only carry it out."""
+"""Tables of background jobs: our own record of jobs and their results; the engine's tables only carry them out."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class JobStep(Base):
 
 
 class JobEvent(Base):
-    """What a job said, in order: progress, learning-curve points, log lines. Server-sent events are read from here."""
+    """What a job reported, in order: progress, learning-curve points, log lines. Server-sent events are read from here."""
 
     __tablename__ = "job_event"
     __table_args__ = (Index("ix_job_event_job_id_id", "job_id", "id"),)

@@ -1,40 +1,38 @@
-"""Which kinds of jobs there are, and which functions their child processes run."""
+"""Which kinds of jobs there are, and which functions their child processes run.
+
+A kind is one record. What it runs is named by strings, `module:function`, and imported by the process that runs it: the orchestration by
+workers, compute functions by children. So the web service knows every kind and loads none of the learners.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from enum import IntEnum
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
+from sqlalchemy.orm import Session
 
 from app.platform.jobs.errors import UnknownKind
 
 if TYPE_CHECKING:
-    from app.platform.jobs.children.report import Report
+    from app.platform.jobs.children.report import StepReport
     from app.platform.jobs.context import JobContext
 
-JOB_MODULES = (
-    "app.pipeline.learning",
-    "app.pipeline.evaluation",
-)
-"""Modules that register kinds, as names: the platform lies below the phases and may not import them. The web service imports them too."""
-
-COMPUTE_MODULES = (
-    "app.learning.training.compute",
-    "app.evaluation.estimates.compute",
-)
-"""Modules with compute functions and their heavy imports, loaded by workers and children alone; a room may do without one."""
+KIND_MODULES = ("app.pipeline.kinds",)
+"""Modules that register kinds, as names: the platform lies below the phases and may not import them."""
 
 Orchestration = Callable[["JobContext"], dict[str, Any]]
-Compute = Callable[[dict[str, Any], Path, "Report"], dict[str, Any]]
+ComputeFunction = Callable[[dict[str, Any], Path, "StepReport"], dict[str, Any]]
+Requirement = Callable[[Session, int, Any], object]
+"""Called with the participant's id and the checked params before a job is put on the queue; raises what the user must mend first."""
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
+_REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 class Priority(IntEnum):
@@ -45,77 +43,82 @@ class Priority(IntEnum):
     BATCH = 90
 
 
-@dataclass(frozen=True)
-class Kind:
-    """One kind of job."""
+@dataclass(frozen=True, kw_only=True)
+class JobKind:
+    """One kind of job.
+
+    Attributes:
+        name: what the API calls `kind`; stored with every job.
+        title: what people read.
+        params: schema of what may be asked for.
+        orchestration: `module:function` that takes a `JobContext` and returns the job's result.
+        compute: `module:function` by the names under which the orchestration calls for compute functions. A name belongs to one function,
+            whichever kinds use it.
+        requires: what must exist before such a job may start.
+        priority: in the queue.
+
+    Raises:
+        ValueError: a malformed name or reference.
+    """
 
     name: str
     title: str
-    params_schema: type[BaseModel]
-    run: Orchestration
-    priority: Priority
+    params: type[BaseModel]
+    orchestration: str
+    compute: Mapping[str, str] = field(default_factory=dict)
+    requires: tuple[Requirement, ...] = ()
+    priority: Priority = Priority.NORMAL
+
+    def __post_init__(self) -> None:
+        for name in (self.name, *self.compute):
+            if not _NAME.fullmatch(name):
+                raise ValueError(
+                    f"{name!r} cannot name a job kind or compute function: use up to 40 of a-z, 0-9 and _, beginning with a letter"
+                )
+        for reference in (self.orchestration, *self.compute.values()):
+            if not _REFERENCE.fullmatch(reference):
+                raise ValueError(f"{reference!r} in job kind {self.name!r} names no function: write module:function")
+
+    def run(self, job: JobContext) -> dict[str, Any]:
+        """Import the orchestration and run it."""
+        orchestration: Orchestration = _load(self.orchestration)
+        return orchestration(job)
 
 
-@dataclass(frozen=True)
-class ComputeFunction:
-    """One function for child processes; `module` is all that the child has to import."""
-
-    name: str
-    module: str
-    run: Compute
+_kinds: dict[str, JobKind] = {}
 
 
-_kinds: dict[str, Kind] = {}
-_computes: dict[str, ComputeFunction] = {}
-
-
-def job_kind(
-    name: str, *, title: str, params_schema: type[BaseModel], priority: Priority = Priority.NORMAL
-) -> Callable[[Orchestration], Orchestration]:
-    """Register an orchestration under the name that the API calls `kind`.
-
-    Raises:
-        ValueError: a malformed name, or one that another function has.
-    """
-    _check_name(name)
-
-    def register(run: Orchestration) -> Orchestration:
-        _refuse_second("job kind", name, _kinds[name].run if name in _kinds else None, run)
-        _kinds[name] = Kind(name, title, params_schema, run, priority)
-        return run
-
-    return register
-
-
-def compute(name: str) -> Callable[[Compute], Compute]:
-    """Register a function that runs in a child process.
+def register(kind: JobKind) -> JobKind:
+    """Make a kind known.
 
     Raises:
-        ValueError: a malformed name, or one that another function has.
+        ValueError: another kind has its name, or another function the name of one of its compute functions.
     """
-    _check_name(name)
+    known = _kinds.get(kind.name)
+    if known is not None and known.orchestration != kind.orchestration:
+        raise ValueError(f"two orchestrations register the job kind {kind.name!r}: {known.orchestration} and {kind.orchestration}")
+    for name, reference in kind.compute.items():
+        others = {other.compute[name] for other in _kinds.values() if name in other.compute} - {reference}
+        if others:
+            raise ValueError(f"two functions register the compute function {name!r}: {others.pop()} and {reference}")
+    _kinds[kind.name] = kind
+    return kind
 
-    def register(run: Compute) -> Compute:
-        _refuse_second("compute function", name, _computes[name].run if name in _computes else None, run)
-        _computes[name] = ComputeFunction(name, run.__module__, run)
-        return run
 
-    return register
-
-
-def load_kinds(modules: tuple[str, ...] | None = None) -> None:
+def load_kinds() -> None:
     """Import every module that registers kinds; a missing one is an error."""
-    for module in JOB_MODULES if modules is None else modules:
+    for module in KIND_MODULES:
         import_module(module)
 
 
-def kinds() -> dict[str, Kind]:
-    """All kinds registered so far, by name."""
+def kinds() -> dict[str, JobKind]:
+    """All kinds, by name, in the order of registration."""
+    load_kinds()
     return dict(_kinds)
 
 
-def kind(name: str) -> Kind:
-    """The kind of a name; the rooms are imported when it is not known yet.
+def kind(name: str) -> JobKind:
+    """The kind of a name.
 
     Raises:
         UnknownKind: there is none; the message lists those there are.
@@ -127,28 +130,30 @@ def kind(name: str) -> Kind:
     return _kinds[name]
 
 
-def compute_function(name: str) -> ComputeFunction:
-    """The compute function of a name.
+def compute_reference(name: str) -> str:
+    """Where the compute function of a name is, as `module:function`; nothing of it is imported.
 
     Raises:
-        UnknownKind: there is none.
+        UnknownKind: no kind has such a function.
     """
-    if name not in _computes:
+    if name not in (known := _compute_references()):
         load_kinds()
-        load_kinds(tuple(module for module in COMPUTE_MODULES if find_spec(module)))
-    if name not in _computes:
-        raise UnknownKind(f"There is no compute function {name!r}. Known ones: {', '.join(sorted(_computes)) or 'none'}.")
-    return _computes[name]
+        known = _compute_references()
+    if name not in known:
+        raise UnknownKind(f"There is no compute function {name!r}. Known ones: {', '.join(sorted(known)) or 'none'}.")
+    return known[name]
 
 
-def _check_name(name: str) -> None:
-    if not _NAME.fullmatch(name):
-        raise ValueError(f"{name!r} cannot name a job kind or compute function: use up to 40 of a-z, 0-9 and _, beginning with a letter")
+def _compute_references() -> dict[str, str]:
+    return {name: reference for kind in _kinds.values() for name, reference in kind.compute.items()}
 
 
-def _refuse_second(what: str, name: str, known: Callable[..., Any] | None, new: Callable[..., Any]) -> None:
-    # the same function imported twice (a reload, `python -m`) is no conflict
-    if known is not None and (known.__module__, known.__qualname__) != (new.__module__, new.__qualname__):
-        raise ValueError(
-            f"two functions register the {what} {name!r}: {known.__module__}.{known.__qualname__} and {new.__module__}.{new.__qualname__}"
-        )
+def load_compute(reference: str) -> ComputeFunction:
+    """Import a compute function; for the child process that runs it."""
+    function: ComputeFunction = _load(reference)
+    return function
+
+
+def _load(reference: str) -> Any:
+    module, _, name = reference.partition(":")
+    return getattr(import_module(module), name)

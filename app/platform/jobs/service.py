@@ -44,7 +44,7 @@ def submit(db: Session, kind: str, participant_id: int | None, params: dict[str,
     wanted = registry.kind(kind)
     raw = params.model_dump(mode="json") if isinstance(params, BaseModel) else params
     try:
-        checked = wanted.params_schema.model_validate(raw).model_dump(mode="json")
+        checked = wanted.params.model_validate(raw).model_dump(mode="json")
     except ValidationError as error:
         errors = error.errors(include_url=False, include_context=False, include_input=False)
         places = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'params'}: {e['msg']}" for e in errors)

@@ -18,8 +18,8 @@ from app.platform.database import new_session
 from app.platform.errors import BetaloopError
 from app.platform.jobs import engine, registry, repository
 from app.platform.jobs.children.slots import Slots
-from app.platform.jobs.children.supervisor import Call, Nursery
-from app.platform.jobs.context import JobContext, Outcome
+from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall
+from app.platform.jobs.context import JobContext, StepOutcome
 from app.platform.jobs.errors import JobCancelled, WorkerStopping
 from app.platform.jobs.ledger import Ledger, persist
 from app.platform.jobs.models import Job, JobStatus
@@ -29,8 +29,8 @@ log = logging.getLogger(__name__)
 
 
 @dataclass
-class Flags:
-    """What the worker tells the threads of one job."""
+class StopRequests:
+    """What the worker asks of the threads of one job: to end as cancelled, or to leave the job to another worker."""
 
     cancelled: threading.Event = field(default_factory=threading.Event)
     abandoned: threading.Event = field(default_factory=threading.Event)
@@ -48,30 +48,30 @@ class JobSteps:
     """The steps of one job, carried out by this worker."""
 
     ledger: Ledger
-    flags: Flags
-    nursery: Nursery
+    requests: StopRequests
+    children: ChildProcesses
     slots: Slots
 
     def declare(self, key: str, title: str, weight: float) -> None:
         """Make the step's row unless it is there."""
         self.ledger.declare(key, title, weight)
 
-    def compute(self, key: str, name: str, params: dict[str, Any], skip: Callable[[], bool]) -> Outcome:
+    def compute(self, key: str, name: str, params: dict[str, Any], skip: Callable[[], bool]) -> StepOutcome:
         """Run a compute function in a child process, unless `skip()` holds when its turn comes."""
-        function = registry.compute_function(name)
-        call = Call(function, _as_json(params, f"the params of step {key!r}"), self.workdir(key), get_settings().job_memory_mb)
-        with self.slots.hold(self.ledger.job_id, self.flags.check):
+        checked = _as_json(params, f"the params of step {key!r}")
+        call = ComputeCall(name, registry.compute_reference(name), checked, self.workdir(key), get_settings().job_memory_mb)
+        with self.slots.hold(self.ledger.job_id, self.requests.check):
             if skip():
                 return {"ok": False, "skipped": True}
             if (known := self.ledger.begin(key)) is not None:
                 return {"ok": True, "result": known}
-            outcome = self.nursery.run(call, lambda heard: self.ledger.hear(key, heard), self.flags.check)
+            outcome = self.children.run(call, lambda messages: self.ledger.record(key, messages), self.requests.check)
         if outcome["ok"]:
             return {"ok": True, "result": self.ledger.commit_step(key, lambda _: outcome["result"])}
         self.ledger.fail_step(key, outcome["message"], outcome["log"])
         return {"ok": False, "message": outcome["message"]}
 
-    def transact(self, key: str, fn: Callable[[Session], dict[str, Any]]) -> Outcome:
+    def transact(self, key: str, fn: Callable[[Session], dict[str, Any]]) -> StepOutcome:
         """Run a function in a database transaction together with its record."""
         if (known := self.ledger.begin(key)) is not None:
             return {"ok": True, "result": known}
@@ -81,10 +81,6 @@ class JobSteps:
             message = worded(error)
             self.ledger.fail_step(key, message, _trace(error))
             return {"ok": False, "message": message}
-
-    def say(self, text: str) -> None:
-        """Add a line to the job's log."""
-        self.ledger.say(text)
 
     def workdir(self, key: str) -> Path:
         """Folder of a step; the parts of a key are joined so that no step's folder lies within another's."""
@@ -97,8 +93,8 @@ class JobRunner:
     def __init__(self, worker: str, slots: int) -> None:
         self._worker = worker
         self._slots = Slots(slots)
-        self._nursery = Nursery()
-        self._running: dict[str, Flags] = {}
+        self._children = ChildProcesses()
+        self._running: dict[str, StopRequests] = {}
         self._changed = threading.Condition()
         self._stopping = False
 
@@ -108,16 +104,16 @@ class JobRunner:
         Raises:
             WorkerStopping: the job is left as it is, for another worker or a later start.
         """
-        flags = Flags()
+        requests = StopRequests()
         with self._changed:
             if self._stopping:
                 raise WorkerStopping
-            self._running[job_id] = flags
+            self._running[job_id] = requests
         try:
-            self._run(job_id, flags)
+            self._run(job_id, requests)
         finally:
             with self._changed:
-                if self._running.get(job_id) is flags:
+                if self._running.get(job_id) is requests:
                     del self._running[job_id]
                 self._changed.notify_all()
 
@@ -129,38 +125,38 @@ class JobRunner:
     def cancel(self, job_id: str) -> None:
         """Kill the job's children and end it as cancelled."""
         with self._changed:
-            if flags := self._running.get(job_id):
-                flags.cancelled.set()
+            if requests := self._running.get(job_id):
+                requests.cancelled.set()
 
     def abandon(self, job_id: str) -> None:
         """Kill the job's children and forget it: another worker has it."""
         with self._changed:
-            if flags := self._running.get(job_id):
-                flags.abandoned.set()
+            if requests := self._running.get(job_id):
+                requests.abandoned.set()
 
     def stop(self, timeout_s: float) -> bool:
         """Abandon everything and wait until the threads have let go; False when they did not in time."""
         with self._changed:
             self._stopping = True
-            for flags in self._running.values():
-                flags.abandoned.set()
+            for requests in self._running.values():
+                requests.abandoned.set()
             done = self._changed.wait_for(lambda: not self._running, timeout_s)
-        self._nursery.close()
+        self._children.close()
         return done
 
-    def _run(self, job_id: str, flags: Flags) -> None:
-        check = _check_abandoned(flags)
+    def _run(self, job_id: str, requests: StopRequests) -> None:
+        check = _check_abandoned(requests)
         job = persist(lambda: _job(job_id), check)
         ledger = Ledger(job_id, job.created_by, self._worker, check)
         if not ledger.open():
             return
-        steps = JobSteps(ledger, flags, self._nursery, self._slots)
+        steps = JobSteps(ledger, requests, self._children, self._slots)
         context = JobContext(job_id, job.kind, job.participant_id, job.params, job.created_by, steps, engine.Durability())
         try:
             if job.cancel_requested_at is not None:
                 raise JobCancelled
             result = _as_json(registry.kind(job.kind).run(context), f"the result of job kind {job.kind!r}")
-            flags.check()
+            requests.check()
             ledger.close(JobStatus.SUCCEEDED, result=result)
         except JobCancelled:
             ledger.close(JobStatus.CANCELLED)
@@ -184,9 +180,9 @@ def _job(job_id: str) -> Job:
         return repository.get(db, job_id)
 
 
-def _check_abandoned(flags: Flags) -> Callable[[], None]:
+def _check_abandoned(requests: StopRequests) -> Callable[[], None]:
     def check() -> None:
-        if flags.abandoned.is_set():
+        if requests.abandoned.is_set():
             raise WorkerStopping
 
     return check

@@ -93,7 +93,7 @@ class Identity:
         return False
 
 
-class Watchman:
+class WorkerMonitor:
     """The worker's own thread: signs of life, cancel requests, jobs of dead workers, old rows and folders."""
 
     def __init__(self, identity: Identity, runner: JobRunner, pace: Pace) -> None:
@@ -113,7 +113,7 @@ class Watchman:
             if time.monotonic() >= self._next_beat:
                 self._next_beat = time.monotonic() + self._pace.beat_s
                 self.beat()
-                self._let_go()
+                self._drop_jobs_taken_over()
                 self._reap()
                 self._end_given_up()
             if time.monotonic() >= self._next_housekeeping:
@@ -137,7 +137,7 @@ class Watchman:
                 for job_id in repository.cancel_requests(db, running):
                     self._runner.cancel(job_id)
 
-    def _let_go(self) -> None:
+    def _drop_jobs_taken_over(self) -> None:
         """Drop jobs that another worker took over, because we were silent for too long."""
         if running := self._runner.running():
             with new_session() as db:
@@ -201,23 +201,23 @@ def run_worker(slots: int, stop_event: threading.Event, pace: Pace | None = None
     identity = Identity()
     worker_id = identity.claim()
     runner = JobRunner(worker_id, slots)
-    watchman = Watchman(identity, runner, pace)
+    monitor = WorkerMonitor(identity, runner, pace)
     with transaction(_ACTOR) as db:
         if moved := engine.adopt_older_protocols(db):
             log.warning("moved %d waiting jobs to job protocol %s", moved, engine.PROTOCOL)
-    watchman.beat()  # before the first job, or others would take it for a dead worker's
+    monitor.beat()  # before the first job, or others would take it for a dead worker's
     engine.launch(database_url(), worker_id, slots, runner.run)
     log.info("worker %s takes jobs, %d at a time", worker_id, slots)
     try:
         while not stop_event.wait(CANCEL_POLL_S):
-            watchman.look()
+            monitor.look()
     finally:
         _stop(identity, runner)
 
 
 def _stop(identity: Identity, runner: JobRunner) -> None:
     if not runner.stop(_STOP_WAIT_S):
-        log.warning("jobs %s did not let go in time; they are recovered later", ", ".join(runner.running()))
+        log.warning("jobs %s did not stop in time; they are recovered later", ", ".join(runner.running()))
     engine.shutdown()
     try:
         with transaction(_ACTOR) as db:

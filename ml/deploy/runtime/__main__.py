@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .envelope import BetaSample, EnvelopeLimits, Signal, reason_names
-from .loop import Controller
+from .loop import BoundedController
 from .network import MlpNetwork, Output
 
 _LIMITS = ("min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s", "window", "period_s", "max_beta_age_s")
@@ -80,9 +80,9 @@ def run(manifest: dict[str, Any], network: MlpNetwork) -> None:
         sys.stdout.flush()
 
 
-def _controller(manifest: dict[str, Any], network: MlpNetwork) -> Controller:
+def _controller(manifest: dict[str, Any], network: MlpNetwork) -> BoundedController:
     limits = EnvelopeLimits(**{name: manifest[name] for name in _LIMITS})
-    return Controller(network, limits, Signal(manifest["beta_unit"], manifest["beta_source"]))
+    return BoundedController(network, limits, Signal(manifest["beta_unit"], manifest["beta_source"]))
 
 
 if __name__ == "__main__":

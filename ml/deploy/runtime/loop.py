@@ -17,7 +17,7 @@ class WindowNetwork(Protocol):
         """Amplitude fraction for the window as it stands."""
 
 
-class Controller:
+class BoundedController:
     """Beta amplitudes in, one amplitude in mA per period out.
 
     Args:

@@ -16,21 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 
-from ml.progress import Report, silent
-from ml.rl.algorithms.learners import CriticLearner, Networks, fresh_critic
-from ml.rl.batches import Batch, RewardScale
+from ml.rl.algorithms._learner import CriticLearner, Networks, fresh_critic
 from ml.rl.configs import CriticConfig
-from ml.rl.held_out import HeldOut
-from ml.rl.networks import MlpPolicy
-from ml.rl.trainer import TrainedPolicy, train_members
-from ml.trajectories import ReplayBuffer
-
-__all__ = ["DdpgConfig", "DdpgLearner", "TrainedPolicy", "train"]
+from ml.rl.kernels.batches import RewardScale, TransitionBatch
+from ml.rl.kernels.networks import MlpPolicy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +47,7 @@ class DdpgLearner(CriticLearner[DdpgConfig]):
     def networks(cls, config: DdpgConfig, policy: MlpPolicy, seeds: Sequence[int]) -> dict[str, Any]:
         return {"policy": policy, "critic": fresh_critic(config, policy, seeds[0])}
 
-    def update(self, batch: Batch) -> None:
+    def update(self, batch: TransitionBatch) -> None:
         """One DDPG update, in the order of the module's text."""
         critic, actor = self.stacks["critic"], self.policy_stack
         next_values = self.target_stacks["critic"].forward(batch.next_states, self.target_actor.act(batch.next_states))
@@ -66,15 +59,3 @@ class DdpgLearner(CriticLearner[DdpgConfig]):
             self.adams["policy"].step()
         self._follow()
         self._counted()
-
-
-def train(
-    buffer: ReplayBuffer,
-    config: DdpgConfig,
-    report: Report = silent,
-    checkpoint: Path | None = None,
-    initial: TrainedPolicy | MlpPolicy | None = None,
-    held_out: HeldOut | None = None,
-) -> TrainedPolicy:
-    """Train one policy with DDPG; see `ml.rl.trainer.train_members`."""
-    return train_members(DdpgLearner, buffer, [config], report, checkpoint, initial, held_out)[0]

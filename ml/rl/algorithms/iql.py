@@ -19,10 +19,10 @@ from typing import Any, ClassVar
 
 import torch
 
-from ml.rl.algorithms.learners import CriticLearner, fresh_critic
-from ml.rl.batches import Batch
+from ml.rl.algorithms._learner import CriticLearner, fresh_critic
 from ml.rl.configs import CriticConfig, setting
-from ml.rl.networks import MlpPolicy, Value
+from ml.rl.kernels.batches import TransitionBatch
+from ml.rl.kernels.networks import MlpPolicy, Value
 
 _LARGEST_WEIGHT = 100.0
 
@@ -53,7 +53,7 @@ class IqlLearner(CriticLearner[IqlConfig]):
             "value": Value(policy.window, config.hidden, seed=seeds[2]),
         }
 
-    def update(self, batch: Batch) -> None:
+    def update(self, batch: TransitionBatch) -> None:
         """One update, in the order of the module's text."""
         logged = self.target_stacks["critic"].forward(batch.states, batch.actions).clone()
         logged = torch.minimum(logged, self.target_stacks["critic_2"].forward(batch.states, batch.actions))
@@ -73,7 +73,7 @@ class IqlLearner(CriticLearner[IqlConfig]):
         self._follow()
         self._counted()
 
-    def _clone_the_better(self, batch: Batch, advantage: Any) -> None:
+    def _clone_the_better(self, batch: TransitionBatch, advantage: Any) -> None:
         weight = torch.exp(advantage * self.member_setting("temperature")).clamp_(max=_LARGEST_WEIGHT)
         actions = self.policy_stack.act(batch.states)
         error = actions - batch.actions

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from app.evaluation.estimates.compute import evaluate_method, fit_dlsm
 from app.pipeline.charts import job_curves
-from app.platform.jobs import Report
+from app.platform.jobs import StepReport
 from app.platform.jobs.models import Job, JobEvent, JobStep
 from ml.ope.dlmm import DlmmConfig
 from tests.app.evaluation.estimates.test_compute import buffer_of, call, sessions
@@ -36,7 +36,7 @@ def test_the_curves_of_a_job_have_a_line_for_every_member_and_identities_of_thei
 
 def test_a_members_fit_tells_loss_held_out_score_and_how_it_ended(db: Session, tmp_path: Path) -> None:
     messages: list[dict[str, Any]] = []
-    result = fit_dlsm(call(db, buffer_of(sessions()), member=1), tmp_path, Report(messages.append, interval_s=0.0))
+    result = fit_dlsm(call(db, buffer_of(sessions()), member=1), tmp_path, StepReport(messages.append, interval_s=0.0))
     points = [p for m in messages for p in m.get("points", [])]
     assert len(points) == result["checks"]
     assert all({"dlsm_loss", "dlsm_held_out_score"} <= set(p["values"]) for p in points)
@@ -67,7 +67,7 @@ def test_the_page_names_methods_in_words(client: TestClient, upload: Callable[..
 def test_members_that_learn_one_after_the_other_have_a_curve_each(db: Session, tmp_path: Path) -> None:
     messages: list[dict[str, Any]] = []
     asked = call(db, buffer_of(sessions()), method="dlmm", preset="full")
-    assert "estimates" in evaluate_method(asked, tmp_path, Report(messages.append, interval_s=0.0))
+    assert "estimates" in evaluate_method(asked, tmp_path, StepReport(messages.append, interval_s=0.0))
     events = [JobEvent(kind="points", step_key="estimate/dlmm", data=m) for m in messages if "points" in m]
     curve = next(c for c in job_curves(Job(steps=[JobStep(key="estimate/dlmm", title="DLMM")]), events) if c.id == "job-dlmm-loss")
     members = DlmmConfig().members

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies.baselines import constant_onnx
-from app.learning.training.compute import read_buffer
+from app.learning.snapshots.buffers import read_buffer
 from app.platform import files
 from app.study.repository import participant_by_code
 from ml.deploy.bundle import verify_bundle

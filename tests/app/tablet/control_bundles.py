@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from ml.deploy.bundle import build_bundle, sign
 from ml.deploy.manifest import BundleManifest
-from ml.rl.networks import MlpPolicy
+from ml.rl import MlpPolicy
 
 KEY = Ed25519PrivateKey.from_private_bytes(b"k" * 32)
 PUBLIC = KEY.public_key().public_bytes_raw().hex()

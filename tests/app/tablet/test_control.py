@@ -23,7 +23,7 @@ from app.tablet.sources import Row, Source, Wish, open_source
 from ml.deploy.bundle import build_bundle, sign
 from ml.deploy.runtime.envelope import BetaSample, Signal
 from ml.formats import decode
-from ml.rl.networks import MlpPolicy
+from ml.rl import MlpPolicy
 from tests.app.tablet.control_bundles import MANIFEST, PUBLIC, made, rows_of
 
 

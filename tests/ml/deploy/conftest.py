@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from ml.deploy.manifest import Approval, BundleManifest
-from ml.rl.networks import MlpPolicy
+from ml.rl import MlpPolicy
 
 
 @pytest.fixture(scope="session")

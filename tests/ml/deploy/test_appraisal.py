@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ml.deploy.appraisal import MANY, battery_gain, battery_words, of, warnings
+from ml.deploy.appraisal import MANY, BundleWarning, WarningCode, battery_gain, of, warnings
 from ml.deploy.bundle import build_bundle, verify_bundle
+from ml.deploy.wording import battery_words, warning_sentences
 from ml.energy import Range
-from ml.rl.networks import MlpPolicy
+from ml.rl import MlpPolicy
 
 
 @pytest.fixture
@@ -35,7 +36,8 @@ def test_shares_and_energy_are_those_of_the_fractions(logged):
 
 def test_on_windows_that_nobody_logged_nothing_is_said_but_that(manifest):
     assert of(np.array([0.0, 0.1]), manifest) == {"test_windows": 2}
-    (only,) = warnings(manifest)
+    assert warnings(manifest) == [BundleWarning(WarningCode.UNTRIED)]
+    (only,) = warning_sentences(manifest)
     assert "Nobody knows" in only
 
 
@@ -48,7 +50,10 @@ def test_a_policy_that_often_leaves_what_was_tried_or_allowed_is_warned_of_on_th
             return warnings(verify_bundle(content)), archive.read("sheet.html").decode()
 
     low, text = sheet(-1.2)  # 0.08: 0.25 mA
-    assert len(low) == 2
+    assert [(w.code, w.value, w.limit) for w in low] == [
+        (WarningCode.BELOW_LOGGED, 1.0, pytest.approx(0.9)),
+        (WarningCode.BELOW_MINIMUM, 1.0, 0.5),
+    ]
     for sentence in ("B = 0.3 of cDBS, 0.9 mA) in 100 % of 16 logged windows", "lowest amplitude (0.5 mA) in 100 %"):
         assert sentence in text
     between, text = sheet(-0.6)  # 0.23: 0.69 mA

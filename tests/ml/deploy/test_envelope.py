@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ml.deploy.runtime.envelope import BetaSample, EnvelopeLimits, Reason, Signal, reason_names
-from ml.deploy.runtime.loop import Controller
+from ml.deploy.runtime.loop import BoundedController
 from ml.deploy.windows import PolicyWindow
 from ml.policies.policy import ConstantPolicy
 
@@ -43,7 +43,7 @@ def constant(fraction, window=3):
 
 def run(network, betas, limits=LIMITS):
     """Decisions over a stream with one sample per period; None where no sample came."""
-    controller = Controller(network, limits, UV)
+    controller = BoundedController(network, limits, UV)
     times = [limits.period_s * k for k in range(len(betas))]
     return [controller.decide(t, None if b is None else BetaSample(t, b, UV)) for t, b in zip(times, betas, strict=True)]
 
@@ -70,7 +70,7 @@ def test_the_amplitude_never_moves_faster_than_the_ramp():
 
 
 def test_decisions_in_quick_succession_share_one_periods_ramp():
-    controller = Controller(constant(0.0), LIMITS, UV)
+    controller = BoundedController(constant(0.0), LIMITS, UV)
     for k in range(3):
         controller.decide(2.0 * k, BetaSample(2.0 * k, 1.0, UV))
     moved = [controller.decide(4.0 + 0.1 * i, None).amplitude_ma for i in range(1, 18)]
@@ -80,14 +80,14 @@ def test_decisions_in_quick_succession_share_one_periods_ramp():
 
 
 def test_a_clock_that_is_set_back_does_not_lock_the_network_out():
-    controller = Controller(constant(1.0), LIMITS, UV)
+    controller = BoundedController(constant(1.0), LIMITS, UV)
     times = [*np.arange(1e6, 1e6 + 10, 2.0), *np.arange(0.0, 10, 2.0)]
     decisions = [controller.decide(t, BetaSample(t, 1.0, UV)) for t in times]
     assert [d.fallback for d in decisions] == [True, True, False, False, False] * 2
 
 
 def test_a_late_decision_moves_no_farther_than_one_period():
-    controller = Controller(constant(0.0), dataclasses.replace(LIMITS, window=1), UV)
+    controller = BoundedController(constant(0.0), dataclasses.replace(LIMITS, window=1), UV)
     controller.decide(0.0, BetaSample(0.0, 1.0, UV))
     assert controller.decide(60.0, BetaSample(60.0, 1.0, UV)).amplitude_ma == pytest.approx(2.0)
 
@@ -111,7 +111,7 @@ def test_beta_that_is_no_amplitude_gives_cdbs_in_that_very_decision_and_until_a_
 
 @pytest.mark.parametrize("signal", [Signal("mV", "time_domain"), Signal("uV", "device_power"), Signal("", "")])
 def test_beta_of_another_unit_or_source_gives_cdbs_at_once(signal):
-    controller = Controller(constant(0.2), LIMITS, UV)
+    controller = BoundedController(constant(0.2), LIMITS, UV)
     for k in range(6):
         controller.decide(2.0 * k, BetaSample(2.0 * k, 1.0, UV))
     decision = controller.decide(12.0, BetaSample(12.0, 1.0, signal))
@@ -123,7 +123,7 @@ def test_beta_that_stops_coming_gives_cdbs_one_period_after_the_last_one():
     assert [d.amplitude_ma for d in decisions[8:]] == [3.0, 3.0, 3.0]
     assert decisions[8].t_s - 7 * 2.0 == LIMITS.period_s
     assert all(names(d) == {"stale_beta"} for d in decisions[8:])
-    controller = Controller(constant(0.2), LIMITS, UV)
+    controller = BoundedController(constant(0.2), LIMITS, UV)
     for k in range(8):
         controller.decide(2.0 * k + 0.1, BetaSample(2.0 * k, 1.0, UV))
     assert not controller.decide(15.7, None).fallback, "1.7 s old: still in time"
@@ -135,7 +135,7 @@ def test_beta_that_stops_coming_gives_cdbs_one_period_after_the_last_one():
 
 
 def test_one_beta_that_comes_late_costs_one_decision_and_not_the_window():
-    controller = Controller(constant(1.0), LIMITS, UV)
+    controller = BoundedController(constant(1.0), LIMITS, UV)
     for k in range(5):
         controller.decide(2.0 * k, BetaSample(2.0 * k, 1.0, UV))
     assert names(controller.decide(10.0, None)) == {"stale_beta"}
@@ -150,7 +150,7 @@ def test_before_any_beta_the_amplitude_is_cdbs():
 
 
 def test_a_window_with_a_gap_begins_anew_and_jitter_is_no_gap():
-    controller = Controller(constant(0.5), LIMITS, UV)
+    controller = BoundedController(constant(0.5), LIMITS, UV)
     times = [0.0, 2.0, 3.4, 6.2, 9.3]
     decisions = [controller.decide(t, BetaSample(t, 1.0, UV)) for t in times]
     assert [d.fallback for d in decisions] == [True, True, False, False, True]
@@ -160,7 +160,7 @@ def test_a_window_with_a_gap_begins_anew_and_jitter_is_no_gap():
 
 @pytest.mark.parametrize("t_s", [2.0, 1.0, 9.0, math.nan, -math.inf, math.inf])
 def test_a_sample_out_of_order_or_from_the_future_is_left_out_and_said(t_s):
-    controller = Controller(constant(1.0, 2), dataclasses.replace(LIMITS, window=2), UV)
+    controller = BoundedController(constant(1.0, 2), dataclasses.replace(LIMITS, window=2), UV)
     controller.decide(0.0, BetaSample(0.0, 1.0, UV))
     controller.decide(2.0, BetaSample(2.0, 1.0, UV))
     decision = controller.decide(4.0, BetaSample(t_s, 50.0, UV))
@@ -174,7 +174,7 @@ def test_a_sample_out_of_order_or_from_the_future_is_left_out_and_said(t_s):
 )
 def test_a_network_that_fails_or_answers_nonsense_gives_cdbs_and_the_log_says_why(answer, reason):
     network = Answers(0.2)
-    controller = Controller(network, LIMITS, UV)
+    controller = BoundedController(network, LIMITS, UV)
     for k in range(6):
         controller.decide(2.0 * k, BetaSample(2.0 * k, 1.0, UV))
     network.answer = answer
@@ -229,7 +229,7 @@ KINDS = ("good", "nan", "negative", "missing", "unit", "again")
 def test_every_sequence_of_five_periods_falls_back_exactly_when_the_rule_says(window):
     limits = dataclasses.replace(LIMITS, window=window)
     for kinds in itertools.product(KINDS, repeat=5):
-        controller, taken = Controller(constant(0.1, window), limits, UV), []
+        controller, taken = BoundedController(constant(0.1, window), limits, UV), []
         before = limits.cdbs_ma
         for k, kind in enumerate(kinds):
             now = 2.0 * k
@@ -270,7 +270,7 @@ SAMPLES = st.none() | st.tuples(st.floats(-4, 1) | ANYTHING, st.floats(0, 1e4) |
 @given(limits=limits_of_any_kind(), stream=st.lists(st.tuples(st.floats(0, 5) | ANYTHING, SAMPLES, ANSWERS), max_size=25))
 def test_whatever_comes_the_limits_hold_and_no_number_is_missing(limits, stream):
     network = Answers(0.0, limits.window)
-    controller, now, before, last = Controller(network, limits, UV), 0.0, limits.cdbs_ma, None
+    controller, now, before, last = BoundedController(network, limits, UV), 0.0, limits.cdbs_ma, None
     newest = -math.inf  # time of the last beta amplitude that could have been used
     for wait, came, answer in stream:
         now = now + wait if math.isfinite(wait) else wait

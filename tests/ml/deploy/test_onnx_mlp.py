@@ -20,7 +20,7 @@ from ml.deploy.fixed_point import SCORE_LIMIT, _quantise, quantise
 from ml.deploy.onnx_mlp import NoPlainNetwork, mlp_of
 from ml.deploy.vectors import edge_windows
 from ml.policies.onnx_policy import OnnxPolicy
-from ml.rl.networks import MlpPolicy
+from ml.rl import MlpPolicy
 
 W = 10
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion", "-O2")

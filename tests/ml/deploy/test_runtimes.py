@@ -24,12 +24,12 @@ from ml.deploy.fixed_point import SCORE_LIMIT, WANTED_BOUND, CutNetwork, _quanti
 from ml.deploy.manifest import BundleError
 from ml.deploy.onnx_mlp import mlp_of
 from ml.deploy.runtime.envelope import BetaSample, Signal
-from ml.deploy.runtime.loop import Controller
+from ml.deploy.runtime.loop import BoundedController
 from ml.deploy.runtime.network import MlpNetwork
 from ml.deploy.vectors import Step, edge_windows, session
 from ml.deploy.windows import PolicyWindow
 from ml.policies.onnx_policy import OnnxPolicy
-from ml.rl.networks import MlpPolicy
+from ml.rl import MlpPolicy
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion", "-O2")
 SANITISED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
@@ -183,7 +183,7 @@ def random_steps(manifest, network, count, seed):
     """A session in which anything comes at any time, and what the Python controller decides."""
     rng = np.random.default_rng(seed)
     signal = Signal(manifest.beta_unit, manifest.beta_source)
-    controller, steps, now = Controller(network, manifest.limits(), signal), [], 0.0
+    controller, steps, now = BoundedController(network, manifest.limits(), signal), [], 0.0
     for _ in range(count):
         now = max(
             round(now + float(rng.choice([2.0, 2.0, 2.0, 2.0, 2.001, 1.5, 0.0, 7.0, -3.0], p=[0.5, 0.2, 0.2, 0.06, *[0.008] * 5])), 3), 0.0

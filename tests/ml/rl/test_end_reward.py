@@ -7,9 +7,7 @@ import pytest
 
 from ml.mdp import MdpSettings
 from ml.qoc import Qoc
-from ml.rl.algorithms.registry import ALGORITHMS
-from ml.rl.end_reward import fit_end_reward
-from ml.rl.held_out import HeldOut
+from ml.rl import ALGORITHMS, HeldOutSessions, fit_end_reward, train
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 SETTINGS = MdpSettings(xi_beta=1.0)
@@ -108,7 +106,7 @@ def test_a_policy_that_learns_for_the_return_spends_amplitude_where_the_end_rewa
     means = {}
     for aim in ("steps", "return"):
         config = algorithm.config(aim=aim, hidden=(24, 16), updates=600, actor_lr=1e-3, seed=1)
-        means[aim] = float(algorithm.train(data, config).policy.act(states).mean())
+        means[aim] = float(train(data, config).policy.act(states).mean())
     assert means["steps"] < 0.35
     assert means["return"] > 0.65
 
@@ -116,7 +114,7 @@ def test_a_policy_that_learns_for_the_return_spends_amplitude_where_the_end_rewa
 def test_held_out_returns_hold_the_share_too_so_that_values_are_compared_with_their_like():
     data = buffer(lambda a, beta: 1.0 + 2.0 * a.mean())
     share = fit_end_reward(data)
-    watched = HeldOut(sessions=data)
+    watched = HeldOutSessions(sessions=data)
     _, plain = watched.starts()
     _, shared = replace(watched, end_reward=share).starts()
     ends = [s.end_reward(SETTINGS) for s in data.sessions]

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from ml.mdp import MdpSettings
-from ml.rl.algorithms.ddpg import DdpgConfig, train
-from ml.rl.held_out import HeldOut, split_sessions
+from ml.rl import HeldOutSessions, split_sessions, train
+from ml.rl.algorithms.ddpg import DdpgConfig
 from ml.trajectories import ReplayBuffer
 
 SMALL = DdpgConfig(hidden=(16, 12), updates=200, batch=16, record_every=50, actor_lr=1e-2)
@@ -51,7 +51,7 @@ def test_one_session_at_least_is_held_out_and_one_kept(make_buffer):
 def test_the_state_of_the_best_score_comes_back_with_its_update(buffer):
     train_part, held = split_sessions(buffer, 0.3)
     score = Rising([1.0, 2.0, 5.0, 4.0])
-    trained = train(train_part, SMALL, held_out=HeldOut(sessions=held, score=score, every=50))
+    trained = train(train_part, SMALL, held_out=HeldOutSessions(sessions=held, score=score, every=50))
     assert trained.best_update == 150
     assert trained.policy.to_onnx() == score.seen[2] != score.seen[3]
     np.testing.assert_array_equal(trained.held_out["score"], [1.0, 2.0, 5.0, 4.0])
@@ -60,7 +60,7 @@ def test_the_state_of_the_best_score_comes_back_with_its_update(buffer):
 
 def test_watching_without_a_score_keeps_the_last_state_and_changes_nothing(buffer):
     train_part, held = split_sessions(buffer, 0.3)
-    watched = train(train_part, SMALL, held_out=HeldOut(sessions=held, every=50))
+    watched = train(train_part, SMALL, held_out=HeldOutSessions(sessions=held, every=50))
     assert watched.policy.to_onnx() == train(train_part, SMALL).policy.to_onnx()
     assert watched.best_update is None
     assert set(watched.held_out) == {"update", "start_q", "over_logged"}
@@ -70,7 +70,7 @@ def test_a_training_without_improvement_stops_early_and_says_so(buffer, tmp_path
     train_part, held = split_sessions(buffer, 0.3)
 
     def watch(score):
-        return HeldOut(sessions=held, score=score, every=10, patience=3)
+        return HeldOutSessions(sessions=held, score=score, every=10, patience=3)
 
     score = Rising([1.0, 3.0, 2.0, 2.5, 2.9, 9.0])
     trained = train(train_part, SMALL, checkpoint=tmp_path / "a", held_out=watch(score))
@@ -85,7 +85,7 @@ def test_a_training_without_improvement_stops_early_and_says_so(buffer, tmp_path
 def test_the_logged_return_goes_on_for_ever_with_the_sessions_mean_reward(make_buffer):
     settings = MdpSettings(xi_beta=100.0, gamma=0.9)
     buffer = make_buffer(settings, count=1, steps=30)
-    states, logged = HeldOut(sessions=buffer).starts()
+    states, logged = HeldOutSessions(sessions=buffer).starts()
     rewards = buffer.sessions[0].rewards(settings)
     expected, weight = 0.0, 1.0
     for step in range(2000):
@@ -97,7 +97,7 @@ def test_the_logged_return_goes_on_for_ever_with_the_sessions_mean_reward(make_b
 
 def test_over_estimation_is_q_at_the_first_states_less_the_return(buffer):
     train_part, held = split_sessions(buffer, 0.3)
-    watch = HeldOut(sessions=held, score=lambda policy: -50.0, is_step_return=True, every=200)
+    watch = HeldOutSessions(sessions=held, score=lambda policy: -50.0, is_step_return=True, every=200)
     trained = train(train_part, SMALL, held_out=watch)
     start_q = trained.held_out["start_q"][-1]
     assert trained.held_out["over_estimate"][-1] == pytest.approx(start_q + 50.0)
@@ -112,4 +112,4 @@ def test_impossible_settings_are_refused(buffer):
     with pytest.raises(ValueError, match="share"):
         split_sessions(buffer, 1.0)
     with pytest.raises(ValueError, match="every"):
-        HeldOut(sessions=buffer, every=0)
+        HeldOutSessions(sessions=buffer, every=0)

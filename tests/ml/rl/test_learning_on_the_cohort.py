@@ -6,8 +6,9 @@ they, and everything else here, were fixed before their true returns were seen, 
 stays in the random controller's range was added after a data set of another seed had gone wrong; it changes none of these three here.
 
 Nothing in training or selection sees a true return: the best state of each training is chosen by fitted Q evaluation on left-out sessions
-among those in range (`ml.rl.support`); the policy to prefer by the lower bound of its estimated gain over cDBS (`ml.rl.selection`), and
-none is where no bound lies above 0. True returns are the yardstick alone, and all controllers meet the same days and noise.
+among those in range (`ml.policies.logged_range`); the policy to prefer by the lower bound of its estimated gain over cDBS
+(`ml.ope.compare.selection`), and none is where no bound lies above 0. True returns are for measuring alone, and all controllers meet the
+same days and noise.
 """
 
 from __future__ import annotations
@@ -18,17 +19,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from ml.ope.compare.selection import gains_over, surest
 from ml.ope.fqe.estimator import Fqe
 from ml.ope.fqe.score import fqe_value
+from ml.policies.from_buffer import best_constant
+from ml.policies.logged_range import stays_in_range
 from ml.policies.policy import ConstantPolicy
 from ml.population import random_controller_buffer, true_return
-from ml.rl.algorithms.registry import ALGORITHMS
-from ml.rl.baselines import best_constant
-from ml.rl.end_reward import fit_end_reward
-from ml.rl.held_out import HeldOut, split_sessions
-from ml.rl.selection import gains_over, surest
-from ml.rl.support import stays_in_range
-from ml.rl.trainer import TrainedPolicy
+from ml.rl import ALGORITHMS, HeldOutSessions, TrainedPolicy, fit_end_reward, split_sessions, train_many
 
 AT_CDBS = {"anchor": "constant", "anchor_amplitude": 1.0}
 SIX = (
@@ -77,7 +75,7 @@ def six_policies(train, watch):
         places = [k for k, (own, changes) in enumerate(SIX) if (own, kind(changes)) == (name, shared)]
         algorithm = ALGORITHMS[name]
         configs = [algorithm.config(**SHARED, **SIX[k][1], seed=k) for k in places]
-        for k, result in zip(places, algorithm.train_many(train, configs, held_out=watch), strict=True):
+        for k, result in zip(places, train_many(train, configs, held_out=watch), strict=True):
             trained[k] = result
     return trained
 
@@ -95,7 +93,7 @@ def test_the_best_of_six_against_continuous_random_and_constant_stimulation(part
     def score(policy):
         return fqe_value(train, policy, held.sessions).value
 
-    watch = HeldOut(sessions=held, score=score, score_name="fqe", eligible=lambda policy: stays_in_range(policy, train), every=1000)
+    watch = HeldOutSessions(sessions=held, score=score, score_name="fqe", eligible=lambda policy: stays_in_range(policy, train), every=1000)
     trained = six_policies(train, watch)
     shared = fit_end_reward(train) is not None
 

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ml.rl.algorithms.ddpg import DdpgConfig, train
-from ml.rl.algorithms.registry import ALGORITHMS
-from ml.rl.training import CheckpointError
+from ml.rl import ALGORITHMS, CheckpointError, train
+from ml.rl.algorithms.ddpg import DdpgConfig
 from ml.trajectories import to_parquet
 
 SMALL = DdpgConfig(hidden=(16, 12), updates=300, batch=16, record_every=10, checkpoint_every=7, actor_lr=1e-3, critic_weight_decay=1e-3)
@@ -54,7 +53,7 @@ def test_a_damaged_checkpoint_is_refused_and_says_how_to_mend_it(buffer, tmp_pat
 WORKER = """
 import sys
 from pathlib import Path
-from ml.rl.algorithms import algorithm
+from ml.rl import algorithm, train
 from ml.trajectories import from_parquet
 
 def report(fraction, message="", **numbers):
@@ -63,7 +62,7 @@ def report(fraction, message="", **numbers):
 
 folder, kind = Path(sys.argv[1]), algorithm(sys.argv[2])
 buffer = from_parquet((folder / "buffer.parquet").read_bytes())
-kind.train(buffer, kind.config.from_json(eval(sys.argv[3])), report, folder / "training.ckpt")
+train(buffer, kind.config.from_json(eval(sys.argv[3])), report, folder / "training.ckpt")
 """
 
 
@@ -91,6 +90,6 @@ def test_a_training_killed_by_the_system_resumes_to_the_same_weights(name, buffe
         assert worker.wait() == -signal.SIGKILL
     updates = []
     file = tmp_path / "training.ckpt"
-    resumed = kind.train(buffer, config, lambda f, message="", **n: updates.append(int(message.split()[1])), file)
+    resumed = train(buffer, config, lambda f, message="", **n: updates.append(int(message.split()[1])), file)
     assert updates[0] > 700, "it must go on from the checkpoint, not start again"
-    assert_same(resumed, kind.train(buffer, config))
+    assert_same(resumed, train(buffer, config))

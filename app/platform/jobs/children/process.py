@@ -17,13 +17,13 @@ import sys
 import threading
 import time
 import traceback
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from app.platform.errors import BetaloopError
-from app.platform.jobs.children.report import Report, pipe_sender, write_atomically
+from app.platform.jobs.children.report import StepReport, pipe_sender, write_atomically
 from app.platform.jobs.errors import JobError
+from app.platform.jobs.registry import load_compute
 
 _PR_SET_PDEATHSIG = 1
 _LOCK_WAIT_S = 30.0
@@ -71,9 +71,9 @@ def main(arguments: list[str]) -> int:
         lock = _lock(workdir)
         outcome |= {"ok": True, "result": _run(name, call, workdir)}
     except Exception as error:
-        # room to speak, when it was the memory that ran out
+        # memory to write the message with, when it was the memory that ran out
         resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-        # stderr is the step's log, where the traceback is kept for those who can read one
+        # stderr is the step's log, which shows the traceback to those who can read one
         traceback.print_exc()
         outcome |= {"ok": False, "message": _worded(error, call["memory_mb"])}
     write_atomically(workdir / "result.json", json.dumps(outcome, allow_nan=False).encode())
@@ -83,17 +83,14 @@ def main(arguments: list[str]) -> int:
 
 
 def _run(name: str, call: dict[str, Any], workdir: Path) -> dict[str, Any]:
-    import_module(call["module"])
-    from app.platform.jobs.registry import compute_function
-
-    function = compute_function(name)
+    function = load_compute(call["function"])
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(1)
     # after the imports: a limit below what they need would only say so in a worse way
     limit = call["memory_mb"] << 20
     resource.setrlimit(resource.RLIMIT_DATA, (limit, resource.RLIM_INFINITY))
-    report = Report(pipe_sender(int(os.environ["BETALOOP_REPORT_FD"])))
-    result = function.run(call["params"], workdir, report)
+    report = StepReport(pipe_sender(int(os.environ["BETALOOP_REPORT_FD"])))
+    result = function(call["params"], workdir, report)
     if not isinstance(result, dict):
         raise TypeError(f"compute function {name!r} must return a dict, not {type(result).__name__}")
     try:

@@ -1,4 +1,4 @@
-"""How a compute function speaks while it works: progress, learning-curve points and log lines, as JSON lines on a pipe."""
+"""How a compute function reports while it works: progress, learning-curve points and log lines, as JSON lines on a pipe."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ml.progress import Report
 
 INTERVAL_S = 0.2
-"""At most one line per this many seconds; points in between are kept and sent together, of progress the latest is sent."""
+"""At most one line per this many seconds; points in between are sent together, of progress the latest is sent."""
 
 
-class Report:
+class StepReport:
     """Handed to every compute function.
 
     Args:
@@ -51,6 +54,16 @@ class Report:
         finite = {name: float(value) for name, value in values.items() if math.isfinite(value)}
         self._points.append({"x": float(x), "values": finite})
         self._maybe_send()
+
+    def curves(self, x_end: float, prefix: str = "") -> Report:
+        """This report for a computation of `ml`: fractions become progress, numbers points of learning curves from 0 to `x_end`."""
+
+        def report(fraction: float, message: str = "", **numbers: float) -> None:
+            self.progress(fraction, message or None)
+            if numbers:
+                self.point(round(fraction * x_end, 6), **{prefix + name: value for name, value in numbers.items()})
+
+        return report
 
     def log(self, text: str) -> None:
         """Add a line to the job's log at once."""

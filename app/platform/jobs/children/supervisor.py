@@ -1,4 +1,4 @@
-"""The worker's side of child processes: starts them, listens to them, watches their memory, kills them."""
+"""The worker's side of child processes: starts them, reads their reports, watches their memory, kills them."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ import psutil
 
 from app.platform.jobs.children.process import params_hash, stored_result, too_much_memory
 from app.platform.jobs.children.report import write_atomically
-from app.platform.jobs.context import Outcome
-from app.platform.jobs.registry import ComputeFunction
+from app.platform.jobs.context import StepOutcome
 from app.settings import private_folder
 
 LISTEN_S = 0.1
@@ -36,10 +35,11 @@ _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM
 
 
 @dataclass(frozen=True)
-class Call:
-    """One call of a compute function."""
+class ComputeCall:
+    """One call of a compute function: its name, and where it is, as `module:function`."""
 
-    function: ComputeFunction
+    name: str
+    reference: str
     params: dict[str, Any]
     workdir: Path
     memory_mb: int
@@ -47,12 +47,12 @@ class Call:
     @property
     def sha256(self) -> str:
         """Hash of name and params."""
-        return params_hash(self.function.name, self.params)
+        return params_hash(self.name, self.params)
 
 
 @dataclass
-class Heard:
-    """What a child said since the last report."""
+class ChildMessages:
+    """What a child reported since the last look."""
 
     progress: float | None = None
     message: str | None = None
@@ -61,13 +61,13 @@ class Heard:
 
     def add(self, line: str) -> None:
         """Take in one line of the pipe."""
-        said = json.loads(line)
-        self.progress = said.get("progress", self.progress)
-        self.message = said.get("message", self.message)
-        if "points" in said:
-            self.points = (self.points or []) + said["points"]
-        if "log" in said:
-            self.logs = [*(self.logs or []), said["log"]]
+        message = json.loads(line)
+        self.progress = message.get("progress", self.progress)
+        self.message = message.get("message", self.message)
+        if "points" in message:
+            self.points = (self.points or []) + message["points"]
+        if "log" in message:
+            self.logs = [*(self.logs or []), message["log"]]
 
     def __bool__(self) -> bool:
         return any(part is not None for part in (self.progress, self.message, self.points, self.logs))
@@ -77,12 +77,12 @@ _Child = subprocess.Popen[bytes]
 _Order = tuple[Callable[[], _Child], Future[_Child]]
 
 
-class Nursery:
+class ChildProcesses:
     """Starts every child from one thread, because the kernel's parent-death signal fires when the starting *thread* ends."""
 
     def __init__(self) -> None:
         self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._work, name="nursery", daemon=True)
+        self._thread = threading.Thread(target=self._work, name="child-starter", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -90,12 +90,12 @@ class Nursery:
         self._orders.put(None)
         self._thread.join()
 
-    def run(self, call: Call, hear: Callable[[Heard], None], check: Callable[[], None]) -> Outcome:
+    def run(self, call: ComputeCall, record: Callable[[ChildMessages], None], check: Callable[[], None]) -> StepOutcome:
         """Run one call in a child process, or take the result that it left before a crash.
 
         Args:
             call: what to run, and where.
-            hear: takes what the child says, at most once per REPORT_S.
+            record: takes what the child reports, at most once per REPORT_S.
             check: called every LISTEN_S; raises to have the child killed.
 
         Returns:
@@ -108,7 +108,7 @@ class Nursery:
         log_start = log.stat().st_size if log.exists() else 0
         process, pipe = self._start(call, log)
         try:
-            killed_for = _listen(process, pipe, call.memory_mb, hear, check)
+            killed_for = _listen(process, pipe, call.memory_mb, record, check)
         finally:
             os.close(pipe)
             _kill(process)
@@ -117,7 +117,7 @@ class Nursery:
             outcome["log"] = log.read_bytes()[log_start:][-LOG_TAIL:].decode(errors="replace")
         return outcome
 
-    def _start(self, call: Call, log: Path) -> tuple[_Child, int]:
+    def _start(self, call: ComputeCall, log: Path) -> tuple[_Child, int]:
         reader, writer = os.pipe()
         env = os.environ | _ONE_THREAD
         env |= {
@@ -125,7 +125,7 @@ class Nursery:
             "BETALOOP_WORKER_PID": str(os.getpid()),
             "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
         }
-        command = [sys.executable, "-m", "app.platform.jobs.children.process", call.function.name, str(call.workdir.resolve())]
+        command = [sys.executable, "-m", "app.platform.jobs.children.process", call.name, str(call.workdir.resolve())]
         with log.open("ab") as out:
 
             def start() -> _Child:
@@ -152,22 +152,22 @@ class Nursery:
                 started.set_exception(error)
 
 
-def _prepare(call: Call) -> None:
+def _prepare(call: ComputeCall) -> None:
     """Make the folder ready; what another call left there (its checkpoints do not fit) is removed."""
     params = call.workdir / "params.json"
     if call.workdir.exists() and (not params.exists() or json.loads(params.read_bytes())["params_sha256"] != call.sha256):
         shutil.rmtree(call.workdir)
     private_folder(call.workdir)
-    content = {"module": call.function.module, "params": call.params, "params_sha256": call.sha256, "memory_mb": call.memory_mb}
+    content = {"function": call.reference, "params": call.params, "params_sha256": call.sha256, "memory_mb": call.memory_mb}
     write_atomically(params, json.dumps(content, allow_nan=False).encode())
     result = call.workdir / "result.json"
     if result.exists() and stored_result(call.workdir, call.sha256) is None:
         result.unlink()  # of a failed attempt
 
 
-def _listen(process: _Child, pipe: int, memory_mb: int, hear: Callable[[Heard], None], check: Callable[[], None]) -> str | None:
-    """Hear a child out; returns why it had to be killed, or None when it ended by itself."""
-    heard, rest, open_ = Heard(), b"", True
+def _listen(process: _Child, pipe: int, memory_mb: int, record: Callable[[ChildMessages], None], check: Callable[[], None]) -> str | None:
+    """Read what a child reports until it ends; returns why it had to be killed, or None when it ended by itself."""
+    messages, rest, open_ = ChildMessages(), b"", True
     reported = measured = time.monotonic()
     while open_ or process.poll() is None:
         check()
@@ -176,21 +176,21 @@ def _listen(process: _Child, pipe: int, memory_mb: int, hear: Callable[[Heard], 
             open_ = bool(chunk)
             *lines, rest = (rest + chunk).split(b"\n")
             for line in lines:
-                heard.add(line.decode())
+                messages.add(line.decode())
         elif not open_:
             time.sleep(0.01)
         present = time.monotonic()
-        if heard and present - reported >= REPORT_S:
-            hear(heard)
-            heard, reported = Heard(), present
+        if messages and present - reported >= REPORT_S:
+            record(messages)
+            messages, reported = ChildMessages(), present
         if present - measured >= MEMORY_CHECK_S:
             measured = present
             if _resident_mb(process.pid) > memory_mb:
                 return too_much_memory(memory_mb)
         if process.poll() is not None and not select.select([pipe], [], [], 0)[0]:
             break  # a grandchild may hold the pipe open
-    if heard:
-        hear(heard)
+    if messages:
+        record(messages)
     return None
 
 
@@ -210,7 +210,7 @@ def _kill(process: _Child) -> None:
     process.wait()
 
 
-def _outcome(call: Call, returncode: int, killed_for: str | None) -> Outcome:
+def _outcome(call: ComputeCall, returncode: int, killed_for: str | None) -> StepOutcome:
     if killed_for:
         return {"ok": False, "message": killed_for}
     try:

@@ -14,7 +14,7 @@ from app.evaluation.estimates.compute import choose_method, evaluate_method
 from app.evaluation.estimates.methods import AGGREGATE, METHODS
 from app.learning.policies.baselines import constant_onnx
 from app.platform import files
-from app.platform.jobs import Report
+from app.platform.jobs import StepReport
 from ml.mdp import MdpSettings
 from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
@@ -55,7 +55,7 @@ def buffer_of(made: tuple[SessionTrajectory, ...]) -> ReplayBuffer:
 @pytest.mark.parametrize("method", FITTED)
 def test_every_method_estimates_reports_and_gives_json(method: str, db: Session, tmp_path: Path) -> None:
     told: list[dict[str, Any]] = []
-    result = evaluate_method(call(db, buffer_of(sessions()), method=method), tmp_path, Report(told.append, interval_s=0.0))
+    result = evaluate_method(call(db, buffer_of(sessions()), method=method), tmp_path, StepReport(told.append, interval_s=0.0))
     estimate = json.loads(json.dumps(result))["estimates"]["7"]
     assert estimate["method"] == method
     assert estimate["low"] <= estimate["high"]
@@ -69,7 +69,7 @@ def test_every_method_estimates_reports_and_gives_json(method: str, db: Session,
 
 @pytest.mark.parametrize("method", ["fqe", "wdr", "dual_dice"])
 def test_a_method_that_cannot_work_on_the_data_says_why(method: str, db: Session, tmp_path: Path) -> None:
-    result = evaluate_method(call(db, buffer_of(sessions(lead=float("nan"))), method=method), tmp_path, Report(lambda _: None))
+    result = evaluate_method(call(db, buffer_of(sessions(lead=float("nan"))), method=method), tmp_path, StepReport(lambda _: None))
     assert "no session has a complete window of beta before its first step" in result["failed"]
     assert "estimates" not in result
 
@@ -77,19 +77,19 @@ def test_a_method_that_cannot_work_on_the_data_says_why(method: str, db: Session
 def test_the_choice_names_its_table_or_why_there_is_none(db: Session, tmp_path: Path) -> None:
     params = call(db, buffer_of(sessions()), methods=["dlsm", "linear", "fqe", "wis", "aggregate"])
     params["policies"] = []
-    found = json.loads(json.dumps(choose_method(params, tmp_path, Report(lambda _: None))))["choice"]
+    found = json.loads(json.dumps(choose_method(params, tmp_path, StepReport(lambda _: None))))["choice"]
     assert {"linear", "fqe", "wis"} <= {row["method"] for row in found["table"]}
     assert found["chosen_by_data"] is True
     assert {p["controller"] for p in found["predictions"]} == {"random", "cdbs", "no_dbs"}
     one = params | {"methods": ["dlsm", "pdis"]}
-    assert "none of the methods asked for" in choose_method(one, tmp_path, Report(lambda _: None))["failed"]
+    assert "none of the methods asked for" in choose_method(one, tmp_path, StepReport(lambda _: None))["failed"]
 
 
 @pytest.mark.parametrize("method", ["linear", "fqe", "wdr", "dual_dice", "dlmm"])
 def test_a_study_without_end_of_session_rewards_still_sees_the_outcomes_predicted(method: str, db: Session, tmp_path: Path) -> None:
     without = MdpSettings(xi_beta=1.0, c2=0.0, c3=0.0, c4=0.0)
     buffer = ReplayBuffer(without, sessions(), "uV", "table")
-    estimate = evaluate_method(call(db, buffer, method=method), tmp_path, Report(lambda _: None))["estimates"]["7"]
+    estimate = evaluate_method(call(db, buffer, method=method), tmp_path, StepReport(lambda _: None))["estimates"]["7"]
     assert {"energy", "mean_beta", "grasp_hz", "rating", "tremor_percent"} <= set(estimate["predicted"])
     assert estimate["end_reward"] == pytest.approx(0.0, abs=1e-9)
     assert estimate["value"] == pytest.approx(estimate["step_return"], abs=1e-9)

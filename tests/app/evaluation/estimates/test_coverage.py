@@ -25,11 +25,11 @@ from app.evaluation.models import Evaluation
 from app.evaluation.schemas import CheckOut
 from app.evaluation.service import store_evaluation
 from app.learning.policies.baselines import constant_onnx, ensure_baselines
+from app.learning.snapshots.buffers import read_buffer
 from app.learning.snapshots.service import collect, take_snapshot
-from app.learning.training.compute import read_buffer
 from app.overview.export import export_participant
 from app.platform import files
-from app.platform.jobs import Report
+from app.platform.jobs import StepReport
 from app.study.repository import participant_by_code
 from ml.ope.support.coverage import AmplitudeSupport
 from ml.ope.support.diagnostics import diagnose
@@ -86,7 +86,7 @@ def test_the_compute_step_gives_what_the_science_finds(db: Session, tmp_path: Pa
     off = files.store(db, constant_onnx(0.0, 10), "application/onnx").sha256
     params["policies"].append({"id": 8, "sha256": off})
     told: list[dict[str, Any]] = []
-    found = json.loads(json.dumps(check_coverage(params, tmp_path, Report(told.append, interval_s=0.0))))["policies"]
+    found = json.loads(json.dumps(check_coverage(params, tmp_path, StepReport(told.append, interval_s=0.0))))["policies"]
     buffer = read_buffer(params["snapshot_sha256"])
     held = {"7": OnnxPolicy(constant_onnx(0.6, 10), 10), "8": OnnxPolicy(constant_onnx(0.0, 10), 10)}
     for policy_id, direct in diagnose(buffer, held, 50).items():
@@ -99,7 +99,7 @@ def test_the_compute_step_gives_what_the_science_finds(db: Session, tmp_path: Pa
 
 
 def test_data_that_cannot_be_checked_say_why(db: Session, tmp_path: Path) -> None:
-    result = check_coverage(call(db, buffer_of(sessions(lead=float("nan")))), tmp_path, Report(lambda _: None))
+    result = check_coverage(call(db, buffer_of(sessions(lead=float("nan")))), tmp_path, StepReport(lambda _: None))
     assert "no session has a complete window of beta before its first step" in result["failed"]
 
 

@@ -1,4 +1,4 @@
-"""What a sweep's page says of policies that should not be believed: below the yardsticks, not surely above cDBS, beyond the data."""
+"""What a sweep's page says of policies that should not be believed: below the baselines, not surely above cDBS, beyond the data."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.learning.models import Policy, Sweep
 from app.learning.policies.baselines import ONNX, constant_onnx
+from app.learning.snapshots.buffers import read_buffer
 from app.learning.snapshots.service import take_snapshot
-from app.learning.training.compute import gains_over_cdbs, read_buffer
+from app.learning.training.compute import gains_over_cdbs
 from app.platform import files
 from app.platform.jobs import service as jobs
 from app.study.repository import participant_by_code
@@ -50,7 +51,7 @@ def store(upload: Upload, db: Session) -> Store:
         rows = [{"controller": "cDBS", "score": 5.0, "mean_amplitude": 1.0}]
         sweep = Sweep(
             participant_id=participant.id, name="s", snapshot_id=snapshot.id, job_id=job.id, config={}, code_version="0", created_by="ada",
-            yardsticks={"rows": rows, "best_constant": 1.0, "held_out_sessions": [1]},
+            baselines={"rows": rows, "best_constant": 1.0, "held_out_sessions": [1]},
         )  # fmt: skip
         db.add(sweep)
         db.flush()

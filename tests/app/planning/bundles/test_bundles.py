@@ -10,16 +10,20 @@ import onnx
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from fastapi.testclient import TestClient
+from sqlalchemy import text
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.planning.bundles.repository import releases
 from app.planning.bundles.service import approvals, device_limits
+from app.platform import files
 from app.platform.audit import AuditEvent
 from app.study.models import Device, Hemisphere, Recording
 from app.study.repository import participant_by_code
 from ml.deploy.bundle import open_bundle, verify_bundle
 from ml.deploy.runtime.envelope import BetaSample, Signal
-from ml.rl.networks import MlpPolicy
+from ml.rl import MlpPolicy
 
 
 @pytest.fixture
@@ -59,7 +63,7 @@ def test_a_bundle_is_signed_with_the_key_that_the_service_tells(client: TestClie
 def test_defaults_are_zero_to_cdbs_and_say_that_nobody_stated_them(client: TestClient, policy: int) -> None:
     manifest = verify_bundle(take(client, policy).content)
     assert (manifest.min_ma, manifest.max_ma, manifest.ramp_ma_per_s) == (0.0, 3.0, 1.5)
-    assert (manifest.limits_stated_by, manifest.device_max_ma) == ("nobody: defaults", None)
+    assert (manifest.limits_stated_by, manifest.device_max_ma) == (None, None)
 
 
 def test_the_stimulators_limits_are_the_default_and_cannot_be_left(client: TestClient, policy: int, db: Session) -> None:
@@ -102,6 +106,22 @@ def test_the_audit_trail_says_who_took_which_limits_out(
     events = db.query(AuditEvent).filter(AuditEvent.entity == "stored_file", AuditEvent.reason.like("controller bundle%")).all()
     assert [(e.actor, e.action) for e in events] == [("clinician@clinic.example", "insert")]
     assert events[0].reason == f"controller bundle of P1, policy {policy}: 0.5 to 3 mA, cDBS 3 mA, ramp 0.25 mA/s"
+
+
+def test_a_release_is_a_row_and_no_sentence_is_read_for_it(
+    client: TestClient, client_as: Callable[[str], TestClient], policy: int, db: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.planning.wording.release_reason", lambda manifest: "worded anew")
+    content = take(client_as("clinician"), policy, min_ma=0.5, max_ma=3.0, ramp_ma_per_s=0.25).content
+    (row,) = releases(db, policy)
+    assert (row.created_by, row.policy_id, row.hemisphere, row.approvals) == ("clinician@clinic.example", policy, None, [])
+    assert (row.min_ma, row.max_ma, row.cdbs_ma, row.ramp_ma_per_s) == (0.5, 3.0, 3.0, 0.25)
+    assert files.read(row.sha256) == content
+    page = client.get(f"/participants/P1/policies/{policy}/bundle").text
+    assert "clinician@clinic.example" in page
+    assert "0.5 to 3 mA, cDBS 3 mA, ramp 0.25 mA/s" in page
+    with pytest.raises(DBAPIError, match="never changed"):
+        db.execute(text("update bundle_release set max_ma = 4"))
 
 
 def test_an_approved_plan_is_the_approval_of_its_policies(client: TestClient, policy: int, db: Session) -> None:

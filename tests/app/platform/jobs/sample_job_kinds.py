@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
-from app.platform.jobs import JobContext, JobError, Report, compute, job_kind, write_atomically
+from app.platform.jobs import JobContext, JobError, JobKind, StepReport, register, write_atomically
 from app.platform.jobs.worker import Pace, run_worker
 
 
@@ -26,8 +26,7 @@ class CountParams(BaseModel):
     pause_s: float = 0.0
 
 
-@compute("count")
-def count(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+def count(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """Count slowly, with a checkpoint after every number."""
     checkpoint = workdir / "checkpoint"
     start = int(checkpoint.read_text()) if checkpoint.exists() else 0
@@ -41,7 +40,6 @@ def count(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, An
     return {"part": params["part"], "counted": params["numbers"], "resumed_from": start, "pid": os.getpid()}
 
 
-@job_kind("count", title="Count", params_schema=CountParams)
 def run_count(job: JobContext) -> dict[str, Any]:
     """Count in parts, then store one row per part."""
     calls = [(f"count/{i}", "count", {**job.params, "part": i}) for i in range(job.params["parts"])]
@@ -65,8 +63,7 @@ class FailParams(BaseModel):
     how: str
 
 
-@compute("fail")
-def fail(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+def fail(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """Fail as asked."""
     how = params["how"]
     if how == "worded":
@@ -88,7 +85,6 @@ def fail(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any
     return {}
 
 
-@job_kind("fail", title="Fail", params_schema=FailParams)
 def run_fail(job: JobContext) -> dict[str, Any]:
     """Fail in a child, in a transaction or in the orchestration."""
     if job.params["how"] == "transaction":
@@ -109,6 +105,18 @@ def _store_and_break(db: Session) -> dict[str, Any]:
 def _kill_worker(db: Session) -> dict[str, Any]:
     os.kill(os.getpid(), signal.SIGKILL)
     return {}
+
+
+for name, schema in (("count", CountParams), ("fail", FailParams)):
+    register(
+        JobKind(
+            name=name,
+            title=name.capitalize(),
+            params=schema,
+            orchestration=f"sample_job_kinds:run_{name}",
+            compute={name: f"sample_job_kinds:{name}"},
+        )
+    )
 
 
 def work(slots: int, beat_s: float, stale_s: float) -> None:

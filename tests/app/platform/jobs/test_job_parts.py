@@ -9,23 +9,23 @@ import threading
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
 from rich.console import Console
 from sqlalchemy import text
 
 from app.platform.database import transaction
 from app.platform.errors import NotFound
-from app.platform.jobs import JobContext, Report, StepFailed, repository, write_atomically
+from app.platform.jobs import JobContext, StepFailed, StepReport, registry, repository, write_atomically
 from app.platform.jobs.children.process import params_hash
 from app.platform.jobs.children.slots import Slots
-from app.platform.jobs.children.supervisor import Call, Heard, Nursery
+from app.platform.jobs.children.supervisor import ChildMessages, ChildProcesses, ComputeCall
 from app.platform.jobs.errors import JobCancelled
 from app.platform.jobs.ledger import Ledger
 from app.platform.jobs.models import JobStatus
-from app.platform.jobs.registry import compute, compute_function
 from app.platform.jobs.steps import JobRunner
 from app.platform.jobs.stream import job_events
 from app.platform.jobs.watch import show_progress, watch
-from app.platform.jobs.worker import Identity, IdentityLost, Pace, Watchman
+from app.platform.jobs.worker import Identity, IdentityLost, Pace, WorkerMonitor
 from app.settings import get_settings
 
 
@@ -73,7 +73,7 @@ def test_waiting_for_a_slot_can_be_given_up_and_loses_none():
 
 def test_a_report_sends_the_latest_progress_and_every_point_but_not_every_call():
     sent = []
-    report = Report(sent.append, interval_s=60.0)
+    report = StepReport(sent.append, interval_s=60.0)
     for i in range(100):
         report.progress(i / 100, f"step {i}")
         report.point(i, loss=1.0 / (i + 1), broken=float("nan"))
@@ -87,11 +87,11 @@ def test_a_report_sends_the_latest_progress_and_every_point_but_not_every_call()
 
 
 def test_what_was_heard_twice_is_merged():
-    heard = Heard()
-    assert not heard
+    messages = ChildMessages()
+    assert not messages
     for line in ({"progress": 0.1, "points": [1]}, {"progress": 0.2, "points": [2], "message": "on"}, {"log": "a"}, {"log": "b"}):
-        heard.add(json.dumps(line))
-    assert heard == Heard(0.2, "on", [1, 2], ["a", "b"])
+        messages.add(json.dumps(line))
+    assert messages == ChildMessages(0.2, "on", [1, 2], ["a", "b"])
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path):
@@ -140,26 +140,41 @@ def test_after_a_failure_those_still_waiting_do_not_start():
     assert caught.value.key == "b"
 
 
-def test_a_name_belongs_to_one_function():
-    @compute("taken_name")
-    def one(params, workdir, report):
-        return {}
+@pytest.fixture
+def registered(monkeypatch):
+    """The registry, with what the test adds taken out again."""
+    registry.load_kinds()  # before the copy: a module registers at its first import alone
+    monkeypatch.setattr(registry, "_kinds", dict(registry._kinds))
+    return registry
 
-    assert compute_function("taken_name").run is one
-    with pytest.raises(ValueError, match="two functions register the compute function 'taken_name'"):
 
-        @compute("taken_name")
-        def two(params, workdir, report):
-            return {}
+def _kind(name="taken_name", orchestration="one.module:run", compute=None):
+    return registry.JobKind(name=name, title="A kind", params=BaseModel, orchestration=orchestration, compute=compute or {})
+
+
+def test_a_name_belongs_to_one_function(registered):
+    registered.register(_kind(compute={"work": "one.module:work"}))
+    registered.register(_kind(compute={"work": "one.module:work"}))  # the same module imported twice is no conflict
+    registered.register(_kind("second", compute={"work": "one.module:work"}))
+    assert registered.compute_reference("work") == "one.module:work"
+    with pytest.raises(ValueError, match="two orchestrations register the job kind 'taken_name'"):
+        registered.register(_kind(orchestration="other.module:run"))
+    with pytest.raises(ValueError, match="two functions register the compute function 'work'"):
+        registered.register(_kind("third", compute={"work": "other.module:work"}))
+
+
+@pytest.mark.parametrize("wrong", [{"name": "No Name"}, {"orchestration": "one.module.run"}, {"compute": {"work": "work"}}])
+def test_a_kind_names_its_functions_by_module_and_name(wrong):
+    with pytest.raises(ValueError, match=r"cannot name a job kind|names no function: write module:function"):
+        _kind(**wrong)
 
 
 def test_a_result_is_reused_for_equal_params_and_the_folder_emptied_for_others(kinds, tmp_path):
-    nursery, workdir = Nursery(), tmp_path / "step"
-    function = compute_function("count")
+    children, workdir = ChildProcesses(), tmp_path / "step"
 
     def run(**params):
-        call = Call(function, {"part": 0, "numbers": 2, "pause_s": 0.0, **params}, workdir, 1024)
-        return nursery.run(call, lambda heard: None, lambda: None)["result"]
+        call = ComputeCall("count", "sample_job_kinds:count", {"part": 0, "numbers": 2, "pause_s": 0.0, **params}, workdir, 1024)
+        return children.run(call, lambda messages: None, lambda: None)["result"]
 
     first = run()
     assert run() == first
@@ -167,7 +182,7 @@ def test_a_result_is_reused_for_equal_params_and_the_folder_emptied_for_others(k
     other = run(numbers=3)
     assert (other["counted"], other["resumed_from"]) == (3, 0)
     assert other["pid"] != first["pid"]
-    nursery.close()
+    children.close()
 
 
 def _lines(job_id, last=None):
@@ -183,7 +198,7 @@ def test_the_stream_starts_with_the_state_resumes_after_an_id_and_ends(jobs):
     ledger.open()
     ledger.declare("a", "A", 1.0)
     ledger.begin("a")
-    ledger.hear("a", Heard(0.5, "half", [{"x": 0.0, "values": {"loss": 1.0}}], ["a\nline"]))
+    ledger.record("a", ChildMessages(0.5, "half", [{"x": 0.0, "values": {"loss": 1.0}}], ["a\nline"]))
     ledger.commit_step("a", lambda db: {"v": 1})
     ledger.close(JobStatus.SUCCEEDED, {"v": 1})
     messages = _lines(job_id)
@@ -208,7 +223,7 @@ def test_progress_is_the_weighted_mean_of_the_steps_and_never_falls(jobs):
     ledger.declare("b", "B", 1.0)
     ledger.declare("a", "A again", 9.0)
     ledger.begin("a")
-    ledger.hear("a", Heard(progress=0.5))
+    ledger.record("a", ChildMessages(progress=0.5))
     assert jobs.get(job_id).progress == pytest.approx(0.375)
     ledger.begin("a")
     assert jobs.get(job_id).progress == pytest.approx(0.375)
@@ -278,7 +293,7 @@ def test_folders_of_jobs_that_ended_long_ago_are_removed_and_others_kept(jobs):
         (get_settings().jobs_dir / job_id / "step").mkdir(parents=True)
     identity, runner = Identity(), JobRunner("w", 1)
     identity.claim()
-    Watchman(identity, runner, Pace()).tidy()
+    WorkerMonitor(identity, runner, Pace()).tidy()
     assert {p.name for p in get_settings().jobs_dir.iterdir()} == {recent, running}
     runner.stop(1.0)
     identity.release()

@@ -136,7 +136,7 @@ def test_a_running_job_cannot_be_retried(jobs):
 
 
 def test_submit_refuses_unknown_kinds_and_params_that_do_not_fit(jobs, monkeypatch):
-    monkeypatch.setattr("app.platform.jobs.registry.JOB_MODULES", ())
+    monkeypatch.setattr("app.platform.jobs.registry.KIND_MODULES", ())
     with new_session() as db:
         with pytest.raises(UnknownKind, match="no job kind 'dance'"):
             service.submit(db, "dance", None, {}, "test")

@@ -9,12 +9,19 @@ import pytest
 import torch
 
 from ml.policies.onnx_policy import OnnxPolicy
-from ml.rl.algorithms.registry import ALGORITHMS, algorithm
-from ml.rl.batches import RewardScale, batch_noise, packed
-from ml.rl.held_out import HeldOut, split_sessions
-from ml.rl.networks import MlpPolicy
-from ml.rl.trainer import TrainedPolicy
-from ml.rl.training import CheckpointError, TrainingDiverged
+from ml.rl import (
+    ALGORITHMS,
+    CheckpointError,
+    HeldOutSessions,
+    MlpPolicy,
+    TrainedPolicy,
+    TrainingDiverged,
+    algorithm,
+    split_sessions,
+    train,
+    train_many,
+)
+from ml.rl.kernels.batches import RewardScale, batch_noise, packed
 
 NAMES = sorted(ALGORITHMS)
 CRITICS = {"ddpg": {"critic"}, "td3_bc": {"critic", "critic_2"}, "rebrac": {"critic", "critic_2"}, "cloning": set()}
@@ -73,7 +80,7 @@ def assert_same(one, two):
 
 
 def test_the_policy_has_the_papers_shape_and_its_answers_are_fractions(name, buffer):
-    trained = algorithm(name).train(buffer, algorithm(name).config(updates=2))
+    trained = train(buffer, algorithm(name).config(updates=2))
     assert trained.policy.hidden == (400, 300)
     answers = trained.policy.act(np.concatenate([buffer.transitions().states, np.array([[1e9] * 10, [-1e9] * 10])]))
     assert answers.shape == (len(buffer.transitions().states) + 2,)
@@ -83,7 +90,7 @@ def test_the_policy_has_the_papers_shape_and_its_answers_are_fractions(name, buf
 
 
 def test_the_onnx_file_answers_as_the_policy_does(name, buffer):
-    trained = algorithm(name).train(buffer, small(name, updates=60))
+    trained = train(buffer, small(name, updates=60))
     states = buffer.transitions().states
     expected = trained.policy.act(states)
     assert expected.std() > 1e-3, "the comparison needs answers that differ"
@@ -91,7 +98,7 @@ def test_the_onnx_file_answers_as_the_policy_does(name, buffer):
 
 
 def test_curves_are_of_one_length_and_their_last_point_is_that_of_the_policy(name, buffer):
-    trained = algorithm(name).train(buffer, small(name))
+    trained = train(buffer, small(name))
     assert {len(values) for values in trained.curve.values()} == {30}
     assert ("mean_q" in trained.curve) == ("critic" in trained.networks)
     logged = buffer.transitions()
@@ -139,45 +146,44 @@ def test_an_unknown_algorithm_is_refused_with_the_names_that_exist():
 
 
 def test_the_same_buffer_configuration_and_seed_give_the_same_training_bit_for_bit(name, buffer):
-    kind = algorithm(name)
-    one, two = kind.train(buffer, small(name, updates=60)), kind.train(buffer, small(name, updates=60))
+    one, two = train(buffer, small(name, updates=60)), train(buffer, small(name, updates=60))
     assert_same(one, two)
-    assert one.policy.to_onnx() != kind.train(buffer, small(name, updates=60, seed=1)).policy.to_onnx()
+    assert one.policy.to_onnx() != train(buffer, small(name, updates=60, seed=1)).policy.to_onnx()
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_training_that_was_interrupted_ends_as_one_that_was_not(name, count, buffer, tmp_path):
-    kind, file = algorithm(name), tmp_path / "training.ckpt"
-    train, held = split_sessions(buffer, 0.3)
-    watch = HeldOut(sessions=held, score=lambda policy: float(policy.act(held.transitions().states).mean()), every=9)
+    file = tmp_path / "training.ckpt"
+    learnt, held = split_sessions(buffer, 0.3)
+    watch = HeldOutSessions(sessions=held, score=lambda policy: float(policy.act(held.transitions().states).mean()), every=9)
     configs = [small(name, seed=k, actor_lr=10.0 ** -(3 + 0.2 * k)) for k in range(count)]
-    whole = kind.train_many(train, configs, held_out=watch)
+    whole = train_many(learnt, configs, held_out=watch)
     for stop in (40, 270):  # neither a multiple of the checkpoint's 23 updates nor of the 256 of a block of batches
         with pytest.raises(StoppedHere):
-            kind.train_many(train, configs, stop_at(stop), file, held_out=watch)
+            train_many(learnt, configs, stop_at(stop), file, held_out=watch)
     seen = []
-    resumed = kind.train_many(train, configs, lambda f, message="", **n: seen.append(round(f * 300)), file, held_out=watch)
+    resumed = train_many(learnt, configs, lambda f, message="", **n: seen.append(round(f * 300)), file, held_out=watch)
     assert seen[0] >= 250, "it must go on from the checkpoint, not start again"
     for one, two in zip(whole, resumed, strict=True):
         assert_same(one, two)
         assert one.best_update == two.best_update
-    again = kind.train_many(train, configs, stop_at(0), file, held_out=watch)
+    again = train_many(learnt, configs, stop_at(0), file, held_out=watch)
     assert_same(again[0], whole[0])
 
 
 def test_a_report_that_raises_cancels_the_training(name, buffer):
     with pytest.raises(StoppedHere):
-        algorithm(name).train(buffer, small(name), stop_at(20))
+        train(buffer, small(name), stop_at(20))
 
 
 def test_the_checkpoint_of_another_run_is_refused(name, buffer, tmp_path):
     file = tmp_path / "training.ckpt"
-    algorithm(name).train(buffer, small(name, updates=7), checkpoint=file)
+    train(buffer, small(name, updates=7), checkpoint=file)
     with pytest.raises(CheckpointError, match="another configuration"):
-        algorithm(name).train(buffer, small(name, updates=8), checkpoint=file)
+        train(buffer, small(name, updates=8), checkpoint=file)
     other = "cloning" if name != "cloning" else "ddpg"
     with pytest.raises(CheckpointError, match="other data"):
-        algorithm(other).train(buffer, small(other, updates=7), checkpoint=file)
+        train(buffer, small(other, updates=7), checkpoint=file)
 
 
 def test_an_update_leaves_its_batch_and_the_buffer_as_they_are(name, buffer):
@@ -205,14 +211,13 @@ def test_measuring_changes_nothing_that_the_next_update_depends_on(name, buffer)
 
 
 def test_a_stored_training_comes_back_and_is_tuned_to_the_same_weights(name, buffer):
-    kind = algorithm(name)
-    first = kind.train(buffer, small(name, updates=50))
+    first = train(buffer, small(name, updates=50))
     back = TrainedPolicy.from_bytes(first.to_bytes())
     assert_same(first, back)
     assert back.config == first.config
     gentle = small(name, updates=50, actor_lr=1e-6)
-    tuned = kind.train(buffer, gentle, initial=back)
-    assert_same(tuned, kind.train(buffer, gentle, initial=first))
+    tuned = train(buffer, gentle, initial=back)
+    assert_same(tuned, train(buffer, gentle, initial=first))
     moved = np.abs(tuned.policy.act(buffer.transitions().states) - first.policy.act(buffer.transitions().states)).max()
     assert 0 < moved < 1e-2
     assert_same(first, back)
@@ -220,10 +225,10 @@ def test_a_stored_training_comes_back_and_is_tuned_to_the_same_weights(name, buf
 
 def test_a_training_of_another_algorithm_cannot_be_gone_on_with_but_its_policy_can(name, buffer):
     other = "iql" if name != "iql" else "ddpg"
-    first = algorithm(other).train(buffer, small(other, updates=5))
+    first = train(buffer, small(other, updates=5))
     with pytest.raises(ValueError, match="start from its policy alone"):
-        algorithm(name).train(buffer, small(name, updates=5), initial=first)
-    assert algorithm(name).train(buffer, small(name, updates=5), initial=first.policy).policy.hidden == (16, 12)
+        train(buffer, small(name, updates=5), initial=first)
+    assert train(buffer, small(name, updates=5), initial=first.policy).policy.hidden == (16, 12)
 
 
 def test_bytes_of_something_else_are_refused():
@@ -236,7 +241,7 @@ def test_a_training_that_diverges_says_so(name, buffer):
     with torch.no_grad():
         broken.layers[0].bias.fill_(float("inf"))
     with pytest.raises(TrainingDiverged, match="diverged"):
-        algorithm(name).train(buffer, small(name), initial=broken)
+        train(buffer, small(name), initial=broken)
 
 
 # --- held near a constant amplitude -------------------------------------------------------------------------------------------------
@@ -251,25 +256,24 @@ def test_every_algorithm_that_is_held_near_an_anchor_is_known_here():
 
 @pytest.mark.parametrize("name", sorted(HELD))
 def test_without_a_bond_the_anchor_changes_nothing_bit_for_bit(name, buffer):
-    kind = algorithm(name)
-    free, held = (kind.train(buffer, small(name, updates=60, anchor=anchor, **HELD[name])) for anchor in ("logged", "constant"))
+    free, held = (train(buffer, small(name, updates=60, anchor=anchor, **HELD[name])) for anchor in ("logged", "constant"))
     assert_same(free, held)
-    bound = kind.train(buffer, small(name, updates=60, anchor="constant"))
-    assert bound.policy.to_onnx() != kind.train(buffer, small(name, updates=60)).policy.to_onnx()
+    bound = train(buffer, small(name, updates=60, anchor="constant"))
+    assert bound.policy.to_onnx() != train(buffer, small(name, updates=60)).policy.to_onnx()
 
 
 @pytest.mark.parametrize("name", sorted(HELD))
 def test_anchors_of_policies_side_by_side_are_their_own_and_a_training_at_one_resumes(name, buffer, tmp_path):
-    kind, file = algorithm(name), tmp_path / "training.ckpt"
+    file = tmp_path / "training.ckpt"
     strong = {"alpha": 0.02} if name == "td3_bc" else {"actor_penalty": 50.0}
     configs = [small(name, anchor="constant", anchor_amplitude=level, seed=3, **strong) for level in (1.0, 0.4)]
-    high, low = kind.train_many(buffer, configs)
+    high, low = train_many(buffer, configs)
     states = buffer.transitions().states
-    np.testing.assert_allclose(low.policy.act(states), kind.train(buffer, configs[1]).policy.act(states), atol=1e-4)
+    np.testing.assert_allclose(low.policy.act(states), train(buffer, configs[1]).policy.act(states), atol=1e-4)
     assert high.policy.act(states).mean() > low.policy.act(states).mean() + 0.1
     with pytest.raises(StoppedHere):
-        kind.train_many(buffer, configs, stop_at(200), file)
-    resumed = kind.train_many(buffer, configs, checkpoint=file)
+        train_many(buffer, configs, stop_at(200), file)
+    resumed = train_many(buffer, configs, checkpoint=file)
     assert_same(resumed[0], high)
     assert_same(resumed[1], low)
     assert TrainedPolicy.from_bytes(low.to_bytes()).config == configs[1]
@@ -281,7 +285,7 @@ def test_the_publications_anchor_is_the_default_and_an_unknown_one_is_refused(na
     with pytest.raises(ValueError, match="anchor must be one of logged, constant"):
         small(name, anchor="best")
     with pytest.raises(ValueError, match="may differ in actor_lr"):
-        algorithm(name).train_many(buffer, [small(name), small(name, anchor="constant")])
+        train_many(buffer, [small(name), small(name, anchor="constant")])
 
 
 # --- devices ------------------------------------------------------------------------------------------------------------------------
@@ -291,14 +295,14 @@ def test_without_cuda_auto_is_the_processor_and_cuda_is_refused(name, buffer, mo
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert small(name, device="auto").resolved_device() == "cpu"
     with pytest.raises(ValueError, match="no CUDA device; use auto or cpu"):
-        algorithm(name).train(buffer, small(name, device="cuda"))
-    auto = algorithm(name).train(buffer, small(name, updates=20, device="auto"))
-    assert_same(auto, algorithm(name).train(buffer, small(name, updates=20)))
+        train(buffer, small(name, device="cuda"))
+    auto = train(buffer, small(name, updates=20, device="auto"))
+    assert_same(auto, train(buffer, small(name, updates=20)))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: that both devices agree cannot be tested here")
 def test_both_devices_agree(name, buffer, tmp_path):
-    processor, card = (algorithm(name).train(buffer, small(name, updates=100, device=device)) for device in ("cpu", "cuda"))
+    processor, card = (train(buffer, small(name, updates=100, device=device)) for device in ("cpu", "cuda"))
     states = buffer.transitions().states
     np.testing.assert_allclose(card.policy.act(states), processor.policy.act(states), atol=1e-3)
     for key, values in processor.curve.items():

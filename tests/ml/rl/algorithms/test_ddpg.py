@@ -8,11 +8,11 @@ import torch
 from scipy.stats import norm
 
 from ml.mdp import MdpSettings
-from ml.rl.algorithms.ddpg import DdpgConfig, DdpgLearner, TrainedPolicy, train
-from ml.rl.batches import Batch, RewardScale, batch_indices, packed
-from ml.rl.networks import Critic, MlpPolicy
-from ml.rl.stacked import into_module
-from ml.rl.training import TrainingDiverged
+from ml.rl import MlpPolicy, TrainedPolicy, TrainingDiverged, train
+from ml.rl.algorithms.ddpg import DdpgConfig, DdpgLearner
+from ml.rl.kernels.batches import RewardScale, TransitionBatch, batch_indices, packed
+from ml.rl.kernels.networks import Critic
+from ml.rl.kernels.stacked import into_module
 
 SMALL = DdpgConfig(hidden=(16, 12), updates=60, batch=16, record_every=10, checkpoint_every=7, actor_lr=1e-3)
 
@@ -154,7 +154,7 @@ def test_an_update_equals_the_slow_twin_in_plain_loops(decay):
     for _ in range(5):
         s, a, r, s2 = (rng.normal(size=(8, 3)), rng.uniform(size=8), rng.normal(size=8), rng.normal(size=(8, 3)))
         columns = (s, a[:, None], r[:, None], s2, a[:, None], a[:, None])
-        learner.update(Batch(*(torch.tensor(x, dtype=torch.float32)[None] for x in columns)))
+        learner.update(TransitionBatch(*(torch.tensor(x, dtype=torch.float32)[None] for x in columns)))
         twin.update(list(zip(s, a, r, s2, strict=True)))
     assert np.abs(twin.pi.flat() - start).max() > 4e-3, "the updates must move the weights"
     for fast, slow, module in (

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from ml.rl.algorithms.registry import ALGORITHMS
-from ml.rl.trainer import train_on
+from ml.rl import ALGORITHMS
+from ml.rl.training import train_on
 from ml.trajectories import Transitions
 
 SHARED = {"batch": 128, "hidden": (48, 48), "updates": 2500, "seed": 1, "critic_lr": 2e-3, "tau": 0.02}
@@ -40,7 +40,7 @@ def test_it_finds_the_linear_quadratic_regulator(name):
     transitions, gain, gamma = linear_quadratic()
     settings, mean, worst = SOLVERS[name]
     kind = ALGORITHMS[name]
-    trained = train_on(kind.learner, transitions, gamma, (0.0, 0.46), [kind.config(**(SHARED | settings))])[0]
+    trained = train_on(transitions, gamma, (0.0, 0.46), [kind.config(**(SHARED | settings))])[0]
     x = np.linspace(-0.5, 0.5, 41)
     optimal = 0.5 - gain * x
     assert np.ptp(optimal) > 0.7, "a problem that a constant would not solve"
@@ -57,7 +57,7 @@ def test_behaviour_cloning_finds_the_mean_of_the_logged_actions_and_not_the_opti
     given = Transitions(*(getattr(transitions, n) if n != "actions" else logged for n in transitions.__dataclass_fields__))
     kind = ALGORITHMS["cloning"]
     config = kind.config(batch=128, hidden=(48, 48), updates=1500, actor_lr=1e-3)
-    policy = train_on(kind.learner, given, gamma, (0.0, 0.46), [config])[0].policy
+    policy = train_on(given, gamma, (0.0, 0.46), [config])[0].policy
     x = np.linspace(-0.5, 0.5, 41)
     error = np.abs(policy.act(np.c_[np.zeros(41), x]) - (0.5 + 0.6 * x))
     assert error.mean() < 0.03
@@ -70,7 +70,7 @@ def test_a_strong_bond_to_the_logged_actions_makes_it_clone_them(name):
     kind = ALGORITHMS[name]
     bond = {"alpha": 1e-4} if name == "td3_bc" else {"actor_penalty": 1e4}
     config = kind.config(**(SHARED | {"updates": 1200, "actor_lr": 1e-3} | bond))
-    policy = train_on(kind.learner, transitions, gamma, (0.0, 0.46), [config])[0].policy
+    policy = train_on(transitions, gamma, (0.0, 0.46), [config])[0].policy
     answers = policy.act(np.c_[np.zeros(21), np.linspace(-0.5, 0.5, 21)])
     assert np.abs(answers - 0.5).mean() < 0.05, "the logged actions are uniform: their mean is 0.5 everywhere"
 
@@ -83,7 +83,7 @@ def test_a_strong_bond_to_a_constant_amplitude_makes_it_that_constant(name):
     base = SHARED | {"updates": 1200, "actor_lr": 1e-3, "anchor": "constant"} | bond
     levels = (0.8, 0.35)
     configs = [kind.config(**base, anchor_amplitude=level) for level in levels]
-    for level, trained in zip(levels, train_on(kind.learner, transitions, gamma, (0.0, 0.46), configs), strict=True):
+    for level, trained in zip(levels, train_on(transitions, gamma, (0.0, 0.46), configs), strict=True):
         answers = trained.policy.act(np.c_[np.zeros(21), np.linspace(-0.5, 0.5, 21)])
         assert np.abs(answers - level).max() < 0.03
 
@@ -107,5 +107,5 @@ def test_a_bond_between_lets_it_leave_the_constant_as_far_as_the_values_pay_for(
     kind = ALGORITHMS[name]
     bond = {"alpha": 1 / strength} if name == "td3_bc" else {"actor_penalty": strength, "critic_penalty": 0.0}
     config = kind.config(**(SHARED | {"actor_lr": 1e-3, "anchor": "constant", "anchor_amplitude": anchor} | bond))
-    policy = train_on(kind.learner, transitions, 0.0, (0.0, 1.0), [config])[0].policy
+    policy = train_on(transitions, 0.0, (0.0, 1.0), [config])[0].policy
     assert policy.act(states[:200]).mean() == pytest.approx(expected, abs=0.04)

@@ -2,7 +2,7 @@
 
 Sizes, initial weights and the place where the action joins the critic follow Lillicrap et al. 2016 (Continuous control with deep
 reinforcement learning), which Gao et al. 2023, section 5.1 and appendix C.1, follow. Two things are ours: inputs are z-scored with one
-mean and standard deviation of beta held *inside* the policy network (so that what leaves the building takes raw beta amplitudes) instead of
+mean and standard deviation of beta held *inside* the policy network (so that an exported policy takes raw beta amplitudes) instead of
 batch normalisation, and the action bound is [0, 1] instead of [-1, 1].
 """
 

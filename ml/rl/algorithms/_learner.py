@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from ml.rl.batches import Batch, RewardScale
 from ml.rl.configs import CriticConfig, TrainConfig
-from ml.rl.networks import Critic, MlpPolicy
-from ml.rl.stacked import Stack, StackedActor, StackedAdam, into_module
+from ml.rl.kernels.batches import RewardScale, TransitionBatch
+from ml.rl.kernels.networks import Critic, MlpPolicy
+from ml.rl.kernels.stacked import Stack, StackedActor, StackedAdam, into_module
 
 SATURATION_MARGIN = 0.01
 """An amplitude fraction this near to 0 or 1 counts as saturated."""
@@ -67,10 +67,10 @@ class StackedLearner(abc.ABC, Generic[C]):
         """A policy and fresh other networks; `seeds` has enough for them."""
 
     @abc.abstractmethod
-    def update(self, batch: Batch) -> None:
+    def update(self, batch: TransitionBatch) -> None:
         """One update, in the order of the module's text."""
 
-    def measure(self, probe: Batch) -> list[dict[str, float]]:
+    def measure(self, probe: TransitionBatch) -> list[dict[str, float]]:
         """Points of the learning curves of each member, as `TrainedPolicy.curve` describes them."""
         actions = self.policy_stack.act(probe.states)
         values = self._probe_values(probe.states, actions)
@@ -171,7 +171,7 @@ CC = TypeVar("CC", bound=CriticConfig)
 class CriticLearner(StackedLearner[CC], Generic[CC]):
     """A learner with critics, warm-up and targets."""
 
-    def _descend_on_target(self, name: str, batch: Batch, targets: Any) -> None:
+    def _descend_on_target(self, name: str, batch: TransitionBatch, targets: Any) -> None:
         """One step of a critic's least squares Q(s, a) towards `targets` [K, B, 1]."""
         critic = self.stacks[name]
         error = critic.forward(batch.states, batch.actions).sub_(targets)

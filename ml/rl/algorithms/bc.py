@@ -1,4 +1,7 @@
-"""Behaviour cloning: the policy that imitates the logged amplitudes. One that does not beat it has learnt nothing of rewards."""
+"""Behaviour cloning: the policy that imitates the logged amplitudes. One that does not beat it has learnt nothing of rewards.
+
+Source: Pomerleau 1989. Its stored key is `cloning`.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from ml.rl.algorithms.learners import StackedLearner
-from ml.rl.batches import Batch
+from ml.rl.algorithms._learner import StackedLearner
 from ml.rl.configs import TrainConfig
-from ml.rl.networks import MlpPolicy
+from ml.rl.kernels.batches import TransitionBatch
+from ml.rl.kernels.networks import MlpPolicy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +31,7 @@ class CloningLearner(StackedLearner[CloningConfig]):
     def networks(cls, config: CloningConfig, policy: MlpPolicy, seeds: Sequence[int]) -> dict[str, Any]:
         return {"policy": policy}
 
-    def update(self, batch: Batch) -> None:
+    def update(self, batch: TransitionBatch) -> None:
         """One step of least squares."""
         actions = self.policy_stack.act(batch.states)
         error = actions - batch.actions

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ml.policies.logged_range import random_bound, share_below_bound, stays_in_range
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
-from ml.rl.algorithms.ddpg import DdpgConfig, train
-from ml.rl.held_out import HeldOut, split_sessions
-from ml.rl.support import random_bound, share_below_bound, stays_in_range
+from ml.rl import HeldOutSessions, split_sessions, train
+from ml.rl.algorithms.ddpg import DdpgConfig
 
 
 def test_the_share_below_the_bound_counts_the_buffers_states(buffer):
@@ -38,11 +38,11 @@ def test_a_state_that_may_not_be_kept_is_not_kept_for_its_score(buffer):
         seen.append(policy)
         return float(len(seen))
 
-    kept = train(learnt, config, held_out=HeldOut(sessions=held, score=score, every=50, eligible=lambda _: len(seen) == 2))
+    kept = train(learnt, config, held_out=HeldOutSessions(sessions=held, score=score, every=50, eligible=lambda _: len(seen) == 2))
     assert kept.best_update == 100
     assert kept.policy.to_onnx() == seen[1].to_onnx()
     np.testing.assert_array_equal(kept.held_out["score"], [1.0, 2.0, 3.0, 4.0])
     seen.clear()
-    last = train(learnt, config, held_out=HeldOut(sessions=held, score=score, every=50, eligible=lambda _: False))
+    last = train(learnt, config, held_out=HeldOutSessions(sessions=held, score=score, every=50, eligible=lambda _: False))
     assert last.best_update is None
     assert last.policy.to_onnx() == seen[-1].to_onnx() == train(learnt, config).policy.to_onnx()

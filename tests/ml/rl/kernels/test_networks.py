@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from ml.policies.onnx_policy import OnnxPolicy, PolicyFileError
-from ml.rl.networks import STUDENT_HIDDEN, TEACHER_HIDDEN, Critic, MlpPolicy
+from ml.rl import STUDENT_HIDDEN, TEACHER_HIDDEN, MlpPolicy
+from ml.rl.kernels.networks import Critic
 
 
 def trained_like(hidden, *, window=10, seed=3):

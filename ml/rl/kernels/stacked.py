@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from ml.rl.networks import Critic, MlpPolicy, Value
+from ml.rl.kernels.networks import Critic, MlpPolicy, Value
 
 _LAYER_NORM_EPSILON = 1e-5
 

@@ -18,7 +18,7 @@ _BATCH_STREAM, _NOISE_STREAM = 1, 4
 _PROBE_STATES = 2048
 
 
-class Batch(NamedTuple):
+class TransitionBatch(NamedTuple):
     """Rows of a buffer as float32 tensors, B for each of K policies.
 
     Attributes:
@@ -57,18 +57,18 @@ class PackedTransitions:
     def __len__(self) -> int:
         return int(self._rows.shape[0])
 
-    def take(self, index: Any, noise: Any = None) -> Batch:
+    def take(self, index: Any, noise: Any = None) -> TransitionBatch:
         """The rows of an int64 tensor [K, B]; a copy, so that nothing a learner does can reach the buffer."""
         w = self._window
         rows = self._rows.index_select(0, index.reshape(-1)).view(*index.shape, -1)
         states, actions, rewards, next_states, next_actions, known = rows.split((w, 1, 1, w, 1, 1), dim=-1)
-        return Batch(states, actions, rewards, next_states, next_actions, known, noise)
+        return TransitionBatch(states, actions, rewards, next_states, next_actions, known, noise)
 
-    def probe(self, members: int = 1) -> Batch:
+    def probe(self, members: int = 1) -> TransitionBatch:
         """Up to 2048 rows spread evenly over the buffer, the same for each of K policies, for measurements."""
         index = torch.from_numpy(np.unique(np.linspace(0, len(self) - 1, _PROBE_STATES).astype(np.int64)))
         one = self.take(index[None].to(self._rows.device))
-        return Batch(*(column.expand(members, -1, -1) for column in one[:-1]))
+        return TransitionBatch(*(column.expand(members, -1, -1) for column in one[:-1]))
 
     def to(self, device: str) -> PackedTransitions:
         """The same on another device."""

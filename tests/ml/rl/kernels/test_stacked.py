@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from ml.rl.algorithms.registry import ALGORITHMS, algorithm
-from ml.rl.networks import Critic, MlpPolicy, Value
-from ml.rl.stacked import Stack, StackedActor, StackedAdam, into_module
+from ml.rl import ALGORITHMS, MlpPolicy, algorithm, train, train_many
+from ml.rl.kernels.networks import Critic, Value
+from ml.rl.kernels.stacked import Stack, StackedActor, StackedAdam, into_module
 
 SIZES, BATCH = (16, 12), 8
 
@@ -102,12 +102,12 @@ def test_policies_trained_side_by_side_are_those_trained_one_by_one(name, buffer
     kind = algorithm(name)
     shared = {"hidden": (32, 24), "updates": 100, "batch": 32, "record_every": 50}
     configs = [kind.config(**shared, seed=k, actor_lr=10.0 ** -(3 + k / 5)) for k in range(6)]
-    together = kind.train_many(buffer, configs)
+    together = train_many(buffer, configs)
     states = buffer.transitions().states
     answers = np.stack([one.policy.act(states) for one in together])
     assert np.abs(answers[1:] - answers[0]).mean(axis=1).min() > 1e-3, "the members must differ"
     for config, one in zip(configs, together, strict=True):
-        alone = kind.train(buffer, config)
+        alone = train(buffer, config)
         np.testing.assert_allclose(one.policy.act(states), alone.policy.act(states), atol=1e-4)
         assert one.config == config
         for key, values in alone.curve.items():
@@ -119,23 +119,23 @@ def test_a_member_does_not_depend_on_its_neighbours(buffer):
     shared = {"hidden": (32, 24), "updates": 60, "batch": 32}
     one, other = kind.config(**shared, seed=1), kind.config(**shared, seed=2)
     wild = kind.config(**shared, seed=3, actor_lr=0.1, critic_lr=0.1)
-    calm = kind.train_many(buffer, [one, other])[0].policy
-    assert calm.to_onnx() == kind.train_many(buffer, [one, wild])[0].policy.to_onnx()
+    calm = train_many(buffer, [one, other])[0].policy
+    assert calm.to_onnx() == train_many(buffer, [one, wild])[0].policy.to_onnx()
 
 
 def test_configurations_that_cannot_share_their_calls_are_refused_by_name(buffer):
     kind = algorithm("rebrac")
     with pytest.raises(ValueError, match="not in tau; train them apart"):
-        kind.train_many(buffer, [kind.config(), kind.config(tau=0.1)])
-    with pytest.raises(ValueError, match="configured by RebracConfig"):
-        kind.train_many(buffer, [algorithm("ddpg").config()])
+        train_many(buffer, [kind.config(), kind.config(tau=0.1)])
+    with pytest.raises(ValueError, match="have one algorithm, not rebrac and ddpg"):
+        train_many(buffer, [kind.config(), algorithm("ddpg").config()])
     with pytest.raises(ValueError, match="one configuration or more"):
-        kind.train_many(buffer, [])
+        train_many(buffer, [])
 
 
 def test_points_of_several_policies_are_told_by_number(buffer):
     kind, told = algorithm("cloning"), {}
     configs = [kind.config(hidden=(8, 8), updates=10, seed=k) for k in range(2)]
-    trained = kind.train_many(buffer, configs, lambda fraction, message="", **numbers: told.update(numbers))
+    trained = train_many(buffer, configs, lambda fraction, message="", **numbers: told.update(numbers))
     assert set(told) == {f"{name}_{k}" for name in ("cloning_loss", "action_distance", "saturated") for k in (1, 2)}
     assert told["action_distance_2"] == trained[1].curve["action_distance"][-1]

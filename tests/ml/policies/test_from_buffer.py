@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ml.rl.baselines import CONSTANT_GRID, behaviour_mean, best_constant, proportional_from_buffer
+from ml.policies.from_buffer import CONSTANT_GRID, behaviour_mean, best_constant, proportional_from_buffer
 from ml.trajectories import ReplayBuffer
 
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ml.policies.policy import ConstantPolicy, ProportionalPolicy
-from ml.rl.held_out import Score
+from ml.policies.policy import ConstantPolicy, ProportionalPolicy, Score
 from ml.trajectories import ReplayBuffer
 
 

@@ -5,9 +5,9 @@ import pytest
 from scipy.stats import norm
 
 from ml.mdp import MdpSettings
+from ml.ope.compare.selection import Gain, gain, gains_over, surest
 from ml.ope.fqe.estimator import Fqe, FqeConfig
 from ml.policies.policy import ConstantPolicy
-from ml.rl.selection import Gain, gain, gains_over, surest
 
 
 def test_what_all_policies_share_cancels_in_a_gain():

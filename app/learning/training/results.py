@@ -1,0 +1,15 @@
+"""Names of the files that training steps leave in their folders."""
+
+from __future__ import annotations
+
+POLICY, CLONE = "policy.onnx", "clone.onnx"
+
+
+def policy_file(member: int) -> str:
+    """A trained policy's file in the folder of its step."""
+    return f"policy-{member}.onnx"
+
+
+def training_file(member: int) -> str:
+    """A whole training's file in the folder of its step."""
+    return f"training-{member}.pt"

@@ -1,0 +1,34 @@
+"""The kind `pipeline`: everything between two visits in one job. Snapshot, train, distil, fit, estimate, rank."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from app.learning.training.configs import training_groups
+from app.pipeline.distillation import declare_distillation, distil_all
+from app.pipeline.evaluation import declare_evaluation, declare_fit, evaluate_all, fit_calls, store_members
+from app.pipeline.params import PipelineParams
+from app.pipeline.stages import STORE_WEIGHT, plan_on_snapshot
+from app.pipeline.training import declare_training, store_trained, training_calls, training_starts
+from app.platform.jobs import JobContext
+
+
+def run_pipeline(job: JobContext) -> dict[str, Any]:
+    """Snapshot, train, distil, fit the DLSM, estimate, rank. Training and fitting run side by side."""
+    params = PipelineParams.model_validate(job.params)
+    training, evaluation = params.training(), params.evaluation()
+    job.step("plan", "Take a buffer snapshot", weight=STORE_WEIGHT)
+    declare_training(job, training)
+    declare_fit(job, evaluation)
+    declare_distillation(job, len(params.policies) or params.count)
+    declare_evaluation(job, evaluation, fit=False)
+    planned = plan_on_snapshot(job, lambda db, snapshot: {"starts": training_starts(db, snapshot.participant_id, training)})
+    snapshot = planned["snapshot"]
+    groups = training_groups(training, planned["starts"])
+    trainings = training_calls(training, snapshot["sha256"], groups)
+    results = job.compute_all([*trainings, *fit_calls(evaluation, snapshot["sha256"])])
+    policies = store_trained(job, training, snapshot["id"], groups, results[: len(trainings)])
+    models = store_members(job, results[len(trainings) :])
+    students = distil_all(job, params.distillation(), snapshot, policies)
+    outcome = evaluate_all(job, evaluation, snapshot, models)
+    return {"snapshot_id": snapshot["id"], "policy_ids": [p["id"] for p in (*policies, *students)]} | outcome

@@ -1,0 +1,76 @@
+"""The kinds of jobs that betaloop has, one record each. API, form, pages and workers derive from them; nothing heavy is imported here."""
+
+from __future__ import annotations
+
+from sqlalchemy.orm import Session
+
+from app.evaluation.schemas import EvaluateParams
+from app.evaluation.service import policies_to_rank
+from app.learning.schemas import DistilParams, TrainParams
+from app.learning.snapshots.service import collect
+from app.pipeline.distillation import teachers
+from app.pipeline.params import PipelineParams
+from app.pipeline.training import training_starts
+from app.platform.jobs import JobKind, register
+from app.study.models import Participant
+
+_TRAINING = {"train": "app.learning.training.compute:train", "baselines": "app.learning.training.compute:baselines"}
+_DISTILLATION = {"distil": "app.learning.training.compute:distil"}
+_EVALUATION = {
+    "fit_dlsm": "app.evaluation.estimates.compute:fit_dlsm",
+    "check_coverage": "app.evaluation.estimates.compute:check_coverage",
+    "evaluate_method": "app.evaluation.estimates.compute:evaluate_method",
+    "choose_method": "app.evaluation.estimates.compute:choose_method",
+}
+
+
+def usable_sessions(db: Session, participant_id: int, params: object) -> None:
+    """Raise Invalid where the participant has no threshold of beta yet, or no session that could enter a snapshot."""
+    collect(db, db.get_one(Participant, participant_id))
+
+
+def starts_of_the_training(db: Session, participant_id: int, params: PipelineParams) -> None:
+    """Raise where a policy to fine-tune from is not there, or cannot be trained further."""
+    training_starts(db, participant_id, params.training())
+
+
+register(
+    JobKind(
+        name="pipeline",
+        title="Between-visit pipeline",
+        params=PipelineParams,
+        orchestration="app.pipeline.between_visits:run_pipeline",
+        compute=_TRAINING | _DISTILLATION | _EVALUATION,
+        requires=(usable_sessions, starts_of_the_training),
+    )
+)
+register(
+    JobKind(
+        name="evaluate",
+        title="Evaluate and rank policies",
+        params=EvaluateParams,
+        orchestration="app.pipeline.evaluation:run_evaluate",
+        compute=_EVALUATION,
+        requires=(usable_sessions, policies_to_rank),
+    )
+)
+register(
+    JobKind(
+        name="train",
+        title="Train policies",
+        params=TrainParams,
+        orchestration="app.pipeline.training:run_train",
+        compute=_TRAINING,
+        requires=(usable_sessions, training_starts),
+    )
+)
+register(
+    JobKind(
+        name="distill",
+        title="Distil policies",
+        params=DistilParams,
+        orchestration="app.pipeline.distillation:run_distil",
+        compute=_DISTILLATION,
+        requires=(usable_sessions, teachers),
+    )
+)

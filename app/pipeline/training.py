@@ -1,0 +1,114 @@
+"""The kind `train`, and its stage for longer jobs: train the policies of a sweep, score controllers without learning, store both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from app.learning import repository
+from app.learning.models import BufferSnapshot
+from app.learning.policies import service
+from app.learning.schemas import ALGORITHM_NAMES, TrainParams
+from app.learning.sweeps import service as sweeps
+from app.learning.sweeps.service import Group
+from app.learning.training.configs import training_groups
+from app.pipeline.stages import STORE_WEIGHT, ComputeStep, plan_on_snapshot, policy_facts
+from app.platform.errors import Invalid
+from app.platform.jobs import JobContext
+from app.study.models import Participant
+
+TRAIN_WEIGHT, BASELINES_WEIGHT = 10.0, 3.0
+BASELINES = "baselines"
+
+
+def run_train(job: JobContext) -> dict[str, Any]:
+    """Train policies on a fresh snapshot."""
+    params = TrainParams.model_validate(job.params)
+    job.step("plan", "Take a buffer snapshot", weight=STORE_WEIGHT)
+    declare_training(job, params)
+    planned = plan_on_snapshot(job, lambda db, snapshot: {"starts": training_starts(db, snapshot.participant_id, params)})
+    groups = training_groups(params, planned["starts"])
+    results = job.compute_all(training_calls(params, planned["snapshot"]["sha256"], groups))
+    policies = store_trained(job, params, planned["snapshot"]["id"], groups, results)
+    return {"snapshot_id": planned["snapshot"]["id"], "policy_ids": [p["id"] for p in policies]}
+
+
+def training_starts(db: Session, participant_id: int, params: TrainParams) -> list[dict[str, Any] | None]:
+    """Where each training starts: None from scratch, else the parent's id, algorithm and files.
+
+    Raises:
+        NotFound: no such policy. Invalid: a policy that cannot be trained further, or takes other windows than the settings say.
+    """
+    if not params.policies:
+        return [None] * params.count
+    starts: list[dict[str, Any] | None] = []
+    for policy in repository.policies_named(db, participant_id, params.policies):
+        if policy.kind not in ("trained", "distilled"):
+            raise Invalid(
+                f"Policy '{policy.name}' is {policy.kind}: only policies trained here can be trained further.", "Choose a trained policy."
+            )
+        service.require_window(policy, db.get_one(Participant, participant_id).current_settings.window)
+        known = {"checkpoint_sha256": policy.checkpoint_sha256} if policy.checkpoint_sha256 else {"onnx_sha256": policy.onnx_sha256}
+        # a student has no critic: the sweep's own algorithm goes on from it
+        algorithm = policy.algorithm if policy.checkpoint_sha256 else params.algorithms[0]
+        starts.append({"policy_id": policy.id, "algorithm": algorithm, **known})
+    return starts
+
+
+def training_calls(params: TrainParams, sha256: str, groups: Sequence[Group]) -> list[ComputeStep]:
+    """Compute steps of the training stage: the groups of policies, then the baselines."""
+    calls: list[ComputeStep] = []
+    for group in groups:
+        call = {"snapshot_sha256": sha256, "algorithm": group["algorithm"], "configs": group["configs"], "held_out": params.held_out}
+        if group["start"] is not None:
+            call["initial"] = {name: value for name, value in group["start"].items() if name.endswith("sha256")}
+        calls.append((group["key"], "train", call))
+    return [*calls, (BASELINES, "baselines", {"snapshot_sha256": sha256, "held_out": params.held_out, "seed": params.seed})]
+
+
+def declare_training(job: JobContext, params: TrainParams) -> None:
+    """Show the training stage from the start; what is fine-tuned is known once the plan is made."""
+    if not params.policies:
+        _declare_groups(job, training_groups(params, [None] * params.count))
+    job.step(BASELINES, "Score controllers without learning", weight=BASELINES_WEIGHT)
+    job.step("store-policies", "Store the policies", weight=STORE_WEIGHT)
+
+
+def _declare_groups(job: JobContext, groups: Sequence[Group]) -> None:
+    first = 1
+    for group in groups:
+        count = len(group["configs"])
+        numbers = f"policy {first}" if count == 1 else f"policies {first} to {first + count - 1}"
+        job.step(group["key"], f"Train {numbers} ({ALGORITHM_NAMES[group['algorithm']]})", weight=TRAIN_WEIGHT * count)
+        first += count
+
+
+def store_trained(
+    job: JobContext, params: TrainParams, snapshot_id: int, groups: Sequence[Group], results: Sequence[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Store the training stage's sweep and policies; returns the policies' ids, names and files.
+
+    Args:
+        job, params: the job. snapshot_id: what was trained on.
+        groups: as `training_groups` made them. results: of `training_calls`, in that order.
+    """
+
+    def store(db: Session) -> dict[str, Any]:
+        policies = sweeps.store(
+            db,
+            job_id=job.id,
+            created_by=job.created_by,
+            snapshot=db.get_one(BufferSnapshot, snapshot_id),
+            name=params.sweep,
+            config=params.model_dump(mode="json"),
+            groups=groups,
+            results=results[:-1],
+            workdirs=[job.workdir(group["key"]) for group in groups],
+            baselines=(results[-1], job.workdir(BASELINES)),
+        )
+        return {"policies": policy_facts(policies)}
+
+    stored: list[dict[str, Any]] = job.transact("store-policies", store)["policies"]
+    return stored

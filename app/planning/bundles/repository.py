@@ -1,0 +1,37 @@
+"""Every query of controller bundles. Participants and policies come from callers that have checked the caller's scope."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.planning.bundles.models import BundleRelease
+from app.planning.plans.models import Plan, PlanItem
+from app.study.models import Hemisphere, Recording, Visit
+
+
+def releases(db: Session, policy_id: int) -> Sequence[BundleRelease]:
+    """The bundles of a policy that left so far, newest first."""
+    return db.scalars(select(BundleRelease).where(BundleRelease.policy_id == policy_id).order_by(BundleRelease.id.desc())).all()
+
+
+def recordings_newest_first(db: Session, participant_id: int, hemisphere: Hemisphere | None) -> Sequence[Recording]:
+    """The participant's recordings; where a side is named, those of it and those that name none."""
+    query = select(Recording).where(Recording.participant_id == participant_id)
+    if hemisphere is not None:
+        query = query.where((Recording.hemisphere == hemisphere) | Recording.hemisphere.is_(None))
+    return db.scalars(query.order_by(Recording.started_at.desc().nulls_last(), Recording.id.desc())).all()
+
+
+def approved_plans(db: Session, participant_id: int, policy_id: int) -> Sequence[tuple[Plan, int]]:
+    """The participant's approved visit plans that a policy stands in, each with its visit's number."""
+    rows = db.execute(
+        select(Plan, Visit.number)
+        .join(Visit, Visit.id == Plan.visit_id)
+        .where(Visit.participant_id == participant_id, Plan.status == "approved")
+        .where(Plan.id.in_(select(PlanItem.plan_id).where(PlanItem.policy_id == policy_id)))
+        .order_by(Plan.id)
+    )
+    return [(plan, number) for plan, number in rows]

@@ -1,0 +1,38 @@
+"""The web process loads none of the learners: compute modules are named by strings and imported by the processes that compute."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def loaded(code: str) -> set[str]:
+    """Names of the modules that a fresh interpreter has loaded after some code."""
+    script = f"{code}\nimport sys\nprint(' '.join(sorted(sys.modules)))"
+    return set(subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split())
+
+
+def test_the_web_process_never_loads_torch() -> None:
+    modules = loaded("from app.main import create_app; create_app().openapi()")
+    assert "app.pipeline.kinds" in modules
+    assert "torch" not in modules
+    assert not {m for m in modules if m.startswith("app.") and m.endswith(".compute")}
+
+
+def test_the_table_of_algorithms_is_read_without_torch() -> None:
+    modules = loaded("from ml.rl import ALGORITHMS; assert ALGORITHMS['iql'].title")
+    assert "torch" not in modules
+
+
+@pytest.mark.parametrize("kind", ["pipeline", "evaluate", "train", "distill"])
+def test_every_function_that_a_kind_names_is_there(kind: str) -> None:
+    from app.platform.jobs import registry
+
+    found = registry.kind(kind)
+    for reference in (found.orchestration, *found.compute.values()):
+        assert callable(registry.load_compute(reference)), reference
