@@ -138,7 +138,7 @@ class ProblemOut(Model):
 
     what: str
     where: str
-    mend: str
+    hint: str
 
 
 class FileReportOut(Model):

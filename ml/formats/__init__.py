@@ -64,7 +64,7 @@ __all__ = [
 
 FileKind = Literal["rcs", "percept", "csv", "parquet", "tremor", "grasp"]
 HEAD = 65_536
-MEND = (
+HINT = (
     "Upload an RC+S session folder as a zip, a Percept session report (JSON), a table as CSV or Parquet, "
     "a tremor export, or a table of open-fist times."
 )
@@ -81,7 +81,7 @@ def sniff(path: Path) -> FileKind:
     with path.open("rb") as stream:
         head = stream.read(HEAD)
     if not head:
-        raise UndecodableFile("the file is empty", "file", MEND)
+        raise UndecodableFile("the file is empty", "file", HINT)
     if head.startswith(b"PAR1"):
         return "parquet"
     if head.startswith((b"PK\x03\x04", b"PK\x05\x06")) or zipfile.is_zipfile(path):
@@ -94,7 +94,7 @@ def sniff(path: Path) -> FileKind:
         raise UndecodableFile(what, "file", "Zip the whole session folder and upload that.")
     if head.startswith((b"\xff\xfe", b"\xfe\xff")) or b"\0" not in head[:4096]:
         return _kind_of_text(path)
-    raise UndecodableFile("no format this service reads", "first bytes", MEND)
+    raise UndecodableFile("no format this service reads", "first bytes", HINT)
 
 
 def _kind_of_zip(path: Path) -> FileKind:
@@ -150,7 +150,7 @@ def decode(path: Path, kind: FileKind | None = None, options: DecodeOptions | No
         name: what to call it in reports and errors; the path's last part when not given.
 
     Raises:
-        UndecodableFile: nothing in it can be used; says what, where and how to mend it.
+        UndecodableFile: nothing in it can be used; says what, where and what to do.
     """
     options = options or DecodeOptions()
     kind = kind or sniff(path)

@@ -65,7 +65,7 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
             redaction = formats.redact(original, clean, kind, get_settings().secret("pseudonyms"), options)
         except UndecodableFile as error:
             clean.unlink(missing_ok=True)
-            raise Invalid(f"It still cannot be read: {error.stored_what} ({error.stored_where}).", error.mend) from error
+            raise Invalid(f"It still cannot be read: {error.stored_what} ({error.stored_where}).", error.hint) from error
     sealed = file.quarantine_sha256
     stored = files.store(db, clean, MEDIA_TYPE).sha256
     file.kind, file.stored_sha256, file.redactor_version = kind, stored, REDACTOR_VERSION
@@ -135,8 +135,8 @@ def _original(file: UploadFile) -> Iterator[Path]:
             with draft.open("wb") as out:
                 out.writelines(encryption.decrypt(files.path_of(file.quarantine_sha256)))
         except (InvalidToken, OSError) as error:
-            mend = "Restore the data folder, with its keys, from a backup."
-            raise Conflict(f"The encrypted bytes of file {file.id} are missing or damaged.", mend) from error
+            hint = "Restore the data folder, with its keys, from a backup."
+            raise Conflict(f"The encrypted bytes of file {file.id} are missing or damaged.", hint) from error
         if files.hash_file(draft)[0] != file.original_sha256:
             raise Conflict(f"The bytes of file {file.id} are not those that came: their hash differs.", "Restore a backup.")
         yield draft

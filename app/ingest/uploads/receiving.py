@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zipfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import cast
@@ -175,9 +175,9 @@ class Receiver:
         except Exception as fault:
             # a fault of ours must not take the other files of the upload with it, and what it left behind may still name a person
             log.exception("file could not be cleaned", upload=self.upload.id, fault=repr(fault))
-            mend = f"It is kept encrypted; tell your administrator: upload {self.upload.id}."
+            hint = f"It is kept encrypted; tell your administrator: upload {self.upload.id}."
             return self._quarantined(
-                draft, clean, UndecodableFile("the service failed while it took identity out of this file", "file", mend)
+                draft, clean, UndecodableFile("the service failed while it took identity out of this file", "file", hint)
             )
         sealed = self._seal(draft) if redaction.unreadable else None
         return Kept(kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, redaction, None)
@@ -288,7 +288,14 @@ def store_reports(row: UploadFile, reports: Sequence[FileReport], known: Sequenc
 
 def stored_reports(row: UploadFile) -> list[FileReport]:
     """The reports of a file as they were stored."""
-    return [FileReport(**{**r, "problem": Problem(**r["problem"]) if r["problem"] else None}) for r in row.report.get("reports", [])]
+    return [FileReport(**{**r, "problem": _stored_problem(r["problem"])}) for r in row.report.get("reports", [])]
+
+
+def _stored_problem(stored: Mapping[str, str] | None) -> Problem | None:
+    """The problem of a stored report; version 0.1.0 called its hint `mend`."""
+    if stored is None:
+        return None
+    return Problem(stored["what"], stored["where"], stored["hint"] if "hint" in stored else stored["mend"])
 
 
 def known_recordings(row: UploadFile) -> list[int]:

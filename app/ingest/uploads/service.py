@@ -154,7 +154,7 @@ def receive(
                 outcome.files.append(receiver.receive(one))
             except TooLarge as error:
                 refused.append(error)
-                problem = Problem(error.detail, "file", f"It was not kept. {error.mend}")
+                problem = Problem(error.detail, "file", f"It was not kept. {error.hint}")
                 outcome.asides.append(FileReport(one.name, problem=problem))
         if refused and not outcome.files:
             raise refused[0]
@@ -283,7 +283,7 @@ def attach_grasps(db: Session, file: UploadFile, session: StudySession) -> list[
     try:
         decoded = formats.decode(files.path_of(file.stored_sha256), cast(FileKind, file.kind), DecodeOptions(), name=file.name)
     except UndecodableFile as error:
-        raise Invalid(f"File {file.id} cannot be read any more: {error.what} ({error.where}).", error.mend) from error
+        raise Invalid(f"File {file.id} cannot be read any more: {error.what} ({error.where}).", error.hint) from error
     return outcomes_intake.take_grasps(db, file, decoded.grasps, session)
 
 

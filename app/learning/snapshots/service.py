@@ -124,7 +124,7 @@ def collect(db: Session, participant: Participant) -> Collection:
         raise Invalid(
             f"Participant {participant.code} has no session that can enter a replay buffer"
             + (f": {listed}." if listed else ": no confirmed session at all."),
-            "Upload sessions with a beta trace and an amplitude trace, or mend what is named.",
+            "Upload sessions with a beta trace and an amplitude trace, or correct what is named.",
         )
     return Collection(version, settings, members, unit, source)
 

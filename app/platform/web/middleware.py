@@ -119,5 +119,5 @@ async def _http_error(request: Request, error: Exception) -> Response:
 async def _unknown_error(request: Request, error: Exception) -> Response:
     log.error("request failed", path=request.url.path, request_id=getattr(request.state, "request_id", None), exc_info=error)
     problem: Any = _PlainError(500, "Something went wrong on our side.")
-    problem.mend = f"Nothing was changed. Tell your administrator the request id {getattr(request.state, 'request_id', '?')}."
+    problem.hint = f"Nothing was changed. Tell your administrator the request id {getattr(request.state, 'request_id', '?')}."
     return _answer(request, problem)

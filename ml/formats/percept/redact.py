@@ -20,7 +20,7 @@ from ml.formats.percept.details import EVENT_WORDS
 from ml.formats.percept.enums import is_known
 from ml.formats.percept.keys import KEYS
 from ml.formats.percept.report import report_members
-from ml.formats.percept.report_json import MEND, SECTIONS, channel_names, moment, read_report
+from ml.formats.percept.report_json import HINT, SECTIONS, channel_names, moment, read_report
 from ml.formats.recording import UndecodableFile
 from ml.formats.redaction import Redaction, pseudonym
 
@@ -80,7 +80,7 @@ def redact_percept(source: Path, target: Path, key: bytes, limits: ArchiveLimits
             done.ignored += [*files.ignored, *([f"{others} file{'s' if others > 1 else ''} that are no session report"] if others else [])]
         if not texts:
             why = f": {done.unreadable[0]}" if done.unreadable else ""
-            raise UndecodableFile(f"no Percept session report in here can be read{why}", "archive", MEND)
+            raise UndecodableFile(f"no Percept session report in here can be read{why}", "archive", HINT)
         with zipfile.ZipFile(target, "w") as archive:
             for name, text in texts.items():
                 info = zipfile.ZipInfo(name, EPOCH)

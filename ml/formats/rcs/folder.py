@@ -186,7 +186,7 @@ def _elements(session: SessionFiles, files: Files, stem: str, infos: list[dict[s
             for element, _ in read_elements(stream, notes, scan if wanted else None):
                 yield element
     except UndecodableFile as error:
-        session.reports[stem] = FileReport(report.name, problem=Problem(error.what, report.name, error.mend))
+        session.reports[stem] = FileReport(report.name, problem=Problem(error.what, report.name, error.hint))
         return
     infos.extend(notes.record_infos[:1])
     report.repaired.extend(notes.defects)

@@ -68,8 +68,8 @@ def decode_strivepd(path: Path, options: DecodeOptions | None = None, name: str 
         minutes = _by_class(table, columns, time, of_class, report)
         used.add(of_class)
     else:
-        mend = f"A wide export has the columns time, {WANTED}; a long one time, severity, duration; a table per minute minute_start, class."
-        raise UndecodableFile("no layout of a tremor export", "line 1", mend)
+        hint = f"A wide export has the columns time, {WANTED}; a long one time, severity, duration; a table per minute minute_start, class."
+        raise UndecodableFile("no layout of a tremor export", "line 1", hint)
     if others := len(table.headers) - len(used):
         report.removed.append(f"{others} other column{'s' if others > 1 else ''}, such as patient and device identifiers")
     if minutes.start_unix_s.size == 0:
@@ -85,8 +85,8 @@ def _wide(table: TextTable, columns: dict[str, int], time: int, report: FileRepo
     outside = np.flatnonzero(((fractions < 0) | (fractions > 1 + SUM_TOLERANCE)).any(axis=1))
     if outside.size:
         line = f"line {table.lines[outside[0]]}"
-        mend = "Upload the export as StrivePD wrote it; its fractions lie between 0 and 1."
-        raise UndecodableFile("a fraction outside 0 to 1", line, mend)
+        hint = "Upload the export as StrivePD wrote it; its fractions lie between 0 and 1."
+        raise UndecodableFile("a fraction outside 0 to 1", line, hint)
     off = np.abs(fractions.sum(axis=1) - 1.0) > SUM_TOLERANCE
     if count := int(off.sum()):
         report.flagged.append(f"{count} minutes whose fractions do not add up to 1: kept as they are")
@@ -177,7 +177,7 @@ def _starts(table: TextTable, time: int, report: FileReport) -> NDArray[np.float
 
 def _unix_s(cell: str, line: int) -> tuple[float, bool]:
     """Unix time of an ISO date, or of a number in s, ms, us or ns; and whether its zone was assumed."""
-    where, mend = f"line {line}, column time", "Give the time as ISO 8601 with its zone, or as Unix time."
+    where, hint = f"line {line}, column time", "Give the time as ISO 8601 with its zone, or as Unix time."
     try:
         value = parse_number(cell)
     except NotANumber:
@@ -186,16 +186,16 @@ def _unix_s(cell: str, line: int) -> tuple[float, bool]:
             zoned = moment.tzinfo is not None
             value = (moment if zoned else moment.replace(tzinfo=UTC)).timestamp()
         except (ValueError, OverflowError) as error:
-            raise UndecodableFile(f"{shown(cell)} is no time", where, mend, "a cell holds no time") from error
+            raise UndecodableFile(f"{shown(cell)} is no time", where, hint, "a cell holds no time") from error
         if not EARLIEST_UNIX_S <= value < LATEST_UNIX_S:
-            raise UndecodableFile("a time before any watch measured tremor", where, mend) from None
+            raise UndecodableFile("a time before any watch measured tremor", where, hint) from None
         return value, not zoned
     if value is None or value <= 0:
-        raise UndecodableFile("a minute has no time", where, mend)
+        raise UndecodableFile("a minute has no time", where, hint)
     for unit in (1.0, 1e3, 1e6, 1e9):
         if EARLIEST_UNIX_S <= value / unit < LATEST_UNIX_S:
             return value / unit, False
-    raise UndecodableFile(f"{value:g} is no date", where, mend, "a number that is no date")
+    raise UndecodableFile(f"{value:g} is no date", where, hint, "a number that is no date")
 
 
 def _in_order(

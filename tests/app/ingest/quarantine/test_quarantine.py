@@ -123,7 +123,7 @@ def test_bytes_that_were_read_meanwhile_are_not_read_twice(send: Any, client: Te
     held = next(f for f in client.get("/api/v1/participants/P1/quarantine").json() if f["held"])
     answer = decide(client, held, "release", how="read", reason="now")
     assert answer.status_code == 409
-    assert "Discard this copy" in answer.json()["mend"]
+    assert "Discard this copy" in answer.json()["hint"]
 
 
 def test_tampered_bytes_are_refused_in_words(held: dict[str, Any], client: TestClient) -> None:
