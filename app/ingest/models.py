@@ -78,8 +78,8 @@ class UploadFile(Base):
 class SessionProposal(Base):
     """Why an upload proposes a session, and how often the proposal was changed; it stays beside the session that it became.
 
-    `evidence` has one sentence per guessed field (`visit`, `controller`, …). Where `visit_open`, the visit is a place to keep the proposal
-    in and no guess. `version` lets no tab overwrite another's correction.
+    `evidence` has an `app.ingest.proposals.evidence.Evidence` per field (`visit`, `controller`, …), in old rows a sentence. Where
+    `visit_open`, the visit is a place to store the proposal in and no guess. `version` lets no tab overwrite another's correction.
     """
 
     __tablename__ = "session_proposal"

@@ -12,10 +12,10 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.ingest import repository
 from app.platform.errors import Conflict, Invalid
-from app.study import blinding
+from app.study import blinding, cdbs_amplitude
 from app.study import repository as study
 from app.study.models import Controller, Hemisphere, Participant, Recording, SessionSegment, StudySession, Trace, Visit
-from app.study.traces import AMPLITUDE_STREAM, cdbs_amplitude_ma, pack, unpack
+from app.study.traces import AMPLITUDE_STREAM, pack, unpack
 
 CONTROL_STREAMS = ("beta", "band_power")
 """Streams that can drive a controller, in the order of preference where the participant's source does not decide."""
@@ -205,7 +205,7 @@ def fix_milliamperes(db: Session, session: StudySession) -> list[str]:
         if not given or repository.confirmed_sessions_of_recording(db, recording_id, besides=session.id):
             continue
         try:
-            cdbs = cdbs_amplitude_ma(session, session.visit.participant.current_settings)
+            cdbs = cdbs_amplitude.of_session(session, session.visit.participant.current_settings)
         except Invalid as error:
             said.append(f"Amplitudes are kept as fractions: {error}")
             continue

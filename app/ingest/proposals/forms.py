@@ -35,6 +35,7 @@ class ProposalForm:
     Attributes:
         stored, typed: field to text, as stored and as the form shows it.
         clocked: whether times are those of the wall; else minutes and seconds of the recording.
+        why: by field, why it is proposed so.
         notes: contradictions that a person should look at.
         problem: why the form was refused.
     """
@@ -45,6 +46,7 @@ class ProposalForm:
     typed: Mapping[str, str]
     parts: list[dict[str, str]]
     clocked: bool
+    why: Mapping[str, str]
     notes: list[str]
     reason: str = ""
     problem: dict[str, Any] | None = None

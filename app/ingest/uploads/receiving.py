@@ -15,7 +15,7 @@ from typing import cast
 import structlog
 from sqlalchemy.orm import Session
 
-from app.ingest import encryption, repository
+from app.ingest import encryption, repository, wording
 from app.ingest.models import Upload, UploadFile
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import recordings
@@ -219,7 +219,7 @@ class Receiver:
         reports = list(decoded.reports)
         _tell(reports[0], kept.redaction, tremor)
         row.status = "decoded"
-        store_reports(row, reports, [r.id for r in stored.known])
+        store_reports(row, reports, [r.id for r in stored.known], kept.redaction.unreadable)
         self.db.commit()
         all_known = bool(stored.known) and not stored.fresh
         return FileOutcome(name, row, reports, all_known, recordings=[*stored.known, *stored.fresh], grasps=decoded.grasps)
@@ -281,9 +281,12 @@ def _stated_by_a_person(trace: TraceLog) -> bool:
     return trace.stream == "beta" and trace.source == "table"
 
 
-def store_reports(row: UploadFile, reports: Sequence[FileReport], known: Sequence[int] = ()) -> None:
-    """Keep a file's reports, and which of its recordings had come before in other files."""
-    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known)}
+def store_reports(
+    row: UploadFile, reports: Sequence[FileReport], known: Sequence[int] = (), unreadable: Sequence[str] | None = None
+) -> None:
+    """Store a file's reports, which of its recordings came before in other files, and which members could not be read (None: as stored)."""
+    found = unreadable_members(row) if unreadable is None else list(unreadable)
+    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known), "unreadable": found}
 
 
 def stored_reports(row: UploadFile) -> list[FileReport]:
@@ -296,6 +299,15 @@ def _stored_problem(stored: Mapping[str, str] | None) -> Problem | None:
     if stored is None:
         return None
     return Problem(stored["what"], stored["where"], stored["hint"] if "hint" in stored else stored["mend"])
+
+
+def unreadable_members(row: UploadFile) -> list[str]:
+    """Members of a stored file that could not be read, and why; in reports of version 0.1.0 they stand among the flags, behind a prefix."""
+    found: list[str] | None = row.report.get("unreadable")
+    if found is not None:
+        return found
+    prefix = "kept encrypted, because it could not be read: "
+    return [s.removeprefix(prefix) for r in stored_reports(row) for s in r.flagged if s.startswith(prefix)]
 
 
 def known_recordings(row: UploadFile) -> list[int]:
@@ -315,7 +327,7 @@ def _tell(report: FileReport, redaction: Redaction, notes: Sequence[str]) -> Non
     """Add to a report what cleaning the file found, and what was made of it."""
     for ours, found in ((report.removed, redaction.removed), (report.repaired, redaction.repaired), (report.ignored, redaction.ignored)):
         ours.extend(sentence for sentence in found if sentence not in ours)
-    report.flagged.extend(f"kept encrypted, because it could not be read: {u}" for u in redaction.unreadable)
+    report.flagged.extend(wording.unreadable(redaction.unreadable))
     report.understood.extend(notes)
 
 
@@ -327,7 +339,7 @@ def _left_out(path: Path, limits: ArchiveLimits) -> list[str]:
     try:
         with ZipFiles(path, limits) as members:
             find_sessions(members, listing)
-            reasons = Counter(sentence.rsplit(": ", 1)[-1] for sentence in members.ignored)
+            reasons = Counter(member.reason for member in members.left_out)
     except UndecodableFile:
         return []  # the problem itself says what is wrong with the archive
     return [*listing.ignored, *(f"{n} file{'s' if n > 1 else ''}: {reason}" for reason, n in sorted(reasons.items()))]

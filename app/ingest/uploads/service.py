@@ -20,7 +20,15 @@ from app.ingest.sessions import StatedSession
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads.in_progress import in_progress
 from app.ingest.uploads.incoming import Incoming, arrange
-from app.ingest.uploads.receiving import BetaStated, FileOutcome, Receiver, known_recordings, store_reports, stored_reports
+from app.ingest.uploads.receiving import (
+    BetaStated,
+    FileOutcome,
+    Receiver,
+    known_recordings,
+    store_reports,
+    stored_reports,
+    unreadable_members,
+)
 from app.platform import files
 from app.platform.errors import BetaloopError, Conflict, Invalid, TooLarge
 from app.platform.web.schemas import sensible_time
@@ -32,7 +40,7 @@ from ml.formats import FileKind
 from ml.formats.options import BetaMeasure, DecodeOptions
 from ml.formats.recording import FileReport, Problem, UndecodableFile
 
-__all__ = ["BetaStated", "FileOutcome", "Incoming", "UploadOutcome", "receive", "state_session", "stored_reports"]
+__all__ = ["BetaStated", "FileOutcome", "Incoming", "UploadOutcome", "receive", "state_session", "stored_reports", "unreadable_members"]
 
 log = structlog.get_logger()
 

@@ -77,7 +77,10 @@ def redact_percept(source: Path, target: Path, key: bytes, limits: ArchiveLimits
             members = report_members(files, damaged=True)
             texts = {f"report-{n}.json": t for n, m in enumerate(members, start=1) if (t := _member(files, m, n, scrub, done)) is not None}
             others = len(files.names()) - len(members)
-            done.ignored += [*files.ignored, *([f"{others} file{'s' if others > 1 else ''} that are no session report"] if others else [])]
+            done.ignored += [
+                *map(str, files.left_out),
+                *([f"{others} file{'s' if others > 1 else ''} that are no session report"] if others else []),
+            ]
         if not texts:
             why = f": {done.unreadable[0]}" if done.unreadable else ""
             raise UndecodableFile(f"no Percept session report in here can be read{why}", "archive", HINT)

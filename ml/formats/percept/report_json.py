@@ -41,6 +41,7 @@ SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 HINT = "Export the session report from the programmer again, and upload it unchanged."
 
 _TOP_KEY = re.compile(r'"([A-Za-z]{6,40})"\s*:')
+_OPEN_STRING = re.compile(r'"(?:[^"\\]++|\\.)*+\\?\Z', re.DOTALL)
 _INF = re.compile(r"(?<=[\[:,\s])([+-]?)(?:INF|Inf|inf)(?=[\],}\s])")
 _CONTACT = r"(?:ZERO|ONE|TWO|THREE|FOUR|FIVE|SIX|SEVEN|EIGHT|NINE|TEN|ELEVEN)(?:_?[ABC])?"
 _CHANNEL = re.compile(rf"(?:ELECTRODE_)?{_CONTACT}(?:_(?:AND|{_CONTACT}|LEFT|RIGHT|RING|SEGMENT)){{0,8}}")
@@ -97,7 +98,7 @@ def _parse(text: str, notes: list[str]) -> Any:
             return _parse(mended, notes)
         line = getattr(error, "lineno", None)
         at = getattr(error, "pos", 0)
-        cut = at >= len(text.rstrip()) - 1 or str(error).startswith("Unterminated string")
+        cut = at >= len(text.rstrip()) - 1 or _OPEN_STRING.match(text, at) is not None
         what = "the JSON text ends in the middle" if cut else "the JSON text is damaged"
         raise UndecodableFile(what, f"line {line}" if line else "file", HINT) from error
 

@@ -75,7 +75,7 @@ def decode_files(files: Files, options: DecodeOptions, name: str) -> DecodedFile
     """Decode every device folder among the files; see `decode_rcs`."""
     whole = FileReport(name)
     sessions = find_sessions(files, whole)
-    whole.ignored.extend(files.ignored)
+    whole.ignored.extend(map(str, files.left_out))
     if not sessions:
         raise UndecodableFile(
             "no RC+S session in here", name, "Zip the session's Device folder with its JSON files (DeviceSettings, StimLog, RawDataTD, …)."

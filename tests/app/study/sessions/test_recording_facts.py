@@ -56,7 +56,7 @@ def test_loss_that_cannot_be_seen_is_not_given_as_no_loss() -> None:
 def test_quality_of_no_stream_is_told_in_words_and_empty_parts_are_not() -> None:
     one = recording(quality={"errors": 2, "spike_packets": {"band 1": 120}, "time_domain": {}, "valid_fraction": {"beta": 0.25}})
     assert quality_rows(one) == []
-    assert quality_remarks(one) == ["errors: 2", "spike packets: band 1 120"]
+    assert quality_remarks(one) == [("errors", "2"), ("spike packets", "band 1 120")]
     assert valid_shares(one) == {"beta": 0.25}
 
 
