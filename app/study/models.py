@@ -289,7 +289,7 @@ class QocRevision(Base):
 
 
 class TremorSeries(Base):
-    """Minutes of tremor from one uploaded file of a watch, on the clock of the wall.
+    """Minutes of tremor from one uploaded file of a watch, in UTC.
 
     Little-endian arrays of `n` minutes in time order: `start_unix_s_f64` and `duration_s_f64` in seconds, `fractions_f32` [n, 6] in the
     order of `ml.qoc.TREMOR_CLASSES`, `any_tremor_f32`; NaN where the export does not tell.

@@ -44,7 +44,7 @@ class UndecodableFile(Exception):
         return type(self), (self.what, self.where, self.hint, self.stored_what, self.stored_where)
 
     @property
-    def told(self) -> Problem:
+    def for_sender(self) -> Problem:
         """The problem for the person who sent the file."""
         return Problem(self.what, self.where, self.hint)
 
@@ -137,13 +137,13 @@ class SpectrumLog:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TremorLog:
-    """Minutes of tremor in time order, on the clock of the wall.
+    """Minutes of tremor in time order, in UTC.
 
     Attributes:
         start_unix_s: begin of each minute, shape [n].
         duration_s: length of each minute's measurement, shape [n].
         fractions: share per class in the order of `TREMOR_CLASSES`, shape [n, 6]; NaN where the export does not split the tremor.
-        any_tremor: share with slight or worse tremor, shape [n]; NaN where not told.
+        any_tremor: share with slight or worse tremor, shape [n]; NaN where not known.
     """
 
     start_unix_s: NDArray[np.float64]

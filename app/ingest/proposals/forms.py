@@ -34,7 +34,7 @@ class ProposalForm:
 
     Attributes:
         stored, typed: field to text, as stored and as the form shows it.
-        clocked: whether times are those of the wall; else minutes and seconds of the recording.
+        clocked: whether times are dates and times of day; else minutes and seconds of the recording.
         why: by field, why it is proposed so.
         notes: contradictions that a person should look at.
         problem: why the form was refused.
@@ -184,5 +184,5 @@ def _clock(moment: datetime) -> str:
 
 
 def is_clocked(session: StudySession) -> bool:
-    """Whether the form shows times of the wall."""
+    """Whether the form shows dates and times of day."""
     return _begin(session) is not None

@@ -18,7 +18,7 @@ from app.accounts.permissions import Caller
 from app.ingest import encryption, repository
 from app.ingest.models import UploadFile
 from app.ingest.uploads import service
-from app.ingest.uploads.receiving import MEDIA_TYPE, BetaStated, Kept, Receiver
+from app.ingest.uploads.receiving import MEDIA_TYPE, BetaStated, Receiver, StoredContent
 from app.ingest.uploads.service import UploadOutcome
 from app.platform import files
 from app.platform.database import now, set_reason
@@ -71,8 +71,8 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
     file.kind, file.stored_sha256, file.redactor_version = kind, stored, REDACTOR_VERSION
     _decide(db, file, reason, caller)
     db.commit()
-    kept = Kept(kind, stored, sealed if redaction.unreadable else None, redaction, None)
-    outcome = UploadOutcome(upload, participant, [Receiver(db, participant, upload, options, beta).decode(file.name, file, kept)])
+    content = StoredContent(kind, stored, sealed if redaction.unreadable else None, redaction, None)
+    outcome = UploadOutcome(upload, participant, [Receiver(db, participant, upload, options, beta).decode(file.name, file, content)])
     if file.status == "decoded":
         service.make_sessions(db, outcome, service.as_stated(db, participant, said))
         if not redaction.unreadable:

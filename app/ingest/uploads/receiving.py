@@ -39,7 +39,7 @@ EMPTY = UndecodableFile("the file is empty", "0 bytes", "Send the file again fro
 CUT_SHORT = UndecodableFile(
     "the service was stopped while it took this file", "file", "Read it again on the page of the quarantine, or send it again."
 )
-TAKEN_UP = "The service was stopped while it read this file and has read it from the kept bytes since; what was removed is not told again."
+RESUMED = "The service was stopped while it read this file and has read it from the kept bytes since; what was removed is not listed again."
 TABLES = ("csv", "parquet")
 MEDIA_TYPE = "application/octet-stream"
 
@@ -55,8 +55,8 @@ class BetaStated:
 
 @dataclass
 class FileOutcome:
-    """What became of one file. `name` is what the sender called it; it and `told`, the problem in the file's own words, are told back to
-    the sender and never stored.
+    """What became of one file. `name` is what the sender called it; it and `for_sender`, the problem in the file's own words, go back
+    to the sender and are never stored.
 
     Attributes:
         duplicate: its bytes, or all of its recordings, had come before. same_bytes: its bytes had; `row` is the earlier file then.
@@ -71,7 +71,7 @@ class FileOutcome:
     duplicate: bool = False
     same_bytes: bool = False
     session_ids: list[int] = field(default_factory=list)
-    told: Problem | None = None
+    for_sender: Problem | None = None
     recordings: list[Recording] = field(default_factory=list)
     grasps: Sequence[GraspLog] = ()
 
@@ -79,11 +79,11 @@ class FileOutcome:
     def reports_for_sender(self) -> list[FileReport]:
         """The reports, naming the file as the sender does, and quoting it where that shows what is wrong."""
         own = [replace(r, name=self.name) if r.name == self.row.name else r for r in self.reports]
-        return [replace(r, problem=self.told) if r.problem is not None and self.told is not None else r for r in own]
+        return [replace(r, problem=self.for_sender) if r.problem is not None and self.for_sender is not None else r for r in own]
 
 
 @dataclass(frozen=True)
-class Kept:
+class StoredContent:
     """A file as it was stored, and why it cannot be decoded, if so."""
 
     kind: str
@@ -117,24 +117,24 @@ class Receiver:
         try:
             if known := self._known(name, sha256):
                 return known
-            kept = self._keep(draft) if size else Kept("unreadable", None, None, Redaction(), EMPTY)
+            content = self._store(draft) if size else StoredContent("unreadable", None, None, Redaction(), EMPTY)
         finally:
             draft.unlink(missing_ok=True)
         row = UploadFile(
             upload_id=self.upload.id,
             participant_id=self.participant.id,
-            name=_harmless_name(name, kept.kind),
-            kind=kept.kind,
+            name=_harmless_name(name, content.kind),
+            kind=content.kind,
             size=size,
             original_sha256=sha256,
-            stored_sha256=kept.stored_sha256,
-            quarantine_sha256=kept.quarantine_sha256,
+            stored_sha256=content.stored_sha256,
+            quarantine_sha256=content.quarantine_sha256,
             redactor_version=REDACTOR_VERSION,
             report={},
         )
         self.db.add(row)
         self.db.commit()  # the bytes are safe from here on, whatever the decoder does with them
-        return self.decode(name, row, kept)
+        return self.decode(name, row, content)
 
     def _known(self, name: str, sha256: str) -> FileOutcome | None:
         """The outcome for bytes that were decoded before: the same recordings, and nothing stored again."""
@@ -148,20 +148,20 @@ class Receiver:
     def _recordings(self, row: UploadFile) -> list[Recording]:
         return [*repository.recordings_of_file(self.db, row.id), *repository.recordings_by_id(self.db, known_recordings(row))]
 
-    def take_up(self, row: UploadFile) -> FileOutcome:
+    def resume(self, row: UploadFile) -> FileOutcome:
         """Go on with a file of an upload that was interrupted: decode it where that is still to do, else as it was left."""
         if row.status != "received":
             return FileOutcome(row.name, row, stored_reports(row), recordings=self._recordings(row))
         sealed = row.stored_sha256 is None or row.stored_sha256 == row.quarantine_sha256
         outcome = self.decode(
-            row.name, row, Kept(row.kind, row.stored_sha256, row.quarantine_sha256, Redaction(), CUT_SHORT if sealed else None)
+            row.name, row, StoredContent(row.kind, row.stored_sha256, row.quarantine_sha256, Redaction(), CUT_SHORT if sealed else None)
         )
         if not outcome.same_bytes:
-            outcome.reports[0].understood.append(TAKEN_UP)
+            outcome.reports[0].understood.append(RESUMED)
             store_reports(row, outcome.reports, known_recordings(row))
         return outcome
 
-    def _keep(self, draft: Path) -> Kept:
+    def _store(self, draft: Path) -> StoredContent:
         """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted.
 
         A table is cleaned by reading it with the participant's options: one that cannot be decoded is kept encrypted too.
@@ -180,21 +180,21 @@ class Receiver:
                 draft, clean, UndecodableFile("the service failed while it took identity out of this file", "file", hint)
             )
         sealed = self._seal(draft) if redaction.unreadable else None
-        return Kept(kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, redaction, None)
+        return StoredContent(kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, redaction, None)
 
-    def _quarantined(self, draft: Path, clean: Path, problem: UndecodableFile) -> Kept:
+    def _quarantined(self, draft: Path, clean: Path, problem: UndecodableFile) -> StoredContent:
         clean.unlink(missing_ok=True)
         left_out = _left_out(draft, self.options.archive)
         sealed = self._seal(draft)
-        return Kept("unreadable", sealed, sealed, Redaction(ignored=left_out), problem)
+        return StoredContent("unreadable", sealed, sealed, Redaction(ignored=left_out), problem)
 
     def _seal(self, draft: Path) -> str:
         return files.store(self.db, encryption.encrypt(draft), MEDIA_TYPE).sha256
 
-    def decode(self, name: str, row: UploadFile, kept: Kept) -> FileOutcome:
+    def decode(self, name: str, row: UploadFile, content: StoredContent) -> FileOutcome:
         """Decode a stored file; whatever is wrong with it becomes its report."""
-        if kept.problem is not None or kept.stored_sha256 is None:
-            return self._failed(name, row, kept, kept.problem or CUT_SHORT)
+        if content.problem is not None or content.stored_sha256 is None:
+            return self._failed(name, row, content, content.problem or CUT_SHORT)
         try:
             repository.lock_participant(self.db, self.participant.id)
             # asked again under the lock: somebody may have sent the same bytes meanwhile
@@ -202,38 +202,38 @@ class Receiver:
                 self.db.delete(row)
                 self.db.commit()
                 return known
-            decoded = formats.decode(files.path_of(kept.stored_sha256), cast(FileKind, kept.kind), self.options, name=row.name)
-            if kept.kind in TABLES:
+            decoded = formats.decode(files.path_of(content.stored_sha256), cast(FileKind, content.kind), self.options, name=row.name)
+            if content.kind in TABLES:
                 decoded = self._name_beta(decoded)
             stored = recordings.store(self.db, self.participant, row, decoded.recordings)
             tremor = outcomes_intake.take_tremor(self.db, row, decoded.tremor)
         except UndecodableFile as error:
             self.db.rollback()
-            return self._failed(name, row, kept, error)
+            return self._failed(name, row, content, error)
         except Exception as fault:
             # a fault of ours must not take the other files of the upload with it; the bytes are safe for a better decoder
             self.db.rollback()
-            log.exception("decoder failed", upload_file=row.id, kind=kept.kind, fault=repr(fault))
+            log.exception("decoder failed", upload_file=row.id, kind=content.kind, fault=repr(fault))
             ours = UndecodableFile("the decoder failed on this file", "file", f"Tell your administrator: upload file {row.id}.")
-            return self._failed(name, row, kept, ours)
+            return self._failed(name, row, content, ours)
         reports = list(decoded.reports)
-        _tell(reports[0], kept.redaction, tremor)
+        _add_redaction(reports[0], content.redaction, tremor)
         row.status = "decoded"
-        store_reports(row, reports, [r.id for r in stored.known], kept.redaction.unreadable)
+        store_reports(row, reports, [r.id for r in stored.known], content.redaction.unreadable)
         self.db.commit()
         all_known = bool(stored.known) and not stored.fresh
         return FileOutcome(name, row, reports, all_known, recordings=[*stored.known, *stored.fresh], grasps=decoded.grasps)
 
-    def _failed(self, name: str, row: UploadFile, kept: Kept, problem: UndecodableFile) -> FileOutcome:
+    def _failed(self, name: str, row: UploadFile, content: StoredContent, problem: UndecodableFile) -> FileOutcome:
         report = FileReport(name=row.name, problem=problem.stored)
-        _tell(report, kept.redaction, ())
+        _add_redaction(report, content.redaction, ())
         before = repository.failed_file(self.db, self.participant.id, row) if row.decided_at is None else None
         if before is not None:
             return self._failed_before(name, row, before, report, problem)
         row.status = "failed"
         store_reports(row, [report])
         self.db.commit()
-        return FileOutcome(name, row, [report], told=problem.told)
+        return FileOutcome(name, row, [report], for_sender=problem.for_sender)
 
     def _failed_before(self, name: str, row: UploadFile, before: UploadFile, report: FileReport, problem: UndecodableFile) -> FileOutcome:
         """The same bytes were of no use before, and still are: they are kept once."""
@@ -248,7 +248,7 @@ class Receiver:
         self.db.commit()
         if sealed is not None:
             files.path_of(sealed).unlink(missing_ok=True)
-        return FileOutcome(name, before, [report], duplicate=True, same_bytes=True, told=problem.told)
+        return FileOutcome(name, before, [report], duplicate=True, same_bytes=True, for_sender=problem.for_sender)
 
     def _name_beta(self, decoded: DecodedFile) -> DecodedFile:
         """A table's beta under its source, with a sentence that says who stated unit and source."""
@@ -265,10 +265,10 @@ def name_beta(decoded: DecodedFile, beta: BetaStated, settings: SettingsVersion)
         replace(r, traces=tuple(replace(t, source=source) if _stated_by_a_person(t) else t for t in r.traces)) for r in decoded.recordings
     )
     report = decoded.reports[0]
-    source_from = _whence(beta.source, settings.beta_source)
+    source_from = _stated_by(beta.source, settings.beta_source)
     for trace in (t for r in decoded.recordings for t in r.traces if _stated_by_a_person(t)):
         in_header = trace.details["unit_from"] == "header"
-        unit_from = "as the file's header says" if in_header else _whence(beta.unit, settings.beta_unit)
+        unit_from = "as the file's header says" if in_header else _stated_by(beta.unit, settings.beta_unit)
         report.understood.append(f"beta: unit '{trace.unit}' {unit_from}, source '{source}' {source_from}")
         if in_header and beta.unit and unit_name(beta.unit) != trace.unit:
             stated = unit_name(beta.unit)
@@ -316,14 +316,14 @@ def known_recordings(row: UploadFile) -> list[int]:
     return found
 
 
-def _whence(by_upload: str | None, by_settings: str | None) -> str:
+def _stated_by(by_upload: str | None, by_settings: str | None) -> str:
     """Who stated a unit or a source."""
     if by_upload:
         return "as stated with the upload"
     return "as the participant's settings say" if by_settings else "because nobody stated one"
 
 
-def _tell(report: FileReport, redaction: Redaction, notes: Sequence[str]) -> None:
+def _add_redaction(report: FileReport, redaction: Redaction, notes: Sequence[str]) -> None:
     """Add to a report what cleaning the file found, and what was made of it."""
     for ours, found in ((report.removed, redaction.removed), (report.repaired, redaction.repaired), (report.ignored, redaction.ignored)):
         ours.extend(sentence for sentence in found if sentence not in ours)

@@ -201,28 +201,28 @@ def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) ->
     with_recordings = [f for f in outcome.files if f.recordings]
     known = {r.id: list(study.session_ids_of_recording(db, r.id)) for f in with_recordings for r in f.recordings}
     fresh = {r.id: r for f in with_recordings for r in f.recordings if not known[r.id]}
-    made: list[proposals.Made] = []
+    created: list[proposals.NewSession] = []
     trouble = ""
     try:
         with db.begin_nested():
-            made = proposals.make_sessions(db, outcome.participant, outcome.upload, list(fresh.values()), stated)
+            created = proposals.make_sessions(db, outcome.participant, outcome.upload, list(fresh.values()), stated)
     except Exception as fault:
         # the recordings are stored and safe; a fault of ours must not turn a whole upload away
         log.exception("sessions could not be made", upload=outcome.upload.id, fault=repr(fault))
         trouble = f"No session could be made of it. It is stored; tell your administrator: upload {outcome.upload.id}."
-    told: set[int] = set()
+    reported: set[int] = set()
     for file in with_recordings:
         mine = {r.id for r in file.recordings}
-        if mine <= told:
-            _tell_copy(db, file, mine)
+        if mine <= reported:
+            _report_copy(db, file, mine)
             continue
-        told |= mine
+        reported |= mine
         earlier = sorted({i for r in mine for i in known[r]})
         if earlier and not file.same_bytes:
             listed = ", ".join(map(str, earlier))
             file.reports[0].understood.append(f"The same recording came before in another file; it stays session {listed}.")
         file.reports[0].flagged.extend(sessions.disagreements(db, earlier, stated))
-        ours = [m for m in made if any(r.id in mine for r in m.recordings)]
+        ours = [m for m in created if any(r.id in mine for r in m.recordings)]
         if file.same_bytes:
             anew = "It has no session any more: it is proposed anew." if ours else "Nothing was changed."
             file.reports[0].understood.append(anew)
@@ -236,7 +236,7 @@ def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) ->
         _keep_reports(file)
 
 
-def _tell_copy(db: Session, file: FileOutcome, recordings: set[int]) -> None:
+def _report_copy(db: Session, file: FileOutcome, recordings: set[int]) -> None:
     """Of a further copy of what this upload holds already, only that it is one, and where it is."""
     file.session_ids = sorted({i for r in recordings for i in study.session_ids_of_recording(db, r)})
     where = f"; it is session {', '.join(map(str, file.session_ids))}" if file.session_ids else ""

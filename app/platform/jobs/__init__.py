@@ -3,7 +3,7 @@
 How to add a job kind
 ---------------------
 A kind has two parts. The *orchestration* runs in a worker and says which steps there are and in which order; the *compute functions* do
-the work, each call in a child process of its own (true cancel, memory returned, one crash harms nobody else). A room registers kinds in its
+the work, each call in a child process of its own (true cancel, memory returned, crashes harm nobody else). A phase registers kinds in its
 `jobs.py` and compute functions in its `compute.py`, by being imported; both names stand in `registry`::
 
     class TrainParams(BaseModel):                          # what POST .../jobs accepts besides `kind`; checked on submit
@@ -43,7 +43,7 @@ Rules
 * Raise `JobError("what, where, what to do")` for errors that a person can put right; its text is shown as it is. Any other exception shows
   its last line and keeps the traceback in the step's log. A failed step raises `StepFailed` in the orchestration, which fails the job.
 * Do not catch `BaseException` in an orchestration: cancelling and stopping travel as such.
-* Put compute functions into the room's `compute.py` (found by convention, see `registry.COMPUTE_MODULES`), not into `jobs.py`: the web
+* Put compute functions into the phase's `compute.py` (found by convention, see `registry.COMPUTE_MODULES`), not into `jobs.py`: the web
   service imports every `jobs.py` to check params and must not load torch for it. The child imports only the module of its function.
 
 Everybody else

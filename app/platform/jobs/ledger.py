@@ -21,7 +21,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.database import now, set_actor, transaction
 from app.platform.jobs import repository
-from app.platform.jobs.children.supervisor import Heard
+from app.platform.jobs.children.supervisor import ChildReport
 from app.platform.jobs.errors import JobCancelled
 from app.platform.jobs.models import Job, JobStatus, JobStep
 
@@ -87,21 +87,21 @@ class Ledger:
 
         return self._persist(write)
 
-    def hear(self, key: str, heard: Heard) -> None:
+    def record(self, key: str, report: ChildReport) -> None:
         """Record what a step's process said."""
 
         def write() -> None:
             with self._locked() as (db, job):
                 step = repository.step(db, job.id, key)
-                if heard.progress is not None:
-                    step.progress = heard.progress
-                if heard.message is not None:
-                    step.message = heard.message
-                for text in heard.logs or ():
+                if report.progress is not None:
+                    step.progress = report.progress
+                if report.message is not None:
+                    step.message = report.message
+                for text in report.logs or ():
                     repository.add_event(db, job.id, "log", {"text": text}, key)
-                if heard.points:
-                    repository.add_event(db, job.id, "points", {"points": heard.points}, key)
-                if heard.progress is not None or heard.message is not None:
+                if report.points:
+                    repository.add_event(db, job.id, "points", {"points": report.points}, key)
+                if report.progress is not None or report.message is not None:
                     self._tell_progress(db, job, step)
 
         self._persist(write)

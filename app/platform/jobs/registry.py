@@ -29,7 +29,7 @@ COMPUTE_MODULES = (
     "app.learning.training.compute",
     "app.evaluation.estimates.compute",
 )
-"""Modules with compute functions and their heavy imports, loaded by workers and children alone; a room may do without one."""
+"""Modules with compute functions and their heavy imports, loaded by workers and children alone; a phase may do without one."""
 
 Orchestration = Callable[["JobContext"], dict[str, Any]]
 Compute = Callable[[dict[str, Any], Path, "Report"], dict[str, Any]]
@@ -115,7 +115,7 @@ def kinds() -> dict[str, Kind]:
 
 
 def kind(name: str) -> Kind:
-    """The kind of a name; the rooms are imported when it is not known yet.
+    """The kind of a name; the phases are imported when it is not known yet.
 
     Raises:
         UnknownKind: there is none; the message lists those there are.

@@ -18,7 +18,7 @@ from app.platform.database import new_session
 from app.platform.errors import BetaloopError
 from app.platform.jobs import engine, registry, repository
 from app.platform.jobs.children.slots import Slots
-from app.platform.jobs.children.supervisor import Call, Nursery
+from app.platform.jobs.children.supervisor import Call, Children
 from app.platform.jobs.context import JobContext, Outcome
 from app.platform.jobs.errors import JobCancelled, WorkerStopping
 from app.platform.jobs.ledger import Ledger, persist
@@ -49,7 +49,7 @@ class JobSteps:
 
     ledger: Ledger
     flags: Flags
-    nursery: Nursery
+    children: Children
     slots: Slots
 
     def declare(self, key: str, title: str, weight: float) -> None:
@@ -65,7 +65,7 @@ class JobSteps:
                 return {"ok": False, "skipped": True}
             if (known := self.ledger.begin(key)) is not None:
                 return {"ok": True, "result": known}
-            outcome = self.nursery.run(call, lambda heard: self.ledger.hear(key, heard), self.flags.check)
+            outcome = self.children.run(call, lambda report: self.ledger.record(key, report), self.flags.check)
         if outcome["ok"]:
             return {"ok": True, "result": self.ledger.commit_step(key, lambda _: outcome["result"])}
         self.ledger.fail_step(key, outcome["message"], outcome["log"])
@@ -97,7 +97,7 @@ class JobRunner:
     def __init__(self, worker: str, slots: int) -> None:
         self._worker = worker
         self._slots = Slots(slots)
-        self._nursery = Nursery()
+        self._children = Children()
         self._running: dict[str, Flags] = {}
         self._changed = threading.Condition()
         self._stopping = False
@@ -145,7 +145,7 @@ class JobRunner:
             for flags in self._running.values():
                 flags.abandoned.set()
             done = self._changed.wait_for(lambda: not self._running, timeout_s)
-        self._nursery.close()
+        self._children.close()
         return done
 
     def _run(self, job_id: str, flags: Flags) -> None:
@@ -154,7 +154,7 @@ class JobRunner:
         ledger = Ledger(job_id, job.created_by, self._worker, check)
         if not ledger.open():
             return
-        steps = JobSteps(ledger, flags, self._nursery, self._slots)
+        steps = JobSteps(ledger, flags, self._children, self._slots)
         context = JobContext(job_id, job.kind, job.participant_id, job.params, job.created_by, steps, engine.Durability())
         try:
             if job.cancel_requested_at is not None:

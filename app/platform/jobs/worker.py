@@ -93,7 +93,7 @@ class Identity:
         return False
 
 
-class Watchman:
+class Upkeep:
     """The worker's own thread: signs of life, cancel requests, jobs of dead workers, old rows and folders."""
 
     def __init__(self, identity: Identity, runner: JobRunner, pace: Pace) -> None:
@@ -201,16 +201,16 @@ def run_worker(slots: int, stop_event: threading.Event, pace: Pace | None = None
     identity = Identity()
     worker_id = identity.claim()
     runner = JobRunner(worker_id, slots)
-    watchman = Watchman(identity, runner, pace)
+    upkeep = Upkeep(identity, runner, pace)
     with transaction(_ACTOR) as db:
         if moved := engine.adopt_older_protocols(db):
             log.warning("moved %d waiting jobs to job protocol %s", moved, engine.PROTOCOL)
-    watchman.beat()  # before the first job, or others would take it for a dead worker's
+    upkeep.beat()  # before the first job, or others would take it for a dead worker's
     engine.launch(database_url(), worker_id, slots, runner.run)
     log.info("worker %s takes jobs, %d at a time", worker_id, slots)
     try:
         while not stop_event.wait(CANCEL_POLL_S):
-            watchman.look()
+            upkeep.look()
     finally:
         _stop(identity, runner)
 

@@ -50,7 +50,7 @@ class Call:
 
 
 @dataclass
-class Heard:
+class ChildReport:
     """What a child said since the last report."""
 
     progress: float | None = None
@@ -76,12 +76,12 @@ _Child = subprocess.Popen[bytes]
 _Order = tuple[Callable[[], _Child], Future[_Child]]
 
 
-class Nursery:
+class Children:
     """Starts every child from one thread, because the kernel's parent-death signal fires when the starting *thread* ends."""
 
     def __init__(self) -> None:
         self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._work, name="nursery", daemon=True)
+        self._thread = threading.Thread(target=self._work, name="children", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -89,12 +89,12 @@ class Nursery:
         self._orders.put(None)
         self._thread.join()
 
-    def run(self, call: Call, hear: Callable[[Heard], None], check: Callable[[], None]) -> Outcome:
+    def run(self, call: Call, on_report: Callable[[ChildReport], None], check: Callable[[], None]) -> Outcome:
         """Run one call in a child process, or take the result that it left before a crash.
 
         Args:
             call: what to run, and where.
-            hear: takes what the child says, at most once per REPORT_S.
+            on_report: takes what the child says, at most once per REPORT_S.
             check: called every LISTEN_S; raises to have the child killed.
 
         Returns:
@@ -107,7 +107,7 @@ class Nursery:
         log_start = log.stat().st_size if log.exists() else 0
         process, pipe = self._start(call, log)
         try:
-            killed_for = _listen(process, pipe, call.memory_mb, hear, check)
+            killed_for = _listen(process, pipe, call.memory_mb, on_report, check)
         finally:
             os.close(pipe)
             _kill(process)
@@ -164,9 +164,9 @@ def _prepare(call: Call) -> None:
         result.unlink()  # of a failed attempt
 
 
-def _listen(process: _Child, pipe: int, memory_mb: int, hear: Callable[[Heard], None], check: Callable[[], None]) -> str | None:
+def _listen(process: _Child, pipe: int, memory_mb: int, on_report: Callable[[ChildReport], None], check: Callable[[], None]) -> str | None:
     """Hear a child out; returns why it had to be killed, or None when it ended by itself."""
-    heard, rest, open_ = Heard(), b"", True
+    report, rest, open_ = ChildReport(), b"", True
     reported = measured = time.monotonic()
     while open_ or process.poll() is None:
         check()
@@ -175,21 +175,21 @@ def _listen(process: _Child, pipe: int, memory_mb: int, hear: Callable[[Heard], 
             open_ = bool(chunk)
             *lines, rest = (rest + chunk).split(b"\n")
             for line in lines:
-                heard.add(line.decode())
+                report.add(line.decode())
         elif not open_:
             time.sleep(0.01)
         present = time.monotonic()
-        if heard and present - reported >= REPORT_S:
-            hear(heard)
-            heard, reported = Heard(), present
+        if report and present - reported >= REPORT_S:
+            on_report(report)
+            report, reported = ChildReport(), present
         if present - measured >= MEMORY_CHECK_S:
             measured = present
             if _resident_mb(process.pid) > memory_mb:
                 return too_much_memory(memory_mb)
         if process.poll() is not None and not select.select([pipe], [], [], 0)[0]:
             break  # a grandchild may hold the pipe open
-    if heard:
-        hear(heard)
+    if report:
+        on_report(report)
     return None
 
 

@@ -17,7 +17,7 @@ from app.platform.errors import NotFound
 from app.platform.jobs import JobContext, Report, StepFailed, repository, write_atomically
 from app.platform.jobs.children.process import params_hash
 from app.platform.jobs.children.slots import Slots
-from app.platform.jobs.children.supervisor import Call, Heard, Nursery
+from app.platform.jobs.children.supervisor import Call, Children, ChildReport
 from app.platform.jobs.errors import JobCancelled
 from app.platform.jobs.ledger import Ledger
 from app.platform.jobs.models import JobStatus
@@ -25,7 +25,7 @@ from app.platform.jobs.registry import compute, compute_function
 from app.platform.jobs.steps import JobRunner
 from app.platform.jobs.stream import job_events
 from app.platform.jobs.watch import show_progress, watch
-from app.platform.jobs.worker import Identity, IdentityLost, Pace, Watchman
+from app.platform.jobs.worker import Identity, IdentityLost, Pace, Upkeep
 from app.settings import get_settings
 
 
@@ -87,11 +87,11 @@ def test_a_report_sends_the_latest_progress_and_every_point_but_not_every_call()
 
 
 def test_what_was_heard_twice_is_merged():
-    heard = Heard()
-    assert not heard
+    report = ChildReport()
+    assert not report
     for line in ({"progress": 0.1, "points": [1]}, {"progress": 0.2, "points": [2], "message": "on"}, {"log": "a"}, {"log": "b"}):
-        heard.add(json.dumps(line))
-    assert heard == Heard(0.2, "on", [1, 2], ["a", "b"])
+        report.add(json.dumps(line))
+    assert report == ChildReport(0.2, "on", [1, 2], ["a", "b"])
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path):
@@ -154,12 +154,12 @@ def test_a_name_belongs_to_one_function():
 
 
 def test_a_result_is_reused_for_equal_params_and_the_folder_emptied_for_others(kinds, tmp_path):
-    nursery, workdir = Nursery(), tmp_path / "step"
+    children, workdir = Children(), tmp_path / "step"
     function = compute_function("count")
 
     def run(**params):
         call = Call(function, {"part": 0, "numbers": 2, "pause_s": 0.0, **params}, workdir, 1024)
-        return nursery.run(call, lambda heard: None, lambda: None)["result"]
+        return children.run(call, lambda report: None, lambda: None)["result"]
 
     first = run()
     assert run() == first
@@ -167,7 +167,7 @@ def test_a_result_is_reused_for_equal_params_and_the_folder_emptied_for_others(k
     other = run(numbers=3)
     assert (other["counted"], other["resumed_from"]) == (3, 0)
     assert other["pid"] != first["pid"]
-    nursery.close()
+    children.close()
 
 
 def _lines(job_id, last=None):
@@ -183,7 +183,7 @@ def test_the_stream_starts_with_the_state_resumes_after_an_id_and_ends(jobs):
     ledger.open()
     ledger.declare("a", "A", 1.0)
     ledger.begin("a")
-    ledger.hear("a", Heard(0.5, "half", [{"x": 0.0, "values": {"loss": 1.0}}], ["a\nline"]))
+    ledger.record("a", ChildReport(0.5, "half", [{"x": 0.0, "values": {"loss": 1.0}}], ["a\nline"]))
     ledger.commit_step("a", lambda db: {"v": 1})
     ledger.close(JobStatus.SUCCEEDED, {"v": 1})
     messages = _lines(job_id)
@@ -208,7 +208,7 @@ def test_progress_is_the_weighted_mean_of_the_steps_and_never_falls(jobs):
     ledger.declare("b", "B", 1.0)
     ledger.declare("a", "A again", 9.0)
     ledger.begin("a")
-    ledger.hear("a", Heard(progress=0.5))
+    ledger.record("a", ChildReport(progress=0.5))
     assert jobs.get(job_id).progress == pytest.approx(0.375)
     ledger.begin("a")
     assert jobs.get(job_id).progress == pytest.approx(0.375)
@@ -278,7 +278,7 @@ def test_folders_of_jobs_that_ended_long_ago_are_removed_and_others_kept(jobs):
         (get_settings().jobs_dir / job_id / "step").mkdir(parents=True)
     identity, runner = Identity(), JobRunner("w", 1)
     identity.claim()
-    Watchman(identity, runner, Pace()).tidy()
+    Upkeep(identity, runner, Pace()).tidy()
     assert {p.name for p in get_settings().jobs_dir.iterdir()} == {recent, running}
     runner.stop(1.0)
     identity.release()

@@ -165,7 +165,7 @@ def test_a_text_in_brackets_that_is_no_unit_is_not_taken_for_one(write):
 def test_the_stored_problem_does_not_repeat_the_files_words_and_the_told_one_does(write, text):
     with pytest.raises(UndecodableFile) as caught:
         decode(write(text))
-    assert "Jane" in caught.value.told.what + caught.value.told.where
+    assert "Jane" in caught.value.for_sender.what + caught.value.for_sender.where
     assert "Jane" not in repr(caught.value.stored)
     assert pickle.loads(pickle.dumps(caught.value)).stored == caught.value.stored
 
