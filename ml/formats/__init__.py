@@ -11,10 +11,8 @@ from typing import Literal
 
 from ml.formats.archive import ZipFiles
 from ml.formats.options import ArchiveLimits, DecodeOptions
-from ml.formats.percept.redact import redact_percept
-from ml.formats.percept.report import decode_percept, report_members
-from ml.formats.percept.report_json import looks_like_report
-from ml.formats.rcs.folder import decode_rcs, find_sessions
+from ml.formats.percept import decode_percept, looks_like_report, redact_percept, report_members
+from ml.formats.rcs import decode_rcs, find_sessions, redact_rcs_zip
 from ml.formats.recording import (
     DECODE_VERSION,
     TREMOR_CLASSES,
@@ -30,13 +28,8 @@ from ml.formats.recording import (
     TremorLog,
     UndecodableFile,
 )
-from ml.formats.redact import redact_rcs_zip
 from ml.formats.redaction import REDACTOR_VERSION, Redaction
-from ml.formats.tables.delimited import read_headers
-from ml.formats.tables.grasps import decode_grasps, looks_like_grasps
-from ml.formats.tables.redact import redact_table
-from ml.formats.tables.steps import decode_csv, decode_parquet
-from ml.formats.tables.strivepd import decode_strivepd, looks_like_tremor
+from ml.formats.tables import TableKind, decode_table, kind_of_text, redact_table
 
 __all__ = [
     "DECODE_VERSION",
@@ -62,7 +55,7 @@ __all__ = [
     "sniff",
 ]
 
-FileKind = Literal["rcs", "percept", "csv", "parquet", "tremor", "grasp"]
+FileKind = Literal["rcs", "percept"] | TableKind
 HEAD = 65_536
 HINT = (
     "Upload an RC+S session folder as a zip, a Percept session report (JSON), a table as CSV or Parquet, "
@@ -93,7 +86,7 @@ def sniff(path: Path) -> FileKind:
         what = "a single JSON file, neither a whole RC+S session nor a Percept session report"
         raise UndecodableFile(what, "file", "Zip the whole session folder and upload that.")
     if head.startswith((b"\xff\xfe", b"\xfe\xff")) or b"\0" not in head[:4096]:
-        return _kind_of_text(path)
+        return kind_of_text(path)
     raise UndecodableFile("no format this service reads", "first bytes", HINT)
 
 
@@ -106,17 +99,6 @@ def _kind_of_zip(path: Path) -> FileKind:
     except UndecodableFile:
         return "rcs"
     return "rcs"
-
-
-def _kind_of_text(path: Path) -> FileKind:
-    """Which table a text is, by its headers."""
-    try:
-        headers = read_headers(path)
-    except UndecodableFile:
-        return "csv"
-    if looks_like_tremor(headers):
-        return "tremor"
-    return "grasp" if looks_like_grasps(headers) else "csv"
 
 
 def redact(source: Path, target: Path, kind: FileKind, key: bytes, options: DecodeOptions | None = None) -> Redaction:
@@ -160,14 +142,9 @@ def decode(path: Path, kind: FileKind | None = None, options: DecodeOptions | No
             said = "this upload holds no data: no stream has a sample and no stimulation log an amplitude; kept as a recording without data"
             decoded.reports[0].flagged.insert(0, said)
         return decoded
-    decoders = {
-        "percept": decode_percept,
-        "tremor": decode_strivepd,
-        "grasp": decode_grasps,
-        "parquet": decode_parquet,
-        "csv": decode_csv,
-    }
-    return decoders[kind](path, options, name)
+    if kind == "percept":
+        return decode_percept(path, options, name)
+    return decode_table(path, kind, options, name)
 
 
 def _is_empty(recording: RecordingLog) -> bool:

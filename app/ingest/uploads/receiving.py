@@ -28,7 +28,7 @@ from ml import formats
 from ml.formats import FileKind
 from ml.formats.archive import ZipFiles
 from ml.formats.options import ArchiveLimits, DecodeOptions
-from ml.formats.rcs.folder import find_sessions
+from ml.formats.rcs import find_sessions
 from ml.formats.recording import DecodedFile, FileReport, GraspLog, Problem, TraceLog, TraceSource, UndecodableFile
 from ml.formats.redaction import REDACTOR_VERSION, Redaction
 from ml.formats.tables.numbers import unit_name

@@ -48,7 +48,7 @@ TEXTS = {
     "Pass": re.compile(r"(FIRST|SECOND|THIRD)_PASS|SQC|((ZERO|ONE|TWO|THREE)_?)+"),
 }
 ENUM = re.compile(r"(Ins(Location|Port)|[A-Za-z]{2,40}Def)[._][A-Za-z0-9_]{1,60}")
-"""What looks like an enumeration; only those of `percept_enums` stay."""
+"""What looks like an enumeration; only those of `enums.py` stay."""
 
 
 def redact_percept(source: Path, target: Path, key: bytes, limits: ArchiveLimits | None = None) -> Redaction:

@@ -1,7 +1,7 @@
 """Compiled reading of plain RC+S stream packets: bytes in, float arrays out, no Python object per number.
 
 A packet is plain when it is strict JSON and holds nothing but the fields of format notes A.2 to A.4 with values of the right kind, each
-once. Everything else, damage included, is left to the tolerant reader of `rcs_json`; `batch_of` gives its packets the same shape.
+once. Everything else, damage included, is left to the tolerant reader of `json_elements`; `batch_of` gives its packets the same shape.
 
 A number whose digits fit 53 bits and whose decimal shift is at most 22 is one correctly rounded operation on exact doubles; the others,
 such as 0.040411999999999997, are left to `float`, so that every value is the one that any JSON parser gives.
@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.rcs.packets.scan_kernel import ARRAYS, PADDING, SCALARS, copy_runs, read_packets
+from ml.formats.rcs.packets._scan_kernel import ARRAYS, PADDING, SCALARS, copy_runs, read_packets
 from ml.formats.rcs.settings import get, number
 
 __all__ = ["ARRAYS", "PADDING", "SCALARS", "Batch", "batch_of", "join", "scan"]

@@ -1,6 +1,6 @@
 """Take identity out of an RC+S archive before it is stored: names, serial numbers, dates of birth, free text, folder names.
 
-What stays is listed, not what goes: a field is kept only where its key is known (`rcs_keys`), and a text only where its key is known to
+What stays is listed, not what goes: a field is kept only where its key is known (`keys.py`), and a text only where its key is known to
 hold a technical word of a known shape. The result decodes to the same recording, apart from the device's name, which becomes a keyed
 pseudonym.
 """
