@@ -10,10 +10,9 @@ from fastapi import APIRouter, FastAPI, Response
 from fastapi.openapi.utils import get_openapi
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
-from sqlalchemy import text
 
 from app import __version__
-from app.platform.database import Db
+from app.platform.database import Db, check_connection
 from app.platform.tables import load_tables
 from app.platform.web import middleware as web
 from app.platform.web.compressed import CompressedFiles
@@ -89,7 +88,7 @@ def _service_routes() -> APIRouter:
     @router.get("/healthz", tags=["service"])
     def healthz(db: Db) -> dict[str, str]:
         """Whether the service and its database answer; no token needed."""
-        db.execute(text("select 1"))
+        check_connection(db)
         return {"status": "ok", "version": __version__}
 
     @router.get("/metrics", include_in_schema=False)

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from numpy.typing import NDArray
-from sqlalchemy import column, select, table
 from sqlalchemy.orm import Session
 
 from app import __version__
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.learning import repository
+from app.learning import repository as learning
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies.service import probe_windows
+from app.planning.bundles import repository
 from app.platform import files
 from app.platform.audit import AuditEvent
 from app.platform.database import set_reason
@@ -26,7 +26,7 @@ from app.platform.errors import Forbidden, Invalid
 from app.settings import get_settings
 from app.study import cdbs_amplitude
 from app.study import repository as study_repository
-from app.study.models import Hemisphere, Participant, Recording, Visit
+from app.study.models import Hemisphere, Participant
 from ml.deploy.bundle import build_bundle, describe, sign
 from ml.deploy.manifest import DEFAULTS, Approval, BundleError, BundleManifest
 from ml.policies.onnx_policy import PolicyFileError
@@ -115,17 +115,13 @@ def may_state(participant: Participant, caller: Caller) -> bool:
 
 def taken(db: Session, participant: Participant, policy: Policy) -> list[AuditEvent]:
     """The bundles of a policy that left so far, newest first, as the audit trail has them."""
-    named = AuditEvent.reason.startswith(f"controller bundle of {participant.code}, policy {policy.id}", autoescape=True)
-    found = db.scalars(select(AuditEvent).where(AuditEvent.entity == "stored_file", named).order_by(AuditEvent.id.desc()))
+    found = repository.stored_file_events(db, f"controller bundle of {participant.code}, policy {policy.id}")
     return [event for event in found if re.match(rf".*, policy {policy.id}[,:]", event.reason or "")]
 
 
 def device_limits(db: Session, participant: Participant, hemisphere: Hemisphere | None) -> DeviceLimits | None:
     """Limits of the newest recording that holds any, of this side where one is named; None where no recording does."""
-    query = select(Recording).where(Recording.participant_id == participant.id)
-    if hemisphere is not None:
-        query = query.where((Recording.hemisphere == hemisphere) | Recording.hemisphere.is_(None))
-    for recording in db.scalars(query.order_by(Recording.started_at.desc().nulls_last(), Recording.id.desc())):
+    for recording in repository.newest_recordings(db, participant.id, hemisphere):
         programs = [p for group in (recording.details.get("limits") or {}).values() for p in group.values()]
         if programs:
             return DeviceLimits(max(p["lower_ma"] for p in programs), min(p["upper_ma"] for p in programs))
@@ -133,18 +129,10 @@ def device_limits(db: Session, participant: Participant, hemisphere: Hemisphere 
 
 
 def approvals(db: Session, policy_id: int) -> tuple[Approval, ...]:
-    """Sign-offs of the approved visit plans that this policy stands in. Plans belong to a later phase; their tables are asked by name."""
-    plan = table("plan", *(column(name) for name in ("id", "visit_id", "status", "approved_at", "approved_by")))
-    item = table("plan_item", column("plan_id"), column("policy_id"))
-    rows = db.execute(
-        select(plan.c.id, plan.c.approved_by, plan.c.approved_at, Visit.number)
-        .join_from(plan, Visit, Visit.id == plan.c.visit_id)
-        .where(plan.c.status == "approved", plan.c.id.in_(select(item.c.plan_id).where(item.c.policy_id == policy_id)))
-        .order_by(plan.c.id)
-    )
+    """Sign-offs of the approved visit plans that this policy stands in."""
     return tuple(
         Approval(name=by, role="approver of plans", approved_at=at.isoformat(timespec="seconds"), statement=f"plan {id_} of visit {number}")
-        for id_, by, at, number in rows
+        for id_, by, at, number in repository.approved_plans(db, policy_id)
     )
 
 
@@ -154,7 +142,7 @@ def _manifest(
     """What the bundle says about itself, and beta windows for its test vectors: logged ones, where there are any of its length."""
     version = study_repository.settings_version(db, policy.settings_version_id)
     snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id else None
-    data = snapshot or repository.newest_snapshot(db, participant.id)
+    data = snapshot or learning.newest_snapshot(db, participant.id)
     unit = data.beta_unit if data else version.beta_unit
     source = data.beta_source if data else version.beta_source
     if unit is None or source is None:
