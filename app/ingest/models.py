@@ -20,10 +20,8 @@ class Upload(Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
-    visit_id: Mapped[int | None] = mapped_column(ForeignKey("visit.id"), index=True)
     status: Mapped[str] = mapped_column(String(20), server_default="received")
     stated: Mapped[dict[str, Any]]
-    report: Mapped[list[Any]]
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
     files: Mapped[list[UploadFile]] = relationship(back_populates="upload", order_by="UploadFile.id")

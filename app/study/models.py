@@ -126,13 +126,12 @@ class Device(Base):
     """An implant or another source of recordings, under a keyed pseudonym."""
 
     __tablename__ = "device"
-    __table_args__ = (UniqueConstraint("participant_id", "pseudonym"), CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"))
+    __table_args__ = (UniqueConstraint("participant_id", "pseudonym"),)
 
     id: Mapped[int] = mapped_column(primary_key=True)
     participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
     pseudonym: Mapped[str] = mapped_column(String(64))
     kind: Mapped[str] = mapped_column(String(40))
-    hemisphere: Mapped[Hemisphere | None] = mapped_column(String(5))
 
 
 class Visit(Base):

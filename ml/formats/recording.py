@@ -207,9 +207,6 @@ class DecodedFile:
     grasps: tuple[GraspLog, ...] = ()
 
 
-SessionLog = DecodedFile
-
-
 def fingerprint(kind: str, parts: Iterable[str | bytes | NDArray[Any]]) -> str:
     """SHA-256 (hex) over the kind and the parts in order; every part is length-prefixed so that no two lists of parts collide."""
     digest = hashlib.sha256()

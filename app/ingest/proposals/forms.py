@@ -23,7 +23,6 @@ LABELS = {
     "visit": "Visit", "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "from": "From", "to": "To",
     "started_at": "Start", "start_s": "From", "stop_s": "To",
 }  # fmt: skip
-FIELDS = ("visit", "controller", "policy", "hemisphere", "from", "to", "started_at")
 PARTS = 6
 """Rows of the form that cuts a recording; longer days are cut twice, or over the interface."""
 

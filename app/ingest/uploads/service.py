@@ -148,8 +148,7 @@ def receive(
         raise Invalid("The upload holds no file.", "Choose at least one file.")
     beta = beta or BetaStated()
     said = _said(stated, beta)
-    visit_id = stated.visit.id if stated.visit else None
-    upload = Upload(participant_id=participant.id, visit_id=visit_id, created_by=caller.label, report=[], stated=said)
+    upload = Upload(participant_id=participant.id, created_by=caller.label, stated=said)
     db.add(upload)
     db.flush()
     with in_progress(upload.id):
@@ -178,7 +177,6 @@ def finish(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
     # a file that came before has its row in another upload; this one only points at it
     earlier = [o.row.id for o in outcome.files if o.same_bytes]
     upload.stated = {**upload.stated, "duplicates": earlier}
-    upload.report = [asdict(r) for o in outcome.files for r in o.reports]
     upload.status = "decoded" if outcome.usable else "failed"
     db.commit()
 

@@ -219,8 +219,8 @@ def _fingerprint(streams: Streams) -> str:
     """Over packets, settings times and stimulation; not over the device's name, nor anything that redaction changes."""
     parts: list[str | bytes | NDArray[Any]] = []
     headers = streams.headers()
-    told = {name: head for name, head in headers.items() if name in PRIMARY} or headers
-    for name, head in sorted(told.items()):
+    primary = {name: head for name, head in headers.items() if name in PRIMARY} or headers
+    for name, head in sorted(primary.items()):
         parts += [name, head.seconds, head.tick, head.sequence, head.gen_ms, head.samples]
     if streams.time_domain is not None:
         parts += list(streams.time_domain.samples)

@@ -29,7 +29,6 @@ EARLIEST_UNIX_S = 1e9
 LATEST_UNIX_S = 1e10
 TIME_NAMES = ("time", "minute_start", "start_utc", "minute_start_utc", "start", "start_time", "timestamp", "start_date", "startdate")
 CLASS_NAMES = ("class", "tremor_class", "tremor")
-LENGTH_NAMES = ("duration_s",)
 KNOWN = frozenset({*TREMOR_CLASSES, "severity", "duration", "duration_s", "measurement_duration_ns", "stream_type_id", "measurement"})
 WANTED = ", ".join(TREMOR_CLASSES)
 
@@ -42,7 +41,7 @@ def looks_like_tremor(headers: Sequence[str]) -> bool:
 
 
 def decode_strivepd(path: Path, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
-    """Decode minutes of tremor in any of three layouts, told apart by their columns.
+    """Decode minutes of tremor in any of three layouts, recognised by their columns.
 
     Times are ISO 8601 or Unix time; a time without a zone is read as UTC, and that is said.
 
@@ -90,8 +89,8 @@ def _wide(table: TextTable, columns: dict[str, int], time: int, report: FileRepo
     off = np.abs(fractions.sum(axis=1) - 1.0) > SUM_TOLERANCE
     if count := int(off.sum()):
         report.flagged.append(f"{count} minutes whose fractions do not add up to 1: kept as they are")
-    told = table.numbers(columns["any_tremor"], decimal, "any_tremor") if "any_tremor" in columns else np.full(start.size, np.nan)
-    any_tremor = np.where(np.isfinite(told), told, fractions[:, 2:].sum(axis=1))
+    stated = table.numbers(columns["any_tremor"], decimal, "any_tremor") if "any_tremor" in columns else np.full(start.size, np.nan)
+    any_tremor = np.where(np.isfinite(stated), stated, fractions[:, 2:].sum(axis=1))
     return _in_order(start, _lengths(table, columns), fractions, any_tremor, report)
 
 
@@ -141,20 +140,20 @@ def _long(table: TextTable, columns: dict[str, int], time: int, report: FileRepo
     length = np.array([lengths[t] for t in start_s], dtype=np.float64)
     table_s = [[_class_seconds(seconds[t], c) for c in TREMOR_CLASSES] for t in start_s]
     fractions = np.array(table_s, dtype=np.float64).reshape(-1, 6) / length[:, None]
-    told = np.array([seconds[t].get(SUMMARY, np.nan) for t in start_s], dtype=np.float64) / length
-    any_tremor = np.where(np.isfinite(told), told, fractions[:, 2:].sum(axis=1))
+    stated = np.array([seconds[t].get(SUMMARY, np.nan) for t in start_s], dtype=np.float64) / length
+    any_tremor = np.where(np.isfinite(stated), stated, fractions[:, 2:].sum(axis=1))
     if (beyond := np.flatnonzero((np.nansum(fractions, axis=1) > 1 + SUM_TOLERANCE) | (any_tremor > 1 + SUM_TOLERANCE))).size:
         when = datetime.fromtimestamp(start_s[beyond[0]], UTC).isoformat()
         raise UndecodableFile(f"the minute of {when} holds more seconds than it has", "column duration", "Give the duration in seconds.")
     return _in_order(start_s, length, fractions, any_tremor, report)
 
 
-def _class_seconds(told: dict[str, float], name: str) -> float:
+def _class_seconds(seconds: dict[str, float], name: str) -> float:
     """Seconds of a class: no row for it means none, unless the minute tells nothing but the sum and that is not 0."""
-    if name in told:
-        return told[name]
-    only_sum = set(told) == {SUMMARY}
-    return float("nan") if only_sum and (told[SUMMARY] > 0 or name in ("unknown", "none")) else 0.0
+    if name in seconds:
+        return seconds[name]
+    only_sum = set(seconds) == {SUMMARY}
+    return float("nan") if only_sum and (seconds[SUMMARY] > 0 or name in ("unknown", "none")) else 0.0
 
 
 def _is_tremor_duration(row: list[str], columns: dict[str, int]) -> bool:

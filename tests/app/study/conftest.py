@@ -57,7 +57,7 @@ def new_file(db: Session) -> Callable[[StudySession], int]:
 
     def make(session: StudySession) -> int:
         participant_id = session.visit.participant_id
-        upload = Upload(participant_id=participant_id, stated={}, report=[], created_by="test")
+        upload = Upload(participant_id=participant_id, stated={}, created_by="test")
         db.add(upload)
         db.flush()
         file = UploadFile(
