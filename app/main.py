@@ -37,6 +37,8 @@ API_MODULES = (
 PAGE_MODULES = (
     "app.accounts.pages",
     "app.study.pages",
+    "app.study.settings.pages",
+    "app.study.visits.pages",
     "app.study.sessions.pages",
     "app.ingest.uploads.pages",
     "app.ingest.proposals.pages",

@@ -20,13 +20,13 @@ from app.platform.web.templates import render
 from app.study import repository, service
 from app.study.blinding import CONTROLLER_NAMES, arm
 from app.study.deps import CurrentSession
+from app.study.form_changes import Shown, own_changes
 from app.study.models import QocRevision, Recording, StudySession
 from app.study.schemas import DerivedChoice, QocIn, SessionChange
 from app.study.service import SessionData
 from app.study.sessions import view as session_view
 from app.study.sessions.charts import operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
-from app.study.settings_form import Shown, own_changes
 from app.study.traces import AMPLITUDE_STREAM, session_offset_s
 from app.study.wording import sentences
 from ml.energy import relative_energy
