@@ -35,7 +35,7 @@ check: install ## Lint, types and the import contract.
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-format: install ## Format the code and mend what the linter can.
+format: install ## Format the code and fix what the linter can.
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 

@@ -69,18 +69,18 @@ def serve(
     structlog.get_logger().info("database", lies_in=database_place())
     service = create_app()
     # beside the service, for reading what a crash left behind may take minutes
-    threading.Thread(target=_take_up_uploads, daemon=True).start()
+    threading.Thread(target=_resume_uploads, daemon=True).start()
     uvicorn.run(
         service, host=host or settings.host, port=port or settings.port, log_level=settings.log_level.lower(), access_log=False,
         timeout_graceful_shutdown=3,
     )  # fmt: skip
 
 
-def _take_up_uploads() -> None:
-    from app.ingest.uploads.interrupted import take_up
+def _resume_uploads() -> None:
+    from app.ingest.uploads.interrupted import resume
 
-    for taken in take_up("start of the service"):
-        structlog.get_logger().info("interrupted upload", upload=taken.upload_id, done=taken.done, said=taken.said)
+    for taken in resume("start of the service"):
+        structlog.get_logger().info("interrupted upload", upload=taken.upload_id, done=taken.done, message=taken.message)
 
 
 @app.command(epilog="Example: betaloop worker --slots 2")
@@ -217,12 +217,12 @@ def redecode_(
 
 @ingest_app.command("resume", epilog="Example: betaloop ingest resume")
 def resume_() -> None:
-    """Take up uploads that a stop of the service cut short; the service does so itself when it starts."""
-    from app.ingest.uploads.interrupted import take_up
+    """Resume uploads that a stop of the service cut short; the service does so itself when it starts."""
+    from app.ingest.uploads.interrupted import resume
 
-    taken = list(take_up(ACTOR))
+    taken = list(resume(ACTOR))
     for one in taken:
-        typer.echo(f"Upload {one.upload_id}: {one.said}")
+        typer.echo(f"Upload {one.upload_id}: {one.message}")
     if not taken:
         typer.echo("No upload was cut short.")
     if any(not one.done for one in taken):

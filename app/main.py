@@ -13,11 +13,10 @@ from fastapi import APIRouter, FastAPI, Response
 from fastapi.openapi.utils import get_openapi
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
-from sqlalchemy import text
 from starlette.concurrency import run_in_threadpool
 
 from app import __version__
-from app.platform.database import Db
+from app.platform.database import Db, check_connection
 from app.platform.files import remove_abandoned
 from app.platform.tables import load_tables
 from app.platform.web import middleware as web
@@ -45,6 +44,8 @@ API_MODULES = (
 PAGE_MODULES = (
     "app.accounts.pages",
     "app.study.pages",
+    "app.study.settings.pages",
+    "app.study.visits.pages",
     "app.study.sessions.pages",
     "app.ingest.uploads.pages",
     "app.ingest.proposals.pages",
@@ -107,7 +108,7 @@ def _service_routes() -> APIRouter:
     @router.get("/healthz", tags=["service"])
     def healthz(db: Db) -> dict[str, str]:
         """Whether the service and its database answer; no token needed."""
-        db.execute(text("select 1"))
+        check_connection(db)
         return {"status": "ok", "version": __version__}
 
     @router.get("/metrics", include_in_schema=False)

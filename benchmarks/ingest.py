@@ -33,11 +33,10 @@ import httpx2 as httpx
 import numpy as np
 
 from ml.formats import DecodeOptions
-from ml.formats.rcs.folder import decode_rcs
+from ml.formats.rcs import decode_rcs, redact_rcs_zip
 from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
 from ml.formats.rcs.packets.scan import scan
 from ml.formats.rcs.packets.streams import read_time_domain
-from ml.formats.redact import redact_rcs_zip
 from ml.population import rcs_session_zip, run_session, session_table_csv
 
 START_MS, DEVICE_START_S = 1_700_000_000_000, 700_000_000

@@ -47,7 +47,7 @@ function start(files) {
   const limit = Number(form.dataset.limitMb);
   const total = files.reduce((sum, { file }) => sum + file.size, 0) / 1048576;
   if (total > limit) {
-    report(shown, 413, { detail: `These files have ${Math.round(total)} MiB together; one upload may have ${limit} MiB.`, mend: "Send them in several uploads." });
+    report(shown, 413, { detail: `These files have ${Math.round(total)} MiB together; one upload may have ${limit} MiB.`, hint: "Send them in several uploads." });
     return;
   }
   busy = busy.then(() => send(files, fields, shown)); // one upload after the other: a clinic's line is narrow
@@ -84,7 +84,7 @@ function send(files, fields, shown) {
       shown.words.textContent = event.loaded < event.total ? `sending, ${Math.round((100 * event.loaded) / event.total)} %` : "decoding …";
     });
     request.addEventListener("load", () => { report(shown, request.status, request.response ?? {}); done(); });
-    request.addEventListener("error", () => { report(shown, 0, { detail: "The connection broke off.", mend: "Send the files again; what has arrived is not counted twice." }); done(); });
+    request.addEventListener("error", () => { report(shown, 0, { detail: "The connection broke off.", hint: "Send the files again; what has arrived is not counted twice." }); done(); });
     request.send(body);
   });
 }
@@ -100,7 +100,7 @@ function report({ item, head, words }, status, answer) {
   if (!good) {
     const note = element("div", { className: "note bad" }, element("b", { textContent: answer.detail ?? `The service answered ${status}.` }));
     note.setAttribute("role", "alert");
-    if (answer.mend) note.append(element("div", { textContent: answer.mend }));
+    if (answer.hint) note.append(element("div", { textContent: answer.hint }));
     item.append(note);
   }
   const states = new Map((answer.files ?? []).map((file) => [file.name, file]));
@@ -109,7 +109,7 @@ function report({ item, head, words }, status, answer) {
     const line = element("div", { className: "row" }, element("h3", { textContent: one.name })); // a file, or a member of an archive
     if (file) line.append(file.duplicate ? badge("known already", "info") : badge(...(STATES[file.status] ?? ["not usable, kept", "bad"])));
     item.append(line);
-    if (one.problem && good) item.append(element("div", { className: "note bad" }, element("b", { textContent: one.problem.what }), element("div", { textContent: one.problem.where }), element("div", { textContent: one.problem.mend })));
+    if (one.problem && good) item.append(element("div", { className: "note bad" }, element("b", { textContent: one.problem.what }), element("div", { textContent: one.problem.where }), element("div", { textContent: one.problem.hint })));
     const pairs = element("dl", { className: "pairs" });
     for (const [key, label] of Object.entries(LABELS)) if (one[key]?.length) {
       pairs.append(element("dt", { textContent: label }), element("dd", {}, ...one[key].map((text) => element("div", { textContent: text }))));

@@ -43,6 +43,16 @@ def sign_in_by_token(db: Session, token_sha256: str, idle_since: datetime, begun
     )
 
 
+def sign_in_of(db: Session, token_sha256: str) -> SignIn | None:
+    """The browser session of a token, live or not."""
+    return db.scalar(select(SignIn).where(SignIn.token_sha256 == token_sha256))
+
+
+def open_sign_ins(db: Session, user_id: int) -> Sequence[SignIn]:
+    """A user's browser sessions that nobody has ended."""
+    return db.scalars(select(SignIn).where(SignIn.user_id == user_id, SignIn.ended_at.is_(None))).all()
+
+
 def api_token_by_hash(db: Session, token_sha256: str) -> ApiToken | None:
     """The live API token of a hash."""
     return db.scalar(

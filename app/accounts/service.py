@@ -9,7 +9,6 @@ from datetime import timedelta
 from functools import lru_cache
 
 from pwdlib import PasswordHash
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts import repository
@@ -61,7 +60,7 @@ def set_password(db: Session, user: User, password: str) -> None:
     """Change a password and end every browser session of the user."""
     check_password(password)
     user.password_hash = _hasher.hash(password)
-    for sign_in in db.scalars(select(SignIn).where(SignIn.user_id == user.id, SignIn.ended_at.is_(None))):
+    for sign_in in repository.open_sign_ins(db, user.id):
         sign_in.ended_at = now()
 
 
@@ -136,7 +135,7 @@ def _count_attempt(db: Session, address: str) -> SignInAttempt:
 
 def sign_out(db: Session, token: str) -> None:
     """End a browser session."""
-    row = db.scalar(select(SignIn).where(SignIn.token_sha256 == _hash(token)))
+    row = repository.sign_in_of(db, _hash(token))
     if row and row.ended_at is None:
         row.ended_at = now()
 
@@ -197,12 +196,11 @@ def revoke_token(db: Session, user_id: int, token_id: int) -> None:
 
 def study_of(db: Session, code: str | None) -> Study:
     """The study of a code, or the only one. Raises NotFound naming those there are."""
-    query = select(Study).order_by(Study.id)
-    studies = db.scalars(query if code is None else query.where(Study.code == code)).all()
-    if len(studies) != 1:
-        known = ", ".join(s.code for s in db.scalars(select(Study).order_by(Study.id)))
-        raise NotFound(f"Which study? Known: {known}.", "Name one.")
-    return studies[0]
+    known = repository.studies(db)
+    found = [s for s in known if code in (None, s.code)]
+    if len(found) != 1:
+        raise NotFound(f"Which study? Known: {', '.join(s.code for s in known)}.", "Name one.")
+    return found[0]
 
 
 def _hash(token: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import datetime
 
-from sqlalchemy import Select, select
+from sqlalchemy import Select, select, text
 from sqlalchemy.orm import Session, selectinload
 
 from app.evaluation.models import Evaluation
@@ -15,6 +15,11 @@ from app.learning.models import Policy
 def newest_evaluation(db: Session, participant_id: int) -> Evaluation | None:
     """The participant's last evaluation with its estimates."""
     return db.scalar(_evaluations().where(Evaluation.participant_id == participant_id).order_by(Evaluation.id.desc()).limit(1))
+
+
+def lock_job(db: Session, job_id: str) -> None:
+    """Let one call at a time store the evaluation of a job; held to the end of the transaction."""
+    db.execute(text("select pg_advisory_xact_lock(hashtextextended(:key, 0))"), {"key": f"evaluation:{job_id}"})
 
 
 def evaluation_of_job(db: Session, job_id: str) -> Evaluation | None:

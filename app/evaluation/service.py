@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.evaluation import repository
@@ -81,7 +80,7 @@ def store_evaluation(
     """
     if job_id is not None:
         # the job's row is locked by whoever stores for it; this covers direct calls too
-        db.execute(text("select pg_advisory_xact_lock(hashtextextended(:key, 0))"), {"key": f"evaluation:{job_id}"})
+        repository.lock_job(db, job_id)
         known = repository.evaluation_of_job(db, job_id)
         if known is not None:
             return known

@@ -20,10 +20,8 @@ class Upload(Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
-    visit_id: Mapped[int | None] = mapped_column(ForeignKey("visit.id"), index=True)
     status: Mapped[str] = mapped_column(String(20), server_default="received")
     stated: Mapped[dict[str, Any]]
-    report: Mapped[list[Any]]
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
     files: Mapped[list[UploadFile]] = relationship(back_populates="upload", order_by="UploadFile.id")
@@ -78,8 +76,8 @@ class UploadFile(Base):
 class SessionProposal(Base):
     """Why an upload proposes a session, and how often the proposal was changed; it stays beside the session that it became.
 
-    `evidence` has one sentence per guessed field (`visit`, `controller`, …). Where `visit_open`, the visit is a place to keep the proposal
-    in and no guess. `version` lets no tab overwrite another's correction.
+    `evidence` has an `app.ingest.proposals.evidence.Evidence` per field (`visit`, `controller`, …), in old rows a sentence. Where
+    `visit_open`, the visit is a place to store the proposal in and no guess. `version` lets no tab overwrite another's correction.
     """
 
     __tablename__ = "session_proposal"

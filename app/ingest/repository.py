@@ -82,6 +82,11 @@ def uploads_of_participant(db: Session, participant_id: int, limit: int = 20) ->
     ).all()
 
 
+def unfinished_uploads(db: Session) -> Sequence[int]:
+    """Numbers of the uploads that were begun and not finished, oldest first."""
+    return db.scalars(select(Upload.id).where(Upload.status == "received").order_by(Upload.id)).all()
+
+
 def recordings_of_file(db: Session, upload_file_id: int) -> Sequence[Recording]:
     """Recordings that a file gave, in the order in which they were stored."""
     return db.scalars(select(Recording).where(Recording.upload_file_id == upload_file_id).order_by(Recording.id)).all()

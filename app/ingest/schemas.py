@@ -32,7 +32,7 @@ class ProposalChange(Model):
     hemisphere: Hemisphere | None = Field(None, description="Side of the controlled implant.")
     start_s: Number | None = Field(None, ge=0, le=1e7, description="Where the session begins in its control recording, s.")
     stop_s: Number | None = Field(None, ge=0, le=1e7, description="Where it ends in its control recording, s.")
-    started_at: Moment | None = Field(None, description="Start on the clock of the wall; moves the begin where the recording has a clock.")
+    started_at: Moment | None = Field(None, description="Start, date and time of day; moves the begin where the recording has a clock.")
     reason: Text | None = Field(None, max_length=1000, description="Kept in the audit trail.")
 
 
@@ -138,7 +138,7 @@ class ProblemOut(Model):
 
     what: str
     where: str
-    mend: str
+    hint: str
 
 
 class FileReportOut(Model):

@@ -12,10 +12,10 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.ingest import repository
 from app.platform.errors import Conflict, Invalid
-from app.study import blinding
+from app.study import blinding, cdbs_amplitude
 from app.study import repository as study
 from app.study.models import Controller, Hemisphere, Participant, Recording, SessionSegment, StudySession, Trace, Visit
-from app.study.traces import AMPLITUDE_STREAM, cdbs_amplitude_ma, pack, unpack
+from app.study.traces import AMPLITUDE_STREAM, pack, unpack
 
 CONTROL_STREAMS = ("beta", "band_power")
 """Streams that can drive a controller, in the order of preference where the participant's source does not decide."""
@@ -50,7 +50,7 @@ class StatedSession:
 
 
 @dataclass
-class Laid:
+class Placement:
     """One session's recordings: the one that its controller saw, the part of it, and the others of the same time."""
 
     control: Recording
@@ -90,7 +90,7 @@ def _belong(a: Recording, b: Recording) -> bool:
     return a.upload_file_id == b.upload_file_id and a.details.get("run", 0) == b.details.get("run", 0)
 
 
-def lay(db: Session, participant: Participant, recordings: Sequence[Recording], stated: StatedSession, alone: bool) -> Laid:
+def place(db: Session, participant: Participant, recordings: Sequence[Recording], stated: StatedSession, alone: bool) -> Placement:
     """Where a session lies in its recordings.
 
     Args:
@@ -109,10 +109,10 @@ def lay(db: Session, participant: Participant, recordings: Sequence[Recording], 
         started_at = stated.started_at
     start_s = offset_s(control, started_at, settings.period_s)
     stream, channel = (trace.stream, trace.channel) if trace else (CONTROL_STREAMS[0], None)
-    laid = Laid(control, list(recordings), start_s, control.duration_s, started_at, stream, channel)
+    placement = Placement(control, list(recordings), start_s, control.duration_s, started_at, stream, channel)
     if stated.started_at is not None and started_at is not stated.started_at:
-        laid.notes.append(_start_refused(stated.started_at, control))
-    return laid
+        placement.notes.append(_start_refused(stated.started_at, control))
+    return placement
 
 
 def _start_refused(stated: datetime, control: Recording) -> str:
@@ -150,23 +150,23 @@ def offset_s(recording: Recording, started_at: datetime | None, period_s: float)
     return offset if 0 < offset < recording.duration_s else 0.0
 
 
-def set_segments(session: StudySession, laid: Laid, period_s: float) -> None:
+def set_segments(session: StudySession, placement: Placement, period_s: float) -> None:
     """Give a session its parts of its recordings, the same stretch of time in each."""
     session.segments.clear()
-    for recording in laid.recordings:
-        if recording is laid.control:
-            stop_s = max(laid.stop_s, laid.start_s + 1e-3)  # a segment needs a length
-            session.segments.append(SessionSegment(recording=recording, start_s=laid.start_s, stop_s=stop_s, is_control=True))
+    for recording in placement.recordings:
+        if recording is placement.control:
+            stop_s = max(placement.stop_s, placement.start_s + 1e-3)  # a segment needs a length
+            session.segments.append(SessionSegment(recording=recording, start_s=placement.start_s, stop_s=stop_s, is_control=True))
         else:
-            add_beside(session, recording, laid, period_s)
+            add_beside(session, recording, placement, period_s)
 
 
-def add_beside(session: StudySession, recording: Recording, laid: Laid, period_s: float) -> bool:
+def add_beside(session: StudySession, recording: Recording, placement: Placement, period_s: float) -> bool:
     """Give a session its stretch of a recording that its controller did not see; whether the recording holds any of it."""
-    start_s = offset_s(recording, laid.started_at, period_s) if laid.started_at else laid.start_s
-    ahead = (recording.started_at - laid.started_at).total_seconds() if recording.started_at and laid.started_at else 0.0
+    start_s = offset_s(recording, placement.started_at, period_s) if placement.started_at else placement.start_s
+    ahead = (recording.started_at - placement.started_at).total_seconds() if recording.started_at and placement.started_at else 0.0
     # a recording that begins within the session holds less of it by what it comes too late
-    stop_s = min(start_s + (laid.stop_s - laid.start_s) - max(ahead, 0.0), recording.duration_s)
+    stop_s = min(start_s + (placement.stop_s - placement.start_s) - max(ahead, 0.0), recording.duration_s)
     if stop_s <= start_s:
         return False
     session.segments.append(SessionSegment(recording=recording, start_s=start_s, stop_s=stop_s, is_control=False))
@@ -174,21 +174,27 @@ def add_beside(session: StudySession, recording: Recording, laid: Laid, period_s
 
 
 def add_session(
-    db: Session, visit: Visit, laid: Laid, controller: Controller | None, policy_id: int | None, hemisphere: Hemisphere | None, counts: bool
+    db: Session,
+    visit: Visit,
+    placement: Placement,
+    controller: Controller | None,
+    policy_id: int | None,
+    hemisphere: Hemisphere | None,
+    counts: bool,
 ) -> StudySession:
     """A new session, confirmed or proposed."""
     session = StudySession(
         visit_id=visit.id,
         ordinal=study.next_ordinal(db, visit.id),
-        hemisphere=hemisphere or laid.control.hemisphere,
+        hemisphere=hemisphere or placement.control.hemisphere,
         status="confirmed" if counts else "proposed",
-        started_at=laid.started_at,
-        duration_s=laid.stop_s - laid.start_s,
-        control_stream=laid.stream,
-        control_channel=laid.channel,
+        started_at=placement.started_at,
+        duration_s=placement.stop_s - placement.start_s,
+        control_stream=placement.stream,
+        control_channel=placement.channel,
     )
     blinding.assign(session, controller, policy_id)
-    set_segments(session, laid, visit.participant.current_settings.period_s)
+    set_segments(session, placement, visit.participant.current_settings.period_s)
     db.add(session)
     db.flush()
     return session
@@ -199,23 +205,23 @@ def fix_milliamperes(db: Session, session: StudySession) -> list[str]:
 
     What was delivered must not change when the cDBS amplitude does. Traces of a recording that an earlier session counts on stay.
     """
-    said = []
+    sentences = []
     for recording_id in dict.fromkeys(s.recording_id for s in session.segments):
         given = [t for t in study.traces_of_recording(db, recording_id) if t.stream == AMPLITUDE_STREAM and t.unit == "fraction"]
         if not given or repository.confirmed_sessions_of_recording(db, recording_id, besides=session.id):
             continue
         try:
-            cdbs = cdbs_amplitude_ma(session, session.visit.participant.current_settings)
+            cdbs = cdbs_amplitude.of_session(session, session.visit.participant.current_settings)
         except Invalid as error:
-            said.append(f"Amplitudes are kept as fractions: {error}")
+            sentences.append(f"Amplitudes are kept as fractions: {error}")
             continue
         if cdbs is None:
-            said.append("Amplitudes are kept as fractions, because nobody has stated a cDBS amplitude for this participant yet.")
+            sentences.append("Amplitudes are kept as fractions, because nobody has stated a cDBS amplitude for this participant yet.")
             continue
         for trace in given:
             in_milliamperes(trace, cdbs)
     db.flush()
-    return said
+    return sentences
 
 
 def in_milliamperes(trace: Trace, cdbs_ma: float) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from sqlalchemy import func, or_, select
+from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.orm import Session, selectinload
 
 from app.accounts.models import Site
@@ -34,6 +36,12 @@ def snapshot_by_pins(db: Session, participant_id: int, pins_sha256: str) -> Buff
     return db.scalar(
         select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id, BufferSnapshot.pins_sha256 == pins_sha256)
     )
+
+
+def add_snapshot(db: Session, **columns: Any) -> int | None:
+    """Add a buffer snapshot; its number, or None where the participant has one of the same pins, made by somebody else meanwhile."""
+    row = insert(BufferSnapshot).values(**columns).on_conflict_do_nothing(index_elements=["participant_id", "pins_sha256"])
+    return db.scalar(row.returning(BufferSnapshot.id))
 
 
 def snapshots(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[BufferSnapshot], int]:

@@ -1,1 +1,1 @@
-"""Pages that join phases; the only room that may import all of them."""
+"""Pages that join phases; with tablet and simulation the only package that may import all of them."""

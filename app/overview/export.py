@@ -9,17 +9,17 @@ import zipfile
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app import __version__
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation.estimates.coverage import coverage_by_policy
-from app.evaluation.models import EstimateRow, Evaluation
 from app.learning.models import Policy
+from app.overview import repository
 from app.platform.errors import BetaloopError
-from app.study import blinding, repository, service
+from app.study import blinding, service
+from app.study import repository as study
 from app.study.models import Participant
 from app.study.schemas import SettingsOut
 
@@ -45,7 +45,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
     service.require(caller, can.READ, participant)
     sessions: list[tuple[Any, ...]] = []
     steps: list[tuple[Any, ...]] = []
-    for session in repository.sessions_of_participant(db, participant.id):
+    for session in study.sessions_of_participant(db, participant.id):
         arm, qoc = blinding.arm(session, caller), session.qoc
         try:
             table, problem = service.session_data(db, session).table, None
@@ -61,7 +61,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
         if table is not None:
             rows = zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, strict=True)
             steps.extend((session.id, *(_blank_nan(v) for v in row)) for row in rows)
-    policies = db.scalars(select(Policy).where(Policy.participant_id == participant.id).order_by(Policy.id)).all()
+    policies = repository.policies(db, participant.id)
     settings = [SettingsOut.model_validate(s).model_dump(mode="json") for s in participant.settings]
     contents = {
         "README.txt": _readme(participant),
@@ -84,24 +84,17 @@ def _policy_row(p: Policy) -> tuple[Any, ...]:
 
 
 def _estimate_rows(db: Session, participant: Participant) -> list[tuple[Any, ...]]:
-    query = (
-        select(Evaluation, EstimateRow)
-        .join(EstimateRow, EstimateRow.evaluation_id == Evaluation.id)
-        .where(Evaluation.participant_id == participant.id)
-        .order_by(Evaluation.id, EstimateRow.policy_id, EstimateRow.method)
-    )
     return [
         (e.id, e.snapshot_id, e.settings_version_id, e.horizon_steps, e.gamma, r.policy_id, r.method, r.value, r.low, r.high, r.level,
          r.supported, "; ".join(map(str, r.flags)))
-        for e, r in db.execute(query)
+        for e, r in repository.estimates(db, participant.id)
     ]  # fmt: skip
 
 
 def _coverage_rows(db: Session, participant: Participant) -> list[tuple[Any, ...]]:
-    query = select(Evaluation).where(Evaluation.participant_id == participant.id).order_by(Evaluation.id)
     return [
         (e.id, policy_id, found.supported, c.name, c.value, c.limit, "least" if c.at_least else "greatest", c.verdict)
-        for e in db.scalars(query)
+        for e in repository.evaluations(db, participant.id)
         for policy_id, found in sorted(coverage_by_policy(e).items())
         for c in found.checks
     ]

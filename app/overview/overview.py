@@ -15,7 +15,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.accounts.repository import studies
 from app.accounts.service import reads_whole_audit
-from app.overview import queries
+from app.overview import repository, state
 from app.platform.audit import AUDITED, AuditEvent
 from app.platform.database import Db
 from app.platform.errors import Forbidden, NotFound
@@ -35,14 +35,14 @@ _HIDDEN = "hidden from you"
 def overview(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
     """All participants as cards, those that need attention marked."""
     rows, total = study.participants(db, caller, paging.limit, paging.offset)
-    states = queries.states(db, rows, datetime.now(UTC).date())
+    states = state.states(db, rows, datetime.now(UTC).date())
     page = render(
         request,
         "overview/overview.html",
         participants=[(p, states[p.id]) for p in rows],
         total=total,
         paging=paging,
-        phases=queries.PHASES,
+        phases=state.PHASES,
         refresh_s=REFRESH_S,
         studies=[s for s in studies(db) if caller.may(can.READ, s.id)],
     )
@@ -63,7 +63,7 @@ def audit(
     caller.require(can.READ_AUDIT)
     if not reads_whole_audit(db, caller):
         raise Forbidden("The audit trail covers all studies and sites, and your role does not.", "Ask an administrator of all studies.")
-    events, total = queries.audit_events(db, entity, entity_id, actor.strip().lower(), paging.limit, paging.offset)
+    events, total = repository.audit_events(db, entity, entity_id, actor.strip().lower(), paging.limit, paging.offset)
     page = render(
         request,
         "overview/audit.html",

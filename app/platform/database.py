@@ -134,3 +134,8 @@ def _announce(db: Session, connection: Connection) -> None:
 def _after_begin(db: Session, _transaction: Any, connection: Connection) -> None:
     if db.info.get("actor"):
         _announce(db, connection)
+
+
+def check_connection(db: Session) -> None:
+    """Ask the database something; raises SQLAlchemy's OperationalError where it does not answer."""
+    db.execute(text("select 1"))

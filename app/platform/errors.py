@@ -6,27 +6,27 @@ from typing import Any
 
 
 class BetaloopError(Exception):
-    """Something a user can understand and mend.
+    """Something a user can understand and put right.
 
     Args:
         detail: what is wrong, and where.
-        mend: what to do about it.
+        hint: what to do about it.
         extra: further members of the problem document.
     """
 
     status = 400
     title = "The request cannot be carried out"
 
-    def __init__(self, detail: str, mend: str = "", **extra: Any) -> None:
-        super().__init__(f"{detail} {mend}".strip())
-        self.detail, self.mend, self.extra = detail, mend, extra
+    def __init__(self, detail: str, hint: str = "", **extra: Any) -> None:
+        super().__init__(f"{detail} {hint}".strip())
+        self.detail, self.hint, self.extra = detail, hint, extra
 
     def problem(self, instance: str) -> dict[str, Any]:
         """The problem document."""
         body: dict[str, Any] = {"type": "about:blank", "title": self.title, "status": self.status}
         body |= {"detail": self.detail, "instance": instance}
-        if self.mend:
-            body["mend"] = self.mend
+        if self.hint:
+            body["hint"] = self.hint
         return body | self.extra
 
 

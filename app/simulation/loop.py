@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
@@ -23,7 +22,8 @@ from app.planning.plans.schedule import total_minutes
 from app.planning.plans.schemas import PlanIn
 from app.platform.database import new_session, set_actor
 from app.platform.errors import BetaloopError, Conflict, NotFound
-from app.platform.jobs.models import Job, JobStatus
+from app.platform.jobs import repository as jobs
+from app.platform.jobs.models import JobStatus
 from app.platform.jobs.watch import POLL_S, look
 from app.simulation import sessions
 from app.simulation.demo_study import participant_body
@@ -129,8 +129,7 @@ class ParticipantLoop:
     def _learn(self, db: Session, person: Participant, number: int) -> None:
         """The pipeline before a visit: the one that was begun for it, or a new one; waits for its end."""
         wanted = number - self.design.preset.random_visits
-        query = select(Job).where(Job.participant_id == person.id, Job.kind == "pipeline").order_by(Job.created_at, Job.id)
-        begun = [job for job in db.scalars(query) if job.status not in (JobStatus.FAILED, JobStatus.CANCELLED)]
+        begun = [job for job in jobs.of_kind(db, person.id, "pipeline") if job.status not in (JobStatus.FAILED, JobStatus.CANCELLED)]
         if len(begun) >= wanted:
             job_id = begun[wanted - 1].id
         else:

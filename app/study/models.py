@@ -126,13 +126,12 @@ class Device(Base):
     """An implant or another source of recordings, under a keyed pseudonym."""
 
     __tablename__ = "device"
-    __table_args__ = (UniqueConstraint("participant_id", "pseudonym"), CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"))
+    __table_args__ = (UniqueConstraint("participant_id", "pseudonym"),)
 
     id: Mapped[int] = mapped_column(primary_key=True)
     participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
     pseudonym: Mapped[str] = mapped_column(String(64))
     kind: Mapped[str] = mapped_column(String(40))
-    hemisphere: Mapped[Hemisphere | None] = mapped_column(String(5))
 
 
 class Visit(Base):
@@ -289,7 +288,7 @@ class QocRevision(Base):
 
 
 class TremorSeries(Base):
-    """Minutes of tremor from one uploaded file of a watch, on the clock of the wall.
+    """Minutes of tremor from one uploaded file of a watch, in UTC.
 
     Little-endian arrays of `n` minutes in time order: `start_unix_s_f64` and `duration_s_f64` in seconds, `fractions_f32` [n, 6] in the
     order of `ml.qoc.TREMOR_CLASSES`, `any_tremor_f32`; NaN where the export does not tell.

@@ -1,11 +1,7 @@
-"""HTML pages of the study: enrolment, settings, visits. Sessions have their own module."""
+"""HTML page of enrolment. Settings, visits and sessions have their own."""
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
-from typing import Any
-
-import structlog
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
@@ -15,32 +11,21 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.platform.database import Db
-from app.platform.errors import BetaloopError, Invalid
+from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
-from app.study import repository, service, settings_form, visit_form
-from app.study.blinding import arm
-from app.study.deps import CurrentParticipant, CurrentVisit
-from app.study.models import Participant, StudySession, Visit
-from app.study.outcomes import service as outcomes
-from app.study.outcomes import values as outcome_values
-from app.study.schemas import CdbsAmplitudeModel, ParticipantIn, SettingsIn, VisitIn
-from app.study.service import may
-from app.study.sessions import pages as session_pages
-from app.study.settings_form import Shown, own_changes
-
-log = structlog.get_logger()
+from app.study import repository, service
+from app.study.schemas import ParticipantIn, SettingsIn
+from app.study.settings import form
 
 router = APIRouter()
-
-_VISIT_LABELS = {"number": "Number", "date": "Date", "note": "Note", "amplitude_ma": "cDBS amplitude"}
 
 
 @router.get("/participants/new")
 def new_participant(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """The enrolment form."""
     caller.require(can.WRITE_STUDY)
-    return _enrolment(request, db, caller, {"code": "", "site": ""}, settings_form.texts(SettingsIn()))
+    return _enrolment(request, db, caller, {"code": "", "site": ""}, form.texts(SettingsIn()))
 
 
 @router.post("/participants")
@@ -49,132 +34,13 @@ def enrol(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -
     known = {name: str(values.get(name, "")).strip() for name in ("code", "site")}
     try:
         draft = parse(ParticipantIn, {k: v for k, v in known.items() if v}, {"code": "Code (letters, digits, - and _)", "site": "Site"})
-        draft.settings = parse(SettingsIn, values, settings_form.LABELS)
+        draft.settings = parse(SettingsIn, values, form.LABELS)
         participant = service.enrol(db, draft, caller)
     except BetaloopError as error:
         db.rollback()
-        return _enrolment(request, db, caller, known, _typed(values, settings_form.texts(SettingsIn())), error)
+        return _enrolment(request, db, caller, known, _typed(values, form.texts(SettingsIn())), error)
     db.commit()
     return RedirectResponse(f"/participants/{participant.code}?done=enrolled", 303)
-
-
-@router.get("/participants/{code}/settings")
-def settings(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """Present settings, with every one explained, and the versions before."""
-    return _settings_page(request, db, participant, caller, settings_form.texts(participant.current_settings))
-
-
-@router.post("/participants/{code}/settings")
-def change_settings(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
-    """Make a new settings version of what the form changes."""
-    before = participant.current_settings.version
-    seen = str(values["version"]) if "version" in values else None
-    shown = [settings_form.Shown(v.version, settings_form.texts(v), v.created_by) for v in participant.settings]
-    changes = settings_form.own_changes(values, seen, shown, settings_form.LABELS)
-    try:
-        service.require(caller, can.WRITE_SETTINGS, participant)
-        changes.refuse_conflicts()
-        row = service.change_settings(db, participant, parse(SettingsIn, changes.fields, settings_form.LABELS), _reason(values), caller)
-    except BetaloopError as error:
-        db.rollback()
-        typed = settings_form.texts(participant.current_settings) | changes.fields
-        return _settings_page(request, db, participant, caller, typed, error, reason=_reason(values))
-    db.commit()
-    return RedirectResponse(f"/participants/{participant.code}/settings?done={'changed' if row.version != before else 'same'}", 303)
-
-
-@router.get("/participants/{code}/visits")
-def visits(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """All visits of a participant with their sessions."""
-    rows, _ = repository.visits(db, participant.id, 1000, 0)
-    sessions = repository.sessions_of_participant(db, participant.id)
-    days = [(v, [(s, arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in rows]
-    may_write = may(caller, can.WRITE_STUDY, participant)
-    waiting = repository.proposals_of_participant(db, participant.id)
-    return HTMLResponse(render(request, "study/visits.html", participant=participant, days=days, waiting=waiting, may_write=may_write))
-
-
-@router.get("/participants/{code}/visits/new")
-def new_visit(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """The form of a new visit; the number is the next one."""
-    service.require(caller, can.WRITE_STUDY, participant)
-    rows, _ = repository.visits(db, participant.id, 1000, 0)
-    draft = {"number": str(max((v.number for v in rows), default=0) + 1), "date": datetime.now(UTC).date().isoformat(), "note": ""}
-    return _visit_form(request, participant, draft)
-
-
-@router.post("/participants/{code}/visits")
-def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
-    """Add a visit."""
-    try:
-        draft = parse(VisitIn, {name: values.get(name, "") for name in ("number", "date", "note")}, _VISIT_LABELS)
-        draft.cdbs_amplitudes = [
-            parse(CdbsAmplitudeModel, {"hemisphere": side, "amplitude_ma": values[f"cdbs_{side}"]}, _VISIT_LABELS)
-            for side in ("left", "right")
-            if str(values.get(f"cdbs_{side}", "")).strip()
-        ]
-        visit = service.add_visit(db, participant, draft, caller)
-    except BetaloopError as error:
-        db.rollback()
-        return _visit_form(request, participant, {k: str(v) for k, v in values.items()}, error)
-    db.commit()
-    return RedirectResponse(f"/visits/{visit.id}?done=added", 303)
-
-
-@router.get("/visits/{visit_id}")
-def visit_page(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """One visit day: its sessions in order."""
-    return _visit_page(request, db, visit, caller)
-
-
-@router.post("/visits/{visit_id}")
-def change_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
-    """Correct a visit's date, note or cDBS amplitudes."""
-    present = Shown(1, visit_form.texts(visit), visit_form.last_editor(db, visit))
-    seen = Shown(0, visit_form.seen(values, present.fields), "")
-    changes = own_changes(visit_form.posted(values), "0", [seen, present], visit_form.labels(present.fields))
-    typed = changes.fields | {"reason": _reason(values) or ""}
-    try:
-        service.require(caller, can.WRITE_STUDY, visit.participant)
-        changes.refuse_conflicts()
-        service.change_visit(db, visit, visit_form.change(present.fields, changes.fields, typed["reason"]), caller)
-    except BetaloopError as error:
-        db.rollback()
-        return _visit_page(request, db, visit, caller, typed, error)
-    db.commit()
-    return RedirectResponse(f"/visits/{visit.id}?done=corrected", 303)
-
-
-def _visit_page(
-    request: Request, db: Session, visit: Visit, caller: Caller, typed: dict[str, str] | None = None, error: BetaloopError | None = None
-) -> HTMLResponse:
-    sessions, _ = repository.sessions_of_visit(db, visit.id)
-    seen = visit_form.texts(visit)
-    page = render(
-        request,
-        "study/visit.html",
-        visit=visit,
-        participant=visit.participant,
-        rows=[_session_row(db, s, caller) for s in sessions],
-        proposals=[s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id],
-        seen=seen,
-        draft=seen | {"reason": ""} | (typed or {}),
-        labels=visit_form.labels(seen),
-        may_write=may(caller, can.WRITE_STUDY, visit.participant),
-        problem=error.problem(request.url.path) if error else None,
-    )
-    return HTMLResponse(page, error.status if error else 200)
-
-
-def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str, Any]:
-    """What the visit's table says of a session; a session that cannot be laid on the grid says why."""
-    clashes = outcomes.disagreements(session, outcome_values.derive(db, session))
-    row: dict[str, Any] = {"session": session, "arm": arm(session, caller), "summary": None, "problem": "", "clashes": clashes}
-    try:
-        row["summary"] = session_pages.summarise(service.session_data(db, session))
-    except BetaloopError as error:
-        row["problem"] = error.detail
-    return row
 
 
 def _enrolment(
@@ -182,58 +48,10 @@ def _enrolment(
 ) -> HTMLResponse:
     sites = [s for s in repository.sites(db, caller) if caller.may(can.WRITE_STUDY, s.study_id, s.id)]
     problem = error.problem(request.url.path) if error else None
-    page = render(
-        request, "study/participant_new.html", known=known, values=values, groups=settings_form.GROUPS, sites=sites, problem=problem
-    )
+    page = render(request, "study/participant_new.html", known=known, values=values, groups=form.GROUPS, sites=sites, problem=problem)
     return HTMLResponse(page, error.status if error else 200)
-
-
-def _settings_page(
-    request: Request,
-    db: Session,
-    participant: Participant,
-    caller: Caller,
-    values: dict[str, str],
-    error: BetaloopError | None = None,
-    reason: str | None = None,
-) -> HTMLResponse:
-    page = render(
-        request,
-        "study/settings.html",
-        participant=participant,
-        current=participant.current_settings,
-        values=values,
-        reason=reason,
-        groups=settings_form.GROUPS,
-        history=settings_form.history(participant.settings),
-        suggestion=_suggestion(db, participant, caller),
-        may_write=may(caller, can.WRITE_SETTINGS, participant),
-        problem=error.problem(request.url.path) if error else None,
-    )
-    return HTMLResponse(page, error.status if error else 200)
-
-
-def _suggestion(db: Session, participant: Participant, caller: Caller) -> float | None:
-    try:
-        return service.suggest_xi_beta(db, participant, caller)
-    except Invalid as error:
-        # the session's own page says what is wrong with it; the settings must stay reachable, for they may be what mends it
-        log.info("no threshold suggested", participant=participant.code, reason=error.detail)
-        return None
-
-
-def _visit_form(request: Request, participant: Participant, draft: dict[str, str], error: BetaloopError | None = None) -> HTMLResponse:
-    problem = error.problem(request.url.path) if error else None
-    values = {"cdbs_left": "", "cdbs_right": "", "number": "", "date": "", "note": ""} | draft
-    return HTMLResponse(
-        render(request, "study/visit_new.html", participant=participant, draft=values, problem=problem), error.status if error else 200
-    )
 
 
 def _typed(values: FormData, base: dict[str, str]) -> dict[str, str]:
     """What the person typed, so that a refused form comes back as it was sent."""
     return {name: str(values.get(name, text)) for name, text in base.items()}
-
-
-def _reason(values: FormData) -> str | None:
-    return str(values.get("reason", "")).strip()[:1000] or None

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from sqlalchemy import select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -335,8 +334,7 @@ def _add_settings(db: Session, participant: Participant, values: dict[str, Any],
 
 
 def _site(db: Session, code: str | None, caller: Caller) -> Site:
-    query = select(Site).where(repository.in_scope(caller)).order_by(Site.id)
-    sites = db.scalars(query if code is None else query.where(Site.code == code)).all()
+    sites = [s for s in repository.sites(db, caller) if code in (None, s.code)]
     if len(sites) == 1:
         return sites[0]
     if not sites:

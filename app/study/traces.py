@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
-from app.study import repository
-from app.study.models import Hemisphere, SettingsVersion, StudySession, Trace, Visit
-from app.study.schemas import CDBS_MA
+from app.study import cdbs_amplitude, repository
+from app.study.models import SettingsVersion, StudySession, Trace
 from ml.mdp import AMPLITUDE_TOLERANCE
 
 AMPLITUDE_STREAM = "amplitude"
@@ -59,38 +58,6 @@ def unpack(trace: Trace) -> NDArray[np.float64]:
     return np.where(valid, values, np.nan)
 
 
-def cdbs_amplitude_ma(session: StudySession, settings: SettingsVersion, program: int = 0) -> float | None:
-    """The cDBS amplitude in force for a session, mA. Raises Invalid as `cdbs_in_force` does."""
-    return cdbs_in_force(session.visit, session.hemisphere, settings, program)
-
-
-def cdbs_in_force(visit: Visit, hemisphere: Hemisphere | None, settings: SettingsVersion, program: int = 0) -> float | None:
-    """The visit's cDBS amplitude of a hemisphere and program, mA, else the settings' shorthand; None where nobody stated one.
-
-    A program of which the visit says nothing has the amplitude of program 0, under which an amplitude without a program is kept.
-
-    Raises:
-        Invalid: the visit states both hemispheres, and it is not known which one is meant; an amplitude that no stimulator gives.
-    """
-    sides = [a for a in visit.cdbs_amplitudes if hemisphere in (None, a.hemisphere)]
-    rows = [a for a in sides if a.program == program] or [a for a in sides if a.program == 0]
-    if len(rows) == 1:
-        return _plausible(rows[0].amplitude_ma, f"Visit {visit.number} states")
-    if len(rows) > 1:
-        raise Invalid(f"No hemisphere is named, and visit {visit.number} has cDBS amplitudes for both.", "Set the session's hemisphere.")
-    return _plausible(settings.cdbs_amplitude_ma, "The participant's settings state")
-
-
-def _plausible(amplitude_ma: float | None, who: str) -> float | None:
-    """A stated cDBS amplitude, mA. Raises Invalid for one that earlier versions let in: fractions of it would be no numbers."""
-    if amplitude_ma is None or CDBS_MA.low <= amplitude_ma <= CDBS_MA.high:
-        return amplitude_ma
-    raise Invalid(
-        f"{who} a cDBS amplitude of {amplitude_ma:g} mA, outside {CDBS_MA.low:g} to {CDBS_MA.high:g} mA: no fraction can be told.",
-        "Correct the amplitude.",
-    )
-
-
 def step_table(db: Session, session: StudySession, settings: SettingsVersion) -> StepTable:
     """Beta and amplitude of a session's control channel, with up to W rows before its start.
 
@@ -114,7 +81,7 @@ def step_table(db: Session, session: StudySession, settings: SettingsVersion) ->
         if driving is not None:
             _place(amount, t_s, driving, origin, period)
             amplitude_trace = driving
-    cdbs = cdbs_amplitude_ma(session, settings, amplitude_program(amplitude_trace) if amplitude_trace else 0)
+    cdbs = cdbs_amplitude.of_session(session, settings, amplitude_program(amplitude_trace) if amplitude_trace else 0)
     return _table(t_s, beta, amount, beta_trace, amplitude_trace, cdbs)
 
 
@@ -127,7 +94,7 @@ def shown_table(session: StudySession, settings: SettingsVersion, trace: Trace, 
         Invalid: a trace that is not on the participant's grid, or a visit that states both sides and a recording that names none.
     """
     program = amplitude_program(amplitude) if amplitude is not None else 0
-    cdbs = cdbs_in_force(session.visit, trace.recording.hemisphere or session.hemisphere, settings, program)
+    cdbs = cdbs_amplitude.in_force(session.visit, trace.recording.hemisphere or session.hemisphere, settings, program)
     t_s = _grid(session, settings)
     beta, amount = np.full(t_s.size, np.nan), np.full(t_s.size, np.nan)
     origin = session_offset_s(session, trace.recording_id)

@@ -116,7 +116,7 @@ def open_source(text: str, manifest: BundleManifest, wish: Wish, stdin: Iterable
         )
         return _recorded(path, options, manifest, wish)
     except UndecodableFile as error:
-        raise Invalid(f"{path.name} cannot be used: {error.what} ({error.where}).", error.mend) from error
+        raise Invalid(f"{path.name} cannot be used: {error.what} ({error.where}).", error.hint) from error
 
 
 def _recorded(path: Path, options: DecodeOptions, manifest: BundleManifest, wish: Wish) -> Source:

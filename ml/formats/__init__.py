@@ -11,10 +11,8 @@ from typing import Literal
 
 from ml.formats.archive import ZipFiles
 from ml.formats.options import ArchiveLimits, DecodeOptions
-from ml.formats.percept.redact import redact_percept
-from ml.formats.percept.report import decode_percept, report_members
-from ml.formats.percept.report_json import looks_like_report
-from ml.formats.rcs.folder import decode_rcs, find_sessions
+from ml.formats.percept import decode_percept, looks_like_report, redact_percept, report_members
+from ml.formats.rcs import decode_rcs, find_sessions, redact_rcs_zip
 from ml.formats.recording import (
     DECODE_VERSION,
     TREMOR_CLASSES,
@@ -24,19 +22,13 @@ from ml.formats.recording import (
     GraspLog,
     Problem,
     RecordingLog,
-    SessionLog,
     SpectrumLog,
     TraceLog,
     TremorLog,
     UndecodableFile,
 )
-from ml.formats.redact import redact_rcs_zip
 from ml.formats.redaction import REDACTOR_VERSION, Redaction
-from ml.formats.tables.delimited import read_headers
-from ml.formats.tables.grasps import decode_grasps, looks_like_grasps
-from ml.formats.tables.redact import redact_table
-from ml.formats.tables.steps import decode_csv, decode_parquet
-from ml.formats.tables.strivepd import decode_strivepd, looks_like_tremor
+from ml.formats.tables import TableKind, decode_table, kind_of_text, redact_table
 
 __all__ = [
     "DECODE_VERSION",
@@ -52,7 +44,6 @@ __all__ = [
     "Problem",
     "RecordingLog",
     "Redaction",
-    "SessionLog",
     "SpectrumLog",
     "TraceLog",
     "TremorLog",
@@ -62,9 +53,9 @@ __all__ = [
     "sniff",
 ]
 
-FileKind = Literal["rcs", "percept", "csv", "parquet", "tremor", "grasp"]
+FileKind = Literal["rcs", "percept"] | TableKind
 HEAD = 65_536
-MEND = (
+HINT = (
     "Upload an RC+S session folder as a zip, a Percept session report (JSON), a table as CSV or Parquet, "
     "a tremor export, or a table of open-fist times."
 )
@@ -81,7 +72,7 @@ def sniff(path: Path) -> FileKind:
     with path.open("rb") as stream:
         head = stream.read(HEAD)
     if not head:
-        raise UndecodableFile("the file is empty", "file", MEND)
+        raise UndecodableFile("the file is empty", "file", HINT)
     if head.startswith(b"PAR1"):
         return "parquet"
     if head.startswith((b"PK\x03\x04", b"PK\x05\x06")) or zipfile.is_zipfile(path):
@@ -93,8 +84,8 @@ def sniff(path: Path) -> FileKind:
         what = "a single JSON file, neither a whole RC+S session nor a Percept session report"
         raise UndecodableFile(what, "file", "Zip the whole session folder and upload that.")
     if head.startswith((b"\xff\xfe", b"\xfe\xff")) or b"\0" not in head[:4096]:
-        return _kind_of_text(path)
-    raise UndecodableFile("no format this service reads", "first bytes", MEND)
+        return kind_of_text(path)
+    raise UndecodableFile("no format this service reads", "first bytes", HINT)
 
 
 def _kind_of_zip(path: Path) -> FileKind:
@@ -106,17 +97,6 @@ def _kind_of_zip(path: Path) -> FileKind:
     except UndecodableFile:
         return "rcs"
     return "rcs"
-
-
-def _kind_of_text(path: Path) -> FileKind:
-    """Which table a text is, by its headers."""
-    try:
-        headers = read_headers(path)
-    except UndecodableFile:
-        return "csv"
-    if looks_like_tremor(headers):
-        return "tremor"
-    return "grasp" if looks_like_grasps(headers) else "csv"
 
 
 def redact(source: Path, target: Path, kind: FileKind, key: bytes, options: DecodeOptions | None = None) -> Redaction:
@@ -150,7 +130,7 @@ def decode(path: Path, kind: FileKind | None = None, options: DecodeOptions | No
         name: what to call it in reports and errors; the path's last part when not given.
 
     Raises:
-        UndecodableFile: nothing in it can be used; says what, where and how to mend it.
+        UndecodableFile: nothing in it can be used; says what, where and what to do.
     """
     options = options or DecodeOptions()
     kind = kind or sniff(path)
@@ -160,14 +140,9 @@ def decode(path: Path, kind: FileKind | None = None, options: DecodeOptions | No
             said = "this upload holds no data: no stream has a sample and no stimulation log an amplitude; kept as a recording without data"
             decoded.reports[0].flagged.insert(0, said)
         return decoded
-    decoders = {
-        "percept": decode_percept,
-        "tremor": decode_strivepd,
-        "grasp": decode_grasps,
-        "parquet": decode_parquet,
-        "csv": decode_csv,
-    }
-    return decoders[kind](path, options, name)
+    if kind == "percept":
+        return decode_percept(path, options, name)
+    return decode_table(path, kind, options, name)
 
 
 def _is_empty(recording: RecordingLog) -> bool:

@@ -18,10 +18,21 @@ READ_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, 
 """What zipfile raises for damaged members, wrong sizes, a password, and (a kind of RuntimeError) a compression that it does not know."""
 
 
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A file that is not read, by the name that may be shown to its sender, and why."""
+
+    name: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.reason}"
+
+
 class Files(Protocol):
     """Named files of one upload: members of an archive or files of a folder. Names use forward slashes and are safe to show."""
 
-    ignored: list[str]
+    left_out: list[LeftOut]
 
     def names(self) -> list[str]:
         """Names in sorted order."""
@@ -35,14 +46,14 @@ class FolderFiles:
     """Files below a folder; links are left out and said."""
 
     root: Path
-    ignored: list[str] = field(default_factory=list)
+    left_out: list[LeftOut] = field(default_factory=list)
     _paths: dict[str, Path] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for path in sorted(self.root.rglob("*")):
             name = path.relative_to(self.root).as_posix()
             if path.is_symlink():
-                self.ignored.append(f"{name}: a link, not followed")
+                self.left_out.append(LeftOut(name, "a link, not followed"))
             elif path.is_file():
                 self._paths[name] = path
 
@@ -63,7 +74,7 @@ class ZipFiles:
     """
 
     def __init__(self, path: Path, limits: ArchiveLimits) -> None:
-        self.ignored: list[str] = []
+        self.left_out: list[LeftOut] = []
         self._limits = limits
         self._members: dict[str, zipfile.ZipInfo] = {}
         try:
@@ -106,17 +117,19 @@ class ZipFiles:
         if info.is_dir() or name.endswith("/"):
             return
         if name.startswith("/") or ".." in parts or (parts and parts[0].endswith(":")) or any(ord(c) < 32 for c in name):
-            self.ignored.append(f"{_safe(name)}: its path leads outside the archive")
+            self.left_out.append(LeftOut(_safe(name), "its path leads outside the archive"))
         elif stat.S_IFMT(mode) not in (0, stat.S_IFREG):
-            self.ignored.append(f"{_safe(name)}: a link or special file, not a file")
+            self.left_out.append(LeftOut(_safe(name), "a link or special file, not a file"))
         elif info.file_size > self._limits.member_bytes:
-            self.ignored.append(f"{_safe(name)}: {info.file_size / 1e6:.0f} MB, larger than {self._limits.member_bytes / 1e6:.0f} MB")
+            self.left_out.append(
+                LeftOut(_safe(name), f"{info.file_size / 1e6:.0f} MB, larger than {self._limits.member_bytes / 1e6:.0f} MB")
+            )
         elif name.lower().endswith(NESTED):
-            self.ignored.append(f"{_safe(name)}: an archive inside the archive; unpack it and upload it by itself")
+            self.left_out.append(LeftOut(_safe(name), "an archive inside the archive; unpack it and upload it by itself"))
         elif "__MACOSX" in parts or (parts and parts[-1].startswith("._")):
             return
         elif name in self._members:
-            self.ignored.append(f"{_safe(name)}: the name stands twice in the archive; the first is used")
+            self.left_out.append(LeftOut(_safe(name), "the name stands twice in the archive; the first is used"))
         else:
             self._members[name] = info
 

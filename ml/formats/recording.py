@@ -26,32 +26,32 @@ Hemisphere = Literal["left", "right"]
 
 
 class UndecodableFile(Exception):
-    """A file of which nothing can be used: what is wrong, where, and how to mend it, in the user's words.
+    """A file of which nothing can be used: what is wrong, where, and what to do about it, in the user's words.
 
     `what` and `where` may quote the file and are for its sender alone; `stored_what` and `stored_where` say the same without the file's own
     texts, which may identify a person, and are what a stored report may hold. They are equal where not given.
     """
 
-    def __init__(self, what: str, where: str, mend: str, stored_what: str | None = None, stored_where: str | None = None) -> None:
-        super().__init__(f"{what} ({where}). {mend}")
+    def __init__(self, what: str, where: str, hint: str, stored_what: str | None = None, stored_where: str | None = None) -> None:
+        super().__init__(f"{what} ({where}). {hint}")
         self.what = what
         self.where = where
-        self.mend = mend
+        self.hint = hint
         self.stored_what = what if stored_what is None else stored_what
         self.stored_where = where if stored_where is None else stored_where
 
     def __reduce__(self) -> tuple[type[UndecodableFile], tuple[str, str, str, str, str]]:
-        return type(self), (self.what, self.where, self.mend, self.stored_what, self.stored_where)
+        return type(self), (self.what, self.where, self.hint, self.stored_what, self.stored_where)
 
     @property
-    def told(self) -> Problem:
+    def for_sender(self) -> Problem:
         """The problem for the person who sent the file."""
-        return Problem(self.what, self.where, self.mend)
+        return Problem(self.what, self.where, self.hint)
 
     @property
     def stored(self) -> Problem:
         """The problem without texts of the file."""
-        return Problem(self.stored_what, self.stored_where, self.mend)
+        return Problem(self.stored_what, self.stored_where, self.hint)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Problem:
 
     what: str
     where: str
-    mend: str
+    hint: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,13 +137,13 @@ class SpectrumLog:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TremorLog:
-    """Minutes of tremor in time order, on the clock of the wall.
+    """Minutes of tremor in time order, in UTC.
 
     Attributes:
         start_unix_s: begin of each minute, shape [n].
         duration_s: length of each minute's measurement, shape [n].
         fractions: share per class in the order of `TREMOR_CLASSES`, shape [n, 6]; NaN where the export does not split the tremor.
-        any_tremor: share with slight or worse tremor, shape [n]; NaN where not told.
+        any_tremor: share with slight or worse tremor, shape [n]; NaN where not known.
     """
 
     start_unix_s: NDArray[np.float64]
@@ -205,9 +205,6 @@ class DecodedFile:
     reports: tuple[FileReport, ...]
     tremor: tuple[TremorLog, ...] = ()
     grasps: tuple[GraspLog, ...] = ()
-
-
-SessionLog = DecodedFile
 
 
 def fingerprint(kind: str, parts: Iterable[str | bytes | NDArray[Any]]) -> str:

@@ -22,7 +22,7 @@ _RANDOM_OPERATORS = {"RandomNormal", "RandomNormalLike", "RandomUniform", "Rando
 
 
 class PolicyFileError(ValueError):
-    """The bytes are no policy that betaloop can run; the message says what is wrong and how to mend it."""
+    """The bytes are no policy that betaloop can run; the message says what is wrong and what to do."""
 
 
 class PolicyOutputError(ValueError):

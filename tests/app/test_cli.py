@@ -104,7 +104,7 @@ def test_what_cannot_be_done_is_said_in_a_line(fresh_database: str, arguments: l
     assert "Traceback" not in result.stderr
 
 
-def test_a_file_of_no_use_is_exit_code_1_with_the_mend(study: str, tmp_path: Path) -> None:
+def test_a_file_of_no_use_is_exit_code_1_with_the_hint(study: str, tmp_path: Path) -> None:
     table = tmp_path / "wrong.csv"
     table.write_text("a,b\n1,2\n")
     result = betaloop("import", str(table), "--participant", study, "--visit", "1", "--controller", "cdbs")

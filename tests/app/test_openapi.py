@@ -41,6 +41,10 @@ INTENDED: dict[str, str] = {
         ),
         "API: sweeps call their scores of controllers without learning `baselines` (was `yardsticks`).",
     ),
+    **dict.fromkeys(
+        ("components > schemas > Problem", "components > schemas > ProblemOut"),
+        "API: the member `mend` of problem documents and of file reports is called `hint`.",
+    ),
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",
     "components > schemas > JobOut > required": "API: a job has `seconds_left`.",
 }

@@ -8,10 +8,9 @@ from fastapi import APIRouter, Query, Response
 
 from app.accounts.deps import CurrentCaller
 from app.analysis.calibration import service as calibration
-from app.analysis.calibration.export import calibration_to_csv
+from app.analysis.calibration.export import calibration_csv_of
 from app.analysis.calibration.schemas import CalibrationOut
 from app.platform.database import Db
-from app.platform.web.csv_files import download
 from app.platform.web.schemas import problems
 from app.study.deps import CurrentParticipant
 
@@ -33,8 +32,3 @@ def read_calibration(
     """Estimates made before each visit against what the visit brought, and the metrics of every method."""
     found = calibration.calibration(db, participant, caller)
     return calibration_csv_of(found) if format == "csv" else found
-
-
-def calibration_csv_of(found: CalibrationOut) -> Response:
-    """A calibration as a CSV download."""
-    return download(calibration_to_csv(found), f"{found.participant}-calibration.csv")

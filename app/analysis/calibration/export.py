@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import io
 
+from fastapi import Response
+
 from app.analysis.calibration.schemas import CalibrationOut
 from app.evaluation.ranking.actual import QUANTITIES
-from app.platform.web.csv_files import safe_cell
+from app.platform.web.csv_files import download, safe_cell
 
 _OF_POLICY_AT_VISIT = (
     "visit", "visit_date", "evaluation_id", "evaluated_at", "policy_id", "name", "kind", "reference", "horizon_steps", "gamma"
@@ -32,3 +34,8 @@ def calibration_to_csv(found: CalibrationOut) -> str:
             cells = (*whole, *(getattr(q, n) for n in _OF_PREDICTION), returns, found.beta_unit, *values)
             out.writerow([safe_cell(cell) for cell in cells])
     return sink.getvalue()
+
+
+def calibration_csv_of(found: CalibrationOut) -> Response:
+    """A calibration as a CSV download."""
+    return download(calibration_to_csv(found), f"{found.participant}-calibration.csv")

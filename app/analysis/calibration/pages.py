@@ -7,7 +7,7 @@ from fastapi.responses import HTMLResponse, Response
 
 from app.accounts.deps import CurrentCaller
 from app.analysis.calibration import charts as calibration_charts
-from app.analysis.calibration.api import calibration_csv_of
+from app.analysis.calibration.export import calibration_csv_of
 from app.analysis.calibration.service import calibration
 from app.analysis.calibration.wording import in_sentences
 from app.evaluation import repository

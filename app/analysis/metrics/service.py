@@ -18,6 +18,7 @@ from app.study import repository as study
 from app.study.blinding import CONTROLLER_NAMES, arm
 from app.study.models import Controller, Participant, SettingsVersion, StudySession
 from app.study.service import qoc_of, session_data
+from app.study.sessions.stimulation import MEAN_FRACTION, fits
 from ml.energy import relative_energy, saving_percent
 
 KNOWN_SHARE = 0.5
@@ -31,9 +32,6 @@ TITLES: dict[str, tuple[str, str]] = {
     "tremor": ("Tremor", "% of session"),
 }
 """The paper's five metrics: title and unit; the unit of beta is the participant's."""
-
-EXPECTED_FRACTION = {Controller.CDBS: (0.9, 1.1), Controller.NO_DBS: (0.0, 0.05)}
-"""Mean amplitude fractions that a session of a controller with a fixed amplitude can have (ours)."""
 
 LIMITS = (
     "Sessions of one visit are not independent: they share the day, the medication and what the session before left. The test treats "
@@ -64,7 +62,7 @@ class SessionMetrics:
 
 
 @dataclass(frozen=True)
-class Contradiction:
+class AmplitudeMismatch:
     """A session whose mean amplitude fraction is not that of its controller; it counts all the same until somebody corrects it."""
 
     session_id: int
@@ -130,7 +128,7 @@ class FiveMetrics:
     controllers: list[ControllerSummary]
     metrics: list[MetricResult]
     excluded: list[Excluded]
-    warnings: list[Contradiction]
+    warnings: list[AmplitudeMismatch]
     limits: list[str]
 
 
@@ -152,7 +150,7 @@ def five_metrics(db: Session, participant: Participant, caller: Caller) -> FiveM
     tests = sum(c.p_value is not None for m in metrics for c in m.comparisons)
     holm = f"p-values are unadjusted, as in the paper; Holm's adjustment beside them covers all {tests} comparisons of this page."
     controllers = [_summary(c, [s for s in included if s.controller is c], metrics[0]) for c in present]
-    return FiveMetrics(participant.code, len(included), controllers, metrics, excluded, _contradictions(included), [*LIMITS, holm])
+    return FiveMetrics(participant.code, len(included), controllers, metrics, excluded, _mismatches(included), [*LIMITS, holm])
 
 
 def session_metrics(db: Session, session: StudySession, caller: Caller) -> SessionMetrics:
@@ -176,20 +174,21 @@ def session_metrics(db: Session, session: StudySession, caller: Caller) -> Sessi
     return SessionMetrics(session, arm(session, caller).controller, values, kind, float(np.nanmean(fraction)) if _known(fraction) else None)
 
 
-def _contradictions(sessions: Sequence[SessionMetrics]) -> list[Contradiction]:
+def _mismatches(sessions: Sequence[SessionMetrics]) -> list[AmplitudeMismatch]:
     """Sessions that were stimulated otherwise than their controller says."""
     found = []
     for s in sessions:
-        expected, mean = EXPECTED_FRACTION.get(s.controller), s.mean_fraction
-        if expected is None or mean is None or expected[0] <= mean <= expected[1]:
+        mean = s.mean_fraction
+        if mean is None or fits(s.controller, mean):
             continue
         visit, ordinal = s.session.visit.number, s.session.ordinal
-        asked = "at most 0.05" if s.controller is Controller.NO_DBS else "0.9 to 1.1"
+        low, high = MEAN_FRACTION[s.controller]
+        asked = f"{low:g} to {high:g}" if low > 0 else f"at most {high:g}"
         text = (
             f"Session {s.session.id} (visit {visit}, place {ordinal}) is a {CONTROLLER_NAMES[s.controller]} session, but its mean "
             f"amplitude fraction is {mean:.2f}; {asked} is expected. It counts until its controller or the cDBS amplitude is corrected."
         )
-        found.append(Contradiction(s.session.id, visit, ordinal, s.controller, mean, text))
+        found.append(AmplitudeMismatch(s.session.id, visit, ordinal, s.controller, mean, text))
     return found
 
 

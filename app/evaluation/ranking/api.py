@@ -8,10 +8,9 @@ from fastapi import APIRouter, Query, Response
 
 from app.accounts.deps import CurrentCaller
 from app.evaluation.ranking import service as ranking
-from app.evaluation.ranking.export import to_csv
+from app.evaluation.ranking.export import csv_of
 from app.evaluation.schemas import Kind, Method, RankingFilter, RankingOut
 from app.platform.database import Db
-from app.platform.web.csv_files import download
 from app.platform.web.schemas import problems
 from app.study.deps import CurrentParticipant
 
@@ -38,8 +37,3 @@ def read_ranking(
     shown = RankingFilter(supported=supported, kind=kind, tested=tested)
     found = ranking.current_ranking(db, participant, caller, method, shown)
     return csv_of(found) if format == "csv" else found
-
-
-def csv_of(found: RankingOut) -> Response:
-    """A ranking as a CSV download."""
-    return download(to_csv(found), f"{found.participant}-ranking-{found.evaluation_id}.csv")

@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import io
 
+from fastapi import Response
+
 from app.evaluation.estimates.coverage import CHECKS
 from app.evaluation.schemas import RankedPolicy, RankingOut, TestedBefore
-from app.platform.web.csv_files import safe_cell
+from app.platform.web.csv_files import download, safe_cell
 
 _PREDICTED = ("energy", "mean_amplitude", "mean_beta", "grasp_hz", "rating", "tremor_percent")
 _NUMBERS = ("value", "low", "high", "level", "standard_error", "n", "step_return", "end_reward")
@@ -49,3 +51,8 @@ def _coverage(p: RankedPolicy) -> list[object]:
         return [None] * len(_coverage_columns())
     values = {c.name: c.value for c in p.coverage.checks}
     return [p.coverage.supported, "; ".join(p.coverage.failing), "; ".join(p.coverage.notes), *(values.get(n) for n in _COVERAGE)]
+
+
+def csv_of(found: RankingOut) -> Response:
+    """A ranking as a CSV download."""
+    return download(to_csv(found), f"{found.participant}-ranking-{found.evaluation_id}.csv")

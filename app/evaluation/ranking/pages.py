@@ -15,7 +15,7 @@ from app.evaluation.estimates import coverage
 from app.evaluation.estimates.methods import METHOD_NAMES, METHOD_SHORT
 from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
-from app.evaluation.ranking.api import csv_of
+from app.evaluation.ranking.export import csv_of
 from app.evaluation.schemas import DECISION_NAMES, RANKING_KINDS, RankingFilter, RankingOut
 from app.learning.snapshots.service import not_ready
 from app.platform.database import Db

@@ -1,31 +1,91 @@
-"""What a recording seems to be, by plain rules, each with the sentence that says why. A person confirms or corrects it."""
+"""What a recording seems to be, by plain rules, each guess with its evidence. A person confirms or corrects it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, date, datetime
-
-import numpy as np
-from numpy.typing import NDArray
+from enum import StrEnum
+from typing import Any
 
 from app.study.models import Controller, Visit
-from app.study.sessions.contradictions import Delivered
+from app.study.sessions.stimulation import Course, Delivered, Pattern, course
 
-CDBS_TOLERANCE = 0.05
-"""A constant amplitude within this share of the cDBS amplitude is taken for cDBS."""
-KNOWN_SHARE = 0.5
-"""Share of a session's steps whose amplitude must be known before anything is guessed from it."""
-NOT_TOLD = "the file tells no amplitude"
+
+class Source(StrEnum):
+    """Who or what says a value of a proposal."""
+
+    UPLOAD = "upload"
+    """The sender, with the upload."""
+    PERSON = "person"
+    """Somebody who corrected the proposal; `by` names them."""
+    CUT = "cut"
+    """Somebody who cut a recording into sessions."""
+    RECORDING = "recording"
+    """A rule that looked at the recording."""
+
+
+class Reason(StrEnum):
+    """Why a value is what it is; behind each the facts that a sentence about it needs."""
+
+    STATED = "stated"
+    """`by`, of a person; `open` where they left the value open."""
+    DAY_OF_VISIT = "day_of_visit"
+    """`day`, `visit`."""
+    NO_DATE = "no_date"
+    SEVERAL_VISITS = "several_visits"
+    """`day`, `visits`: how many."""
+    NO_VISIT_OF_DAY = "no_visit_of_day"
+    """`day`."""
+    AMPLITUDE = "amplitude"
+    """`courses`: one per side, as `Course.as_json`."""
+    UNREADABLE = "unreadable"
+    """`detail`."""
+    RECORDED_SIDE = "recorded_side"
+    NO_SIDE = "no_side"
+    CUT_OUT = "cut_out"
+    """`session`: of the proposal that was cut."""
+    SENTENCE = "sentence"
+    """`text`: stored before evidence had a shape."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Why one value of a proposal is what it is. `app.ingest.wording` puts it in words."""
+
+    source: Source
+    reason: Reason
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def stated(self) -> bool:
+        """Whether it is a person's word, which no guess replaces."""
+        return self.source is not Source.RECORDING
+
+    def as_json(self) -> dict[str, Any]:
+        """For storage."""
+        return {"source": self.source, "reason": self.reason, "facts": dict(self.facts)}
+
+    @classmethod
+    def from_json(cls, stored: Any) -> Evidence:
+        """Evidence as it was stored; a bare sentence is of a time when that was all, and a person's word began with "as stated" then."""
+        if isinstance(stored, str):
+            source = Source.PERSON if stored[:9] == "as stated" else Source.RECORDING
+            return cls(source, Reason.SENTENCE, {"text": stored})
+        return cls(Source(stored["source"]), Reason(stored["reason"]), stored["facts"])
+
+
+BY_UPLOAD = Evidence(Source.UPLOAD, Reason.STATED)
+BY_CUT = Evidence(Source.CUT, Reason.STATED)
 
 
 @dataclass(frozen=True)
 class VisitGuess:
-    """The visit that a recording belongs to; `open`: it is only kept there until a person says which."""
+    """The visit that a recording belongs to; `open`: it is only a place to store it until a person says which."""
 
     visit: Visit
     open: bool
-    why: str
+    why: Evidence
 
 
 def guess_visit(visits: Sequence[Visit], day: date | None, stated: Visit | None, today: date | None = None) -> VisitGuess:
@@ -36,64 +96,41 @@ def guess_visit(visits: Sequence[Visit], day: date | None, stated: Visit | None,
         day: on which the recording was made, by the clock of the place where its file tells it.
     """
     if stated is not None:
-        return VisitGuess(stated, False, "as stated with the upload")
-    if day is not None:
-        same = [v for v in visits if v.date == day]
-        if len(same) == 1:
-            return VisitGuess(same[0], False, f"recorded on {day}, the day of visit {same[0].number}")
+        return VisitGuess(stated, False, BY_UPLOAD)
+    same = [v for v in visits if v.date == day] if day is not None else []
+    if len(same) == 1:
+        return VisitGuess(same[0], False, _recorded(Reason.DAY_OF_VISIT, day, visit=same[0].number))
     today = today or datetime.now(UTC).date()
     past = [v for v in visits if v.date is None or v.date <= today]
     place = (past or list(visits))[-1]
     if day is None:
-        return VisitGuess(place, True, "the file tells no date: choose the visit")
+        return VisitGuess(place, True, Evidence(Source.RECORDING, Reason.NO_DATE))
     if len(same) > 1:
-        return VisitGuess(same[0], True, f"{len(same)} visits are dated {day}: choose one")
-    return VisitGuess(place, True, f"recorded on {day}, and no visit has that date: choose the visit, or add it")
+        return VisitGuess(same[0], True, _recorded(Reason.SEVERAL_VISITS, day, visits=len(same)))
+    return VisitGuess(place, True, _recorded(Reason.NO_VISIT_OF_DAY, day))
 
 
-def guess_controller(sides: Sequence[Delivered]) -> tuple[Controller | None, str]:
+def _recorded(reason: Reason, day: date | None, **facts: int) -> Evidence:
+    return Evidence(Source.RECORDING, reason, {"day": str(day), **facts})
+
+
+def guess_controller(sides: Sequence[Delivered]) -> tuple[Controller | None, Evidence]:
     """No DBS where no side was stimulated, cDBS where every side is constant at its cDBS amplitude, else left open; and why.
 
     Args:
         sides: of all recordings of the session. One whose amplitude is not known leaves the controller open.
     """
-    judged = [(side.name, *_judge(side)) for side in sides]
-    if len(judged) == 1:
-        return judged[0][1], judged[0][2]
-    if not judged:
-        return None, NOT_TOLD
-    guesses = {guess for _, guess, _ in judged}
-    said = "; ".join(f"{name}: {why}" for name, _, why in judged)
-    if len(guesses) == 1:
-        return guesses.pop(), said
-    return None, f"the sides do not agree, so that a person must say which controller it was ({said})"
+    courses = [course(side) for side in sides]
+    why = Evidence(Source.RECORDING, Reason.AMPLITUDE, {"courses": [c.as_json() for c in courses]})
+    return agreed(courses), why
 
 
-def _judge(side: Delivered) -> tuple[Controller | None, str]:
-    amount, fraction, in_ma = side.inside
-    scale, unit = (1.0, "mA") if in_ma else (100.0, "% of cDBS")
-    known = scale * amount[~np.isnan(amount)]
-    if known.size == 0:
-        return None, NOT_TOLD
-    if known.size < KNOWN_SHARE * amount.size:
-        return None, f"the amplitude is known in only {known.size} of {amount.size} steps"
-    low, high = float(known.min()), float(known.max())
-    if side.silent:
-        return Controller.NO_DBS, f"the amplitude is 0 in all {known.size} steps where it is known"
-    relative = fraction[~np.isnan(fraction)]
-    level = f"{float(np.median(known)):.3g} {unit}"
-    if relative.size and np.all(np.abs(relative - 1) <= CDBS_TOLERANCE + 1e-6):
-        cdbs_ma = side.table.cdbs_ma if side.table else None
-        against = f" of {cdbs_ma:.3g} mA" if cdbs_ma else ""
-        return Controller.CDBS, f"about {level} throughout, within {100 * CDBS_TOLERANCE:.0f} % of the cDBS amplitude{against}"
-    if not _constant(known):
-        return None, f"the amplitude varies between {low:.3g} and {high:.3g} {unit}: say which controller it was"
-    if relative.size == 0:
-        return None, f"the amplitude is constant at {level}, but no cDBS amplitude is stated to hold it against"
-    share = 100 * float(np.median(relative))
-    return None, f"the amplitude is constant at {level}, {share:.0f} % of the cDBS amplitude: say which controller it was"
+def agreed(courses: Sequence[Course]) -> Controller | None:
+    """The controller that every side speaks for; None where they do not agree, or leave it open."""
+    guesses = {c.controller for c in courses}
+    return guesses.pop() if len(guesses) == 1 else None
 
 
-def _constant(known: NDArray[np.float64]) -> bool:
-    middle = float(np.median(known))
-    return bool(np.all(np.abs(known - middle) <= CDBS_TOLERANCE * middle))
+def stored_courses(facts: Mapping[str, Any]) -> list[Course]:
+    """The courses of the amplitude in stored evidence."""
+    return [Course(**{**c, "pattern": Pattern(c["pattern"])}) for c in facts["courses"]]

@@ -23,7 +23,6 @@ LABELS = {
     "visit": "Visit", "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "from": "From", "to": "To",
     "started_at": "Start", "start_s": "From", "stop_s": "To",
 }  # fmt: skip
-FIELDS = ("visit", "controller", "policy", "hemisphere", "from", "to", "started_at")
 PARTS = 6
 """Rows of the form that cuts a recording; longer days are cut twice, or over the interface."""
 
@@ -34,7 +33,8 @@ class ProposalForm:
 
     Attributes:
         stored, typed: field to text, as stored and as the form shows it.
-        clocked: whether times are those of the wall; else minutes and seconds of the recording.
+        clocked: whether times are dates and times of day; else minutes and seconds of the recording.
+        why: by field, why it is proposed so.
         notes: contradictions that a person should look at.
         problem: why the form was refused.
     """
@@ -45,6 +45,7 @@ class ProposalForm:
     typed: Mapping[str, str]
     parts: list[dict[str, str]]
     clocked: bool
+    why: Mapping[str, str]
     notes: list[str]
     reason: str = ""
     problem: dict[str, Any] | None = None
@@ -182,5 +183,5 @@ def _clock(moment: datetime) -> str:
 
 
 def is_clocked(session: StudySession) -> bool:
-    """Whether the form shows times of the wall."""
+    """Whether the form shows dates and times of day."""
     return _begin(session) is not None

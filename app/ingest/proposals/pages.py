@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
-from app.ingest import repository
+from app.ingest import repository, wording
 from app.ingest.deps import CurrentProposal
 from app.ingest.models import SessionProposal
 from app.ingest.proposals import service as proposals
@@ -30,6 +30,7 @@ from app.study.deps import CurrentParticipant
 from app.study.models import Participant, StudySession
 from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions
+from app.study.wording import sentences
 
 router = APIRouter()
 
@@ -154,7 +155,7 @@ def _page(
         _form(request, db, s, behind[s.id], caller, refused.get(s.id), sent) for s in waiting[:SHOWN] if s.id in behind
     ]  # fmt: skip
     everyone = study.sessions_of_participant(db, participant.id, with_proposals=True)
-    fresh = [(s, contradictions(db, s)) for s in everyone if s.id in (confirmed or []) and s.status == "confirmed"]
+    fresh = [(s, sentences(contradictions(db, s))) for s in everyone if s.id in (confirmed or []) and s.status == "confirmed"]
     page = render(
         request,
         "ingest/proposals.html",
@@ -193,7 +194,8 @@ def _form(
         {**stored, **own_texts(sent, session.id, stored)} if error else stored,
         typed_parts(sent if error else {}, session.id),
         is_clocked(session),
-        contradictions(db, session, proposal.visit_open),
+        wording.reasons(proposal.evidence),
+        sentences(contradictions(db, session, proposal.visit_open)),
         sent.get(f"reason-{session.id}", "") if error else "",
         error.problem(request.url.path) if error else None,
     )

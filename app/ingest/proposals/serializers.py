@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.ingest import repository
+from app.ingest import repository, wording
 from app.ingest.models import SessionProposal
 from app.ingest.schemas import (
     PartOut,
@@ -30,7 +30,7 @@ def proposal_out(session: StudySession, row: SessionProposal, caller: Caller) ->
         version=row.version,
         upload_id=row.upload_id,
         visit_open=row.visit_open,
-        evidence=row.evidence,
+        evidence=wording.reasons(row.evidence),
         changed_by=row.changed_by,
         parts=[
             PartOut(

@@ -11,11 +11,11 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
-from app.ingest import repository, sessions
+from app.ingest import repository, sessions, wording
 from app.ingest.models import SessionProposal, Upload
-from app.ingest.proposals.evidence import guess_controller, guess_visit
+from app.ingest.proposals.evidence import BY_CUT, BY_UPLOAD, Evidence, Reason, Source, guess_controller, guess_visit
 from app.ingest.schemas import PartIn, ProposalChange
-from app.ingest.sessions import Laid, StatedSession, add_session, set_segments
+from app.ingest.sessions import Placement, StatedSession, add_session, set_segments
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
@@ -24,17 +24,16 @@ from app.study import repository as study
 from app.study import service as study_service
 from app.study.models import Controller, Participant, Recording, StudySession
 from app.study.service import POLICY_CONTROLLERS
-from app.study.sessions.contradictions import contradictions, control_recording, delivered, local_day
+from app.study.sessions.contradictions import contradictions, control_recording, local_day
+from app.study.sessions.stimulation import delivered
+from app.study.wording import sentences
 
-STATED = "as stated"
-"""Evidence that begins so is a person's word, which no guess replaces."""
-AS_STATED = f"{STATED} with the upload"
 RESTS_ON = frozenset({"visit", "hemisphere", "start_s", "stop_s", "started_at", "controller"})
 """Fields of a correction after which a guessed controller is guessed anew."""
 
 
 @dataclass(frozen=True)
-class Made:
+class NewSession:
     """A session that came out of an upload.
 
     Attributes:
@@ -49,63 +48,76 @@ class Made:
 
 def make_sessions(
     db: Session, participant: Participant, upload: Upload, recordings: Sequence[Recording], stated: StatedSession
-) -> list[Made]:
+) -> list[NewSession]:
     """Sessions of recordings that have none: confirmed where the sender stated visit and controller and says so, else proposed."""
     usable = [r for r in recordings if sessions.makes_session(study.traces_of_recording(db, r.id), r)]
     groups = sessions.together(usable)
     return [_make(db, participant, upload, group, stated, alone=len(groups) == 1) for group in groups]
 
 
-def _make(db: Session, participant: Participant, upload: Upload, group: list[Recording], stated: StatedSession, alone: bool) -> Made:
+def _make(db: Session, participant: Participant, upload: Upload, group: list[Recording], stated: StatedSession, alone: bool) -> NewSession:
     if (joined := _join_earlier(db, participant, group, stated)) is not None:
         return joined
-    laid = sessions.lay(db, participant, group, stated, alone)
-    day = local_day(laid.control, laid.started_at)[0] if laid.started_at else None
+    placement = sessions.place(db, participant, group, stated, alone)
+    day = local_day(placement.control, placement.started_at) if placement.started_at else None
     guess = guess_visit(study.visits(db, participant.id, 1000, 0)[0], day, stated.visit)
-    session = add_session(db, guess.visit, laid, stated.controller, stated.policy_id, stated.hemisphere, stated.counts)
+    session = add_session(db, guess.visit, placement, stated.controller, stated.policy_id, stated.hemisphere, stated.counts)
     length = f"{session.duration_s / 60:.1f} min" if session.duration_s else "no data"
-    seen = _seen(session, laid)
+    seen = _seen(session, placement)
     if stated.counts:
-        said = f"Session {session.id}: visit {guess.visit.number}, {stated.controller}, {length}, {seen} (recording {laid.control.id})."
-        flagged = [*laid.notes, *sessions.fix_milliamperes(db, session), *contradictions(db, session)]
-        return Made(session, group, [said, *outcomes_intake.derive(db, session)], flagged)
-    evidence = {"visit": guess.why, "controller": AS_STATED}
+        said = (
+            f"Session {session.id}: visit {guess.visit.number}, {stated.controller}, {length}, {seen} (recording {placement.control.id})."
+        )
+        flagged = [*placement.notes, *sessions.fix_milliamperes(db, session), *sentences(contradictions(db, session))]
+        return NewSession(session, group, [said, *outcomes_intake.derive(db, session)], flagged)
+    evidence = {"visit": guess.why, "controller": BY_UPLOAD}
     controller = stated.controller
     if controller is None:
         controller, evidence["controller"] = _guess_controller(db, session)
         blinding.assign(session, controller, stated.policy_id if controller in POLICY_CONTROLLERS else None)
-    of_recording = "of the recording that a controller could have seen" if session.hemisphere else "the file tells no side"
-    evidence["hemisphere"] = AS_STATED if stated.hemisphere else of_recording
+    of_recording = Evidence(Source.RECORDING, Reason.RECORDED_SIDE if session.hemisphere else Reason.NO_SIDE)
+    evidence["hemisphere"] = BY_UPLOAD if stated.hemisphere else of_recording
     proposal = SessionProposal(
-        session_id=session.id, upload_id=upload.id, visit_open=guess.open, evidence=evidence, changed_by=upload.created_by, version=1
+        session_id=session.id,
+        upload_id=upload.id,
+        visit_open=guess.open,
+        evidence={name: e.as_json() for name, e in evidence.items()},
+        changed_by=upload.created_by,
+        version=1,
     )
     db.add(proposal)
     db.flush()
     said = (
         f"Proposed session {session.id}, which counts nowhere until it is confirmed: "
-        f"{'visit open' if guess.open else f'visit {guess.visit.number}'} ({guess.why}), "
-        f"{controller or 'controller open'} ({evidence['controller']}), {length}, {seen}."
+        f"{'visit open' if guess.open else f'visit {guess.visit.number}'} ({wording.reason(guess.why)}), "
+        f"{controller or 'controller open'} ({wording.reason(evidence['controller'])}), {length}, {seen}."
     )
-    return Made(session, group, [said], [*laid.notes, *contradictions(db, session, guess.open)])
+    return NewSession(session, group, [said], [*placement.notes, *sentences(contradictions(db, session, guess.open))])
 
 
-def _seen(session: StudySession, laid: Laid) -> str:
+def _seen(session: StudySession, placement: Placement) -> str:
     """Which trace of which side the controller is taken to have seen, in words."""
     trace = f"{session.control_stream} {session.control_channel or ''}".strip()
-    others = [r for r in laid.recordings if r is not laid.control]
-    side = f" of the {laid.control.hemisphere} side" if laid.control.hemisphere else f" of recording {laid.control.id}" if others else ""
+    others = [r for r in placement.recordings if r is not placement.control]
+    side = (
+        f" of the {placement.control.hemisphere} side"
+        if placement.control.hemisphere
+        else f" of recording {placement.control.id}"
+        if others
+        else ""
+    )
     beside = [f"the {r.hemisphere} side" if r.hemisphere else f"recording {r.id}" for r in others]
     return f"controlled by {trace}{side}" + (f", recorded together with {' and '.join(beside)}" if beside else "")
 
 
-def _guess_controller(db: Session, session: StudySession) -> tuple[Controller | None, str]:
+def _guess_controller(db: Session, session: StudySession) -> tuple[Controller | None, Evidence]:
     try:
         return guess_controller(delivered(db, session))
     except Invalid as error:
-        return None, f"its steps cannot be read: {error.detail}"
+        return None, Evidence(Source.RECORDING, Reason.UNREADABLE, {"detail": error.detail})
 
 
-def _join_earlier(db: Session, participant: Participant, group: list[Recording], stated: StatedSession) -> Made | None:
+def _join_earlier(db: Session, participant: Participant, group: list[Recording], stated: StatedSession) -> NewSession | None:
     """The sessions of earlier uploads that these recordings share their time with (the other implant came first), if there are any.
 
     A confirmed session gets them beside its controlled recording: nothing that counts changes.
@@ -114,23 +126,23 @@ def _join_earlier(db: Session, participant: Participant, group: list[Recording],
     if first.started_at is None:
         return None
     end = first.started_at + timedelta(seconds=first.duration_s)
-    made: Made | None = None
+    found: NewSession | None = None
     for session in repository.overlapping_sessions(db, participant.id, first.started_at, end):
         known = [s.recording for s in session.segments]
         if any(r.device_id == k.device_id for r in group for k in known) or len(sessions.together([*known, *group])) != 1:
             continue
         control = next(s for s in session.segments if s.is_control)
-        laid = _as_laid(session, control.start_s, control.stop_s)
+        placement = _placement(session, control.start_s, control.stop_s)
         period_s = participant.current_settings.period_s
-        added = [sessions.add_beside(session, r, laid, period_s) for r in group]
+        added = [sessions.add_beside(session, r, placement, period_s) for r in group]
         if not any(added):
             continue
         db.flush()
         said, flagged = _joined(db, session, stated)
-        made = Made(session, group, [], []) if made is None else made
-        made.understood.append(said)
-        made.flagged.extend(flagged)
-    return made
+        found = NewSession(session, group, [], []) if found is None else found
+        found.understood.append(said)
+        found.flagged.extend(flagged)
+    return found
 
 
 def _joined(db: Session, session: StudySession, stated: StatedSession) -> tuple[str, list[str]]:
@@ -139,13 +151,13 @@ def _joined(db: Session, session: StudySession, stated: StatedSession) -> tuple[
     if session.status == "confirmed":
         side = f" ({control_recording(session).hemisphere} side)" if control_recording(session).hemisphere else ""
         said = f"Recorded at the same time as session {session.id}, which counts already: added to it beside its controlled recording"
-        return f"{said}{side}.", [*differs, *contradictions(db, session)]
+        return f"{said}{side}.", [*differs, *sentences(contradictions(db, session))]
     proposal = repository.proposals(db, [session.id])[session.id]
     proposal.version += 1
     _renew_guess(db, session, proposal)
     db.flush()
     said = f"Recorded at the same time as proposed session {session.id}, which counts nowhere until it is confirmed"
-    return f"{said}: it belongs to that session.", [*differs, *contradictions(db, session, proposal.visit_open)]
+    return f"{said}: it belongs to that session.", [*differs, *sentences(contradictions(db, session, proposal.visit_open))]
 
 
 def _renew_guess(db: Session, session: StudySession, proposal: SessionProposal, keep: bool = False) -> None:
@@ -154,11 +166,11 @@ def _renew_guess(db: Session, session: StudySession, proposal: SessionProposal, 
     Args:
         keep: leave the controller, for somebody confirms it as it stands, and renew the reason alone.
     """
-    if str(proposal.evidence.get("controller", "")).startswith(STATED):
+    if "controller" in proposal.evidence and Evidence.from_json(proposal.evidence["controller"]).stated:
         return
     arm = blinding.stated_arm(session, SYSTEM)
     controller, why = _guess_controller(db, session)
-    proposal.evidence = {**proposal.evidence, "controller": why}
+    proposal.evidence = {**proposal.evidence, "controller": why.as_json()}
     if not keep and controller != (arm.controller if arm else None):
         kept = arm.policy_id if arm and controller in POLICY_CONTROLLERS else None
         blinding.assign(session, controller, kept)
@@ -183,10 +195,10 @@ def _correct(db: Session, session: StudySession, wanted: ProposalChange, caller:
         _choose_side(db, session, given)
     if {"start_s", "stop_s", "started_at"} & given.keys():
         _choose_part(session, given)
-    told = {name: f"{STATED} by {caller.label}" for name in ("visit", "controller", "hemisphere") if given.get(name) is not None}
+    stated = {name: _by(caller) for name in ("visit", "controller", "hemisphere") if given.get(name) is not None}
     if "controller" in given and given["controller"] is None:
-        told["controller"] = f"{STATED} by {caller.label}: open"
-    proposal.evidence = {**proposal.evidence, **told}
+        stated["controller"] = _by(caller, open=True)
+    proposal.evidence = {**proposal.evidence, **{name: e.as_json() for name, e in stated.items()}}
     if RESTS_ON & given.keys():
         db.flush()
         _renew_guess(db, session, proposal, keep=confirming)
@@ -194,6 +206,11 @@ def _correct(db: Session, session: StudySession, wanted: ProposalChange, caller:
     proposal.changed_by = caller.label
     db.flush()
     return proposal
+
+
+def _by(caller: Caller, **facts: bool) -> Evidence:
+    """The word of the person who corrects a proposal."""
+    return Evidence(Source.PERSON, Reason.STATED, {"by": caller.label, **facts})
 
 
 def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: Caller) -> list[str]:
@@ -208,12 +225,13 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
     proposal = _correct(db, session, wanted, caller, confirming=True)
     missing = [name for name, open_ in (("visit", proposal.visit_open), ("controller", _controller(session, caller) is None)) if open_]
     if missing:
-        why = "; ".join(f"{name}: {proposal.evidence.get(name, 'nobody stated it')}" for name in missing)
+        known = wording.reasons(proposal.evidence)
+        why = "; ".join(f"{name}: {known.get(name, 'nobody stated it')}" for name in missing)
         raise Invalid(f"Session {session.id} cannot be confirmed yet: its {' and '.join(missing)} is open ({why}).", "State it.")
     sessions.refuse_overlap(db, session)
     session.status = "confirmed"
     db.flush()
-    return [*sessions.fix_milliamperes(db, session), *contradictions(db, session), *outcomes_intake.derive(db, session)]
+    return [*sessions.fix_milliamperes(db, session), *sentences(contradictions(db, session)), *outcomes_intake.derive(db, session)]
 
 
 def split(db: Session, session: StudySession, version: int, parts: Sequence[PartIn], caller: Caller) -> list[StudySession]:
@@ -230,14 +248,15 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
     arm = blinding.stated_arm(session, caller)
     made = []
     for part in sorted(parts, key=lambda p: p.start_s):
-        laid = _as_laid(session, *_on_grid(session, part.start_s, part.stop_s))
-        new = add_session(db, session.visit, laid, part.controller, None, session.hemisphere, counts=False)
-        why = f"{STATED} when the recording was cut"
+        placement = _placement(session, *_on_grid(session, part.start_s, part.stop_s))
+        new = add_session(db, session.visit, placement, part.controller, None, session.hemisphere, counts=False)
+        why = BY_CUT
         if part.controller is None:
             guessed, why = _guess_controller(db, new)
             policy_id = arm.policy_id if arm and guessed == arm.controller else None
             blinding.assign(new, guessed, policy_id)
-        evidence = {**proposal.evidence, "controller": why, "part": f"cut out of proposed session {session.id}"}
+        part_of = Evidence(Source.CUT, Reason.CUT_OUT, {"session": session.id})
+        evidence = {**proposal.evidence, "controller": why.as_json(), "part": part_of.as_json()}
         db.add(
             SessionProposal(
                 session_id=new.id,
@@ -324,11 +343,11 @@ def _choose_side(db: Session, session: StudySession, given: dict[str, object]) -
     other = next((s for s in session.segments if s.recording.hemisphere == side), None)
     if side is None or other is None or other.recording_id == control.recording_id:
         return
-    laid = sessions.lay(db, session.visit.participant, [other.recording], StatedSession(started_at=session.started_at), alone=True)
-    laid.stop_s = min(laid.start_s + session.duration_s, laid.control.duration_s)
-    laid.recordings = list(dict.fromkeys(s.recording for s in session.segments))
-    session.control_stream, session.control_channel = laid.stream, laid.channel
-    _relay(session, laid)
+    placement = sessions.place(db, session.visit.participant, [other.recording], StatedSession(started_at=session.started_at), alone=True)
+    placement.stop_s = min(placement.start_s + session.duration_s, placement.control.duration_s)
+    placement.recordings = list(dict.fromkeys(s.recording for s in session.segments))
+    session.control_stream, session.control_channel = placement.stream, placement.channel
+    _move(session, placement)
 
 
 def _choose_part(session: StudySession, given: dict[str, object]) -> None:
@@ -339,15 +358,15 @@ def _choose_part(session: StudySession, given: dict[str, object]) -> None:
     end = float(stop_s) if isinstance(stop_s, int | float) else control.stop_s
     if started_at is not None and control.recording.started_at is not None:
         begin = (started_at - control.recording.started_at).total_seconds()  # type: ignore[operator]
-    laid = _as_laid(session, *_on_grid(session, begin, end))
+    placement = _placement(session, *_on_grid(session, begin, end))
     if control.recording.started_at is None and "started_at" in given:
-        laid.started_at = started_at  # type: ignore[assignment]
-    _relay(session, laid)
+        placement.started_at = started_at  # type: ignore[assignment]
+    _move(session, placement)
 
 
-def _relay(session: StudySession, laid: Laid) -> None:
-    set_segments(session, laid, session.visit.participant.current_settings.period_s)
-    session.started_at, session.duration_s = laid.started_at, laid.stop_s - laid.start_s
+def _move(session: StudySession, placement: Placement) -> None:
+    set_segments(session, placement, session.visit.participant.current_settings.period_s)
+    session.started_at, session.duration_s = placement.started_at, placement.stop_s - placement.start_s
 
 
 def _on_grid(session: StudySession, start_s: float, stop_s: float) -> tuple[float, float]:
@@ -364,10 +383,10 @@ def _on_grid(session: StudySession, start_s: float, stop_s: float) -> tuple[floa
     return start, stop
 
 
-def _as_laid(session: StudySession, start_s: float, stop_s: float) -> Laid:
-    """A session's recordings, laid on another part of its control recording."""
+def _placement(session: StudySession, start_s: float, stop_s: float) -> Placement:
+    """A session's recordings, placement on another part of its control recording."""
     control = next(s for s in session.segments if s.is_control)
     recordings = list(dict.fromkeys(s.recording for s in session.segments))
     # a stated start may differ from the device's clock: the session's own start is what moves
     started_at = session.started_at + timedelta(seconds=start_s - control.start_s) if session.started_at is not None else None
-    return Laid(control.recording, recordings, start_s, stop_s, started_at, session.control_stream, session.control_channel)
+    return Placement(control.recording, recordings, start_s, stop_s, started_at, session.control_stream, session.control_channel)

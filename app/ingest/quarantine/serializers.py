@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fastapi import Response
 
+from app.ingest import wording
 from app.ingest.models import UploadFile
 from app.ingest.schemas import QuarantinedOut
 from app.ingest.uploads import service
@@ -23,7 +24,7 @@ def problem_of(file: UploadFile) -> str:
     """Why a file could not be read, in the words that may be stored."""
     reports = service.stored_reports(file)
     found = [f"{r.problem.what} ({r.problem.where})" for r in reports if r.problem]
-    return "; ".join(found or [s for r in reports for s in r.flagged if s.startswith("kept encrypted")])
+    return "; ".join(found or wording.unreadable(service.unreadable_members(file)))
 
 
 def quarantined_out(file: UploadFile) -> QuarantinedOut:

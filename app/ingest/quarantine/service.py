@@ -19,7 +19,7 @@ from app.accounts.permissions import Caller
 from app.ingest import encryption, repository
 from app.ingest.models import UploadFile
 from app.ingest.uploads import service
-from app.ingest.uploads.receiving import ASIDE, MEDIA_TYPE, BetaStated, Kept, Receiver
+from app.ingest.uploads.receiving import ASIDE, MEDIA_TYPE, BetaStated, Receiver, StoredContent
 from app.ingest.uploads.service import UploadOutcome
 from app.platform import files
 from app.platform.database import now, set_reason
@@ -68,14 +68,14 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
             clean.unlink(missing_ok=True)
             if not isinstance(error, UndecodableFile):
                 raise
-            raise Invalid(f"It still cannot be read: {error.stored_what} ({error.stored_where}).", error.mend) from error
+            raise Invalid(f"It still cannot be read: {error.stored_what} ({error.stored_where}).", error.hint) from error
     sealed = file.quarantine_sha256
     stored = files.store(db, clean, MEDIA_TYPE).sha256
     file.kind, file.stored_sha256, file.redactor_version = kind, stored, REDACTOR_VERSION
     _decide(db, file, reason, caller)
     db.commit()
-    kept = Kept(kind, stored, sealed if redaction.unreadable else None, redaction, None)
-    outcome = UploadOutcome(upload, participant, [Receiver(db, participant, upload, options, beta).decode(file.name, file, kept)])
+    content = StoredContent(kind, stored, sealed if redaction.unreadable else None, redaction, None)
+    outcome = UploadOutcome(upload, participant, [Receiver(db, participant, upload, options, beta).decode(file.name, file, content)])
     if file.status == "decoded":
         service.make_sessions(db, outcome, service.as_stated(db, participant, said))
         if not redaction.unreadable:
@@ -139,8 +139,8 @@ def _original(file: UploadFile) -> Iterator[Path]:
             for chunk in encryption.decrypt(files.path_of(file.quarantine_sha256)):
                 files.write_all(out, chunk)
         except (InvalidToken, OSError) as error:
-            mend = "Restore the data folder, with its keys, from a backup."
-            raise Conflict(f"The encrypted bytes of file {file.id} are missing or damaged.", mend) from error
+            hint = "Restore the data folder, with its keys, from a backup."
+            raise Conflict(f"The encrypted bytes of file {file.id} are missing or damaged.", hint) from error
         if files.hash_file(raw)[0] != file.report.get(ASIDE, file.original_sha256):
             raise Conflict(f"The bytes of file {file.id} are not those that came: their hash differs.", "Restore a backup.")
         yield raw

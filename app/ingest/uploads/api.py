@@ -79,7 +79,7 @@ def read_upload(upload_id: RowId, db: Db, caller: CurrentCaller) -> UploadOut:
 
 
 def unusable(outcome: UploadOutcome) -> UnusableUpload:
-    """The problem document of an upload of which nothing can be used: the first file, the place, the mend; and every report."""
+    """The problem document of an upload of which nothing can be used: the first file, the place, the hint; and every report."""
     first = next((r for r in outcome.reports_for_sender if r.problem), None)
     reports = [FileReportOut.model_validate(r).model_dump() for r in outcome.reports_for_sender]
     if first is None or first.problem is None:
@@ -90,7 +90,7 @@ def unusable(outcome: UploadOutcome) -> UnusableUpload:
     what = f"{first.name}: {first.problem.what} ({first.problem.where}). {'The file is kept.' if kept else 'Nothing of it was kept.'}"
     return UnusableUpload(
         " ".join([*together, what]),
-        first.problem.mend,
+        first.problem.hint,
         file=first.name,
         where=first.problem.where,
         upload_id=outcome.upload.id,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from sqlalchemy import NullPool, create_engine, select, text
+from sqlalchemy import NullPool, create_engine, text
 from sqlalchemy.orm import Session
 
-from app.ingest.models import Upload
+from app.ingest import repository
 from app.platform.database import database_url
 
 LOCKS = 0x75706C64
@@ -32,6 +32,5 @@ def in_progress(upload_id: int) -> Iterator[None]:
 
 def interrupted(db: Session) -> list[int]:
     """Numbers of the uploads that were begun and that nobody is receiving, oldest first."""
-    begun = db.scalars(select(Upload.id).where(Upload.status == "received").order_by(Upload.id)).all()
     free = text("select pg_try_advisory_xact_lock(:space, :upload)")
-    return [i for i in begun if db.scalar(free, {"space": LOCKS, "upload": i})]
+    return [i for i in repository.unfinished_uploads(db) if db.scalar(free, {"space": LOCKS, "upload": i})]

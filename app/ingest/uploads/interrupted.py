@@ -1,4 +1,4 @@
-"""Uploads that a stop of the service cut short, taken up from the bytes that were kept."""
+"""Uploads that a stop of the service cut short, resumed from the bytes that were stored."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ log = structlog.get_logger()
 
 
 @dataclass(frozen=True)
-class TakenUp:
-    """An upload that was interrupted; what became of it, in words; whether that worked."""
+class ResumedUpload:
+    """An upload that was interrupted; what became of it; whether that worked."""
 
     upload_id: int
-    said: str
+    message: str
     done: bool
 
 
-def take_up(actor: str) -> Iterator[TakenUp]:
+def resume(actor: str) -> Iterator[ResumedUpload]:
     """Read the kept files of interrupted uploads and make or propose their sessions, each upload by itself; yields as it goes.
 
     A file of which not all bytes had come is not there: its sender saw the upload fail, and sends it again.
@@ -43,22 +43,22 @@ def take_up(actor: str) -> Iterator[TakenUp]:
     for upload_id in found:
         try:
             with in_progress(upload_id), transaction(actor) as db:
-                taken = TakenUp(upload_id, _take_up(db, upload_id), True)
+                resumed = ResumedUpload(upload_id, _resume(db, upload_id), True)
         except Exception as fault:
-            # one upload that cannot be read must not keep the others from being taken up; it stays as it is
-            log.exception("interrupted upload could not be taken up", upload=upload_id, fault=repr(fault))
-            taken = TakenUp(upload_id, f"it could not be taken up: {fault}", False)
-        yield taken
+            # one upload that cannot be read must not keep the others from being resumed; it stays as it is
+            log.exception("interrupted upload could not be resumed", upload=upload_id, fault=repr(fault))
+            resumed = ResumedUpload(upload_id, f"it could not be resumed: {fault}", False)
+        yield resumed
 
 
-def _take_up(db: Session, upload_id: int) -> str:
+def _resume(db: Session, upload_id: int) -> str:
     upload = db.get_one(Upload, upload_id)
     if upload.status != "received":
         return "it was finished meanwhile"
     participant, said = db.get_one(Participant, upload.participant_id), upload.stated
     beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
     receiver = Receiver(db, participant, upload, service.decode_options(participant, beta), beta)
-    outcome = UploadOutcome(upload, participant, [receiver.take_up(row) for row in list(upload.files)])
+    outcome = UploadOutcome(upload, participant, [receiver.resume(row) for row in list(upload.files)])
     try:
         stated = service.as_stated(db, participant, said)
     except Invalid:

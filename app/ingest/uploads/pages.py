@@ -28,7 +28,7 @@ from app.study.blinding import CONTROLLER_NAMES
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.schemas import BetaSource
-from app.study.settings_form import SOURCES
+from app.study.settings.form import SOURCES
 
 router = APIRouter(route_class=UploadRoute)
 

@@ -126,7 +126,7 @@ def _device(db: Session, participant: Participant, decoded: RecordingLog) -> Dev
     name = pseudonym(decoded.device_key, get_settings().secret("pseudonyms")) if decoded.device_key else decoded.kind
     device = repository.device(db, participant.id, name)
     if device is None:
-        device = Device(participant_id=participant.id, pseudonym=name, kind=decoded.kind, hemisphere=decoded.hemisphere)
+        device = Device(participant_id=participant.id, pseudonym=name, kind=decoded.kind)
         db.add(device)
         db.flush()
     return device

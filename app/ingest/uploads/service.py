@@ -28,6 +28,7 @@ from app.ingest.uploads.receiving import (
     known_recordings,
     store_reports,
     stored_reports,
+    unreadable_members,
 )
 from app.platform import files
 from app.platform.errors import BetaloopError, Conflict, Invalid, TooLarge
@@ -40,7 +41,7 @@ from ml.formats import FileKind
 from ml.formats.options import BetaMeasure, DecodeOptions
 from ml.formats.recording import FileReport, Problem, UndecodableFile
 
-__all__ = ["BetaStated", "FileOutcome", "Incoming", "UploadOutcome", "receive", "state_session", "stored_reports"]
+__all__ = ["BetaStated", "FileOutcome", "Incoming", "UploadOutcome", "receive", "state_session", "stored_reports", "unreadable_members"]
 
 log = structlog.get_logger()
 
@@ -151,8 +152,7 @@ def receive(
         raise Invalid("The upload holds no file.", "Choose at least one file.")
     beta = beta or BetaStated()
     said = _said(stated, beta)
-    visit_id = stated.visit.id if stated.visit else None
-    upload = Upload(participant_id=participant.id, visit_id=visit_id, created_by=caller.label, report=[], stated=said)
+    upload = Upload(participant_id=participant.id, created_by=caller.label, stated=said)
     db.add(upload)
     db.flush()
     with in_progress(upload.id):
@@ -165,7 +165,7 @@ def receive(
                 outcome.files.append(receiver.receive(one))
             except TooLarge as error:
                 refused.append(error)
-                problem = Problem(error.detail, "file", f"It was not kept. {error.mend}")
+                problem = Problem(error.detail, "file", f"It was not kept. {error.hint}")
                 outcome.asides.append(FileReport(one.name, problem=problem))
         if refused and not outcome.files:
             raise refused[0]
@@ -188,7 +188,6 @@ def finish(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
     # a file that came before has its row in another upload; this one only points at it
     earlier = [o.row.id for o in outcome.files if o.same_bytes]
     upload.stated = {**upload.stated, "duplicates": earlier}
-    upload.report = [asdict(r) for o in outcome.files for r in o.reports]
     upload.status = "decoded" if outcome.usable else "failed"
     db.commit()
 
@@ -223,28 +222,28 @@ def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) ->
     with_recordings = [f for f in outcome.files if f.recordings]
     known = {r.id: list(study.session_ids_of_recording(db, r.id)) for f in with_recordings for r in f.recordings}
     fresh = {r.id: r for f in with_recordings for r in f.recordings if not known[r.id]}
-    made: list[proposals.Made] = []
+    created: list[proposals.NewSession] = []
     trouble = ""
     try:
         with db.begin_nested():
-            made = proposals.make_sessions(db, outcome.participant, outcome.upload, list(fresh.values()), stated)
+            created = proposals.make_sessions(db, outcome.participant, outcome.upload, list(fresh.values()), stated)
     except Exception as fault:
         # the recordings are stored and safe; a fault of ours must not turn a whole upload away
         log.exception("sessions could not be made", upload=outcome.upload.id, fault=repr(fault))
         trouble = f"No session could be made of it. It is stored; tell your administrator: upload {outcome.upload.id}."
-    told: set[int] = set()
+    reported: set[int] = set()
     for file in with_recordings:
         mine = {r.id for r in file.recordings}
-        if mine <= told:
-            _tell_copy(db, file, mine)
+        if mine <= reported:
+            _report_copy(db, file, mine)
             continue
-        told |= mine
+        reported |= mine
         earlier = sorted({i for r in mine for i in known[r]})
         if earlier and not file.same_bytes:
             listed = ", ".join(map(str, earlier))
             file.reports[0].understood.append(f"The same recording came before in another file; it stays session {listed}.")
         file.reports[0].flagged.extend(sessions.disagreements(db, earlier, stated))
-        ours = [m for m in made if any(r.id in mine for r in m.recordings)]
+        ours = [m for m in created if any(r.id in mine for r in m.recordings)]
         if file.same_bytes:
             anew = "It has no session any more: it is proposed anew." if ours else "Nothing was changed."
             file.reports[0].understood.append(anew)
@@ -258,7 +257,7 @@ def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) ->
         _keep_reports(file)
 
 
-def _tell_copy(db: Session, file: FileOutcome, recordings: set[int]) -> None:
+def _report_copy(db: Session, file: FileOutcome, recordings: set[int]) -> None:
     """Of a further copy of what this upload holds already, only that it is one, and where it is."""
     file.session_ids = sorted({i for r in recordings for i in study.session_ids_of_recording(db, r)})
     where = f"; it is session {', '.join(map(str, file.session_ids))}" if file.session_ids else ""
@@ -313,7 +312,7 @@ def attach_grasps(db: Session, file: UploadFile, session: StudySession) -> list[
     try:
         decoded = formats.decode(files.path_of(file.stored_sha256), cast(FileKind, file.kind), DecodeOptions(), name=file.name)
     except UndecodableFile as error:
-        raise Invalid(f"File {file.id} cannot be read any more: {error.what} ({error.where}).", error.mend) from error
+        raise Invalid(f"File {file.id} cannot be read any more: {error.what} ({error.where}).", error.hint) from error
     return outcomes_intake.take_grasps(db, file, decoded.grasps, session)
 
 

@@ -14,7 +14,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
@@ -124,7 +123,7 @@ def collect(db: Session, participant: Participant) -> Collection:
         raise Invalid(
             f"Participant {participant.code} has no session that can enter a replay buffer"
             + (f": {listed}." if listed else ": no confirmed session at all."),
-            "Upload sessions with a beta trace and an amplitude trace, or mend what is named.",
+            "Upload sessions with a beta trace and an amplitude trace, or correct what is named.",
         )
     return Collection(version, settings, members, unit, source)
 
@@ -152,22 +151,18 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
     if known is not None:
         return known
     stored = files.store(db, to_parquet(found.buffer), PARQUET)
-    row_id = db.scalar(
-        insert(BufferSnapshot)
-        .values(
-            participant_id=participant.id,
-            settings_version_id=found.settings_version.id,
-            pins_sha256=found.pins_sha256,
-            file_sha256=stored.sha256,
-            sessions=len(found.buffer.sessions),
-            steps=sum(m.steps or 0 for m in found.members),
-            median_steps=found.buffer.median_steps(),
-            beta_unit=found.beta_unit,
-            beta_source=found.beta_source,
-            created_by=caller.label,
-        )
-        .on_conflict_do_nothing(index_elements=["participant_id", "pins_sha256"])
-        .returning(BufferSnapshot.id)
+    row_id = repository.add_snapshot(
+        db,
+        participant_id=participant.id,
+        settings_version_id=found.settings_version.id,
+        pins_sha256=found.pins_sha256,
+        file_sha256=stored.sha256,
+        sessions=len(found.buffer.sessions),
+        steps=sum(m.steps or 0 for m in found.members),
+        median_steps=found.buffer.median_steps(),
+        beta_unit=found.beta_unit,
+        beta_source=found.beta_source,
+        created_by=caller.label,
     )
     if row_id is None:
         other = repository.snapshot_by_pins(db, participant.id, found.pins_sha256)

@@ -24,9 +24,10 @@ from app.platform import files
 from app.platform.database import set_reason
 from app.platform.errors import Forbidden, Invalid
 from app.settings import get_settings
+from app.study import cdbs_amplitude
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.models import Hemisphere, Participant, Visit
+from app.study.models import Hemisphere, Participant
 from ml.deploy.bundle import build_bundle, describe, sign
 from ml.deploy.manifest import Approval, BundleError, BundleManifest
 from ml.policies.onnx_policy import PolicyFileError
@@ -144,20 +145,6 @@ def approvals(db: Session, participant_id: int, policy_id: int) -> tuple[Approva
     )
 
 
-def present_cdbs_ma(participant: Participant, hemisphere: Hemisphere | None) -> float:
-    """The cDBS amplitude in force now: the newest visit that states one (of this hemisphere), else the settings' shorthand."""
-    for visit in sorted(participant.visits, key=_visit_number, reverse=True):
-        stated = {a.amplitude_ma for a in visit.cdbs_amplitudes if hemisphere in (None, a.hemisphere)}
-        if len(stated) == 1:
-            return stated.pop()
-        if stated:
-            raise Invalid(f"Visit {visit.number} states several cDBS amplitudes.", "Name the hemisphere: left or right.")
-    shorthand = participant.current_settings.cdbs_amplitude_ma
-    if shorthand is None:
-        raise Invalid("The cDBS amplitude is not known.", "Set cdbs_amplitude_ma in the participant's settings or at a visit.")
-    return shorthand
-
-
 def _manifest(
     db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
 ) -> tuple[BundleManifest, NDArray[np.float64]]:
@@ -170,7 +157,7 @@ def _manifest(
     source = data.beta_source if data else version.beta_source
     if unit is None or source is None:
         raise Invalid("The unit and source of beta are not known.", "Set beta_unit and beta_source in the participant's settings.")
-    cdbs = present_cdbs_ma(participant, hemisphere)
+    cdbs = cdbs_amplitude.in_force_now(participant, hemisphere)
     device = device_limits(db, participant, hemisphere)
     usable = data if data and study_repository.settings_version(db, data.settings_version_id).window == version.window else None
     teacher = db.get(Policy, policy.teacher_id) if policy.teacher_id else None
@@ -216,7 +203,3 @@ def _manifest(
 
 def _unmade(policy: Policy, error: Exception) -> Invalid:
     return Invalid(f"The bundle of policy '{policy.name}' cannot be made: {error}.", "Correct what is named.")
-
-
-def _visit_number(visit: Visit) -> int:
-    return visit.number

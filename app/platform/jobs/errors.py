@@ -6,7 +6,7 @@ from app.platform.errors import BetaloopError
 
 
 class JobError(BetaloopError):
-    """An error in the user's words (what, where, how to mend it); its text is shown as it is."""
+    """An error in the user's words (what, where, what to do); its text is shown as it is."""
 
 
 class StepFailed(JobError):

@@ -61,6 +61,12 @@ def find(
     return list(db.scalars(newest)), total
 
 
+def of_kind(db: Session, participant_id: int, kind: str) -> Sequence[Job]:
+    """A participant's jobs of a kind, oldest first."""
+    query = select(Job).where(Job.participant_id == participant_id, Job.kind == kind)
+    return db.scalars(query.order_by(Job.created_at, Job.id)).all()
+
+
 def step(db: Session, job_id: str, key: str) -> JobStep:
     """A step of a job; it must have been declared."""
     return db.scalars(select(JobStep).where(JobStep.job_id == job_id, JobStep.key == key)).one()

@@ -49,7 +49,7 @@ async def _refuse(send: Send, path: str) -> None:
         "title": "The file is too large",
         "status": 413,
         "detail": f"The request is larger than {megabytes} MiB.",
-        "mend": "Split the upload, or have BETALOOP_UPLOAD_LIMIT_MB raised.",
+        "hint": "Split the upload, or have BETALOOP_UPLOAD_LIMIT_MB raised.",
         "instance": path,
     }
     headers = [(b"content-type", b"application/problem+json"), (b"connection", b"close")]

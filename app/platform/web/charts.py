@@ -60,7 +60,7 @@ def marker(controller: str, size: float = 8, **more: Any) -> dict[str, Any]:
 
 
 def figure(data: Sequence[Mapping[str, Any]], **layout: Any) -> dict[str, Any]:
-    """A Plotly figure in the house style; `layout` members override or add. NaN becomes null: a gap, never a zero."""
+    """A Plotly figure in the style of all charts; `layout` members override or add. NaN becomes null: a gap, never a zero."""
     base: dict[str, Any] = {
         "margin": {"l": 56, "r": 16, "t": 12, "b": 44},
         "paper_bgcolor": "rgba(0,0,0,0)",

@@ -130,5 +130,5 @@ async def _unknown_error(request: Request, error: Exception) -> Response:
     log.error("request failed", path=request.url.path, request_id=getattr(request.state, "request_id", None), exc_info=error)
     problem: Any = _PlainError(500, "Something went wrong on our side.")
     number = getattr(request.state, "request_id", "?")
-    problem.mend = f"Tell your administrator the request id {number}. Look at what is stored before you send anything again."
+    problem.hint = f"Tell your administrator the request id {number}. Look at what is stored before you send anything again."
     return _secured(request, _answer(request, problem))

@@ -83,7 +83,7 @@ class Problem(BaseModel):
     status: int
     detail: str
     instance: str
-    mend: str | None = None
+    hint: str | None = None
     errors: list[dict[str, Any]] | None = None
 
 

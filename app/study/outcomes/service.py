@@ -59,8 +59,8 @@ def store_tremor(
         db: the caller commits.
         participant_id, upload_file_id: whose minutes, and the file they came in.
         start_unix_s, duration_s: begin and length of each minute, s, shape [n].
-        fractions: share per class in the order of `ml.qoc.TREMOR_CLASSES`, shape [n, 6]; NaN where not told.
-        any_tremor: share with slight or worse tremor, shape [n]; NaN where not told.
+        fractions: share per class in the order of `ml.qoc.TREMOR_CLASSES`, shape [n, 6]; NaN where not known.
+        any_tremor: share with slight or worse tremor, shape [n]; NaN where not known.
 
     Returns:
         Sentences for the upload's report.

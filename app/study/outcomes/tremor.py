@@ -20,7 +20,7 @@ class Minutes:
     Attributes:
         start_unix_s, duration_s: begin and length of each minute's measurement, s, shape [n].
         fractions: share per class in the order of `ml.qoc.TREMOR_CLASSES`, shape [n, 6]; NaN where the export does not split the tremor.
-        any_tremor: share with slight or worse tremor, shape [n]; NaN where not told.
+        any_tremor: share with slight or worse tremor, shape [n]; NaN where not known.
     """
 
     start_unix_s: NDArray[np.float64]
@@ -51,7 +51,7 @@ class SessionMinutes:
     Attributes:
         minutes: shape [n]; they may reach over the session's ends.
         upload_file_ids: the file of each, [n].
-        notes: sentences on minutes that were told twice or contradict each other.
+        notes: sentences on minutes that were given twice or contradict each other.
     """
 
     minutes: Minutes

@@ -132,18 +132,18 @@ def tremor_outcome(db: Session, session: StudySession) -> TremorOutcome | None:
 def _tremor_value(reading: TremorReading) -> tuple[float | None, str]:
     """The reading that counts, where the minutes suffice, and what it rests on."""
     whole = reading.session_s
-    told = f"{reading.covered_s / 60:.1f} of {whole / 60:.1f} min covered"
+    covered = f"{reading.covered_s / 60:.1f} of {whole / 60:.1f} min covered"
     if reading.undivided_s:
-        told += f", besides {reading.undivided_s / 60:.1f} min that tell only all tremor together"
+        covered += f", besides {reading.undivided_s / 60:.1f} min that tell only all tremor together"
     if reading.covered_s < MIN_COVERAGE * whole - 1e-6:
-        return None, f"{told}; {100 * MIN_COVERAGE:.0f} % of the session are needed"
-    told += f", {reading.unknown_s / 60:.1f} min unknown"
+        return None, f"{covered}; {100 * MIN_COVERAGE:.0f} % of the session are needed"
+    covered += f", {reading.unknown_s / 60:.1f} min unknown"
     untold = reading.covered_s - sum(reading.class_seconds.values())
     if untold > 1:
-        told += f", {untold / 60:.1f} min of no class"
+        covered += f", {untold / 60:.1f} min of no class"
     if reading.unknown_s + max(0.0, untold) > MAX_UNKNOWN * whole:
-        return None, f"{told}; at most {100 * MAX_UNKNOWN:.0f} % of the session may be"
-    return reading.duration_weighted, f"duration-weighted, {told}; by each minute's largest class {reading.arg_max:.4g} %"
+        return None, f"{covered}; at most {100 * MAX_UNKNOWN:.0f} % of the session may be"
+    return reading.duration_weighted, f"duration-weighted, {covered}; by each minute's largest class {reading.arg_max:.4g} %"
 
 
 def grasp_outcome(db: Session, session: StudySession) -> GraspOutcome | None:

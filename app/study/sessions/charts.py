@@ -183,10 +183,7 @@ def control_chart(data: SessionData) -> Chart:
     if spikes.any():
         subtitle += f" · power spikes left out of {int(spikes.sum())} windows"
     columns = ("Step end (s)", f"{name} ({unit or '—'})", "Amplitude (mA)", "Fraction of cDBS", "Mark")
-    marks = [
-        ", ".join(w for w, on in (("no valid window", m), ("power spikes left out", x)) if on)
-        for m, x in zip(np.isnan(table.beta), spikes, strict=True)
-    ]
+    marks = [_mark(m, x) for m, x in zip(np.isnan(table.beta), spikes, strict=True)]
     rows: list[list[Cell]] = [
         [float(t), _known(b), _known(a), _known(f), mark]
         for t, b, a, f, mark in zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, marks, strict=True)

@@ -20,14 +20,15 @@ from app.platform.web.templates import render
 from app.study import repository, service
 from app.study.blinding import CONTROLLER_NAMES, arm
 from app.study.deps import CurrentSession
+from app.study.form_changes import Shown, own_changes
 from app.study.models import QocRevision, Recording, StudySession
 from app.study.schemas import DerivedChoice, QocIn, SessionChange
 from app.study.service import SessionData
 from app.study.sessions import view as session_view
 from app.study.sessions.charts import operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
-from app.study.settings_form import Shown, own_changes
 from app.study.traces import AMPLITUDE_STREAM, session_offset_s
+from app.study.wording import sentences
 from ml.energy import relative_energy
 
 router = APIRouter()
@@ -230,7 +231,7 @@ def _page(
         data=data,
         trouble=trouble,
         summary=summarise(data) if data else None,
-        contradictions=contradictions(db, session, steps_told=True),
+        contradictions=sentences(contradictions(db, session, steps_shown=True)),
         control=control_recording(session),
         view=view,
         steps=stimulation_steps(data, events, origin) if data else [],

@@ -7,15 +7,22 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.study.models import Recording
+from ml.formats.rcs.packets.time import Rejected
+from ml.formats.rcs.quality import REJECTED_WORDS
 
 CLOCKS = {
     "pc": "clock of the PC that recorded (packet times)",
-    "device": "clock of the device, which may be off the clock of the wall",
+    "device": "clock of the device, which may be off local time",
     "table": "times of the table",
 }
 
-_TWICE = "the same packet twice"
-_BACK = "PacketGenTime steps back"
+_STORED_SENTENCES = {
+    "timestamp more than a day off": Rejected.DAY_OFF,
+    "device and PC clock disagree by more than 2 s": Rejected.CLOCKS_DISAGREE,
+    "the same packet twice": Rejected.DUPLICATE,
+    "PacketGenTime steps back": Rejected.STEPS_BACK,
+}
+"""Version 0.1.0 counted rejected packets under sentences; these stand in stored recordings and are never changed."""
 _KNOWN = {"packets", "samples", "missing", "missing_samples", "loss", "chunks", "rejected", "unusable", "clock", "loss_visible", "rate_hz"}
 
 
@@ -44,21 +51,21 @@ class StreamQuality:
 def quality_rows(recording: Recording) -> list[StreamQuality]:
     """Data quality of each stream, in the order of the decoder."""
     rows = []
-    for name, told in recording.details.get("quality", {}).items():
-        if not isinstance(told, Mapping) or name == "valid_fraction" or not _is_stream(told):
+    for name, stored in recording.details.get("quality", {}).items():
+        if not isinstance(stored, Mapping) or name == "valid_fraction" or not _is_stream(stored):
             continue
-        if _KNOWN & told.keys():
-            rows.append(_row(name, told, recording.clock))
+        if _KNOWN & stored.keys():
+            rows.append(_row(name, stored, recording.clock))
         else:
-            rows += [_row(f"{name} {channel}", one, recording.clock) for channel, one in told.items()]
+            rows += [_row(f"{name} {channel}", one, recording.clock) for channel, one in stored.items()]
     return rows
 
 
-def quality_remarks(recording: Recording) -> list[str]:
-    """What the quality says that belongs to no stream, in words."""
+def quality_remarks(recording: Recording) -> list[tuple[str, str]]:
+    """What the quality says that belongs to no stream: of what, and what."""
     quality = recording.details.get("quality", {})
     return [
-        f"{_words(name)}: {_plain(value)}"
+        (_words(name), _plain(value))
         for name, value in quality.items()
         if value not in (None, {}) and name != "valid_fraction" and not (isinstance(value, Mapping) and _is_stream(value))
     ]
@@ -106,9 +113,11 @@ def leads(recording: Recording) -> str:
 
 def valid_shares(recording: Recording) -> dict[str, float]:
     """Share of valid windows per trace over the whole recording, 0 to 1."""
-    told = recording.details.get("quality", {}).get("valid_fraction", {})
+    stored = recording.details.get("quality", {}).get("valid_fraction", {})
     return (
-        {_words(name): float(value) for name, value in told.items() if isinstance(value, int | float)} if isinstance(told, Mapping) else {}
+        {_words(name): float(value) for name, value in stored.items() if isinstance(value, int | float)}
+        if isinstance(stored, Mapping)
+        else {}
     )
 
 
@@ -121,44 +130,49 @@ def amplitude_limits(recording: Recording) -> list[tuple[str, str]]:
     return found
 
 
-def _is_stream(told: Mapping[str, Any]) -> bool:
+def _is_stream(stored: Mapping[str, Any]) -> bool:
     """Whether a part of the quality is a stream's, or has one of these per channel."""
-    return bool(_KNOWN & told.keys()) or (bool(told) and all(isinstance(v, Mapping) and _KNOWN & v.keys() for v in told.values()))
+    return bool(_KNOWN & stored.keys()) or (bool(stored) and all(isinstance(v, Mapping) and _KNOWN & v.keys() for v in stored.values()))
 
 
-def _limit_rows(told: Any) -> list[tuple[str, str]]:
-    if not isinstance(told, Mapping):
-        return [("", _plain(told))]
-    if "lower_ma" in told or "upper_ma" in told:
-        return [("", f"{_ma(told.get('lower_ma'))} to {_ma(told.get('upper_ma'))} mA")]
-    return [(" ".join(w for w in (_words(k), tail) if w), limit) for k, v in told.items() for tail, limit in _limit_rows(v)]
+def _limit_rows(stored: Any) -> list[tuple[str, str]]:
+    if not isinstance(stored, Mapping):
+        return [("", _plain(stored))]
+    if "lower_ma" in stored or "upper_ma" in stored:
+        return [("", f"{_ma(stored.get('lower_ma'))} to {_ma(stored.get('upper_ma'))} mA")]
+    return [(" ".join(w for w in (_words(k), tail) if w), limit) for k, v in stored.items() for tail, limit in _limit_rows(v)]
 
 
-def _row(name: str, told: Mapping[str, Any], clock: str) -> StreamQuality:
-    samples = "packets" not in told and "samples" in told
-    rejected = dict(told.get("rejected") or {})
-    back, twice = int(rejected.pop(_BACK, 0)), int(rejected.pop(_TWICE, 0))
-    remarks = [f"{count} left out: {why}" for why, count in rejected.items()]
-    if told.get("unusable"):
-        remarks.append(f"{told['unusable']} left out: fields missing or of the wrong kind")
-    if told.get("loss_visible") is False:
+def _row(name: str, stored: Mapping[str, Any], clock: str) -> StreamQuality:
+    samples = "packets" not in stored and "samples" in stored
+    rejected = {_rejected(why): int(count) for why, count in (stored.get("rejected") or {}).items()}
+    back, twice = rejected.pop(Rejected.STEPS_BACK, 0), rejected.pop(Rejected.DUPLICATE, 0)
+    remarks = [f"{count} left out: {REJECTED_WORDS[why]}" for why, count in rejected.items()]
+    if stored.get("unusable"):
+        remarks.append(f"{stored['unusable']} left out: fields missing or of the wrong kind")
+    if stored.get("loss_visible") is False:
         remarks.append("the file gives no packet times: loss cannot be seen")
-    if told.get("rate_hz"):
-        remarks.append(f"{_plain(told['rate_hz'])} Hz")
-    remarks += [f"{_words(key)}: {_plain(value)}" for key, value in told.items() if key not in _KNOWN and value not in (None, {}, [])]
-    unseen = told.get("loss_visible") is False
+    if stored.get("rate_hz"):
+        remarks.append(f"{_plain(stored['rate_hz'])} Hz")
+    remarks += [f"{_words(key)}: {_plain(value)}" for key, value in stored.items() if key not in _KNOWN and value not in (None, {}, [])]
+    unseen = stored.get("loss_visible") is False
     return StreamQuality(
         _words(name),
         "samples" if samples else "packets",
-        told.get("samples" if samples else "packets"),
-        None if unseen else told.get("missing_samples" if samples else "missing"),
-        None if unseen else told.get("loss"),
-        max(0, int(told["chunks"]) - 1) if told.get("chunks") is not None else None,
+        stored.get("samples" if samples else "packets"),
+        None if unseen else stored.get("missing_samples" if samples else "missing"),
+        None if unseen else stored.get("loss"),
+        max(0, int(stored["chunks"]) - 1) if stored.get("chunks") is not None else None,
         back,
         twice,
-        str(told.get("clock", clock)),
+        str(stored.get("clock", clock)),
         remarks,
     )
+
+
+def _rejected(stored: str) -> Rejected:
+    """Why packets were left out, as stored."""
+    return _STORED_SENTENCES.get(stored) or Rejected(stored)
 
 
 def _ma(value: Any) -> str:

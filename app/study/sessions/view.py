@@ -72,7 +72,7 @@ class RecordingBlock:
     charts: list[Chart]
     spectra: list[Chart]
     quality: list[StreamQuality]
-    remarks: list[str]
+    remarks: list[tuple[str, str]]
     limits: list[tuple[str, str]]
     valid: dict[str, float]
     amplitude_from: str

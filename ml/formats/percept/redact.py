@@ -20,7 +20,7 @@ from ml.formats.percept.details import EVENT_WORDS
 from ml.formats.percept.enums import is_known
 from ml.formats.percept.keys import KEYS
 from ml.formats.percept.report import report_members
-from ml.formats.percept.report_json import MEND, SECTIONS, channel_names, moment, read_report
+from ml.formats.percept.report_json import HINT, SECTIONS, channel_names, moment, read_report
 from ml.formats.recording import UndecodableFile
 from ml.formats.redaction import Redaction, pseudonym
 
@@ -48,7 +48,7 @@ TEXTS = {
     "Pass": re.compile(r"(FIRST|SECOND|THIRD)_PASS|SQC|((ZERO|ONE|TWO|THREE)_?)+"),
 }
 ENUM = re.compile(r"(Ins(Location|Port)|[A-Za-z]{2,40}Def)[._][A-Za-z0-9_]{1,60}")
-"""What looks like an enumeration; only those of `percept_enums` stay."""
+"""What looks like an enumeration; only those of `enums.py` stay."""
 
 
 def redact_percept(source: Path, target: Path, key: bytes, limits: ArchiveLimits | None = None) -> Redaction:
@@ -77,10 +77,13 @@ def redact_percept(source: Path, target: Path, key: bytes, limits: ArchiveLimits
             members = report_members(files, damaged=True)
             texts = {f"report-{n}.json": t for n, m in enumerate(members, start=1) if (t := _member(files, m, n, scrub, done)) is not None}
             others = len(files.names()) - len(members)
-            done.ignored += [*files.ignored, *([f"{others} file{'s' if others > 1 else ''} that are no session report"] if others else [])]
+            done.ignored += [
+                *map(str, files.left_out),
+                *([f"{others} file{'s' if others > 1 else ''} that are no session report"] if others else []),
+            ]
         if not texts:
             why = f": {done.unreadable[0]}" if done.unreadable else ""
-            raise UndecodableFile(f"no Percept session report in here can be read{why}", "archive", MEND)
+            raise UndecodableFile(f"no Percept session report in here can be read{why}", "archive", HINT)
         with zipfile.ZipFile(target, "w") as archive:
             for name, text in texts.items():
                 info = zipfile.ZipInfo(name, EPOCH)

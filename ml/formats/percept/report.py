@@ -101,7 +101,7 @@ def decode_percept(path: Path, options: DecodeOptions, name: str | None = None) 
             recordings.extend(found)
         others = len(files.names()) - len(members)
         if reports:
-            reports[0].ignored.extend(files.ignored)
+            reports[0].ignored.extend(map(str, files.left_out))
         if reports and others:
             reports[0].ignored.append(f"{others} file{'s' if others > 1 else ''} that are no session report")
     if not any(r.problem is None for r in reports):

@@ -38,9 +38,10 @@ TELLING = SECTIONS - {"Groups", "Stimulation", "Impedance"}
 """Keys that no other kind of file has at its top."""
 
 SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
-MEND = "Export the session report from the programmer again, and upload it unchanged."
+HINT = "Export the session report from the programmer again, and upload it unchanged."
 
 _TOP_KEY = re.compile(r'"([A-Za-z]{6,40})"\s*:')
+_OPEN_STRING = re.compile(r'"(?:[^"\\]++|\\.)*+\\?\Z', re.DOTALL)
 _INF = re.compile(r"(?<=[\[:,\s])([+-]?)(?:INF|Inf|inf)(?=[\],}\s])")
 _CONTACT = r"(?:ZERO|ONE|TWO|THREE|FOUR|FIVE|SIX|SEVEN|EIGHT|NINE|TEN|ELEVEN)(?:_?[ABC])?"
 _CHANNEL = re.compile(rf"(?:ELECTRODE_)?{_CONTACT}(?:_(?:AND|{_CONTACT}|LEFT|RIGHT|RING|SEGMENT)){{0,8}}")
@@ -75,13 +76,13 @@ def read_report(stream: IO[bytes], notes: list[str]) -> dict[str, Any]:
     except READ_ERRORS as error:
         raise UndecodableFile("the compressed data are damaged", "file", "Zip the session report again.") from error
     if len(raw) > MAX_BYTES:
-        raise UndecodableFile(f"a JSON file of more than {MAX_BYTES // 1024**2} MiB", "file", MEND)
+        raise UndecodableFile(f"a JSON file of more than {MAX_BYTES // 1024**2} MiB", "file", HINT)
     text = _text(raw)
     if text is None or not text.strip():
-        raise UndecodableFile("the file is empty" if text is not None else "this is no text", "file", MEND)
+        raise UndecodableFile("the file is empty" if text is not None else "this is no text", "file", HINT)
     report = _parse(text, notes)
     if not isinstance(report, dict) or not SECTIONS & set(report):
-        raise UndecodableFile("JSON, but no Percept session report: none of its sections is there", "file", MEND)
+        raise UndecodableFile("JSON, but no Percept session report: none of its sections is there", "file", HINT)
     return report
 
 
@@ -89,7 +90,7 @@ def _parse(text: str, notes: list[str]) -> Any:
     try:
         return json.loads(text)
     except RecursionError as error:
-        raise UndecodableFile("brackets nested deeper than any programmer writes them", "file", MEND) from error
+        raise UndecodableFile("brackets nested deeper than any programmer writes them", "file", HINT) from error
     except ValueError as error:
         mended = _INF.sub(r"\1Infinity", text)
         if mended != text:
@@ -97,9 +98,9 @@ def _parse(text: str, notes: list[str]) -> Any:
             return _parse(mended, notes)
         line = getattr(error, "lineno", None)
         at = getattr(error, "pos", 0)
-        cut = at >= len(text.rstrip()) - 1 or str(error).startswith("Unterminated string")
+        cut = at >= len(text.rstrip()) - 1 or _OPEN_STRING.match(text, at) is not None
         what = "the JSON text ends in the middle" if cut else "the JSON text is damaged"
-        raise UndecodableFile(what, f"line {line}" if line else "file", MEND) from error
+        raise UndecodableFile(what, f"line {line}" if line else "file", HINT) from error
 
 
 def entries(value: Any) -> list[dict[str, Any]]:

@@ -75,7 +75,7 @@ def decode_files(files: Files, options: DecodeOptions, name: str) -> DecodedFile
     """Decode every device folder among the files; see `decode_rcs`."""
     whole = FileReport(name)
     sessions = find_sessions(files, whole)
-    whole.ignored.extend(files.ignored)
+    whole.ignored.extend(map(str, files.left_out))
     if not sessions:
         raise UndecodableFile(
             "no RC+S session in here", name, "Zip the session's Device folder with its JSON files (DeviceSettings, StimLog, RawDataTD, …)."
@@ -186,7 +186,7 @@ def _elements(session: SessionFiles, files: Files, stem: str, infos: list[dict[s
             for element, _ in read_elements(stream, notes, scan if wanted else None):
                 yield element
     except UndecodableFile as error:
-        session.reports[stem] = FileReport(report.name, problem=Problem(error.what, report.name, error.mend))
+        session.reports[stem] = FileReport(report.name, problem=Problem(error.what, report.name, error.hint))
         return
     infos.extend(notes.record_infos[:1])
     report.repaired.extend(notes.defects)

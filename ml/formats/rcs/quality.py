@@ -9,7 +9,7 @@ import numpy as np
 
 from ml.formats.rcs.beta import flat_share
 from ml.formats.rcs.packets.streams import Power, TimeDomain, TimeSync
-from ml.formats.rcs.packets.time import PacketHeaders, PacketTimes, device_clock_drift
+from ml.formats.rcs.packets.time import PacketHeaders, PacketTimes, Rejected, device_clock_drift
 from ml.formats.recording import FileReport
 
 STEMS = {
@@ -24,6 +24,14 @@ STEMS = {
 
 COUNTED = {"errors": "ErrorLog", "diagnostics": "DiagnosticsLog"}
 """Files whose records are counted."""
+
+REJECTED_WORDS = {
+    Rejected.DAY_OFF: "timestamp more than a day off",
+    Rejected.CLOCKS_DISAGREE: "device and PC clock disagree by more than 2 s",
+    Rejected.DUPLICATE: "the same packet twice",
+    Rejected.STEPS_BACK: "PacketGenTime steps back",
+}
+"""Why packets were left out, in words."""
 
 
 class _Stream(Protocol):
@@ -69,7 +77,7 @@ def describe_quality(
 def _packets(data: _Stream, t: PacketTimes, said: FileReport) -> dict[str, Any]:
     if t.missing:
         said.flagged.append(f"{100 * t.loss:.1f} % of the packets are missing ({t.missing}); {t.chunks} stretches without a gap")
-    said.repaired.extend(f"{count} packet{'s' if count != 1 else ''} left out: {why}" for why, count in t.rejected.items())
+    said.repaired.extend(f"{count} packet{'s' if count != 1 else ''} left out: {REJECTED_WORDS[why]}" for why, count in t.rejected.items())
     if t.reordered:
         said.repaired.append(f"{t.reordered} packet{'s' if t.reordered != 1 else ''} out of order put in the order of the device's clock")
     if data.unusable:
@@ -81,7 +89,7 @@ def _packets(data: _Stream, t: PacketTimes, said: FileReport) -> dict[str, Any]:
         "missing": t.missing,
         "loss": round(t.loss, 4),
         "chunks": t.chunks,
-        "rejected": dict(t.rejected),
+        "rejected": {why.value: count for why, count in t.rejected.items()},
         "reordered": t.reordered,
         "unusable": data.unusable,
     }

@@ -29,7 +29,7 @@ MAX_ROWS = 100_000
 PRIMARY = ("time_domain", "power", "adaptive")
 """Streams that say what was recorded; the others matter for identity only where none of these is there."""
 
-Report = Callable[[str], FileReport]
+ReportOf = Callable[[str], FileReport]
 Stream = TimeDomain | Power | Adaptive | Accel | Fft | TimeSync
 
 
@@ -58,7 +58,7 @@ class Streams:
         return {name: data.headers for name, data in self.data().items() if data.headers.size}
 
 
-def build_recording(streams: Streams, report: Report, options: DecodeOptions) -> RecordingLog:
+def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) -> RecordingLog:
     """Put a recording together; what is left out is said in the report of the file it comes from."""
     times = {name: reconstruct(headers) for name, headers in streams.headers().items()}
     spans = _spans(streams.headers(), times, report, options)
@@ -97,7 +97,7 @@ def build_recording(streams: Streams, report: Report, options: DecodeOptions) ->
     )
 
 
-def _hemisphere(streams: Streams, report: Report) -> Hemisphere | None:
+def _hemisphere(streams: Streams, report: ReportOf) -> Hemisphere | None:
     """The side that the leads behind the sensed channels share, where the settings tell."""
     subject = get(streams.settings.merged, "SubjectInfo")
     keys: set[int] = set()
@@ -114,7 +114,7 @@ def _hemisphere(streams: Streams, report: Report) -> Hemisphere | None:
 
 
 def _spans(
-    headers: dict[str, PacketHeaders], times: dict[str, PacketTimes], report: Report, options: DecodeOptions
+    headers: dict[str, PacketHeaders], times: dict[str, PacketTimes], report: ReportOf, options: DecodeOptions
 ) -> dict[str, tuple[float, float]]:
     """Begin and end of each stream, PC ms; a stream that lies impossibly far from the longest one is left out and said."""
     spans: dict[str, tuple[float, float]] = {}
@@ -149,7 +149,7 @@ def _first_record_ms(streams: Streams) -> float:
 
 
 def _traces(
-    streams: Streams, times: dict[str, PacketTimes], steps: AmplitudeSteps, grid: Grid, report: Report
+    streams: Streams, times: dict[str, PacketTimes], steps: AmplitudeSteps, grid: Grid, report: ReportOf
 ) -> tuple[list[TraceLog], list[SpectrumLog]]:
     traces: list[TraceLog] = []
     spectra: list[SpectrumLog] = []
@@ -219,8 +219,8 @@ def _fingerprint(streams: Streams) -> str:
     """Over packets, settings times and stimulation; not over the device's name, nor anything that redaction changes."""
     parts: list[str | bytes | NDArray[Any]] = []
     headers = streams.headers()
-    told = {name: head for name, head in headers.items() if name in PRIMARY} or headers
-    for name, head in sorted(told.items()):
+    primary = {name: head for name, head in headers.items() if name in PRIMARY} or headers
+    for name, head in sorted(primary.items()):
         parts += [name, head.seconds, head.tick, head.sequence, head.gen_ms, head.samples]
     if streams.time_domain is not None:
         parts += list(streams.time_domain.samples)

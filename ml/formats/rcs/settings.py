@@ -10,7 +10,6 @@ from typing import Any, Generic, TypeVar
 
 RATE_HZ = {0: 250.0, 1: 500.0, 2: 1000.0}
 FFT_SIZE = {0: 64, 1: 256, 3: 1024}
-EMBEDDED_ADAPTIVE = 2
 ADAPTIVE_BIT = 128
 GROUPS = "ABCD"
 SENSING_SECTIONS = frozenset({"SensingConfig", "SenseState"})

@@ -123,7 +123,7 @@ def _spikes(values: NDArray[np.float64], t_s: NDArray[np.float64], data: Power) 
 
 
 def window_s(data: Power | Fft) -> NDArray[np.float64]:
-    """Length of each packet's FFT window, s, [n]; 0 where size or rate are not told."""
+    """Length of each packet's FFT window, s, [n]; 0 where size or rate are not known."""
     sizes = np.array([FFT_SIZE.get(code, 0) for code in data.fft_size.tolist()], dtype=np.float64)
     return np.where(np.isfinite(data.td_rate_hz), sizes / np.nan_to_num(data.td_rate_hz, nan=1.0), 0.0)
 

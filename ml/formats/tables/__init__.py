@@ -1,1 +1,42 @@
-"""Tables: steps of 2 s, raw LFP, minutes of tremor, grasp tests."""
+"""Tables of steps, raw LFP, tremor or grasps: read by `decode_table`, cut down to known columns by `redact_table`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from ml.formats.options import DecodeOptions
+from ml.formats.recording import DecodedFile, UndecodableFile
+from ml.formats.tables.delimited import read_headers
+from ml.formats.tables.grasps import decode_grasps, looks_like_grasps
+from ml.formats.tables.redact import redact_table
+from ml.formats.tables.steps import decode_csv, decode_parquet
+from ml.formats.tables.strivepd import decode_strivepd, looks_like_tremor
+
+__all__ = ["TableKind", "decode_table", "kind_of_text", "redact_table"]
+
+TableKind = Literal["csv", "parquet", "tremor", "grasp"]
+
+_DECODERS: dict[TableKind, Callable[[Path, DecodeOptions, str | None], DecodedFile]] = {
+    "csv": decode_csv,
+    "parquet": decode_parquet,
+    "tremor": decode_strivepd,
+    "grasp": decode_grasps,
+}
+
+
+def decode_table(path: Path, kind: TableKind, options: DecodeOptions, name: str | None = None) -> DecodedFile:
+    """Decode a table; see `ml.formats.decode`. Raises UndecodableFile."""
+    return _DECODERS[kind](path, options, name)
+
+
+def kind_of_text(path: Path) -> TableKind:
+    """Which table a text is, by its headers."""
+    try:
+        headers = read_headers(path)
+    except UndecodableFile:
+        return "csv"
+    if looks_like_tremor(headers):
+        return "tremor"
+    return "grasp" if looks_like_grasps(headers) else "csv"

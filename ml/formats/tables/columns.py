@@ -60,10 +60,10 @@ class Columns:
         unit = self.units[role]
         return f"{role} [{unit}]" if unit else role
 
-    def error(self, what: str, role: str, mend: str, row: int | None = None, stored: str | None = None) -> UndecodableFile:
+    def error(self, what: str, role: str, hint: str, row: int | None = None, stored: str | None = None) -> UndecodableFile:
         """An error at a column, and at the line of a row; `stored` is the text without the file's own words."""
         line = "" if row is None else f"line {self.lines[row]}, "
-        return UndecodableFile(what, f"{line}column {self.names[role]}", mend, stored, f"{line}column {role}")
+        return UndecodableFile(what, f"{line}column {self.names[role]}", hint, stored, f"{line}column {role}")
 
 
 def check_reach(t_s: NDArray[np.float64], columns: Columns) -> None:
@@ -187,7 +187,7 @@ def _header_unit(role: str, unit: str | None, header: str, notes: list[str]) -> 
 
 
 def _unknown_unit(role: str, unit: str, header: str) -> UndecodableFile:
-    mend = {
+    hint = {
         "t_s": "Give the time in seconds (s).",
         "lfp": "Give the LFP in uV, and say so in the header: lfp [uV]. nV, mV and V are converted.",
         "amplitude_ma": "Give the amplitude in mA, and say so in the header: amplitude (mA). uA and A are converted.",
@@ -195,7 +195,7 @@ def _unknown_unit(role: str, unit: str, header: str) -> UndecodableFile:
     }[role]
     column = {"t_s": "time", "lfp": "LFP"}.get(role, "amplitude")
     what = f"unknown unit {shown(unit)} of the {column} column"
-    return UndecodableFile(what, f"column {header.strip()}", mend, f"unknown unit of the {column} column", f"column {role}")
+    return UndecodableFile(what, f"column {header.strip()}", hint, f"unknown unit of the {column} column", f"column {role}")
 
 
 def read_csv(path: Path, options: DecodeOptions) -> Columns:
@@ -216,12 +216,12 @@ def read_parquet(path: Path, options: DecodeOptions) -> Columns:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    mend = "Write the table again, for example with pandas' to_parquet."
+    hint = "Write the table again, for example with pandas' to_parquet."
     try:
         file = pq.ParquetFile(path)
         headers = [str(n) for n in file.schema_arrow.names]
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise UndecodableFile("the Parquet file is damaged or cut", "file", mend) from error
+        raise UndecodableFile("the Parquet file is damaged or cut", "file", hint) from error
     most = options.max_lfp_rows if is_lfp(headers) else options.max_table_rows
     if file.metadata.num_rows > most:
         raise UndecodableFile(f"more than {most} rows", "file", "Upload one session per table.")
@@ -236,7 +236,7 @@ def read_parquet(path: Path, options: DecodeOptions) -> Columns:
         table = file.read(columns=[headers[i] for i in found.values()])
         values = {role: _arrow_floats(table.column(headers[i])) for role, i in found.items()}
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise UndecodableFile("the Parquet file is damaged or cut", "file", mend) from error
+        raise UndecodableFile("the Parquet file is damaged or cut", "file", hint) from error
     lines = np.arange(1, table.num_rows + 1, dtype=np.int64)
     return Columns({role: headers[i] for role, i in found.items()}, units, lines, values, unused, notes)
 
@@ -270,8 +270,8 @@ def checked_amplitude(role: str, columns: Columns, report: FileReport) -> NDArra
         report.flagged.append(f"{lost} rows without a number in {role}: kept as gaps")
     values = values / PER_UNIT[role][columns.units[role]]
     if (negative := np.flatnonzero(values < 0)).size:
-        mend = "Amplitudes are 0 or more; leave the cell empty if unknown."
-        raise columns.error(f"negative amplitude {values[negative[0]]:g}", role, mend, int(negative[0]))
+        hint = "Amplitudes are 0 or more; leave the cell empty if unknown."
+        raise columns.error(f"negative amplitude {values[negative[0]]:g}", role, hint, int(negative[0]))
     if (absurd := np.flatnonzero(values > LARGEST[role] * (1 + 1e-9))).size:
         raise _absurd(role, float(values[absurd[0]]), columns, int(absurd[0]))
     if role == "amplitude_fraction" and (above := int(np.sum(values > 1))):
@@ -283,11 +283,11 @@ def _absurd(role: str, value: float, columns: Columns, row: int) -> UndecodableF
     largest = LARGEST[role]
     if role == "amplitude_ma":
         what = f"amplitude {value:g} mA, more than the {largest:g} mA that a stimulator can give"
-        mend = "Give mA; if the numbers are in uA, name the column amplitude (uA)."
+        hint = "Give mA; if the numbers are in uA, name the column amplitude (uA)."
     else:
         what = f"amplitude fraction {value:g}, more than {largest:g} times the cDBS amplitude"
-        mend = "Give 1 for the cDBS amplitude; name the column amplitude_fraction (%) for percent or amplitude_ma for mA."
-    return columns.error(what, role, mend, row)
+        hint = "Give 1 for the cDBS amplitude; name the column amplitude_fraction (%) for percent or amplitude_ma for mA."
+    return columns.error(what, role, hint, row)
 
 
 def compare_amplitudes(milliamps: NDArray[np.float64], fraction: NDArray[np.float64], report: FileReport) -> None:

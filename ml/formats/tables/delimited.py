@@ -44,8 +44,8 @@ class TextTable:
             return "."
         point = self._first_with(".", columns)
         if point is not None and self.delimiter != ",":
-            mend = "Use one decimal mark and no thousands separators."
-            raise UndecodableFile("decimal points and commas in one table", f"line {max(comma, point)}", mend)
+            hint = "Use one decimal mark and no thousands separators."
+            raise UndecodableFile("decimal points and commas in one table", f"line {max(comma, point)}", hint)
         return "." if point is not None else ","
 
     def _first_with(self, mark: str, columns: Sequence[int]) -> int | None:
@@ -72,9 +72,9 @@ class TextTable:
             value = parse_number(cell, decimal)
         except NotANumber as error:
             where = f"line {line}, column {self.headers[column].strip()}"
-            mend = "Put a number there, or leave the cell empty."
+            hint = "Put a number there, or leave the cell empty."
             what = f"{shown(cell.strip())} is text, not a number"
-            raise UndecodableFile(what, where, mend, "a cell holds text, not a number", f"line {line}, {known}") from error
+            raise UndecodableFile(what, where, hint, "a cell holds text, not a number", f"line {line}, {known}") from error
         return math.nan if value is None else value
 
 
@@ -129,8 +129,8 @@ def _lines(stream: io.TextIOWrapper) -> Iterator[str]:
     while line := stream.readline(MAX_LINE):
         number += 1
         if len(line) == MAX_LINE and not line.endswith("\n"):
-            mend = "Save the table as CSV (UTF-8), one row per line."
-            raise UndecodableFile(f"a line of more than {MAX_LINE} characters", f"line {number}", mend)
+            hint = "Save the table as CSV (UTF-8), one row per line."
+            raise UndecodableFile(f"a line of more than {MAX_LINE} characters", f"line {number}", hint)
         yield line
 
 
@@ -152,8 +152,8 @@ def _cells(source: Iterator[str], delimiter: str, width: int, offset: int, max_r
             while len(row) > width and not row[-1].strip():
                 row.pop()
             if len(row) != width:
-                mend = "Give every row one cell per column; with decimal commas separate the columns by semicolons."
-                raise UndecodableFile(f"{len(row)} cells where the header has {width}", f"line {number}", mend)
+                hint = "Give every row one cell per column; with decimal commas separate the columns by semicolons."
+                raise UndecodableFile(f"{len(row)} cells where the header has {width}", f"line {number}", hint)
             lines.append(number)
             rows.append(row)
             if len(rows) > max_rows:

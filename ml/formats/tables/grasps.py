@@ -94,8 +94,8 @@ def _one_hand(
     back = np.flatnonzero(intervals <= 0)
     if back.size:
         line = table.lines[rows[back[0] + 1]]
-        mend = "Sort the rows by time; keep one row per open fist, and name the hand where both are in one table."
-        raise UndecodableFile("times must increase", f"line {line}, column of times", mend)
+        hint = "Sort the rows by time; keep one row per open fist, and name the hand where both are in one table."
+        raise UndecodableFile("times must increase", f"line {line}, column of times", hint)
     implausible = (intervals < PLAUSIBLE_INTERVAL_S[0]) | (intervals > PLAUSIBLE_INTERVAL_S[1])
     whose = "" if hand is None else f"{hand} hand: "
     report.understood.append(f"{whose}{t.size} open fists")

@@ -39,8 +39,8 @@ def decode_lfp(columns: Columns, options: DecodeOptions, report: FileReport) -> 
     t_s = _times(columns)
     unit = columns.units["lfp"] or known_unit(options.table_lfp_unit or "")
     if unit not in LFP_SCALE:
-        mend = "Write the unit into the header, lfp [uV], or state it with the upload."
-        raise columns.error("the lfp column states no unit", "lfp", mend)
+        hint = "Write the unit into the header, lfp [uV], or state it with the upload."
+        raise columns.error("the lfp column states no unit", "lfp", hint)
     lfp = columns.values["lfp"] * LFP_SCALE[unit]
     if (absurd := np.flatnonzero(np.abs(lfp) > LARGEST_UV)).size:
         what = f"{lfp[absurd[0]]:g} uV, more than any electrode in a brain gives"

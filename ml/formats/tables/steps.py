@@ -95,8 +95,8 @@ def _grid(t_s: NDArray[np.float64], columns: Columns, options: DecodeOptions) ->
     off = np.flatnonzero(np.abs(t_s - steps * period) > GRID_TOLERANCE * period)
     if off.size:
         i = int(off[0])
-        mend = f"The row t_s covers the {period:g} s that end at t_s and the session starts at 0: use {period:g}, {2 * period:g}, …"
-        raise columns.error(f"{t_s[i]:g} s is no multiple of the period {period:g} s", "t_s", mend, i)
+        hint = f"The row t_s covers the {period:g} s that end at t_s and the session starts at 0: use {period:g}, {2 * period:g}, …"
+        raise columns.error(f"{t_s[i]:g} s is no multiple of the period {period:g} s", "t_s", hint, i)
     return (steps - steps[0]).astype(np.int64), float(steps[0] * period)
 
 

@@ -29,7 +29,6 @@ EARLIEST_UNIX_S = 1e9
 LATEST_UNIX_S = 1e10
 TIME_NAMES = ("time", "minute_start", "start_utc", "minute_start_utc", "start", "start_time", "timestamp", "start_date", "startdate")
 CLASS_NAMES = ("class", "tremor_class", "tremor")
-LENGTH_NAMES = ("duration_s",)
 KNOWN = frozenset({*TREMOR_CLASSES, "severity", "duration", "duration_s", "measurement_duration_ns", "stream_type_id", "measurement"})
 WANTED = ", ".join(TREMOR_CLASSES)
 
@@ -42,7 +41,7 @@ def looks_like_tremor(headers: Sequence[str]) -> bool:
 
 
 def decode_strivepd(path: Path, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
-    """Decode minutes of tremor in any of three layouts, told apart by their columns.
+    """Decode minutes of tremor in any of three layouts, recognised by their columns.
 
     Times are ISO 8601 or Unix time; a time without a zone is read as UTC, and that is said.
 
@@ -68,8 +67,8 @@ def decode_strivepd(path: Path, options: DecodeOptions | None = None, name: str 
         minutes = _by_class(table, columns, time, of_class, report)
         used.add(of_class)
     else:
-        mend = f"A wide export has the columns time, {WANTED}; a long one time, severity, duration; a table per minute minute_start, class."
-        raise UndecodableFile("no layout of a tremor export", "line 1", mend)
+        hint = f"A wide export has the columns time, {WANTED}; a long one time, severity, duration; a table per minute minute_start, class."
+        raise UndecodableFile("no layout of a tremor export", "line 1", hint)
     if others := len(table.headers) - len(used):
         report.removed.append(f"{others} other column{'s' if others > 1 else ''}, such as patient and device identifiers")
     if minutes.start_unix_s.size == 0:
@@ -85,13 +84,13 @@ def _wide(table: TextTable, columns: dict[str, int], time: int, report: FileRepo
     outside = np.flatnonzero(((fractions < 0) | (fractions > 1 + SUM_TOLERANCE)).any(axis=1))
     if outside.size:
         line = f"line {table.lines[outside[0]]}"
-        mend = "Upload the export as StrivePD wrote it; its fractions lie between 0 and 1."
-        raise UndecodableFile("a fraction outside 0 to 1", line, mend)
+        hint = "Upload the export as StrivePD wrote it; its fractions lie between 0 and 1."
+        raise UndecodableFile("a fraction outside 0 to 1", line, hint)
     off = np.abs(fractions.sum(axis=1) - 1.0) > SUM_TOLERANCE
     if count := int(off.sum()):
         report.flagged.append(f"{count} minutes whose fractions do not add up to 1: kept as they are")
-    told = table.numbers(columns["any_tremor"], decimal, "any_tremor") if "any_tremor" in columns else np.full(start.size, np.nan)
-    any_tremor = np.where(np.isfinite(told), told, fractions[:, 2:].sum(axis=1))
+    stated = table.numbers(columns["any_tremor"], decimal, "any_tremor") if "any_tremor" in columns else np.full(start.size, np.nan)
+    any_tremor = np.where(np.isfinite(stated), stated, fractions[:, 2:].sum(axis=1))
     return _in_order(start, _lengths(table, columns), fractions, any_tremor, report)
 
 
@@ -141,20 +140,20 @@ def _long(table: TextTable, columns: dict[str, int], time: int, report: FileRepo
     length = np.array([lengths[t] for t in start_s], dtype=np.float64)
     table_s = [[_class_seconds(seconds[t], c) for c in TREMOR_CLASSES] for t in start_s]
     fractions = np.array(table_s, dtype=np.float64).reshape(-1, 6) / length[:, None]
-    told = np.array([seconds[t].get(SUMMARY, np.nan) for t in start_s], dtype=np.float64) / length
-    any_tremor = np.where(np.isfinite(told), told, fractions[:, 2:].sum(axis=1))
+    stated = np.array([seconds[t].get(SUMMARY, np.nan) for t in start_s], dtype=np.float64) / length
+    any_tremor = np.where(np.isfinite(stated), stated, fractions[:, 2:].sum(axis=1))
     if (beyond := np.flatnonzero((np.nansum(fractions, axis=1) > 1 + SUM_TOLERANCE) | (any_tremor > 1 + SUM_TOLERANCE))).size:
         when = datetime.fromtimestamp(start_s[beyond[0]], UTC).isoformat()
         raise UndecodableFile(f"the minute of {when} holds more seconds than it has", "column duration", "Give the duration in seconds.")
     return _in_order(start_s, length, fractions, any_tremor, report)
 
 
-def _class_seconds(told: dict[str, float], name: str) -> float:
+def _class_seconds(seconds: dict[str, float], name: str) -> float:
     """Seconds of a class: no row for it means none, unless the minute tells nothing but the sum and that is not 0."""
-    if name in told:
-        return told[name]
-    only_sum = set(told) == {SUMMARY}
-    return float("nan") if only_sum and (told[SUMMARY] > 0 or name in ("unknown", "none")) else 0.0
+    if name in seconds:
+        return seconds[name]
+    only_sum = set(seconds) == {SUMMARY}
+    return float("nan") if only_sum and (seconds[SUMMARY] > 0 or name in ("unknown", "none")) else 0.0
 
 
 def _is_tremor_duration(row: list[str], columns: dict[str, int]) -> bool:
@@ -177,7 +176,7 @@ def _starts(table: TextTable, time: int, report: FileReport) -> NDArray[np.float
 
 def _unix_s(cell: str, line: int) -> tuple[float, bool]:
     """Unix time of an ISO date, or of a number in s, ms, us or ns; and whether its zone was assumed."""
-    where, mend = f"line {line}, column time", "Give the time as ISO 8601 with its zone, or as Unix time."
+    where, hint = f"line {line}, column time", "Give the time as ISO 8601 with its zone, or as Unix time."
     try:
         value = parse_number(cell)
     except NotANumber:
@@ -186,16 +185,16 @@ def _unix_s(cell: str, line: int) -> tuple[float, bool]:
             zoned = moment.tzinfo is not None
             value = (moment if zoned else moment.replace(tzinfo=UTC)).timestamp()
         except (ValueError, OverflowError) as error:
-            raise UndecodableFile(f"{shown(cell)} is no time", where, mend, "a cell holds no time") from error
+            raise UndecodableFile(f"{shown(cell)} is no time", where, hint, "a cell holds no time") from error
         if not EARLIEST_UNIX_S <= value < LATEST_UNIX_S:
-            raise UndecodableFile("a time before any watch measured tremor", where, mend) from None
+            raise UndecodableFile("a time before any watch measured tremor", where, hint) from None
         return value, not zoned
     if value is None or value <= 0:
-        raise UndecodableFile("a minute has no time", where, mend)
+        raise UndecodableFile("a minute has no time", where, hint)
     for unit in (1.0, 1e3, 1e6, 1e9):
         if EARLIEST_UNIX_S <= value / unit < LATEST_UNIX_S:
             return value / unit, False
-    raise UndecodableFile(f"{value:g} is no date", where, mend, "a number that is no date")
+    raise UndecodableFile(f"{value:g} is no date", where, hint, "a number that is no date")
 
 
 def _in_order(

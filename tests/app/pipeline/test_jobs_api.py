@@ -30,7 +30,7 @@ def test_no_job_starts_without_a_threshold_and_the_answer_suggests_one(client: T
     client.put("/api/v1/participants/P1/settings", json={"settings": {"xi_beta": None}})
     answer = client.post(JOBS, json={"kind": "pipeline"})
     assert answer.status_code == 422
-    assert "xi_beta" in answer.json()["mend"]
+    assert "xi_beta" in answer.json()["hint"]
     assert 0 < answer.json()["suggested_xi_beta"] < 2
     assert client.get(JOBS).json()["total"] == 0
 

@@ -26,7 +26,7 @@ def study_session(db: Session) -> StudySession:
     settings = SettingsIn(xi_beta=1.0, cdbs_amplitude_ma=3.0, beta_unit="uV", beta_source="table")
     participant = service.enrol(db, ParticipantIn(code="P1", settings=settings), SYSTEM)
     visit = service.add_visit(db, participant, VisitIn(number=1, date=START.date()), SYSTEM)
-    device = Device(participant_id=participant.id, pseudonym="d", kind="rcs", hemisphere=Hemisphere.LEFT)
+    device = Device(participant_id=participant.id, pseudonym="d", kind="rcs")
     db.add(device)
     db.flush()
     recording = Recording(
@@ -57,7 +57,7 @@ def new_file(db: Session) -> Callable[[StudySession], int]:
 
     def make(session: StudySession) -> int:
         participant_id = session.visit.participant_id
-        upload = Upload(participant_id=participant_id, stated={}, report=[], created_by="test")
+        upload = Upload(participant_id=participant_id, stated={}, created_by="test")
         db.add(upload)
         db.flush()
         file = UploadFile(

@@ -113,7 +113,7 @@ def test_a_session_takes_only_its_own_participants_policy_and_its_own_traces(cli
     assert "no policy 12345" in foreign.json()["detail"]
     nowhere = client.patch(f"/api/v1/sessions/{session}", json={"control_channel": "nope"})
     assert nowhere.status_code == 422
-    assert "beta" in nowhere.json()["mend"]
+    assert "beta" in nowhere.json()["hint"]
     assert client.get(f"/api/v1/sessions/{session}").json()["controller"] == "other"
 
 

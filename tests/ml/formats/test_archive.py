@@ -14,7 +14,7 @@ from ml.formats.archive import FolderFiles, ZipFiles
 
 def members(path, **limits):
     with ZipFiles(path, ArchiveLimits(**limits)) as files:
-        return files.names(), files.ignored
+        return files.names(), [str(f) for f in files.left_out]
 
 
 def test_paths_that_lead_out_are_ignored_and_said(pack):
@@ -48,7 +48,7 @@ def test_links_in_a_folder_are_not_followed(tmp_path):
     (folder / "StimLog.json").symlink_to(secret)
     files = FolderFiles(folder)
     assert files.names() == []
-    assert "not followed" in files.ignored[0]
+    assert "not followed" in files.left_out[0].reason
 
 
 def test_an_encrypted_archive_is_refused(pack):

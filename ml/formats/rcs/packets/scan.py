@@ -1,7 +1,7 @@
 """Compiled reading of plain RC+S stream packets: bytes in, float arrays out, no Python object per number.
 
 A packet is plain when it is strict JSON and holds nothing but the fields of format notes A.2 to A.4 with values of the right kind, each
-once. Everything else, damage included, is left to the tolerant reader of `rcs_json`; `batch_of` gives its packets the same shape.
+once. Everything else, damage included, is left to the tolerant reader of `json_elements`; `batch_of` gives its packets the same shape.
 
 A number whose digits fit 53 bits and whose decimal shift is at most 22 is one correctly rounded operation on exact doubles; the others,
 such as 0.040411999999999997, are left to `float`, so that every value is the one that any JSON parser gives.
@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.rcs.packets.scan_kernel import ARRAYS, PADDING, SCALARS, copy_runs, read_packets
+from ml.formats.rcs.packets._scan_kernel import ARRAYS, PADDING, SCALARS, copy_runs, read_packets
 from ml.formats.rcs.settings import get, number
 
 __all__ = ["ARRAYS", "PADDING", "SCALARS", "Batch", "batch_of", "join", "scan"]
@@ -71,10 +71,10 @@ def scan(text: bytes, at: int) -> tuple[Batch, int, bool]:
     """
     raw = np.frombuffer(text, dtype=np.uint8)
     end = raw.size - len(PADDING)
-    room = min(_MAX_BATCH, (end - at) // _SHORTEST_PACKET + 1)
-    scalars = np.full((room, len(SCALARS)), np.nan)
-    starts = np.zeros((room, len(ARRAYS)), dtype=np.int64)
-    lengths = np.full((room, len(ARRAYS)), -1, dtype=np.int64)
+    capacity = min(_MAX_BATCH, (end - at) // _SHORTEST_PACKET + 1)
+    scalars = np.full((capacity, len(SCALARS)), np.nan)
+    starts = np.zeros((capacity, len(ARRAYS)), dtype=np.int64)
+    lengths = np.full((capacity, len(ARRAYS)), -1, dtype=np.int64)
     pool = np.empty((end - at) // 2 + 1)
     hard = np.empty(((end - at) // _SHORTEST_HARD + 1, 2), dtype=np.int64)
     count, used, difficult, stop, failed = read_packets(raw, at, end, scalars, starts, lengths, pool, hard)

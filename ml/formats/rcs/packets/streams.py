@@ -78,7 +78,7 @@ class Fft:
 
 @dataclass(frozen=True, slots=True)
 class TimeSync:
-    """Clock exchanges: measured latency in ms, [n]; NaN where none was told."""
+    """Clock exchanges: measured latency in ms, [n]; NaN where none was measured."""
 
     headers: PacketHeaders
     latency_ms: NDArray[np.float64]
@@ -135,14 +135,14 @@ class _Table:
         return PacketHeaders(seconds, tick, gen, rx, sequence, many.astype(np.int64), rate)
 
     def pc_ms(self) -> NDArray[np.float64]:
-        """PC time of every packet, ms: when it was generated, else when it arrived; NaN when neither is told."""
+        """PC time of every packet, ms: when it was generated, else when it arrived; NaN when neither is known."""
         gen, rx = self.column("PacketGenTime"), self.column("PacketRxUnixTime")
         return np.where(gen > 0, gen, np.where(rx > 0, rx, np.nan))
 
     def rate_of(self, interval_at: Interval) -> NDArray[np.float64]:
         """Packets per second under the FFT interval in force at each packet, [n]."""
-        told = [interval_at(t) for t in self.pc_ms().tolist()]
-        return _rate(np.array([np.nan if value is None else value for value in told], dtype=np.float64), self.column("systemTick"))
+        values = [interval_at(t) for t in self.pc_ms().tolist()]
+        return _rate(np.array([np.nan if value is None else value for value in values], dtype=np.float64), self.column("systemTick"))
 
 
 _KEPT = ("seconds", "systemTick", "dataTypeSequence", "PacketGenTime", "PacketRxUnixTime", "SampleRate", "FftSize", "Channel")

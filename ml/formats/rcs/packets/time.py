@@ -15,6 +15,7 @@ Differences from the toolbox, on purpose:
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +26,17 @@ ROLLOVER_S = ROLLOVER / TICKS_PER_S
 DAY_S = 86_400
 CLOCK_DEVIATION_MS = 2_000
 BACK_STEP_MS = 500
-TWICE = "the same packet twice"
 UNSEEN_GAP_S = 6.5
 """Beyond this the 8-bit sequence number says nothing about how many packets are missing, or whether the stream was on."""
+
+
+class Rejected(StrEnum):
+    """Why a packet was left out."""
+
+    DAY_OFF = "day_off"
+    CLOCKS_DISAGREE = "clocks_disagree"
+    DUPLICATE = "duplicate"
+    STEPS_BACK = "steps_back"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +78,7 @@ class PacketTimes:
     chunk: NDArray[np.int64]
     device_clock: bool
     missing: int
-    rejected: dict[str, int] = field(default_factory=dict)
+    rejected: dict[Rejected, int] = field(default_factory=dict)
     reordered: int = 0
 
     @property
@@ -86,7 +95,7 @@ class PacketTimes:
 
 def reconstruct(headers: PacketHeaders) -> PacketTimes:
     """Place every packet of one stream in time."""
-    rejected: dict[str, int] = {}
+    rejected: dict[Rejected, int] = {}
     gen = np.where(headers.gen_ms > 0, headers.gen_ms, np.nan)
     keep = _acceptable(headers, gen, rejected)
     last_ms = np.full(headers.size, np.nan)
@@ -104,7 +113,7 @@ def reconstruct(headers: PacketHeaders) -> PacketTimes:
     return PacketTimes(last_ms, chunk, device_clock, _missing(kept, device_ms), rejected, reordered)
 
 
-def _in_device_order(headers: PacketHeaders, index: NDArray[np.int64], rejected: dict[str, int]) -> tuple[NDArray[np.int64], int]:
+def _in_device_order(headers: PacketHeaders, index: NDArray[np.int64], rejected: dict[Rejected, int]) -> tuple[NDArray[np.int64], int]:
     """The packets in the order of the device's clock without repetitions, and how many of them were late."""
     device_ms = _device_ms(headers.take(index))
     reordered = int(np.sum(device_ms < np.maximum.accumulate(device_ms)))
@@ -113,7 +122,7 @@ def _in_device_order(headers: PacketHeaders, index: NDArray[np.int64], rejected:
     order = index[np.argsort(device_ms, kind="stable")]
     twin = np.concatenate(([False], _same_packet(headers.take(order))))
     if twin.any():
-        rejected[TWICE] = rejected.get(TWICE, 0) + int(twin.sum())
+        rejected[Rejected.DUPLICATE] = rejected.get(Rejected.DUPLICATE, 0) + int(twin.sum())
     return order[~twin], reordered
 
 
@@ -122,24 +131,24 @@ def _same_packet(headers: PacketHeaders) -> NDArray[np.bool_]:
     return np.asarray((np.diff(headers.sequence) == 0) & (np.diff(headers.tick) == 0))
 
 
-def _acceptable(headers: PacketHeaders, gen: NDArray[np.float64], rejected: dict[str, int]) -> NDArray[np.bool_]:
+def _acceptable(headers: PacketHeaders, gen: NDArray[np.float64], rejected: dict[Rejected, int]) -> NDArray[np.bool_]:
     """Which packets to use, [n]; counts the others by reason."""
     keep = np.ones(headers.size, dtype=bool)
 
-    def drop(mask: NDArray[np.bool_], reason: str) -> None:
+    def drop(mask: NDArray[np.bool_], reason: Rejected) -> None:
         if count := int(np.sum(keep & mask)):
             rejected[reason] = count
             keep[mask] = False
 
     if headers.size == 0:
         return keep
-    drop(np.abs(headers.seconds - np.median(headers.seconds)) > DAY_S, "timestamp more than a day off")
+    drop(np.abs(headers.seconds - np.median(headers.seconds)) > DAY_S, Rejected.DAY_OFF)
     deviation = gen - 1000.0 * headers.seconds
     if np.any(usable := keep & np.isfinite(deviation)):
         far = np.abs(deviation - np.median(deviation[usable])) > CLOCK_DEVIATION_MS
-        drop(np.isfinite(deviation) & far, "device and PC clock disagree by more than 2 s")
-    drop(np.concatenate(([False], _same_packet(headers))), TWICE)
-    drop(_after_back_step(gen), "PacketGenTime steps back")
+        drop(np.isfinite(deviation) & far, Rejected.CLOCKS_DISAGREE)
+    drop(np.concatenate(([False], _same_packet(headers))), Rejected.DUPLICATE)
+    drop(_after_back_step(gen), Rejected.STEPS_BACK)
     return keep
 
 

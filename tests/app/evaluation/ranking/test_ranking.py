@@ -37,7 +37,7 @@ def ranked(client: TestClient) -> dict[str, Any]:
 def test_before_any_evaluation_the_ranking_says_what_to_do(client: TestClient, enrolled: str) -> None:
     answer = client.get(RANKING)
     assert answer.status_code == 404
-    assert "pipeline" in answer.json()["mend"]
+    assert "pipeline" in answer.json()["hint"]
     page = client.get("/participants/P1/ranking")
     assert page.status_code == 200
     assert "Not enough data." in page.text

@@ -1,15 +1,17 @@
-"""Guesses at the visit and the controller of a recording, and the sentence that says why."""
+"""Guesses at the visit and the controller of a recording, and their evidence, in words where somebody reads it."""
 
 from __future__ import annotations
 
+import json
 from datetime import date
 
 import numpy as np
 import pytest
 
-from app.ingest.proposals.evidence import guess_controller, guess_visit
+from app.ingest import wording
+from app.ingest.proposals.evidence import BY_CUT, BY_UPLOAD, Evidence, Reason, Source, guess_controller, guess_visit
 from app.study.models import Controller, Visit
-from app.study.sessions.contradictions import Delivered
+from app.study.sessions.stimulation import Delivered
 from app.study.traces import StepTable
 
 nan = float("nan")
@@ -42,16 +44,15 @@ def side(table: StepTable | None, name: str = "right side") -> Delivered:
     ],
 )
 def test_the_controller_is_guessed_from_the_amplitude_or_left_open(amplitude_ma: list[float], guess: Controller | None, why: str) -> None:
-    found, said = guess_controller([side(steps(amplitude_ma))])
+    found, evidence = guess_controller([side(steps(amplitude_ma))])
     assert found is guess
-    assert why in said
+    assert why in wording.reason(evidence)
 
 
 def test_without_a_stated_cdbs_amplitude_a_constant_one_proves_nothing_but_zero_does() -> None:
-    assert guess_controller([side(steps([2.4, 2.4], cdbs_ma=None))]) == (
-        None,
-        "the amplitude is constant at 2.4 mA, but no cDBS amplitude is stated to hold it against",
-    )
+    found, evidence = guess_controller([side(steps([2.4, 2.4], cdbs_ma=None))])
+    assert found is None
+    assert wording.reason(evidence) == "the amplitude is constant at 2.4 mA, but no cDBS amplitude is stated to hold it against"
     assert guess_controller([side(steps([0, 0], cdbs_ma=None))])[0] is Controller.NO_DBS
 
 
@@ -69,9 +70,9 @@ def test_without_a_stated_cdbs_amplitude_a_constant_one_proves_nothing_but_zero_
 def test_the_controller_is_guessed_from_every_side_or_left_open(
     left: StepTable, right: StepTable | None, guess: Controller | None, why: str
 ) -> None:
-    found, said = guess_controller([side(left, "left side"), side(right)])
+    found, evidence = guess_controller([side(left, "left side"), side(right)])
     assert found is guess
-    assert why in said
+    assert why in wording.reason(Evidence.from_json(json.loads(json.dumps(evidence.as_json()))))
 
 
 VISITS = [Visit(number=1, date=date(2026, 3, 2)), Visit(number=2, date=date(2026, 3, 30)), Visit(number=3, date=date(2026, 4, 27))]
@@ -80,7 +81,8 @@ TODAY = date(2026, 4, 1)
 
 def test_the_visit_of_the_recordings_day_is_taken() -> None:
     guess = guess_visit(VISITS, date(2026, 3, 2), None, TODAY)
-    assert (guess.visit.number, guess.open, guess.why) == (1, False, "recorded on 2026-03-02, the day of visit 1")
+    assert (guess.visit.number, guess.open) == (1, False)
+    assert wording.reason(guess.why) == "recorded on 2026-03-02, the day of visit 1"
 
 
 def test_the_stated_visit_wins_over_the_day() -> None:
@@ -95,11 +97,28 @@ def test_the_stated_visit_wins_over_the_day() -> None:
 def test_without_a_visit_of_that_day_the_choice_is_open_and_kept_in_the_newest_past_visit(day: date | None, why: str) -> None:
     guess = guess_visit(VISITS, day, None, TODAY)
     assert (guess.visit.number, guess.open) == (2, True)
-    assert why in guess.why
+    assert why in wording.reason(guess.why)
 
 
 def test_two_visits_of_one_day_leave_the_choice_open() -> None:
     twice = [*VISITS, Visit(number=4, date=date(2026, 3, 2))]
     guess = guess_visit(twice, date(2026, 3, 2), None, TODAY)
     assert guess.open
-    assert "2 visits are dated 2026-03-02" in guess.why
+    assert "2 visits are dated 2026-03-02" in wording.reason(guess.why)
+
+
+def test_a_persons_word_is_told_from_a_guess_by_its_source_and_not_by_its_sentence() -> None:
+    by_person = Evidence(Source.PERSON, Reason.STATED, {"by": "a@clinic.example"})
+    assert [e.stated for e in (BY_UPLOAD, BY_CUT, by_person)] == [True, True, True]
+    assert not guess_visit(VISITS, date(2026, 3, 2), None, TODAY).why.stated
+    assert not guess_controller([side(steps([0, 0]))])[1].stated
+
+
+@pytest.mark.parametrize(("sentence", "stated"), [("as stated by a@clinic.example", True), ("the file tells no amplitude", False)])
+def test_evidence_stored_as_a_sentence_is_still_read(sentence: str, stated: bool) -> None:
+    evidence = Evidence.from_json(sentence)
+    assert (evidence.stated, wording.reason(evidence)) == (stated, sentence)
+
+
+def test_every_reason_has_words() -> None:
+    assert set(wording._SENTENCES) | {Reason.STATED} == set(Reason)

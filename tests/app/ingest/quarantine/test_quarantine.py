@@ -13,6 +13,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.ingest.models import UploadFile
+from app.ingest.quarantine.serializers import problem_of
+from app.ingest.uploads.receiving import stored_reports
 from app.platform import files
 from app.platform.audit import AuditEvent
 from app.platform.files import StoredFile
@@ -123,7 +125,7 @@ def test_bytes_that_were_read_meanwhile_are_not_read_twice(send: Any, client: Te
     held = next(f for f in client.get("/api/v1/participants/P1/quarantine").json() if f["held"])
     answer = decide(client, held, "release", how="read", reason="now")
     assert answer.status_code == 409
-    assert "Discard this copy" in answer.json()["mend"]
+    assert "Discard this copy" in answer.json()["hint"]
 
 
 def test_tampered_bytes_are_refused_in_words(held: dict[str, Any], client: TestClient) -> None:
@@ -168,3 +170,20 @@ def test_the_report_tells_files_of_one_name_apart_and_puts_what_is_of_use_first(
     places = {f["name"]: page.index(f">file {f['id']}<") for f in answer["files"]}
     assert places["t.csv"] < min(p for n, p in places.items() if n != "t.csv")
     assert len(set(places.values())) == 3
+
+
+def test_why_members_could_not_be_read_is_stored_beside_the_sentences_and_read_from_old_rows_too() -> None:
+    flag = "kept encrypted, because it could not be read: StimLog.json: damaged"
+    report = {"name": "rcs.zip", "understood": [], "repaired": [], "ignored": [], "flagged": [flag], "removed": [], "problem": None}
+    new = UploadFile(report={"reports": [{**report, "flagged": ["other words"]}], "unreadable": ["StimLog.json: damaged"]})
+    old = UploadFile(report={"reports": [report], "known_recordings": []})
+    assert problem_of(new) == problem_of(old) == flag
+
+
+def test_a_report_of_version_0_1_0_is_read_with_its_hint() -> None:
+    problem = {"what": "the file is empty", "where": "file", "mend": "Send it again."}
+    lists = {name: [] for name in ("understood", "repaired", "ignored", "flagged", "removed")}
+    row = UploadFile(report={"reports": [{"name": "a.csv", **lists, "problem": problem}]})
+    found = stored_reports(row)[0].problem
+    assert found is not None
+    assert found.hint == "Send it again."

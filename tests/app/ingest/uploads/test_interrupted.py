@@ -1,4 +1,4 @@
-"""A service that is stopped in the middle of an upload: what had come is taken up, and nothing is read while it is still coming."""
+"""A service that is stopped in the middle of an upload: what had come is resumed, and nothing is read while it is still coming."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from app.ingest.models import Upload, UploadFile
 from app.ingest.sessions import StatedSession
 from app.ingest.uploads import service
 from app.ingest.uploads.in_progress import in_progress, interrupted
-from app.ingest.uploads.interrupted import take_up
+from app.ingest.uploads.interrupted import resume
 from app.ingest.uploads.receiving import Receiver
 from app.ingest.uploads.service import Incoming
 from app.platform.database import new_session
@@ -60,7 +60,7 @@ def test_an_upload_that_was_cut_short_is_taken_up(
 ) -> None:
     number = cut_short(db, monkeypatch, where, name, nth)
     assert client.get(f"/api/v1/uploads/{number}").json()["status"] == "received"
-    (taken,) = take_up("test")
+    (taken,) = resume("test")
     assert (taken.upload_id, taken.done) == (number, True)
     body = client.get(f"/api/v1/uploads/{number}").json()
     assert body["status"] == "decoded"
@@ -72,7 +72,7 @@ def test_an_upload_that_was_cut_short_is_taken_up(
         assert "The service was stopped while it read this file" in repr(body["report"])
     if files == 2:
         assert client.get(f"/api/v1/uploads/{number}").json()["files"][1]["session_ids"] == [proposal["session"]["id"]]
-    assert list(take_up("test")) == []
+    assert list(resume("test")) == []
 
 
 def test_what_the_sender_had_stated_holds_when_it_is_taken_up(
@@ -80,7 +80,7 @@ def test_what_the_sender_had_stated_holds_when_it_is_taken_up(
 ) -> None:
     visit = study.visit_by_number(db, study.participant_by_code(db, "P1", SYSTEM).id, 1)
     cut_short(db, monkeypatch, service, "make_sessions", visit=visit, controller=Controller.RANDOM)
-    assert [t.done for t in take_up("test")] == [True]
+    assert [t.done for t in resume("test")] == [True]
     (session,) = client.get("/api/v1/visits/1/sessions").json()["items"]
     assert (session["controller"], session["status"]) == ("random", "confirmed")
 
@@ -89,7 +89,7 @@ def test_an_upload_that_is_still_coming_is_left_alone(enrolled: str, db: Session
     number = cut_short(db, monkeypatch, formats, "decode")
     with in_progress(number):
         assert interrupted(db) == []
-        assert list(take_up("test")) == []
+        assert list(resume("test")) == []
     db.rollback()
     assert interrupted(db) == [number]
 
@@ -109,7 +109,7 @@ def test_bytes_that_nobody_can_read_are_told_when_they_are_taken_up(
         noise, mine = Incoming("noise.bin", io.BytesIO(b"\x00\x01noise" * 20)), study.participant_by_code(dying, "P1", SYSTEM)
         with pytest.raises(Stopped):
             service.receive(dying, mine, StatedSession(), [noise], SYSTEM)
-    assert [t.done for t in take_up("test")] == [True]
+    assert [t.done for t in resume("test")] == [True]
     (file,) = db.scalars(select(UploadFile))
     assert (file.status, file.quarantine_sha256 is not None) == ("failed", True)
     (row,) = client.get("/api/v1/participants/P1/quarantine").json()

@@ -193,7 +193,7 @@ def test_a_hostile_file_ends_as_a_sentence_and_the_good_one_beside_it_counts(
     assert (told[name]["status"], told["good.csv"]["status"]) == ("failed", "decoded")
     problem = next(r["problem"] for r in answer.json()["report"] if r["name"] == name)
     assert named in f"{problem['what']} {problem['where']}"
-    assert problem["mend"]
+    assert problem["hint"]
     assert told[name]["quarantined"] == (name != "empty.csv")  # of an empty file there is nothing to keep
     assert len(answer.json()["sessions"]) == 1
     assert client.get("/healthz").status_code == 200
@@ -221,7 +221,7 @@ def test_one_file_above_the_limit_loses_none_of_the_others(send: Any, monkeypatc
     assert [f["name"] for f in answer.json()["files"]] == ["good.csv"]
     problem = next(r["problem"] for r in answer.json()["report"] if r["name"] == "big.csv")
     assert "larger than 1 MiB" in problem["what"]
-    assert "not kept" in problem["mend"]
+    assert "not kept" in problem["hint"]
 
 
 def test_a_request_that_claims_ten_gigabytes_is_refused_before_it_is_read(client: TestClient, enrolled: str) -> None:

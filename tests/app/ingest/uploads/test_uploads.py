@@ -128,7 +128,7 @@ def test_a_file_of_no_use_is_kept_and_named(client: TestClient, enrolled: str, c
     assert problem["file"] == name
     assert name in problem["detail"]
     assert named in (problem["detail"] + problem["where"]).lower()
-    assert problem["mend"]
+    assert problem["hint"]
     kept = client.get(f"/api/v1/uploads/{problem['upload_id']}").json()["files"][0]
     assert kept["status"] == "failed"
     assert files.path_of(kept["stored_sha256"]).exists()

@@ -84,7 +84,7 @@ def test_what_is_no_policy_is_refused_in_words(client: TestClient, enrolled: str
     assert answer.headers["content-type"] == "application/problem+json"
     assert words in answer.json()["detail"]
     assert "lyon.onnx" in answer.json()["detail"]
-    assert "[N, 10]" in answer.json()["mend"]
+    assert "[N, 10]" in answer.json()["hint"]
     assert client.get("/api/v1/participants/P1/policies").json()["total"] == 0
 
 

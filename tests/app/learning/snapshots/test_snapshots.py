@@ -114,7 +114,7 @@ def test_a_threshold_whose_unit_or_source_nobody_stated_judges_no_session(
     db.rollback()
     with pytest.raises(Invalid, match=unstated) as refused:
         take_snapshot(db, participant_by_code(db, "P1", SYSTEM), SYSTEM)
-    assert "uV from table (2), mV from table (1)" in refused.value.mend
+    assert "uV from table (2), mV from table (1)" in refused.value.hint
     stated = {"beta_unit": "uV", "beta_source": "table"}
     client.put("/api/v1/participants/P1/settings", json={"settings": stated})
     snapshot, buffer = taken(db)

@@ -39,7 +39,7 @@ def take(client: TestClient, policy: int, **query: Any) -> Any:
 
 def record_limits(db: Session, limits: dict[str, Any], day: int = 1, hemisphere: Hemisphere | None = None) -> None:
     participant = participant_by_code(db, "P1", SYSTEM)
-    device = Device(participant_id=participant.id, pseudonym=f"d{day}", kind="rcs", hemisphere=hemisphere)
+    device = Device(participant_id=participant.id, pseudonym=f"d{day}", kind="rcs")
     db.add(device)
     db.flush()
     row = Recording(

@@ -31,7 +31,7 @@ def test_a_visit_without_a_plan_says_how_to_get_one(client: TestClient, studied:
     answer = client.get(_path(studied.visit))
     assert answer.status_code == 404
     assert answer.json()["detail"] == "Visit 2 of participant P1 has no plan yet."
-    assert "draft one" in answer.json()["mend"]
+    assert "draft one" in answer.json()["hint"]
     assert client.get(_path(studied.visit, ".pdf")).status_code == 404
     assert client.post(_path(studied.visit, "/approve")).status_code == 404
 
@@ -160,7 +160,7 @@ def test_an_approved_plan_is_fixed_and_superseded_only_with_a_reason_in_the_audi
     assert "was approved by admin@clinic.example already" in again.json()["detail"]
     unexplained = _draft(client, studied, reason=" ")
     assert unexplained.status_code == 422
-    assert "Say why the approved plan is replaced" in unexplained.json()["mend"]
+    assert "Say why the approved plan is replaced" in unexplained.json()["hint"]
     assert client.get(_path(studied.visit)).json()["id"] == draft["id"]
     assert _draft(client, studied, reason="participant came late").status_code == 201
     rows = db.scalars(

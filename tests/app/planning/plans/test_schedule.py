@@ -78,7 +78,7 @@ def test_a_day_that_is_too_long_says_how_many_policies_fit() -> None:
     with pytest.raises(Invalid) as refusal:
         schedule([Candidate(i, Controller.RL) for i in range(4)], tight, seed=0)
     assert refusal.value.detail == "4 policies with the sessions around them take 100 minutes; the visit has 60."
-    assert refusal.value.mend == "Choose at most 2 policies, or shorten sessions or washout, or give the visit more minutes."
+    assert refusal.value.hint == "Choose at most 2 policies, or shorten sessions or washout, or give the visit more minutes."
     schedule([Candidate(i, Controller.RL) for i in range(2)], tight, seed=0)
 
 
@@ -100,7 +100,7 @@ def test_an_early_visit_without_policies_is_random_sessions_after_one_of_cdbs() 
     assert day[-1].end_minute == pytest.approx(total_minutes(0, Rules(random_sessions=3, no_dbs=True)))
     with pytest.raises(Invalid, match=r"The random sessions .* take 130 minutes") as refusal:
         schedule([], Rules(random_sessions=8), seed=3)
-    assert refusal.value.mend.startswith("Plan fewer random sessions, or shorten sessions or washout")
+    assert refusal.value.hint.startswith("Plan fewer random sessions, or shorten sessions or washout")
 
 
 @pytest.mark.parametrize("minutes", [4.9, 20.1])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from app.study.models import Recording
 from app.study.sessions.recording_charts import Stretch, spectrum_charts, trace_charts
 from app.study.sessions.recording_facts import (
@@ -19,8 +21,14 @@ def recording(**details: Any) -> Recording:
     return Recording(id=7, clock="pc", duration_s=100.0, details=details)
 
 
-def test_packets_left_out_stand_under_their_reason() -> None:
-    rejected = {"the same packet twice": 3, "PacketGenTime steps back": 4, "timestamp more than a day off": 1}
+@pytest.mark.parametrize(
+    "rejected",
+    [
+        {"duplicate": 3, "steps_back": 4, "day_off": 1},
+        {"the same packet twice": 3, "PacketGenTime steps back": 4, "timestamp more than a day off": 1},  # stored by version 0.1.0
+    ],
+)
+def test_packets_left_out_stand_under_their_reason(rejected: dict[str, int]) -> None:
     told = {
         "packets": 2156,
         "missing": 385,
@@ -56,7 +64,7 @@ def test_loss_that_cannot_be_seen_is_not_given_as_no_loss() -> None:
 def test_quality_of_no_stream_is_told_in_words_and_empty_parts_are_not() -> None:
     one = recording(quality={"errors": 2, "spike_packets": {"band 1": 120}, "time_domain": {}, "valid_fraction": {"beta": 0.25}})
     assert quality_rows(one) == []
-    assert quality_remarks(one) == ["errors: 2", "spike packets: band 1 120"]
+    assert quality_remarks(one) == [("errors", "2"), ("spike packets", "band 1 120")]
     assert valid_shares(one) == {"beta": 0.25}
 
 

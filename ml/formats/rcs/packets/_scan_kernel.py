@@ -1,4 +1,4 @@
-"""The compiled part of `rcs_scan`: a strict parser of RC+S stream packets over raw bytes.
+"""The compiled part of `scan`: a strict parser of RC+S stream packets over raw bytes.
 
 Functions return the place behind what they read, or minus the place where they failed; the caller says what that means.
 """

@@ -282,7 +282,7 @@ def test_every_complete_packet_of_a_malformed_file_is_kept_and_the_defect_said(r
 def test_the_duplicate_counts_once(recordings, tmp_path):
     shutil.copy(recordings / "rcs/malformed/RawDataTD_duplicate_packet.json", tmp_path / "RawDataTD.json")
     quality = one(decode_rcs(tmp_path, DecodeOptions())).quality["time_domain"]
-    assert quality["rejected"] == {"the same packet twice": 1}
+    assert quality["rejected"] == {"duplicate": 1}
     assert quality["packets"] - 1 == 279
 
 

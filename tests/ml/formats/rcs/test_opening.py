@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from ml.formats import decode, sniff
+from ml.formats.rcs import redact_rcs_zip
 from ml.formats.rcs.opening import Opening, group, read_opening
-from ml.formats.redact import redact_rcs_zip
 
 
 @pytest.mark.parametrize("name", ["stim_sweep", "embedded_adaptive", "montage_packet_loss", "empty_streams"])

@@ -46,7 +46,7 @@ def test_a_report_that_is_no_whole_json_is_refused_with_a_reason(write, content,
     assert sniff(path) == "percept"
     with pytest.raises(UndecodableFile, match=what) as caught:
         decode(path)
-    assert caught.value.mend
+    assert caught.value.hint
 
 
 def test_a_single_json_of_something_else_is_no_report(write):

@@ -151,7 +151,7 @@ def test_a_decimal_comma_is_read(write):
 def test_lfp_that_cannot_be_used_says_why(write, text, what):
     with pytest.raises(UndecodableFile, match=what) as caught:
         decode(write(text))
-    assert caught.value.mend
+    assert caught.value.hint
     assert caught.value.where
 
 

@@ -165,7 +165,7 @@ def test_a_text_in_brackets_that_is_no_unit_is_not_taken_for_one(write):
 def test_the_stored_problem_does_not_repeat_the_files_words_and_the_told_one_does(write, text):
     with pytest.raises(UndecodableFile) as caught:
         decode(write(text))
-    assert "Jane" in caught.value.told.what + caught.value.told.where
+    assert "Jane" in caught.value.for_sender.what + caught.value.for_sender.where
     assert "Jane" not in repr(caught.value.stored)
     assert pickle.loads(pickle.dumps(caught.value)).stored == caught.value.stored
 
@@ -232,7 +232,7 @@ def test_a_table_that_cannot_be_used_says_what_where_and_how_to_mend_it(write, t
     with pytest.raises(UndecodableFile, match=what) as caught:
         decode(write(text))
     assert where in caught.value.where
-    assert caught.value.mend
+    assert caught.value.hint
 
 
 def test_a_table_is_known_by_its_content_not_its_extension(write, tmp_path):
@@ -322,5 +322,5 @@ def test_no_bytes_whatever_raise_anything_but_a_clear_error(tmp_path_factory, co
         decoded = decode(path)
         found = (*decoded.recordings, *decoded.tremor, *decoded.grasps)
     except UndecodableFile as error:
-        said = error.what and error.where and error.mend
+        said = error.what and error.where and error.hint
     assert found or said

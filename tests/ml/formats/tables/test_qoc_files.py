@@ -213,7 +213,7 @@ def test_whatever_follows_a_header_gives_content_or_a_clear_error(tmp_path_facto
         decoded = decode(path)
         found = (*decoded.recordings, *decoded.tremor, *decoded.grasps)
     except UndecodableFile as error:
-        said = error.what and error.where and error.mend
+        said = error.what and error.where and error.hint
     assert found or said
 
 

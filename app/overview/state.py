@@ -1,4 +1,4 @@
-"""Queries that join phases: what the overview says of every participant, in a handful of statements whatever their number."""
+"""Where every participant stands, and what somebody should do."""
 
 from __future__ import annotations
 
@@ -6,16 +6,11 @@ import datetime as dt
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
-from app.evaluation.models import Evaluation
-from app.evaluation.schemas import RANKING_KINDS
-from app.learning.models import BufferSnapshot, Policy
-from app.planning.plans.models import Plan
-from app.platform.audit import AuditEvent
-from app.platform.jobs.models import Job, JobStatus
-from app.study.models import Participant, QocRevision, StudySession, Visit
+from app.overview import repository
+from app.platform.jobs.models import Job
+from app.study.models import Participant
 
 PHASES = (("I", "Collect"), ("II", "Learn"), ("III", "Evaluate"), ("IV", "Plan"))
 
@@ -34,7 +29,7 @@ class State:
         plan: status of the plan of the latest visit that has one.
         running, failed: jobs; the latter of the last 7 days.
         ranking_job: the live job that will bring the first ranking; None where there is a ranking or no such job.
-        attention: sentences with the page where the matter is mended.
+        attention: sentences with the page where the matter is put right.
     """
 
     sessions: int = 0
@@ -105,73 +100,25 @@ def attention(participant: Participant, state: State) -> list[tuple[str, str]]:
     return todo
 
 
-def audit_events(db: Session, entity: str, entity_id: str, actor: str, limit: int, offset: int) -> tuple[Sequence[AuditEvent], int]:
-    """A page of the audit trail, newest first, and how many rows match; empty filters match all."""
-    query: Select[AuditEvent] = select(AuditEvent)
-    for column, wanted in ((AuditEvent.entity, entity), (AuditEvent.entity_id, entity_id), (AuditEvent.actor, actor)):
-        if wanted:
-            query = query.where(column == wanted)
-    total = db.scalar(select(func.count()).select_from(query.subquery())) or 0
-    return db.scalars(query.order_by(AuditEvent.id.desc()).limit(limit).offset(offset)).all(), total
-
-
 def _study(db: Session, ids: list[int], found: dict[int, State], today: dt.date) -> None:
-    visits = (
-        select(
-            Visit.participant_id,
-            func.count(),
-            func.max(Visit.date).filter(Visit.date <= today),
-            func.min(Visit.date).filter(Visit.date >= today),
-        )
-        .where(Visit.participant_id.in_(ids))
-        .group_by(Visit.participant_id)
-    )
-    for key, visits_n, last, coming in db.execute(visits):
-        found[key].visits, found[key].last_visit, found[key].next_visit = visits_n, last, coming
-    confirmed = StudySession.status == "confirmed"
-    counts = confirmed & StudySession.excluded_reason.is_(None)
-    has_qoc = select(QocRevision.id).where(QocRevision.session_id == StudySession.id).exists()
-    sessions = (
-        select(
-            Visit.participant_id,
-            func.count().filter(confirmed),
-            func.count().filter(confirmed & ~counts),
-            func.count().filter(counts & ~has_qoc),
-            func.count().filter(~confirmed),
-            func.max(StudySession.created_at).filter(confirmed),
-        )
-        .join(Visit, Visit.id == StudySession.visit_id)
-        .where(Visit.participant_id.in_(ids))
-        .group_by(Visit.participant_id)
-    )
-    for key, total, excluded, without, proposed, newest in db.execute(sessions):
+    for key, visits, last, coming in repository.visit_days(db, ids, today):
+        found[key].visits, found[key].last_visit, found[key].next_visit = visits, last, coming
+    for key, total, excluded, without, proposed, newest in repository.session_counts(db, ids):
         state = found[key]
         state.sessions, state.excluded, state.without_qoc, state.proposed, state.newest_session = total, excluded, without, proposed, newest
 
 
 def _results(db: Session, ids: list[int], found: dict[int, State]) -> None:
-    policies = select(Policy.participant_id, func.count()).where(Policy.participant_id.in_(ids), Policy.retired_reason.is_(None))
-    for key, total in db.execute(policies.where(Policy.kind != "baseline").group_by(Policy.participant_id)):
+    for key, total in repository.policy_counts(db, ids):
         found[key].policies = total
-    evaluations = (
-        select(Evaluation.participant_id, Evaluation.created_at, BufferSnapshot.created_at)
-        .join(BufferSnapshot, BufferSnapshot.id == Evaluation.snapshot_id)
-        .where(Evaluation.participant_id.in_(ids))
-        .order_by(Evaluation.id)
-    )
-    for key, evaluated_at, snapshot_at in db.execute(evaluations):
+    for key, evaluated_at, snapshot_at in repository.evaluation_times(db, ids):
         found[key].evaluated_at, found[key].snapshot_at = evaluated_at, snapshot_at
-    plans = select(Visit.participant_id, Plan.status).join(Visit, Visit.id == Plan.visit_id)
-    for key, status in db.execute(plans.where(Visit.participant_id.in_(ids), Plan.status != "superseded").order_by(Visit.number)):
+    for key, status in repository.plan_statuses(db, ids):
         found[key].plan = status
-    live = Job.status.in_([JobStatus.QUEUED, JobStatus.RUNNING])
-    lately = (Job.status == JobStatus.FAILED) & (Job.finished_at > func.now() - dt.timedelta(days=7))
-    jobs = select(Job.participant_id, func.count().filter(live), func.count().filter(lately)).where(Job.participant_id.in_(ids))
-    for owner, running, failed in db.execute(jobs.group_by(Job.participant_id)):
+    for owner, running, failed in repository.job_counts(db, ids):
         if owner is not None:
             found[owner].running, found[owner].failed = running, failed
-    first = select(Job).where(Job.participant_id.in_(ids), live, Job.kind.in_(RANKING_KINDS)).order_by(Job.created_at.desc())
-    for job in db.scalars(first):
+    for job in repository.live_ranking_jobs(db, ids):
         if job.participant_id is not None and found[job.participant_id].evaluated_at is None:
             found[job.participant_id].ranking_job = job
 

@@ -1,6 +1,6 @@
 """Take identity out of an RC+S archive before it is stored: names, serial numbers, dates of birth, free text, folder names.
 
-What stays is listed, not what goes: a field is kept only where its key is known (`rcs_keys`), and a text only where its key is known to
+What stays is listed, not what goes: a field is kept only where its key is known (`keys.py`), and a text only where its key is known to
 hold a technical word of a known shape. The result decodes to the same recording, apart from the device's name, which becomes a keyed
 pseudonym.
 """
@@ -74,7 +74,7 @@ def redact_rcs_zip(source: Path, target: Path, key: bytes, limits: ArchiveLimits
         if not sessions:
             raise UndecodableFile("no RC+S session in here", "archive", "Zip the session's Device folder with its JSON files.")
         # in the archive that is written every recording has a folder of its own
-        done = Redaction(repaired=listing.flagged, ignored=[*listing.ignored, *files.ignored])
+        done = Redaction(repaired=listing.flagged, ignored=[*listing.ignored, *map(str, files.left_out)])
         scrub = _Scrubber(key)
         taken: set[str] = set()
         members = sorted(_plan(sessions, files, scrub, taken))

@@ -1,0 +1,80 @@
+"""Sentences of uploads and proposals, made where somebody reads them; nothing is decided by them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from app.ingest.proposals.evidence import Evidence, Reason, Source, stored_courses
+from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern
+
+
+def reasons(evidence: Mapping[str, Any]) -> dict[str, str]:
+    """The stored evidence of a proposal, by field, in words."""
+    return {name: reason(Evidence.from_json(stored)) for name, stored in evidence.items()}
+
+
+def reason(evidence: Evidence) -> str:
+    """Why a value of a proposal is what it is."""
+    return _stated(evidence) if evidence.reason is Reason.STATED else _SENTENCES[evidence.reason](evidence.facts)
+
+
+def unreadable(members: list[str]) -> list[str]:
+    """Of files that could not be read, and are stored encrypted for that reason."""
+    return [f"kept encrypted, because it could not be read: {member}" for member in members]
+
+
+def _stated(evidence: Evidence) -> str:
+    if evidence.source is Source.PERSON:
+        return f"as stated by {evidence.facts['by']}{': open' if evidence.facts.get('open') else ''}"
+    return "as stated with the upload" if evidence.source is Source.UPLOAD else "as stated when the recording was cut"
+
+
+def _amplitude(facts: Mapping[str, Any]) -> str:
+    courses = stored_courses(facts)
+    if not courses:
+        return _NO_AMPLITUDE
+    if len(courses) == 1:
+        return _course(courses[0])
+    each = "; ".join(f"{c.side}: {_course(c)}" for c in courses)
+    if len({c.controller for c in courses}) == 1:
+        return each
+    return f"the sides do not agree, so that a person must say which controller it was ({each})"
+
+
+_NO_AMPLITUDE = "the file tells no amplitude"
+
+
+def _course(c: Course) -> str:
+    """How the amplitude of one side ran."""
+    level = f"{c.median:.3g} {c.unit}" if c.median is not None else ""
+    match c.pattern:
+        case Pattern.UNKNOWN:
+            return _NO_AMPLITUDE
+        case Pattern.MOSTLY_UNKNOWN:
+            return f"the amplitude is known in only {c.known} of {c.steps} steps"
+        case Pattern.OFF:
+            return f"the amplitude is 0 in all {c.known} steps where it is known"
+        case Pattern.AT_CDBS:
+            against = f" of {c.cdbs_ma:.3g} mA" if c.cdbs_ma else ""
+            return f"about {level} throughout, within {100 * CDBS_TOLERANCE:.0f} % of the cDBS amplitude{against}"
+        case Pattern.VARIES:
+            return f"the amplitude varies between {c.low:.3g} and {c.high:.3g} {c.unit}: say which controller it was"
+        case Pattern.CONSTANT_WITHOUT_CDBS:
+            return f"the amplitude is constant at {level}, but no cDBS amplitude is stated to hold it against"
+        case Pattern.CONSTANT:
+            return f"the amplitude is constant at {level}, {c.share:.0f} % of the cDBS amplitude: say which controller it was"
+
+
+_SENTENCES: dict[Reason, Callable[[Mapping[str, Any]], str]] = {
+    Reason.DAY_OF_VISIT: lambda f: f"recorded on {f['day']}, the day of visit {f['visit']}",
+    Reason.NO_DATE: lambda f: "the file tells no date: choose the visit",
+    Reason.SEVERAL_VISITS: lambda f: f"{f['visits']} visits are dated {f['day']}: choose one",
+    Reason.NO_VISIT_OF_DAY: lambda f: f"recorded on {f['day']}, and no visit has that date: choose the visit, or add it",
+    Reason.AMPLITUDE: _amplitude,
+    Reason.UNREADABLE: lambda f: f"its steps cannot be read: {f['detail']}",
+    Reason.RECORDED_SIDE: lambda f: "of the recording that a controller could have seen",
+    Reason.NO_SIDE: lambda f: "the file tells no side",
+    Reason.CUT_OUT: lambda f: f"cut out of proposed session {f['session']}",
+    Reason.SENTENCE: lambda f: str(f["text"]),
+}

@@ -1,0 +1,118 @@
+"""Queries that join phases: what the overview says of every participant, in a handful of statements whatever their number; the trail."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Iterable, Sequence
+
+from sqlalchemy import Row, Select, func, select
+from sqlalchemy.orm import Session
+
+from app.evaluation.models import EstimateRow, Evaluation
+from app.evaluation.schemas import RANKING_KINDS
+from app.learning.models import BufferSnapshot, Policy
+from app.planning.plans.models import Plan
+from app.platform.audit import AuditEvent
+from app.platform.jobs.models import Job, JobStatus
+from app.study.models import QocRevision, StudySession, Visit
+
+
+def audit_events(db: Session, entity: str, entity_id: str, actor: str, limit: int, offset: int) -> tuple[Sequence[AuditEvent], int]:
+    """A page of the audit trail, newest first, and how many rows match; empty filters match all."""
+    query: Select[AuditEvent] = select(AuditEvent)
+    for column, wanted in ((AuditEvent.entity, entity), (AuditEvent.entity_id, entity_id), (AuditEvent.actor, actor)):
+        if wanted:
+            query = query.where(column == wanted)
+    total = db.scalar(select(func.count()).select_from(query.subquery())) or 0
+    return db.scalars(query.order_by(AuditEvent.id.desc()).limit(limit).offset(offset)).all(), total
+
+
+def visit_days(db: Session, ids: Sequence[int], today: dt.date) -> Iterable[Row[int, int, dt.date | None, dt.date | None]]:
+    """By participant: number of visits, the last one up to today, the first from today on."""
+    return db.execute(
+        select(
+            Visit.participant_id,
+            func.count(),
+            func.max(Visit.date).filter(Visit.date <= today),
+            func.min(Visit.date).filter(Visit.date >= today),
+        )
+        .where(Visit.participant_id.in_(ids))
+        .group_by(Visit.participant_id)
+    )
+
+
+def session_counts(db: Session, ids: Sequence[int]) -> Iterable[Row[int, int, int, int, int, dt.datetime | None]]:
+    """By participant: confirmed sessions, excluded and without QoCs, proposed ones, and when the newest one was entered."""
+    confirmed = StudySession.status == "confirmed"
+    counts = confirmed & StudySession.excluded_reason.is_(None)
+    has_qoc = select(QocRevision.id).where(QocRevision.session_id == StudySession.id).exists()
+    return db.execute(
+        select(
+            Visit.participant_id,
+            func.count().filter(confirmed),
+            func.count().filter(confirmed & ~counts),
+            func.count().filter(counts & ~has_qoc),
+            func.count().filter(~confirmed),
+            func.max(StudySession.created_at).filter(confirmed),
+        )
+        .join(Visit, Visit.id == StudySession.visit_id)
+        .where(Visit.participant_id.in_(ids))
+        .group_by(Visit.participant_id)
+    )
+
+
+def policy_counts(db: Session, ids: Sequence[int]) -> Iterable[Row[int, int]]:
+    """By participant: policies that are no baseline and not retired."""
+    policies = select(Policy.participant_id, func.count()).where(Policy.participant_id.in_(ids), Policy.retired_reason.is_(None))
+    return db.execute(policies.where(Policy.kind != "baseline").group_by(Policy.participant_id))
+
+
+def evaluation_times(db: Session, ids: Sequence[int]) -> Iterable[Row[int, dt.datetime, dt.datetime]]:
+    """Participant, time of an evaluation and of its buffer snapshot, oldest first."""
+    return db.execute(
+        select(Evaluation.participant_id, Evaluation.created_at, BufferSnapshot.created_at)
+        .join(BufferSnapshot, BufferSnapshot.id == Evaluation.snapshot_id)
+        .where(Evaluation.participant_id.in_(ids))
+        .order_by(Evaluation.id)
+    )
+
+
+def plan_statuses(db: Session, ids: Sequence[int]) -> Iterable[Row[int, str]]:
+    """Participant and status of each plan that counts, by visit."""
+    plans = select(Visit.participant_id, Plan.status).join(Visit, Visit.id == Plan.visit_id)
+    return db.execute(plans.where(Visit.participant_id.in_(ids), Plan.status != "superseded").order_by(Visit.number))
+
+
+def job_counts(db: Session, ids: Sequence[int]) -> Iterable[Row[int | None, int, int]]:
+    """By participant: jobs that wait or run, and those that failed in the last 7 days."""
+    live = Job.status.in_([JobStatus.QUEUED, JobStatus.RUNNING])
+    lately = (Job.status == JobStatus.FAILED) & (Job.finished_at > func.now() - dt.timedelta(days=7))
+    jobs = select(Job.participant_id, func.count().filter(live), func.count().filter(lately)).where(Job.participant_id.in_(ids))
+    return db.execute(jobs.group_by(Job.participant_id))
+
+
+def live_ranking_jobs(db: Session, ids: Sequence[int]) -> Sequence[Job]:
+    """Jobs that wait or run and end with a ranking, newest first."""
+    live = Job.status.in_([JobStatus.QUEUED, JobStatus.RUNNING])
+    query = select(Job).where(Job.participant_id.in_(ids), live, Job.kind.in_(RANKING_KINDS))
+    return db.scalars(query.order_by(Job.created_at.desc())).all()
+
+
+def policies(db: Session, participant_id: int) -> Sequence[Policy]:
+    """Every policy of a participant, oldest first."""
+    return db.scalars(select(Policy).where(Policy.participant_id == participant_id).order_by(Policy.id)).all()
+
+
+def evaluations(db: Session, participant_id: int) -> Sequence[Evaluation]:
+    """Every evaluation of a participant, oldest first."""
+    return db.scalars(select(Evaluation).where(Evaluation.participant_id == participant_id).order_by(Evaluation.id)).all()
+
+
+def estimates(db: Session, participant_id: int) -> Iterable[Row[Evaluation, EstimateRow]]:
+    """Every estimate of a participant with its evaluation."""
+    return db.execute(
+        select(Evaluation, EstimateRow)
+        .join(EstimateRow, EstimateRow.evaluation_id == Evaluation.id)
+        .where(Evaluation.participant_id == participant_id)
+        .order_by(Evaluation.id, EstimateRow.policy_id, EstimateRow.method)
+    )

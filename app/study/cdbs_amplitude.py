@@ -1,0 +1,78 @@
+"""The cDBS amplitude in force: what every amplitude fraction is a fraction of."""
+
+from __future__ import annotations
+
+from typing import overload
+
+from app.platform.errors import Invalid
+from app.study.models import Hemisphere, Participant, SettingsVersion, StudySession, Visit
+from app.study.schemas import CDBS_MA
+
+
+def stated_at(visit: Visit, hemisphere: Hemisphere | None, program: int | None = 0) -> float | None:
+    """The cDBS amplitude that a visit states for a hemisphere and program, mA; None where it states none.
+
+    A program of which the visit says nothing has the amplitude of program 0, under which an amplitude without a program is stored.
+
+    Args:
+        hemisphere: None where it is not known.
+        program: None where it is not known which one will run: program 0, else the only amplitude that is stated.
+
+    Raises:
+        Invalid: the visit states several, and nothing says which one is meant; an amplitude that no stimulator gives.
+    """
+    sides = [a for a in visit.cdbs_amplitudes if hemisphere in (None, a.hemisphere)]
+    rows = [a for a in sides if a.program == program] or [a for a in sides if a.program == 0] or (sides if program is None else [])
+    if len(rows) > 1:
+        if len({a.hemisphere for a in rows}) > 1:
+            what = f"No hemisphere is named, and visit {visit.number} has cDBS amplitudes for both."
+            raise Invalid(what, "Set the session's hemisphere; for a bundle, name it: left or right.")
+        raise Invalid(f"Visit {visit.number} states cDBS amplitudes of several programs.", "State the amplitude of program 0.")
+    return plausible(rows[0].amplitude_ma, f"Visit {visit.number} states") if rows else None
+
+
+def in_force(visit: Visit, hemisphere: Hemisphere | None, settings: SettingsVersion, program: int = 0) -> float | None:
+    """The cDBS amplitude of a visit's hemisphere and program, mA, else the settings' shorthand; None where nobody stated one.
+
+    Raises:
+        Invalid: as `stated_at`.
+    """
+    stated = stated_at(visit, hemisphere, program)
+    return plausible(settings.cdbs_amplitude_ma, "The participant's settings state") if stated is None else stated
+
+
+def of_session(session: StudySession, settings: SettingsVersion, program: int = 0) -> float | None:
+    """The cDBS amplitude in force for a session, mA; None where nobody stated one. Raises Invalid as `stated_at`."""
+    return in_force(session.visit, session.hemisphere, settings, program)
+
+
+def in_force_now(participant: Participant, hemisphere: Hemisphere | None) -> float:
+    """The cDBS amplitude of the newest visit that states one (of this hemisphere), mA, else the settings' shorthand.
+
+    Raises:
+        Invalid: as `stated_at`, or nobody has stated one.
+    """
+    for visit in sorted(participant.visits, key=lambda v: v.number, reverse=True):
+        stated = stated_at(visit, hemisphere, None)
+        if stated is not None:
+            return stated
+    shorthand = plausible(participant.current_settings.cdbs_amplitude_ma, "The participant's settings state")
+    if shorthand is None:
+        raise Invalid("The cDBS amplitude is not known.", "Set cdbs_amplitude_ma in the participant's settings or at a visit.")
+    return shorthand
+
+
+@overload
+def plausible(amplitude_ma: float, who: str) -> float: ...
+@overload
+def plausible(amplitude_ma: None, who: str) -> None: ...
+@overload
+def plausible(amplitude_ma: float | None, who: str) -> float | None: ...
+def plausible(amplitude_ma: float | None, who: str) -> float | None:
+    """A stated cDBS amplitude, mA. Raises Invalid for one that earlier versions let in: fractions of it would be no numbers."""
+    if amplitude_ma is None or CDBS_MA.low <= amplitude_ma <= CDBS_MA.high:
+        return amplitude_ma
+    raise Invalid(
+        f"{who} a cDBS amplitude of {amplitude_ma:g} mA, outside {CDBS_MA.low:g} to {CDBS_MA.high:g} mA: no fraction follows from it.",
+        "Correct the amplitude.",
+    )

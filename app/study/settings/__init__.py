@@ -1,0 +1,1 @@
+"""Settings of a participant: the form and its page."""

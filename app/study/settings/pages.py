@@ -1,0 +1,86 @@
+"""HTML page of a participant's settings."""
+
+from __future__ import annotations
+
+import structlog
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
+from app.platform.database import Db
+from app.platform.errors import BetaloopError, Invalid
+from app.platform.web.forms import FormValues, parse
+from app.platform.web.templates import render
+from app.study import service
+from app.study.deps import CurrentParticipant
+from app.study.form_changes import Shown, own_changes, reason_of
+from app.study.models import Participant
+from app.study.schemas import SettingsIn
+from app.study.service import may
+from app.study.settings import form
+
+log = structlog.get_logger()
+
+router = APIRouter()
+
+
+@router.get("/participants/{code}/settings")
+def settings(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """Present settings, with every one explained, and the versions before."""
+    return _settings_page(request, db, participant, caller, form.texts(participant.current_settings))
+
+
+@router.post("/participants/{code}/settings")
+def change_settings(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Make a new settings version of what the form changes."""
+    before = participant.current_settings.version
+    seen = str(values["version"]) if "version" in values else None
+    shown = [Shown(v.version, form.texts(v), v.created_by) for v in participant.settings]
+    changes = own_changes(values, seen, shown, form.LABELS)
+    try:
+        service.require(caller, can.WRITE_SETTINGS, participant)
+        changes.refuse_conflicts()
+        row = service.change_settings(db, participant, parse(SettingsIn, changes.fields, form.LABELS), reason_of(values), caller)
+    except BetaloopError as error:
+        db.rollback()
+        typed = form.texts(participant.current_settings) | changes.fields
+        return _settings_page(request, db, participant, caller, typed, error, reason=reason_of(values))
+    db.commit()
+    return RedirectResponse(f"/participants/{participant.code}/settings?done={'changed' if row.version != before else 'same'}", 303)
+
+
+def _settings_page(
+    request: Request,
+    db: Session,
+    participant: Participant,
+    caller: Caller,
+    values: dict[str, str],
+    error: BetaloopError | None = None,
+    reason: str | None = None,
+) -> HTMLResponse:
+    page = render(
+        request,
+        "study/settings.html",
+        participant=participant,
+        current=participant.current_settings,
+        values=values,
+        reason=reason,
+        groups=form.GROUPS,
+        history=form.history(participant.settings),
+        suggestion=_suggestion(db, participant, caller),
+        may_write=may(caller, can.WRITE_SETTINGS, participant),
+        problem=error.problem(request.url.path) if error else None,
+    )
+    return HTMLResponse(page, error.status if error else 200)
+
+
+def _suggestion(db: Session, participant: Participant, caller: Caller) -> float | None:
+    try:
+        return service.suggest_xi_beta(db, participant, caller)
+    except Invalid as error:
+        # the session's own page says what is wrong with it; the settings must stay reachable, for they may be what mends it
+        log.info("no threshold suggested", participant=participant.code, reason=error.detail)
+        return None

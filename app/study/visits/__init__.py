@@ -1,0 +1,1 @@
+"""Visits: their pages and the form that corrects one."""

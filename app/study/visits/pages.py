@@ -1,0 +1,135 @@
+"""HTML pages of visits."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
+from app.platform.database import Db
+from app.platform.errors import BetaloopError
+from app.platform.web.forms import FormValues, parse
+from app.platform.web.templates import render
+from app.study import repository, service
+from app.study.blinding import arm
+from app.study.deps import CurrentParticipant, CurrentVisit
+from app.study.form_changes import Shown, own_changes, reason_of
+from app.study.models import Participant, StudySession, Visit
+from app.study.outcomes import service as outcomes
+from app.study.outcomes import values as outcome_values
+from app.study.schemas import CdbsAmplitudeModel, VisitIn
+from app.study.service import may
+from app.study.sessions import pages as session_pages
+from app.study.visits import form
+
+router = APIRouter()
+
+_VISIT_LABELS = {"number": "Number", "date": "Date", "note": "Note", "amplitude_ma": "cDBS amplitude"}
+
+
+@router.get("/participants/{code}/visits")
+def visits(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """All visits of a participant with their sessions."""
+    rows, _ = repository.visits(db, participant.id, 1000, 0)
+    sessions = repository.sessions_of_participant(db, participant.id)
+    days = [(v, [(s, arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in rows]
+    may_write = may(caller, can.WRITE_STUDY, participant)
+    waiting = repository.proposals_of_participant(db, participant.id)
+    return HTMLResponse(render(request, "study/visits.html", participant=participant, days=days, waiting=waiting, may_write=may_write))
+
+
+@router.get("/participants/{code}/visits/new")
+def new_visit(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """The form of a new visit; the number is the next one."""
+    service.require(caller, can.WRITE_STUDY, participant)
+    rows, _ = repository.visits(db, participant.id, 1000, 0)
+    draft = {"number": str(max((v.number for v in rows), default=0) + 1), "date": datetime.now(UTC).date().isoformat(), "note": ""}
+    return _visit_form(request, participant, draft)
+
+
+@router.post("/participants/{code}/visits")
+def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Add a visit."""
+    try:
+        draft = parse(VisitIn, {name: values.get(name, "") for name in ("number", "date", "note")}, _VISIT_LABELS)
+        draft.cdbs_amplitudes = [
+            parse(CdbsAmplitudeModel, {"hemisphere": side, "amplitude_ma": values[f"cdbs_{side}"]}, _VISIT_LABELS)
+            for side in ("left", "right")
+            if str(values.get(f"cdbs_{side}", "")).strip()
+        ]
+        visit = service.add_visit(db, participant, draft, caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _visit_form(request, participant, {k: str(v) for k, v in values.items()}, error)
+    db.commit()
+    return RedirectResponse(f"/visits/{visit.id}?done=added", 303)
+
+
+@router.get("/visits/{visit_id}")
+def visit_page(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """One visit day: its sessions in order."""
+    return _visit_page(request, db, visit, caller)
+
+
+@router.post("/visits/{visit_id}")
+def change_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Correct a visit's date, note or cDBS amplitudes."""
+    present = Shown(1, form.texts(visit), form.last_editor(db, visit))
+    seen = Shown(0, form.seen(values, present.fields), "")
+    changes = own_changes(form.posted(values), "0", [seen, present], form.labels(present.fields))
+    typed = changes.fields | {"reason": reason_of(values) or ""}
+    try:
+        service.require(caller, can.WRITE_STUDY, visit.participant)
+        changes.refuse_conflicts()
+        service.change_visit(db, visit, form.change(present.fields, changes.fields, typed["reason"]), caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _visit_page(request, db, visit, caller, typed, error)
+    db.commit()
+    return RedirectResponse(f"/visits/{visit.id}?done=corrected", 303)
+
+
+def _visit_page(
+    request: Request, db: Session, visit: Visit, caller: Caller, typed: dict[str, str] | None = None, error: BetaloopError | None = None
+) -> HTMLResponse:
+    sessions, _ = repository.sessions_of_visit(db, visit.id)
+    seen = form.texts(visit)
+    page = render(
+        request,
+        "study/visit.html",
+        visit=visit,
+        participant=visit.participant,
+        rows=[_session_row(db, s, caller) for s in sessions],
+        proposals=[s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id],
+        seen=seen,
+        draft=seen | {"reason": ""} | (typed or {}),
+        labels=form.labels(seen),
+        may_write=may(caller, can.WRITE_STUDY, visit.participant),
+        problem=error.problem(request.url.path) if error else None,
+    )
+    return HTMLResponse(page, error.status if error else 200)
+
+
+def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str, Any]:
+    """What the visit's table says of a session; a session that cannot be laid on the grid says why."""
+    clashes = outcomes.disagreements(session, outcome_values.derive(db, session))
+    row: dict[str, Any] = {"session": session, "arm": arm(session, caller), "summary": None, "problem": "", "clashes": clashes}
+    try:
+        row["summary"] = session_pages.summarise(service.session_data(db, session))
+    except BetaloopError as error:
+        row["problem"] = error.detail
+    return row
+
+
+def _visit_form(request: Request, participant: Participant, draft: dict[str, str], error: BetaloopError | None = None) -> HTMLResponse:
+    problem = error.problem(request.url.path) if error else None
+    values = {"cdbs_left": "", "cdbs_right": "", "number": "", "date": "", "note": ""} | draft
+    return HTMLResponse(
+        render(request, "study/visit_new.html", participant=participant, draft=values, problem=problem), error.status if error else 200
+    )

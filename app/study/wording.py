@@ -1,0 +1,69 @@
+"""Sentences of the study, made where somebody reads them; nothing is decided by them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from app.study.models import Controller
+from app.study.sessions.contradictions import Contradiction, Kind
+
+_SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be without DBS"}
+
+
+def sentences(contradictions: Iterable[Contradiction]) -> list[str]:
+    """What a person should look at, a sentence each."""
+    return [_SENTENCES[c.kind](c.facts) for c in contradictions]
+
+
+def _day(f: Mapping[str, Any]) -> str:
+    clock = f" (UTC{f['utc_offset_h']:+g} h)" if f["utc_offset_h"] else ""
+    return f"Recorded on {f['day']}{clock}, but visit {f['visit']} is dated {f['visit_date']}. Correct one of them."
+
+
+def _start(f: Mapping[str, Any]) -> str:
+    return (
+        f"Said to start at {f['stated']:%Y-%m-%d %H:%M:%S} UTC, but by the recording's own clock this part of it starts at "
+        f"{f['by_clock']:%Y-%m-%d %H:%M:%S} UTC. Tremor minutes are found by the start."
+    )
+
+
+def _side(f: Mapping[str, Any]) -> str:
+    return (
+        f"Said to be controlled on the {f['stated']} side, but its control trace is of recording {f['recording']}, which is of "
+        f"the {f['recorded']} side. Correct the hemisphere, which also chooses the hand of the grasp test."
+    )
+
+
+def _above_cdbs(f: Mapping[str, Any]) -> str:
+    return (
+        f"{f['above']} of {f['steps']} steps lie above the cDBS amplitude of {f['cdbs_ma'] or float('nan'):g} mA; "
+        "they are kept as they are and stay out of replay buffers."
+    )
+
+
+def _amplitude(f: Mapping[str, Any]) -> str:
+    of = f" on the {f['side']}" if f["side"] else ""
+    share = f"{100 * f['mean_fraction']:.0f} % of the cDBS amplitude" if f["mean_fraction"] is not None else f"{f['mean']:.3g} mA"
+    return f"{_SAID[f['controller']]}, but its mean amplitude{of} is {share}. Correct one of them."
+
+
+def _silent_control(f: Mapping[str, Any]) -> str:
+    return (
+        f"The controlled {f['side']} had no stimulation, while the {' and the '.join(f['others'])} had: mean amplitude and energy "
+        "are those of the controlled side alone. Correct the hemisphere if the other one counts."
+    )
+
+
+_SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
+    Kind.DAY: _day,
+    Kind.START: _start,
+    Kind.SIDE: _side,
+    Kind.UNREADABLE: lambda f: f"{f['detail']} {f['hint']}".strip(),
+    Kind.ABOVE_CDBS: _above_cdbs,
+    Kind.AMPLITUDE: _amplitude,
+    Kind.SILENT_CONTROL: _silent_control,
+    Kind.NO_POLICY: lambda f: (
+        "No policy is named for this session: it cannot be compared with its estimate. Name one on the session's page."
+    ),
+}

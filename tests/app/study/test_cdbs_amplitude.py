@@ -1,0 +1,53 @@
+"""One rule for the cDBS amplitude in force, of a session as of the next bundle."""
+
+from __future__ import annotations
+
+import pytest
+
+from app.platform.errors import Invalid
+from app.study import cdbs_amplitude
+from app.study.models import CdbsAmplitude, Hemisphere, Participant, SettingsVersion, Visit
+
+LEFT, RIGHT = Hemisphere.LEFT, Hemisphere.RIGHT
+
+
+def visit(number: int, *stated: tuple[Hemisphere, int, float]) -> Visit:
+    return Visit(number=number, cdbs_amplitudes=[CdbsAmplitude(hemisphere=h, program=p, amplitude_ma=ma) for h, p, ma in stated])
+
+
+def settings(cdbs: float | None = 2.0) -> SettingsVersion:
+    return SettingsVersion(cdbs_amplitude_ma=cdbs)
+
+
+def test_a_visits_amplitude_of_the_side_and_program_is_in_force_else_that_of_program_0_else_the_settings() -> None:
+    day = visit(1, (LEFT, 0, 3.0), (LEFT, 2, 1.5), (RIGHT, 0, 2.5))
+    assert [cdbs_amplitude.in_force(day, LEFT, settings(), p) for p in (0, 1, 2)] == [3.0, 3.0, 1.5]
+    assert cdbs_amplitude.in_force(day, RIGHT, settings(), 2) == 2.5
+    assert cdbs_amplitude.in_force(visit(1, (LEFT, 0, 3.0)), RIGHT, settings()) == 2.0
+    assert cdbs_amplitude.in_force(visit(1, (LEFT, 1, 3.0)), LEFT, settings()) == 2.0
+    assert cdbs_amplitude.in_force(visit(1), None, settings(None)) is None
+
+
+def test_two_sides_need_a_name_even_where_they_agree() -> None:
+    for right in (2.5, 3.0):
+        with pytest.raises(Invalid, match="visit 4 has cDBS amplitudes for both"):
+            cdbs_amplitude.in_force(visit(4, (LEFT, 0, 3.0), (RIGHT, 0, right)), None, settings())
+
+
+def test_the_newest_visit_that_states_the_side_is_in_force_now() -> None:
+    person = Participant(settings=[settings()], visits=[visit(2, (LEFT, 0, 3.0)), visit(3, (RIGHT, 0, 2.5)), visit(1, (LEFT, 0, 9.0))])
+    assert cdbs_amplitude.in_force_now(person, LEFT) == 3.0
+    assert cdbs_amplitude.in_force_now(person, None) == 2.5
+    assert cdbs_amplitude.in_force_now(Participant(settings=[settings()], visits=[visit(1)]), LEFT) == 2.0
+    with pytest.raises(Invalid, match="not known"):
+        cdbs_amplitude.in_force_now(Participant(settings=[settings(None)], visits=[]), LEFT)
+
+
+def test_of_several_programs_the_next_bundle_takes_program_0_else_the_only_amplitude() -> None:
+    def now(*stated: tuple[Hemisphere, int, float]) -> float:
+        return cdbs_amplitude.in_force_now(Participant(settings=[settings()], visits=[visit(1, *stated)]), LEFT)
+
+    assert now((LEFT, 0, 3.0), (LEFT, 1, 1.5)) == 3.0
+    assert now((LEFT, 1, 1.5)) == 1.5
+    with pytest.raises(Invalid, match="several programs"):
+        now((LEFT, 1, 1.5), (LEFT, 2, 1.0))
