@@ -114,7 +114,8 @@ def cells_of(name, values, flat=False):
     method = {"estimates": estimates, "dose": [1.0, 2.0], "follow": [-1.0, 1.0], "seconds": 1.0}
     return {
         f"{name}/truth": {
-            "policies": truth, "on_days": on_days, "dose": [3.0, 0.1], "follow": [0.0, 1.0], "responder": True, "silent": False, "flat": flat
+            "policies": truth, "on_days": on_days, "dose": [3.0, 0.1], "follow": [0.0, 1.0],
+            "responder": True, "silent": False, "flat": flat,
         },
         f"{name}/paper/linear": method,
         f"{name}/paper/page": method | {"places": {"a": 1, "b": 2, "c": 3}, "method": "linear"},
