@@ -166,7 +166,7 @@ def draw_patient(kind: int, rng: np.random.Generator, *, silent_beta: bool = Fal
     marginal = rng.random() < 0.25  # cDBS is hardly enough: lowering it costs at once
     tremor = pick(0.25, 0.5, 0.25)
     medicated = rng.random() < 0.6
-    day = uniform(0.5, 1.8)
+    day = uniform(0.1, 0.6)
     return Patient(
         kind=kind,
         log_scale=int(rng.random() < 0.65),
@@ -174,7 +174,7 @@ def draw_patient(kind: int, rng: np.random.Generator, *, silent_beta: bool = Fal
         shape=shape,
         half=uniform(0.55, 0.8) if shape == U_SHAPE else uniform(0.3, 0.7),
         steep=uniform(1.5, 5.0),
-        depth=uniform(0.01, 0.04) if silent_beta else uniform(0.25, 0.7),
+        depth=uniform(0.01, 0.04) if silent_beta else uniform(0.35, 0.8),
         immediate=float(shares[0]),
         fast=float(shares[1]),
         fast_up=tau(2.0, 15.0),
