@@ -121,7 +121,7 @@ def tasks(chosen: argparse.Namespace, cells: Cells) -> list[Task]:
     """What is to be run, in order."""
     methods = tuple(m for m in CHEAP if m not in chosen.without.split(","))
     if chosen.participants:
-        return [Task(code, chosen.truth, methods, ("paper",), _of(cells, code)) for code in PARTICIPANTS]
+        return [Task(code, chosen.truth, methods, ("paper",), _of(cells, code)) for code in PARTICIPANTS[: 1 if chosen.quick else None]]
     result = []
     for index in range(chosen.first, min(chosen.first + chosen.worlds, WORLDS_PER_PART)):
         with_dlsm = chosen.dlsm and index % DLSM_EVERY == 0
@@ -139,7 +139,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--part", choices=("A", "B", "C"), default="A", help="A to develop on, B to report on, C once before a release")
     parser.add_argument("--release", help="the release that a run of part C belongs to")
     parser.add_argument("--participants", action="store_true", help="the four detailed participants instead of the population")
-    parser.add_argument("--quick", action="store_true", help="three worlds, few simulated sessions, no DLSM")
+    parser.add_argument("--quick", action="store_true", help="three worlds or one participant, few simulated sessions, no DLSM")
     parser.add_argument("--worlds", type=int, default=WORLDS_PER_PART)
     parser.add_argument("--first", type=int, default=0, help="index of the first world")
     parser.add_argument("--without", default="", help="methods to leave out, with commas")

@@ -11,7 +11,7 @@ from ope_policies import fixed_policies
 from simulators import WORLDS as SIMULATORS
 
 from ml.population.virtual import Truth, is_responder, simple_policies, world
-from ml.population.virtual.world import STEPS
+from ml.population.virtual.world import STEPS, VISITS, visit_plan
 from ml.rl.policy import ConstantPolicy, Policy
 from ml.trajectories import ReplayBuffer
 
@@ -46,8 +46,9 @@ def virtual_case(part: str, index: int, sessions: int, known: dict[str, Any] | N
         part, index: which. sessions: simulated ones behind each true return. known: truth from an earlier run.
 
     Returns:
-        Its case; `truth` has `policies` and `on_days` (name -> means with standard errors), `dose` and `follow` (true difference of
-        returns with its standard error, same days and noise), `responder`, `mechanism`, `silent`, `flat` (range below two standard errors).
+        Its case. `truth` has `policies` and `on_days` (name -> means with standard errors), `dose` and `follow` (true difference of returns
+        with its standard error, same days and noise), `responder`, `mechanism`, `silent`, `flat` (range below two standard errors) and
+        `sessions` of the data.
     """
     w = world(part, index)  # type: ignore[arg-type]
     candidates, low, follows = w.candidates(), "constant low", "proportional slow"
@@ -67,6 +68,7 @@ def virtual_case(part: str, index: int, sessions: int, known: dict[str, Any] | N
             "mechanism": w.patient.mechanism,
             "silent": not w.patient.beta_answers,
             "flat": bool(np.ptp(v) < 2 * error),
+            "sessions": len(visit_plan(w.settings, "paper", 0, VISITS)),
         }
     matched = ConstantPolicy(truth["policies"][MATCHED]["amplitude"][0])
     return Case(f"{part}{index:02d}", candidates, {**probes, MATCHED: matched}, low, follows, truth, lambda d: w.data(d))  # type: ignore[arg-type]
@@ -98,6 +100,7 @@ def participant_case(code: str, sessions: int, known: dict[str, Any] | None = No
             "mechanism": "participant",
             "silent": False,
             "flat": flat,
+            "sessions": len(simulator.data(0, PARTICIPANT_VISITS).sessions),
         }
     return Case(code, candidates, probes, "constant 0.40", "proportional fast", truth, lambda _: simulator.data(0, PARTICIPANT_VISITS))
 

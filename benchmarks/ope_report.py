@@ -14,9 +14,6 @@ from ope_scores import Told, over_worlds, scores_of_tests, signs, world_scores
 
 DESIGNS = ("stratified", "paper")
 ORACLES = ("days alone", "tested")
-SESSIONS = 21
-"""Sessions of the data of three visits; what `tested` may spend."""
-
 SHOWN = ("rank", "rank supported", "regret", "sharpe", "mae", "mae supported", "interval score", "width", "coverage", "supported")
 LOW_IS_WORSE = ("rank", "rank supported", "sharpe", "coverage", "supported")
 DRAWN = {"rank": "rank correlation", "regret": "regret, % of range", "mae": "MAE, % of range", "width": "median width, % of range"}
@@ -59,7 +56,7 @@ def summarise(names: Iterable[str], cells: Table, methods: list[str]) -> Summary
         truth = cells.get(f"{name}/truth")
         if truth["flat"]:
             continue
-        candidates = list(truth["on_days"] or truth["policies"])
+        candidates = list(truth["on_days"])
         v = [truth["policies"][n]["total"][0] for n in candidates]
         cdbs = truth["policies"]["cDBS"]["total"][0]
         for design in DESIGNS:
@@ -72,7 +69,7 @@ def summarise(names: Iterable[str], cells: Table, methods: list[str]) -> Summary
             days = [{"value": x, "low": x, "high": x} for x in (truth["on_days"][n]["total"][0] for n in candidates)]
             result.setdefault((design, "days alone"), Row()).add(name, world_scores(v, days, cdbs))
             spread = [truth["policies"][n]["returns_sd"] for n in candidates]
-            result.setdefault((design, "tested"), Row()).add(name, scores_of_tests(v, spread, cdbs, SESSIONS))
+            result.setdefault((design, "tested"), Row()).add(name, scores_of_tests(v, spread, cdbs, truth["sessions"]))
     return result
 
 

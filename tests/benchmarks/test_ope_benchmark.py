@@ -115,7 +115,7 @@ def cells_of(name, values, flat=False):
     return {
         f"{name}/truth": {
             "policies": truth, "on_days": on_days, "dose": [3.0, 0.1], "follow": [0.0, 1.0],
-            "responder": True, "silent": False, "flat": flat,
+            "responder": True, "silent": False, "flat": flat, "sessions": 6,
         },
         f"{name}/paper/linear": method,
         f"{name}/paper/page": method | {"places": {"a": 1, "b": 2, "c": 3}, "method": "linear"},

@@ -143,7 +143,7 @@ class World:
             )
         return ReplayBuffer(self.settings, tuple(sessions), "uV", "table")
 
-    def data_days(self, rows: list[PlannedSession], seed: int) -> Days:
+    def data_days(self, rows: list[DataSession], seed: int) -> Days:
         """Days of planned sessions."""
         visits = np.array([row.visit for row in rows]) + 64 * seed
         return visit_days(self.key, visits, np.array([row.hour for row in rows]))
@@ -165,7 +165,7 @@ class World:
 
 
 @dataclass(frozen=True)
-class PlannedSession:
+class DataSession:
     """One session of the data: visit, controller (`cdbs`, `random`, `no_dbs`), hour of the visit, amplitude of every step."""
 
     visit: int
@@ -174,7 +174,7 @@ class PlannedSession:
     amplitudes: Floats
 
 
-def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int) -> list[PlannedSession]:
+def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int) -> list[DataSession]:
     """Sessions of early visits in their order."""
     laid = lay_out(
         DesignSettings(
@@ -188,12 +188,12 @@ def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int
             seed=seed,
         )
     )
-    rows: list[PlannedSession] = []
+    rows: list[DataSession] = []
     for visit in range(1, visits + 1):
         random = [("random", s.amplitudes) for s in laid if s.visit == visit]
         cdbs, off = ("cdbs", np.ones(STEPS)), ("no_dbs", np.zeros(NO_DBS_STEPS))
         slots = [cdbs, *random[:2], cdbs, *random[2:], off]
-        rows += [PlannedSession(visit, name, k * (STEPS * 2 / 3600 + PAUSE_H), a) for k, (name, a) in enumerate(slots)]
+        rows += [DataSession(visit, name, k * (STEPS * 2 / 3600 + PAUSE_H), a) for k, (name, a) in enumerate(slots)]
     return rows
 
 
