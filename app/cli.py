@@ -18,7 +18,7 @@ from rich.table import Table
 
 from app.accounts import service as accounts
 from app.accounts.models import Role
-from app.accounts.policy import SYSTEM
+from app.accounts.permissions import SYSTEM
 from app.platform import logs
 from app.platform.database import transaction
 from app.platform.errors import BetaloopError
@@ -77,7 +77,7 @@ def serve(
 
 
 def _take_up_uploads() -> None:
-    from app.ingest.interrupted import take_up
+    from app.ingest.uploads.interrupted import take_up
 
     for taken in take_up("start of the service"):
         structlog.get_logger().info("interrupted upload", upload=taken.upload_id, done=taken.done, said=taken.said)
@@ -102,7 +102,7 @@ def demo(
     port: Annotated[int | None, typer.Option(help="Port to listen on.")] = None,
 ) -> None:
     """Start everything with a small synthetic study: database, web, worker, uploads, and the first ranking."""
-    from app.demo import run_demo
+    from app.simulation.demo import run_demo
 
     settings = get_settings()
     run_demo(host or settings.host, port or settings.port)
@@ -163,7 +163,7 @@ def import_(
     as_json: AsJson = False,
 ) -> None:
     """Import a file, as an upload does: with visit and controller its sessions count at once, else they wait for confirmation."""
-    from app.ingest import api, service
+    from app.ingest.uploads import api, service
     from app.study import repository as study
     from app.study.models import Controller
 
@@ -189,7 +189,7 @@ def redecode_(
     as_json: AsJson = False,
 ) -> None:
     """Read stored files with the present decoder; sessions use what it gives from then on, snapshots keep what they pin."""
-    from app.ingest.redecode import redecode
+    from app.ingest.uploads.redecode import redecode
     from app.study import repository as study
 
     with transaction(ACTOR) as db:
@@ -209,7 +209,7 @@ def redecode_(
 @ingest_app.command("resume", epilog="Example: betaloop ingest resume")
 def resume_() -> None:
     """Take up uploads that a stop of the service cut short; the service does so itself when it starts."""
-    from app.ingest.interrupted import take_up
+    from app.ingest.uploads.interrupted import take_up
 
     taken = list(take_up(ACTOR))
     for one in taken:
@@ -230,7 +230,7 @@ def pipeline(
     as_json: AsJson = False,
 ) -> None:
     """Train, distil, evaluate and rank: the work between two visits. A worker must be running."""
-    from app.evaluation.service import start_job
+    from app.pipeline.service import start_job
     from app.platform.jobs.models import JobStatus
     from app.platform.jobs.watch import show_progress
     from app.study import repository as study
@@ -248,7 +248,7 @@ def pipeline(
 @app.command(epilog="Example: betaloop rank P1")
 def rank(code: Code, as_json: AsJson = False) -> None:
     """Print the ranked policies of a participant."""
-    from app.evaluation.ranking import current_ranking
+    from app.evaluation.ranking.service import current_ranking
     from app.study import repository as study
 
     with transaction(ACTOR) as db:
@@ -303,7 +303,7 @@ def export_(
     as_json: AsJson = False,
 ) -> None:
     """Write everything of a participant as a zip of tables (CSV) and settings (JSON)."""
-    from app.export import export_participant
+    from app.overview.export import export_participant
     from app.study import repository as study
 
     target = to or Path(f"{code}.zip")
@@ -337,8 +337,8 @@ def control_(
     as_json: AsJson = False,
 ) -> None:
     """Verify a controller bundle and run it on a stream of beta, as the tablet does."""
-    from app.control import Task, control, lines
-    from app.control_sources import Wish
+    from app.tablet.control import Task, control, lines
+    from app.tablet.sources import Wish
 
     if speed not in ("realtime", "fast"):
         raise typer.BadParameter(f"'{speed}' is neither realtime nor fast.", param_hint="--speed")

@@ -13,39 +13,46 @@ from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from sqlalchemy import text
 
 from app import __version__
-from app.platform import web
-from app.platform.compressed import CompressedFiles
 from app.platform.database import Db
 from app.platform.tables import load_tables
-from app.platform.templates import STATIC
+from app.platform.web import middleware as web
+from app.platform.web.compressed import CompressedFiles
+from app.platform.web.templates import STATIC
 
 API_MODULES = (
     "app.study.api",
-    "app.ingest.api",
-    "app.ingest.proposals_api",
-    "app.ingest.quarantine_api",
-    "app.learning.api",
-    "app.learning.gate_api",
-    "app.learning.sweep_api",
-    "app.evaluation.api",
-    "app.analysis.api",
-    "app.planning.api",
+    "app.ingest.uploads.api",
+    "app.ingest.proposals.api",
+    "app.ingest.quarantine.api",
+    "app.learning.policies.api",
+    "app.learning.snapshots.api",
+    "app.learning.gate.api",
+    "app.learning.sweeps.api",
+    "app.evaluation.ranking.api",
+    "app.pipeline.api",
+    "app.planning.plans.api",
+    "app.planning.bundles.api",
+    "app.analysis.metrics.api",
+    "app.analysis.calibration.api",
 )
 PAGE_MODULES = (
     "app.accounts.pages",
     "app.study.pages",
-    "app.ingest.pages",
-    "app.ingest.proposals_pages",
-    "app.ingest.quarantine_pages",
-    "app.learning.pages",
-    "app.learning.bundle_pages",
-    "app.learning.gate_pages",
-    "app.learning.sweep_pages",
-    "app.evaluation.pages",
-    "app.analysis.pages",
-    "app.planning.pages",
-    "app.pages.overview",
-    "app.pages.participant",
+    "app.study.sessions.pages",
+    "app.ingest.uploads.pages",
+    "app.ingest.proposals.pages",
+    "app.ingest.quarantine.pages",
+    "app.learning.policies.pages",
+    "app.learning.gate.pages",
+    "app.learning.sweeps.pages",
+    "app.evaluation.ranking.pages",
+    "app.pipeline.pages",
+    "app.planning.plans.pages",
+    "app.planning.bundles.pages",
+    "app.analysis.metrics.pages",
+    "app.analysis.calibration.pages",
+    "app.overview.overview",
+    "app.overview.participant",
 )
 
 

@@ -13,8 +13,8 @@ import time
 
 import numpy as np
 
-from ml.cohort import PARTICIPANTS, run_session, run_sessions, true_return
-from ml.rl.policy import ConstantPolicy, ProportionalPolicy
+from ml.policies.policy import ConstantPolicy, ProportionalPolicy
+from ml.population import PARTICIPANTS, run_session, run_sessions, true_return
 
 SETTLE_AND_LEAD_S = 2.0 * (5 + 10)
 

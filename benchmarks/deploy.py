@@ -30,16 +30,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from ml.cohort import PARTICIPANTS, random_controller_buffer
-from ml.cohort.env import ParticipantEnv
 from ml.deploy.appraisal import battery_gain
 from ml.deploy.bundle import build_bundle, open_bundle
 from ml.deploy.manifest import BundleManifest
 from ml.deploy.runtime.envelope import BetaSample, Signal
-from ml.rl.algorithms import ALGORITHMS
+from ml.policies.onnx_policy import OnnxPolicy
+from ml.population import PARTICIPANTS, random_controller_buffer
+from ml.population.env import ParticipantEnv
+from ml.rl.algorithms.registry import ALGORITHMS
 from ml.rl.distillation import DistilConfig, distil
 from ml.rl.networks import STUDENT_HIDDEN, TEACHER_HIDDEN, MlpPolicy
-from ml.rl.onnx_policy import OnnxPolicy
 from ml.trajectories import ReplayBuffer
 
 WINDOW, MEAN, STD = 10, 120.0, 35.0

@@ -4,7 +4,7 @@
     python benchmarks/dlsm_selection.py --out FOLDER [--data hidden,P1] [--candidates sum,posterior] [--minutes 30]
     python benchmarks/dlsm_selection.py --out FOLDER --truth
 
-The first table holds shares of a constant's error (`ml/ope/dlsm_held_out.py: Shares`); it is what a default is chosen by. Known returns are
+The first table holds shares of a constant's error (`ml/ope/dlsm/held_out.py: Shares`); it is what a default is chosen by. Known returns are
 computed only with --truth, in a second table, for what has been chosen. Finished cells are lines of FOLDER/selection.jsonl; a run that is
 started again skips them. CPU seconds of one thread.
 """
@@ -27,12 +27,12 @@ import torch
 from cells import Cells
 from simulators import STEPS, VISITS, WORLDS
 
-from ml.ope.batches import learn_scale, make_batch
-from ml.ope.dlsm import Dlsm
-from ml.ope.dlsm_config import DlsmConfig
-from ml.ope.dlsm_selection import SelectionRun
-from ml.ope.metrics import accuracy
-from ml.rl.policy import ConstantPolicy, Policy, ProportionalPolicy
+from ml.ope.compare.metrics import accuracy
+from ml.ope.dlsm.batches import learn_scale, make_batch
+from ml.ope.dlsm.config import DlsmConfig
+from ml.ope.dlsm.estimator import Dlsm
+from ml.ope.dlsm.selection import SelectionRun
+from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 
 BASE = DlsmConfig(latent=8, hidden=24, heads=(24,), objective="sum", steps=150, learning_rate=6e-3)

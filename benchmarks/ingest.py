@@ -32,13 +32,13 @@ from typing import Any
 import httpx2 as httpx
 import numpy as np
 
-from app.ingest.formats import DecodeOptions
-from app.ingest.formats.rcs import decode_rcs
-from app.ingest.formats.rcs_json import JsonNotes, read_elements
-from app.ingest.formats.rcs_scan import scan
-from app.ingest.formats.rcs_streams import read_time_domain
-from app.ingest.formats.redact import redact_rcs_zip
-from ml.cohort import rcs_session_zip, run_session, session_table_csv
+from ml.formats import DecodeOptions
+from ml.formats.rcs.folder import decode_rcs
+from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
+from ml.formats.rcs.packets.scan import scan
+from ml.formats.rcs.packets.streams import read_time_domain
+from ml.formats.redact import redact_rcs_zip
+from ml.population import rcs_session_zip, run_session, session_table_csv
 
 START_MS, DEVICE_START_S = 1_700_000_000_000, 700_000_000
 RATE_HZ, PER_PACKET, CHANNELS = 500, 50, (0, 2)
@@ -124,7 +124,7 @@ def whole_decode_peak_mb(folder: Path) -> float:
     """Highest resident memory in MB of a process that decodes the folder and does nothing else."""
     code = (
         "import sys; from pathlib import Path\n"
-        "from app.ingest.formats import DecodeOptions, decode\n"
+        "from ml.formats import DecodeOptions, decode\n"
         "(recording,) = decode(Path(sys.argv[1]), 'rcs', DecodeOptions()).recordings\n"
         "assert recording.traces\n"
         # not ru_maxrss: that begins with the memory of the process which started this one

@@ -32,7 +32,7 @@ from page_order import NEEDED, page_order
 
 from app.evaluation.decision import gain_over
 from ml.ope.estimate import Estimate, Estimator
-from ml.ope.panel import estimators
+from ml.ope.registry import estimators
 from ml.population.virtual import WORLDS_PER_PART
 
 PAGE = "page"

@@ -10,9 +10,9 @@ import numpy as np
 from ope_policies import fixed_policies
 from simulators import WORLDS as SIMULATORS
 
+from ml.policies.policy import ConstantPolicy, Policy
 from ml.population.virtual import Truth, is_responder, simple_policies, world
 from ml.population.virtual.world import STEPS, VISITS, visit_plan
-from ml.rl.policy import ConstantPolicy, Policy
 from ml.trajectories import ReplayBuffer
 
 CDBS, MATCHED = "cDBS", "matched constant"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ml.rl.policy import ConstantPolicy, Policy, ProportionalPolicy
+from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
 
 
 def fixed_policies(xi: float) -> dict[str, Policy]:

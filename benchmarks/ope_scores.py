@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ml.ope.metrics import spearman
+from ml.ope.compare.metrics import spearman
 
 LEVEL = 0.90
 TOP = 3

@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from app.evaluation.choice import choose, combined, widened
-from app.evaluation.methods import AGGREGATE
+from app.evaluation.estimates.choice import choose, combined, widened
+from app.evaluation.estimates.methods import AGGREGATE
+from ml.ope.compare.ranking import rank_policies
+from ml.ope.compare.skill import choose_default
 from ml.ope.estimate import Estimate
-from ml.ope.panel import quick_estimators
-from ml.ope.ranking import rank_policies
-from ml.ope.skill import choose_default
+from ml.ope.registry import quick_estimators
 from ml.trajectories import ReplayBuffer
 
 NEEDED = tuple(quick_estimators())

@@ -22,8 +22,9 @@ import numpy as np
 from figure import draw
 from looks import look, said
 
-from ml.ope.linear import LinearConfig, LinearModel
-from ml.ope.metrics import accuracy
+from ml.ope.compare.metrics import accuracy
+from ml.ope.linear.estimator import LinearConfig, LinearModel
+from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.population.virtual import (
     MECHANISMS,
     WORLDS_PER_PART,
@@ -36,7 +37,6 @@ from ml.population.virtual import (
     world,
 )  # fmt: skip
 from ml.population.virtual.world import PAUSE_H, STEPS, visit_plan
-from ml.rl.policy import ConstantPolicy, ProportionalPolicy
 
 REQUIRED = 20_000
 DESIGNS = ("paper", "stratified", "ladder")

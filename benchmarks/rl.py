@@ -2,7 +2,8 @@
 
     python benchmarks/rl.py [--steps N] [--repeats N] [--six]
 
-`ddpg_vs_eager`: one DDPG update of `ml.rl.actor_critic` against the loop as usually written in PyTorch (below), 400x300, batch 64 and 256.
+`ddpg_vs_eager`: one DDPG update of `ml.rl.algorithms.ddpg` against the loop as usually written in PyTorch (below), 400x300, batches of
+64 and 256.
 `six_vs_eager`: six policies side by side against six such loops, batch 64.
 `ddpg_vs_d3rlpy`: one update against d3rlpy's DDPG at batch 256, where d3rlpy is installed (the `bench` extra).
 `ddpg_of_products`: share of the update's time that its matrix products alone take, in their own shapes, batch 256.
@@ -26,12 +27,12 @@ import torch
 from torch import nn
 
 from ml.mdp import MdpSettings
-from ml.rl.actor_critic import DdpgConfig, DdpgLearner
-from ml.rl.algorithms import algorithm
+from ml.policies.onnx_policy import OnnxPolicy
+from ml.rl.algorithms.ddpg import DdpgConfig, DdpgLearner
+from ml.rl.algorithms.registry import algorithm
 from ml.rl.batches import BLOCK, PackedTransitions, RewardScale, batch_indices
 from ml.rl.distillation import DistilConfig, distil
 from ml.rl.networks import STUDENT_HIDDEN, TEACHER_HIDDEN, Critic, MlpPolicy
-from ml.rl.onnx_policy import OnnxPolicy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 WINDOW, ROWS, GAMMA, TAU = 10, 100_000, 0.99, 0.005

@@ -14,11 +14,11 @@ from typing import Protocol
 
 import numpy as np
 
-from ml.cohort import PARTICIPANTS, true_return
-from ml.cohort.sessions import run_sessions
 from ml.mdp import MdpSettings, end_reward, step_reward
+from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
+from ml.population import PARTICIPANTS, true_return
+from ml.population.sessions import run_sessions
 from ml.qoc import Qoc
-from ml.rl.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 WINDOW, STEPS, NO_DBS_STEPS = 10, 300, 150

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import lzma
 import os
 import shutil
+import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psycopg
@@ -21,7 +24,9 @@ from sqlalchemy.orm import Session
 import app.platform.database as database
 from app.accounts import service as accounts
 from app.platform.embedded_postgres import EmbeddedPostgres
+from app.platform.files import path_of
 from app.platform.jobs import engine as jobs_engine
+from app.platform.migrate import migrate
 from app.settings import get_settings
 
 # Machines that are busy with other work make single examples slow; in CI the same examples are drawn every time.
@@ -30,6 +35,8 @@ settings.load_profile("betaloop")
 
 ROOT = Path(__file__).resolve().parents[1]
 PASSWORD = "correct horse battery"
+RELEASED_DUMP = ROOT / "tests" / "data" / "released-0.1.0.sql.xz"
+RELEASED_FILES = ROOT / "tests" / "data" / "released-0.1.0-files.zip"
 
 
 @pytest.fixture(scope="session")
@@ -61,16 +68,16 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedPostgre
 _counter = iter(range(10**9))
 
 
-@pytest.fixture
-def fresh_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A database and data folder of the test's own, named in the environment too, so that child processes find them."""
+@contextmanager
+def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.MonkeyPatch, template: str) -> Iterator[str]:
+    """A database and data folder of one test, named in the environment too, so that child processes find them."""
     name = f"test_{os.getpid()}_{next(_counter)}"
     admin = f"host='{server._sockets}' user=postgres dbname=postgres"
     with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f"create database {name} template betaloop")
+        connection.execute(f"create database {name} template {template}")
     url = server.url(name)
     monkeypatch.setenv("BETALOOP_DATABASE_URL", url)
-    monkeypatch.setenv("BETALOOP_DATA_DIR", str(tmp_path / "data"))
+    monkeypatch.setenv("BETALOOP_DATA_DIR", str(data))
     get_settings.cache_clear()
     yield url
     for engine in database._engines.values():
@@ -79,7 +86,28 @@ def fresh_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest
     get_settings.cache_clear()
     with psycopg.connect(admin, autocommit=True) as connection:
         connection.execute(f"drop database {name} with (force)")
-    shutil.rmtree(tmp_path / "data", ignore_errors=True)
+    shutil.rmtree(data, ignore_errors=True)
+
+
+@pytest.fixture
+def fresh_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """An empty database at the newest schema."""
+    with own_database(server, tmp_path / "data", monkeypatch, "betaloop") as url:
+        yield url
+
+
+@pytest.fixture
+def released_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The database that release 0.1.0 filled (see test_released_database.py), with its small files, migrated to the newest schema."""
+    with own_database(server, tmp_path / "data", monkeypatch, "template0") as url:
+        with psycopg.connect(url.replace("+psycopg", ""), autocommit=True) as connection:
+            connection.execute(lzma.decompress(RELEASED_DUMP.read_bytes()).decode())
+        with zipfile.ZipFile(RELEASED_FILES) as archive:
+            for sha256 in archive.namelist():
+                path_of(sha256).parent.mkdir(parents=True, exist_ok=True)
+                path_of(sha256).write_bytes(archive.read(sha256))
+        migrate()
+        yield url
 
 
 @pytest.fixture(autouse=True, scope="session")

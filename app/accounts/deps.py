@@ -8,7 +8,7 @@ from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from app.accounts import service
-from app.accounts.policy import Caller
+from app.accounts.permissions import Caller
 from app.platform.database import Db, set_actor
 from app.platform.errors import Unauthorized
 

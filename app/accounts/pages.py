@@ -8,16 +8,16 @@ from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
 
-from app.accounts import policy as can
+from app.accounts import permissions as can
 from app.accounts import repository, service
 from app.accounts.deps import COOKIE, CurrentCaller
 from app.accounts.models import Role, User
-from app.accounts.policy import Caller
+from app.accounts.permissions import Caller
 from app.platform.database import Db, set_actor
 from app.platform.errors import BetaloopError, Invalid, NotFound
-from app.platform.forms import FormValues
-from app.platform.schemas import RowId
-from app.platform.templates import render
+from app.platform.web.forms import FormValues
+from app.platform.web.schemas import RowId
+from app.platform.web.templates import render
 from app.settings import get_settings
 
 router = APIRouter()

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import repository
 from app.accounts.models import ApiToken, Membership, Role, SignIn, SignInAttempt, Study, User
-from app.accounts.policy import MANAGE_ACCOUNTS, PERMISSIONS, READ_AUDIT, Caller, Grant
+from app.accounts.permissions import MANAGE_ACCOUNTS, PERMISSIONS, READ_AUDIT, Caller, Grant
 from app.platform.database import now
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 from app.settings import get_settings

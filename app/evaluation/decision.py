@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from app.evaluation.methods import METHOD_NAMES
+from app.evaluation.estimates.methods import METHOD_NAMES
 from app.evaluation.schemas import Decision, TestedBefore
-from ml.ope.coverage import UNSUPPORTED_SHARE
+from ml.ope.compare.skill import reach_with
 from ml.ope.estimate import Estimate
-from ml.ope.skill import reach_with
+from ml.ope.support.coverage import UNSUPPORTED_SHARE
 
 FEWEST_DRAWS = 20
 """Aligned draws below which a gain's interval comes from the two standard errors as if they were independent, which is wider."""

@@ -1,4 +1,4 @@
-"""Rules of evaluations: which jobs may start, how estimates are stored. The caller commits."""
+"""Rules of evaluations: which policies are ranked, how estimates are stored. The caller commits."""
 
 from __future__ import annotations
 
@@ -8,63 +8,22 @@ from typing import Any
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
-from app.accounts import policy as can
-from app.accounts.policy import Caller
 from app.evaluation import repository
-from app.evaluation.choice import choose, combined, widened
-from app.evaluation.coverage import STORED, refused, told_apart
-from app.evaluation.estimates import as_estimate
-from app.evaluation.methods import AGGREGATE, METHOD_NAMES
+from app.evaluation.estimates.choice import choose, combined, widened
+from app.evaluation.estimates.coverage import STORED, refused, told_apart
+from app.evaluation.estimates.methods import AGGREGATE, METHOD_NAMES
+from app.evaluation.estimates.rows import as_estimate
 from app.evaluation.models import EstimateRow, Evaluation
-from app.evaluation.ranking import current_ranking as current_ranking
-from app.evaluation.schemas import EvaluateParams, PipelineParams
+from app.evaluation.ranking.service import current_ranking as current_ranking
+from app.evaluation.schemas import EvaluateParams
 from app.learning import repository as learning
-from app.learning.jobs import teachers, training_starts
 from app.learning.models import BufferSnapshot, Policy
-from app.learning.schemas import DistilParams, TrainParams
-from app.learning.service import require_window, window_of
-from app.learning.snapshots import collect
+from app.learning.policies.service import require_window, window_of
 from app.platform.errors import Invalid
 from app.platform.jobs import service as jobs
-from app.platform.jobs.models import Job
 from app.study import repository as study_repository
-from app.study import service as study
 from app.study.models import Participant
 from ml.ope.estimate import Estimate
-
-
-def start_job(db: Session, participant: Participant, kind: str, params: Mapping[str, Any], caller: Caller) -> Job:
-    """Put a job of this participant on the queue.
-
-    Raises:
-        Invalid: params that break the kind's schema; no beta threshold yet; no usable session; nothing to train from, distil or rank.
-        Forbidden: the caller may not run jobs.
-    """
-    study.require(caller, can.RUN_JOBS, participant)
-    collect(db, participant)
-    job = jobs.submit(db, kind, participant.id, dict(params), caller.label)
-    if kind == "train":
-        training_starts(db, participant.id, TrainParams.model_validate(job.params))
-    elif kind == "pipeline":
-        training_starts(db, participant.id, PipelineParams.model_validate(job.params).training())
-    elif kind == "distill":
-        teachers(db, participant.id, DistilParams.model_validate(job.params))
-    elif kind == "evaluate":
-        policies_to_rank(db, participant.id, EvaluateParams.model_validate(job.params))
-    return job
-
-
-def retry_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
-    """A new job with the same params. Raises Conflict while the job has not ended, or another one repeats it."""
-    study.require(caller, can.RUN_JOBS, participant)
-    job = jobs.repeatable(db, job)
-    return start_job(db, participant, job.kind, job.params, caller)
-
-
-def cancel_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
-    """Cancel a job. Raises Conflict when it has ended."""
-    study.require(caller, can.RUN_JOBS, participant)
-    return jobs.cancel(db, job, caller.label)
 
 
 def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams) -> list[Policy]:

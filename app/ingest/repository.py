@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from sqlalchemy import select
 from sqlalchemy.orm import Session, joinedload, selectinload
 
-from app.accounts.policy import Caller
+from app.accounts.permissions import Caller
 from app.ingest.models import SessionProposal, Upload, UploadFile
 from app.platform.errors import NotFound
 from app.study.models import Device, Participant, Recording, SessionSegment, StudySession, Visit

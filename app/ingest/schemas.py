@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from app.platform.schemas import Int, Model, Moment, Number, Text
+from app.platform.web.schemas import Int, Model, Moment, Number, Text
 from app.study.models import Controller, Hemisphere
 from app.study.schemas import SessionOut
 

@@ -9,7 +9,7 @@ from datetime import datetime, timedelta
 import numpy as np
 from sqlalchemy.orm import Session
 
-from app.accounts.policy import SYSTEM
+from app.accounts.permissions import SYSTEM
 from app.ingest import repository
 from app.platform.errors import Conflict, Invalid
 from app.study import blinding

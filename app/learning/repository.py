@@ -8,7 +8,7 @@ from sqlalchemy import func, or_, select
 from sqlalchemy.orm import Session, selectinload
 
 from app.accounts.models import Site
-from app.accounts.policy import Caller
+from app.accounts.permissions import Caller
 from app.learning.models import BufferGateDecision, BufferSnapshot, Policy, SnapshotSession, Sweep
 from app.platform.errors import NotFound
 from app.study.models import Participant

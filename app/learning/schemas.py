@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from app.learning.models import GateChoice
-from app.platform.schemas import Int, Model, Number, Text
+from app.platform.web.schemas import Int, Model, Number, Text
 
 Preset = Literal["full", "quick"]
 _CONTROL = r"\x00-\x1f\x7f-\x9f"

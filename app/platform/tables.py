@@ -16,7 +16,7 @@ TABLE_MODULES = (
     "app.ingest.models",
     "app.learning.models",
     "app.evaluation.models",
-    "app.planning.models",
+    "app.planning.plans.models",
 )
 
 

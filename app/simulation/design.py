@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from app.platform.errors import Conflict, Invalid
-from ml.cohort import PARTICIPANTS
-from ml.cohort.clinic import PlannedSession, plan_day
+from ml.population import PARTICIPANTS
+from ml.population.clinic import PlannedSession, plan_day
 
 BETWEEN_VISITS: Final = dt.timedelta(days=28)
 SINCE_LAST_VISIT: Final = dt.timedelta(days=14)

@@ -11,22 +11,22 @@ from typing import Protocol
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.accounts.policy import Caller
-from app.demo_study import participant_body
-from app.evaluation.ranking import current_ranking
+from app.accounts.permissions import Caller
+from app.evaluation.ranking.service import current_ranking
 from app.evaluation.schemas import RankedPolicy
-from app.evaluation.service import start_job
 from app.learning import repository as learning
 from app.learning.models import Policy
-from app.planning import repository as plans
-from app.planning import service as planning
-from app.planning.schedule import total_minutes
-from app.planning.schemas import PlanIn
+from app.pipeline.service import start_job
+from app.planning.plans import repository as plans
+from app.planning.plans import service as planning
+from app.planning.plans.schedule import total_minutes
+from app.planning.plans.schemas import PlanIn
 from app.platform.database import new_session, set_actor
 from app.platform.errors import BetaloopError, Conflict, NotFound
 from app.platform.jobs.models import Job, JobStatus
 from app.platform.jobs.watch import POLL_S, look
 from app.simulation import sessions
+from app.simulation.demo_study import participant_body
 from app.simulation.design import BETWEEN_VISITS, MORNING, STEPS_PER_MINUTE, Design, Remembered, collecting_day
 from app.simulation.sessions import PlacedSession
 from app.study import repository as study_repository

@@ -8,8 +8,8 @@ from typing import Any
 from rich.table import Table
 from sqlalchemy.orm import Session
 
-from app.accounts.policy import Caller
-from app.analysis.trial_time import TrialTime, trial_time
+from app.accounts.permissions import Caller
+from app.analysis.trial_time.service import TrialTime, trial_time
 from app.study import repository as study
 
 

@@ -14,7 +14,7 @@ from sqlalchemy import text
 from app.accounts import repository as accounts_repository
 from app.accounts import service as accounts
 from app.accounts.models import Role
-from app.accounts.policy import SYSTEM, Caller
+from app.accounts.permissions import SYSTEM, Caller
 from app.platform.database import get_engine, new_session, now, transaction
 from app.platform.errors import BetaloopError, Conflict
 from app.platform.jobs.worker import run_worker

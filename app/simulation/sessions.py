@@ -9,20 +9,20 @@ from dataclasses import dataclass
 import numpy as np
 from sqlalchemy.orm import Session
 
-from app.accounts.policy import Caller
-from app.demo_study import device_session, session_file
-from app.ingest import service as ingest
+from app.accounts.permissions import Caller
+from app.ingest.uploads import service as ingest
 from app.learning.models import Policy
 from app.platform import files
 from app.platform.errors import BetaloopError
+from app.simulation.demo_study import device_session, session_file
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Controller, Participant, StudySession, Visit
 from app.study.schemas import QocIn
-from ml.cohort import SimulatedSession, run_session
-from ml.cohort.controllers import Controller as CohortController
 from ml.mdp import discounted_sum, end_reward, step_reward
-from ml.rl.onnx_policy import OnnxPolicy
+from ml.policies.onnx_policy import OnnxPolicy
+from ml.population import SimulatedSession, run_session
+from ml.population.controllers import Controller as CohortController
 
 RESOLUTION_MA = 0.1
 """What an RC+S delivers."""

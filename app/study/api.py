@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-import numpy as np
-from fastapi import APIRouter, Depends, Path
-from numpy.typing import NDArray
+from fastapi import APIRouter
 
 from app.accounts.deps import CurrentCaller
-from app.accounts.policy import Caller
 from app.platform.database import Db
-from app.platform.schemas import Page, PagingQuery, RowId, problems
-from app.study import blinding, outcome_values, outcomes, repository, service
-from app.study.models import Participant, StudySession, Visit
+from app.platform.web.schemas import Page, PagingQuery, problems
+from app.study import repository, service
+from app.study.deps import CurrentParticipant, CurrentSession, CurrentVisit
+from app.study.outcomes import values as outcome_values
 from app.study.schemas import (
     DerivedChoice,
     OutcomeOut,
@@ -30,29 +26,9 @@ from app.study.schemas import (
     VisitIn,
     VisitOut,
 )
-from app.study.service import SessionData
+from app.study.serializers import outcome_out, participant_out, session_out, trace_out, visit_out
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
-
-
-def current_participant(code: Annotated[str, Path(max_length=40, pattern=r"^[^\x00]*$")], db: Db, caller: CurrentCaller) -> Participant:
-    """The participant that the path names."""
-    return repository.participant_by_code(db, code, caller)
-
-
-def current_visit(visit_id: RowId, db: Db, caller: CurrentCaller) -> Visit:
-    """The visit that the path names."""
-    return repository.visit(db, visit_id, caller)
-
-
-def current_session(session_id: RowId, db: Db, caller: CurrentCaller) -> StudySession:
-    """The session that the path names."""
-    return repository.session(db, session_id, caller)
-
-
-CurrentParticipant = Annotated[Participant, Depends(current_participant)]
-CurrentVisit = Annotated[Visit, Depends(current_visit)]
-CurrentSession = Annotated[StudySession, Depends(current_session)]
 
 
 @router.get("/participants")
@@ -172,72 +148,3 @@ def take_outcome(session: CurrentSession, choice: DerivedChoice, db: Db, caller:
     row = service.take_derived(db, session, choice, caller)
     db.commit()
     return QocOut.model_validate(row)
-
-
-def outcome_out(session: StudySession, derived: outcome_values.Derived) -> OutcomeOut:
-    """A derived QoC for the API."""
-    conflicts = bool(outcomes.disagreements(session, [derived]))
-    return OutcomeOut.model_validate(
-        {"name": derived.name, "value": derived.value, "unit": derived.unit, "basis": derived.basis, "conflicts": conflicts}
-    )
-
-
-def participant_out(p: Participant) -> ParticipantOut:
-    """A participant for the API."""
-    return ParticipantOut(
-        code=p.code, status=p.status, site=p.site.code, created_at=p.created_at, settings=SettingsOut.model_validate(p.current_settings)
-    )
-
-
-def visit_out(v: Visit, code: str) -> VisitOut:
-    """A visit for the API."""
-    amplitudes = [{"hemisphere": a.hemisphere, "program": a.program, "amplitude_ma": a.amplitude_ma} for a in v.cdbs_amplitudes]
-    return VisitOut.model_validate(
-        {"id": v.id, "participant": code, "number": v.number, "date": v.date, "note": v.note or "", "cdbs_amplitudes": amplitudes}
-    )
-
-
-def session_out(s: StudySession, caller: Caller) -> SessionOut:
-    """A session for the API; the controller comes through the blinding gate."""
-    arm = blinding.stated_arm(s, caller)
-    return SessionOut(
-        id=s.id,
-        visit_id=s.visit_id,
-        visit=s.visit.number,
-        participant=s.visit.participant.code,
-        ordinal=s.ordinal,
-        controller=arm.controller if arm else None,
-        policy_id=arm.policy_id if arm else None,
-        hemisphere=s.hemisphere,
-        status=s.status,
-        started_at=s.started_at,
-        duration_s=s.duration_s,
-        control_channel=s.control_channel,
-        excluded_reason=s.excluded_reason,
-        recordings=sorted({g.recording_id for g in s.segments}),
-        qoc=QocOut.model_validate(s.qoc) if s.qoc else None,
-    )
-
-
-def trace_out(data: SessionData) -> TraceOut:
-    """A step table for the API."""
-    table, beta = data.table, data.table.beta_trace
-    return TraceOut(
-        session_id=data.session.id,
-        period_s=data.settings.period_s,
-        beta_unit=beta.unit if beta else None,
-        beta_source=beta.source if beta else None,
-        beta_channel=beta.channel if beta else None,
-        decode_version=beta.decode_version if beta else None,
-        cdbs_amplitude_ma=table.cdbs_ma,
-        xi_beta=data.threshold,
-        steps_above_cdbs=table.above_one,
-        t_s=table.t_s.tolist(),
-        beta=_nullable(table.beta),
-        amplitude_ma=_nullable(table.amplitude_ma),
-        amplitude_fraction=_nullable(table.fraction),
-    )
-
-
-def _nullable(values: NDArray[np.float64]) -> list[float | None]:
-    return [None if np.isnan(v) else float(v) for v in values]

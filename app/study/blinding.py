@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from app.accounts.policy import Caller
+from app.accounts.permissions import Caller
 from app.platform.errors import Conflict
 from app.study.models import Controller, StudySession
 

@@ -11,23 +11,27 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
 from starlette.datastructures import FormData
 
-from app.accounts import policy as can
+from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
-from app.accounts.policy import Caller
+from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.forms import FormValues, parse
-from app.platform.templates import render
-from app.study import outcome_values, outcomes, repository, service, session_pages, settings_form, visit_form
-from app.study.api import CurrentParticipant, CurrentVisit
+from app.platform.web.forms import FormValues, parse
+from app.platform.web.templates import render
+from app.study import repository, service, settings_form, visit_form
 from app.study.blinding import arm
+from app.study.deps import CurrentParticipant, CurrentVisit
 from app.study.models import Participant, StudySession, Visit
+from app.study.outcomes import service as outcomes
+from app.study.outcomes import values as outcome_values
 from app.study.schemas import CdbsAmplitudeModel, ParticipantIn, SettingsIn, VisitIn
+from app.study.service import may
+from app.study.sessions import pages as session_pages
 from app.study.settings_form import Shown, own_changes
 
 log = structlog.get_logger()
+
 router = APIRouter()
-router.include_router(session_pages.router)
 
 _VISIT_LABELS = {"number": "Number", "date": "Date", "note": "Note", "amplitude_ma": "cDBS amplitude"}
 
@@ -85,7 +89,7 @@ def visits(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
     rows, _ = repository.visits(db, participant.id, 1000, 0)
     sessions = repository.sessions_of_participant(db, participant.id)
     days = [(v, [(s, arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in rows]
-    may_write = _may(caller, can.WRITE_STUDY, participant)
+    may_write = may(caller, can.WRITE_STUDY, participant)
     waiting = repository.proposals_of_participant(db, participant.id)
     return HTMLResponse(render(request, "study/visits.html", participant=participant, days=days, waiting=waiting, may_write=may_write))
 
@@ -156,7 +160,7 @@ def _visit_page(
         seen=seen,
         draft=seen | {"reason": ""} | (typed or {}),
         labels=visit_form.labels(seen),
-        may_write=_may(caller, can.WRITE_STUDY, visit.participant),
+        may_write=may(caller, can.WRITE_STUDY, visit.participant),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)
@@ -203,7 +207,7 @@ def _settings_page(
         groups=settings_form.GROUPS,
         history=settings_form.history(participant.settings),
         suggestion=_suggestion(db, participant, caller),
-        may_write=_may(caller, can.WRITE_SETTINGS, participant),
+        may_write=may(caller, can.WRITE_SETTINGS, participant),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)
@@ -233,7 +237,3 @@ def _typed(values: FormData, base: dict[str, str]) -> dict[str, str]:
 
 def _reason(values: FormData) -> str | None:
     return str(values.get("reason", "")).strip()[:1000] or None
-
-
-def _may(caller: Caller, permission: str, participant: Participant) -> bool:
-    return caller.may(permission, participant.site.study_id, participant.site_id)

@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, Select, column, false, func, or_, select, 
 from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.models import Site
-from app.accounts.policy import Caller
+from app.accounts.permissions import Caller
 from app.platform.audit import AuditEvent
 from app.platform.errors import NotFound
 from app.study.models import (

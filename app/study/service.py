@@ -11,13 +11,14 @@ from sqlalchemy import select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from app.accounts import policy as can
+from app.accounts import permissions as can
 from app.accounts.models import Site
-from app.accounts.policy import Caller
+from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
-from app.study import blinding, outcomes, repository
+from app.study import blinding, repository
 from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision, SettingsVersion, StudySession, Visit
+from app.study.outcomes import service as outcomes
 from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, ParticipantIn, QocIn, SessionChange, SettingsIn, VisitChange, VisitIn
 from app.study.traces import StepTable, step_table
 from ml.mdp import MdpSettings
@@ -275,6 +276,11 @@ def qoc_of(session: StudySession) -> Qoc:
 def require(caller: Caller, permission: str, participant: Participant) -> None:
     """Raises NotFound or Forbidden unless the caller holds the permission for this participant."""
     caller.require(permission, participant.site.study_id, participant.site_id)
+
+
+def may(caller: Caller, permission: str, participant: Participant) -> bool:
+    """Whether the caller holds the permission for this participant: for pages that leave out what would be refused."""
+    return caller.may(permission, participant.site.study_id, participant.site_id)
 
 
 def _add_settings(db: Session, participant: Participant, values: dict[str, Any], caller: Caller, reason: str | None) -> SettingsVersion:

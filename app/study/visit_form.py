@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
-from app.platform.forms import parse
+from app.platform.web.forms import parse
 from app.study import repository
 from app.study.models import Hemisphere, Visit
 from app.study.schemas import CdbsAmplitudeModel, VisitChange

@@ -39,7 +39,7 @@ from ml.deploy.runtime.loop import Controller, WindowNetwork
 from ml.deploy.runtime.network import MlpNetwork
 from ml.deploy.sheet import render
 from ml.deploy.windows import PolicyWindow
-from ml.rl.onnx_policy import MAX_FILE_BYTES, OnnxPolicy, PolicyFileError, PolicyOutputError
+from ml.policies.onnx_policy import MAX_FILE_BYTES, OnnxPolicy, PolicyFileError, PolicyOutputError
 
 SHEET, MANIFEST, SIGNATURE, MODEL, VECTORS = "sheet.html", "manifest.json", "manifest.sig", "model.onnx", "test_vectors.json"
 WEIGHTS, HEADER, SELF_TEST = "weights.f32", "betaloop_controller.h", "selftest.c"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ml.rl.policy import Policy
+from ml.policies.policy import Policy
 
 
 class PolicyWindow:

@@ -22,13 +22,13 @@ from scipy.stats import norm
 from torch import Tensor, nn
 
 from ml.mdp import step_reward
-from ml.ope.batches import Batch, Scale, learn_scale, make_batch, session_folds
-from ml.ope.coverage import AmplitudeSupport
-from ml.ope.dlsm_heads import GaussianHead, gaussian_kl, gaussian_log_prob
-from ml.ope.end_outcomes import EndModel, fit_end_model, summarise
+from ml.ope.dlsm.batches import Batch, Scale, learn_scale, make_batch, session_folds
+from ml.ope.dlsm.heads import GaussianHead, gaussian_kl, gaussian_log_prob
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.linear.end_outcomes import EndModel, fit_end_model, summarise
+from ml.ope.support.coverage import AmplitudeSupport
+from ml.policies.policy import Policy
 from ml.progress import Report, part_of, silent
-from ml.rl.policy import Policy
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]

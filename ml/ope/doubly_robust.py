@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.batches import outcome_table
-from ml.ope.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size
-from ml.ope.end_outcomes import summarise
+from ml.ope.dlsm.batches import outcome_table
 from ml.ope.estimate import Estimate, checked_horizon
-from ml.ope.fqe import FittedFqe, Fqe, FqeConfig, QMember, head_schedule, value_estimate, within_reach
+from ml.ope.fqe.estimator import FittedFqe, Fqe, FqeConfig, QMember, head_schedule, value_estimate, within_reach
+from ml.ope.fqe.steps import TargetActions, fresh_memory
 from ml.ope.importance import behaviour_densities, horizon_of_ten, kernel_log_density
-from ml.ope.steps import TargetActions, fresh_memory
+from ml.ope.linear.end_outcomes import summarise
+from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size
+from ml.policies.policy import Policy
 from ml.progress import Report, silent
-from ml.rl.policy import Policy
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]

@@ -19,13 +19,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ml.ope.coverage import AmplitudeSupport
-from ml.ope.end_outcomes import LATE_STEPS, EndModel, fit_end_model
 from ml.ope.estimate import Estimate, checked_horizon
-from ml.ope.fqe import value_estimate, within_reach
-from ml.ope.steps import StepTable, TargetActions, ValueFeatures, fresh_memory, step_table
+from ml.ope.fqe.estimator import value_estimate, within_reach
+from ml.ope.fqe.steps import StepTable, TargetActions, ValueFeatures, fresh_memory, step_table
+from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
+from ml.ope.support.coverage import AmplitudeSupport
+from ml.policies.policy import Policy
 from ml.progress import Report, silent
-from ml.rl.policy import Policy
 from ml.statistics.bootstrap import resamples
 from ml.trajectories import ReplayBuffer
 

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from ml.policies.policy import Policy
 from ml.progress import Report, silent
-from ml.rl.policy import Policy
 from ml.trajectories import ReplayBuffer
 
 LEVEL = 0.90

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from ml.ope.behaviour import Key, clones, controller_key, rule_of_thumb_bandwidth
-from ml.ope.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size
 from ml.ope.estimate import LEVEL, Estimate, checked_horizon
+from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size
+from ml.policies.policy import Policy
 from ml.progress import Report, silent
-from ml.rl.policy import Policy
 from ml.statistics.bootstrap import bca_interval, percentile_interval, resamples
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.rl.held_out import Score
-from ml.rl.policy import ConstantPolicy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 
 

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.rl.networks import STUDENT_HIDDEN, MlpPolicy
-from ml.rl.policy import Policy
 from ml.rl.training import TrainingDiverged, single_thread
 from ml.trajectories import ReplayBuffer
 

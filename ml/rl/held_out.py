@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.policies.policy import Policy
 from ml.rl.end_reward import EndReward
-from ml.rl.policy import Policy
 from ml.trajectories import ReplayBuffer, to_parquet
 
 Score = Callable[[Policy], float]

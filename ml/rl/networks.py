@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from ml.rl.onnx_policy import PolicyFileError
+from ml.policies.onnx_policy import PolicyFileError
 
 TEACHER_HIDDEN = (400, 300)
 STUDENT_HIDDEN = (20, 10)

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.rl.policy import Policy
+from ml.policies.policy import Policy
 
 LEVEL = 0.95
 """One-sided level of a lower bound."""

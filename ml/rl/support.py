@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ml.mdp import AMPLITUDE_TOLERANCE
-from ml.rl.policy import Policy
+from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer
 
 LARGEST_SHARE_BELOW = 0.05

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from ml.progress import Report, silent
+from ml.rl.algorithms.learners import StackedLearner
 from ml.rl.batches import RewardScale, packed
 from ml.rl.configs import TrainConfig
 from ml.rl.end_reward import fit_end_reward
 from ml.rl.held_out import HeldOut
-from ml.rl.learners import StackedLearner
 from ml.rl.networks import MlpPolicy
 from ml.rl.training import (
     Curve,
@@ -68,7 +68,7 @@ class TrainedPolicy:
 
     @property
     def algorithm(self) -> str:
-        """Name in `ml.rl.algorithms.ALGORITHMS`."""
+        """Name in `ml.rl.algorithms.registry.ALGORITHMS`."""
         return self.config.algorithm
 
     @property
@@ -95,7 +95,7 @@ class TrainedPolicy:
     @staticmethod
     def from_bytes(content: bytes) -> TrainedPolicy:
         """The inverse of `to_bytes`. Raises ValueError when the bytes are no such training."""
-        from ml.rl.algorithms import algorithm  # the registry knows this class
+        from ml.rl.algorithms.registry import algorithm  # the registry knows this class
 
         saved = tensors_from_bytes(content)
         try:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from app.accounts.policy import SYSTEM
-from app.export import export_participant
+from app.accounts.permissions import SYSTEM
+from app.overview.export import export_participant
 from app.platform.database import transaction
 from app.study.models import CdbsAmplitude, Hemisphere, StudySession
 from app.study.repository import participant_by_code

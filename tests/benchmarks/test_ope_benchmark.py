@@ -142,9 +142,9 @@ def test_figures_come_from_the_headline_and_the_baseline_from_the_papers_page(mo
 
 
 def test_the_page_puts_unsupported_candidates_last_whatever_their_values(module):
-    from ml.ope.panel import estimators
+    from ml.ope.registry import estimators
+    from ml.policies.policy import ConstantPolicy
     from ml.population.virtual import world
-    from ml.rl.policy import ConstantPolicy
 
     buffer = world("A", 2).data("paper", visits=1)
     policies = {"in": ConstantPolicy(0.7), "below": ConstantPolicy(0.15), "high": ConstantPolicy(0.95)}

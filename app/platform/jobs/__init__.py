@@ -55,9 +55,9 @@ terminal's progress bar; `worker.run_worker(slots, stop_event)` is the worker. `
 
 from __future__ import annotations
 
+from app.platform.jobs.children.report import Report, write_atomically
 from app.platform.jobs.context import JobContext
 from app.platform.jobs.errors import JobError, StepFailed
 from app.platform.jobs.registry import Priority, compute, job_kind
-from app.platform.jobs.report import Report, write_atomically
 
 __all__ = ["JobContext", "JobError", "Priority", "Report", "StepFailed", "compute", "job_kind", "write_atomically"]

@@ -21,9 +21,9 @@ from sqlalchemy.orm import Session
 
 from app.platform.database import now, set_actor, transaction
 from app.platform.jobs import repository
+from app.platform.jobs.children.supervisor import Heard
 from app.platform.jobs.errors import JobCancelled
 from app.platform.jobs.models import Job, JobStatus, JobStep
-from app.platform.jobs.nursery import Heard
 
 log = logging.getLogger(__name__)
 

@@ -16,18 +16,18 @@ from pydantic import BaseModel
 from app.platform.jobs.errors import UnknownKind
 
 if TYPE_CHECKING:
+    from app.platform.jobs.children.report import Report
     from app.platform.jobs.context import JobContext
-    from app.platform.jobs.report import Report
 
 JOB_MODULES = (
-    "app.learning.jobs",
-    "app.evaluation.jobs",
+    "app.pipeline.learning",
+    "app.pipeline.evaluation",
 )
 """Modules that register kinds, as names: the platform lies below the phases and may not import them. The web service imports them too."""
 
 COMPUTE_MODULES = (
-    "app.learning.compute",
-    "app.evaluation.compute",
+    "app.learning.training.compute",
+    "app.evaluation.estimates.compute",
 )
 """Modules with compute functions and their heavy imports, loaded by workers and children alone; a room may do without one."""
 

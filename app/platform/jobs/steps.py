@@ -17,12 +17,12 @@ from sqlalchemy.orm import Session
 from app.platform.database import new_session
 from app.platform.errors import BetaloopError
 from app.platform.jobs import engine, registry, repository
+from app.platform.jobs.children.slots import Slots
+from app.platform.jobs.children.supervisor import Call, Nursery
 from app.platform.jobs.context import JobContext, Outcome
 from app.platform.jobs.errors import JobCancelled, WorkerStopping
 from app.platform.jobs.ledger import Ledger, persist
 from app.platform.jobs.models import Job, JobStatus
-from app.platform.jobs.nursery import Call, Nursery
-from app.platform.jobs.slots import Slots
 from app.settings import get_settings
 
 log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.rl.policy import ConstantPolicy, Policy, ProportionalPolicy
+from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
 
 Floats = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.policies.policy import Policy
 from ml.population.virtual import _kernel, equations
 from ml.population.virtual.equations import CONSTANTS, GAIN, HALF, HOUR, LEVEL, NEED, NOISES, NORMALS, STATES
 from ml.population.virtual.patient import HYSTERESIS, OSCILLATOR, TOLERANCE, Patient
-from ml.rl.policy import Policy
 
 Floats = NDArray[np.float64]
 

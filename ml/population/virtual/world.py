@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from ml.designs import DesignSettings, lay_out
 from ml.mdp import MdpSettings, step_reward
+from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.population.virtual.candidates import draw_candidates
 from ml.population.virtual.patient import MECHANISMS, Patient, draw_patient
 from ml.population.virtual.sessions import Days, Sessions, new_days, simulate, visit_days
 from ml.qoc import Qoc
-from ml.rl.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import service
 from app.accounts.models import Role
-from app.accounts.policy import APPROVE_PLAN, MANAGE_ACCOUNTS, PERMISSIONS, READ, WRITE_STUDY, Caller, Grant
+from app.accounts.permissions import APPROVE_PLAN, MANAGE_ACCOUNTS, PERMISSIONS, READ, WRITE_STUDY, Caller, Grant
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 
 EMAIL, PASSWORD = "ada@clinic.example", "correct horse battery"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sqlalchemy.orm import Session
 
-from app.accounts.policy import SYSTEM
+from app.accounts.permissions import SYSTEM
 from app.study import blinding, repository
 from app.study.models import Controller, Device, Hemisphere, QocRevision, Recording, SessionSegment, StudySession, Trace
 from app.study.traces import pack

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from ml.cohort import rcs_session_zip, run_session
+from ml.population import rcs_session_zip, run_session
 
 DAY = datetime(2026, 3, 2, 10, 0, tzinfo=UTC)
 """The day of visit 1 of participant P1."""

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from app.planning.schedule import SESSION_MINUTES
+from app.planning.plans.schedule import SESSION_MINUTES
 from app.platform.errors import Conflict, Invalid
 from app.simulation.design import PRESETS, collecting_day, design, remember, visit_day
 

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 from sqlalchemy import func, select
 
-from app.accounts.policy import SYSTEM
-from app.analysis.trial_time import trial_time
+from app.accounts.permissions import SYSTEM
+from app.analysis.trial_time.service import trial_time
 from app.evaluation.models import Evaluation
 from app.ingest.models import UploadFile
-from app.planning.models import Plan
+from app.planning.plans.models import Plan
 from app.platform.audit import AuditEvent
 from app.platform.database import new_session
 from app.platform.errors import Conflict

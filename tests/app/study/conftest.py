@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sqlalchemy.orm import Session
 
-from app.accounts.policy import SYSTEM
+from app.accounts.permissions import SYSTEM
 from app.ingest.models import Upload, UploadFile
 from app.study import blinding, repository, service
 from app.study.models import Controller, Device, Hemisphere, Recording, SessionSegment, StudySession, Trace

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from sqlalchemy.orm import Session
 
-from app.accounts.policy import SYSTEM
+from app.accounts.permissions import SYSTEM
 from app.study import service
 from app.study.models import StudySession
 from app.study.schemas import SettingsIn
-from app.study.session_charts import control_chart
-from app.study.session_pages import summarise
+from app.study.sessions.charts import control_chart
+from app.study.sessions.pages import summarise
 
 
 def test_a_threshold_with_stated_unit_and_source_counts(db: Session, study_session: StudySession) -> None:

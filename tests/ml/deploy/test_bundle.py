@@ -19,8 +19,8 @@ from pypdf import PdfReader
 from ml.deploy.bundle import RUNNER, build_bundle, model_of, open_bundle, sign, verify_bundle
 from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.runtime.envelope import BetaSample, EnvelopeLimits, Signal
+from ml.policies.onnx_policy import PolicyFileError
 from ml.rl.networks import MlpPolicy
-from ml.rl.onnx_policy import PolicyFileError
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_the_test_vectors_reach_saturation_and_every_way_in_which_beta_goes_wron
 
 
 def test_a_policy_without_layers_leaves_as_onnx_alone_and_runs_within_the_same_envelope(manifest, test_windows):
-    from app.learning.baselines import constant_onnx
+    from app.learning.policies.baselines import constant_onnx
 
     made = build_bundle(
         constant_onnx(0.5, 10), dataclasses.replace(manifest, normalisation_mean=None, normalisation_std=None), test_windows

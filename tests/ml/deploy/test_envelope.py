@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ml.deploy.runtime.envelope import BetaSample, EnvelopeLimits, Reason, Signal, reason_names
 from ml.deploy.runtime.loop import Controller
 from ml.deploy.windows import PolicyWindow
-from ml.rl.policy import ConstantPolicy
+from ml.policies.policy import ConstantPolicy
 
 LIMITS = EnvelopeLimits(min_ma=0.5, max_ma=3.2, cdbs_ma=3.0, ramp_ma_per_s=0.25, window=3, period_s=2.0)
 UV = Signal("uV", "time_domain")

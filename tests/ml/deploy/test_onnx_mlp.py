@@ -19,8 +19,8 @@ from ml.deploy.bundle import build_bundle, open_bundle, verify_bundle
 from ml.deploy.fixed_point import SCORE_LIMIT, _quantise, quantise
 from ml.deploy.onnx_mlp import NoPlainNetwork, mlp_of
 from ml.deploy.vectors import edge_windows
+from ml.policies.onnx_policy import OnnxPolicy
 from ml.rl.networks import MlpPolicy
-from ml.rl.onnx_policy import OnnxPolicy
 
 W = 10
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion", "-O2")
@@ -169,8 +169,8 @@ def test_our_own_networks_are_read_to_the_last_bit():
 
 
 def test_the_proportional_baseline_is_a_network_of_one_layer_and_a_constant_is_none():
-    from app.learning.baselines import constant_onnx, proportional_onnx
-    from ml.rl.policy import ProportionalPolicy
+    from app.learning.policies.baselines import constant_onnx, proportional_onnx
+    from ml.policies.policy import ProportionalPolicy
 
     policy = ProportionalPolicy(90.0, 150.0, floor=0.3, newest=3)
     network = mlp_of(proportional_onnx(policy, W), usual_windows(120.0, 35.0))

@@ -28,8 +28,8 @@ from ml.deploy.runtime.loop import Controller
 from ml.deploy.runtime.network import MlpNetwork
 from ml.deploy.vectors import Step, edge_windows, session
 from ml.deploy.windows import PolicyWindow
+from ml.policies.onnx_policy import OnnxPolicy
 from ml.rl.networks import MlpPolicy
-from ml.rl.onnx_policy import OnnxPolicy
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion", "-O2")
 SANITISED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ml.mdp import MdpSettings, step_reward
+from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.qoc import Qoc
-from ml.rl.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 WINDOW = 10

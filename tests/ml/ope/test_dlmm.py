@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from ml.ope.compare.metrics import accuracy
 from ml.ope.dlmm import Dlmm, DlmmConfig, DlmmNetworks
-from ml.ope.metrics import accuracy
+from ml.policies.policy import ConstantPolicy
 from ml.qoc import Qoc
-from ml.rl.policy import ConstantPolicy
 from ml.trajectories import ReplayBuffer
 
 TINY = DlmmConfig(latent=2, hidden=(8,), members=2, updates=30, rollouts=8)

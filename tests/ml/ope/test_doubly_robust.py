@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ml.ope.compare.metrics import accuracy
 from ml.ope.doubly_robust import DoublyRobust, step_weights, weighted_doubly_robust
-from ml.ope.fqe import Fqe, FqeConfig
-from ml.ope.metrics import accuracy
-from ml.rl.policy import ConstantPolicy
+from ml.ope.fqe.estimator import Fqe, FqeConfig
+from ml.policies.policy import ConstantPolicy
 from ml.trajectories import ReplayBuffer
 
 GO = np.array([[[0.9, 0.1], [0.4, 0.6]], [[0.5, 0.5], [0.2, 0.8]]])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ml.ope.dual_dice import DiceConfig, DualDice, StackedMlp, ratios, saddle
-from ml.rl.policy import ConstantPolicy
+from ml.policies.policy import ConstantPolicy
 
 GO = np.array([[[0.75, 0.25], [0.5, 0.5]], [[0.25, 0.75], [0.5, 0.5]]])
 REWARD = np.array([[1.0, -0.5], [0.2, 2.0]])

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ml.ope.fqe import Fqe, FqeConfig, backward_induction, head_schedule, logged_returns, spectral_radius, summaries_of
-from ml.ope.fqe_score import fqe_value
-from ml.ope.metrics import accuracy
-from ml.ope.steps import TargetActions, fresh_memory, held_amplitude, memories, step_table
+from ml.ope.compare.metrics import accuracy
+from ml.ope.fqe.estimator import Fqe, FqeConfig, backward_induction, head_schedule, logged_returns, spectral_radius, summaries_of
+from ml.ope.fqe.score import fqe_value
+from ml.ope.fqe.steps import TargetActions, fresh_memory, held_amplitude, memories, step_table
+from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.qoc import Qoc
-from ml.rl.policy import ConstantPolicy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 
 GO = np.array([[[0.75, 0.25], [0.5, 0.5]], [[0.25, 0.75], [0.5, 0.5]]])  # [s, a, s']

@@ -20,7 +20,7 @@ from ml.ope.importance import (
     per_trajectory,
     weighted,
 )
-from ml.rl.policy import ConstantPolicy, ProportionalPolicy
+from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ml.mdp import MdpSettings, end_reward
+from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.population.virtual import (
     MECHANISMS,
     WORLDS_PER_PART,
@@ -25,7 +26,6 @@ from ml.population.virtual.patient import HILL, LINE, THRESHOLD, U_SHAPE
 from ml.population.virtual.sessions import quality
 from ml.population.virtual.world import end_rewards, mechanisms_of, visit_plan
 from ml.qoc import Qoc, tremor_percent
-from ml.rl.policy import ConstantPolicy, ProportionalPolicy
 
 FIELDS = ("lead", "beta", "amplitude", "brady", "tremor", "overload", "grasp_hz", "rating", "tremor_percent")
 FOLLOWING = ProportionalPolicy(0.6, 1.8, 0.2, 3)

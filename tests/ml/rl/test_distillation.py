@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.rl.distillation import ActionError, DistilConfig, distil, distil_sizes
 from ml.rl.networks import MlpPolicy
-from ml.rl.policy import ConstantPolicy, ProportionalPolicy
 
 QUICK = DistilConfig(updates=1500, batch=128)
 

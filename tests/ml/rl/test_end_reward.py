@@ -7,7 +7,7 @@ import pytest
 
 from ml.mdp import MdpSettings
 from ml.qoc import Qoc
-from ml.rl.algorithms import ALGORITHMS
+from ml.rl.algorithms.registry import ALGORITHMS
 from ml.rl.end_reward import fit_end_reward
 from ml.rl.held_out import HeldOut
 from ml.trajectories import ReplayBuffer, SessionTrajectory

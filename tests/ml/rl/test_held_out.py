@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ml.mdp import MdpSettings
-from ml.rl.actor_critic import DdpgConfig, train
+from ml.rl.algorithms.ddpg import DdpgConfig, train
 from ml.rl.held_out import HeldOut, split_sessions
 from ml.trajectories import ReplayBuffer
 

@@ -8,8 +8,8 @@ import onnxruntime as ort
 import pytest
 import torch
 
+from ml.policies.onnx_policy import OnnxPolicy, PolicyFileError
 from ml.rl.networks import STUDENT_HIDDEN, TEACHER_HIDDEN, Critic, MlpPolicy
-from ml.rl.onnx_policy import OnnxPolicy, PolicyFileError
 
 
 def trained_like(hidden, *, window=10, seed=3):

@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import norm
 
 from ml.mdp import MdpSettings
-from ml.ope.fqe import Fqe, FqeConfig
-from ml.rl.policy import ConstantPolicy
+from ml.ope.fqe.estimator import Fqe, FqeConfig
+from ml.policies.policy import ConstantPolicy
 from ml.rl.selection import Gain, gain, gains_over, surest
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ml.rl.algorithms import ALGORITHMS, algorithm
+from ml.rl.algorithms.registry import ALGORITHMS, algorithm
 from ml.rl.networks import Critic, MlpPolicy, Value
 from ml.rl.stacked import Stack, StackedActor, StackedAdam, into_module
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ml.rl.actor_critic import DdpgConfig, train
+from ml.policies.policy import ConstantPolicy, ProportionalPolicy
+from ml.rl.algorithms.ddpg import DdpgConfig, train
 from ml.rl.held_out import HeldOut, split_sessions
-from ml.rl.policy import ConstantPolicy, ProportionalPolicy
 from ml.rl.support import random_bound, share_below_bound, stays_in_range
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ml.rl.actor_critic import DdpgConfig, train
-from ml.rl.algorithms import ALGORITHMS
+from ml.rl.algorithms.ddpg import DdpgConfig, train
+from ml.rl.algorithms.registry import ALGORITHMS
 from ml.rl.training import CheckpointError
 from ml.trajectories import to_parquet
 

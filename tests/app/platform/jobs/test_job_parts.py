@@ -15,13 +15,13 @@ from sqlalchemy import text
 from app.platform.database import transaction
 from app.platform.errors import NotFound
 from app.platform.jobs import JobContext, Report, StepFailed, repository, write_atomically
-from app.platform.jobs.child import params_hash
+from app.platform.jobs.children.process import params_hash
+from app.platform.jobs.children.slots import Slots
+from app.platform.jobs.children.supervisor import Call, Heard, Nursery
 from app.platform.jobs.errors import JobCancelled
 from app.platform.jobs.ledger import Ledger
 from app.platform.jobs.models import JobStatus
-from app.platform.jobs.nursery import Call, Heard, Nursery
 from app.platform.jobs.registry import compute, compute_function
-from app.platform.jobs.slots import Slots
 from app.platform.jobs.steps import JobRunner
 from app.platform.jobs.stream import job_events
 from app.platform.jobs.watch import show_progress, watch

@@ -1,0 +1,1 @@
+"""Calibration: estimates made before a visit against what the visit brought."""

@@ -1,0 +1,285 @@
+"""Charts of the calibration: predicted against actual return, the metrics of every method, and each outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from app.analysis.calibration.schemas import AccuracyOut, CalibrationOut, MethodMetricOut, PredictionOut, TestedPolicyOut
+from app.evaluation.estimates.methods import METHOD_NAMES, METHOD_SHORT
+from app.evaluation.ranking.charts import METHOD_STYLES
+from app.platform.web.charts import MUTED, Chart, axis, figure
+
+QUANTITY_NAMES = {
+    "grasp_hz": ("Grasp frequency", "Hz"),
+    "rating": ("Rating", "1–10"),
+    "tremor_percent": ("Tremor", "% of time"),
+    "energy": ("Energy", "share of cDBS"),
+    "mean_beta": ("Mean beta", ""),
+}
+METRIC_NAMES = {
+    "mae": ("Mean absolute error", "reward"),
+    "rank_correlation": ("Rank correlation", "Spearman"),
+    "regret_of_range": ("Regret@1", "share of range"),
+}
+"""What the chart of metrics shows; the table has the other forms too."""
+
+Point = tuple[TestedPolicyOut, PredictionOut]
+
+
+def label(p: TestedPolicyOut) -> str:
+    """A policy at a visit."""
+    return f"{'cDBS (reference)' if p.reference else p.name}, visit {p.visit}"
+
+
+def returns(found: CalibrationOut, method: str) -> Chart:
+    """Actual against predicted return with the line on which they agree; one method is shown, the others wait in the legend."""
+    order = sorted(found.methods, key=lambda m: m != method)
+    points = {m: [(p, q) for p in found.policies for q in p.predictions if q.method == m] for m in order}
+    ends = [v for own in points.values() for _, q in own for v in (q.predicted, q.actual)]
+    data = [_trace(m, points[m], visible=m == method) for m in order]
+    shown = points[method]
+    bars = [v for _, q in shown for v in (q.predicted, q.low, q.high, q.actual, q.actual_low, q.actual_high) if v is not None]
+    square = _square(bars, ends)
+    rows = [
+        [
+            label(p), METHOD_NAMES[m], q.predicted, q.low, q.high, q.actual, q.actual_low, q.actual_high, q.sessions,
+            "whole return" if q.parts == "return" else "steps alone",
+        ]
+        for m in order
+        for p, q in points[m]
+    ]  # fmt: skip
+    level = f"{100 * found.level:.0f} %"
+    return Chart(
+        id="predicted-actual",
+        title="Actual against predicted return",
+        subtitle=f"reward, {level} intervals \u00b7 {_n([(p, q.sessions) for p, q in shown])} \u00b7 "
+        "dashed: predicted = actual \u00b7 circles: cDBS \u00b7 open marks: not supported by the data",
+        figure=figure(
+            data,
+            xaxis=axis("Predicted before the visit", "reward", range=square["range"]),
+            yaxis=axis("Actual", "reward", range=square["range"]),
+            shapes=square["shapes"],
+            showlegend=True,
+            legend={"orientation": "h", "y": -0.2, "yanchor": "top", "x": 0, "font": {"color": MUTED, "size": 11}},
+        ),
+        columns=["Policy", "Method", "Predicted (reward)", "Low", "High", "Actual (reward)", "Low", "High", "Sessions", "Compared"],
+        rows=rows,
+        height=460,
+    )
+
+
+def metrics(found: CalibrationOut) -> Chart:
+    """MAE, rank correlation and regret of every method over all visits, side by side, with session-bootstrap intervals."""
+    rows = [m for m in found.metrics if m.visit is None]
+    names = [METHOD_SHORT[m.method] for m in rows]
+    data: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {}
+    for k, (metric, (title, unit)) in enumerate(METRIC_NAMES.items()):
+        suffix = "" if k == 0 else str(k + 1)
+        values = [getattr(m, metric) for m in rows]
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "x": [v.value for v in values],
+                "y": names,
+                "xaxis": f"x{suffix}",
+                "error_x": _error_bars(values),
+                "marker": {
+                    "size": 10,
+                    "color": [METHOD_STYLES[m.method]["color"] for m in rows],
+                    "symbol": [METHOD_STYLES[m.method]["symbol"] for m in rows],
+                },
+                "hovertemplate": "%{y}: %{x:.3g}<extra>" + title + "</extra>",
+            }
+        )
+        more = {"range": [-1.1, 1.1]} if metric == "rank_correlation" else {"rangemode": "tozero"}
+        layout[f"xaxis{suffix}"] = axis(title, unit, domain=[k / 3 + (0.03 if k else 0.0), (k + 1) / 3 - 0.02], anchor="y", **more)
+    level = f"{100 * found.level:.0f} %"
+    columns = ["Method", "n policies at visits", "n sessions"]
+    for title, unit in METRIC_NAMES.values():
+        columns += [f"{title} ({unit})", f"Low ({level})", f"High ({level})"]
+    return Chart(
+        id="metrics",
+        title="Metrics of every method",
+        subtitle=f"over all visits, {level} session bootstrap \u00b7 n = {max((m.sessions for m in rows), default=0)} sessions",
+        figure=figure(
+            data,
+            yaxis=axis("", categoryorder="array", categoryarray=names[::-1]),
+            showlegend=False,
+            margin={"l": 96, "r": 16, "t": 12, "b": 48},
+            **layout,
+        ),
+        columns=columns,
+        rows=[[METHOD_NAMES[m.method], m.policies, m.sessions, *(v for name in METRIC_NAMES for v in _cells(m, name))] for m in rows],
+        height=110 + 34 * len(rows),
+    )
+
+
+def over_visits(found: CalibrationOut, method: str) -> Chart | None:
+    """The three metrics of every method at each visit, side by side; None where there are not two visits to compare.
+
+    The shown method is drawn strongly with its intervals, the others thinly beside it.
+    """
+    rows = [m for m in found.metrics if m.visit is not None]
+    visits = sorted({m.visit for m in rows if m.visit is not None})
+    if len(visits) < 2:
+        return None
+    data: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {}
+    for k, (metric, (title, unit)) in enumerate(METRIC_NAMES.items()):
+        suffix = "" if k == 0 else str(k + 1)
+        for name in sorted(found.methods, key=lambda m: m == method):
+            own = [m for m in rows if m.method == name]
+            values, style, chosen = [getattr(m, metric) for m in own], METHOD_STYLES[name], name == method
+            data.append(
+                {
+                    "type": "scatter",
+                    "mode": "lines+markers",
+                    "name": METHOD_SHORT[name],
+                    "legendgroup": name,
+                    "showlegend": k == 0,
+                    "opacity": 1.0 if chosen else 0.45,
+                    "x": [m.visit for m in own],
+                    "y": [v.value for v in values],
+                    "xaxis": f"x{suffix}",
+                    "yaxis": f"y{suffix}",
+                    "line": {"color": style["color"], "width": 2.5 if chosen else 1.2},
+                    "marker": {"size": 9 if chosen else 6, "color": style["color"], "symbol": style["symbol"]},
+                    "hovertemplate": "visit %{x}: %{y:.3g}<extra>" + METHOD_NAMES[name] + "</extra>",
+                }
+                | ({"error_y": _error_bars(values)} if chosen else {})
+            )
+        ticks = {"tickvals": visits, "range": [visits[0] - 0.3, visits[-1] + 0.3]}
+        layout[f"xaxis{suffix}"] = axis(
+            "Visit", "", domain=[k / 3 + (0.05 if k else 0.0), (k + 1) / 3 - 0.02], anchor=f"y{suffix}", **ticks
+        )
+        more = {"range": [-1.1, 1.1]} if metric == "rank_correlation" else {"rangemode": "tozero"}
+        layout[f"yaxis{suffix}"] = axis(title, unit, anchor=f"x{suffix}", **more)
+    level = f"{100 * found.level:.0f} %"
+    columns = ["Visit", "Method", "n policies", "n sessions"]
+    for title, unit in METRIC_NAMES.values():
+        columns += [f"{title} ({unit})", f"Low ({level})", f"High ({level})"]
+    return Chart(
+        id="over-visits",
+        title="Metrics visit by visit",
+        subtitle=f"strong: {METHOD_NAMES[method]}, {level} session bootstrap \u00b7 n = {len(visits)} visits, "
+        f"{sum(m.sessions for m in rows if m.method == method)} sessions \u00b7 a gap: too few policies at that visit",
+        figure=figure(
+            data,
+            showlegend=True,
+            legend={"orientation": "h", "y": -0.24, "yanchor": "top", "x": 0, "font": {"color": MUTED, "size": 11}},
+            **layout,
+        ),
+        columns=columns,
+        rows=[
+            [m.visit, METHOD_NAMES[m.method], m.policies, m.sessions, *(v for name in METRIC_NAMES for v in _cells(m, name))] for m in rows
+        ],
+        height=340,
+    )
+
+
+def quantities(found: CalibrationOut, method: str) -> list[Chart]:
+    """Actual against predicted, of every outcome that the method predicts."""
+    points = [(p, q) for p in found.policies for q in p.predictions if q.method == method]
+    charts = []
+    for name, (title, unit) in QUANTITY_NAMES.items():
+        own = [(p, quantity) for p, q in points for quantity in q.quantities if quantity.name == name]
+        if not own:
+            continue
+        unit = unit or found.beta_unit or ""
+        ends = [v for _, q in own for v in (q.predicted, q.actual)]
+        square = _square(ends, ends)
+        style = METHOD_STYLES[method]
+        trace = {
+            "type": "scatter",
+            "mode": "markers",
+            "name": METHOD_NAMES[method],
+            "x": [q.predicted for _, q in own],
+            "y": [q.actual for _, q in own],
+            "text": [label(p) for p, _ in own],
+            "marker": {"size": 9, "color": style["color"], "symbol": ["circle" if p.reference else style["symbol"] for p, _ in own]},
+            "hovertemplate": "%{text}: predicted %{x:.3g}, actual %{y:.3g}<extra></extra>",
+        }
+        charts.append(
+            Chart(
+                id=f"actual-{name.replace('_', '-')}",
+                title=title,
+                subtitle=f"{unit}, {METHOD_NAMES[method]} \u00b7 {_n([(p, q.sessions) for p, q in own])}",
+                figure=figure(
+                    [trace],
+                    xaxis=axis("Predicted", unit, range=square["range"]),
+                    yaxis=axis("Actual", unit, range=square["range"]),
+                    shapes=square["shapes"],
+                    showlegend=False,
+                ),
+                columns=["Policy", f"Predicted ({unit})", f"Actual ({unit})", "Sessions"],
+                rows=[[label(p), q.predicted, q.actual, q.sessions] for p, q in own],
+                height=280,
+            )
+        )
+    return charts
+
+
+def _n(counted: Sequence[tuple[TestedPolicyOut, int]]) -> str:
+    """How many points and sessions; cDBS is named apart, since it is not counted in the metrics."""
+    policies = sum(p.reference is None for p, _ in counted)
+    beside = len(counted) - policies
+    return f"n = {policies} policies at visits{f' and {beside} of cDBS' if beside else ''}, {sum(n for _, n in counted)} sessions"
+
+
+def _square(values: Sequence[float], everything: Sequence[float]) -> dict[str, Any]:
+    """Layout members: both axes over one range that holds the values, and the line on which predicted and actual agree, over everything."""
+    low, high = min(values), max(values)
+    margin = 0.06 * (high - low) or 1.0
+    ends = [min(low - margin, *everything), max(high + margin, *everything)]
+    line = {"type": "line", "layer": "below", "x0": ends[0], "y0": ends[0], "x1": ends[1], "y1": ends[1]}
+    return {"range": [low - margin, high + margin], "shapes": [line | {"line": {"color": MUTED, "width": 1.2, "dash": "dash"}}]}
+
+
+def _trace(method: str, points: Sequence[Point], *, visible: bool) -> dict[str, Any]:
+    style = METHOD_STYLES[method]
+
+    def bars(of: Callable[[PredictionOut], tuple[float | None, float, float | None]]) -> dict[str, Any]:
+        """Error bars from (low, value, high); none where an end is unknown."""
+        ends = [of(q) for _, q in points]
+        return {
+            "type": "data",
+            "symmetric": False,
+            "array": [h - v if h is not None else 0.0 for _, v, h in ends],
+            "arrayminus": [v - low if low is not None else 0.0 for low, v, _ in ends],
+            "color": style["color"],
+            "thickness": 1,
+        }
+
+    symbols = [("circle" if p.reference else style["symbol"]) + ("" if q.supported else "-open") for p, q in points]
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "name": METHOD_SHORT[method],
+        "visible": True if visible else "legendonly",
+        "x": [q.predicted for _, q in points],
+        "y": [q.actual for _, q in points],
+        "text": [label(p) for p, _ in points],
+        "error_x": bars(lambda q: (q.low, q.predicted, q.high)),
+        "error_y": bars(lambda q: (q.actual_low, q.actual, q.actual_high)),
+        "marker": {"size": 10, "color": style["color"], "symbol": symbols},
+        "hovertemplate": "%{text}: predicted %{x:.2f}, actual %{y:.2f}<extra>" + METHOD_NAMES[method] + "</extra>",
+    }
+
+
+def _error_bars(values: Sequence[MethodMetricOut]) -> dict[str, Any]:
+    return {
+        "type": "data",
+        "symmetric": False,
+        "array": [v.high - v.value if v.value is not None and v.high is not None else None for v in values],
+        "arrayminus": [v.value - v.low if v.value is not None and v.low is not None else None for v in values],
+        "color": MUTED,
+        "thickness": 1.2,
+    }
+
+
+def _cells(m: AccuracyOut, name: str) -> list[float | None]:
+    metric: MethodMetricOut = getattr(m, name)
+    return [metric.value, metric.low, metric.high]

@@ -1,0 +1,1 @@
+"""The five metrics of every controller against cDBS."""

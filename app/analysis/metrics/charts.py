@@ -1,0 +1,109 @@
+"""The five charts of the participant page, in the manner of the paper's results figure: a box and every session, by controller."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from app.analysis.metrics.comparisons import ALPHA, Comparison, Group
+from app.analysis.metrics.service import FiveMetrics, MetricResult
+from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, figure, marker
+from app.study.models import Controller
+
+SHORT = {Controller.DISTILLED: "Distilled"}
+"""Names that must fit under a narrow box."""
+
+COLUMNS = (
+    "Controller", "n", "Median", "Quartile 1", "Quartile 3", "Difference from cDBS", "95 % low", "95 % high", "p", "p (Holm)", "Test",
+)  # fmt: skip
+
+_SPREAD = 0.16
+
+
+@dataclass(frozen=True)
+class FiveMetricsView:
+    """What the fragment `analysis/five_metrics.html` shows: pass it as `analysis`."""
+
+    result: FiveMetrics
+    charts: list[Chart]
+
+
+def view(result: FiveMetrics) -> FiveMetricsView:
+    """The analysis with its charts."""
+    return FiveMetricsView(result, [metric_chart(m) for m in result.metrics if m.n])
+
+
+def metric_chart(metric: MetricResult) -> Chart:
+    """Box and strip of one metric by controller, with p-values above and the numbers in the table."""
+    shown = [g for g in metric.groups if g.n]
+    tests = {c.controller: c for c in metric.comparisons}
+    data: list[dict[str, Any]] = []
+    for at, g in enumerate(shown):
+        data += [_box(at, g), _points(at, g, metric)]
+    names = [f"{SHORT.get(g.controller, g.label)}<br>n = {g.n}" for g in shown]
+    places = {"tickvals": list(range(len(shown))), "ticktext": names, "range": [-0.6, len(shown) - 0.4], "tickangle": 0}
+    layout: dict[str, Any] = {
+        "xaxis": {**places, "showgrid": False, "zeroline": False},
+        "yaxis": axis(metric.unit, rangemode="tozero", zeroline=False),
+        "annotations": [_p_label(at, tests.get(g.controller)) for at, g in enumerate(shown)],
+        "margin": {"l": 52, "r": 8, "t": 30, "b": 44},
+        "showlegend": False,
+        "dragmode": False,
+    }
+    if metric.metric == "rating":
+        layout["yaxis"] |= {"range": [0.5, 10.5], "dtick": 1}
+    rows = [_row(g, tests.get(g.controller)) for g in metric.groups]
+    subtitle = f"{metric.unit} \u00b7 n = {metric.n} sessions"
+    return Chart(f"metric-{metric.metric}", metric.title, subtitle, figure(data, **layout), COLUMNS, rows, height=270)
+
+
+def p_text(p: float | None) -> str:
+    """A p-value for people, without the p and without the zero that every p has before its point."""
+    if p is None:
+        return "\u2014"
+    if p < 0.001:
+        return "< .001"
+    return "1" if p > 0.9995 else f"{p:.3f}".removeprefix("0")
+
+
+def _box(at: int, g: Group) -> dict[str, Any]:
+    return {
+        "type": "box", "x": [at], "q1": [g.q1], "median": [g.median], "q3": [g.q3],
+        "lowerfence": [min(g.values)], "upperfence": [max(g.values)], "width": 0.5, "boxpoints": False, "hoverinfo": "skip",
+        "line": {"color": colour(g.controller), "width": 1.5}, "fillcolor": colour(g.controller, 0.12),
+    }  # fmt: skip
+
+
+def _points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
+    unit = metric.unit if metric.metric != "rating" else "of 10"
+    return {
+        "type": "scatter", "mode": "markers", "x": [at + s for s in _spread(g.values)], "y": list(g.values), "cliponaxis": False,
+        "marker": marker(g.controller, 7, opacity=0.8), "name": g.label,
+        "text": [f"{g.label}, session {i}" for i in g.session_ids], "hovertemplate": f"%{{text}}<br>%{{y:.4g}} {unit}<extra></extra>",
+    }  # fmt: skip
+
+
+def _spread(values: Sequence[float]) -> list[float]:
+    """Sideways places of points so that equal values stay apart: by rank, left and right of the middle in turn."""
+    order = sorted(range(len(values)), key=lambda i: (values[i], i))
+    places = [0.0] * len(values)
+    for rank, i in enumerate(order):
+        places[i] = _SPREAD * ((rank % 3) - 1) if len(values) > 1 else 0.0
+    return places
+
+
+def _p_label(at: int, test: Comparison | None) -> dict[str, Any]:
+    strong = test is not None and test.p_value is not None and test.p_value < ALPHA
+    text = "p" if test is None else p_text(test.p_value) if test.p_value is not None else "too few"
+    return {
+        "x": at, "y": 1.0, "yref": "paper", "yanchor": "bottom", "showarrow": False, "text": f"<b>{text}</b>" if strong else text,
+        "font": {"size": 12, "color": TEXT if strong else MUTED},
+    }  # fmt: skip
+
+
+def _row(g: Group, test: Comparison | None) -> list[Cell]:
+    row: list[Cell] = [g.label, g.n, g.median, g.q1, g.q3]
+    if test is None:
+        return [*row, None, None, None, None, None, "reference"]
+    return [*row, test.difference, test.low, test.high, test.p_value, test.p_holm, test.method or test.note]

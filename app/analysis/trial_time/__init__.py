@@ -1,0 +1,1 @@
+"""Trial time: minutes that each controller was tested."""

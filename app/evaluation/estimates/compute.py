@@ -1,0 +1,217 @@
+"""What the child processes of evaluation run: check coverage, fit one DLSM ensemble member, estimate by one method, choose the method."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from app.evaluation.estimates.methods import AGGREGATE
+from app.learning.training.compute import read_buffer, told
+from app.platform import files
+from app.platform.jobs import Report, compute, write_atomically
+from ml import progress
+
+if TYPE_CHECKING:
+    from ml.ope.dlsm.config import DlsmConfig
+    from ml.ope.estimate import Estimator
+    from ml.policies.policy import Policy
+    from ml.trajectories import ReplayBuffer
+
+FIT_SHARE = 0.5
+"""Share of an evaluation step's progress that fitting takes."""
+
+
+def member_file(k: int) -> str:
+    """Name under which the estimator looks for the k-th member of its ensemble."""
+    return f"dlsm-member-{k}.pt"
+
+
+@compute("fit_dlsm")
+def fit_dlsm(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+    """Train one member of the DLSM ensemble; its file stays in the working folder, where an interrupted training goes on from it.
+
+    Args:
+        params: `snapshot_sha256`, `preset`, `seed`, `member`.
+        workdir: gets `dlsm-member-K.pt`.
+        report: loss and held-out score over gradient steps.
+
+    Returns:
+        `held_out_score` of the best check and the number of `checks`, or `failed` with the reason where these data cannot be fitted.
+    """
+    import torch
+
+    from ml.ope.dlsm.estimator import Dlsm
+
+    torch.set_num_threads(1)
+    buffer = read_buffer(params["snapshot_sha256"])
+    estimator = Dlsm(_dlsm_config(params))
+    try:
+        member = estimator.fit_member(buffer, params["member"], told(report, estimator.config.steps, "dlsm_"), workdir)
+    except ValueError as error:
+        return {"failed": str(error)}
+    report.log(f"member {params['member'] + 1} {_ended(member.course, estimator.config.steps)}")
+    return {"held_out_score": float(member.check.score), "checks": len(member.course)}
+
+
+def _ended(course: Sequence[tuple[int, float, float]], steps: int) -> str:
+    """How a member's training ended, from its (update, loss, held-out score) and the updates that it might have taken."""
+    last, (best, _, score) = course[-1][0], min(course, key=lambda check: check[2] if math.isfinite(check[2]) else math.inf)
+    end = "ran to its last update" if last >= steps else f"was stopped early, at update {last} of {steps}"
+    return f"{end}: the best held-out score, {score:.4g}, was that of update {best}, which is kept"
+
+
+@compute("evaluate_method")
+def evaluate_method(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+    """Estimate every policy by one method.
+
+    Args:
+        params: `snapshot_sha256`, `preset`, `seed`, `method`, `horizon_steps`, `policies` as [{`id`, `sha256`}], and for the DLSM
+            `members`, the stored files of its ensemble; or `failed`, the reason why its ensemble could not be fitted.
+        workdir: scratch.
+        report: progress, and learning curves where the method trains a network.
+
+    Returns:
+        `estimates` by policy id, or `failed` with the reason where the method cannot work on these data.
+    """
+    if "failed" in params:
+        return {"failed": params["failed"]}
+    import torch
+
+    from ml.ope.dlmm import Dlmm
+
+    torch.set_num_threads(1)
+    buffer = read_buffer(params["snapshot_sha256"])
+    estimator = _estimator(params)
+    for k, sha256 in enumerate(params.get("members", [])):
+        write_atomically(workdir / member_file(k), files.read(sha256))
+    policies = _policies(params["policies"], buffer)
+    # its members learn one after the other, those of DualDICE side by side
+    members = estimator.config.members if isinstance(estimator, Dlmm) else 1
+
+    def part(first: float, share: float, what: str, curves: bool) -> progress.Report:
+        def tell(fraction: float, message: str = "", **numbers: float) -> None:
+            report.progress(first + share * fraction, message or what)
+            if curves and numbers:
+                at, suffix = _of_member(fraction, members)
+                report.point(round(100 * at, 3), **{f"{params['method']}_{name}{suffix}": value for name, value in numbers.items()})
+
+        return tell
+
+    # the DLSM has its curves from `fit_dlsm`; here its members are only read
+    fitting = part(0.0, FIT_SHARE, "fitting", params["method"] != "dlsm")
+    rolling = part(FIT_SHARE, 1 - FIT_SHARE, "estimating", True)
+    try:
+        fitted = estimator.fit(buffer, fitting, workdir)
+        estimates = fitted.evaluate(policies, params["horizon_steps"], rolling)
+    except ValueError as error:
+        return {"failed": str(error)}
+    return {"estimates": {policy_id: _finite(e.to_json()) for policy_id, e in estimates.items()}}
+
+
+@compute("check_coverage")
+def check_coverage(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+    """Check what the data can say about every policy, whatever the methods say of it.
+
+    Args:
+        params: `snapshot_sha256`, `horizon_steps`, `policies` as [{`id`, `sha256`}].
+        workdir: not used. report: progress over policies.
+
+    Returns:
+        `policies`, by policy id what `ml.ope.support.diagnostics.Diagnostics` holds; or `failed` with the reason where these data cannot be
+        checked.
+    """
+    import torch
+
+    from ml.ope.support.diagnostics import diagnose
+
+    torch.set_num_threads(1)
+    buffer = read_buffer(params["snapshot_sha256"])
+    try:
+        found = diagnose(buffer, _policies(params["policies"], buffer), params["horizon_steps"], told(report, 1.0))
+    except ValueError as error:
+        return {"failed": str(error)}
+    return {"policies": {policy_id: _finite(d.to_json()) for policy_id, d in found.items()}}
+
+
+@compute("choose_method")
+def choose_method(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+    """Hold the methods that are fitted within seconds against controllers that were left out of their fits.
+
+    Args:
+        params: `snapshot_sha256`, `seed`, `methods` asked for, `horizon_steps`, and `policies` that drove logged sessions as
+            [{`id`, `sha256`}].
+        workdir: not used. report: progress over controllers.
+
+    Returns:
+        `choice`, as `ml.ope.compare.skill.Choice` has it, or `failed` with the reason where the data cannot choose.
+    """
+    import torch
+
+    from ml.ope.compare.skill import choose_default
+    from ml.ope.registry import quick_estimators
+
+    torch.set_num_threads(1)
+    buffer = read_buffer(params["snapshot_sha256"])
+    quick = {name: e for name, e in quick_estimators(params["seed"]).items() if name in params["methods"]}
+    if not quick:
+        return {"failed": "none of the methods asked for is fitted fast enough to leave each controller out in turn"}
+    policies = {int(policy_id): policy for policy_id, policy in _policies(params["policies"], buffer).items()}
+    try:
+        choice = choose_default(
+            buffer,
+            quick,
+            policies=policies,
+            horizon_steps=params["horizon_steps"],
+            aggregate=AGGREGATE in params["methods"],
+            seed=params["seed"],
+            report=told(report, 1.0),
+        )
+    except ValueError as error:
+        return {"failed": str(error)}
+    return {"choice": _finite(choice.to_json())}
+
+
+def dlsm_members(preset: str, seed: int) -> int:
+    """Ensemble size of a preset."""
+    return _dlsm_config({"preset": preset, "seed": seed}).members
+
+
+def _dlsm_config(params: dict[str, Any]) -> DlsmConfig:
+    from ml.ope.dlsm.config import DlsmConfig
+
+    return DlsmConfig.demo(params["seed"]) if params["preset"] == "quick" else DlsmConfig(seed=params["seed"])
+
+
+def _estimator(params: dict[str, Any]) -> Estimator:
+    from ml.ope.dlsm.estimator import Dlsm
+    from ml.ope.registry import estimators
+
+    quick, seed = params["preset"] == "quick", params["seed"]
+    if params["method"] == "dlsm":
+        return Dlsm(_dlsm_config(params))
+    return estimators(seed, demo=quick)[params["method"]]
+
+
+def _policies(named: list[dict[str, Any]], buffer: ReplayBuffer) -> dict[str, Policy]:
+    from ml.policies.onnx_policy import OnnxPolicy
+
+    return {str(p["id"]): OnnxPolicy(files.read(p["sha256"]), buffer.settings.window) for p in named}
+
+
+def _of_member(fraction: float, members: int) -> tuple[float, str]:
+    """A fraction of the whole fit as a fraction of one member's, and the ending of its curve's name."""
+    if members == 1:
+        return fraction, ""
+    k = min(max(math.ceil(fraction * members - 1e-9) - 1, 0), members - 1)
+    return fraction * members - k, f"_{k + 1}"
+
+
+def _finite(value: Any) -> Any:
+    """A copy that JSON can hold: what is not a finite number becomes null."""
+    if isinstance(value, dict):
+        return {name: _finite(v) for name, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,96 @@
+"""Sessions that policies drove, read as a snapshot's settings read them, and what they returned."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import Caller
+from app.evaluation.ranking.actual import Actual, actual, mean_of
+from app.evaluation.schemas import TestedBefore
+from app.learning.models import BufferSnapshot
+from app.learning.snapshots.trajectories import trajectory_of
+from app.platform.errors import Invalid
+from app.study import blinding
+from app.study import repository as study_repository
+from app.study.blinding import Arm
+from app.study.models import Controller, SettingsVersion, StudySession
+from app.study.traces import step_table
+from ml.mdp import MdpSettings
+from ml.trajectories import SessionTrajectory
+
+
+@dataclass(frozen=True)
+class Ran:
+    """One session of a policy (or of cDBS) that may be held against estimates, or why it may not.
+
+    Attributes:
+        session_id, visit: its number, and that of its visit.
+        controller, policy_id: what drove it; no policy for cDBS.
+        trajectory: its steps; None with `left_out`, the reason.
+    """
+
+    session_id: int
+    visit: int
+    controller: Controller
+    policy_id: int | None
+    trajectory: SessionTrajectory | None
+    left_out: str | None
+
+
+def sessions_that_ran(db: Session, snapshot: BufferSnapshot, caller: Caller) -> list[Ran]:
+    """Every confirmed session of a policy or of cDBS, by visit and order, under a snapshot's settings, unit and source of beta.
+
+    The buffer's gate does not matter here: it guards what is learnt from, and these sessions are only looked at.
+
+    Args:
+        db: the session. snapshot: what the estimates rest on. caller: decides which arms may be known.
+    """
+    version = study_repository.settings_version(db, snapshot.settings_version_id)
+    found = []
+    for session in study_repository.sessions_of_participant(db, snapshot.participant_id):
+        arm = blinding.arm(session, caller)
+        if arm.policy_id is None and arm.controller is not Controller.CDBS:
+            continue
+        read = _read(db, session, arm, version, snapshot)
+        trajectory, reason = (None, read) if isinstance(read, str) else (read, None)
+        found.append(Ran(session.id, session.visit.number, arm.controller, arm.policy_id, trajectory, reason))
+    return found
+
+
+def results_by_policy(ran: list[Ran], settings: MdpSettings, horizon_steps: int, cdbs: int | None) -> dict[int, TestedBefore]:
+    """Actual results by policy, under the settings, horizon and discount of the estimates; those of cDBS under its reference's id."""
+    results: dict[int, list[Actual]] = defaultdict(list)
+    for session in ran:
+        policy_id = session.policy_id if session.policy_id is not None else cdbs
+        if policy_id is not None and session.trajectory is not None:
+            results[policy_id].append(actual(session.trajectory, settings, horizon_steps))
+    return {
+        policy_id: TestedBefore(
+            sessions=len(found),
+            sessions_with_return=sum(a.value is not None for a in found),
+            mean_return=mean_of([a.value for a in found]),
+            mean_step_return=mean_of([a.step_return for a in found]),
+            mean_end_reward=mean_of([a.end_reward for a in found]),
+            energy=mean_of([a.energy for a in found]),
+            mean_beta=mean_of([a.shown.get("mean_beta") for a in found]),
+            grasp_hz=mean_of([a.shown.get("grasp_hz") for a in found]),
+            rating=mean_of([a.shown.get("rating") for a in found]),
+            tremor_percent=mean_of([a.shown.get("tremor_percent") for a in found]),
+        )
+        for policy_id, found in results.items()
+    }
+
+
+def _read(db: Session, session: StudySession, arm: Arm, version: SettingsVersion, snapshot: BufferSnapshot) -> SessionTrajectory | str:
+    """The session's steps, or why they cannot be held against estimates."""
+    try:
+        table = step_table(db, session, version)
+    except Invalid as error:
+        return str(error)
+    read, trace = trajectory_of(session, table, arm, version.window), table.beta_trace
+    if not isinstance(read, str) and trace is not None and (trace.unit, trace.source) != (snapshot.beta_unit, snapshot.beta_source):
+        return f"its beta is in {trace.unit} from {trace.source}, the estimates are in {snapshot.beta_unit} from {snapshot.beta_source}"
+    return read

@@ -1,0 +1,23 @@
+"""FastAPI dependency: the proposed session that a path names, within what the caller may read."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Depends
+
+from app.accounts.deps import CurrentCaller
+from app.ingest import repository
+from app.platform.database import Db
+from app.platform.web.schemas import RowId
+from app.study import repository as study
+from app.study.models import StudySession
+
+
+def current_proposal(session_id: RowId, db: Db, caller: CurrentCaller) -> StudySession:
+    """The session, once or still proposed, that the path names."""
+    repository.proposal(db, session_id, caller)
+    return study.session(db, session_id, caller)
+
+
+CurrentProposal = Annotated[StudySession, Depends(current_proposal)]

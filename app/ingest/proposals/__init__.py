@@ -1,0 +1,1 @@
+"""Proposed sessions: made from uploads; a person corrects, splits, confirms or discards them."""

@@ -1,0 +1,95 @@
+"""REST routes of proposed sessions: list, correct, confirm, cut, drop; and grasp files that wait for their session."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
+from app.ingest import repository
+from app.ingest.deps import CurrentProposal
+from app.ingest.proposals import service as proposals
+from app.ingest.proposals.serializers import proposal_out, proposals_out
+from app.ingest.schemas import (
+    AttachedOut,
+    AttachIn,
+    ConfirmedOut,
+    DiscardIn,
+    ProposalChange,
+    ProposalOut,
+    SplitIn,
+)
+from app.ingest.uploads import service
+from app.platform.database import Db
+from app.platform.errors import NotFound
+from app.platform.web.schemas import RowId, problems
+from app.study import repository as study
+from app.study import service as study_service
+from app.study.deps import CurrentParticipant
+from app.study.models import StudySession
+from app.study.serializers import session_out
+
+router = APIRouter(tags=["proposals"], responses=problems(401, 403, 404, 422))
+
+
+@router.get("/participants/{code}/proposals")
+def list_proposals(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> list[ProposalOut]:
+    """Sessions of a participant that wait for confirmation, by visit and start."""
+    return proposals_out(db, participant.id, caller)
+
+
+@router.get("/proposals/{session_id}")
+def read_proposal(session: CurrentProposal, db: Db, caller: CurrentCaller) -> ProposalOut:
+    """One proposed session; NotFound once it counts."""
+    return _one(db, session, caller)
+
+
+@router.patch("/proposals/{session_id}", responses=problems(409))
+def correct_proposal(session: CurrentProposal, change: ProposalChange, db: Db, caller: CurrentCaller) -> ProposalOut:
+    """Correct a proposal without confirming it. 409 where somebody changed it after the stated version."""
+    row = proposals.change(db, session, change, caller)
+    db.commit()
+    return proposal_out(session, row, caller)
+
+
+@router.post("/proposals/{session_id}/confirm", responses=problems(409))
+def confirm_proposal(session: CurrentProposal, change: ProposalChange, db: Db, caller: CurrentCaller) -> ConfirmedOut:
+    """Correct a proposal, where members are given, and let it count from now on."""
+    notes = proposals.confirm(db, session, change, caller)
+    db.commit()
+    return ConfirmedOut(session=session_out(study.session(db, session.id, caller), caller), notes=notes)
+
+
+@router.post("/proposals/{session_id}/split", status_code=201, responses=problems(409))
+def split_proposal(session: CurrentProposal, parts: SplitIn, db: Db, caller: CurrentCaller) -> list[ProposalOut]:
+    """Cut a long recording into several proposals that take the place of this one."""
+    made = proposals.split(db, session, parts.version, parts.parts, caller)
+    db.commit()
+    behind = repository.proposals(db, [s.id for s in made])
+    return [proposal_out(s, behind[s.id], caller) for s in made]
+
+
+@router.post("/proposals/{session_id}/discard", status_code=204, responses=problems(409))
+def discard_proposal(session: CurrentProposal, why: DiscardIn, db: Db, caller: CurrentCaller) -> None:
+    """Say that a proposal is no session; its recordings stay, and the same file sent again proposes it anew."""
+    proposals.discard(db, session, why.version, why.reason, caller)
+    db.commit()
+
+
+@router.post("/uploaded-files/{file_id}/session", responses=problems(409))
+def attach_file(file_id: RowId, target: AttachIn, db: Db, caller: CurrentCaller) -> AttachedOut:
+    """Attach a grasp file, which names no clock, to its session."""
+    file, participant = repository.upload_file(db, file_id, caller, lock=True)
+    study_service.require(caller, can.WRITE_STUDY, participant)
+    session = study.session(db, target.session_id, caller)
+    notes = service.attach_grasps(db, file, session)
+    db.commit()
+    return AttachedOut(session=session_out(study.session(db, session.id, caller), caller), notes=notes)
+
+
+def _one(db: Session, session: StudySession, caller: Caller) -> ProposalOut:
+    if session.status != "proposed":
+        raise NotFound(f"Session {session.id} is confirmed; it is no proposal any more.", "Read it as a session.")
+    return proposal_out(session, repository.proposal(db, session.id, caller), caller)

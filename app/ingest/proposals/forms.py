@@ -1,0 +1,186 @@
+"""A proposed session as a form: its values as text, and the typed text as a correction."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import Caller
+from app.ingest.models import SessionProposal
+from app.ingest.schemas import PartIn, ProposalChange
+from app.platform.errors import Invalid
+from app.platform.web.forms import parse
+from app.study import blinding
+from app.study import repository as study
+from app.study.models import Controller, SessionSegment, StudySession
+
+LABELS = {
+    "visit": "Visit", "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "from": "From", "to": "To",
+    "started_at": "Start", "start_s": "From", "stop_s": "To",
+}  # fmt: skip
+FIELDS = ("visit", "controller", "policy", "hemisphere", "from", "to", "started_at")
+PARTS = 6
+"""Rows of the form that cuts a recording; longer days are cut twice, or over the interface."""
+
+
+@dataclass(frozen=True)
+class ProposalForm:
+    """A proposal as its page shows it.
+
+    Attributes:
+        stored, typed: field to text, as stored and as the form shows it.
+        clocked: whether times are those of the wall; else minutes and seconds of the recording.
+        notes: contradictions that a person should look at.
+        problem: why the form was refused.
+    """
+
+    session: StudySession
+    proposal: SessionProposal
+    stored: Mapping[str, str]
+    typed: Mapping[str, str]
+    parts: list[dict[str, str]]
+    clocked: bool
+    notes: list[str]
+    reason: str = ""
+    problem: dict[str, Any] | None = None
+
+    @property
+    def seen(self) -> str:
+        """The stored values for the form to send back, so that an old form's own corrections can be told from what others changed."""
+        return json.dumps(dict(self.stored))
+
+    @property
+    def control(self) -> SessionSegment:
+        """The part of the recording that the controller saw."""
+        return next(s for s in self.session.segments if s.is_control)
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is open."""
+        return bool(self.typed["visit"] and self.typed["controller"])
+
+
+def texts(db: Session, session: StudySession, proposal: SessionProposal, caller: Caller) -> dict[str, str]:
+    """The values of a proposal as text."""
+    arm = blinding.stated_arm(session, caller)
+    control = next(s for s in session.segments if s.is_control)
+    return {
+        "visit": "" if proposal.visit_open else str(session.visit.number),
+        "controller": arm.controller.value if arm else "",
+        "policy": study.policy_name(db, arm.policy_id if arm else None) or "",
+        "hemisphere": session.hemisphere or "",
+        "from": _time(session, control.start_s),
+        "to": _time(session, control.stop_s),
+        "started_at": _clock(session.started_at) if session.started_at else "",
+    }
+
+
+def typed_texts(values: Mapping[str, Any], session_id: int, stored: Mapping[str, str]) -> dict[str, str]:
+    """What the form sent for a proposal; a field that it does not have is as stored."""
+    return {name: str(values.get(f"{name}-{session_id}", text)).strip() for name, text in stored.items()}
+
+
+def own_texts(values: Mapping[str, Any], session_id: int, stored: Mapping[str, str]) -> dict[str, str]:
+    """What a person changed in the form of a proposal: what was sent and is not what the form had shown, nor what is stored by now."""
+    try:
+        seen = json.loads(str(values.get(f"seen-{session_id}", "{}")))
+    except ValueError:
+        seen = {}
+    shown = {**stored, **seen} if isinstance(seen, dict) else stored
+    typed = typed_texts(values, session_id, stored)
+    return {name: text for name, text in typed.items() if text not in (str(shown[name]), stored[name])}
+
+
+def typed_parts(values: Mapping[str, Any], session_id: int) -> list[dict[str, str]]:
+    """The rows of the form that cuts a recording, filled in or not."""
+    names = ("from", "to", "controller")
+    return [{name: str(values.get(f"part-{session_id}-{i}-{name}", "")).strip() for name in names} for i in range(PARTS)]
+
+
+def as_change(session: StudySession, version: str, stored: Mapping[str, str], typed: Mapping[str, str]) -> ProposalChange:
+    """The fields that a person changed, as a correction. Raises Invalid, naming the field."""
+    own = {name: text for name, text in typed.items() if text != stored[name]}
+    fields: dict[str, Any] = {n: own[n] for n in ("visit", "controller", "policy", "hemisphere", "started_at") if n in own}
+    if "visit" in own and not own["visit"]:
+        del fields["visit"]  # an open visit stays open
+    errors = []
+    for name, target in (("from", "start_s"), ("to", "stop_s")):
+        if name in own:
+            try:
+                fields[target] = f"{_seconds(session, own[name]):.3f}"
+            except ValueError as error:
+                errors.append({"where": LABELS[name], "what": str(error)})
+    if errors:
+        raise Invalid("Some times cannot be used.", "Correct them and send the form again.", errors=errors)
+    return parse(ProposalChange, {"version": version, **fields}, LABELS)
+
+
+def as_parts(session: StudySession, rows: list[dict[str, str]]) -> list[PartIn]:
+    """The filled rows as parts of the recording. Raises Invalid, naming the row."""
+    parts, errors = [], []
+    for i, row in enumerate(rows, start=1):
+        if not row["from"] and not row["to"]:
+            continue
+        try:
+            start, stop = _seconds(session, row["from"]), _seconds(session, row["to"])
+            parts.append(PartIn(start_s=start, stop_s=stop, controller=Controller(row["controller"]) if row["controller"] else None))
+        except ValueError as error:
+            errors.append({"where": f"row {i}", "what": str(error).splitlines()[0]})
+    if errors:
+        raise Invalid("Some parts cannot be used.", "Correct them and send the form again.", errors=errors)
+    if not parts:
+        raise Invalid("No part is filled in.", "Give at least one begin and end.")
+    return parts
+
+
+def _time(session: StudySession, offset_s: float) -> str:
+    """A place in the control recording as the form shows it."""
+    begin = _begin(session)
+    if begin is not None:
+        return _clock(begin + timedelta(seconds=offset_s))
+    minutes, seconds = divmod(round(offset_s), 60)
+    return f"{minutes}:{seconds:02d}"
+
+
+def _seconds(session: StudySession, text: str) -> float:
+    """A place in the control recording, s, from what the form sent. Raises ValueError."""
+    begin = _begin(session)
+    if begin is not None:
+        try:
+            moment = datetime.fromisoformat(text)
+        except ValueError:
+            raise ValueError(f"'{text}' is no date and time (as in {_clock(begin)})") from None
+        seconds = (moment.replace(tzinfo=moment.tzinfo or UTC) - begin).total_seconds()
+        if seconds < -1:
+            raise ValueError(f"{text} lies before the recording, which begins at {_clock(begin)} UTC")
+        return max(seconds, 0.0)
+    minutes, colon, seconds_text = text.partition(":")
+    try:
+        found = 60 * int(minutes) + float(seconds_text) if colon else float(text)
+    except ValueError:
+        raise ValueError(f"'{text}' is no time (minutes:seconds from the begin of the recording, as in 12:30)") from None
+    if not 0 <= found < 1e7:
+        raise ValueError(f"'{text}' does not lie in the recording")
+    return found
+
+
+def _begin(session: StudySession) -> datetime | None:
+    """When the control recording began, by the session's own clock; None for a recording without one."""
+    control = next(s for s in session.segments if s.is_control)
+    if control.recording.started_at is None or session.started_at is None:
+        return None
+    return session.started_at - timedelta(seconds=control.start_s)
+
+
+def _clock(moment: datetime) -> str:
+    return moment.astimezone(UTC).replace(tzinfo=None).isoformat(timespec="seconds")
+
+
+def is_clocked(session: StudySession) -> bool:
+    """Whether the form shows times of the wall."""
+    return _begin(session) is not None

@@ -1,0 +1,207 @@
+"""HTML pages of proposed sessions: look, correct, confirm, cut, drop; and grasp files that wait for their session."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
+from app.ingest import repository
+from app.ingest.deps import CurrentProposal
+from app.ingest.models import SessionProposal
+from app.ingest.proposals import service as proposals
+from app.ingest.proposals.forms import ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
+from app.ingest.uploads import service
+from app.platform.database import Db
+from app.platform.errors import BetaloopError, Invalid
+from app.platform.web.forms import FormValues
+from app.platform.web.schemas import RowId
+from app.platform.web.templates import render
+from app.study import repository as study
+from app.study import service as study_service
+from app.study.blinding import CONTROLLER_NAMES
+from app.study.deps import CurrentParticipant
+from app.study.models import Participant, StudySession
+from app.study.sessions.charts import control_chart
+from app.study.sessions.contradictions import contradictions
+
+router = APIRouter()
+
+SHOWN = 40
+"""Proposals on one page; the next ones follow when these are decided."""
+
+
+@router.get("/participants/{code}/proposals")
+def proposals_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, confirmed: str = "") -> HTMLResponse:
+    """All proposals of a participant in one form; what was just confirmed is listed with its contradictions."""
+    return _page(request, db, participant, caller, confirmed=[int(i) for i in confirmed.split(",") if i.isdecimal() and len(i) < 10])
+
+
+@router.get("/proposals/{session_id}")
+def proposal_page(request: Request, session: CurrentProposal, db: Db, caller: CurrentCaller) -> Response:
+    """One proposal with its traces; a confirmed one has a page as a session."""
+    if session.status != "proposed":
+        return RedirectResponse(f"/sessions/{session.id}", 303)
+    return _page(request, db, session.visit.participant, caller, only=session)
+
+
+@router.post("/participants/{code}/proposals")
+def decide(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Do what the pressed button says to its proposal; corrections typed into the others are saved too."""
+    study_service.require(caller, can.WRITE_STUDY, participant)
+    verb, _, which = str(values.get("do", "")).partition(":")
+    typed = {str(k): str(v) for k, v in values.items()}
+    rows = study.proposals_of_participant(db, participant.id)
+    behind = repository.proposals(db, [s.id for s in rows])
+    refused: dict[int, BetaloopError] = {}
+    confirmed: list[int] = []
+    for session in rows:
+        if f"version-{session.id}" not in values or session.id not in behind:
+            continue
+        mine = which == str(session.id)
+        try:
+            with db.begin_nested():
+                if _decide_one(db, session, behind[session.id], verb, mine, which == "all", typed, caller):
+                    confirmed.append(session.id)
+        except BetaloopError as error:
+            refused[session.id] = error
+    db.commit()
+    if which.isdecimal() and int(which) not in {s.id for s in rows}:
+        gone = Invalid(f"Session {which} is no proposal any more: somebody confirmed, cut or dropped it.", "Nothing was changed.")
+        return _page(request, db, participant, caller, error=gone)
+    if refused:
+        return _page(request, db, participant, caller, refused=refused, sent=typed, confirmed=confirmed)
+    done = {"discard": "dropped", "split": "cut", "confirm": "confirmed"}.get(verb, "saved")
+    listed = f"&confirmed={','.join(map(str, confirmed))}" if confirmed else ""
+    return RedirectResponse(f"/participants/{participant.code}/proposals?done={done}{listed}", 303)
+
+
+@router.post("/uploaded-files/{file_id}/session")
+def attach(request: Request, file_id: RowId, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Attach a grasp file to its session."""
+    file, participant = repository.upload_file(db, file_id, caller, lock=True)
+    study_service.require(caller, can.WRITE_STUDY, participant)
+    try:
+        chosen = str(values.get("session_id", ""))
+        if not chosen.isdecimal() or len(chosen) > 9:
+            raise Invalid("No session was chosen.", "Choose the session that the test belongs to.")
+        service.attach_grasps(db, file, study.session(db, int(chosen), caller))
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, db, participant, caller, error=error)
+    db.commit()
+    return RedirectResponse(f"/participants/{participant.code}/proposals?done=attached", 303)
+
+
+def _decide_one(
+    db: Session,
+    session: StudySession,
+    proposal: SessionProposal,
+    verb: str,
+    mine: bool,
+    everyone: bool,
+    values: Mapping[str, str],
+    caller: Caller,
+) -> bool:
+    """One proposal of the posted form; whether it was confirmed."""
+    stored = texts(db, session, proposal, caller)
+    own = own_texts(values, session.id, stored)
+    typed = {**stored, **own}
+    version = values[f"version-{session.id}"]
+    if mine and verb == "discard":
+        why = values.get(f"reason-{session.id}", "").strip()
+        if not why:
+            raise Invalid("A proposal is dropped with a reason.", "Say why this is no session.")
+        proposals.discard(db, session, _version(version), why[:1000], caller)
+    elif mine and verb == "split":
+        proposals.split(db, session, _version(version), as_parts(session, typed_parts(values, session.id)), caller)
+    elif verb == "confirm" and (mine or (everyone and typed["visit"] and typed["controller"])):
+        proposals.confirm(db, session, as_change(session, version, stored, typed), caller)
+        return True
+    elif own:
+        # what another tab changed meanwhile stays as it is there; an own correction beside it is refused by its version, not lost
+        proposals.change(db, session, as_change(session, version, stored, typed), caller)
+    return False
+
+
+def _version(text: str) -> int:
+    if not text.isdecimal() or len(text) > 9:
+        raise Invalid("The form names no version of the proposal.", "Load the page again.")
+    return int(text)
+
+
+def _page(
+    request: Request,
+    db: Session,
+    participant: Participant,
+    caller: Caller,
+    only: StudySession | None = None,
+    error: BetaloopError | None = None,
+    refused: Mapping[int, BetaloopError] | None = None,
+    sent: Mapping[str, str] | None = None,
+    confirmed: list[int] | None = None,
+) -> HTMLResponse:
+    refused, sent = refused or {}, sent or {}
+    waiting = [only] if only else list(study.proposals_of_participant(db, participant.id))
+    behind = repository.proposals(db, [s.id for s in waiting])
+    forms = [
+        _form(request, db, s, behind[s.id], caller, refused.get(s.id), sent) for s in waiting[:SHOWN] if s.id in behind
+    ]  # fmt: skip
+    everyone = study.sessions_of_participant(db, participant.id, with_proposals=True)
+    fresh = [(s, contradictions(db, s)) for s in everyone if s.id in (confirmed or []) and s.status == "confirmed"]
+    page = render(
+        request,
+        "ingest/proposals.html",
+        participant=participant,
+        only=only,
+        forms=forms,
+        beyond=max(len(waiting) - SHOWN, 0),
+        chart=_chart(db, only) if only else None,
+        confirmed=fresh,
+        grasp_files=[] if only else repository.waiting_grasp_files(db, participant.id),
+        sessions=everyone,
+        visits=study.visits(db, participant.id, 1000, 0)[0],
+        controllers=[("", "open: choose …"), *((c.value, name) for c, name in CONTROLLER_NAMES.items())],
+        policies=study.policy_names(db, participant.id),
+        may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
+        problem=error.problem(request.url.path) if error else None,
+    )
+    worst = error or next(iter(refused.values()), None)
+    return HTMLResponse(page, worst.status if worst else 200)
+
+
+def _form(
+    request: Request,
+    db: Session,
+    session: StudySession,
+    proposal: SessionProposal,
+    caller: Caller,
+    error: BetaloopError | None,
+    sent: Mapping[str, str],
+) -> ProposalForm:
+    stored = texts(db, session, proposal, caller)
+    return ProposalForm(
+        session,
+        proposal,
+        stored,
+        {**stored, **own_texts(sent, session.id, stored)} if error else stored,
+        typed_parts(sent if error else {}, session.id),
+        is_clocked(session),
+        contradictions(db, session, proposal.visit_open),
+        sent.get(f"reason-{session.id}", "") if error else "",
+        error.problem(request.url.path) if error else None,
+    )
+
+
+def _chart(db: Session, session: StudySession) -> Any:
+    try:
+        data = study_service.session_data(db, session)
+    except Invalid:
+        return None  # the proposal's notes say why its steps cannot be read
+    return control_chart(data) if data.table.beta_trace or data.table.amplitude_trace else None

@@ -1,0 +1,47 @@
+"""Proposed sessions as API types."""
+
+from __future__ import annotations
+
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import Caller
+from app.ingest import repository
+from app.ingest.models import SessionProposal
+from app.ingest.schemas import (
+    PartOut,
+    ProposalOut,
+)
+from app.study import repository as study
+from app.study.models import StudySession
+from app.study.serializers import session_out
+
+
+def proposals_out(db: Session, participant_id: int, caller: Caller) -> list[ProposalOut]:
+    """All proposals of a participant for the API."""
+    rows = study.proposals_of_participant(db, participant_id)
+    behind = repository.proposals(db, [s.id for s in rows])
+    return [proposal_out(s, behind[s.id], caller) for s in rows if s.id in behind]
+
+
+def proposal_out(session: StudySession, row: SessionProposal, caller: Caller) -> ProposalOut:
+    """A proposal for the API."""
+    return ProposalOut(
+        session=session_out(session, caller),
+        version=row.version,
+        upload_id=row.upload_id,
+        visit_open=row.visit_open,
+        evidence=row.evidence,
+        changed_by=row.changed_by,
+        parts=[
+            PartOut(
+                recording_id=s.recording_id,
+                hemisphere=s.recording.hemisphere,
+                recording_started_at=s.recording.started_at,
+                recording_s=s.recording.duration_s,
+                start_s=s.start_s,
+                stop_s=s.stop_s,
+                is_control=s.is_control,
+            )
+            for s in session.segments
+        ],
+    )

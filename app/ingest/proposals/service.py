@@ -1,0 +1,373 @@
+"""Proposed sessions: made from an upload, corrected, cut, confirmed or dropped by a person. Nothing counts before that."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from itertools import pairwise
+
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import SYSTEM, Caller
+from app.ingest import repository, sessions
+from app.ingest.models import SessionProposal, Upload
+from app.ingest.proposals.evidence import guess_controller, guess_visit
+from app.ingest.schemas import PartIn, ProposalChange
+from app.ingest.sessions import Laid, StatedSession, add_session, set_segments
+from app.ingest.uploads import outcomes as outcomes_intake
+from app.platform.database import set_reason
+from app.platform.errors import Conflict, Invalid
+from app.study import blinding
+from app.study import repository as study
+from app.study import service as study_service
+from app.study.models import Controller, Participant, Recording, StudySession
+from app.study.service import POLICY_CONTROLLERS
+from app.study.sessions.contradictions import contradictions, control_recording, delivered, local_day
+
+STATED = "as stated"
+"""Evidence that begins so is a person's word, which no guess replaces."""
+AS_STATED = f"{STATED} with the upload"
+RESTS_ON = frozenset({"visit", "hemisphere", "start_s", "stop_s", "started_at", "controller"})
+"""Fields of a correction after which a guessed controller is guessed anew."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """A session that came out of an upload.
+
+    Attributes:
+        understood, flagged: sentences for the reports of its files.
+    """
+
+    session: StudySession
+    recordings: list[Recording]
+    understood: list[str]
+    flagged: list[str]
+
+
+def make_sessions(
+    db: Session, participant: Participant, upload: Upload, recordings: Sequence[Recording], stated: StatedSession
+) -> list[Made]:
+    """Sessions of recordings that have none: confirmed where the sender stated visit and controller and says so, else proposed."""
+    usable = [r for r in recordings if sessions.makes_session(study.traces_of_recording(db, r.id), r)]
+    groups = sessions.together(usable)
+    return [_make(db, participant, upload, group, stated, alone=len(groups) == 1) for group in groups]
+
+
+def _make(db: Session, participant: Participant, upload: Upload, group: list[Recording], stated: StatedSession, alone: bool) -> Made:
+    if (joined := _join_earlier(db, participant, group, stated)) is not None:
+        return joined
+    laid = sessions.lay(db, participant, group, stated, alone)
+    day = local_day(laid.control, laid.started_at)[0] if laid.started_at else None
+    guess = guess_visit(study.visits(db, participant.id, 1000, 0)[0], day, stated.visit)
+    session = add_session(db, guess.visit, laid, stated.controller, stated.policy_id, stated.hemisphere, stated.counts)
+    length = f"{session.duration_s / 60:.1f} min" if session.duration_s else "no data"
+    seen = _seen(session, laid)
+    if stated.counts:
+        said = f"Session {session.id}: visit {guess.visit.number}, {stated.controller}, {length}, {seen} (recording {laid.control.id})."
+        flagged = [*laid.notes, *sessions.fix_milliamperes(db, session), *contradictions(db, session)]
+        return Made(session, group, [said, *outcomes_intake.derive(db, session)], flagged)
+    evidence = {"visit": guess.why, "controller": AS_STATED}
+    controller = stated.controller
+    if controller is None:
+        controller, evidence["controller"] = _guess_controller(db, session)
+        blinding.assign(session, controller, stated.policy_id if controller in POLICY_CONTROLLERS else None)
+    of_recording = "of the recording that a controller could have seen" if session.hemisphere else "the file tells no side"
+    evidence["hemisphere"] = AS_STATED if stated.hemisphere else of_recording
+    proposal = SessionProposal(
+        session_id=session.id, upload_id=upload.id, visit_open=guess.open, evidence=evidence, changed_by=upload.created_by, version=1
+    )
+    db.add(proposal)
+    db.flush()
+    said = (
+        f"Proposed session {session.id}, which counts nowhere until it is confirmed: "
+        f"{'visit open' if guess.open else f'visit {guess.visit.number}'} ({guess.why}), "
+        f"{controller or 'controller open'} ({evidence['controller']}), {length}, {seen}."
+    )
+    return Made(session, group, [said], [*laid.notes, *contradictions(db, session, guess.open)])
+
+
+def _seen(session: StudySession, laid: Laid) -> str:
+    """Which trace of which side the controller is taken to have seen, in words."""
+    trace = f"{session.control_stream} {session.control_channel or ''}".strip()
+    others = [r for r in laid.recordings if r is not laid.control]
+    side = f" of the {laid.control.hemisphere} side" if laid.control.hemisphere else f" of recording {laid.control.id}" if others else ""
+    beside = [f"the {r.hemisphere} side" if r.hemisphere else f"recording {r.id}" for r in others]
+    return f"controlled by {trace}{side}" + (f", recorded together with {' and '.join(beside)}" if beside else "")
+
+
+def _guess_controller(db: Session, session: StudySession) -> tuple[Controller | None, str]:
+    try:
+        return guess_controller(delivered(db, session))
+    except Invalid as error:
+        return None, f"its steps cannot be read: {error.detail}"
+
+
+def _join_earlier(db: Session, participant: Participant, group: list[Recording], stated: StatedSession) -> Made | None:
+    """The sessions of earlier uploads that these recordings share their time with (the other implant came first), if there are any.
+
+    A confirmed session gets them beside its controlled recording: nothing that counts changes.
+    """
+    first = group[0]
+    if first.started_at is None:
+        return None
+    end = first.started_at + timedelta(seconds=first.duration_s)
+    made: Made | None = None
+    for session in repository.overlapping_sessions(db, participant.id, first.started_at, end):
+        known = [s.recording for s in session.segments]
+        if any(r.device_id == k.device_id for r in group for k in known) or len(sessions.together([*known, *group])) != 1:
+            continue
+        control = next(s for s in session.segments if s.is_control)
+        laid = _as_laid(session, control.start_s, control.stop_s)
+        period_s = participant.current_settings.period_s
+        added = [sessions.add_beside(session, r, laid, period_s) for r in group]
+        if not any(added):
+            continue
+        db.flush()
+        said, flagged = _joined(db, session, stated)
+        made = Made(session, group, [], []) if made is None else made
+        made.understood.append(said)
+        made.flagged.extend(flagged)
+    return made
+
+
+def _joined(db: Session, session: StudySession, stated: StatedSession) -> tuple[str, list[str]]:
+    """What to tell of recordings that were added to a session that was there, after their time."""
+    differs = sessions.disagreements(db, [session.id], stated)
+    if session.status == "confirmed":
+        side = f" ({control_recording(session).hemisphere} side)" if control_recording(session).hemisphere else ""
+        said = f"Recorded at the same time as session {session.id}, which counts already: added to it beside its controlled recording"
+        return f"{said}{side}.", [*differs, *contradictions(db, session)]
+    proposal = repository.proposals(db, [session.id])[session.id]
+    proposal.version += 1
+    _renew_guess(db, session, proposal)
+    db.flush()
+    said = f"Recorded at the same time as proposed session {session.id}, which counts nowhere until it is confirmed"
+    return f"{said}: it belongs to that session.", [*differs, *contradictions(db, session, proposal.visit_open)]
+
+
+def _renew_guess(db: Session, session: StudySession, proposal: SessionProposal, keep: bool = False) -> None:
+    """Guess the controller anew after what the guess rests on has changed; what a person stated stays.
+
+    Args:
+        keep: leave the controller, for somebody confirms it as it stands, and renew the reason alone.
+    """
+    if str(proposal.evidence.get("controller", "")).startswith(STATED):
+        return
+    arm = blinding.stated_arm(session, SYSTEM)
+    controller, why = _guess_controller(db, session)
+    proposal.evidence = {**proposal.evidence, "controller": why}
+    if not keep and controller != (arm.controller if arm else None):
+        kept = arm.policy_id if arm and controller in POLICY_CONTROLLERS else None
+        blinding.assign(session, controller, kept)
+
+
+def change(db: Session, session: StudySession, wanted: ProposalChange, caller: Caller) -> SessionProposal:
+    """Correct a proposal; what is left out stays.
+
+    Raises:
+        Conflict: it was confirmed, or changed after the caller looked at it. Invalid: a value that cannot be.
+    """
+    return _correct(db, session, wanted, caller, confirming=False)
+
+
+def _correct(db: Session, session: StudySession, wanted: ProposalChange, caller: Caller, confirming: bool) -> SessionProposal:
+    proposal = _locked(db, session, wanted.version, caller)
+    given = wanted.model_dump(exclude_unset=True, exclude={"version", "reason"})
+    set_reason(db, wanted.reason)
+    _move_to_visit(db, session, proposal, given)
+    _name_controller(db, session, given, caller)
+    if "hemisphere" in given:
+        _choose_side(db, session, given)
+    if {"start_s", "stop_s", "started_at"} & given.keys():
+        _choose_part(session, given)
+    told = {name: f"{STATED} by {caller.label}" for name in ("visit", "controller", "hemisphere") if given.get(name) is not None}
+    if "controller" in given and given["controller"] is None:
+        told["controller"] = f"{STATED} by {caller.label}: open"
+    proposal.evidence = {**proposal.evidence, **told}
+    if RESTS_ON & given.keys():
+        db.flush()
+        _renew_guess(db, session, proposal, keep=confirming)
+    proposal.version += 1
+    proposal.changed_by = caller.label
+    db.flush()
+    return proposal
+
+
+def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: Caller) -> list[str]:
+    """Correct a proposal and let it count from now on.
+
+    Returns:
+        Sentences: contradictions with its amplitudes, and what was derived for it from tremor and grasp files.
+
+    Raises:
+        Conflict: as `change`, or another confirmed session counts on the same stretch. Invalid: visit or controller is still open.
+    """
+    proposal = _correct(db, session, wanted, caller, confirming=True)
+    missing = [name for name, open_ in (("visit", proposal.visit_open), ("controller", _controller(session, caller) is None)) if open_]
+    if missing:
+        why = "; ".join(f"{name}: {proposal.evidence.get(name, 'nobody stated it')}" for name in missing)
+        raise Invalid(f"Session {session.id} cannot be confirmed yet: its {' and '.join(missing)} is open ({why}).", "State it.")
+    sessions.refuse_overlap(db, session)
+    session.status = "confirmed"
+    db.flush()
+    return [*sessions.fix_milliamperes(db, session), *contradictions(db, session), *outcomes_intake.derive(db, session)]
+
+
+def split(db: Session, session: StudySession, version: int, parts: Sequence[PartIn], caller: Caller) -> list[StudySession]:
+    """Several proposals in the place of one: a part of the same recordings each.
+
+    Raises:
+        Conflict: as `change`. Invalid: parts outside the recording or over each other.
+    """
+    proposal = _locked(db, session, version, caller)
+    spans = sorted((p.start_s, p.stop_s) for p in parts)
+    for (_, stop), (start, _) in pairwise(spans):
+        if start < stop - 1e-6:
+            raise Invalid(f"Two parts share the time from {start:g} to {stop:g} s.", "Let each part begin where the one before has ended.")
+    arm = blinding.stated_arm(session, caller)
+    made = []
+    for part in sorted(parts, key=lambda p: p.start_s):
+        laid = _as_laid(session, *_on_grid(session, part.start_s, part.stop_s))
+        new = add_session(db, session.visit, laid, part.controller, None, session.hemisphere, counts=False)
+        why = f"{STATED} when the recording was cut"
+        if part.controller is None:
+            guessed, why = _guess_controller(db, new)
+            policy_id = arm.policy_id if arm and guessed == arm.controller else None
+            blinding.assign(new, guessed, policy_id)
+        evidence = {**proposal.evidence, "controller": why, "part": f"cut out of proposed session {session.id}"}
+        db.add(
+            SessionProposal(
+                session_id=new.id,
+                upload_id=proposal.upload_id,
+                visit_open=proposal.visit_open,
+                evidence=evidence,
+                changed_by=caller.label,
+                version=1,
+            )
+        )
+        made.append(new)
+    set_reason(db, f"cut into sessions {', '.join(str(s.id) for s in made)}")
+    db.delete(session)
+    db.flush()
+    return made
+
+
+def discard(db: Session, session: StudySession, version: int, reason: str, caller: Caller) -> None:
+    """Drop a proposal that is no session; its recordings stay. Raises Conflict as `change`."""
+    _locked(db, session, version, caller)
+    set_reason(db, reason)
+    db.delete(session)
+    db.flush()
+
+
+def _locked(db: Session, session: StudySession, version: int, caller: Caller) -> SessionProposal:
+    study_service.require(caller, can.WRITE_STUDY, session.visit.participant)
+    proposal = repository.proposal(db, session.id, caller, lock=True)
+    db.refresh(session, ["status"])
+    if session.status != "proposed":
+        raise Conflict(f"Session {session.id} was confirmed meanwhile.", "Correct it on its own page.")
+    if proposal.version != version:
+        raise Conflict(
+            f"Proposed session {session.id} was changed by {proposal.changed_by} after this form was opened; nothing was saved.",
+            "What you typed still stands in the form: send it again to replace what is stored, or load the page again to keep that.",
+            version=proposal.version,
+        )
+    return proposal
+
+
+def _controller(session: StudySession, caller: Caller) -> Controller | None:
+    arm = blinding.stated_arm(session, caller)
+    return arm.controller if arm else None
+
+
+def _move_to_visit(db: Session, session: StudySession, proposal: SessionProposal, given: dict[str, object]) -> None:
+    number = given.get("visit")
+    if not isinstance(number, int):
+        return
+    participant = session.visit.participant
+    visit = study.visit_by_number(db, participant.id, number)
+    if visit is None:
+        raise Invalid(f"Participant {participant.code} has no visit {number}.", "Add the visit first.")
+    if visit.id != session.visit_id:
+        session.ordinal = study.next_ordinal(db, visit.id)
+        session.visit = visit
+    proposal.visit_open = False
+
+
+def _name_controller(db: Session, session: StudySession, given: dict[str, object], caller: Caller) -> None:
+    if not {"controller", "policy"} & given.keys():
+        return
+    arm = blinding.stated_arm(session, caller)
+    wanted = given.get("controller", arm.controller if arm else None)
+    controller = Controller(str(wanted)) if wanted else None
+    name = str(given["policy"] or "") if "policy" in given else None
+    participant = session.visit.participant
+    if name is None:
+        policy_id = arm.policy_id if arm and controller in POLICY_CONTROLLERS else None
+    else:
+        policy_id = study.policy_id(db, participant.id, name) if name else None
+        if name and policy_id is None:
+            raise Invalid(f"Participant {participant.code} has no policy '{name}'.", "Give the name or number of one of its policies.")
+    if policy_id is not None and controller not in POLICY_CONTROLLERS:
+        raise Invalid(f"A {controller or ''} session has no policy.".replace("  ", " "), "Leave the policy empty, or name the controller.")
+    blinding.assign(session, controller, policy_id)
+
+
+def _choose_side(db: Session, session: StudySession, given: dict[str, object]) -> None:
+    """The stated side; where a recording of that side belongs to the session, its trace is the one that the controller saw."""
+    side = given["hemisphere"]
+    session.hemisphere = side  # type: ignore[assignment]
+    control = next(s for s in session.segments if s.is_control)
+    other = next((s for s in session.segments if s.recording.hemisphere == side), None)
+    if side is None or other is None or other.recording_id == control.recording_id:
+        return
+    laid = sessions.lay(db, session.visit.participant, [other.recording], StatedSession(started_at=session.started_at), alone=True)
+    laid.stop_s = min(laid.start_s + session.duration_s, laid.control.duration_s)
+    laid.recordings = list(dict.fromkeys(s.recording for s in session.segments))
+    session.control_stream, session.control_channel = laid.stream, laid.channel
+    _relay(session, laid)
+
+
+def _choose_part(session: StudySession, given: dict[str, object]) -> None:
+    control = next(s for s in session.segments if s.is_control)
+    started_at = given.get("started_at")
+    start_s, stop_s = given.get("start_s"), given.get("stop_s")
+    begin = float(start_s) if isinstance(start_s, int | float) else control.start_s
+    end = float(stop_s) if isinstance(stop_s, int | float) else control.stop_s
+    if started_at is not None and control.recording.started_at is not None:
+        begin = (started_at - control.recording.started_at).total_seconds()  # type: ignore[operator]
+    laid = _as_laid(session, *_on_grid(session, begin, end))
+    if control.recording.started_at is None and "started_at" in given:
+        laid.started_at = started_at  # type: ignore[assignment]
+    _relay(session, laid)
+
+
+def _relay(session: StudySession, laid: Laid) -> None:
+    set_segments(session, laid, session.visit.participant.current_settings.period_s)
+    session.started_at, session.duration_s = laid.started_at, laid.stop_s - laid.start_s
+
+
+def _on_grid(session: StudySession, start_s: float, stop_s: float) -> tuple[float, float]:
+    """A part of the control recording on the grid of steps. Raises Invalid where it is empty or outside the recording."""
+    period = session.visit.participant.current_settings.period_s
+    length = next(s for s in session.segments if s.is_control).recording.duration_s
+    start, stop = round(start_s / period) * period, round(stop_s / period) * period
+    if not 0 <= start < length or stop_s > length + period:
+        raise Invalid(f"The recording is {length:.0f} s long; {start_s:.0f} to {stop_s:.0f} s is not within it.", "Choose a part of it.")
+    # its end is the last row, whole or not: forms show it in whole seconds
+    stop = length if stop_s > length - 1.0 and length - stop > 0.1 else min(stop, length)
+    if stop - start < period:
+        raise Invalid(f"The part from {start_s:.0f} to {stop_s:.0f} s holds no step of {period:g} s.", "Let it end after it begins.")
+    return start, stop
+
+
+def _as_laid(session: StudySession, start_s: float, stop_s: float) -> Laid:
+    """A session's recordings, laid on another part of its control recording."""
+    control = next(s for s in session.segments if s.is_control)
+    recordings = list(dict.fromkeys(s.recording for s in session.segments))
+    # a stated start may differ from the device's clock: the session's own start is what moves
+    started_at = session.started_at + timedelta(seconds=start_s - control.start_s) if session.started_at is not None else None
+    return Laid(control.recording, recordings, start_s, stop_s, started_at, session.control_stream, session.control_channel)

@@ -1,0 +1,1 @@
+"""Quarantine: unreadable files, encrypted until a person releases or discards them."""

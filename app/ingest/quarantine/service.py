@@ -1,0 +1,157 @@
+"""Files kept encrypted because they could not be read, and so not be cleaned: a person reviews them, releases them, or discards them.
+
+Every function here commits by itself: bytes are erased only after the decision is safe. Who decided what, when and why stands on the file's
+row and in the audit trail.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from cryptography.fernet import InvalidToken
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.ingest import encryption, repository
+from app.ingest.models import UploadFile
+from app.ingest.uploads import service
+from app.ingest.uploads.receiving import MEDIA_TYPE, BetaStated, Kept, Receiver
+from app.ingest.uploads.service import UploadOutcome
+from app.platform import files
+from app.platform.database import now, set_reason
+from app.platform.errors import Conflict, Invalid
+from app.settings import get_settings
+from app.study import service as study_service
+from app.study.models import Participant
+from ml import formats
+from ml.formats.recording import UndecodableFile
+from ml.formats.redaction import REDACTOR_VERSION
+
+
+def review(db: Session, file_id: int, caller: Caller) -> bytes:
+    """The original bytes, for a person to look at; the audit trail says who did. They may identify the participant.
+
+    Raises:
+        Conflict: the file is not, or no longer, in quarantine.
+    """
+    file, _ = _held(db, file_id, caller)
+    with _original(file) as path:
+        content = path.read_bytes()
+    file.reviewed_by, file.reviewed_at = caller.label, now()
+    db.commit()
+    return content
+
+
+def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> UploadOutcome:
+    """Release a file to the present decoder; where all of it can be read now, the encrypted original goes.
+
+    Raises:
+        Conflict: not in quarantine, or the same bytes were decoded meanwhile. Invalid: still unreadable, and why.
+    """
+    file, participant = _held(db, file_id, caller)
+    if file.status == "failed" and (known := repository.decoded_file(db, participant.id, file.original_sha256)) is not None:
+        raise Conflict(f"The same bytes were read as file {known.id} of upload {known.upload_id}.", "Discard this copy.")
+    upload = repository.upload(db, file.upload_id, caller)[0]
+    said = upload.stated
+    beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
+    options = service.decode_options(participant, beta)
+    clean = files.draft_path()
+    with _original(file) as original:
+        try:
+            kind = formats.sniff(original)
+            redaction = formats.redact(original, clean, kind, get_settings().secret("pseudonyms"), options)
+        except UndecodableFile as error:
+            clean.unlink(missing_ok=True)
+            raise Invalid(f"It still cannot be read: {error.stored_what} ({error.stored_where}).", error.mend) from error
+    sealed = file.quarantine_sha256
+    stored = files.store(db, clean, MEDIA_TYPE).sha256
+    file.kind, file.stored_sha256, file.redactor_version = kind, stored, REDACTOR_VERSION
+    _decide(db, file, reason, caller)
+    db.commit()
+    kept = Kept(kind, stored, sealed if redaction.unreadable else None, redaction, None)
+    outcome = UploadOutcome(upload, participant, [Receiver(db, participant, upload, options, beta).decode(file.name, file, kept)])
+    if file.status == "decoded":
+        service.make_sessions(db, outcome, service.as_stated(db, participant, said))
+        if not redaction.unreadable:
+            _erase(db, file)
+    db.commit()
+    return outcome
+
+
+def release_as_is(db: Session, file_id: int, reason: str, caller: Caller) -> UploadFile:
+    """Store a reviewed file as it came, decrypted. Raises Conflict: not in quarantine, or nobody has reviewed it."""
+    file, _ = _held(db, file_id, caller)
+    if file.reviewed_at is None:
+        raise Conflict(f"Nobody has looked at file {file.id} yet.", "Review its content first: it may name the participant.")
+    with _original(file) as path:
+        file.released_sha256 = files.store(db, path, MEDIA_TYPE).sha256
+    file.status = "released" if file.status == "failed" else file.status
+    _decide(db, file, reason, caller)
+    _erase(db, file)
+    return file
+
+
+def discard(db: Session, file_id: int, reason: str, caller: Caller) -> UploadFile:
+    """Erase the bytes for good; the row says what there was. Raises Conflict: not in quarantine."""
+    file, _ = _held(db, file_id, caller)
+    file.status = "discarded" if file.status == "failed" else file.status
+    _decide(db, file, reason, caller)
+    _erase(db, file)
+    return file
+
+
+def _held(db: Session, file_id: int, caller: Caller) -> tuple[UploadFile, Participant]:
+    file, participant = repository.upload_file(db, file_id, caller, lock=True)
+    study_service.require(caller, can.DECIDE_QUARANTINE, participant)
+    if file.quarantine_sha256 is None:
+        done = f": {file.decided_by} decided on it" if file.decided_by else ""
+        raise Conflict(f"File {file.id} is not in quarantine{done}.", "Load the page again.")
+    return file, participant
+
+
+def _decide(db: Session, file: UploadFile, reason: str, caller: Caller) -> None:
+    reason = reason.strip()
+    if not reason:
+        raise Invalid("A decision on a quarantined file needs a reason.", "Say why.")
+    set_reason(db, reason)
+    file.decided_by, file.decided_at, file.decision_reason = caller.label, now(), reason
+    db.flush()
+
+
+@contextmanager
+def _original(file: UploadFile) -> Iterator[Path]:
+    """The decrypted original as a draft file that goes when it was used.
+
+    Raises:
+        Conflict: its bytes cannot be decrypted, or are not those that came.
+    """
+    assert file.quarantine_sha256 is not None
+    draft = files.draft_path()
+    try:
+        try:
+            with draft.open("wb") as out:
+                out.writelines(encryption.decrypt(files.path_of(file.quarantine_sha256)))
+        except (InvalidToken, OSError) as error:
+            mend = "Restore the data folder, with its keys, from a backup."
+            raise Conflict(f"The encrypted bytes of file {file.id} are missing or damaged.", mend) from error
+        if files.hash_file(draft)[0] != file.original_sha256:
+            raise Conflict(f"The bytes of file {file.id} are not those that came: their hash differs.", "Restore a backup.")
+        yield draft
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _erase(db: Session, file: UploadFile) -> None:
+    """Forget the encrypted bytes, and remove them once that is safe."""
+    sealed = file.quarantine_sha256
+    assert sealed is not None
+    file.quarantine_sha256 = None
+    if file.stored_sha256 == sealed:
+        file.stored_sha256 = None
+    db.flush()
+    db.delete(db.get_one(files.StoredFile, sealed))
+    db.commit()
+    files.path_of(sealed).unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""Uploads: receiving files, removing identity, decoding, and making sessions of what came."""

@@ -1,0 +1,38 @@
+"""Uploads are refused by role before their body is read: a form is parsed before any dependency is asked, and may have gigabytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from fastapi import Request, Response
+from fastapi.routing import APIRoute
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.concurrency import run_in_threadpool
+
+from app.accounts import permissions as can
+from app.accounts.deps import get_caller
+from app.platform.database import new_session
+
+_bearer = HTTPBearer(auto_error=False)
+
+
+class UploadRoute(APIRoute):
+    """A route whose POST nobody reaches who may upload nowhere; whose participant it is, the endpoint asks."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """The route's handler, after the check."""
+        handle = super().get_route_handler()
+
+        async def checked(request: Request) -> Response:
+            if request.method == "POST":
+                await run_in_threadpool(_check, request, await _bearer(request))
+            return await handle(request)
+
+        return checked
+
+
+def _check(request: Request, bearer: HTTPAuthorizationCredentials | None) -> None:
+    """Raises Unauthorized for an unknown caller, Forbidden for one whose roles do not include uploads."""
+    with new_session() as db:
+        get_caller(request, db, bearer).require(can.UPLOAD)

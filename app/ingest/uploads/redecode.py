@@ -1,0 +1,243 @@
+"""`betaloop ingest redecode`: read every stored file again with the present decoder, and keep what it gives beside what there was.
+
+Traces are added under the new decode version and never replaced: sessions use the newest version from then on, buffer snapshots keep the
+traces that they pin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+import structlog
+from sqlalchemy.orm import Session
+
+from app.ingest import repository
+from app.ingest.models import Upload, UploadFile
+from app.ingest.sessions import in_milliamperes
+from app.ingest.uploads import outcomes as outcomes_intake
+from app.ingest.uploads import recordings
+from app.ingest.uploads.receiving import TABLES, BetaStated, name_beta
+from app.ingest.uploads.service import decode_options
+from app.platform import files
+from app.platform.database import transaction
+from app.platform.errors import NotFound
+from app.study import repository as study
+from app.study.models import Participant, Recording, StudySession, Trace
+from app.study.traces import AMPLITUDE_STREAM, unpack
+from ml import formats
+from ml.formats import FileKind
+from ml.formats.recording import DECODE_VERSION, DecodedFile, RecordingLog, UndecodableFile
+
+log = structlog.get_logger()
+
+
+class Refused(Exception):
+    """The present decoder's recording cannot take the place of the stored one without moving or losing data of sessions."""
+
+
+@dataclass
+class Change:
+    """What reading a file again came to.
+
+    Attributes:
+        state: `up to date`, `read again`, or `failed` (then nothing of the file was changed).
+        said: what changed, or why it failed.
+    """
+
+    upload_file_id: int
+    participant: str
+    kind: str
+    state: str
+    said: list[str] = field(default_factory=list)
+
+
+def redecode(participant_id: int | None, upload_file_id: int | None, dry_run: bool, actor: str) -> Iterator[Change]:
+    """Read files again, each in a transaction of its own, so that a fault in one leaves the others alone; yields as it goes.
+
+    Args:
+        participant_id, upload_file_id: only these; all where None.
+        dry_run: tell what would change, and change nothing.
+        actor: who stands in the audit trail.
+
+    Raises:
+        NotFound: the named file does not exist or was never decoded.
+    """
+    with transaction(actor) as db:
+        ids = repository.readable_files(db, participant_id, upload_file_id)
+    if upload_file_id is not None and not ids:
+        raise NotFound(f"There is no decoded file {upload_file_id}.", "See the numbers on the page of an upload.")
+    for file_id in ids:
+        with transaction(actor) as db:
+            file = db.get_one(UploadFile, file_id)
+            participant = db.get_one(Participant, file.participant_id)
+            change = Change(file_id, participant.code, file.kind, "read again")
+            try:
+                with db.begin_nested() as savepoint:
+                    repository.lock_participant(db, participant.id)
+                    change.said = _read_again(db, file, participant)
+                    if dry_run:
+                        savepoint.rollback()
+                if not change.said:
+                    change.state = "up to date"
+            except (UndecodableFile, Refused, files.MissingFile) as error:
+                change.state, change.said = "failed", [str(error)]
+            except Exception as fault:
+                # a fault of ours in one file must not keep the others at the old version
+                log.exception("redecoding failed", upload_file=file_id, fault=repr(fault))
+                change.state, change.said = "failed", [f"fault in the decoder: {fault!r}"]
+        yield change
+
+
+def _read_again(db: Session, file: UploadFile, participant: Participant) -> list[str]:
+    known = [*repository.recordings_of_file(db, file.id)]
+    outcomes_only = file.kind in ("tremor", "grasp")
+    if not outcomes_only and all(_version(db, r) >= DECODE_VERSION for r in known):
+        return []
+    decoded = _decoded(db, file, participant)
+    if outcomes_only:
+        return _outcomes_again(db, file, decoded)
+    said = []
+    pairs, added = _matched(known, decoded.recordings)
+    for recording, fresh in pairs:
+        if _version(db, recording) < DECODE_VERSION:
+            said.append(_renew(db, recording, fresh))
+    for fresh in added:
+        other = study.recording_by_fingerprint(db, participant.id, fresh.fingerprint)
+        if other is None:
+            row = recordings.add(db, participant, file, fresh)
+            said.append(f"recording {row.id} is new; send the file again to have its session proposed")
+    for lost in [r for r in known if r not in {p[0] for p in pairs}]:
+        raise Refused(f"the present decoder no longer finds recording {lost.id} in the file")
+    return said
+
+
+def _decoded(db: Session, file: UploadFile, participant: Participant) -> DecodedFile:
+    """The stored file as the present decoder reads it, with what its sender had stated of it."""
+    assert file.stored_sha256 is not None
+    path = files.path_of(file.stored_sha256)
+    if not path.exists() or files.hash_file(path)[0] != file.stored_sha256:
+        raise files.MissingFile(f"stored bytes {file.stored_sha256[:12]} are missing or damaged: restore a backup of the data folder")
+    said = db.get_one(Upload, file.upload_id).stated
+    beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
+    decoded = formats.decode(path, cast(FileKind, file.kind), decode_options(participant, beta), name=file.name)
+    return name_beta(decoded, beta, participant.current_settings) if file.kind in TABLES else decoded
+
+
+def _outcomes_again(db: Session, file: UploadFile, decoded: DecodedFile) -> list[str]:
+    """Tremor minutes and grasp tests as they are read now; what came of it, or nothing where all of it is as it was."""
+    before = _outcomes(db, file)
+    said = outcomes_intake.take_tremor(db, file, decoded.tremor)
+    if file.session_id is not None:
+        said += outcomes_intake.take_grasps(db, file, decoded.grasps, db.get_one(StudySession, file.session_id))
+    return said if _outcomes(db, file) != before else []
+
+
+def _outcomes(db: Session, file: UploadFile) -> list[tuple[object, ...]]:
+    """All that reading an outcome file again can change: its minutes, its grasp tests, and the QoCs of the participant's sessions."""
+    series = study.tremor_series_of_file(db, file.participant_id, file.id)
+    minutes = (series.n, series.start_unix_s_f64, series.duration_s_f64, series.fractions_f32, series.any_tremor_f32) if series else ()
+    tests = [(t.session_id, t.hand, t.open_fist_s_f64, tuple(t.implausible)) for t in study.grasp_tests_of_file(db, file.id)]
+    revisions = [(s.id, len(s.qocs)) for s in study.sessions_of_participant(db, file.participant_id)]
+    return [minutes, *tests, *revisions]
+
+
+def _version(db: Session, recording: Recording) -> int:
+    """The newest decode version of a recording."""
+    traces = study.traces_of_recording(db, recording.id)
+    return max([t.decode_version for t in traces] or [int(recording.details.get("decode_version", 0))])
+
+
+def _matched(
+    known: Sequence[Recording], decoded: Sequence[RecordingLog]
+) -> tuple[list[tuple[Recording, RecordingLog]], list[RecordingLog]]:
+    """Stored recordings with what they are now, by content, else by device, side and start; and recordings that were not stored before."""
+    pairs: list[tuple[Recording, RecordingLog]] = []
+    left, rest = list(known), list(decoded)
+    for same in (lambda r, d: r.fingerprint == d.fingerprint, _same_stretch):
+        for fresh in list(rest):
+            found = [r for r in left if same(r, fresh)]
+            if len(found) == 1:
+                pairs.append((found[0], fresh))
+                left.remove(found[0])
+                rest.remove(fresh)
+    return pairs, rest
+
+
+def _same_stretch(recording: Recording, fresh: RecordingLog) -> bool:
+    began = recordings.known_time(fresh.started_at)
+    if (recording.hemisphere, recording.details.get("kind")) != (fresh.hemisphere, fresh.kind):
+        return False
+    if recording.started_at is None or began is None:
+        return recording.started_at is None and began is None
+    return abs((recording.started_at - began).total_seconds()) < 60
+
+
+def _renew(db: Session, recording: Recording, fresh: RecordingLog) -> str:
+    """Add the traces of the present version to a recording; a sentence on what differs.
+
+    Raises:
+        Refused: sessions would lose their control trace, or their place in the recording.
+    """
+    before = {(t.stream, t.channel): t for t in study.traces_of_recording(db, recording.id)}
+    session_ids = sorted(study.session_ids_of_recording(db, recording.id))
+    _refuse_shift(recording, fresh, session_ids)
+    rows = [recordings.trace_row(recording.id, t) for t in fresh.traces]
+    after = {(t.stream, t.channel): t for t in rows}
+    for session in (db.get_one(StudySession, i) for i in session_ids):
+        _refuse_loss(session, recording, before, after)
+    for key, row in after.items():
+        fixed = before[key].details.get("cdbs_ma") if key in before else None
+        if row.stream == AMPLITUDE_STREAM and row.unit == "fraction" and fixed is not None:
+            in_milliamperes(row, float(fixed))  # what was delivered does not change with today's settings
+    db.add_all(rows)
+    recording.fingerprint, recording.duration_s = fresh.fingerprint, fresh.duration_s
+    recording.details = recordings.details(fresh)
+    db.flush()
+    differences = [_difference(key, before.get(key), after.get(key)) for key in sorted({*before, *after})]
+    listed = "; ".join(d for d in differences if d) or "the same numbers"
+    old = max((t.decode_version for t in before.values()), default=0)
+    used = f" (session{'s' if len(session_ids) > 1 else ''} {', '.join(map(str, session_ids))})" if session_ids else ""
+    return f"recording {recording.id}{used}, version {old} to {DECODE_VERSION}: {listed}"
+
+
+def _refuse_shift(recording: Recording, fresh: RecordingLog, session_ids: Sequence[int]) -> None:
+    began = recordings.known_time(fresh.started_at)
+    if session_ids and recording.started_at is not None and began is not None:
+        shift = (began - recording.started_at).total_seconds()
+        if abs(shift) > 1.0:
+            raise Refused(f"recording {recording.id} would begin {shift:+.1f} s from where its sessions were laid: cut them anew by hand")
+
+
+def _refuse_loss(
+    session: StudySession, recording: Recording, before: dict[tuple[str, str], Trace], after: dict[tuple[str, str], Trace]
+) -> None:
+    if not any(s.recording_id == recording.id and s.is_control for s in session.segments):
+        return
+
+    def found(traces: dict[tuple[str, str], Trace]) -> bool:
+        return any(stream == session.control_stream and session.control_channel in (None, channel) for stream, channel in traces)
+
+    if found(before) and not found(after):
+        trace = f"{session.control_stream} {session.control_channel or ''}".strip()
+        raise Refused(f"session {session.id} would lose its control trace '{trace}': choose another one on its page first")
+
+
+def _difference(key: tuple[str, str], before: Trace | None, after: Trace | None) -> str:
+    name = " ".join(key).strip()
+    if before is None or after is None:
+        return f"{name}: {'gone' if after is None else 'new'}"
+    old, new = unpack(before), unpack(after)
+    notes = [f"{a} was {b}" for a, b in ((after.unit, before.unit), (after.source, before.source)) if a != b]
+    if old.size != new.size:
+        notes.append(f"{new.size} rows, was {old.size}")
+    n = min(old.size, new.size)
+    changed = int(np.sum(~np.isclose(old[:n], new[:n], rtol=1e-6, atol=0, equal_nan=True)))
+    if changed:
+        notes.append(f"{changed} of {n} rows differ")
+    gained = int(np.sum(~np.isnan(new))) - int(np.sum(~np.isnan(old)))
+    if gained:
+        notes.append(f"{gained:+d} valid rows")
+    return f"{name}: {', '.join(notes)}" if notes else ""

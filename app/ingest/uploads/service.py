@@ -1,0 +1,311 @@
+"""Rules of uploads: bytes first, then identity out, then recordings, then sessions; the same bytes twice are one recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
+from typing import Any, cast
+
+import structlog
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.ingest import repository, sessions
+from app.ingest.models import Upload, UploadFile
+from app.ingest.proposals import service as proposals
+from app.ingest.repository import GRASP_KIND
+from app.ingest.sessions import StatedSession
+from app.ingest.uploads import outcomes as outcomes_intake
+from app.ingest.uploads.in_progress import in_progress
+from app.ingest.uploads.incoming import Incoming, arrange
+from app.ingest.uploads.receiving import BetaStated, FileOutcome, Receiver, known_recordings, store_reports, stored_reports
+from app.platform import files
+from app.platform.errors import BetaloopError, Conflict, Invalid, TooLarge
+from app.platform.web.schemas import sensible_time
+from app.study import repository as study
+from app.study import service as study_service
+from app.study.models import Controller, Hemisphere, Participant, StudySession
+from ml import formats
+from ml.formats import FileKind
+from ml.formats.options import BetaMeasure, DecodeOptions
+from ml.formats.recording import FileReport, Problem, UndecodableFile
+
+__all__ = ["BetaStated", "FileOutcome", "Incoming", "UploadOutcome", "receive", "state_session", "stored_reports"]
+
+log = structlog.get_logger()
+
+
+@dataclass
+class UploadOutcome:
+    """What became of an upload.
+
+    Attributes:
+        files: those that were kept.
+        asides: reports of what was not: larger than allowed, left by the operating system.
+    """
+
+    upload: Upload
+    participant: Participant
+    files: list[FileOutcome]
+    asides: list[FileReport] = field(default_factory=list)
+
+    @property
+    def session_ids(self) -> list[int]:
+        """Sessions of all files, each once."""
+        return sorted({i for f in self.files for i in f.session_ids})
+
+    @property
+    def usable(self) -> bool:
+        """Whether anything could be used."""
+        return any(f.row.status == "decoded" for f in self.files)
+
+    @property
+    def reports_for_sender(self) -> list[FileReport]:
+        """Every report, in the sender's names."""
+        return [r for f in self.files for r in f.reports_for_sender] + self.asides
+
+
+def state_session(
+    db: Session,
+    participant: Participant,
+    visit_number: int | None = None,
+    controller: Controller | None = None,
+    policy: str | None = None,
+    started_at: datetime | None = None,
+    hemisphere: Hemisphere | None = None,
+    confirm: bool = True,
+    session_id: int | None = None,
+) -> StatedSession:
+    """What the sender says of the sessions. Raises Invalid for a visit, policy or session that does not exist, or that do not fit."""
+    try:
+        started_at = sensible_time(started_at) if started_at else None
+    except ValueError as error:
+        raise Invalid(f"The stated start {started_at} is out of range: {error}.", "Give the start of the session.") from error
+    known = ", ".join(str(v.number) for v in study.visits(db, participant.id, 500, 0)[0])
+    visit = study.visit_by_number(db, participant.id, visit_number) if visit_number is not None else None
+    if visit is None and visit_number is not None:
+        listed = f"visits: {known or 'none yet'}"
+        raise Invalid(f"Participant {participant.code} has no visit {visit_number} ({listed}).", "Add the visit first.")
+    if not known:
+        raise Invalid(f"Participant {participant.code} has no visit yet.", "Add the visit first.")
+    if controller is not None and visit is None and confirm:
+        raise Invalid("A controller is stated, but no visit.", "Name the visit, or send confirm=false and let it be proposed by its date.")
+    policy_id = study.policy_id(db, participant.id, policy) if policy else None
+    if policy and policy_id is None:
+        raise Invalid(f"Participant {participant.code} has no policy '{policy}'.", "Give the name or number of one of its policies.")
+    session = None
+    if session_id is not None:
+        mine = study.sessions_of_participant(db, participant.id, with_proposals=True)
+        session = next((s for s in mine if s.id == session_id), None)
+        if session is None:
+            raise Invalid(f"Participant {participant.code} has no session {session_id}.", "Name one of this participant's sessions.")
+    return StatedSession(visit, controller, policy_id, started_at, hemisphere, confirm, session)
+
+
+def as_stated(db: Session, participant: Participant, said: Mapping[str, object]) -> StatedSession:
+    """What the sender of a stored upload had said of its sessions. Raises Invalid as `state_session`."""
+    visit, controller, side, start, session = (said.get(name) for name in ("visit", "controller", "hemisphere", "started_at", "session"))
+    return state_session(
+        db,
+        participant,
+        visit if isinstance(visit, int) else None,
+        Controller(str(controller)) if controller else None,
+        str(said["policy_id"]) if said.get("policy_id") else None,
+        datetime.fromisoformat(start) if isinstance(start, str) else None,
+        Hemisphere(str(side)) if side else None,
+        bool(said.get("confirm", True)),
+        session if isinstance(session, int) else None,
+    )
+
+
+def receive(
+    db: Session,
+    participant: Participant,
+    stated: StatedSession,
+    incoming: Sequence[Incoming],
+    caller: Caller,
+    beta: BetaStated | None = None,
+) -> UploadOutcome:
+    """Take an upload: keep every file, decode what can be decoded, make or propose sessions. Commits by itself; see `Receiver`.
+
+    `beta` says what the columns of a table are; the participant's unit and source are taken, and said, where it is silent.
+
+    Raises:
+        TooLarge: every file exceeds the installation's limit. Invalid: no file.
+    """
+    study_service.require(caller, can.UPLOAD, participant)
+    if not incoming:
+        raise Invalid("The upload holds no file.", "Choose at least one file.")
+    beta = beta or BetaStated()
+    said = _said(stated, beta)
+    visit_id = stated.visit.id if stated.visit else None
+    upload = Upload(participant_id=participant.id, visit_id=visit_id, created_by=caller.label, report=[], stated=said)
+    db.add(upload)
+    db.flush()
+    with in_progress(upload.id):
+        arranged = arrange(incoming)
+        receiver = Receiver(db, participant, upload, decode_options(participant, beta), beta)
+        outcome = UploadOutcome(upload, participant, [], arranged.asides)
+        refused: list[TooLarge] = []
+        for one in arranged.incoming:
+            try:
+                outcome.files.append(receiver.receive(one))
+            except TooLarge as error:
+                refused.append(error)
+                problem = Problem(error.detail, "file", f"It was not kept. {error.mend}")
+                outcome.asides.append(FileReport(one.name, problem=problem))
+        if refused and not outcome.files:
+            raise refused[0]
+        finish(db, outcome, stated)
+    return outcome
+
+
+def finish(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
+    """What is done once all files of an upload are in: sessions, grasp tests, the report. Commits."""
+    upload = outcome.upload
+    make_sessions(db, outcome, stated)
+    _attach_grasps(db, outcome, stated)
+    # a file that came before has its row in another upload; this one only points at it
+    earlier = [o.row.id for o in outcome.files if o.same_bytes]
+    upload.stated = {**upload.stated, "duplicates": earlier}
+    upload.report = [asdict(r) for o in outcome.files for r in o.reports]
+    upload.status = "decoded" if outcome.usable else "failed"
+    db.commit()
+
+
+def _said(stated: StatedSession, beta: BetaStated) -> dict[str, Any]:
+    return asdict(beta) | {
+        "visit": stated.visit.number if stated.visit else None,
+        "controller": stated.controller,
+        "policy_id": stated.policy_id,
+        "started_at": stated.started_at.isoformat() if stated.started_at else None,
+        "hemisphere": stated.hemisphere,
+        "confirm": stated.confirm,
+        "session": stated.session.id if stated.session else None,
+    }
+
+
+def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
+    """Sessions of all recordings of the upload that have none yet; what was known keeps the sessions it has."""
+    repository.lock_participant(db, outcome.participant.id)
+    with_recordings = [f for f in outcome.files if f.recordings]
+    known = {r.id: list(study.session_ids_of_recording(db, r.id)) for f in with_recordings for r in f.recordings}
+    fresh = {r.id: r for f in with_recordings for r in f.recordings if not known[r.id]}
+    made: list[proposals.Made] = []
+    trouble = ""
+    try:
+        with db.begin_nested():
+            made = proposals.make_sessions(db, outcome.participant, outcome.upload, list(fresh.values()), stated)
+    except Exception as fault:
+        # the recordings are stored and safe; a fault of ours must not turn a whole upload away
+        log.exception("sessions could not be made", upload=outcome.upload.id, fault=repr(fault))
+        trouble = f"No session could be made of it. It is stored; tell your administrator: upload {outcome.upload.id}."
+    told: set[int] = set()
+    for file in with_recordings:
+        mine = {r.id for r in file.recordings}
+        if mine <= told:
+            _tell_copy(db, file, mine)
+            continue
+        told |= mine
+        earlier = sorted({i for r in mine for i in known[r]})
+        if earlier and not file.same_bytes:
+            listed = ", ".join(map(str, earlier))
+            file.reports[0].understood.append(f"The same recording came before in another file; it stays session {listed}.")
+        file.reports[0].flagged.extend(sessions.disagreements(db, earlier, stated))
+        ours = [m for m in made if any(r.id in mine for r in m.recordings)]
+        if file.same_bytes:
+            anew = "It has no session any more: it is proposed anew." if ours else "Nothing was changed."
+            file.reports[0].understood.append(anew)
+        for one in ours:
+            file.reports[0].understood.extend(one.understood)
+            file.reports[0].flagged.extend(one.flagged)
+        without = [r for r in mine & fresh.keys() if not any(r == x.id for m in ours for x in m.recordings)]
+        if without:
+            file.reports[0].flagged.append(trouble or _no_session(len(without), len(mine)))
+        file.session_ids = sorted({*earlier, *(m.session.id for m in ours)})
+        _keep_reports(file)
+
+
+def _tell_copy(db: Session, file: FileOutcome, recordings: set[int]) -> None:
+    """Of a further copy of what this upload holds already, only that it is one, and where it is."""
+    file.session_ids = sorted({i for r in recordings for i in study.session_ids_of_recording(db, r)})
+    where = f"; it is session {', '.join(map(str, file.session_ids))}" if file.session_ids else ""
+    file.duplicate = True
+    file.reports[0].understood.append(f"The same recording as in another file of this upload{where}.")
+    _keep_reports(file)
+
+
+def _no_session(without: int, of: int) -> str:
+    if of == 1:
+        return "It holds no data of a session: the recording is kept, and no session was made."
+    return f"{without} of {of} recordings hold no data of a session: they are kept, and no session was made of them."
+
+
+def _attach_grasps(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
+    """Grasp tests to the stated session, else to the only one that this upload gave."""
+    target = stated.session
+    if target is None and len(outcome.session_ids) == 1:
+        target = db.get_one(StudySession, outcome.session_ids[0])
+    for file in outcome.files:
+        if file.row.kind != GRASP_KIND or file.row.status != "decoded":
+            continue
+        if file.row.session_id is not None:
+            file.session_ids = [file.row.session_id]
+            if stated.session is not None and stated.session.id != file.row.session_id:
+                file.reports[0].flagged.append(f"It belongs to session {file.row.session_id} already and was not moved.")
+            continue
+        try:
+            said = attach_grasps(db, file.row, target) if target else outcomes_intake.take_grasps(db, file.row, file.grasps, None)
+        except BetaloopError as error:
+            said = [str(error)]
+        file.reports[0].understood.extend(said)
+        file.session_ids = [file.row.session_id] if file.row.session_id is not None else []
+        _keep_reports(file)
+
+
+def _keep_reports(file: FileOutcome) -> None:
+    if not file.same_bytes:
+        store_reports(file.row, file.reports, known_recordings(file.row))
+
+
+def attach_grasps(db: Session, file: UploadFile, session: StudySession) -> list[str]:
+    """Attach a stored grasp file to a session and derive its grasp frequency; sentences on what came of it.
+
+    Raises:
+        Invalid: no grasp file, or another participant's session. Conflict: it belongs to a session already.
+    """
+    if file.kind != GRASP_KIND or file.status != "decoded" or file.stored_sha256 is None:
+        raise Invalid(f"File {file.id} is no decoded grasp test.", "Choose a grasp file that waits for its session.")
+    if file.session_id is not None and file.session_id != session.id:
+        raise Conflict(f"File {file.id} belongs to session {file.session_id} already.", "Correct the QoCs of the session by hand instead.")
+    try:
+        decoded = formats.decode(files.path_of(file.stored_sha256), cast(FileKind, file.kind), DecodeOptions(), name=file.name)
+    except UndecodableFile as error:
+        raise Invalid(f"File {file.id} cannot be read any more: {error.what} ({error.where}).", error.mend) from error
+    return outcomes_intake.take_grasps(db, file, decoded.grasps, session)
+
+
+def decode_options(participant: Participant, beta: BetaStated) -> DecodeOptions:
+    """The participant's choices for decoders, and what the sender said of a table."""
+    settings = participant.current_settings
+    return DecodeOptions(
+        period_s=settings.period_s,
+        beta_low_hz=settings.beta_low_hz,
+        beta_high_hz=settings.beta_high_hz,
+        beta_measure=cast(BetaMeasure, settings.beta_measure),
+        min_valid_fraction=settings.min_valid_fraction,
+        table_beta_unit=beta.unit or settings.beta_unit or "unstated",
+        table_lfp_unit=beta.lfp_unit,
+    )
+
+
+def stored_outcomes(db: Session, upload: Upload) -> list[FileOutcome]:
+    """The files of an upload as they were stored, and those that had come before."""
+    earlier = [db.get_one(UploadFile, i) for i in upload.stated.get("duplicates", [])]
+    both = [(f, False) for f in upload.files] + [(f, True) for f in earlier]
+    return [
+        FileOutcome(f.name, f, stored_reports(f), before, before, repository.session_ids_of_file(db, f, known_recordings(f)))
+        for f, before in both
+    ]

@@ -1,0 +1,154 @@
+"""The gate of the replay buffer: sessions of learned policies enter once their QoCs are significantly better than the random controller's.
+
+Source: Gao et al. 2023, section 4.1, which names no test. Ours: for each QoC that counts in r_end, a one-sided rank-sum test of all RL and
+distilled sessions against all random ones, Holm-adjusted; the gate opens when at least one QoC is better and none is worse. A clinician
+may decide otherwise with a reason; the decision stays on record and holds until the next one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import comb
+from statistics import median
+
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import SYSTEM, Caller
+from app.learning import repository
+from app.learning.models import BufferGateDecision, GateChoice
+from app.platform.database import set_reason
+from app.platform.errors import Invalid
+from app.study import blinding
+from app.study import service as study
+from app.study.models import Controller, Participant, SettingsVersion, StudySession
+from ml.statistics.multiplicity import holm
+from ml.statistics.ranksum import p_greater
+
+ALPHA = 0.05
+LEARNED = (Controller.RL, Controller.DISTILLED)
+QOCS = (("grasp_hz", "Grasp frequency", "Hz", True), ("rating", "Rating", "1-10", True), ("tremor_percent", "Tremor", "% of time", False))
+"""Field, name, unit, and whether more is better."""
+
+
+@dataclass(frozen=True)
+class QocTest:
+    """One QoC of learned policies against the random controller.
+
+    Attributes:
+        n_learned, n_random: sessions with a value. median_learned, median_random: None without one.
+        p_better, p_worse: one-sided, Holm-adjusted over the QoCs tested; None where there is not enough data.
+        note: the check that failed; empty where the test was made.
+    """
+
+    field: str
+    name: str
+    unit: str
+    n_learned: int
+    n_random: int
+    median_learned: float | None
+    median_random: float | None
+    p_better: float | None = None
+    p_worse: float | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Whether sessions of learned policies may enter the buffer, and on what grounds.
+
+    Attributes:
+        tests: one per QoC that counts.
+        opened_by_test: what the tests say.
+        decision: the clinician's last word; None where nobody has decided.
+    """
+
+    tests: tuple[QocTest, ...]
+    opened_by_test: bool
+    decision: BufferGateDecision | None
+
+    @property
+    def is_open(self) -> bool:
+        """The decision where there is one that does not follow the tests, else the tests."""
+        if self.decision is None or self.decision.choice == GateChoice.TEST:
+            return self.opened_by_test
+        return self.decision.choice == GateChoice.OPEN
+
+    @property
+    def grounds(self) -> str:
+        """Why it is open or shut, in one sentence."""
+        if self.decision is not None and self.decision.choice != GateChoice.TEST:
+            return f"decided by {self.decision.created_by}: {self.decision.reason}"
+        if self.opened_by_test:
+            better = [t.name.lower() for t in self.tests if t.p_better is not None and t.p_better < ALPHA]
+            return f"{' and '.join(better)} significantly better than under the random controller (Holm-adjusted p < {ALPHA})"
+        worse = [t.name.lower() for t in self.tests if t.p_worse is not None and t.p_worse < ALPHA]
+        if worse:
+            return f"{' and '.join(worse)} significantly worse than under the random controller"
+        if not self.tests:
+            return "no QoC counts in r_end (C2 = C3 = C4 = 0), so nothing can be tested"
+        if all(t.note for t in self.tests):
+            return self.tests[0].note
+        return "no QoC is significantly better than under the random controller"
+
+
+def gate(db: Session, participant: Participant, sessions: Sequence[StudySession]) -> Gate:
+    """The gate as the participant's confirmed sessions, less the excluded ones, have it."""
+    live = [s for s in sessions if s.status == "confirmed" and not s.excluded_reason]
+    arms = [(s, blinding.arm(s, SYSTEM).controller) for s in live]
+    learned = [s for s, controller in arms if controller in LEARNED]
+    random = [s for s, controller in arms if controller is Controller.RANDOM]
+    raw = [_compare(q, learned, random) for q in QOCS if _counts(participant.current_settings, q[0])]
+    tests = _adjusted(raw)
+    better = any(t.p_better is not None and t.p_better < ALPHA for t in tests)
+    worse = any(t.p_worse is not None and t.p_worse < ALPHA for t in tests)
+    return Gate(tests, better and not worse, repository.newest_gate_decision(db, participant.id))
+
+
+def decide(db: Session, participant: Participant, choice: GateChoice, reason: str, caller: Caller) -> BufferGateDecision:
+    """Record a clinician's decision; the caller commits.
+
+    Raises:
+        Invalid: no reason. Forbidden: the caller approves no plans in this study.
+    """
+    study.require(caller, can.APPROVE_PLAN, participant)
+    if not reason.strip():
+        raise Invalid("A decision on the replay buffer needs its reason.", "Say why in a sentence.")
+    row = BufferGateDecision(participant_id=participant.id, choice=choice, reason=reason.strip(), created_by=caller.label)
+    set_reason(db, row.reason)
+    db.add(row)
+    db.flush()
+    return row
+
+
+def _counts(settings: SettingsVersion, field: str) -> bool:
+    return {"grasp_hz": settings.c2, "rating": settings.c3, "tremor_percent": settings.c4}[field] > 0
+
+
+def _compare(qoc: tuple[str, str, str, bool], learned: Sequence[StudySession], random: Sequence[StudySession]) -> QocTest:
+    """Unadjusted one-sided tests of one QoC."""
+    field, name, unit, more_is_better = qoc
+    x, y = _values(learned, field), _values(random, field)
+    medians = (median(x) if x else None, median(y) if y else None)
+    if not x or not y or 1 / comb(len(x) + len(y), len(x)) >= ALPHA:
+        note = (
+            f"not enough sessions with {name.lower()}: {len(x)} of learned policies and {len(y)} of the random controller "
+            "(3 against 4, 2 against 5 or 1 against 20 are the fewest that can show a difference)"
+        )
+        return QocTest(field, name, unit, len(x), len(y), *medians, note=note)
+    sign = 1 if more_is_better else -1
+    a, b = [sign * v for v in x], [sign * v for v in y]
+    return QocTest(field, name, unit, len(x), len(y), *medians, p_better=p_greater(a, b), p_worse=p_greater(b, a))
+
+
+def _values(sessions: Sequence[StudySession], field: str) -> list[float]:
+    found = (getattr(s.qoc, field) for s in sessions if s.qoc is not None)
+    return [float(v) for v in found if v is not None]
+
+
+def _adjusted(tests: Sequence[QocTest]) -> tuple[QocTest, ...]:
+    """Both families of p-values by Holm's method, over the QoCs that could be tested."""
+    made = [t for t in tests if not t.note]
+    better, worse = (iter(holm([getattr(t, name) for t in made])) for name in ("p_better", "p_worse"))
+    return tuple(t if t.note else replace(t, p_better=next(better), p_worse=next(worse)) for t in tests)

@@ -1,0 +1,1 @@
+"""Policies of a participant: trained, external and baseline ones."""

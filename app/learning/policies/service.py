@@ -1,0 +1,158 @@
+"""Rules of policies: how they come in, what they are stored with, how they leave is in `bundles.py`. The caller commits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from app import __version__
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.learning import repository
+from app.learning.models import BufferSnapshot, Policy
+from app.learning.policies.baselines import ONNX
+from app.learning.training.compute import POLICY, read_buffer
+from app.platform import files
+from app.platform.database import set_reason
+from app.platform.errors import Conflict, Invalid
+from app.platform.jobs.service import code_version
+from app.study import repository as study_repository
+from app.study import service as study
+from app.study.models import Participant, SettingsVersion
+from ml.policies.onnx_policy import MAX_FILE_BYTES, OnnxPolicy, PolicyFileError
+
+BUNDLE_TEST_WINDOWS = 64
+UPLOAD_LIMIT = MAX_FILE_BYTES
+
+
+def window_of(policy: Policy) -> int:
+    """W that a policy takes: what an uploaded one was tried with, else what its file says."""
+    own = policy.config.get("window") if policy.kind == "external" else None
+    return int(own) if own else OnnxPolicy(files.read(policy.onnx_sha256)).window
+
+
+def require_window(policy: Policy, window: int) -> None:
+    """Raise Invalid where a policy takes other windows than the participant's settings say now."""
+    if (own := window_of(policy)) != window:
+        raise Invalid(
+            f"Policy '{policy.name}' takes windows of {own} beta amplitudes; the participant's settings say {window}.",
+            "Leave it out, or set the window back.",
+        )
+
+
+def add_external(db: Session, participant: Participant, name: str, content: bytes, file_name: str, caller: Caller) -> Policy:
+    """Store a policy made elsewhere. It is run on beta windows of many scales, and on the participant's own where there are some.
+
+    The file's name, which may name a person, stands in the answer to a bad file alone and is not kept.
+
+    Raises:
+        Invalid: the file is no such policy; says what is wrong with it. Conflict: the name is taken.
+    """
+    study.require(caller, can.WRITE_POLICIES, participant)
+    settings = participant.current_settings
+    newest = repository.newest_snapshot(db, participant.id)
+    probe = probe_windows(newest, settings) if newest and _window_of(db, newest) == settings.window else None
+    try:
+        OnnxPolicy(content, settings.window, probe)
+    except PolicyFileError as error:
+        raise Invalid(
+            f"'{file_name}' is no policy that betaloop can run: {error}.",
+            f"Give an ONNX file with one input [N, {settings.window}] of beta windows, oldest first, and one output [N, 1] in [0, 1].",
+        ) from error
+    if repository.policy_by_name(db, participant.id, name):
+        raise Conflict(f"Participant {participant.code} already has a policy '{name}'.", "Choose another name.")
+    row = Policy(
+        participant_id=participant.id,
+        name=name,
+        kind="external",
+        algorithm="external",
+        settings_version_id=settings.id,
+        config={"window": settings.window},
+        onnx_sha256=files.store(db, content, ONNX).sha256,
+        metrics={"bytes": len(content)},
+        code_version=__version__,
+        created_by=caller.label,
+    )
+    db.add(row)
+    try:
+        db.flush()
+    except IntegrityError as error:
+        db.rollback()
+        raise Conflict(f"Participant {participant.code} already has a policy '{name}'.", "Choose another name.") from error
+    return row
+
+
+def retire(db: Session, participant: Participant, policy: Policy, reason: str | None, caller: Caller) -> Policy:
+    """Take a policy out of rankings and plans, or (no reason) back in; the policy itself stays as it is."""
+    study.require(caller, can.WRITE_POLICIES, participant)
+    policy.retired_reason = (reason or "").strip() or None
+    set_reason(db, policy.retired_reason)
+    db.flush()
+    return policy
+
+
+def store_students(
+    db: Session, job_id: str, created_by: str, snapshot: BufferSnapshot, steps: Sequence[tuple[str, dict[str, Any], Path, int]]
+) -> list[Policy]:
+    """Students of a job's distillation steps, each with its key, result, working folder and teacher.
+
+    A step whose student is there already gives that one.
+    """
+    repository.lock_participant(db, snapshot.participant_id)
+    rows = []
+    for key, result, workdir, teacher_id in steps:
+        row = repository.policy_of_step(db, job_id, key)
+        if row is None:
+            row = _student_row(job_id, created_by, snapshot, key, result)
+            row.teacher_id = teacher_id
+            row.onnx_sha256 = files.store(db, (workdir / POLICY).read_bytes(), ONNX).sha256
+            row.name = free_name(db, snapshot.participant_id, f"{db.get_one(Policy, teacher_id).name[:80]}-small")
+            db.add(row)
+            db.flush()
+        rows.append(row)
+    return rows
+
+
+def probe_windows(snapshot: BufferSnapshot | None, settings: SettingsVersion) -> NDArray[np.float64]:
+    """Beta windows for test vectors: spread over the snapshot's states; without one, ramps around the threshold."""
+    if snapshot is not None:
+        states = read_buffer(snapshot.file_sha256).transitions().states
+        return np.asarray(states[np.unique(np.linspace(0, len(states) - 1, BUNDLE_TEST_WINDOWS).astype(int))])
+    level = settings.xi_beta if settings.xi_beta else 1.0
+    shares = np.linspace(0.0, 2.0, BUNDLE_TEST_WINDOWS)[:, None]
+    return np.asarray(level * shares * np.linspace(0.5, 1.5, settings.window)[None, :])
+
+
+def _window_of(db: Session, snapshot: BufferSnapshot) -> int:
+    return study_repository.settings_version(db, snapshot.settings_version_id).window
+
+
+def _student_row(job_id: str, created_by: str, snapshot: BufferSnapshot, key: str, result: dict[str, Any]) -> Policy:
+    return Policy(
+        participant_id=snapshot.participant_id,
+        kind="distilled",
+        algorithm="distillation",
+        snapshot_id=snapshot.id,
+        settings_version_id=snapshot.settings_version_id,
+        job_id=job_id,
+        job_step=key,
+        config=result["config"],
+        seed=result["config"]["seed"],
+        metrics=result["metrics"],
+        code_version=code_version(),
+        created_by=created_by,
+    )
+
+
+def free_name(db: Session, participant_id: int, wish: str) -> str:
+    """The wish, or with the first free number behind it."""
+    taken = repository.names_in_use(db, participant_id, wish)
+    if wish not in taken:
+        return wish
+    return next(name for name in (f"{wish}-{n}" for n in range(2, len(taken) + 3)) if name not in taken)

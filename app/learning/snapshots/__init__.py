@@ -1,0 +1,1 @@
+"""Buffer snapshots: which sessions a result rests on, and what they cover."""

@@ -1,0 +1,268 @@
+"""Buffer snapshots: which sessions a result may rest on, the version of everything in them, and why the others were left out.
+
+Every confirmed session is looked at. What cannot enter is kept in the snapshot's list with its reason. Sessions of learned policies enter
+when the gate is open (`app.learning.gate.service`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from sqlalchemy.dialects.postgresql import insert
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import SYSTEM, Caller
+from app.learning import repository
+from app.learning.gate.service import LEARNED, Gate, gate
+from app.learning.models import BufferSnapshot, SnapshotSession
+from app.learning.snapshots.trajectories import trajectory_of
+from app.platform import files
+from app.platform.errors import Invalid
+from app.study import blinding
+from app.study import repository as study_repository
+from app.study import service as study
+from app.study.models import Participant, SettingsVersion, StudySession
+from app.study.traces import StepTable
+from ml.mdp import MdpSettings
+from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
+
+PARQUET = "application/vnd.apache.parquet"
+PINS_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Member:
+    """One confirmed session as the buffer sees it: a trajectory, or the reason why there is none."""
+
+    session: StudySession
+    table: StepTable | None
+    trajectory: SessionTrajectory | None
+    left_out: str | None
+
+    def pins(self) -> list[Any]:
+        """Everything of this session that a result depends on."""
+        table, s = self.table, self.trajectory
+        arm = blinding.arm(self.session, SYSTEM)
+        return [
+            self.session.id,
+            self.session.visit.number,
+            arm.controller.value,
+            arm.policy_id,
+            table.beta_trace.id if table and table.beta_trace else None,
+            table.amplitude_trace.id if table and table.amplitude_trace else None,
+            self.decode_version,
+            self.session.qoc.id if self.session.qoc else None,
+            table.cdbs_ma if table else None,
+            self.left_out,
+            _digest(s) if s else None,
+        ]
+
+    @property
+    def decode_version(self) -> int | None:
+        """Decode version of the session's beta trace."""
+        return self.table.beta_trace.decode_version if self.table and self.table.beta_trace else None
+
+    @property
+    def steps(self) -> int | None:
+        """Usable steps; None where the session is left out."""
+        return int(self.trajectory.usable().sum()) if self.trajectory else None
+
+
+@dataclass(frozen=True)
+class Collection:
+    """The buffer that the study's present data give."""
+
+    settings_version: SettingsVersion
+    settings: MdpSettings
+    members: tuple[Member, ...]
+    beta_unit: str
+    beta_source: str
+
+    @cached_property
+    def buffer(self) -> ReplayBuffer:
+        """The sessions that entered."""
+        inside = tuple(m.trajectory for m in self.members if m.trajectory is not None)
+        return ReplayBuffer(self.settings, inside, self.beta_unit, self.beta_source)
+
+    @cached_property
+    def pins_sha256(self) -> str:
+        """Name of everything pinned: equal exactly when nothing that a result depends on has changed."""
+        pins = {
+            "version": PINS_VERSION,
+            "settings_version_id": self.settings_version.id,
+            "beta": [self.beta_unit, self.beta_source],
+            "sessions": [m.pins() for m in self.members],
+        }
+        return hashlib.sha256(json.dumps(pins, sort_keys=True).encode()).hexdigest()
+
+
+def collect(db: Session, participant: Participant) -> Collection:
+    """The buffer of the participant as the data are now; nothing is stored.
+
+    Raises:
+        Invalid: no beta threshold yet (with a suggestion from the data), one without a unit and source, or no session with a usable step
+            (with the reasons).
+    """
+    version = participant.current_settings
+    suggestion = study.suggest_xi_beta(db, participant, SYSTEM) if version.xi_beta is None else None
+    settings = study.mdp_settings(version, suggestion)
+    sessions = [s for s in study_repository.sessions_of_participant(db, participant.id) if s.status == "confirmed"]
+    read = [_read(db, session, settings) for session in sessions]
+    unit, source = _signal(version, read)
+    barrier = gate(db, participant, sessions)
+    members = tuple(_pass_gate(_admit(m, unit, source), barrier) for m in read)
+    if not any(m.trajectory for m in members):
+        reasons = Counter(m.left_out for m in members)
+        listed = "; ".join(f"{n} x {reason}" for reason, n in reasons.most_common(4))
+        raise Invalid(
+            f"Participant {participant.code} has no session that can enter a replay buffer"
+            + (f": {listed}." if listed else ": no confirmed session at all."),
+            "Upload sessions with a beta trace and an amplitude trace, or mend what is named.",
+        )
+    return Collection(version, settings, members, unit, source)
+
+
+def not_ready(db: Session, participant: Participant) -> Invalid | None:
+    """Why nothing can be learned or estimated yet; None when it can."""
+    try:
+        collect(db, participant)
+    except Invalid as error:
+        return error
+    return None
+
+
+def take_snapshot(db: Session, participant: Participant, caller: Caller) -> BufferSnapshot:
+    """Store the buffer as it is now; when nothing it depends on has changed, the snapshot that already pins it.
+
+    Two transactions at once get one row: the unique pins make the later one wait for, and then find, the other's.
+
+    Raises:
+        Invalid: as `collect`. Forbidden: the caller may not run jobs.
+    """
+    study.require(caller, can.RUN_JOBS, participant)
+    found = collect(db, participant)
+    known = repository.snapshot_by_pins(db, participant.id, found.pins_sha256)
+    if known is not None:
+        return known
+    stored = files.store(db, to_parquet(found.buffer), PARQUET)
+    row_id = db.scalar(
+        insert(BufferSnapshot)
+        .values(
+            participant_id=participant.id,
+            settings_version_id=found.settings_version.id,
+            pins_sha256=found.pins_sha256,
+            file_sha256=stored.sha256,
+            sessions=len(found.buffer.sessions),
+            steps=sum(m.steps or 0 for m in found.members),
+            median_steps=found.buffer.median_steps(),
+            beta_unit=found.beta_unit,
+            beta_source=found.beta_source,
+            created_by=caller.label,
+        )
+        .on_conflict_do_nothing(index_elements=["participant_id", "pins_sha256"])
+        .returning(BufferSnapshot.id)
+    )
+    if row_id is None:
+        other = repository.snapshot_by_pins(db, participant.id, found.pins_sha256)
+        assert other is not None
+        return other
+    db.add_all(_row(row_id, m) for m in found.members)
+    db.flush()
+    return db.get_one(BufferSnapshot, row_id)
+
+
+def _read(db: Session, session: StudySession, settings: MdpSettings) -> Member:
+    """The session's trajectory, or the first reason of its own against it."""
+    try:
+        table = study.session_data(db, session).table
+    except Invalid as error:
+        return Member(session, None, None, str(error))
+    trajectory = trajectory_of(session, table, blinding.arm(session, SYSTEM), settings.window, settings.lower_bound)
+    if isinstance(trajectory, str):
+        return Member(session, table, None, trajectory)
+    if not trajectory.usable().any():
+        return Member(session, table, None, _why_unusable(trajectory, table))
+    return Member(session, table, trajectory, None)
+
+
+def _why_unusable(trajectory: SessionTrajectory, table: StepTable) -> str:
+    if np.isnan(trajectory.beta).all():
+        return "no usable step: no valid beta amplitude"
+    if table.above_one == trajectory.steps:
+        return "no usable step: every amplitude exceeds the cDBS amplitude"
+    return (
+        f"no usable step: none of its {trajectory.steps} steps has a whole beta window before it and an amplitude within the cDBS amplitude"
+    )
+
+
+def _signal(version: SettingsVersion, read: list[Member]) -> tuple[str, str]:
+    """The one unit and source of beta for the buffer, as the settings state them.
+
+    Raises:
+        Invalid: they do not. A threshold without a unit judges no trace, and every reward rests on it.
+    """
+    unstated = [name for name, value in (("unit", version.beta_unit), ("source", version.beta_source)) if not value]
+    if not unstated:
+        return str(version.beta_unit), str(version.beta_source)
+    kinds = Counter(f"{m.table.beta_trace.unit} from {m.table.beta_trace.source}" for m in read if m.table and m.table.beta_trace)
+    raise Invalid(
+        f"Nobody has stated the {' and the '.join(unstated)} of the threshold of {version.xi_beta:g} of participant "
+        f"{version.participant.code}, so that no reward can be computed.",
+        "State unit and source of beta in the participant's settings."
+        + (f" The confirmed sessions have beta in {', '.join(f'{kind} ({n})' for kind, n in kinds.most_common(4))}." if kinds else ""),
+    )
+
+
+UNSTATED = "unstated"
+"""Unit of a table's beta that neither the table nor the settings of its time named."""
+
+
+def _admit(m: Member, unit: str, source: str) -> Member:
+    """Leave out what is in another unit or from another source: beta amplitudes of two kinds are never mixed."""
+    if m.trajectory is None or m.table is None or m.table.beta_trace is None:
+        return m
+    trace = m.table.beta_trace
+    # A table that came before anyone had stated a unit is in the one that the settings state for tables now.
+    stated = unit if (trace.unit, trace.source, source) == (UNSTATED, "table", "table") else trace.unit
+    if (stated, trace.source) == (unit, source):
+        return m
+    reason = f"its beta is in {trace.unit} from {trace.source}; the participant's settings say {unit} from {source}"
+    return Member(m.session, m.table, None, reason)
+
+
+def _pass_gate(m: Member, barrier: Gate) -> Member:
+    """Leave out sessions of learned policies while the gate is shut."""
+    if m.trajectory is None or barrier.is_open or blinding.arm(m.session, SYSTEM).controller not in LEARNED:
+        return m
+    return Member(m.session, m.table, None, f"session of a learned policy, and the buffer's gate is shut: {barrier.grounds}")
+
+
+def _row(snapshot_id: int, m: Member) -> SnapshotSession:
+    table = m.table
+    return SnapshotSession(
+        snapshot_id=snapshot_id,
+        session_id=m.session.id,
+        beta_trace_id=table.beta_trace.id if table and table.beta_trace else None,
+        amplitude_trace_id=table.amplitude_trace.id if table and table.amplitude_trace else None,
+        decode_version=m.decode_version,
+        qoc_id=m.session.qoc.id if m.session.qoc else None,
+        cdbs_amplitude_ma=table.cdbs_ma if table else None,
+        steps=m.steps,
+        left_out_reason=m.left_out,
+    )
+
+
+def _digest(s: SessionTrajectory) -> str:
+    """Hash of a trajectory's numbers: catches every change that the row numbers do not show, such as a moved segment."""
+    digest = hashlib.sha256()
+    for values in (s.lead_beta, s.beta, s.amplitude):
+        digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes() + b"|")
+    digest.update(repr(s.random_lower_bound).encode())
+    return digest.hexdigest()

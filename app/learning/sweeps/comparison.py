@@ -1,0 +1,141 @@
+"""How the policies of a sweep compare: on sessions that they did not learn from, with each other and with controllers without learning."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from app.learning.models import Policy, Sweep
+from app.platform.web.charts import Chart, axis, figure
+from ml.rl.selection import Gain, surest
+from ml.rl.support import LARGEST_SHARE_BELOW
+
+PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")
+DASHES = ("solid", "dash", "dot")
+CURVES = (
+    ("held_out", "score", "Estimated return on held-out sessions", "reward, fitted Q evaluation"),
+    ("held_out", "over_logged", "Q beyond the logged return", "reward; Q of the first states less the return logged from them"),
+    ("curve", "mean_q", "Mean Q of the policy", "reward; an unbounded climb is over-estimation"),
+    ("curve", "action_distance", "Distance from the logged amplitudes", "mean absolute difference, fraction"),
+)
+"""Where a curve stands in a policy's metrics, its name there, its title and unit."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One policy of a sweep.
+
+    Attributes:
+        score: estimated return on the held-out sessions at the state that was kept; None where none were held out.
+        over_logged: mean Q of the held-out sessions' first states less the return logged from them, at the same state.
+        action_distance: mean absolute difference from the logged amplitudes over the buffer's states, fraction.
+        saturated: share of these states answered with next to 0 or 1.
+        mean_amplitude: over the buffer's states, fraction.
+        best_update: the update whose state was kept; None: the last.
+        rate: the policy's learning rate. seed: of its training.
+        gain: estimated return less that of cDBS, with its lower bound; None where it was not estimated.
+        below: the lower bound B of the buffer's random sessions, and the share of its states answered with less; None where unknown.
+    """
+
+    policy: Policy
+    score: float | None
+    over_logged: float | None
+    action_distance: float | None
+    saturated: float | None
+    mean_amplitude: float | None
+    best_update: int | None
+    rate: float | None
+    seed: int | None
+    gain: Gain | None
+    below: tuple[float, float] | None
+
+    @property
+    def leaves_the_logged_range(self) -> bool:
+        """Whether it asks for less than the random controller was allowed to more often than `LARGEST_SHARE_BELOW`."""
+        return self.below is not None and self.below[1] > LARGEST_SHARE_BELOW
+
+
+def candidates(sweep: Sweep) -> list[Candidate]:
+    """The sweep's policies, the best score first; in the order of training where nothing was held out."""
+    found = [_candidate(p) for p in sweep.policies]
+    return sorted(found, key=lambda c: -c.score if c.score is not None else float("inf"))
+
+
+def better_without_learning(found: Sequence[Candidate], yardsticks: Sequence[dict[str, Any]]) -> str | None:
+    """The best controller without learning where it scores above every policy of the sweep, else None; None too where nothing scored."""
+    scores = [c.score for c in found if c.score is not None]
+    best = max(yardsticks, key=lambda row: row["score"], default=None)
+    return str(best["controller"]) if best is not None and scores and best["score"] > max(scores) else None
+
+
+def surely_above_cdbs(found: Sequence[Candidate]) -> Candidate | None:
+    """The policy with the largest lower bound of its gain over cDBS; None where no bound lies above 0."""
+    name = surest({str(k): c.gain for k, c in enumerate(found) if c.gain is not None})
+    return None if name is None else found[int(name)]
+
+
+def below_bound(policy: Policy) -> tuple[float, float] | None:
+    """The lower bound of the random sessions that a policy learned from, and how often it asks for less; None where that is not known."""
+    told = policy.metrics.get("below_bound")
+    return None if told is None else (float(told["bound"]), float(told["share"]))
+
+
+def _candidate(policy: Policy) -> Candidate:
+    held = policy.metrics.get("held_out", {})
+    # Policies of before the state that was kept was looked at have the figures of their last state.
+    kept = policy.metrics.get("kept") or policy.metrics.get("last", {})
+    at = _kept(held, policy.metrics.get("best_update"))
+    return Candidate(
+        policy=policy,
+        score=_at(held, "score", at),
+        over_logged=_at(held, "over_logged", at),
+        action_distance=kept.get("action_distance"),
+        saturated=kept.get("saturated"),
+        mean_amplitude=policy.metrics.get("mean_amplitude_on_buffer"),
+        best_update=policy.metrics.get("best_update"),
+        rate=policy.config.get("actor_lr"),
+        seed=policy.seed,
+        gain=Gain(**gained) if (gained := policy.metrics.get("gain_over_cdbs")) else None,
+        below=below_bound(policy),
+    )
+
+
+def _kept(held: dict[str, list[float]], best_update: int | None) -> int:
+    """Index of the scoring whose state was kept."""
+    updates = held.get("update", [])
+    return updates.index(best_update) if best_update in updates else len(updates) - 1
+
+
+def _at(curves: dict[str, list[float]], name: str, index: int) -> float | None:
+    values = curves.get(name)
+    return values[index] if values else None
+
+
+def charts(sweep: Sweep) -> list[Chart]:
+    """Learning curves of all policies of a sweep, one chart for each kind of curve that was recorded."""
+    made = (_chart(sweep.policies, *curve) for curve in CURVES)
+    return [chart for chart in made if chart is not None]
+
+
+def _chart(policies: Sequence[Policy], place: str, name: str, title: str, unit: str) -> Chart | None:
+    data: list[dict[str, Any]] = []
+    rows: list[list[Any]] = []
+    for k, policy in enumerate(policies):
+        curves = policy.metrics.get(place, {})
+        if not curves.get(name):
+            continue
+        line = {"color": PALETTE[k % len(PALETTE)], "dash": DASHES[k // len(PALETTE) % len(DASHES)], "width": 1.8}
+        data.append({"type": "scatter", "mode": "lines", "name": policy.name, "x": curves["update"], "y": curves[name], "line": line})
+        rows += [[policy.name, int(u), float(v)] for u, v in zip(curves["update"], curves[name], strict=True)]
+    if not rows:
+        return None
+    return Chart(
+        id=f"sweep-{name.replace('_', '-')}",
+        title=title,
+        subtitle=f"{unit} · n = {len(data)} policies",
+        figure=figure(data, xaxis=axis("Update"), yaxis=axis(""), showlegend=True, legend={"orientation": "h", "y": -0.3}),
+        columns=["Policy", "Update", title],
+        rows=rows,
+        height=320,
+    )

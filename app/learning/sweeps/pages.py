@@ -1,0 +1,37 @@
+"""Sweeps for people and programs: their list, and one sweep's comparison."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse
+
+from app.learning.deps import CurrentSweep
+from app.learning.schemas import ALGORITHM_NAMES
+from app.learning.sweeps import comparison
+from app.platform.database import Db
+from app.platform.web.templates import render
+from app.study.models import Participant
+
+router = APIRouter()
+
+
+@router.get("/sweeps/{sweep_id}")
+def sweep_page(request: Request, sweep: CurrentSweep, db: Db) -> HTMLResponse:
+    """One sweep: its policies on sessions they did not learn from, beside controllers without learning."""
+    found = comparison.candidates(sweep)
+    page = render(
+        request,
+        "learning/sweep.html",
+        participant=db.get_one(Participant, sweep.participant_id),
+        sweep=sweep,
+        candidates=found,
+        better=comparison.better_without_learning(found, sweep.yardsticks["rows"]),
+        surest=comparison.surely_above_cdbs(found),
+        gains=any(c.gain for c in found),
+        low_ones=[c for c in found if c.leaves_the_logged_range],
+        yardsticks=sorted(sweep.yardsticks["rows"], key=lambda row: -row["score"]),
+        held_out=sweep.yardsticks["held_out_sessions"],
+        charts=comparison.charts(sweep),
+        algorithm_names=ALGORITHM_NAMES,
+    )
+    return HTMLResponse(page)

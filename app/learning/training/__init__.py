@@ -1,0 +1,1 @@
+"""Training and distillation as the child processes run them, and their configurations."""

@@ -1,0 +1,101 @@
+"""Study-wide pages: the overview of all participants, and the audit trail."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import HTMLResponse
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
+from app.accounts.repository import studies
+from app.accounts.service import reads_whole_audit
+from app.overview import queries
+from app.platform.audit import AUDITED, AuditEvent
+from app.platform.database import Db
+from app.platform.errors import Forbidden, NotFound
+from app.platform.web.schemas import PagingQuery, Text
+from app.platform.web.templates import render
+from app.study import blinding
+from app.study import repository as study
+
+router = APIRouter()
+
+_ARM_COLUMNS = ("controller", "policy_id")
+_HIDDEN = "hidden from you"
+
+
+@router.get("/")
+def overview(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
+    """All participants as cards, those that need attention marked."""
+    rows, total = study.participants(db, caller, paging.limit, paging.offset)
+    states = queries.states(db, rows, datetime.now(UTC).date())
+    page = render(
+        request,
+        "overview/overview.html",
+        participants=[(p, states[p.id]) for p in rows],
+        total=total,
+        paging=paging,
+        phases=queries.PHASES,
+        studies=[s for s in studies(db) if caller.may(can.READ, s.id)],
+    )
+    return HTMLResponse(page)
+
+
+@router.get("/audit")
+def audit(
+    request: Request,
+    db: Db,
+    caller: CurrentCaller,
+    paging: PagingQuery,
+    entity: Annotated[Text, Query(max_length=63)] = "",
+    entity_id: Annotated[Text, Query(max_length=200)] = "",
+    actor: Annotated[Text, Query(max_length=254)] = "",
+) -> HTMLResponse:
+    """Who changed what, when and why, newest first."""
+    caller.require(can.READ_AUDIT)
+    if not reads_whole_audit(db, caller):
+        raise Forbidden("The audit trail covers all studies and sites, and your role does not.", "Ask an administrator of all studies.")
+    events, total = queries.audit_events(db, entity, entity_id, actor.strip().lower(), paging.limit, paging.offset)
+    page = render(
+        request,
+        "overview/audit.html",
+        events=[(e, changes(db, e, caller)) for e in events],
+        total=total,
+        paging=paging,
+        entities=sorted(AUDITED),
+        filters={"entity": entity, "entity_id": entity_id, "actor": actor},
+    )
+    return HTMLResponse(page)
+
+
+def changes(db: Session, event: AuditEvent, caller: Caller) -> list[tuple[str, str | None, str | None]]:
+    """Column, value before, value after of what an event changed; arms only through the blinding gate."""
+    before, after = event.before or {}, event.after or {}
+    names = [n for n in dict.fromkeys([*before, *after]) if before.get(n) != after.get(n)]
+    hidden = _ARM_COLUMNS if event.entity == "session" and not _may_know_arm(db, event.entity_id, caller) else ()
+    return [
+        (name, _HIDDEN if name in hidden else _short(before.get(name)), _HIDDEN if name in hidden else _short(after.get(name)))
+        for name in names
+    ]
+
+
+def _may_know_arm(db: Session, session_id: str, caller: Caller) -> bool:
+    try:
+        blinding.arm(study.session(db, int(session_id), caller), caller)
+    except (NotFound, Forbidden):
+        return False
+    return True
+
+
+def _short(value: Any) -> str | None:
+    """A value as text; long ones are cut, the database has them whole."""
+    if value is None:
+        return None
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 300 else f"{text[:300]} …"

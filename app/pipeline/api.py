@@ -1,0 +1,77 @@
+"""REST routes of jobs of every kind: start, look, follow, cancel, retry."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Query
+from fastapi.responses import StreamingResponse
+
+from app.accounts.deps import CurrentCaller
+from app.pipeline import service
+from app.pipeline.deps import CurrentJob
+from app.pipeline.schemas import JobIn, JobOut
+from app.pipeline.serializers import job_out
+from app.platform.database import Db
+from app.platform.jobs import repository as jobs
+from app.platform.jobs import stream
+from app.platform.jobs.models import JobStatus
+from app.platform.web.schemas import Page, PagingQuery, problems
+from app.study.deps import CurrentParticipant
+
+router = APIRouter(tags=["jobs"], responses=problems(401, 403, 404, 422))
+
+
+@router.post("/participants/{code}/jobs", status_code=202)
+def start_job(participant: CurrentParticipant, body: JobIn, db: Db, caller: CurrentCaller) -> JobOut:
+    """Start a job; everything but `kind` has a default. It needs the threshold xi_beta and at least one usable session."""
+    job = service.start_job(db, participant, body.kind, body.model_dump(mode="json", exclude={"kind"}), caller)
+    db.commit()
+    return job_out(job, participant)
+
+
+@router.get("/participants/{code}/jobs")
+def list_jobs(
+    participant: CurrentParticipant,
+    db: Db,
+    paging: PagingQuery,
+    status: Annotated[JobStatus | None, Query(description="Only jobs of this status.")] = None,
+) -> Page[JobOut]:
+    """Jobs of a participant, newest first."""
+    rows, total = jobs.find(db, participant.id, status=(status,) if status else (), limit=paging.limit, offset=paging.offset)
+    return Page(items=[job_out(j, participant) for j in rows], total=total, limit=paging.limit, offset=paging.offset)
+
+
+@router.get("/jobs/{job_id}")
+def read_job(found: CurrentJob) -> JobOut:
+    """One job with its steps."""
+    return job_out(found.job, found.participant)
+
+
+@router.get(
+    "/jobs/{job_id}/events",
+    response_class=StreamingResponse,
+    responses={200: {"content": {"text/event-stream": {}}, "description": "Server-sent events until the job ends."}},
+)
+def follow_job(found: CurrentJob, db: Db, last_event_id: Annotated[str | None, Header(max_length=20)] = None) -> StreamingResponse:
+    """Follow a job: its state, what happens (`status`, `step`, `progress`, `points`, `log`), `end`; goes on after Last-Event-ID."""
+    job_id = found.job.id
+    # the stream may last for hours and reads with sessions of its own: this one's connection goes back now
+    db.close()
+    return StreamingResponse(stream.job_events(job_id, last_event_id), media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
+
+
+@router.post("/jobs/{job_id}/cancel", responses=problems(409))
+def cancel_job(found: CurrentJob, db: Db, caller: CurrentCaller) -> JobOut:
+    """Cancel a job: a waiting one ends at once, a running one within 2 s."""
+    job = service.cancel_job(db, found.participant, found.job, caller)
+    db.commit()
+    return job_out(job, found.participant)
+
+
+@router.post("/jobs/{job_id}/retry", status_code=202, responses=problems(409))
+def retry_job(found: CurrentJob, db: Db, caller: CurrentCaller) -> JobOut:
+    """Start a new job with the params of one that has ended."""
+    job = service.retry_job(db, found.participant, found.job, caller)
+    db.commit()
+    return job_out(job, found.participant)

@@ -1,0 +1,169 @@
+"""Background work of evaluation: the kinds `evaluate` and `pipeline` (snapshot, train, distil, fit, estimate, rank)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from app.evaluation import repository, service
+from app.evaluation.estimates import compute
+from app.evaluation.estimates.methods import AGGREGATE, METHOD_NAMES, METHOD_WEIGHTS, Method
+from app.evaluation.schemas import EvaluateParams
+from app.learning.models import BufferSnapshot
+from app.learning.policies.baselines import ensure_baselines
+from app.learning.schemas import DistilParams
+from app.learning.training.compute import read_buffer
+from app.learning.training.configs import training_groups
+from app.pipeline import learning
+from app.pipeline.schemas import PipelineParams
+from app.platform import files
+from app.platform.jobs import JobContext, Priority, job_kind
+
+FIT_WEIGHT = 15.0
+COVERAGE_STEP = "coverage"
+COVERAGE_WEIGHT = 1.0
+SKILL_STEP = "choose-method"
+SKILL_WEIGHT = 2.0
+_TORCH_FILE = "application/x-pytorch"
+
+
+def declare_evaluation(job: JobContext, params: EvaluateParams, *, fit: bool) -> None:
+    """Show the evaluation stage from the start."""
+    if fit:
+        _declare_fit(job, params)
+    job.step("choose-policies", "Choose policies and references", weight=learning.STORE_WEIGHT)
+    job.step(COVERAGE_STEP, "Check what the data can say about each policy", weight=COVERAGE_WEIGHT)
+    for method in _fitted(params):
+        job.step(f"estimate/{method}", f"Estimate every policy: {METHOD_NAMES[method]}", weight=METHOD_WEIGHTS[method])
+    job.step(SKILL_STEP, "Hold the methods against controllers that were left out", weight=SKILL_WEIGHT)
+    job.step("rank", "Store the estimates and rank", weight=learning.STORE_WEIGHT)
+
+
+def fit_calls(params: EvaluateParams, sha256: str) -> list[learning.Call]:
+    """Compute steps that fit the DLSM ensemble, one member each; none where the DLSM is not asked for."""
+    common = {"snapshot_sha256": sha256, "preset": params.preset, "seed": params.seed}
+    return [(f"fit/{k}", "fit_dlsm", common | {"member": k}) for k in range(_members(params))]
+
+
+def store_members(job: JobContext, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Keep the ensemble's files; `{"members": [hashes]}` or `{"failed": reason}`."""
+
+    def store(db: Session) -> dict[str, Any]:
+        reasons = [r["failed"] for r in results if "failed" in r]
+        if reasons:
+            return {"failed": reasons[0]}
+        contents = [(job.workdir(f"fit/{k}") / compute.member_file(k)).read_bytes() for k in range(len(results))]
+        return {"members": [files.store(db, content, _TORCH_FILE).sha256 for content in contents]}
+
+    return job.transact("store-models", store)
+
+
+def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, Any], models: dict[str, Any]) -> dict[str, Any]:
+    """Check coverage, estimate candidates and references by every method, choose the default one by left-out controllers, rank."""
+
+    def choose(db: Session) -> dict[str, Any]:
+        row = db.get_one(BufferSnapshot, snapshot["id"])
+        candidates = service.policies_to_rank(db, row.participant_id, params)
+        buffer = read_buffer(row.file_sha256)
+        references = ensure_baselines(db, learning.participant_of(db, job), row, buffer, job.created_by)
+        ran = repository.policies_by_id(db, sorted({s.policy_id for s in buffer.sessions if s.policy_id is not None}))
+        return {
+            "candidates": [p.id for p in candidates],
+            "ran": [{"id": p.id, "sha256": p.onnx_sha256} for p in ran.values()],
+            "policies": [{"id": p.id, "sha256": p.onnx_sha256} for p in (*candidates, *references)],
+            "horizon_steps": params.horizon_steps or row.median_steps,
+        }
+
+    chosen = job.transact("choose-policies", choose)
+    common = {
+        "snapshot_sha256": snapshot["sha256"],
+        "preset": params.preset,
+        "seed": params.seed,
+        "horizon_steps": chosen["horizon_steps"],
+        "policies": chosen["policies"],
+    }
+    methods = _fitted(params)
+    calls: list[learning.Call] = [(COVERAGE_STEP, "check_coverage", common)]
+    calls += [
+        (f"estimate/{method}", "evaluate_method", common | {"method": method} | (models if method == "dlsm" else {})) for method in methods
+    ]
+    calls.append((SKILL_STEP, "choose_method", common | {"methods": params.methods, "policies": chosen["ran"]}))
+    coverage, *estimates, skill = job.compute_all(calls)
+    results = dict(zip(methods, estimates, strict=True))
+
+    def store(db: Session) -> dict[str, Any]:
+        row = service.store_evaluation(
+            db,
+            job_id=job.id,
+            created_by=job.created_by,
+            snapshot=db.get_one(BufferSnapshot, snapshot["id"]),
+            horizon_steps=chosen["horizon_steps"],
+            candidates=chosen["candidates"],
+            results=results,
+            config=params.model_dump(mode="json") | {"dlsm_members": models.get("members", [])},
+            skill=skill,
+            coverage=coverage,
+        )
+        return {"evaluation_id": row.id, "default_method": row.default_method}
+
+    return job.transact("rank", store)
+
+
+@job_kind("evaluate", title="Evaluate and rank policies", params_schema=EvaluateParams)
+def run_evaluate(job: JobContext) -> dict[str, Any]:
+    """Estimate the named policies, or all, on a fresh snapshot."""
+    params = EvaluateParams.model_validate(job.params)
+    job.step("plan", "Take a buffer snapshot", weight=learning.STORE_WEIGHT)
+    declare_evaluation(job, params, fit=True)
+
+    def plan(db: Session) -> dict[str, Any]:
+        return {"snapshot": learning.snapshot_facts(learning.take_snapshot(job, db))}
+
+    snapshot = job.transact("plan", plan)["snapshot"]
+    models = store_members(job, job.compute_all(fit_calls(params, snapshot["sha256"])))
+    return {"snapshot_id": snapshot["id"]} | evaluate_all(job, params, snapshot, models)
+
+
+@job_kind("pipeline", title="Between-visit pipeline", params_schema=PipelineParams, priority=Priority.NORMAL)
+def run_pipeline(job: JobContext) -> dict[str, Any]:
+    """Everything between two visits: snapshot, train, distil, fit the DLSM, estimate, rank. Training and fitting run side by side."""
+    params = PipelineParams.model_validate(job.params)
+    training, distillation, evaluation = params.training(), params.distillation(), params.evaluation()
+    job.step("plan", "Take a buffer snapshot", weight=learning.STORE_WEIGHT)
+    learning.declare_training(job, training)
+    _declare_fit(job, evaluation)
+    learning.declare_distillation(job, len(params.policies) or params.count)
+    declare_evaluation(job, evaluation, fit=False)
+
+    def plan(db: Session) -> dict[str, Any]:
+        snapshot = learning.take_snapshot(job, db)
+        starts = learning.training_starts(db, snapshot.participant_id, training)
+        return {"snapshot": learning.snapshot_facts(snapshot), "starts": starts}
+
+    planned = job.transact("plan", plan)
+    snapshot, starts = planned["snapshot"], planned["starts"]
+    groups = training_groups(training, starts)
+    trainings = learning.training_calls(training, snapshot["sha256"], groups)
+    results = job.compute_all([*trainings, *fit_calls(evaluation, snapshot["sha256"])])
+    policies = learning.store_trained(job, training, snapshot["id"], groups, results[: len(trainings)])
+    models = store_members(job, results[len(trainings) :])
+    students = learning.distil_all(job, DistilParams.model_validate(distillation), snapshot, policies)
+    outcome = evaluate_all(job, evaluation, snapshot, models)
+    return {"snapshot_id": snapshot["id"], "policy_ids": [p["id"] for p in (*policies, *students)]} | outcome
+
+
+def _declare_fit(job: JobContext, params: EvaluateParams) -> None:
+    for k in range(_members(params)):
+        job.step(f"fit/{k}", f"Fit the deep latent sequential model, member {k + 1}", weight=FIT_WEIGHT)
+    job.step("store-models", "Store the models", weight=learning.STORE_WEIGHT)
+
+
+def _fitted(params: EvaluateParams) -> list[Method]:
+    """Methods with a compute step: all but the combination, which is computed from their estimates."""
+    return [m for m in params.methods if m != AGGREGATE]
+
+
+def _members(params: EvaluateParams) -> int:
+    return compute.dlsm_members(params.preset, params.seed) if "dlsm" in params.methods else 0

@@ -1,0 +1,159 @@
+"""HTML pages of jobs: the jobs of a participant, one job."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
+from app.evaluation.estimates.methods import METHOD_NAMES, METHODS, QUICK_METHODS
+from app.evaluation.schemas import EvaluateParams
+from app.learning import repository as learning
+from app.learning.schemas import ALGORITHM_NAMES, AlgorithmName, DistilParams, TrainParams
+from app.learning.snapshots.service import not_ready
+from app.pipeline import charts, service
+from app.pipeline.deps import CurrentJob
+from app.pipeline.schemas import PipelineParams
+from app.platform.database import Db
+from app.platform.errors import BetaloopError, Invalid
+from app.platform.jobs import repository as jobs
+from app.platform.jobs import service as job_service
+from app.platform.jobs.models import JobStatus
+from app.platform.web.forms import FormValues, parse
+from app.platform.web.schemas import Model, PagingQuery
+from app.platform.web.templates import render
+from app.study.deps import CurrentParticipant
+from app.study.models import Participant
+from app.study.service import may
+
+router = APIRouter()
+
+KINDS: dict[str, tuple[str, type[Model]]] = {
+    "pipeline": ("Between-visit pipeline", PipelineParams),
+    "evaluate": ("Evaluate and rank policies", EvaluateParams),
+    "train": ("Train policies", TrainParams),
+    "distill": ("Distil policies", DistilParams),
+}
+
+
+TRAINABLE = [(name, ALGORITHM_NAMES[name]) for name in get_args(AlgorithmName)]
+
+
+SHOWN_EVENTS = 20_000
+
+
+LOG_LINES = 200
+
+
+REFRESH_S = 4
+
+
+@router.get("/participants/{code}/jobs")
+def jobs_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
+    """Jobs of a participant, and the form to start one."""
+    return _jobs(request, participant, db, caller, paging.limit, paging.offset)
+
+
+@router.post("/participants/{code}/jobs")
+def start_job(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Start a job from the form; empty fields take the preset's value."""
+    given: dict[str, Any] = {name: str(v) for name, v in values.items() if str(v).strip()}
+    given["algorithms"] = [str(v) for v in values.getlist("algorithms")] or ["ddpg"]
+    if methods := [str(v) for v in values.getlist("methods")]:
+        given["methods"] = methods
+    try:
+        if given.get("kind") not in KINDS:
+            raise Invalid("The form names no kind of job.", f"Choose one of {', '.join(KINDS)}.")
+        params = parse(KINDS[given["kind"]][1], given).model_dump(mode="json")
+        job = service.start_job(db, participant, given["kind"], params, caller)
+        db.commit()
+    except BetaloopError as error:
+        db.rollback()
+        return _jobs(request, participant, db, caller, 50, 0, error.problem(request.url.path), given, error.status)
+    return RedirectResponse(f"/jobs/{job.id}?done=started", 303)
+
+
+@router.get("/jobs/{job_id}")
+def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """One job: progress, learning curves, log."""
+    events = jobs.events_after(db, found.job.id, 0, SHOWN_EVENTS)
+    page = render(
+        request,
+        "pipeline/job.html",
+        participant=found.participant,
+        job=found.job,
+        title=KINDS[found.job.kind][0] if found.job.kind in KINDS else found.job.kind,
+        live=not JobStatus(found.job.status).ended,
+        curves=charts.job_curves(found.job, [e for e in events if e.kind == "points"]),
+        log=[e for e in events if e.kind == "log"][-LOG_LINES:],
+        params=_in_words({k: v for k, v in found.job.params.items() if v not in (None, [])}),
+        refresh_s=REFRESH_S,
+        workers=len(jobs.live_workers(db, job_service.STALE_S)),
+        may_run=may(caller, can.RUN_JOBS, found.participant),
+    )
+    return HTMLResponse(page)
+
+
+@router.post("/jobs/{job_id}/cancel")
+def cancel_job(found: CurrentJob, db: Db, caller: CurrentCaller) -> Response:
+    """Cancel a job."""
+    service.cancel_job(db, found.participant, found.job, caller)
+    db.commit()
+    return RedirectResponse(f"/jobs/{found.job.id}?done=cancelled", 303)
+
+
+@router.post("/jobs/{job_id}/retry")
+def retry_job(found: CurrentJob, db: Db, caller: CurrentCaller) -> Response:
+    """Start the same job again."""
+    job = service.retry_job(db, found.participant, found.job, caller)
+    db.commit()
+    return RedirectResponse(f"/jobs/{job.id}?done=started", 303)
+
+
+def _jobs(
+    request: Request,
+    participant: Participant,
+    db: Session,
+    caller: Caller,
+    limit: int,
+    offset: int,
+    problem: dict[str, Any] | None = None,
+    given: dict[str, Any] | None = None,
+    status: int = 200,
+) -> HTMLResponse:
+    rows, total = jobs.find(db, participant.id, limit=limit, offset=offset)
+    blocked = not_ready(db, participant)
+    page = render(
+        request,
+        "pipeline/jobs.html",
+        participant=participant,
+        jobs=rows,
+        total=total,
+        limit=limit,
+        offset=offset,
+        kinds=[(kind, title) for kind, (title, _) in KINDS.items()],
+        titles={kind: title for kind, (title, _) in KINDS.items()},
+        live=any(not JobStatus(j.status).ended for j in rows),
+        refresh_s=REFRESH_S,
+        problem=problem or (blocked.problem(request.url.path) if blocked else None),
+        given=given or {},
+        algorithms=TRAINABLE,
+        given_algorithms=(given or {}).get("algorithms", ["ddpg"]),
+        methods=[(m, METHOD_NAMES[m], m in QUICK_METHODS) for m in METHODS],
+        given_methods=(given or {}).get("methods", []),
+        workers=len(jobs.live_workers(db, job_service.STALE_S)),
+        trained=[p for p in learning.candidates(db, participant.id) if p.kind == "trained"],
+        may_run=may(caller, can.RUN_JOBS, participant),
+    )
+    return HTMLResponse(page, status)
+
+
+def _in_words(params: dict[str, Any]) -> dict[str, Any]:
+    """What was asked for, with methods and algorithms by their names."""
+    names = {"methods": METHOD_NAMES, "algorithms": ALGORITHM_NAMES}
+    return {k: [str(names[k].get(one, one)) for one in v] if k in names else v for k, v in params.items()}

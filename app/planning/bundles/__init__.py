@@ -1,0 +1,1 @@
+"""Controller bundles: a policy within stated limits, approved and signed, for the tablet."""

@@ -1,0 +1,50 @@
+"""REST routes of controller bundles."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Response
+from fastapi.responses import PlainTextResponse
+
+from app.accounts.deps import CurrentCaller
+from app.learning.deps import CurrentPolicy
+from app.planning.bundles import service as bundles
+from app.platform.database import Db
+from app.platform.web.schemas import problems
+from app.study.models import Hemisphere, Participant
+
+router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
+
+Milliamperes = Annotated[float | None, Query(ge=0, le=25.5, allow_inf_nan=False)]
+
+
+@router.get(
+    "/policies/{policy_id}/bundle",
+    response_class=Response,
+    responses={200: {"content": {"application/zip": {}}, "description": "The controller bundle."}},
+)
+def read_bundle(
+    policy: CurrentPolicy,
+    db: Db,
+    caller: CurrentCaller,
+    min_ma: Annotated[Milliamperes, Query(description="Lowest amplitude, mA; the stimulator's own limit, or 0, where not given.")] = None,
+    max_ma: Annotated[Milliamperes, Query(description="Highest amplitude, mA; the cDBS amplitude where not given.")] = None,
+    ramp_ma_per_s: Annotated[float | None, Query(gt=0, le=100, allow_inf_nan=False, description="Fastest change, mA/s.")] = None,
+    hemisphere: Annotated[Hemisphere | None, Query(description="Needed where a visit states several cDBS amplitudes.")] = None,
+) -> Response:
+    """The signed controller bundle as a ZIP: network, C header, reference runner, test vectors, the clinician's limits, a sheet.
+
+    Each is stored as it left, and the audit trail says who took it, for whom and within which limits.
+    """
+    participant = db.get_one(Participant, policy.participant_id)
+    content = bundles.bundle(db, participant, policy, bundles.Limits(min_ma, max_ma, ramp_ma_per_s), hemisphere, caller)
+    db.commit()
+    name = f"{participant.code}-policy-{policy.id}.zip"
+    return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+@router.get("/bundle-key", response_class=PlainTextResponse)
+def read_bundle_key(caller: CurrentCaller) -> str:
+    """The public key that this installation's bundles are signed with: 64 hexadecimal digits. Give it to a tablet once."""
+    return bundles.public_key() + "\n"

@@ -1,0 +1,102 @@
+"""The page of a policy's controller bundle: what it would hold and say, and the form to take it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, Response
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy.orm import Session
+
+from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
+from app.learning.deps import CurrentPolicy
+from app.learning.models import Policy
+from app.planning.bundles import service as bundles
+from app.platform.database import Db
+from app.platform.errors import BetaloopError, Invalid, NotFound
+from app.platform.web.forms import FormValues, parse
+from app.platform.web.templates import render
+from app.study.deps import CurrentParticipant
+from app.study.models import Hemisphere, Participant
+from ml.deploy.appraisal import battery_words, warnings
+
+router = APIRouter()
+
+LABELS = {"min_ma": "Lowest amplitude", "max_ma": "Highest amplitude", "ramp_ma_per_s": "Fastest change", "hemisphere": "Hemisphere"}
+
+
+class StatedLimits(BaseModel):
+    """The form: the clinician's limits, mA and mA/s."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    min_ma: float = Field(ge=0, le=25.5, allow_inf_nan=False)
+    max_ma: float = Field(ge=0, le=25.5, allow_inf_nan=False)
+    ramp_ma_per_s: float = Field(gt=0, le=100, allow_inf_nan=False)
+    hemisphere: Hemisphere | None = None
+
+
+@router.get("/participants/{code}/policies/{policy_id}/bundle")
+def bundle_page(request: Request, participant: CurrentParticipant, policy: CurrentPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """What the bundle would hold under the default limits."""
+    return _page(request, participant, policy, db, caller)
+
+
+@router.post("/participants/{code}/policies/{policy_id}/bundle")
+def take_bundle(
+    request: Request, participant: CurrentParticipant, policy: CurrentPolicy, db: Db, caller: CurrentCaller, values: FormValues
+) -> Response:
+    """The signed ZIP under the limits of the form; the page again, with what was typed, where they cannot be used."""
+    typed = {name: str(values.get(name, "")) for name in LABELS}
+    try:
+        stated = parse(StatedLimits, typed, LABELS)
+        limits = bundles.Limits(stated.min_ma, stated.max_ma, stated.ramp_ma_per_s)
+        content = bundles.bundle(db, participant, policy, limits, stated.hemisphere, caller)
+        db.commit()
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, participant, policy, db, caller, error, typed)
+    name = f"{participant.code}-policy-{policy.id}.zip"
+    return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+def _page(
+    request: Request,
+    participant: Participant,
+    policy: Policy,
+    db: Session,
+    caller: Caller,
+    error: BetaloopError | None = None,
+    typed: Mapping[str, str] | None = None,
+) -> HTMLResponse:
+    if policy.participant_id != participant.id:
+        raise NotFound("There is no such policy of this participant.", "Choose one from the participant's policies.")
+    sides = sorted({Hemisphere(a.hemisphere) for visit in participant.visits for a in visit.cdbs_amplitudes})
+    facts: dict[str, Any] = {"manifest": None, "warnings": [], "energy": None, "unmade": None}
+    try:
+        wished = (typed or {}).get("hemisphere")
+        side = next((side for side in sides if side == wished), sides[0] if sides else None)
+        m = bundles.preview(db, participant, policy, bundles.Limits(), side, caller)
+        energy = None if m.energy_of_cdbs is None or m.charge_of_cdbs is None else battery_words(m.energy_of_cdbs, m.charge_of_cdbs)
+        shown = {"min_ma": f"{m.min_ma:g}", "max_ma": f"{m.max_ma:g}", "ramp_ma_per_s": f"{m.ramp_ma_per_s:.4g}"}
+        facts |= {"manifest": m, "warnings": warnings(m), "energy": energy, "shown": shown | {"hemisphere": m.hemisphere or ""}}
+    except Invalid as reason:
+        facts["unmade"] = reason.problem(request.url.path)
+    page = render(
+        request,
+        "planning/bundle.html",
+        participant=participant,
+        policy=policy,
+        typed=typed,
+        sides=sides,
+        device=bundles.device_limits(db, participant, None),
+        taken=bundles.taken(db, participant, policy),
+        may_state=bundles.may_state(participant, caller),
+        key=bundles.public_key(),
+        problem=error.problem(request.url.path) if error else None,
+        **facts,
+    )
+    return HTMLResponse(page, error.status if error else 200)

@@ -1,0 +1,1 @@
+"""Visit plans: drafted from a ranking, approved by a clinician, printed."""

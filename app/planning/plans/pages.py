@@ -1,0 +1,185 @@
+"""HTML pages of visit plans."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Sequence
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from pydantic import Field
+from sqlalchemy.orm import Session
+from starlette.datastructures import FormData
+
+from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
+from app.evaluation.ranking.service import current_ranking
+from app.evaluation.schemas import METHOD_NAMES, RankingOut
+from app.learning import repository as learning
+from app.planning.plans import repository, service
+from app.planning.plans.schedule import most_policies, total_minutes
+from app.planning.plans.schemas import Id, PlanIn, PlanOptions
+from app.planning.plans.service import PlanView, rules_of
+from app.platform.database import Db
+from app.platform.errors import BetaloopError, Invalid, NotFound
+from app.platform.web.forms import FormValues, parse
+from app.platform.web.schemas import Int, Model, PagingQuery
+from app.platform.web.templates import render
+from app.study.deps import CurrentParticipant, CurrentVisit
+from app.study.models import Participant, Visit
+
+router = APIRouter()
+
+EARLY_RANDOM_SESSIONS = 3
+"""What the form offers while a participant has no policy: with a cDBS session first, an hour."""
+
+LABELS = {
+    "minutes_per_session": "Minutes per session",
+    "total_minutes": "Minutes of the visit",
+    "washout_minutes": "Washout",
+    "random_sessions": "Random sessions",
+    "note": "Note on the sheet",
+    "reason": "Why the approved plan is replaced",
+    "visit_id": "Visit",
+    "visit_number": "Number of the new visit",
+    "visit_date": "Date of the new visit",
+}
+
+
+class VisitChoice(Model):
+    """Which visit a draft is for; with neither id nor number the first open visit or a new one with the next number."""
+
+    visit_id: Id | None = None
+    visit_number: Int | None = Field(None, ge=1, le=10_000)
+    visit_date: dt.date | None = None
+
+
+@router.get("/visits/{visit_id}/plan")
+def plan(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """The visit day to scale, its sessions, approval, and the form for a new draft."""
+    return HTMLResponse(_page(request, db, visit, caller))
+
+
+@router.post("/visits/{visit_id}/plan")
+def draft(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Draft the visit from the form."""
+    try:
+        service.draft_plan(db, visit, _draft(values), caller)
+        db.commit()
+    except BetaloopError as error:
+        db.rollback()
+        return HTMLResponse(_page(request, db, visit, caller, error, values), error.status)
+    return RedirectResponse(f"/visits/{visit.id}/plan?done=drafted", 303)
+
+
+@router.post("/visits/{visit_id}/plan/approve")
+def approve(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Approve the draft that the page showed."""
+    try:
+        shown = str(values.get("plan_id", ""))
+        service.approve_plan(db, visit, caller, int(shown) if shown.isdecimal() else None)
+        db.commit()
+    except BetaloopError as error:
+        db.rollback()
+        return HTMLResponse(_page(request, db, visit, caller, error), error.status)
+    return RedirectResponse(f"/visits/{visit.id}/plan?done=approved", 303)
+
+
+@router.get("/participants/{code}/plans")
+def plans(request: Request, participant: CurrentParticipant, db: Db, paging: PagingQuery) -> HTMLResponse:
+    """All plans of a participant, and the visits that may still be planned."""
+    rows, total = repository.plans(db, participant.id, paging.limit, paging.offset)
+    page = render(
+        request,
+        "planning/plans.html",
+        participant=participant,
+        rows=rows,
+        total=total,
+        paging=paging,
+        open_visits=repository.open_visits(db, participant.id, service.today()),
+        next_number=repository.next_visit_number(db, participant.id),
+    )
+    return HTMLResponse(page)
+
+
+@router.post("/participants/{code}/plan/draft")
+def draft_from_ranking(participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Draft a visit from the policies ticked in the ranking; the visit is an open one or a new one."""
+    wanted, plan_in = parse(VisitChoice, {k: "" if v == "new" else v for k, v in values.items()}, LABELS), _draft(values)
+    visit = service.visit_for_draft(db, participant, wanted.visit_id, wanted.visit_number, wanted.visit_date, caller)
+    service.draft_plan(db, visit, plan_in, caller)
+    db.commit()
+    return RedirectResponse(f"/visits/{visit.id}/plan?done=drafted", 303)
+
+
+def _draft(values: FormData) -> PlanIn:
+    """The form as the API's type."""
+    ids = [str(v) for v in values.getlist("policy_ids")]
+    wrong = [i for i in ids if not (i.isdecimal() and 0 < int(i) < 2**31)]
+    if wrong:
+        raise Invalid(f"'{wrong[0]}' is no policy.", "Choose policies of the list.")
+    if len(ids) > 20:
+        raise Invalid(f"{len(ids)} policies are chosen; a visit takes 20 at most.", "Tick fewer.")
+    options = parse(PlanOptions, values, LABELS)
+    return PlanIn(policy_ids=[int(i) for i in ids], **options.model_dump(exclude_unset=True))
+
+
+def _page(
+    request: Request, db: Session, visit: Visit, caller: Caller, error: BetaloopError | None = None, values: FormData | None = None
+) -> str:
+    participant = visit.participant
+    try:
+        view: PlanView | None = service.read_plan(db, visit, caller)
+    except NotFound:
+        view = None
+    try:
+        ranking: RankingOut | None = current_ranking(db, participant, caller)
+    except NotFound:
+        ranking = None
+    defaults = rules_of(PlanOptions())
+    choices = _choices(db, participant, ranking)
+    form = _form_values(view, values, choices)
+    return render(
+        request,
+        "planning/plan.html",
+        visit=visit,
+        participant=participant,
+        site=participant.site,
+        view=view,
+        ranking=ranking,
+        method=METHOD_NAMES.get(ranking.default_method, ranking.default_method) if ranking else "",
+        plan_method=METHOD_NAMES.get(view.evaluation.default_method, view.evaluation.default_method) if view and view.evaluation else "",
+        choices=choices,
+        form_values=form,
+        chosen=_chosen(view, values),
+        problem=error.problem(request.url.path) if error else None,
+        fit=[(n, total_minutes(n, defaults)) for n in range(1, most_policies(defaults) + 1)],
+        defaults=defaults,
+    )
+
+
+def _choices(db: Session, participant: Participant, ranking: RankingOut | None) -> list[dict[str, Any]]:
+    """Policies that may be planned, best first; those that no ranking holds come last."""
+    ranked = {p.policy_id: p for p in ranking.policies} if ranking else {}
+    places = {i: p.rank for i, p in ranked.items() if p.rank is not None}
+    policies = sorted(learning.candidates(db, participant.id), key=lambda p: (places.get(p.id, len(places) + 1), p.id))
+    return [{"policy": p, "ranked": ranked.get(p.id)} for p in policies]
+
+
+def _chosen(view: PlanView | None, values: FormData | None) -> Sequence[int]:
+    if values is not None:
+        return [int(v) for v in map(str, values.getlist("policy_ids")) if v.isdecimal()]
+    return [line.item.policy_id for line in view.lines if line.item.policy_id] if view else []
+
+
+def _form_values(view: PlanView | None, values: FormData | None, choices: Sequence[Any]) -> dict[str, Any]:
+    """What the form shows: what was sent, else the present plan's note, else the defaults."""
+    shown: dict[str, Any] = {k: f"{v:g}" if isinstance(v, float) else v for k, v in PlanOptions().model_dump().items()}
+    if view:
+        shown["note"] = view.plan.note
+    elif not choices:
+        shown["random_sessions"] = EARLY_RANDOM_SESSIONS
+    if values is not None:
+        shown |= {name: str(values[name]) for name in shown if name in values} | {"no_dbs": "no_dbs" in values}
+    return shown

@@ -1,0 +1,64 @@
+"""Every query of visit plans. Visits and policies reach this room already scoped to what the caller may see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import date
+
+from sqlalchemy import exists, func, or_, select
+from sqlalchemy.orm import Session, selectinload
+
+from app.evaluation.models import Evaluation
+from app.planning.plans.models import Plan
+from app.study.models import StudySession, Visit
+from app.study.repository import CONFIRMED, count
+
+
+def live_plan(db: Session, visit_id: int) -> Plan | None:
+    """The visit's plan that is not superseded, with its items."""
+    return db.scalar(select(Plan).where(Plan.visit_id == visit_id, Plan.status != "superseded").options(selectinload(Plan.items)))
+
+
+def plans(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[tuple[Plan, Visit]], int]:
+    """A page of a participant's plans with their visits, newest visit and newest plan first."""
+    query = select(Plan, Visit).join(Visit, Visit.id == Plan.visit_id).where(Visit.participant_id == participant_id)
+    rows = db.execute(
+        query.order_by(Visit.number.desc(), Plan.id.desc()).limit(limit).offset(offset).options(selectinload(Plan.items))
+    ).all()
+    return [(row[0], row[1]) for row in rows], count(db, select(Plan.id).join(Visit).where(Visit.participant_id == participant_id))
+
+
+def lock_visit(db: Session, visit_id: int) -> None:
+    """Let one transaction at a time change the plan of a visit."""
+    db.execute(select(Visit.id).where(Visit.id == visit_id).with_for_update())
+
+
+def session_count(db: Session, visit_id: int) -> int:
+    """Confirmed sessions that a visit already has."""
+    return db.scalar(select(func.count()).select_from(StudySession).where(StudySession.visit_id == visit_id, CONFIRMED)) or 0
+
+
+def open_visits(db: Session, participant_id: int, today: date) -> Sequence[Visit]:
+    """Visits that may still be planned: without a confirmed session, today or later or without a date; by number."""
+    return db.scalars(
+        select(Visit)
+        .where(Visit.participant_id == participant_id, or_(Visit.date.is_(None), Visit.date >= today))
+        .where(~exists().where(StudySession.visit_id == Visit.id, CONFIRMED))
+        .order_by(Visit.number)
+    ).all()
+
+
+def visits_with_approved_plan(db: Session, participant_id: int) -> set[int]:
+    """Ids of the visits whose plan is approved."""
+    query = select(Plan.visit_id).join(Visit, Visit.id == Plan.visit_id)
+    return set(db.scalars(query.where(Visit.participant_id == participant_id, Plan.status == "approved")))
+
+
+def next_visit_number(db: Session, participant_id: int) -> int:
+    """The number after the participant's last visit."""
+    return (db.scalar(select(func.max(Visit.number)).where(Visit.participant_id == participant_id)) or 0) + 1
+
+
+def evaluation(db: Session, evaluation_id: int) -> Evaluation:
+    """An evaluation that a plan pins, with its estimates."""
+    return db.get_one(Evaluation, evaluation_id, options=[selectinload(Evaluation.estimates)])

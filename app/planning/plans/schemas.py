@@ -1,0 +1,103 @@
+"""API types of visit plans."""
+
+from __future__ import annotations
+
+import datetime as dt
+from datetime import datetime
+from typing import Annotated
+
+from pydantic import Field
+
+from app.platform.web.schemas import Bool, Int, Model, Number, Text
+from app.study.models import Controller
+
+Id = Annotated[Int, Field(ge=1)]
+
+
+class PlanOptions(Model):
+    """How a visit day shall be laid out; what is left out takes the default."""
+
+    minutes_per_session: Number = Field(10.0, ge=5, le=20, description="Length of every session but no-DBS, minutes.")
+    total_minutes: Number = Field(120.0, gt=0, le=1440, description="From the first session's start to the last one's end, at most.")
+    washout_minutes: Number = Field(5.0, ge=0, le=120, description="Pause on the clinical stimulation after each session but the last.")
+    no_dbs: Bool = Field(False, description="One session without stimulation, 5 minutes, at the end.")
+    random_sessions: Int = Field(0, ge=0, le=10, description="Sessions of the random controller.")
+    seed: Int | None = Field(None, ge=0, description="Draws the order; without one it is drawn too, and recorded.")
+    evaluation_id: Id | None = Field(None, description="Ranking that the choice rests on; the participant's newest where not given.")
+    note: Text = Field("", max_length=4000)
+    reason: Text | None = Field(
+        None, max_length=1000, description="Why an approved plan is replaced; needed then, kept in the audit trail."
+    )
+
+
+class PlanIn(PlanOptions):
+    """A plan to draft."""
+
+    policy_ids: list[Id] = Field(
+        default_factory=list, max_length=20, description="Policies to test, each in one session; none for a visit of random sessions alone."
+    )
+
+
+class Approval(Model):
+    """Which draft is approved; a guard against approving one that somebody replaced meanwhile."""
+
+    plan_id: Id | None = None
+
+
+class PlanEstimateOut(Model):
+    """What the pinned ranking said about a policy."""
+
+    method: str
+    value: float
+    low: float
+    high: float
+    level: float
+    supported: bool
+    flags: list[str]
+
+
+class PlannedSessionOut(Model):
+    """One session of a plan."""
+
+    position: int
+    start_minute: float = Field(description="From the first session's start.")
+    controller: Controller
+    policy_id: int | None
+    policy: str | None
+    minutes: float
+    washout_minutes: float
+    estimate: PlanEstimateOut | None
+    predicted_energy: float | None = Field(description="Mean squared amplitude fraction; cDBS = 1.")
+
+
+class PlanEvaluationOut(Model):
+    """The ranking that a plan rests on."""
+
+    id: int
+    created_at: datetime
+    method: str
+    horizon_steps: int
+    gamma: float
+    snapshot_id: int
+
+
+class PlanOut(Model):
+    """The plan of a visit."""
+
+    id: int
+    visit_id: int
+    visit: int
+    date: dt.date | None
+    participant: str
+    status: str = Field(description="draft, approved or superseded.")
+    seed: int
+    note: str
+    created_at: datetime
+    created_by: str
+    approved_at: datetime | None
+    approved_by: str | None
+    total_minutes: float
+    evaluation: PlanEvaluationOut | None
+    stale: bool = Field(description="The ranking no longer speaks about the study as it is.")
+    warnings: list[str]
+    sessions: list[PlannedSessionOut]

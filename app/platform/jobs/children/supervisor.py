@@ -1,0 +1,225 @@
+"""The worker's side of child processes: starts them, listens to them, watches their memory, kills them."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from app.platform.jobs.children.process import params_hash, stored_result, too_much_memory
+from app.platform.jobs.children.report import write_atomically
+from app.platform.jobs.context import Outcome
+from app.platform.jobs.registry import ComputeFunction
+
+LISTEN_S = 0.1
+"""Longest time between two looks at a child, and so the longest that it outlives a cancel."""
+REPORT_S = 0.5
+"""Least time between two reports to the database."""
+MEMORY_CHECK_S = 0.5
+LOG_TAIL = 6000
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+
+@dataclass(frozen=True)
+class Call:
+    """One call of a compute function."""
+
+    function: ComputeFunction
+    params: dict[str, Any]
+    workdir: Path
+    memory_mb: int
+
+    @property
+    def sha256(self) -> str:
+        """Hash of name and params."""
+        return params_hash(self.function.name, self.params)
+
+
+@dataclass
+class Heard:
+    """What a child said since the last report."""
+
+    progress: float | None = None
+    message: str | None = None
+    points: list[dict[str, Any]] | None = None
+    logs: list[str] | None = None
+
+    def add(self, line: str) -> None:
+        """Take in one line of the pipe."""
+        said = json.loads(line)
+        self.progress = said.get("progress", self.progress)
+        self.message = said.get("message", self.message)
+        if "points" in said:
+            self.points = (self.points or []) + said["points"]
+        if "log" in said:
+            self.logs = [*(self.logs or []), said["log"]]
+
+    def __bool__(self) -> bool:
+        return any(part is not None for part in (self.progress, self.message, self.points, self.logs))
+
+
+_Child = subprocess.Popen[bytes]
+_Order = tuple[Callable[[], _Child], Future[_Child]]
+
+
+class Nursery:
+    """Starts every child from one thread, because the kernel's parent-death signal fires when the starting *thread* ends."""
+
+    def __init__(self) -> None:
+        self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name="nursery", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the starting thread, and with it every child that is left."""
+        self._orders.put(None)
+        self._thread.join()
+
+    def run(self, call: Call, hear: Callable[[Heard], None], check: Callable[[], None]) -> Outcome:
+        """Run one call in a child process, or take the result that it left before a crash.
+
+        Args:
+            call: what to run, and where.
+            hear: takes what the child says, at most once per REPORT_S.
+            check: called every LISTEN_S; raises to have the child killed.
+
+        Returns:
+            The outcome; a failed one has the end of the child's log under `log`.
+        """
+        _prepare(call)
+        if (result := stored_result(call.workdir, call.sha256)) is not None:
+            return {"ok": True, "result": result}
+        log = call.workdir / "log.txt"
+        log_start = log.stat().st_size if log.exists() else 0
+        process, pipe = self._start(call, log)
+        try:
+            killed_for = _listen(process, pipe, call.memory_mb, hear, check)
+        finally:
+            os.close(pipe)
+            _kill(process)
+        outcome = _outcome(call, process.returncode, killed_for)
+        if not outcome["ok"]:
+            outcome["log"] = log.read_bytes()[log_start:][-LOG_TAIL:].decode(errors="replace")
+        return outcome
+
+    def _start(self, call: Call, log: Path) -> tuple[_Child, int]:
+        reader, writer = os.pipe()
+        env = os.environ | _ONE_THREAD
+        env |= {
+            "BETALOOP_REPORT_FD": str(writer),
+            "BETALOOP_WORKER_PID": str(os.getpid()),
+            "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+        }
+        command = [sys.executable, "-m", "app.platform.jobs.children.process", call.function.name, str(call.workdir.resolve())]
+        with log.open("ab") as out:
+
+            def start() -> _Child:
+                return subprocess.Popen(
+                    command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=env, pass_fds=(writer,), start_new_session=True
+                )
+
+            started: Future[_Child] = Future()
+            self._orders.put((start, started))
+            try:
+                return started.result(), reader
+            except BaseException:
+                os.close(reader)
+                raise
+            finally:
+                os.close(writer)
+
+    def _work(self) -> None:
+        while order := self._orders.get():
+            start, started = order
+            try:
+                started.set_result(start())
+            except OSError as error:
+                started.set_exception(error)
+
+
+def _prepare(call: Call) -> None:
+    """Make the folder ready; what another call left there (its checkpoints do not fit) is removed."""
+    params = call.workdir / "params.json"
+    if call.workdir.exists() and (not params.exists() or json.loads(params.read_bytes())["params_sha256"] != call.sha256):
+        shutil.rmtree(call.workdir)
+    call.workdir.mkdir(parents=True, exist_ok=True)
+    content = {"module": call.function.module, "params": call.params, "params_sha256": call.sha256, "memory_mb": call.memory_mb}
+    write_atomically(params, json.dumps(content, allow_nan=False).encode())
+    result = call.workdir / "result.json"
+    if result.exists() and stored_result(call.workdir, call.sha256) is None:
+        result.unlink()  # of a failed attempt
+
+
+def _listen(process: _Child, pipe: int, memory_mb: int, hear: Callable[[Heard], None], check: Callable[[], None]) -> str | None:
+    """Hear a child out; returns why it had to be killed, or None when it ended by itself."""
+    heard, rest, open_ = Heard(), b"", True
+    reported = measured = time.monotonic()
+    while open_ or process.poll() is None:
+        check()
+        if open_ and select.select([pipe], [], [], LISTEN_S)[0]:
+            chunk = os.read(pipe, 1 << 16)
+            open_ = bool(chunk)
+            *lines, rest = (rest + chunk).split(b"\n")
+            for line in lines:
+                heard.add(line.decode())
+        elif not open_:
+            time.sleep(0.01)
+        present = time.monotonic()
+        if heard and present - reported >= REPORT_S:
+            hear(heard)
+            heard, reported = Heard(), present
+        if present - measured >= MEMORY_CHECK_S:
+            measured = present
+            if _resident_mb(process.pid) > memory_mb:
+                return too_much_memory(memory_mb)
+        if process.poll() is not None and not select.select([pipe], [], [], 0)[0]:
+            break  # a grandchild may hold the pipe open
+    if heard:
+        hear(heard)
+    return None
+
+
+def _resident_mb(pid: int) -> float:
+    try:
+        return float(psutil.Process(pid).memory_info().rss) / (1 << 20)
+    except psutil.NoSuchProcess:
+        return 0.0
+
+
+def _kill(process: _Child) -> None:
+    if process.poll() is None:
+        try:
+            os.killpg(process.pid, signal.SIGKILL)  # its own session: its children go too
+        except ProcessLookupError:
+            process.kill()
+    process.wait()
+
+
+def _outcome(call: Call, returncode: int, killed_for: str | None) -> Outcome:
+    if killed_for:
+        return {"ok": False, "message": killed_for}
+    try:
+        stored: dict[str, Any] = json.loads((call.workdir / "result.json").read_bytes())
+    except FileNotFoundError:
+        if returncode < 0:
+            name = signal.Signals(-returncode).name
+            why = "most likely because the machine ran out of memory" if name == "SIGKILL" else "see the step's log"
+            return {"ok": False, "message": f"The step's process was killed from outside ({name}), {why}."}
+        return {"ok": False, "message": f"The step's process ended with exit code {returncode} and without a result; see the step's log."}
+    if stored["ok"]:
+        return {"ok": True, "result": stored["result"]}
+    return {"ok": False, "message": stored["message"]}

@@ -1,0 +1,1 @@
+"""What every request and page shares: middleware, API types, forms, templates, charts, static files."""

@@ -1,0 +1,123 @@
+"""What every request passes: request id, security headers, cross-site check, one place for errors."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import time
+from typing import Any
+from urllib.parse import quote, urlsplit
+
+import structlog
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse
+from prometheus_client import Counter, Histogram
+from starlette.exceptions import HTTPException
+from starlette.middleware.base import RequestResponseEndpoint
+
+from app.platform.errors import BetaloopError, Forbidden, Unauthorized
+from app.platform.web.body_limit import BodyLimit
+from app.platform.web.templates import render
+
+log = structlog.get_logger()
+
+CONTENT_SECURITY_POLICY = (
+    "default-src 'self'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; connect-src 'self'; "
+    "form-action 'self'; frame-ancestors 'none'; base-uri 'none'; object-src 'none'"
+)
+_SAFE = {"GET", "HEAD", "OPTIONS"}
+_requests = Counter("betaloop_requests_total", "Requests by method, route and status.", ["method", "route", "status"])
+_seconds = Histogram("betaloop_request_seconds", "Time to answer by route.", ["route"])
+
+
+def install(app: FastAPI) -> None:
+    """Add middleware and error handlers to the service."""
+    app.middleware("http")(_around)
+    app.add_middleware(BodyLimit)
+    app.add_exception_handler(BetaloopError, _known_error)
+    app.add_exception_handler(RequestValidationError, _bad_input)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(Exception, _unknown_error)
+
+
+async def _around(request: Request, call_next: RequestResponseEndpoint) -> Response:
+    request.state.request_id = secrets.token_hex(8)
+    started = time.perf_counter()
+    refused = _cross_site(request)
+    response = _answer(request, refused) if refused else await call_next(request)
+    route = getattr(request.scope.get("route"), "path", "none")
+    _requests.labels(request.method, route, response.status_code).inc()
+    _seconds.labels(route).observe(time.perf_counter() - started)
+    response.headers["X-Request-ID"] = request.state.request_id
+    response.headers["Content-Security-Policy"] = CONTENT_SECURITY_POLICY
+    response.headers["X-Content-Type-Options"] = "nosniff"
+    response.headers["Referrer-Policy"] = "same-origin"
+    if not request.url.path.startswith("/static/"):
+        response.headers.setdefault("Cache-Control", "no-store")
+    return response
+
+
+def _cross_site(request: Request) -> BetaloopError | None:
+    """A browser tells where a request comes from; what changes data must come from our own pages. Tokens are not sent by browsers."""
+    if request.method in _SAFE or "authorization" in request.headers:
+        return None
+    site, origin = request.headers.get("sec-fetch-site"), request.headers.get("origin")
+    if site in ("same-origin", "none") or (site is None and origin is None):
+        return None
+    if site is None and origin is not None and urlsplit(origin).netloc == request.headers.get("host"):
+        return None
+    return Forbidden("This request came from another site.", "Open the page from betaloop itself and try again.")
+
+
+def wants_page(request: Request) -> bool:
+    """Whether a person at a browser page asks, not a program."""
+    return not request.url.path.startswith("/api/") and "text/html" in request.headers.get("accept", "")
+
+
+def _answer(request: Request, error: BetaloopError) -> Response:
+    body = error.problem(request.url.path) | {"request_id": getattr(request.state, "request_id", None)}
+    if not wants_page(request):
+        headers = {"WWW-Authenticate": "Bearer"} if error.status == 401 else {}
+        return JSONResponse(json.loads(json.dumps(body, default=str)), error.status, headers, "application/problem+json")
+    if isinstance(error, Unauthorized) and request.method in _SAFE:
+        target = request.url.path + (f"?{request.url.query}" if request.url.query else "")
+        return RedirectResponse(f"/sign-in?next={quote(target, safe='/')}" if target != "/" else "/sign-in", 303)
+    return HTMLResponse(render(request, "error.html", problem=body), error.status)
+
+
+async def _known_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, BetaloopError)
+    return _answer(request, error)
+
+
+class _InputError(BetaloopError):
+    status = 422
+    title = "The input cannot be used"
+
+
+async def _bad_input(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    errors = [{"where": " > ".join(map(str, e["loc"])), "what": e["msg"]} for e in error.errors()]
+    detail = "; ".join(f"{e['where']}: {e['what']}" for e in errors[:5])
+    return _answer(request, _InputError(detail, "Correct the named members and send again.", errors=errors))
+
+
+class _PlainError(BetaloopError):
+    def __init__(self, status: int, detail: str) -> None:
+        super().__init__(detail)
+        self.status, self.title = status, detail
+
+
+async def _http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    response = _answer(request, _PlainError(error.status_code, str(error.detail)))
+    response.headers.update(error.headers or {})
+    return response
+
+
+async def _unknown_error(request: Request, error: Exception) -> Response:
+    log.error("request failed", path=request.url.path, request_id=getattr(request.state, "request_id", None), exc_info=error)
+    problem: Any = _PlainError(500, "Something went wrong on our side.")
+    problem.mend = f"Nothing was changed. Tell your administrator the request id {getattr(request.state, 'request_id', '?')}."
+    return _answer(request, problem)

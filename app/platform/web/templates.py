@@ -1,0 +1,95 @@
+"""Jinja2 pages: one environment, autoescaped, with the filters that every page uses."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from datetime import date, datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import plotly
+from fastapi import Request
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+ROOT = Path(__file__).resolve().parents[3]
+STATIC = ROOT / "static"
+
+_environment = Environment(
+    loader=FileSystemLoader(Path(__file__).resolve().parents[2] / "templates"),
+    autoescape=select_autoescape(default=True),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+
+
+def render(request: Request, template: str, **values: Any) -> str:
+    """A page as text. `me` (who is signed in, or None) and `path` are there for every template.
+
+    Not `caller`: that word belongs to Jinja inside `call` blocks, where it would silently mean something else.
+    """
+    return _environment.get_template(template).render(
+        request=request, me=getattr(request.state, "caller", None), path=request.url.path, **values
+    )
+
+
+def static_url(name: str) -> str:
+    """URL of a file under static/, with its hash, so that browsers may keep it for ever."""
+    return f"/static/{name}?v={_hash(name, (STATIC / name).stat().st_mtime_ns)}"
+
+
+def plotly_url() -> str:
+    """URL of plotly.js, which comes from plotly's own package; charts.js loads it only where there is a chart."""
+    return f"/static/plotly/plotly.min.js?v={plotly.__version__}"
+
+
+@lru_cache(maxsize=256)
+def _hash(name: str, _changed: int) -> str:
+    return hashlib.sha256((STATIC / name).read_bytes()).hexdigest()[:10]
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number for people: significant digits, an em dash where there is none."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "—"
+    if value == 0:
+        return "0"
+    if abs(value) >= 10**digits:
+        return f"{value:,.0f}".replace(",", "\u202f")
+    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    return f"{value:.{min(decimals, 6)}f}".replace("-", "\u2212")
+
+
+def fixed(value: float | None, decimals: int = 1) -> str:
+    """A number with a fixed count of decimals."""
+    return "—" if value is None or math.isnan(value) else f"{value:.{decimals}f}".replace("-", "\u2212")
+
+
+def minutes(seconds: float | None) -> str:
+    """A length of time for people: 10 min 20 s."""
+    if seconds is None:
+        return "—"
+    whole = round(seconds)
+    return f"{whole // 60} min" + (f" {whole % 60} s" if whole % 60 else "") if whole >= 60 else f"{whole} s"
+
+
+def size(value: int) -> str:
+    """Bytes for people."""
+    amount, unit = float(value), "B"
+    for larger in ("KiB", "MiB", "GiB"):
+        if amount >= 1024:
+            amount, unit = amount / 1024, larger
+    return f"{number(amount)} {unit}"
+
+
+def when(value: datetime | date | None) -> str:
+    """A date, or a time to the minute (UTC)."""
+    if value is None:
+        return "—"
+    return value.strftime("%Y-%m-%d %H:%M UTC") if isinstance(value, datetime) else value.isoformat()
+
+
+_environment.filters.update(number=number, fixed=fixed, minutes=minutes, size=size, when=when)
+_environment.globals.update(static_url=static_url, plotly_url=plotly_url)

@@ -1,0 +1,257 @@
+"""`betaloop demo`: everything on one machine, with a small synthetic study that enters through the public upload path.
+
+Started again, it finds its study and serves it within seconds; interrupted, it goes on: every simulated session has fixed numbers and the
+day on which the demo was begun is kept, so that what was uploaded before is recognised by its bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import httpx2 as httpx
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from app.accounts import repository as accounts_repository
+from app.accounts import service as accounts
+from app.accounts.models import Role
+from app.platform.database import now, transaction
+from app.platform.errors import BetaloopError, Conflict
+from app.platform.migrate import migrate
+from app.settings import get_settings
+from app.simulation.demo_study import DemoVisit, demo_visits, participant_body
+
+ACCOUNTS = {"admin@demo.example": Role.ADMIN, "clinician@demo.example": Role.CLINICIAN, "engineer@demo.example": Role.ENGINEER}
+PARTICIPANTS = ("P1", "P2", "P3", "P4")
+START_TIMEOUT_S = 60.0
+_POLL_S = 0.5
+
+console = Console()
+
+
+class DemoFailed(BetaloopError):
+    """The demo cannot go on."""
+
+
+def run_demo(host: str, port: int) -> None:
+    """Start the database, the web service and a worker, load the study, run the first pipelines, and serve until Ctrl-C."""
+    settings = get_settings()
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    os.environ["BETALOOP_DATA_DIR"] = str(settings.data_dir.resolve())
+    url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"
+    _refuse_taken_port(url)
+    started = time.monotonic()
+    with console.status("Starting the database …"):
+        migrate()
+        password = _accounts(settings.data_dir)
+    with _children(settings.data_dir / "log", host, port) as children:
+        with console.status("Starting the web service and a worker …"):
+            _wait_until_up(url, children)
+        console.print(f"\n  [bold]betaloop is up[/bold] after {time.monotonic() - started:.0f} s: [bold underline]{url}[/]")
+        console.print(f"  sign in as [bold]clinician@demo.example[/] (or engineer@, admin@), password [bold]{password}[/]")
+        console.print("  The four participants are synthetic: simulated, and not fitted to patients.\n")
+        _load_and_rank(url, settings.data_dir / "demo.json", children)
+        console.print("\n  Ready. Ctrl-C stops the demo and keeps its data; `make demo` starts it again.")
+        _wait(children)
+
+
+def _accounts(data_dir: Path) -> str:
+    """The demo's users, all with one random password that is kept in the data folder."""
+    path = data_dir / "secrets" / "demo-password"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        path.touch(mode=0o600)
+        path.write_text(f"beta-{secrets.token_hex(4)}")
+    password = path.read_text()
+    with transaction("demo") as db:
+        for email, role in ACCOUNTS.items():
+            if accounts_repository.user_by_email(db, email) is None:
+                accounts.add_user(db, email, role, password)
+    return password
+
+
+def _token() -> str:
+    with transaction("demo") as db:
+        return accounts.create_token(db, "admin@demo.example", f"demo loader {secrets.token_hex(3)}")
+
+
+@contextmanager
+def _children(logs: Path, host: str, port: int) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """The web service and the worker as child processes with log files; both are stopped at the end."""
+    logs.mkdir(parents=True, exist_ok=True)
+    commands = {"web": ["serve", "--host", host, "--port", str(port)], "worker": ["worker"]}
+    children = []
+    for name, arguments in commands.items():
+        log = (logs / f"{name}.log").open("ab")
+        # a session of its own: Ctrl-C reaches this process alone, which then stops the others in order
+        children.append(subprocess.Popen([sys.executable, "-m", "app.cli", *arguments], stdout=log, stderr=log, start_new_session=True))
+        log.close()
+    previous = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        yield children
+    except KeyboardInterrupt:
+        console.print("\n  Stopping …")
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+        for child in reversed(children):
+            child.terminate()
+        for child in children:
+            try:
+                child.wait(timeout=10)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+
+
+def _interrupt(_number: int, _frame: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def _refuse_taken_port(url: str) -> None:
+    try:
+        httpx.get(f"{url}/healthz", timeout=2)
+    except httpx.TransportError:
+        return
+    raise Conflict(f"Something already answers at {url}.", "Is a demo running? Otherwise choose another port: betaloop demo --port 8001")
+
+
+def _wait_until_up(url: str, children: list[subprocess.Popen[bytes]]) -> None:
+    deadline = time.monotonic() + START_TIMEOUT_S
+    while time.monotonic() < deadline:
+        _check(children)
+        try:
+            if httpx.get(f"{url}/healthz", timeout=2).status_code == 200:
+                return
+        except httpx.TransportError:
+            time.sleep(0.2)
+    raise DemoFailed(f"The web service did not answer within {START_TIMEOUT_S:.0f} s.", _log_hint())
+
+
+def _check(children: list[subprocess.Popen[bytes]]) -> None:
+    if any(child.poll() is not None for child in children):
+        raise DemoFailed("The web service or the worker ended by itself.", _log_hint())
+
+
+def _log_hint() -> str:
+    return f"See the files in {get_settings().data_dir / 'log'}."
+
+
+def _wait(children: list[subprocess.Popen[bytes]]) -> None:
+    while True:
+        time.sleep(1.0)
+        _check(children)
+
+
+def _load_and_rank(url: str, state_path: Path, children: list[subprocess.Popen[bytes]]) -> None:
+    state: dict[str, Any] = (
+        json.loads(state_path.read_text()) if state_path.exists() else {"begun": now().date().isoformat(), "loaded": [], "jobs": {}}
+    )
+    if set(state["loaded"]) == set(PARTICIPANTS) and set(state["jobs"]) == set(PARTICIPANTS):
+        return
+    columns = (TextColumn("  {task.description:<42}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    _save(state_path, state)
+    with httpx.Client(base_url=f"{url}/api/v1", headers={"Authorization": f"Bearer {_token()}"}, timeout=120) as client:
+        loader = _Loader(client, state, state_path)
+        with Progress(*columns, console=console) as bars:
+            for code in PARTICIPANTS:
+                if code not in state["loaded"]:
+                    loader.load(code, bars)
+        for i, code in enumerate(PARTICIPANTS):
+            if code not in state["jobs"]:
+                loader.submit(code)
+            if i == 0:  # the first ranking has the machine to itself; the others follow in the background
+                _follow(client, state["jobs"][code], children)
+    console.print(f"  Ranked policies of {PARTICIPANTS[0]}: [underline]{url}/participants/{PARTICIPANTS[0]}/ranking[/]")
+    console.print(f"  The other participants are ranked in the background: [underline]{url}/participants/{PARTICIPANTS[1]}/jobs[/]")
+
+
+@dataclass
+class _Loader:
+    """Sends the simulated study through the REST interface, as any clinic's uploader would."""
+
+    client: httpx.Client
+    state: dict[str, Any]
+    path: Path
+
+    def load(self, code: str, bars: Progress) -> None:
+        """One participant: enrol, add visits, upload every session's file, enter the QoCs."""
+        self._post("/participants", participant_body(code), may_exist=True)
+        visits = demo_visits(code, date.fromisoformat(self.state["begun"]))
+        total = sum(len(v.sessions) for v in visits) or 1
+        bar = bars.add_task(f"{code}: simulate and upload sessions", total=total)
+        for visit in visits:
+            self._post(f"/participants/{code}/visits", {"number": visit.number, "date": visit.date.isoformat()}, may_exist=True)
+            self._upload(code, visit, bars, bar)
+        self.state["loaded"].append(code)
+        _save(self.path, self.state)
+
+    def submit(self, code: str) -> None:
+        """Ask for the between-visit pipeline."""
+        asked = {"kind": "pipeline", "preset": "quick", "algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "both"}
+        self.state["jobs"][code] = self._post(f"/participants/{code}/jobs", asked)["id"]
+        _save(self.path, self.state)
+
+    def _upload(self, code: str, visit: DemoVisit, bars: Progress, bar: TaskID) -> None:
+        for session in visit.sessions:
+            name, content = session.file()
+            fields = {"participant": code, "visit": str(visit.number), "controller": session.controller}
+            if session.started_at is not None:
+                fields["started_at"] = session.started_at.isoformat()
+            answer = self.client.post("/uploads", data=fields, files={"file": (name, content)})
+            stored = self._checked(answer)["sessions"][0]["id"]
+            self._checked(self.client.put(f"/sessions/{stored}/qoc", json=session.qoc()))
+            bars.advance(bar)
+
+    def _post(self, path: str, body: dict[str, Any], may_exist: bool = False) -> dict[str, Any]:
+        answer = self.client.post(path, json=body)
+        if may_exist and answer.status_code == 409:
+            return {}
+        return self._checked(answer)
+
+    def _checked(self, answer: httpx.Response) -> dict[str, Any]:
+        if answer.is_error:
+            raise DemoFailed(f"{answer.request.method} {answer.request.url.path} was answered {answer.status_code}: {answer.text}")
+        body: dict[str, Any] = answer.json()
+        return body
+
+
+def _save(path: Path, state: dict[str, Any]) -> None:
+    draft = path.with_suffix(".part")
+    draft.write_text(json.dumps(state))
+    draft.replace(path)
+
+
+def _follow(client: httpx.Client, job_id: str, children: list[subprocess.Popen[bytes]]) -> None:
+    """A progress bar for every step of a job, until it has ended."""
+    columns = (TextColumn("  {task.description:<42}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+        known: dict[str, TaskID] = {}
+        while True:
+            _check(children)
+            job = client.get(f"/jobs/{job_id}").json()
+            for step in job["steps"]:
+                if not console.is_terminal and step["status"] == "succeeded" and step["key"] not in known:
+                    console.print(f"  {step['title']}: done")  # bars need a terminal; a log file gets lines
+                if step["key"] not in known and (console.is_terminal or step["status"] == "succeeded"):
+                    known[step["key"]] = bars.add_task(step["title"], total=1.0, start=False)
+                if (task := known.get(step["key"])) is not None:
+                    if step["status"] != "queued":
+                        bars.start_task(task)
+                    bars.update(task, completed=step["progress"])
+            if job["status"] in {"succeeded", "failed", "cancelled"}:
+                break
+            time.sleep(_POLL_S)
+    if job["status"] != "succeeded":
+        console.print(f"  [bold red]The pipeline {job['status']}:[/] {job.get('error') or ''} See the Jobs page.")

@@ -1,0 +1,294 @@
+"""QoCs from uploaded files: tremor from a watch's minutes, grasp frequency from hand tracking. Source: Gao et al. 2023, section 3.
+
+A derived value is a revision of the QoCs like any other, and says where it came from. What a person typed is never overwritten; where it
+disagrees with the files, `disagreements` has both numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy.orm import Session
+
+from app.platform.database import set_reason
+from app.platform.errors import Invalid
+from app.study import repository
+from app.study.models import GraspTest, Hemisphere, QocRevision, StudySession, TremorSeries
+from app.study.outcomes import tremor
+from app.study.outcomes import values as outcome_values
+from app.study.outcomes.tremor import Minutes
+from app.study.outcomes.values import Derived
+from ml.qoc import TREMOR_CLASSES
+
+QOC_FIELDS = ("grasp_hz", "rating", "tremor_percent")
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A QoC that a person typed (or took back) and that the files tell otherwise.
+
+    Attributes:
+        name: of the QoC. typed: the person's value, None where it was taken back. author: who entered it.
+    """
+
+    name: str
+    typed: float | None
+    author: str
+    derived: Derived
+
+
+def store_tremor(
+    db: Session,
+    participant_id: int,
+    upload_file_id: int,
+    start_unix_s: NDArray[np.float64],
+    duration_s: NDArray[np.float64],
+    fractions: NDArray[np.float64],
+    any_tremor: NDArray[np.float64],
+) -> list[str]:
+    """Keep all minutes of tremor of a file, and derive the tremor of every confirmed session that they overlap.
+
+    The same file again replaces its own minutes, so that decoding anew changes nothing but what the decoder reads otherwise.
+
+    Args:
+        db: the caller commits.
+        participant_id, upload_file_id: whose minutes, and the file they came in.
+        start_unix_s, duration_s: begin and length of each minute, s, shape [n].
+        fractions: share per class in the order of `ml.qoc.TREMOR_CLASSES`, shape [n, 6]; NaN where not told.
+        any_tremor: share with slight or worse tremor, shape [n]; NaN where not told.
+
+    Returns:
+        Sentences for the upload's report.
+
+    Raises:
+        ValueError: shapes that do not agree, a minute without time or length.
+    """
+    minutes = _in_order(start_unix_s, duration_s, fractions, any_tremor)
+    before = repository.tremor_series_of_file(db, participant_id, upload_file_id)
+    spans = [(before.first_start_at, before.last_end_at)] if before else []
+    if minutes.start_unix_s.size == 0:
+        if before is not None:
+            db.delete(before)
+            db.flush()
+        return ["The file holds no minute of tremor.", *(_derive_overlapping(db, participant_id, spans) if spans else [])]
+    row = before or TremorSeries(participant_id=participant_id, upload_file_id=upload_file_id)
+    tremor.pack(row, minutes)
+    db.add(row)
+    db.flush()
+    spans.append((row.first_start_at, row.last_end_at))
+    said = [f"{row.n} minutes of tremor from {_when(row.first_start_at)} to {_when(row.last_end_at)} UTC are kept."]
+    others = [s for s in repository.tremor_series(db, participant_id, row.first_start_at, row.last_end_at) if s.id != row.id]
+    same, different = tremor.compare(minutes, others)
+    if same or different:
+        said.append(
+            f"{same + different} of these minutes came in other files too, {different} of them with other values: each counts once, "
+            "as the newest file tells it."
+        )
+    return said + _derive_overlapping(db, participant_id, spans)
+
+
+def store_grasp(
+    db: Session,
+    session: StudySession,
+    upload_file_id: int,
+    hand: str | None,
+    open_fist_s: NDArray[np.float64],
+    implausible: NDArray[np.bool_],
+) -> list[str]:
+    """Keep one hand's grasp test of a session, and derive the session's grasp frequency (eq:grasp_speed).
+
+    Args:
+        db: the caller commits.
+        session: whose test it was. upload_file_id: the file; the same file and hand again replace what it gave before, and a file that
+            belonged to another session no longer counts there.
+        hand: `left`, `right`, or None where the file does not say.
+        open_fist_s: times of open fists, s, strictly increasing, shape [n].
+        implausible: intervals too short or too long for a grasp, shape [n - 1]; they are kept and marked.
+
+    Returns:
+        Sentences for the upload's report.
+
+    Raises:
+        ValueError: shapes that do not agree, no open fist at all, times that do not increase.
+    """
+    times = np.asarray(open_fist_s, dtype=np.float64)
+    marks = np.asarray(implausible, dtype=bool)
+    if times.ndim != 1 or times.size == 0 or marks.shape != (times.size - 1,):
+        raise ValueError(f"{times.shape} open fists need one mark per interval between them, not {marks.shape}")
+    if not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
+        raise ValueError("times of open fists must be numbers that increase")
+    said = _take_from_other_sessions(db, session, upload_file_id)
+    side = Hemisphere(hand) if hand else None
+    known = (t for t in repository.grasp_tests(db, session.id) if t.upload_file_id == upload_file_id and t.hand == side)
+    row = next(known, None) or GraspTest(session_id=session.id, upload_file_id=upload_file_id, hand=side)
+    row.n, row.open_fist_s_f64, row.implausible = times.size, times.astype("<f8").tobytes(), marks.tolist()
+    db.add(row)
+    db.flush()
+    whose = f"{hand} hand" if hand else "hand not stated"
+    return [*said, f"Session {session.id}: grasp test, {whose}, {times.size} open fists are kept.", *derive_for_session(db, session)]
+
+
+def derive_for_session(db: Session, session: StudySession) -> list[str]:
+    """Derive a session's QoCs from the files that are there, after an upload, a confirmation, or a change of its time or side.
+
+    Returns:
+        Sentences on what was derived, what was not and why, and where a person's value disagrees. Empty where no file speaks of it.
+    """
+    found = outcome_values.derive(db, session)
+    if session.status != "confirmed":
+        return [f"Session {session.id} is proposed: its QoCs are derived when it is confirmed."] if found else []
+    repository.lock_session(db, session)
+    free = {d.name: d for d in found if person_behind(session, d.name) is None}
+    known = session.qoc
+    if known is not None:
+        # a derived value whose minutes no longer lie in the session is taken back
+        gone = [n for n in known.derived if n not in {d.name for d in found}]
+        free |= {n: Derived(n, None, "no uploaded file speaks of this session any more", ()) for n in gone}
+    said = [f"Session {session.id}: {d.sentence}." for d in found if d.name in free]
+    changed = [d for d in free.values() if not _same(getattr(known, d.name, None), d.value)]
+    if changed:
+        _add_revision(db, session, changed)
+    for clash in disagreements(session, found):
+        typed = "no value" if clash.typed is None else f"{clash.typed:.4g} {clash.derived.unit}"
+        said.append(
+            f"Session {session.id}: {clash.author} entered {typed} for {clash.derived.label.lower()}, which stays; "
+            f"the files give {clash.derived.sentence}. Compare them on the session's page."
+        )
+    return said
+
+
+def disagreements(session: StudySession, found: Sequence[Derived]) -> list[Disagreement]:
+    """Where a person's value stands against what the files give; a value that the files cannot give disagrees with none."""
+    clashes = []
+    for derived in found:
+        author = person_behind(session, derived.name)
+        typed = getattr(session.qoc, derived.name, None)
+        if author is not None and derived.value is not None and not _same(typed, derived.value):
+            clashes.append(Disagreement(derived.name, typed, author, derived))
+    return clashes
+
+
+def person_behind(session: StudySession, name: str) -> str | None:
+    """Who typed, or took back, the present value of a QoC; None where nobody did or where it was derived."""
+    known = session.qoc
+    if known is None or name in known.derived:
+        return None
+    author, before, was_derived = None, None, False
+    for revision in session.qocs:
+        value, derived = getattr(revision, name), name in revision.derived
+        if value != before or derived != was_derived:
+            author, before, was_derived = revision.entered_by, value, derived
+    return author
+
+
+def take_derived(db: Session, session: StudySession, name: str, shown: float, author: str) -> QocRevision:
+    """Put the derived value of a QoC in the place of the one that a person typed.
+
+    Args:
+        shown: the derived value that the page showed. author: who takes it.
+
+    Raises:
+        Invalid: the files give another value by now, or none.
+    """
+    found = next((d for d in outcome_values.derive(db, session) if d.name == name and d.value is not None), None)
+    if session.status != "confirmed" or found is None or found.value is None or abs(found.value - shown) > 1e-6 * max(1.0, abs(shown)):
+        raise Invalid("The uploaded files give another value by now.", "Look at the value on this page and decide again.")
+    repository.lock_session(db, session)
+    return _add_revision(db, session, [found], author)
+
+
+def add_revision(
+    db: Session, session: StudySession, given: Mapping[str, Any], entered_by: str, reason: str | None, derived: Sequence[str]
+) -> QocRevision:
+    """A new revision under the session's lock: `given` values, the others as they are; `derived` names those that come from files."""
+    known = session.qoc
+    merged = {name: getattr(known, name, None) for name in QOC_FIELDS} | dict(given)
+    set_reason(db, reason)
+    revision = QocRevision(
+        session_id=session.id,
+        revision=repository.qoc_revision(db, session.id) + 1,
+        entered_by=entered_by,
+        reason=reason,
+        derived=sorted(derived),
+        **merged,
+    )
+    db.add(revision)
+    db.flush()
+    db.expire(session, ["qocs"])
+    return revision
+
+
+def _add_revision(db: Session, session: StudySession, changed: Sequence[Derived], author: str | None = None) -> QocRevision:
+    """A revision with derived values; the other QoCs stay."""
+    files = sorted({i for d in changed for i in d.upload_file_ids})
+    uploads = ", ".join(str(i) for i in sorted(set(repository.uploads_of_files(db, files).values())))
+    reason = "; ".join(d.sentence for d in changed)
+    origin = f"derived from upload {uploads}"[:254] if uploads else "derived from uploaded files"
+    names = {d.name for d in changed} | set(session.qoc.derived if session.qoc else ())
+    values = {d.name: d.value for d in changed}
+    before = db.info.get("actor", {}).get("reason")
+    row = add_revision(db, session, values, author or origin, f"{origin}: {reason}" if author else reason, sorted(names))
+    set_reason(db, before)  # what the caller writes next has its own reason
+    return row
+
+
+def _take_from_other_sessions(db: Session, session: StudySession, upload_file_id: int) -> list[str]:
+    """A file that was attached to the wrong session leaves no value behind there."""
+    said = []
+    elsewhere = [t for t in repository.grasp_tests_of_file(db, upload_file_id) if t.session_id != session.id]
+    for row in elsewhere:
+        db.delete(row)
+    db.flush()
+    for session_id in sorted({t.session_id for t in elsewhere}):
+        said += [f"The grasp tests of this file no longer belong to session {session_id}."]
+        said += derive_for_session(db, db.get_one(StudySession, session_id))
+    return said
+
+
+def _derive_overlapping(db: Session, participant_id: int, spans: Sequence[tuple[datetime, datetime]]) -> list[str]:
+    said, without_start, touched = [], [], False
+    for session in repository.sessions_of_participant(db, participant_id):
+        if session.status != "confirmed":
+            continue
+        if session.started_at is None:
+            without_start.append(session.id)
+            continue
+        start, stop = session.started_at.timestamp(), session.started_at.timestamp() + session.duration_s
+        if any(first.timestamp() < stop and last.timestamp() > start for first, last in spans):
+            touched = True
+            said += derive_for_session(db, session)
+    if without_start:
+        listed = ", ".join(map(str, without_start[:20]))
+        said.append(f"Confirmed sessions whose start nobody stated cannot be laid over these minutes: {listed}.")
+    if not touched:
+        # true whatever session is made of the same upload afterwards
+        said.append("They count in every confirmed session with a start that they cover, also in one that is made later.")
+    return said
+
+
+def _in_order(
+    start_unix_s: NDArray[np.float64], duration_s: NDArray[np.float64], fractions: NDArray[np.float64], any_tremor: NDArray[np.float64]
+) -> Minutes:
+    start, length = np.asarray(start_unix_s, dtype=np.float64), np.asarray(duration_s, dtype=np.float64)
+    n = start.size
+    if start.shape != (n,) or length.shape != (n,) or fractions.shape != (n, len(TREMOR_CLASSES)) or any_tremor.shape != (n,):
+        raise ValueError(f"minutes must agree in number: {start.shape}, {length.shape}, {fractions.shape}, {any_tremor.shape}")
+    if not np.all(np.isfinite(start)) or not np.all(length > 0) or not np.all(np.isfinite(length)):
+        raise ValueError("every minute needs a begin and a length above 0 s")
+    order = np.argsort(start, kind="stable")
+    return Minutes(start, length, np.asarray(fractions, dtype=np.float64), np.asarray(any_tremor, dtype=np.float64)).at(order)
+
+
+def _same(a: float | None, b: float | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return abs(a - b) <= 1e-9 * max(1.0, abs(a))
+
+
+def _when(moment: datetime) -> str:
+    return moment.astimezone(UTC).strftime("%Y-%m-%d %H:%M")

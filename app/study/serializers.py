@@ -1,0 +1,91 @@
+"""Rows of the study as API types."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.accounts.permissions import Caller
+from app.study import blinding
+from app.study.models import Participant, StudySession, Visit
+from app.study.outcomes import service as outcomes
+from app.study.outcomes import values as outcome_values
+from app.study.schemas import (
+    OutcomeOut,
+    ParticipantOut,
+    QocOut,
+    SessionOut,
+    SettingsOut,
+    TraceOut,
+    VisitOut,
+)
+from app.study.service import SessionData
+
+
+def outcome_out(session: StudySession, derived: outcome_values.Derived) -> OutcomeOut:
+    """A derived QoC for the API."""
+    conflicts = bool(outcomes.disagreements(session, [derived]))
+    return OutcomeOut.model_validate(
+        {"name": derived.name, "value": derived.value, "unit": derived.unit, "basis": derived.basis, "conflicts": conflicts}
+    )
+
+
+def participant_out(p: Participant) -> ParticipantOut:
+    """A participant for the API."""
+    return ParticipantOut(
+        code=p.code, status=p.status, site=p.site.code, created_at=p.created_at, settings=SettingsOut.model_validate(p.current_settings)
+    )
+
+
+def visit_out(v: Visit, code: str) -> VisitOut:
+    """A visit for the API."""
+    amplitudes = [{"hemisphere": a.hemisphere, "program": a.program, "amplitude_ma": a.amplitude_ma} for a in v.cdbs_amplitudes]
+    return VisitOut.model_validate(
+        {"id": v.id, "participant": code, "number": v.number, "date": v.date, "note": v.note or "", "cdbs_amplitudes": amplitudes}
+    )
+
+
+def session_out(s: StudySession, caller: Caller) -> SessionOut:
+    """A session for the API; the controller comes through the blinding gate."""
+    arm = blinding.stated_arm(s, caller)
+    return SessionOut(
+        id=s.id,
+        visit_id=s.visit_id,
+        visit=s.visit.number,
+        participant=s.visit.participant.code,
+        ordinal=s.ordinal,
+        controller=arm.controller if arm else None,
+        policy_id=arm.policy_id if arm else None,
+        hemisphere=s.hemisphere,
+        status=s.status,
+        started_at=s.started_at,
+        duration_s=s.duration_s,
+        control_channel=s.control_channel,
+        excluded_reason=s.excluded_reason,
+        recordings=sorted({g.recording_id for g in s.segments}),
+        qoc=QocOut.model_validate(s.qoc) if s.qoc else None,
+    )
+
+
+def trace_out(data: SessionData) -> TraceOut:
+    """A step table for the API."""
+    table, beta = data.table, data.table.beta_trace
+    return TraceOut(
+        session_id=data.session.id,
+        period_s=data.settings.period_s,
+        beta_unit=beta.unit if beta else None,
+        beta_source=beta.source if beta else None,
+        beta_channel=beta.channel if beta else None,
+        decode_version=beta.decode_version if beta else None,
+        cdbs_amplitude_ma=table.cdbs_ma,
+        xi_beta=data.threshold,
+        steps_above_cdbs=table.above_one,
+        t_s=table.t_s.tolist(),
+        beta=_nullable(table.beta),
+        amplitude_ma=_nullable(table.amplitude_ma),
+        amplitude_fraction=_nullable(table.fraction),
+    )
+
+
+def _nullable(values: NDArray[np.float64]) -> list[float | None]:
+    return [None if np.isnan(v) else float(v) for v in values]

@@ -1,0 +1,1 @@
+"""One session: its page, charts, recordings, and where statements and recordings disagree."""

@@ -1,0 +1,271 @@
+"""The main chart of one session: beta against the threshold and the amplitude on one time axis; its stimulation steps and conflicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.platform.web.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, figure, horizontal
+from app.study.service import SessionData
+from app.study.sessions.recording_charts import trace_name
+from app.study.traces import amplitude_program, session_offset_s
+from ml.mdp import AMPLITUDE_TOLERANCE
+
+
+@dataclass(frozen=True)
+class StimulationStep:
+    """A stretch of equal amplitude, in seconds of the session.
+
+    Attributes:
+        amplitude_ma, fraction: None where unknown.
+    """
+
+    start_s: float
+    stop_s: float
+    amplitude_ma: float | None
+    fraction: float | None
+
+    @property
+    def above_cdbs(self) -> bool:
+        """Whether it exceeds the cDBS amplitude."""
+        return self.fraction is not None and self.fraction > 1 + AMPLITUDE_TOLERANCE
+
+
+def stimulation_steps(data: SessionData, events: Sequence[Mapping[str, Any]], origin_s: float) -> list[StimulationStep]:
+    """Stretches of equal amplitude within the session: from the device's log where there is one, else from the 2 s table.
+
+    Under embedded adaptive stimulation the log of stimulation does not hold what was delivered (the amplitude trace comes from AdaptiveLog
+    then): the table counts.
+
+    Args:
+        data: the session. events: of its control recording, as stored. origin_s: where the session starts in that recording's clock.
+    """
+    trace = data.table.amplitude_trace
+    origin = trace.details.get("origin") if trace is not None else None
+    logged = [e for e in events if e["kind"] == "stimulation" and "delivered_ma" in e["data"] and e["data"].get("origin", origin) == origin]
+    return _logged_steps(data, logged, origin_s) if logged else _table_steps(data)
+
+
+def _logged_steps(data: SessionData, logged: Sequence[Mapping[str, Any]], origin_s: float) -> list[StimulationStep]:
+    """Steps from the device's log, in the program that the amplitude trace shows, cut at the session's ends."""
+    trace, cdbs = data.table.amplitude_trace, data.table.cdbs_ma
+    program = amplitude_program(trace) if trace else 0
+    changes = sorted((float(e["t_s"]) - origin_s, float(e["data"]["delivered_ma"][program])) for e in logged)
+    steps: list[StimulationStep] = []
+    for i, (start, amplitude) in enumerate(changes):
+        stop = min(changes[i + 1][0] if i + 1 < len(changes) else data.session.duration_s, data.session.duration_s)
+        start = max(start, 0.0)
+        if stop <= start:
+            continue
+        if steps and steps[-1].amplitude_ma == amplitude:
+            start = steps.pop().start_s
+        steps.append(StimulationStep(start, stop, amplitude, amplitude / cdbs if cdbs else None))
+    return steps
+
+
+def operator_conflicts(events: Sequence[Mapping[str, Any]], origin_s: float) -> list[tuple[float, str, float | None]]:
+    """Operator's notes that disagree with the device: time in the session (s), the note, what the device delivered (mA)."""
+    notes = (e for e in events if e["kind"] == "operator_note" and e["data"].get("conflict"))
+    return [(float(e["t_s"]) - origin_s, str(e["label"]), e["data"].get("device_amplitude_ma")) for e in notes]
+
+
+def _fit_axis(yaxis: dict[str, Any], values: NDArray[np.float64], threshold: float | None) -> float | None:
+    """Keep a few huge windows (an amplifier's step) from flattening the rest; returns the top of the axis where some lie above it."""
+    known = values[~np.isnan(values)]
+    if known.size < 20:
+        return None
+    top = 1.5 * float(np.quantile(known, 0.9))
+    if float(known.max()) <= 4 * top or top <= 0:
+        return None
+    top = max(top, 1.2 * threshold if threshold is not None else 0.0)
+    yaxis["range"] = [0, top]
+    return top
+
+
+def _table_steps(data: SessionData) -> list[StimulationStep]:
+    """Runs of equal amplitude in the 2 s table; unknown stretches between known ones are steps without amplitude."""
+    table, period = data.table, data.settings.period_s
+    inside = table.t_s > 0
+    ends, values = table.t_s[inside], np.where(np.isnan(table.amplitude_ma), table.fraction, table.amplitude_ma)[inside]
+    if not np.any(~np.isnan(values)):
+        return []
+    # amplitudes are set in steps of 0.1 mA or coarser; float32 noise makes no new step
+    keys = np.where(np.isnan(values), -1.0, np.round(values, 4))
+    starts = np.flatnonzero(np.r_[True, np.diff(keys) != 0])
+    stops = np.r_[starts[1:], keys.size]
+    milliamperes, fraction = table.amplitude_ma[inside], table.fraction[inside]
+    return [
+        StimulationStep(float(ends[i] - period), float(ends[j - 1]), _known(milliamperes[i]), _known(fraction[i]))
+        for i, j in zip(starts, stops, strict=True)
+    ]
+
+
+def control_chart(data: SessionData) -> Chart:
+    """Beta with the threshold above, amplitude in mA and as a fraction below, one time axis; windows without valid beta stay gaps."""
+    table, settings = data.table, data.settings
+    minutes = table.t_s / 60
+    unit = table.beta_trace.unit if table.beta_trace else ""
+    stream = table.beta_trace.stream if table.beta_trace else "beta"
+    name = {"beta": "Beta amplitude", "band_power": "Band power"}.get(stream, stream.replace("_", " ").capitalize())
+    known = int(np.sum(~np.isnan(table.beta[table.t_s > 0])))
+    traces: list[dict[str, Any]] = [
+        {
+            "type": "scatter", "mode": "lines+markers", "name": name, "x": minutes, "y": table.beta, "connectgaps": False,
+            "line": {"color": ACCENT, "width": 1.5}, "marker": {"size": 3.5, "color": ACCENT},
+            "hovertemplate": f"%{{x:.2f}} min<br>%{{y:.4g}} {unit}<extra></extra>",
+        },
+        *_amplitude_traces(data, minutes),
+    ]  # fmt: skip
+    layout: dict[str, Any] = {
+        "grid": {"rows": 2, "columns": 1},
+        "xaxis": axis("Time in session", "min", anchor="y2", zeroline=False),
+        "yaxis": axis(name, unit, domain=[0.47, 1.0], zeroline=False, rangemode="tozero"),
+        "yaxis2": axis(
+            "Amplitude", "mA" if _has(table.amplitude_ma) else "fraction", domain=[0.0, 0.38], rangemode="nonnegative", zeroline=False,
+        ),
+        "shapes": [], "annotations": [], "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0},
+        "hovermode": "x unified", "margin": {"l": 62, "r": 62, "t": 30, "b": 44},
+    }  # fmt: skip
+    _mark_lead(layout, float(minutes[0]))
+    if data.threshold is not None:
+        line, _ = horizontal(data.threshold, "", WARN)
+        layout["shapes"].append(line)
+        # named in the legend: beta runs about the threshold, so that a label at the line would lie on the data
+        label = f"threshold {data.threshold:.4g} {unit}".strip()
+        traces.append({"type": "scatter", "mode": "lines", "name": label, "x": [None], "y": [None], "line": line["line"]})
+    missing = _mark_missing(layout, data) if table.beta_trace else 0
+    if missing:
+        # an entry of the legend for the shading
+        shade = {"symbol": "square", "size": 11, "color": "token:warn/0.3"}
+        traces.append({"type": "scatter", "mode": "markers", "name": "no valid window", "x": [None], "y": [None], "marker": shade})
+    spikes = _spike_rows(data)
+    if spikes.any():
+        bottom = np.where(np.isnan(table.beta), 0.0, table.beta)
+        mark = {"symbol": "x-thin", "size": 9, "color": BAD, "line": {"width": 2, "color": BAD}}
+        traces.append(
+            {
+                "type": "scatter", "mode": "markers", "name": "power spikes left out", "x": minutes[spikes], "y": bottom[spikes],
+                "marker": mark, "hoverinfo": "skip",
+            }
+        )  # fmt: skip
+    top = _fit_axis(layout["yaxis"], table.beta, data.threshold)
+    over = table.beta > (top if top is not None else np.inf)
+    if top is not None:
+        traces.append(
+            {
+                "type": "scatter", "mode": "markers", "name": "above the axis", "x": minutes[over],
+                "y": np.full(int(over.sum()), 0.985 * top), "marker": {"symbol": "triangle-up-open", "size": 9, "color": BAD},
+                "customdata": table.beta[over], "hovertemplate": f"%{{customdata:.4g}} {unit}<extra>above the axis</extra>",
+            }
+        )  # fmt: skip
+    if _has(table.amplitude_ma) and table.cdbs_ma:
+        _add(layout, horizontal(table.cdbs_ma, f"cDBS {table.cdbs_ma:.3g} mA", MUTED, "dot", "y2"))
+        highest = 1.15 * max(table.cdbs_ma, float(np.nanmax(table.amplitude_ma)))
+        layout["yaxis2"] |= {"range": [0, highest]}
+        layout["yaxis3"] = axis(
+            "of cDBS",
+            "%",
+            overlaying="y2",
+            side="right",
+            range=[0, 100 * highest / table.cdbs_ma],
+            showgrid=False,
+            zeroline=False,
+            tickmode="auto",
+        )
+        traces.append({"type": "scatter", "x": [minutes[0]], "y": [None], "yaxis": "y3", "showlegend": False, "hoverinfo": "skip"})
+    subtitle = f"{unit or 'no unit'} over {settings.period_s:g} s · n = {known} of {int(np.sum(table.t_s > 0))} steps with a valid window"
+    if over.any():
+        subtitle += f" · {int(over.sum())} above the axis, up to {float(np.nanmax(table.beta)):.3g}"
+    if spikes.any():
+        subtitle += f" · power spikes left out of {int(spikes.sum())} windows"
+    columns = ("Step end (s)", f"{name} ({unit or '—'})", "Amplitude (mA)", "Fraction of cDBS", "Mark")
+    marks = [
+        ", ".join(w for w, on in (("no valid window", m), ("power spikes left out", x)) if on)
+        for m, x in zip(np.isnan(table.beta), spikes, strict=True)
+    ]
+    rows: list[list[Cell]] = [
+        [float(t), _known(b), _known(a), _known(f), mark]
+        for t, b, a, f, mark in zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, marks, strict=True)
+    ]
+    title = f"{trace_name(table.beta_trace)} and amplitude" if table.beta_trace else "Amplitude"
+    return Chart("control", title[:1].upper() + title[1:], subtitle, figure(traces, **layout), columns, rows, height=470)
+
+
+def _amplitude_traces(data: SessionData, minutes: NDArray[np.float64]) -> list[dict[str, Any]]:
+    table = data.table
+    values = table.amplitude_ma if _has(table.amplitude_ma) else table.fraction
+    # a row holds the amplitude over the period that ends at its time, so the line steps first and then runs
+    base: dict[str, Any] = {"type": "scatter", "yaxis": "y2", "connectgaps": False, "line": {"shape": "vh", "color": TEXT, "width": 1.8}}
+    hover = "%{y:.3g}" + (" mA (%{customdata:.0%})" if _has(table.amplitude_ma) else "") + "<extra>amplitude</extra>"
+    traces = [
+        base | {"mode": "lines", "name": "Amplitude", "x": minutes, "y": values, "customdata": table.fraction, "hovertemplate": hover}
+    ]
+    above = table.fraction > 1 + AMPLITUDE_TOLERANCE
+    if np.any(above):
+        mark = {"symbol": "triangle-up", "size": 8, "color": BAD}
+        traces.append(
+            {
+                "type": "scatter", "mode": "markers", "yaxis": "y2", "name": "above cDBS", "x": minutes[above], "y": values[above],
+                "marker": mark, "hoverinfo": "skip",
+            }
+        )  # fmt: skip
+    return traces
+
+
+def _mark_lead(layout: dict[str, Any], first: float) -> None:
+    """Shade the window before the session: the state s_0."""
+    layout["shapes"].append(
+        {
+            "type": "rect", "xref": "x", "yref": "paper", "x0": first, "x1": 0, "y0": 0, "y1": 1, "fillcolor": GRID, "opacity": 0.35,
+            "line": {"width": 0}, "layer": "below",
+        }
+    )  # fmt: skip
+
+
+def _mark(missing: bool, spikes: bool) -> str:
+    return ", ".join(word for word, on in (("no valid window", missing), ("power spikes left out", spikes)) if on)
+
+
+def _spike_rows(data: SessionData) -> NDArray[np.bool_]:
+    """Rows of the session's grid in which the decoder left spikes out."""
+    table, trace = data.table, data.table.beta_trace
+    out = np.zeros(table.t_s.size, dtype=bool)
+    if trace is None:
+        return out
+    rows = np.array([r for r in trace.details.get("spike_rows") or [] if isinstance(r, int)], dtype=np.int64)
+    ends = trace.first_end_s + trace.dt_s * rows - session_offset_s(data.session, trace.recording_id)
+    at = np.rint((ends - table.t_s[0]) / data.settings.period_s).astype(int)
+    out[at[(at >= 0) & (at < out.size)]] = True
+    return out
+
+
+def _mark_missing(layout: dict[str, Any], data: SessionData) -> int:
+    """Shade the session's windows without a valid value; returns how many there are."""
+    table, period = data.table, data.settings.period_s
+    missing = np.isnan(table.beta) & (table.t_s > 0)
+    edges = np.flatnonzero(np.diff(np.r_[False, missing, False].astype(int)))
+    for first, stop in zip(edges[::2], edges[1::2], strict=True):
+        layout["shapes"].append(
+            {
+                "type": "rect", "xref": "x", "x0": (table.t_s[first] - period) / 60, "x1": table.t_s[stop - 1] / 60, "yref": "y domain",
+                "y0": 0, "y1": 1, "fillcolor": "token:warn/0.18", "line": {"width": 0}, "layer": "below",
+            }
+        )  # fmt: skip
+    return int(missing.sum())
+
+
+def _add(layout: dict[str, Any], line_and_label: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    layout["shapes"].append(line_and_label[0])
+    layout["annotations"].append(line_and_label[1])
+
+
+def _has(values: NDArray[np.float64]) -> bool:
+    return bool(np.any(~np.isnan(values)))
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)

@@ -1,0 +1,257 @@
+"""HTML page of a session: its traces, stimulation, data quality, QoCs and corrections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
+from app.platform.database import Db
+from app.platform.errors import BetaloopError, Invalid
+from app.platform.web.forms import FormValues, parse
+from app.platform.web.templates import render
+from app.study import repository, service
+from app.study.blinding import CONTROLLER_NAMES, arm
+from app.study.deps import CurrentSession
+from app.study.models import QocRevision, Recording, StudySession
+from app.study.schemas import DerivedChoice, QocIn, SessionChange
+from app.study.service import SessionData
+from app.study.sessions import view as session_view
+from app.study.sessions.charts import operator_conflicts, stimulation_steps
+from app.study.sessions.contradictions import contradictions, control_recording
+from app.study.settings_form import Shown, own_changes
+from app.study.traces import AMPLITUDE_STREAM, session_offset_s
+from ml.energy import relative_energy
+
+router = APIRouter()
+
+_QOC_LABELS = {"grasp_hz": "Grasp frequency", "rating": "Rating", "tremor_percent": "Tremor", "reason": "Reason"}
+_CORRECTION_LABELS = {
+    "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "control": "Control trace", "correction_reason": "Reason",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A session in a few numbers.
+
+    Attributes:
+        steps, beta_steps, amplitude_steps: of the session, and those with a valid beta and a known amplitude.
+        gaps, longest_gap_s: stretches without beta within the session.
+        median_beta: in `unit`; None without beta.
+        below_threshold: share of valid steps with beta below xi_beta; None without a threshold or beta.
+        mean_fraction, energy: of the steps with a known fraction; energy relative to cDBS; None without any.
+        above_cdbs: steps above 100 % of the cDBS amplitude.
+    """
+
+    steps: int
+    beta_steps: int
+    amplitude_steps: int
+    gaps: int
+    longest_gap_s: float
+    unit: str
+    median_beta: float | None
+    below_threshold: float | None
+    mean_fraction: float | None
+    energy: float | None
+    above_cdbs: int
+
+
+def summarise(data: SessionData) -> Summary:
+    """The numbers of a session's step table."""
+    table, settings = data.table, data.settings
+    inside = table.t_s > 0
+    beta, fraction = table.beta[inside], table.fraction[inside]
+    missing = np.isnan(beta)
+    edges = np.flatnonzero(np.diff(np.r_[False, missing, False].astype(int)))
+    lengths = edges[1::2] - edges[::2]
+    valid, known = beta[~missing], fraction[~np.isnan(fraction)]
+    return Summary(
+        steps=int(inside.sum()),
+        beta_steps=int(valid.size),
+        amplitude_steps=int(np.sum(~np.isnan(fraction) | ~np.isnan(table.amplitude_ma[inside]))),
+        gaps=int(lengths.size),
+        longest_gap_s=float(lengths.max(initial=0) * settings.period_s),
+        unit=table.beta_trace.unit if table.beta_trace else "",
+        median_beta=float(np.median(valid)) if valid.size else None,
+        below_threshold=float(np.mean(valid < data.threshold)) if valid.size and data.threshold is not None else None,
+        mean_fraction=float(known.mean()) if known.size else None,
+        energy=relative_energy(fraction) if known.size else None,
+        above_cdbs=table.above_one,
+    )
+
+
+@router.get("/sessions/{session_id}")
+def session_page(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller) -> Response:
+    """One session; a proposal is looked at where it is confirmed."""
+    if session.status == "proposed":
+        return RedirectResponse(f"/proposals/{session.id}", 303)
+    return _page(request, db, session, caller)
+
+
+@router.post("/sessions/{session_id}/qoc")
+def record_qoc(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Enter or correct QoCs."""
+    # what was left as shown keeps its digits, which the form does not show, and what others entered meanwhile
+    seen = str(values["revision"]) if "revision" in values else None
+    changes = own_changes(values, seen, _qoc_revisions(session), _QOC_LABELS)
+    reason = {"reason": str(values["reason"])} if "reason" in values else {}
+    try:
+        service.require(caller, can.WRITE_STUDY, session.visit.participant)
+        changes.refuse_conflicts()
+        service.record_qoc(db, session, parse(QocIn, changes.fields | reason, _QOC_LABELS), caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, db, session, caller, error, typed=changes.fields | reason)
+    db.commit()
+    return RedirectResponse(f"/sessions/{session.id}?done=qoc", 303)
+
+
+@router.post("/sessions/{session_id}/exclusion")
+def exclude(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Keep a session out of buffers and analyses, or take it in again."""
+    include = values.get("include") == "yes"
+    why = str(values.get("excluded_reason", "")).strip()
+    try:
+        if not include and not why:
+            raise Invalid("An exclusion needs a reason.", "Say why the session shall not count.")
+        change = SessionChange(excluded_reason=None if include else why[:1000], reason="included again" if include else why[:1000])
+        service.change_session(db, session, change, caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, db, session, caller, error)
+    db.commit()
+    return RedirectResponse(f"/sessions/{session.id}?done={'included' if include else 'excluded'}", 303)
+
+
+@router.post("/sessions/{session_id}/correction")
+def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Correct what a session was: controller, policy, hemisphere, the trace that drove the controller."""
+    # only what the form changed of what it showed, so that an old form takes back nothing that somebody else corrected meanwhile
+    present = Shown(1, _correction(session, caller), repository.last_editor(db, "session", session.id))
+    shown = Shown(0, {n: str(values.get(f"seen_{n}", text)) for n, text in present.fields.items()}, "")
+    changes = own_changes(values, "0", [shown, present], _CORRECTION_LABELS)
+    reason = str(values.get("reason", "")).strip()[:1000]
+    try:
+        service.require(caller, can.WRITE_STUDY, session.visit.participant)
+        changes.refuse_conflicts()
+        fields: dict[str, Any] = {n: changes.fields[n] for n in ("controller", "hemisphere") if n in changes.fields} | {"reason": reason}
+        if "policy" in changes.fields:
+            policy = changes.fields["policy"]
+            fields["policy_id"] = _policy_id(db, session, policy) if policy else ""
+        stream, _, channel = changes.fields.get("control", "").partition("\t")
+        if stream:
+            fields |= {"control_stream": stream, "control_channel": channel}
+        service.change_session(db, session, parse(SessionChange, fields, _CORRECTION_LABELS), caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, db, session, caller, error, typed=changes.fields | {"correction_reason": reason})
+    db.commit()
+    return RedirectResponse(f"/sessions/{session.id}?done=corrected", 303)
+
+
+@router.post("/sessions/{session_id}/derived")
+def take_derived(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Put the value that the uploaded files give in the place of a typed one."""
+    try:
+        shown = parse(DerivedChoice, {"name": values.get("name", ""), "value": values.get("value", "")}, {"value": "Derived value"})
+        service.take_derived(db, session, shown, caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, db, session, caller, error)
+    db.commit()
+    return RedirectResponse(f"/sessions/{session.id}?done=derived", 303)
+
+
+def _correction(session: StudySession, caller: Caller) -> dict[str, str]:
+    """What the form of corrections shows of a session."""
+    known = arm(session, caller)
+    return {
+        "controller": known.controller.value,
+        "policy": "" if known.policy_id is None else str(known.policy_id),
+        "hemisphere": session.hemisphere or "",
+        "control": f"{session.control_stream}\t{session.control_channel or ''}",
+    }
+
+
+def _qoc_revisions(session: StudySession) -> list[Shown]:
+    """Every revision as the form showed it; before the first one, it was empty."""
+    return [Shown(0, _shown_qoc(None), ""), *(Shown(q.revision, _shown_qoc(q), q.entered_by) for q in session.qocs)]
+
+
+def _shown_qoc(revision: QocRevision | None) -> dict[str, str]:
+    """QoCs as the form shows them."""
+    values = {n: getattr(revision, n, None) for n in ("grasp_hz", "rating", "tremor_percent")}
+    return {name: "" if value is None else f"{value:.4g}" for name, value in values.items()}
+
+
+def _policy_id(db: Session, session: StudySession, name: str) -> int:
+    found = repository.policy_id(db, session.visit.participant_id, name)
+    if found is None:
+        raise Invalid(f"Participant {session.visit.participant.code} has no policy '{name}'.", "Give the name or number of one.")
+    return found
+
+
+def _page(
+    request: Request,
+    db: Session,
+    session: StudySession,
+    caller: Caller,
+    error: BetaloopError | None = None,
+    typed: dict[str, str] | None = None,
+) -> HTMLResponse:
+    participant = session.visit.participant
+    recordings = list(dict.fromkeys(s.recording for s in session.segments))
+    traces = {r.id: repository.traces_of_recording(db, r.id) for r in recordings}
+    data, trouble = None, None
+    try:
+        data = service.session_data(db, session)
+    except BetaloopError as unreadable:
+        trouble = unreadable.problem(request.url.path)
+    view = session_view.shown_trace(session, data, traces, request.query_params.get("trace", ""))
+    known, seen = _shown_qoc(session.qoc), _correction(session, caller)
+    events, origin = _control_events(session, recordings)
+    page = render(
+        request,
+        "study/session.html",
+        session=session,
+        visit=session.visit,
+        participant=participant,
+        arm=arm(session, caller),
+        policy_name=repository.policy_name(db, arm(session, caller).policy_id),
+        controllers=[(c.value, name) for c, name in CONTROLLER_NAMES.items()],
+        data=data,
+        trouble=trouble,
+        summary=summarise(data) if data else None,
+        contradictions=contradictions(db, session, steps_told=True),
+        control=control_recording(session),
+        view=view,
+        steps=stimulation_steps(data, events, origin) if data else [],
+        conflicts=operator_conflicts(events, origin),
+        blocks=session_view.recording_blocks(session, recordings, traces, view.used),
+        outcomes=session_view.outcomes_view(db, session),
+        streams=[t for r in recordings for t in traces[r.id] if t.stream != AMPLITUDE_STREAM],
+        recordings=recordings,
+        qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
+        correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},
+        seen=seen,
+        may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
+        problem=error.problem(request.url.path) if error else None,
+    )
+    return HTMLResponse(page, error.status if error else 200)
+
+
+def _control_events(session: StudySession, recordings: list[Recording]) -> tuple[list[dict[str, Any]], float]:
+    """Events of the recording that the controller saw, as stored, and where the session starts in its clock, seconds."""
+    control = {s.recording_id for s in session.segments if s.is_control}
+    for recording in recordings:
+        if recording.id in control:
+            return list(recording.details.get("events", [])), session_offset_s(session, recording.id)
+    return [], 0.0

@@ -1,0 +1,382 @@
+"""`betaloop control`: a bundle at work on a stream of beta amplitudes, every decision logged. No database, no service."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+import sys
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+from app.platform.errors import Invalid
+from app.settings import get_settings
+from app.tablet.battery import Implant, read_implant
+from app.tablet.sources import Row, Source, Wish, open_source
+from ml.deploy.appraisal import battery_gain, battery_words, warnings
+from ml.deploy.bundle import OpenBundle, open_bundle
+from ml.deploy.manifest import BundleError, BundleManifest
+from ml.deploy.runtime.envelope import Decision, Reason, Signal, reason_names
+from ml.energy import relative_energy, saving_percent
+
+COLUMNS = (
+    "t_s", "beta", "unit", "valid", "window", "fraction", "requested_ma", "amplitude_ma", "action", "reasons", "latency_us", "signal_us",
+    "late_ms", "missed", "detail",
+)  # fmt: skip
+_KEY = "bundle-signing"
+
+
+class Sink(Protocol):
+    """What a log is written to."""
+
+    def write(self, row: str, /) -> int:
+        """Add one line."""
+
+
+@dataclass
+class Run:
+    """What a session of the controller amounted to; grows with every decision."""
+
+    period_s: float
+    cdbs_ma: float
+    decisions: list[Decision] = field(default_factory=list)
+    latency_us: list[float] = field(default_factory=list)
+    signal_us: list[float] = field(default_factory=list)
+    signals: set[Signal] = field(default_factory=set)
+    missed: int = 0
+    worst_late_ms: float = 0.0
+
+    def summary(self, source: Source) -> dict[str, Any]:
+        """Numbers of the session by name; None where there is nothing to count."""
+        amplitudes = np.array([d.amplitude_ma for d in self.decisions])
+        latency = np.array(self.latency_us)
+        asked = [d for d in self.decisions if not d.fallback]
+        energy = relative_energy(amplitudes / self.cdbs_ma) if amplitudes.size else math.nan
+        body: dict[str, Any] = {
+            "source": source.description,
+            "decisions": len(self.decisions),
+            "policy": len(asked),
+            "fallbacks": len(self.decisions) - len(asked),
+            "reasons": dict(Counter(name for d in self.decisions for name in reason_names(d.reasons))),
+            "deadline_misses": self.missed,
+            "worst_late_ms": round(self.worst_late_ms, 3),
+            "latency_us": _spread(latency),
+            "signal_us": _spread(np.array(self.signal_us)) if any(self.signal_us) else None,
+            "mean_amplitude_ma": float(amplitudes.mean()) if amplitudes.size else None,
+            "energy_of_cdbs": None if math.isnan(energy) else energy,
+            "energy_saved_percent": None if math.isnan(energy) else saving_percent(energy, 1.0),
+        }
+        return body | _agreement(source)
+
+
+def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[str, Any]:
+    """Verify a bundle and, with a source, run its controller. Returns the summary.
+
+    Args:
+        bundle: the ZIP. source, wish: as `open_source` takes them; without a source the bundle is verified and no more.
+        task: what else is to be done.
+
+    Raises:
+        Invalid: the bundle is not what it should be, or an argument makes no sense. NotFound: no such source.
+    """
+    implant = None if task.battery is None else read_implant(task.battery)
+    opened = verified(bundle, task.key)
+    manifest = opened.manifest
+    if task.participant is not None and task.participant != manifest.participant:
+        raise Invalid(
+            f"{bundle.name} is of participant {manifest.participant}, not {task.participant}.", "A bundle is for its participant alone."
+        )
+    facts: dict[str, Any] = {"bundle": bundle.name, "participant": manifest.participant, "policy_name": manifest.policy_name}
+    facts |= {"policy_id": manifest.policy_id, "approved": bool(manifest.approvals), "warnings": warnings(manifest)}
+    if source is None:
+        return facts | {"verified": True, "files": len(manifest.files)}
+    if source == "-" and wish.realtime and not manifest.approvals and not task.bench:
+        raise Invalid(
+            f"{bundle.name} is not approved and must not be run live.",
+            "Have the visit plan with this policy approved and take the bundle anew, or add --bench where nobody is connected.",
+        )
+    if isinstance(sys.stdin, io.TextIOWrapper):
+        sys.stdin.reconfigure(errors="replace")  # bytes that are no text are no number either, and no reason to stop
+    stream = open_source(source, manifest, wish, sys.stdin)
+    if stream.participant not in (None, manifest.participant):
+        facts["warnings"].append(
+            f"The bundle is of participant {manifest.participant}, the source is synthetic participant {stream.participant}."
+        )
+    run = Run(manifest.period_s, manifest.cdbs_ma)
+    try:
+        with nullcontext(None) if task.log is None else DecisionLog(task.log) as sink:
+            drive(opened, stream, run, wish.realtime, sink)
+    except KeyboardInterrupt:  # ended by hand: what was done so far is summed up
+        facts["ended"] = "by hand"
+    return facts | run.summary(stream) | _battery(run, implant) | _foreign(run, manifest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What is asked of a run.
+
+    Attributes:
+        log: CSV to write, one row per decision.
+        key: as `verified` takes it.
+        participant: code that the bundle must be of.
+        battery: JSON file with assumptions about the implant, as `read_implant` takes it.
+        bench: nobody is connected, so that a bundle without approval may run live.
+    """
+
+    log: Path | None = None
+    key: str | None = None
+    participant: str | None = None
+    battery: Path | None = None
+    bench: bool = False
+
+
+class DecisionLog:
+    """A new CSV file that gets one row per decision, each handed to the operating system at once, so that a killed process loses none.
+
+    Args:
+        path: of the file; one that holds something already is not written over.
+
+    Raises:
+        Invalid: the file is there already or cannot be written, at the start or at any row.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._rows = path, -1  # the first row is the header
+        try:
+            if path.is_file() and path.stat().st_size:
+                raise Invalid(f"The log {path} is there already.", "Name a new file: no decision is written over.")
+            self._stream = path.open("w", newline="", encoding="utf-8")
+        except OSError as error:
+            raise self._unwritten(error) from error
+
+    def __enter__(self) -> DecisionLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            self._stream.close()
+        except OSError as error:
+            raise self._unwritten(error) from error
+
+    def write(self, row: str) -> int:
+        """Add one line, whole or not at all as far as a kill is concerned."""
+        try:
+            self._stream.write(row)
+            self._stream.flush()
+        except OSError as error:
+            raise self._unwritten(error) from error
+        self._rows += 1
+        return len(row)
+
+    def _unwritten(self, error: OSError) -> Invalid:
+        done = f" The run ended after {self._rows} decisions." if self._rows >= 0 else ""
+        return Invalid(
+            f"The log {self._path} cannot be written: {error.strerror}.{done}", "Name a file where there is room and leave to write."
+        )
+
+
+def verified(path: Path, key: str | None) -> OpenBundle:
+    """A bundle whose signature, hashes and test vectors are right.
+
+    Args:
+        path: of the ZIP. key: public key as 64 hexadecimal digits, or a file with them; the one of this installation when None.
+
+    Raises:
+        Invalid: no key, or a bundle that is not as it should be.
+    """
+    try:
+        return open_bundle(path.read_bytes(), _public_key(key))
+    except BundleError as error:
+        raise Invalid(f"{path.name} must not be used: {error}.", "Take the bundle from the study anew.") from error
+    except OSError as error:
+        raise Invalid(f"{path} cannot be read: {error.strerror}.", "Name the ZIP that the study gave you.") from error
+
+
+def drive(
+    opened: OpenBundle, source: Source, run: Run, realtime: bool, sink: Sink | None, wait: Callable[[float], None] = time.sleep
+) -> None:
+    """Run the loop to the end of the source, one decision per row.
+
+    Args:
+        opened: the bundle. source: what comes. run: is filled in.
+        realtime: wait until each row is due, and decide by the clock, so that a decision which comes a period late finds its beta stale.
+        sink: gets the log, row by row, so that a crash loses none. wait: sleeps for so many seconds.
+    """
+    controller = opened.controller()
+    writer = csv.writer(sink) if sink else None
+    if writer:
+        writer.writerow(COLUMNS)
+    window: deque[float] = deque(maxlen=opened.manifest.window)
+    rows = source.rows
+    row = next(rows, None)
+    began_s = time.perf_counter() - (row.now_s if row else 0.0)
+    while row is not None:
+        due = began_s + row.now_s
+        if realtime and (pause := due - time.perf_counter()) > 0:
+            wait(pause)
+        now_s = max(row.now_s, time.perf_counter() - began_s) if realtime else row.now_s
+        start = time.perf_counter_ns()
+        decision = controller.decide(now_s, row.sample)
+        latency_us = (time.perf_counter_ns() - start) / 1000.0
+        # A decision is late when it is not there within one period of the end of the window it is about.
+        late_s = (max(0.0, time.perf_counter() - due) if realtime else latency_us / 1e6) + row.signal_us / 1e6
+        missed = late_s > run.period_s
+        run.decisions.append(decision)
+        if row.sample is not None:
+            run.signals.add(row.sample.signal)
+        run.latency_us.append(latency_us)
+        run.signal_us.append(row.signal_us)
+        run.missed += missed
+        if missed:
+            sys.stderr.write(f"deadline missed: the decision of {row.now_s:.3f} s came {1000.0 * late_s:.0f} ms after its window's end\n")
+        run.worst_late_ms = max(run.worst_late_ms, 1000.0 * late_s)
+        if row.sample is not None and not decision.reasons & Reason.LATE_SAMPLE:
+            window.append(row.sample.beta)
+        if writer:
+            writer.writerow(_log_row(row, decision, list(window), latency_us, late_s, missed))
+        try:
+            row = rows.send(decision.amplitude_ma)
+        except StopIteration:
+            row = None
+
+
+def lines(summary: dict[str, Any]) -> str:
+    """The summary for a person."""
+    use = "approved" if summary["approved"] else "NOT APPROVED: not to be used on a participant"
+    who = f"participant {summary['participant']}, policy {summary['policy_name']} (no. {summary['policy_id']}), {use}"
+    warned = [f"warning          {text}" for text in summary["warnings"]]
+    if summary.get("verified"):
+        return "\n".join([f"{summary['bundle']}: signature, {summary['files']} files and test vectors are right. {who}.", *warned])
+    latency = summary["latency_us"]
+    reasons = ", ".join(f"{name} {count}" for name, count in summary["reasons"].items()) or "none"
+    out = [
+        f"bundle           {who}",
+        *warned,
+        f"source           {summary['source']}",
+        f"decisions        {summary['decisions']}: {summary['fallbacks']} on cDBS as fall-back",
+        f"reasons          {reasons}",
+        f"deadline misses  {summary['deadline_misses']} (worst {summary['worst_late_ms']:.3g} ms after the window's end)",
+    ]
+    for name, spread in (("decision", latency), ("P_beta", summary["signal_us"])):
+        if spread:
+            spread_text = f"mean {spread['mean']:.1f}, std {spread['std']:.1f}, median {spread['median']:.1f}, 99 % {spread['p99']:.1f}"
+            out.append(f"{name + ' in us':<17}{spread_text}")
+    if summary["mean_amplitude_ma"] is not None:
+        out.append(f"mean amplitude   {summary['mean_amplitude_ma']:.3f} mA")
+        out.append(f"energy           {summary['energy_of_cdbs']:.3f} of cDBS: {summary['energy_saved_percent']:.1f} % saved")
+    if "battery" in summary:
+        out.append(f"battery          {summary['battery']}")
+    if "battery_life" in summary:
+        out += [f"battery life     {summary['battery_life']}", f"  on cDBS        {summary['battery_life_on_cdbs']}"]
+    if "streaming_correlation" in summary:
+        out.append(
+            f"P_beta in time   correlation with afterwards {summary['streaming_correlation']:.5f}, mean difference "
+            f"{summary['streaming_mean_percent']:.2f} %, worst {summary['streaming_worst_percent']:.2f} % (n = {summary['streaming_n']})"
+        )
+    if "wrong_signal" in summary:
+        out.append(f"NO DECISION BY THE POLICY: {summary['wrong_signal']}")
+    return "\n".join(out)
+
+
+def _public_key(key: str | None) -> Ed25519PublicKey:
+    if key is None:
+        path = get_settings().data_dir / "secrets" / _KEY
+        if not path.exists():
+            raise Invalid(
+                "This machine does not know the key that bundles are signed with.", "Give it with --key: GET /api/v1/bundle-key tells it."
+            )
+        return Ed25519PrivateKey.from_private_bytes(get_settings().secret(_KEY)).public_key()
+    text = key.strip()
+    if not re.fullmatch(r"[0-9a-fA-F]{64}", text):
+        try:
+            text = Path(key).read_text("utf-8").strip()
+        except (OSError, UnicodeDecodeError, ValueError) as error:
+            raise Invalid(f"The key '{key[:80]}' is neither 64 hexadecimal digits nor a readable file.", "Give one of them.") from error
+    try:
+        return Ed25519PublicKey.from_public_bytes(bytes.fromhex(text))
+    except ValueError as error:
+        raise Invalid("The key is not 64 hexadecimal digits.", "GET /api/v1/bundle-key tells it.") from error
+
+
+def _log_row(row: Row, decision: Decision, window: list[float], latency_us: float, late_s: float, missed: bool) -> list[Any]:
+    sample = row.sample
+    shown = window[len(window) - decision.valid :] if decision.valid else []
+    return [
+        f"{decision.t_s:.3f}",
+        "" if sample is None else f"{sample.beta:.6g}",
+        "" if sample is None else sample.signal.unit,
+        decision.valid,
+        " ".join(f"{beta:.6g}" for beta in shown),
+        "" if decision.fraction is None else f"{decision.fraction:.7g}",
+        "" if decision.requested_ma is None else f"{decision.requested_ma:.6g}",
+        f"{decision.amplitude_ma:.6g}",
+        "cdbs" if decision.fallback else "policy",
+        " ".join(reason_names(decision.reasons)),
+        f"{latency_us:.1f}",
+        f"{row.signal_us:.1f}",
+        f"{1000.0 * late_s:.3f}",
+        int(missed),
+        decision.detail,
+    ]
+
+
+def _spread(values: Any) -> dict[str, float] | None:
+    if len(values) == 0:
+        return None
+    return {
+        "mean": float(np.mean(values)),
+        "std": float(np.std(values)),
+        "median": float(np.median(values)),
+        "p99": float(np.quantile(values, 0.99)),
+    }
+
+
+def _foreign(run: Run, manifest: BundleManifest) -> dict[str, Any]:
+    """Said where every beta amplitude that came was of another unit or source than the bundle's."""
+    came = [d for d in run.decisions if not d.reasons & (Reason.NO_BETA | Reason.STALE_BETA)]
+    if not came or not all(d.reasons & Reason.WRONG_SIGNAL for d in came):
+        return {}
+    given = ", ".join(sorted(f"{unit} from {source}" for unit, source in run.signals))
+    return {"wrong_signal": f"the bundle takes beta in {manifest.beta_unit} from {manifest.beta_source}; the source gives {given}"}
+
+
+def _battery(run: Run, implant: Implant | None) -> dict[str, Any]:
+    """What the session's amplitudes mean for a battery; nothing where nothing was decided."""
+    fractions = np.array([d.amplitude_ma for d in run.decisions]) / run.cdbs_ma
+    if not fractions.size:
+        return {}
+    energy, charge = float(np.mean(fractions**2)), float(fractions.mean())
+    gain = battery_gain(energy, charge)
+    facts: dict[str, Any] = {"battery": battery_words(energy, charge), "battery_life_of_cdbs": [gain.low, gain.high]}
+    if implant is None:
+        return facts
+    life, cdbs = implant.life(fractions * run.cdbs_ma), implant.life([run.cdbs_ma])
+    facts |= {"battery_life": str(life), "battery_days": [life.days.low, life.days.high]}
+    return facts | {"battery_life_on_cdbs": str(cdbs), "battery_days_on_cdbs": [cdbs.days.low, cdbs.days.high]}
+
+
+def _agreement(source: Source) -> dict[str, Any]:
+    """How close P_beta in time was to P_beta as computed afterwards, over the periods that are valid in both."""
+    streamed = np.array(source.streamed)
+    offline = source.offline[: streamed.size]
+    both = np.isfinite(streamed[: offline.size]) & np.isfinite(offline)
+    if both.sum() < 3:
+        return {}
+    now, later = streamed[: offline.size][both], offline[both]
+    difference = 100.0 * np.abs(now - later) / later
+    return {
+        "streaming_n": int(both.sum()),
+        "streaming_only_later": int(np.sum(np.isfinite(offline) & ~both)),
+        "streaming_correlation": float(np.corrcoef(now, later)[0, 1]),
+        "streaming_mean_percent": float(difference.mean()),
+        "streaming_worst_percent": float(difference.max()),
+    }

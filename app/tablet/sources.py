@@ -1,0 +1,347 @@
+"""Where beta amplitudes come from for `betaloop control`: recordings, synthetic participants, standard input."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.platform.errors import Invalid, NotFound
+from ml.deploy.manifest import BundleManifest
+from ml.deploy.runtime.envelope import BetaSample, Signal
+from ml.deploy.streaming import StreamingBeta, Stretch, split_by_period
+from ml.formats import DecodeOptions, RecordingLog, TraceLog, UndecodableFile, decode, sniff
+from ml.formats.archive import FolderFiles, ZipFiles
+from ml.formats.rcs.beta import time_domain_stretches
+from ml.formats.rcs.folder import SessionFiles, find_sessions
+from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
+from ml.formats.rcs.packets.scan import batch_of
+from ml.formats.rcs.packets.streams import read_time_domain
+from ml.formats.rcs.packets.time import reconstruct
+from ml.formats.rcs.settings import follow
+from ml.formats.recording import FileReport
+from ml.formats.tables.delimited import read_delimited
+from ml.formats.tables.numbers import column_name, unit_name
+
+LFP_UNITS = {"uV": 1.0, "mV": 1000.0, "V": 1e6}
+_COHORT = re.compile(r"cohort:([A-Za-z0-9]+)(?::(\d{1,9}))?")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_PACKETS_AT_ONCE = 4096
+
+
+class Row(NamedTuple):
+    """What has come by the time of a decision: the time, the beta amplitude (None: nothing), microseconds that computing it took."""
+
+    now_s: float
+    sample: BetaSample | None
+    signal_us: float = 0.0
+
+
+Rows = Generator[Row, float, None]
+"""Yields rows; is sent the amplitude (mA) that was decided on the last one."""
+
+
+@dataclass
+class Source:
+    """One stream of beta amplitudes.
+
+    Attributes:
+        rows: to be run through once.
+        description: of the source, for the summary.
+        offline: P_beta of the same periods as computed afterwards, NaN where invalid; empty where there is nothing to compare.
+        streamed: P_beta as it was known in time; grows while `rows` runs.
+        participant: code of a synthetic participant; None where the source does not say whose it is.
+    """
+
+    rows: Rows
+    description: str
+    offline: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    streamed: list[float] = field(default_factory=list)
+    participant: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wish:
+    """What was asked of a source.
+
+    Attributes:
+        channel: of a recording with several; the one with most valid periods when None.
+        beta_source: how the beta amplitudes of a table were made; `table` when None.
+        steps: length of a simulated session.
+        realtime: standard input is timed by its arrival.
+    """
+
+    channel: str | None = None
+    beta_source: str | None = None
+    steps: int = 300
+    realtime: bool = False
+
+
+def open_source(text: str, manifest: BundleManifest, wish: Wish, stdin: Iterable[str]) -> Source:
+    """A source by its name.
+
+    Args:
+        text: a path (RC+S zip or folder, table of 2 s steps, table of `t_s, lfp`), `cohort:P1` or `cohort:P1:SEED`, or `-`.
+        manifest: of the bundle: period, band, unit and source of its beta amplitudes.
+        wish: what else was asked.
+        stdin: lines of standard input.
+
+    Raises:
+        NotFound: no such file or participant. Invalid: nothing in it can be used.
+    """
+    if text == "-":
+        rows = _live_lines(stdin, manifest) if wish.realtime else _lines(stdin, manifest)
+        return Source(rows, "beta amplitudes from standard input")
+    if text.startswith("cohort:"):
+        return _cohort(text, manifest, wish.steps)
+    path = Path(text)
+    if not path.exists():
+        raise NotFound(f"There is no file {path}.", "Name a recording, cohort:P1, or - for standard input.")
+    try:
+        if not path.is_dir() and sniff(path) == "csv" and (lfp := _lfp_columns(path)):
+            return _raw(lfp, manifest, f"{path.name}, raw LFP")
+        options = DecodeOptions(
+            manifest.period_s, manifest.beta_low_hz, manifest.beta_high_hz, min_valid_fraction=manifest.min_valid_fraction
+        )
+        return _recorded(path, options, manifest, wish)
+    except UndecodableFile as error:
+        raise Invalid(f"{path.name} cannot be used: {error.what} ({error.where}).", error.mend) from error
+
+
+def _recorded(path: Path, options: DecodeOptions, manifest: BundleManifest, wish: Wish) -> Source:
+    """The first recording of a file that has the bundle's kind of beta."""
+    recordings = [r for r in decode(path, options=options).recordings if _same_side(r, manifest)]
+    for recording in recordings:
+        traces = [t for t in recording.traces if t.stream in ("beta", "band_power") and t.unit != "uV2"]
+        has_raw = recording.kind == "rcs" and recording.started_at and any(t.source == "time_domain" for t in traces)
+        if has_raw and manifest.beta_source == "time_domain":
+            trace = _chosen([t for t in traces if t.source == "time_domain"], wish.channel)
+            stretches = _rcs_stretches(path, options, recording).get(trace.channel, [])
+            source = _raw(stretches, manifest, f"{path.name}, {trace.channel}, raw LFP", rows=trace.values.size)
+            source.offline = _offline(stretches, manifest, trace.values.size)
+            return source
+        if traces:
+            trace = _chosen([t for t in traces if t.source == manifest.beta_source] or traces, wish.channel)
+            signal = Signal(trace.unit, wish.beta_source if wish.beta_source and trace.source == "table" else trace.source)
+            return Source(_from_trace(trace, signal), f"{path.name}, {trace.channel or trace.stream}, one value per period as decoded")
+    side = f" of the {manifest.hemisphere} hemisphere" if manifest.hemisphere else ""
+    raise Invalid(
+        f"{path.name} holds no beta amplitudes{side}.", "Name a recording with time-domain data, band power, or a table with beta."
+    )
+
+
+def _same_side(recording: RecordingLog, manifest: BundleManifest) -> bool:
+    """Whether a recording can be of the bundle's hemisphere: one that says the other side never is."""
+    return manifest.hemisphere is None or recording.hemisphere in (None, manifest.hemisphere)
+
+
+def _chosen(traces: list[TraceLog], channel: str | None) -> TraceLog:
+    if channel is None:
+        return max(traces, key=lambda t: int(t.valid.sum()))
+    named = [t for t in traces if t.channel == channel]
+    if not named:
+        raise NotFound(f"There is no channel '{channel}'.", f"Name one of: {', '.join(t.channel for t in traces)}.")
+    return named[0]
+
+
+def _from_trace(trace: TraceLog, signal: Signal) -> Rows:
+    """One value per period, known at its end; an invalid one comes as NaN."""
+    for end_s, value, valid in zip(trace.t_end_s.tolist(), trace.values.tolist(), trace.valid.tolist(), strict=True):
+        yield Row(end_s, BetaSample(end_s, value if valid else math.nan, signal))
+
+
+def _lines(lines: Iterable[str], manifest: BundleManifest) -> Rows:
+    """A line per period."""
+    for k, line in enumerate(lines):
+        now_s = k * manifest.period_s
+        yield Row(now_s, _sample(line, now_s, manifest))
+
+
+def _live_lines(lines: Iterable[str], manifest: BundleManifest) -> Rows:
+    """Lines as they arrive, and a row in every period whether or not one did; of several the newest counts, since the others are past."""
+    inbox: SimpleQueue[str | None] = SimpleQueue()
+    Thread(target=_pump, args=(lines, inbox), daemon=True).start()
+    try:
+        line = inbox.get(timeout=manifest.period_s)  # the session starts with the first line, and without it after a period
+    except Empty:
+        line = ""
+    began, k = time.perf_counter(), 0
+    while line is not None:
+        now_s = k * manifest.period_s
+        yield Row(now_s, _sample(line, now_s, manifest))
+        k += 1
+        time.sleep(max(0.0, began + k * manifest.period_s - time.perf_counter()))
+        line = _newest(inbox)
+
+
+def _pump(lines: Iterable[str], inbox: SimpleQueue[str | None]) -> None:
+    """Hand lines on from a thread of its own, None at their end, so that the loop never waits for one."""
+    try:
+        for line in lines:
+            inbox.put(line)
+    finally:
+        inbox.put(None)
+
+
+def _newest(inbox: SimpleQueue[str | None]) -> str | None:
+    """The newest line that has come, "" where none has, None once all have been seen and there will be no more."""
+    line: str | None = ""
+    while True:
+        try:
+            came = inbox.get_nowait()
+        except Empty:
+            return line
+        if came is None:
+            inbox.put(None)
+            return line or None
+        line = came
+
+
+def _sample(line: str, now_s: float, manifest: BundleManifest) -> BetaSample | None:
+    """A number, taken to be of the bundle's unit and source; NaN where there is another text, nothing where the line is empty."""
+    if not line.strip():
+        return None
+    beta = float(line) if _NUMBER.fullmatch(line.strip()) else math.nan  # float() alone takes "1_5" for 15
+    return BetaSample(now_s, beta, Signal(manifest.beta_unit, manifest.beta_source))
+
+
+def _raw(stretches: list[Stretch], manifest: BundleManifest, description: str, rows: int | None = None) -> Source:
+    """P_beta in time from raw samples in uV."""
+    end_s = max((start + x.size / rate for start, rate, x in stretches), default=0.0)
+    count = math.ceil(end_s / manifest.period_s - 1e-9) if rows is None else rows
+    if not stretches or count < 1:
+        raise Invalid(f"{description}: there are no samples.", "Name another recording or channel.")
+    streamed: list[float] = []
+    offline = _offline(stretches, manifest, count)
+    return Source(_stream(stretches, manifest, count, streamed), description, offline, streamed)
+
+
+def _stream(stretches: list[Stretch], manifest: BundleManifest, count: int, streamed: list[float]) -> Rows:
+    period = manifest.period_s
+    signal = Signal("uV2" if manifest.beta_unit == "uV2" else "uV", "time_domain")
+    beta = StreamingBeta(period, manifest.beta_low_hz, manifest.beta_high_hz, manifest.min_valid_fraction)
+    for k, pieces in enumerate(split_by_period(stretches, period, count)):
+        began = time.perf_counter_ns()
+        for piece in pieces:
+            beta.add(*piece)
+        value = beta.value((k + 1) * period)
+        streamed.append(value)
+        used_us = (time.perf_counter_ns() - began) / 1000.0
+        now_s = (k + 1) * period
+        yield Row(now_s, BetaSample(now_s, value**2 if signal.unit == "uV2" else value, signal), used_us)
+
+
+def _offline(stretches: list[Stretch], manifest: BundleManifest, rows: int) -> NDArray[np.float64]:
+    from ml.signals import band_rows
+
+    found = band_rows(stretches, rows, manifest.period_s, manifest.beta_low_hz, manifest.beta_high_hz)
+    return np.where(found.covered >= manifest.min_valid_fraction - 1e-9, found.rms, np.nan)
+
+
+def _rcs_stretches(path: Path, options: DecodeOptions, recording: RecordingLog) -> dict[str, list[Stretch]]:
+    """Gap-free stretches of the recording's channels in uV, on the recording's clock."""
+    files = FolderFiles(path) if path.is_dir() else ZipFiles(path, options.archive)
+    start_ms = recording.started_at.timestamp() * 1000.0 if recording.started_at else 0.0
+    out: dict[str, list[Stretch]] = {}
+    with files if isinstance(files, ZipFiles) else nullcontext():
+        for session in find_sessions(files, FileReport(path.name)):
+            data = read_time_domain(_batches(_elements(session, files, "RawDataTD")))
+            if data.headers.size == 0:
+                continue
+            settings = follow(list(_elements(session, files, "DeviceSettings")), list(_elements(session, files, "StimLog")))
+            for name, pieces in time_domain_stretches(data, reconstruct(data.headers), settings).items():
+                placed = [((first_ms - start_ms) / 1000.0, rate, x * 1000.0) for first_ms, rate, x in pieces]
+                if any(-1.0 <= t <= recording.duration_s + 1.0 for t, _, _ in placed):
+                    out.setdefault(name, []).extend(placed)
+    return out
+
+
+def _elements(session: SessionFiles, files: Any, stem: str) -> Iterator[Any]:
+    if stem in session.members:
+        with files.open(session.members[stem]) as stream:
+            yield from (element for element, _ in read_elements(stream, JsonNotes()))
+
+
+def _batches(elements: Iterator[Any]) -> Iterator[Any]:
+    packets: list[Any] = []
+    for element in elements:
+        packets.append(element)
+        if len(packets) == _PACKETS_AT_ONCE:
+            yield batch_of(packets)
+            packets = []
+    if packets:
+        yield batch_of(packets)
+
+
+def _lfp_columns(path: Path) -> list[Stretch]:
+    """Gap-free stretches in uV of a table `t_s, lfp [unit]`; empty where the table is another.
+
+    Raises:
+        UndecodableFile: times that do not increase, or no known unit.
+    """
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        if "lfp" not in stream.readline().lower():
+            return []
+    table = read_delimited(path, 2_000_000, "t_s and lfp [uV]")
+    named = {column_name(header): i for i, header in enumerate(table.headers)}
+    time_columns = [i for (name, _), i in named.items() if name in ("t_s", "t", "time_s", "time")]
+    lfp = [(i, unit) for (name, unit), i in named.items() if name == "lfp"]
+    if len(time_columns) != 1 or len(lfp) != 1:
+        return []
+    column, unit = lfp[0]
+    known = unit_name(unit) if unit else "uV"
+    if known not in LFP_UNITS:
+        raise UndecodableFile(f"LFP in '{unit}'", "line 1, column lfp", f"Give it in one of {', '.join(LFP_UNITS)}.")
+    decimal = table.decimal_mark([time_columns[0], column])
+    t_s, values = table.numbers(time_columns[0], decimal), table.numbers(column, decimal) * LFP_UNITS[known]
+    kept = np.isfinite(t_s) & np.isfinite(values)
+    t_s, values = t_s[kept], values[kept]
+    steps = np.diff(t_s)
+    if t_s.size < 2 or np.any(steps <= 0):
+        raise UndecodableFile("times that do not increase", "column t_s", "Sort the rows by time, each time once.")
+    step = float(np.median(steps))
+    cuts = (np.flatnonzero(steps > 1.5 * step) + 1).tolist()
+    bounds = [0, *cuts, t_s.size]
+    return [(float(t_s[a]), 1.0 / step, values[a:b]) for a, b in pairwise(bounds)]
+
+
+def _cohort(text: str, manifest: BundleManifest, steps: int) -> Source:
+    """A synthetic participant that answers to the amplitude: the loop is closed."""
+    from ml.population import PARTICIPANTS
+
+    found = _COHORT.fullmatch(text)
+    if found is None or found[1] not in PARTICIPANTS:
+        raise NotFound(f"There is no synthetic participant '{text}'.", f"Name one of cohort:{', cohort:'.join(PARTICIPANTS)}, with :SEED.")
+    name, seed = found[1], int(found[2] or 0)
+    description = f"synthetic participant {name}, seed {seed}, closed loop of {steps} steps"
+    return Source(_simulate(name, seed, manifest, steps), description, participant=name)
+
+
+def _simulate(name: str, seed: int, manifest: BundleManifest, steps: int) -> Rows:
+    from ml.population.env import ParticipantEnv
+    from ml.population.participants import PARTICIPANTS
+
+    environment = ParticipantEnv(name, steps, PARTICIPANTS[name].mdp_settings(window=manifest.window, period_s=manifest.period_s))
+    signal = Signal("uV", manifest.beta_source)  # the simulation gives the amplitude itself, whatever the device would make it from
+    window, _ = environment.reset(seed=seed)
+    amplitude = manifest.cdbs_ma
+    for i, beta in enumerate(window.tolist()):  # the window before the session, recorded under cDBS
+        now_s = (i - len(window) + 1) * manifest.period_s
+        amplitude = yield Row(now_s, BetaSample(now_s, beta, signal))
+    for k in range(1, steps + 1):
+        _, _, done, _, info = environment.step(np.array([amplitude / manifest.cdbs_ma], dtype=np.float32))
+        now_s = k * manifest.period_s
+        amplitude = yield Row(now_s, BetaSample(now_s, float(info["beta"]), signal))
+        if done:
+            return

@@ -1,0 +1,177 @@
+"""Decoders of uploaded files: bytes in, recordings and reports out. No database and no network in here.
+
+`sniff`, `redact` and `decode` are the only entrances.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Literal
+
+from ml.formats.archive import ZipFiles
+from ml.formats.options import ArchiveLimits, DecodeOptions
+from ml.formats.percept.redact import redact_percept
+from ml.formats.percept.report import decode_percept, report_members
+from ml.formats.percept.report_json import looks_like_report
+from ml.formats.rcs.folder import decode_rcs, find_sessions
+from ml.formats.recording import (
+    DECODE_VERSION,
+    TREMOR_CLASSES,
+    DecodedFile,
+    EventLog,
+    FileReport,
+    GraspLog,
+    Problem,
+    RecordingLog,
+    SessionLog,
+    SpectrumLog,
+    TraceLog,
+    TremorLog,
+    UndecodableFile,
+)
+from ml.formats.redact import redact_rcs_zip
+from ml.formats.redaction import REDACTOR_VERSION, Redaction
+from ml.formats.tables.delimited import read_headers
+from ml.formats.tables.grasps import decode_grasps, looks_like_grasps
+from ml.formats.tables.redact import redact_table
+from ml.formats.tables.steps import decode_csv, decode_parquet
+from ml.formats.tables.strivepd import decode_strivepd, looks_like_tremor
+
+__all__ = [
+    "DECODE_VERSION",
+    "REDACTOR_VERSION",
+    "TREMOR_CLASSES",
+    "ArchiveLimits",
+    "DecodeOptions",
+    "DecodedFile",
+    "EventLog",
+    "FileKind",
+    "FileReport",
+    "GraspLog",
+    "Problem",
+    "RecordingLog",
+    "Redaction",
+    "SessionLog",
+    "SpectrumLog",
+    "TraceLog",
+    "TremorLog",
+    "UndecodableFile",
+    "decode",
+    "redact",
+    "sniff",
+]
+
+FileKind = Literal["rcs", "percept", "csv", "parquet", "tremor", "grasp"]
+HEAD = 65_536
+MEND = (
+    "Upload an RC+S session folder as a zip, a Percept session report (JSON), a table as CSV or Parquet, "
+    "a tremor export, or a table of open-fist times."
+)
+
+
+def sniff(path: Path) -> FileKind:
+    """What a file is, by its content; its name and extension are not asked.
+
+    Raises:
+        UndecodableFile: empty, or nothing this service reads.
+    """
+    if path.is_dir():
+        return "rcs"
+    with path.open("rb") as stream:
+        head = stream.read(HEAD)
+    if not head:
+        raise UndecodableFile("the file is empty", "file", MEND)
+    if head.startswith(b"PAR1"):
+        return "parquet"
+    if head.startswith((b"PK\x03\x04", b"PK\x05\x06")) or zipfile.is_zipfile(path):
+        return _kind_of_zip(path)
+    if looks_like_report(head):
+        return "percept"
+    text = head.lstrip(b"\xef\xbb\xbf \t\r\n")
+    if text.startswith((b"[", b"{")):
+        what = "a single JSON file, neither a whole RC+S session nor a Percept session report"
+        raise UndecodableFile(what, "file", "Zip the whole session folder and upload that.")
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")) or b"\0" not in head[:4096]:
+        return _kind_of_text(path)
+    raise UndecodableFile("no format this service reads", "first bytes", MEND)
+
+
+def _kind_of_zip(path: Path) -> FileKind:
+    """A zip of Percept reports where it holds no RC+S file; what cannot be opened is left to the decoder of RC+S, which says why."""
+    try:
+        with ZipFiles(path, ArchiveLimits()) as files:
+            if not find_sessions(files, FileReport("archive")) and report_members(files):
+                return "percept"
+    except UndecodableFile:
+        return "rcs"
+    return "rcs"
+
+
+def _kind_of_text(path: Path) -> FileKind:
+    """Which table a text is, by its headers."""
+    try:
+        headers = read_headers(path)
+    except UndecodableFile:
+        return "csv"
+    if looks_like_tremor(headers):
+        return "tremor"
+    return "grasp" if looks_like_grasps(headers) else "csv"
+
+
+def redact(source: Path, target: Path, kind: FileKind, key: bytes, options: DecodeOptions | None = None) -> Redaction:
+    """Write a file without identity; the same bytes in give the same bytes out, and they decode to the same content.
+
+    Args:
+        source: the uploaded file.
+        target: where the redacted file is written.
+        kind: what it is, from `sniff`.
+        key: secret of the installation for pseudonyms of devices, at least 16 bytes.
+        options: choices of the decoder, which checks tables as the sender wrote them.
+
+    Raises:
+        UndecodableFile: it cannot be parsed, and so not be cleaned; nothing is written then.
+    """
+    options = options or DecodeOptions()
+    if kind == "rcs":
+        return redact_rcs_zip(source, target, key, options.archive)
+    if kind == "percept":
+        return redact_percept(source, target, key, options.archive)
+    return redact_table(source, target, kind, options)
+
+
+def decode(path: Path, kind: FileKind | None = None, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
+    """Decode a file.
+
+    Args:
+        path: where its bytes are; for RC+S a folder will do too.
+        kind: what it is; sniffed when not given.
+        options: choices that change the numbers.
+        name: what to call it in reports and errors; the path's last part when not given.
+
+    Raises:
+        UndecodableFile: nothing in it can be used; says what, where and how to mend it.
+    """
+    options = options or DecodeOptions()
+    kind = kind or sniff(path)
+    if kind == "rcs":
+        decoded = decode_rcs(path, options, name)
+        if all(_is_empty(r) for r in decoded.recordings):
+            said = "this upload holds no data: no stream has a sample and no stimulation log an amplitude; kept as a recording without data"
+            decoded.reports[0].flagged.insert(0, said)
+        return decoded
+    decoders = {
+        "percept": decode_percept,
+        "tremor": decode_strivepd,
+        "grasp": decode_grasps,
+        "parquet": decode_parquet,
+        "csv": decode_csv,
+    }
+    return decoders[kind](path, options, name)
+
+
+def _is_empty(recording: RecordingLog) -> bool:
+    """Whether an RC+S recording has neither a sample nor an amplitude in its stimulation log."""
+    logged = (e.data for e in recording.events if e.kind == "stimulation" and e.data["origin"] == "StimLog")
+    stimulated = any(program["amplitude_ma"] is not None for data in logged for program in data["programs"])
+    return recording.duration_s == 0 and not recording.traces and not stimulated

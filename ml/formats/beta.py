@@ -1,0 +1,94 @@
+"""P_beta per step from samples of a local field potential, whichever device or table they come from. Source: Gao et al. 2023, section 3."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.formats.options import DecodeOptions
+from ml.formats.recording import SpectrumLog, TraceLog, TraceSource
+from ml.signals import band_rows, spectrum
+
+Stretch = tuple[float, float, NDArray[np.float64]]
+"""A gap-free piece: time of its first sample in s, rate in Hz, samples in uV [n]."""
+
+
+def step_trace(
+    names: tuple[str, str, str],
+    source: TraceSource,
+    values: NDArray[np.float64],
+    covered: NDArray[np.float64],
+    options: DecodeOptions,
+    details: Mapping[str, Any],
+    t_end_first_s: float | None = None,
+) -> TraceLog:
+    """A trace of (stream, channel, unit) on the grid of steps; rows covered too little, or without a number, are invalid and NaN.
+
+    Args:
+        names: stream, channel, unit.
+        source: where the values come from.
+        values: one per row, shape [rows].
+        covered: share of each row that there are data for, 0..1, shape [rows].
+        options: the period, and the share that a valid row needs.
+        details: how the values were made.
+        t_end_first_s: end of the first row; one period where not given.
+    """
+    valid = (covered >= options.min_valid_fraction - 1e-9) & np.isfinite(values)
+    stored = np.where(valid, values, np.nan).astype(np.float32)
+    first = options.period_s if t_end_first_s is None else t_end_first_s
+    said = {**details, "min_valid_fraction": options.min_valid_fraction}
+    return TraceLog(*names, source, options.period_s, first, stored, valid, said)
+
+
+def time_domain_traces(
+    stretches: Sequence[Stretch],
+    channel: str,
+    rows: int,
+    options: DecodeOptions,
+    details: Mapping[str, Any],
+    t0_s: float = 0.0,
+) -> list[TraceLog]:
+    """RMS amplitude and power of one channel's beta band: the stream `beta` is the measure that the options name, the other is beside it.
+
+    Stretches sampled too slowly for the band are left out; none where all are.
+
+    Args:
+        stretches: gap-free pieces in uV.
+        channel: name of the channel.
+        rows: number of rows, the first beginning at `t0_s`.
+        options: band, period, measure, share that a valid row needs.
+        details: what else is known of the channel.
+        t0_s: where row 0 begins, s.
+    """
+    fits = [s for s in stretches if options.beta_high_hz < s[1] / 2]
+    if not fits:
+        return []
+    found = band_rows(fits, rows, options.period_s, options.beta_low_hz, options.beta_high_hz, t0_s)
+    said = {
+        **details,
+        "low_hz": options.beta_low_hz,
+        "high_hz": options.beta_high_hz,
+        "rates_hz": sorted({round(rate, 6) for _, rate, _ in fits}),
+    }
+    first = t0_s + options.period_s
+    return [
+        step_trace(
+            (stream, channel, unit),
+            "time_domain",
+            found.rms if measure == "rms" else found.power,
+            found.covered,
+            options,
+            {**said, "measure": measure},
+            first,
+        )
+        for stream, unit, measure in options.beta_streams
+    ]
+
+
+def channel_spectrum(stretches: Sequence[Stretch], channel: str) -> list[SpectrumLog]:
+    """The channel's spectrum in uV2/Hz up to 100 Hz; empty where no stretch is long enough for one."""
+    hz, density, seconds = spectrum(stretches)
+    return [SpectrumLog(channel, "uV2/Hz", hz, density, round(seconds, 3))] if seconds else []

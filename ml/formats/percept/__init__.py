@@ -1,0 +1,1 @@
+"""Medtronic Percept session reports (JSON)."""

@@ -1,0 +1,269 @@
+"""What a Percept report tells beside its streams: therapy groups and their history, trends, snapshots, events, battery, in plain values.
+
+Nothing in here quotes free text of the report: enumerations are reduced to known shapes, and names that a person may have typed (groups,
+events) to known words or numbers, so that a redacted report gives the same details as the original.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import datetime
+from typing import Any
+
+from ml.formats.percept.report_json import SIDES, entries, finite, inside, moment, samples, side_of, word
+from ml.formats.recording import EventLog
+
+EVENT_WORDS = (
+    "tremor",
+    "dyskinesia",
+    "stiffness",
+    "rigidity",
+    "bradykinesia",
+    "slowness",
+    "freezing",
+    "walking",
+    "fall",
+    "balance",
+    "speech",
+    "dystonia",
+    "pain",
+    "cramp",
+    "took medication",
+    "medication",
+    "feeling good",
+    "streaming",
+    "sleep",
+    "exercise",
+    "on",
+    "off",
+)
+"""Names of patient events that are kept; any other name may say who somebody is, and is shown as its number."""
+
+MAX_EVENTS = 5_000
+
+
+def event_label(entry: dict[str, Any]) -> str:
+    """A patient event's name where it is a known word, else its number: `event 3`."""
+    name = entry.get("EventName")
+    if isinstance(name, str) and name.strip().lower() in EVENT_WORDS:
+        return name.strip().lower()
+    number = finite(entry.get("EventID", entry.get("EventId")))
+    return "event" if number is None else f"event {number:g}"
+
+
+def groups(value: Any) -> list[dict[str, Any]]:
+    """Therapy groups: programs and sensing per side."""
+    out = []
+    for group in entries(value):
+        settings = group.get("ProgramSettings")
+        rate = finite(inside(settings, "RateInHertz"))
+        sensing = [_sensing(s) for s in entries(inside(settings, "SensingChannel"))]
+        programs = [
+            _program(program, side, rate)
+            for side in SIDES
+            for program in entries(inside(settings, f"{side.capitalize()}Hemisphere", "Programs"))
+        ]
+        programs += [
+            _program(s, named, rate) for s in entries(inside(settings, "SensingChannel")) if (named := side_of(s.get("HemisphereLocation")))
+        ]
+        letter = _letter(group.get("GroupId"))
+        if letter is None and not programs and not sensing:
+            continue  # an entry of which nothing is understood is no group
+        out.append(
+            {
+                "group": letter,
+                "active": group.get("ActiveGroup") is True,
+                "programs": programs,
+                "sensing": sensing,
+            }
+        )
+    return out
+
+
+def _letter(value: Any) -> str | None:
+    """`A` of `GroupIdDef.GROUP_A`."""
+    named = word(value)
+    return named.removeprefix("GROUP_") if named else None
+
+
+def _program(program: dict[str, Any], side: str, rate_hz: float | None) -> dict[str, Any]:
+    own = finite(program.get("RateInHertz"))
+    return {
+        "side": side,
+        "amplitude_ma": finite(program.get("AmplitudeInMilliAmps")),
+        "lower_ma": finite(program.get("LowerLimitInMilliAmps")),
+        "upper_ma": finite(program.get("UpperLimitInMilliAmps")),
+        "rate_hz": rate_hz if own is None else own,
+        "pulse_width_us": finite(program.get("PulseWidthInMicroSecond")),
+        "contacts": contacts(program.get("ElectrodeState")),
+    }
+
+
+def contacts(value: Any) -> str:
+    """Electrodes in use with their sign: `-SenSight_1a +Case`."""
+    signs = {"Negative": "-", "Positive": "+"}
+    named = ((word(e.get("Electrode")), signs.get(word(e.get("ElectrodeStateResult")) or "")) for e in entries(value))
+    return " ".join(f"{sign}{name}" for name, sign in named if name and sign)
+
+
+def _sensing(sensing: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "side": side_of(sensing.get("HemisphereLocation")),
+        "channel": word(sensing.get("Channel")),
+        "frequency_hz": finite(inside(sensing, "SensingSetup", "FrequencyInHertz")),
+        "averaging_ms": finite(inside(sensing, "SensingSetup", "AveragingDurationInMilliSeconds")),
+        "lower_threshold": finite(sensing.get("LowerLfpThreshold")),
+        "upper_threshold": finite(sensing.get("UpperLfpThreshold")),
+        "suspend_amplitude_ma": finite(sensing.get("SuspendAmplitudeInMilliAmps")),
+        "status": word(sensing.get("BrainSensingStatus")),
+        "adaptive": word(sensing.get("AdaptiveTherapyStatus")),
+    }
+
+
+def snapshot(value: dict[str, Any], side: str) -> dict[str, Any]:
+    """Therapy and sensing of one side as they were set when a run began (TherapySnapshot)."""
+    own = inside(value, side.capitalize())
+    return {
+        "group": _letter(value.get("ActiveGroup")),
+        "high_pass_hz": finite(value.get("HighPassFilterInHertz")),
+        "sensing_frequency_hz": finite(inside(own, "FrequencyInHertz")),
+        "rate_hz": finite(inside(own, "RateInHertz")),
+        "pulse_width_us": finite(inside(own, "PulseWidthInMicroSecond")),
+        "averaging_ms": finite(inside(own, "AveragingDurationInMilliSeconds")),
+        "lower_threshold": finite(inside(own, "LowerLfpThreshold")),
+        "upper_threshold": finite(inside(own, "UpperLfpThreshold")),
+        "contacts": contacts(inside(own, "ElectrodeState")),
+    }
+
+
+def limits(value: dict[str, Any], side: str) -> dict[str, Any]:
+    """Clinician's amplitude limits of one side, mA, in the shape of `RecordingLog.limits`."""
+    own = inside(value, side.capitalize())
+    low, high = finite(inside(own, "LowerLimitInMilliAmps")), finite(inside(own, "UpperLimitInMilliAmps"))
+    if low is None or high is None:
+        return {}
+    return {f"group {_letter(value.get('ActiveGroup')) or '?'}": {side: {"lower_ma": low, "upper_ma": high}}}
+
+
+def group_history(value: Any) -> list[dict[str, Any]]:
+    """Therapy groups at earlier visits, oldest first. The date stands under `SessionDate` or `Sessiondate`."""
+    dated = []
+    for entry in entries(value):
+        when = moment(entry.get("SessionDate", entry.get("Sessiondate")))
+        dated.append({"at": _iso(when), "groups": groups(entry.get("Groups", entry.get("Settings")))})
+    return sorted(dated, key=lambda d: str(d["at"] or ""))
+
+
+def trends(value: Any) -> dict[str, Any]:
+    """Averages over 10 minutes by side: times, power in device units, amplitude in mA; sorted, each time once (the newest read counts)."""
+    out: dict[str, Any] = {}
+    for hemisphere, blocks in value.items() if isinstance(value, dict) else ():
+        side = side_of(word(hemisphere) or hemisphere)
+        if side is None:
+            continue
+        reads = sorted(blocks.items()) if isinstance(blocks, dict) else [("", blocks)]
+        by_time: dict[datetime, tuple[float | None, float | None]] = {}
+        for _, rows in reads:
+            for row in entries(rows):
+                if (when := moment(row.get("DateTime"))) is not None:
+                    by_time[when] = finite(row.get("LFP")), finite(row.get("AmplitudeInMilliAmps"))
+        times = sorted(by_time)
+        if times:
+            out[side] = {
+                "unix_s": [t.timestamp() for t in times],
+                "power_device_units": [by_time[t][0] for t in times],
+                "amplitude_ma": [by_time[t][1] for t in times],
+            }
+    return out
+
+
+def snapshot_events(value: Any) -> list[dict[str, Any]]:
+    """Spectra that the device stored when the patient marked an event. Events may promise a spectrum (`LFP: true`) and hold none."""
+    out = []
+    for entry in entries(value)[:MAX_EVENTS]:
+        spectra = {}
+        held = entry.get("LfpFrequencySnapshotEvents")
+        for hemisphere, data in held.items() if isinstance(held, dict) else ():
+            side = side_of(word(hemisphere) or hemisphere)
+            hz, bins = samples(inside(data, "Frequency")), samples(inside(data, "FFTBinData"))
+            if side and 0 < hz.size == bins.size <= 1000:
+                spectra[side] = {"hz": hz.tolist(), "magnitude": bins.tolist(), "group": _letter(inside(data, "GroupId"))}
+        out.append({"at": _iso(moment(entry.get("DateTime"))), "label": event_label(entry), "spectra": spectra})
+    return out
+
+
+def montage(value: Any) -> list[dict[str, Any]]:
+    """The device's own spectra of a survey (LFPMontage): magnitude in uVp, as the programmer shows it."""
+    out = []
+    for entry in entries(value)[:200]:
+        hz = samples(entry.get("LFPFrequency", entry.get("LFPFrequencyinHertz")))
+        magnitude = samples(entry.get("LFPMagnitude", entry.get("LFPMagnitudeinMicroVoltPeak")))
+        if 0 < hz.size == magnitude.size <= 1000:
+            said = {
+                "side": side_of(word(entry.get("Hemisphere"))),
+                "channel": word(entry.get("SensingElectrodes")),
+                "artifact": word(entry.get("ArtifactStatus")),
+                "peak_hz": finite(entry.get("PeakFrequencyInHertz")),
+            }
+            out.append({**said, "hz": hz.tolist(), "magnitude": magnitude.tolist()})
+    return out
+
+
+def battery(report: dict[str, Any]) -> dict[str, Any]:
+    """State of the battery, without its telemetry codes."""
+    state = report.get("BatteryInformation")
+    return {
+        "percent": finite(inside(state, "BatteryPercentage")),
+        "months_left": finite(inside(state, "EstimatedBatteryLifeMonths")),
+        "status": word(inside(state, "BatteryStatus")),
+    }
+
+
+def impedance(value: Any) -> list[dict[str, Any]]:
+    """Impedances by side in ohm."""
+    out = []
+    for test in entries(value):
+        for half in entries(test.get("Hemisphere")):
+            measured = inside(half, "SessionImpedance")
+            pairs = [*entries(inside(measured, "Monopolar")), *entries(inside(measured, "Bipolar"))]
+            named = [[word(p.get("Electrode1")), word(p.get("Electrode2")), finite(p.get("ResultValue"))] for p in pairs[:200]]
+            out.append({"side": side_of(word(half.get("Hemisphere"))), "ohm": named})
+    return out
+
+
+def dated_events(report: dict[str, Any]) -> list[tuple[datetime, str, str, dict[str, Any]]]:
+    """(time, kind, label, data) of the device's event log and of the patient's events, in time order."""
+    out: list[tuple[datetime, str, str, dict[str, Any]]] = []
+    for entry in _log_entries(report):
+        when = moment(entry.get("DateTime", entry.get("EventDateTime")))
+        if when is None:
+            continue
+        if "EventName" in entry or "EventID" in entry or "EventId" in entry:
+            out.append((when, "patient", event_label(entry), {}))
+            continue
+        said = {k: word(v) for k, v in entry.items() if word(v) and k in LOG_WORDS}
+        out.append((when, "device", " ".join(filter(None, said.values())) or "log entry", said))
+    return sorted(out, key=lambda e: e[0])[-MAX_EVENTS:]
+
+
+LOG_WORDS = ("SessionType", "NewGroupId", "OldGroupId", "TherapyStatus", "AdaptiveTherapyStatus", "ParameterTrendId", "SensingStatus")
+
+
+def _log_entries(report: dict[str, Any]) -> Iterable[dict[str, Any]]:
+    yield from entries(inside(report, "DiagnosticData", "EventLogs"))
+    yield from entries(inside(report, "DiagnosticData", "LfpFrequencySnapshotEvents"))
+    patient = report.get("PatientEvents")
+    if isinstance(patient, dict) and not {"EventName", "DateTime"} & set(patient):
+        for part in patient.values():
+            yield from entries(part)
+    else:
+        yield from entries(patient)
+
+
+def as_events(dated: Iterable[tuple[datetime, str, str, dict[str, Any]]], origin: datetime) -> tuple[EventLog, ...]:
+    """The events in seconds after `origin`."""
+    return tuple(EventLog(round((when - origin).total_seconds(), 3), kind, label, data) for when, kind, label, data in dated)
+
+
+def _iso(when: datetime | None) -> str | None:
+    return when.isoformat() if when else None

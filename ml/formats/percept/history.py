@@ -1,0 +1,80 @@
+"""The part of a Percept report that is no session: surveys and tests of sensing, and the history that the device keeps."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from ml.formats.beta import channel_spectrum
+from ml.formats.options import DecodeOptions
+from ml.formats.percept import details
+from ml.formats.percept.report_json import entries, inside, moment
+from ml.formats.percept.streams import time_domains
+from ml.formats.recording import FileReport, RecordingLog, SpectrumLog, fingerprint
+
+SURVEYS = ("LfpMontageTimeDomain", "BrainSenseSurveysTimeDomain", "SenseChannelTests", "CalibrationTests")
+
+
+def _surveys(report: dict[str, Any], said: FileReport) -> list[SpectrumLog]:
+    """Spectra of surveys and tests of 20 s, named by channel, section and time."""
+    out: list[SpectrumLog] = []
+    seen: set[tuple[str, datetime | None, int]] = set()
+    for section in SURVEYS:
+        value = report.get(section)
+        if section == "BrainSenseSurveysTimeDomain":
+            value = _inner(value)
+        # newer reports tell a survey twice
+        channels = [c for c in time_domains(section, value) if (c.channel, c.first_packet, c.values.size) not in seen]
+        seen.update((c.channel, c.first_packet, c.values.size) for c in channels)
+        for c in channels:
+            when = f" {c.first_packet:%H:%M:%S}" if c.first_packet else ""
+            out += channel_spectrum(c.stretches(c.begin_ms), f"{c.channel} {section}{when}")
+        if channels:
+            said.understood.append(f"{section}: {len(channels)} channels; their spectra are kept, no session")
+            said.repaired.extend(dict.fromkeys(f"{section}: {n}" for c in channels for n in c.notes))
+    return out
+
+
+def _inner(value: Any) -> list[dict[str, Any]]:
+    """Entries of a survey as newer versions write it: in lists of their own, by kind of survey."""
+    return [inner for entry in entries(value) for held in entry.values() if isinstance(held, list) for inner in entries(held)]
+
+
+def history_recording(report: dict[str, Any], said: FileReport, options: DecodeOptions) -> RecordingLog | None:
+    """Surveys, and what the device keeps: groups, their history, trends, snapshots, events; a recording that belongs to no session."""
+    spectra = _surveys(report, said)
+    diagnostic = report.get("DiagnosticData")
+    kept: dict[str, Any] = {
+        "groups": details.groups(inside(report, "Groups", "Final") or inside(report, "Groups", "Initial")),
+        "group_history": details.group_history(report.get("GroupHistory")),
+        "trends": details.trends(inside(diagnostic, "LFPTrendLogs")),
+        "snapshots": [e for e in details.snapshot_events(inside(diagnostic, "LfpFrequencySnapshotEvents")) if e["spectra"]],
+        "montage": details.montage(report.get("LFPMontage") or _inner(report.get("BrainSenseSurveys"))),
+        "impedance": details.impedance(report.get("Impedance")),
+    }
+    dated = details.dated_events(report)
+    kept = {name: value for name, value in kept.items() if value}
+    if not (kept or dated or spectra):
+        return None
+    battery = {k: v for k, v in details.battery(report).items() if v is not None}
+    started = moment(inside(report, "DeviceInformation", "Initial", "DeviceDateTime")) or (dated[0][0] if dated else None)
+    origin = started or datetime.fromisoformat("2000-01-01T00:00:00+00:00")
+    counts = [f"{len(v)} {name.replace('_', ' ')}" for name, v in kept.items()] + ([f"{len(dated)} events"] if dated else [])
+    if counts:
+        said.understood.append(f"history of the device: {', '.join(counts)}; kept, no session")
+    return RecordingLog(
+        kind="percept",
+        device_key=None,
+        hemisphere=None,
+        clock="device",
+        started_at=started,
+        duration_s=0.0,
+        traces=(),
+        events=details.as_events(dated, origin),
+        limits={},
+        settings={"period_s": options.period_s, "section": "history", **kept, **({"battery": battery} if battery else {})},
+        quality={},
+        fingerprint=fingerprint("percept history", [repr((started, kept, dated)), *(s.channel for s in spectra)]),
+        spectra=tuple(spectra),
+        run=None,
+    )

@@ -1,0 +1,371 @@
+"""Percept session reports (JSON): streaming runs, surveys and the history that the device keeps. Source: format notes, A′.
+
+Each streaming run gives one recording per side of the brain, on the common grid of steps: `beta` from the samples (`time_domain`), the
+device's `band_power` (`percept_lfp`) and the `amplitude`. The recordings of one run carry the same `run`, and belong to one session. Runs
+of the device's own clock are paired by ticks and channel; when they took place is the programmer's FirstPacketDateTime.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.formats.archive import READ_ERRORS, ZipFiles
+from ml.formats.beta import channel_spectrum, step_trace, time_domain_traces
+from ml.formats.options import DecodeOptions
+from ml.formats.percept import details
+from ml.formats.percept.history import history_recording
+from ml.formats.percept.report_json import SIDES, entries, inside, looks_like_report, moment, read_report, side_of, word
+from ml.formats.percept.streams import DevicePower, Side, TimeDomain, device_powers, time_domains
+from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
+from ml.signals import row_means
+
+SAME_RUN_MS = 2_000.0
+"""First ticks of one run's channels lie this close together."""
+
+SAME_RUN_S = 2.0
+"""Programmer's times of one run lie this close together where there are no ticks."""
+
+MOSTLY = 0.8
+"""Share of the shorter one of samples and power that the other must cover to be of the same run."""
+
+WRONG_DATE_S = 24 * 3600.0
+
+
+@dataclass(slots=True)
+class Run:
+    """One streaming run: channels of samples, and the device's power with the amplitude."""
+
+    channels: list[TimeDomain] = field(default_factory=list)
+    power: DevicePower | None = None
+
+    @property
+    def first_packet(self) -> datetime | None:
+        """Time of the programmer at the first packet: of the samples where there are any."""
+        known = next((c.first_packet for c in self.channels if c.first_packet), None)
+        return known or (self.power.first_packet if self.power else None)
+
+    @property
+    def power_origin_ms(self) -> float:
+        """Begin of the power's first interval, in the ticks that the run's span is in."""
+        if self.power is None:
+            return 0.0
+        first = float(self.power.ticks_ms[0]) - self.power.interval_ms
+        # samples without ticks begin at 0, and the power is taken to begin with them
+        return first if not self.channels or self.channels[0].ticked else 0.0
+
+    @property
+    def span_ms(self) -> tuple[float, float]:
+        """Begin and end in ticks; from 0 where the samples have none."""
+        begins = [c.begin_ms for c in self.channels]
+        ends = [c.end_ms for c in self.channels]
+        if self.power is not None:
+            begins.append(self.power_origin_ms)
+            ends.append(self.power_origin_ms + float(self.power.ticks_ms[-1] - self.power.ticks_ms[0]) + self.power.interval_ms)
+        return min(begins), max(ends)
+
+
+def decode_percept(path: Path, options: DecodeOptions, name: str | None = None) -> DecodedFile:
+    """Decode a session report, or a zip of them.
+
+    Raises:
+        UndecodableFile: no report in it can be read; says why.
+    """
+    with path.open("rb") as stream:
+        zipped = stream.read(4) == b"PK\x03\x04"
+    if not zipped:
+        with path.open("rb") as stream:
+            report = FileReport(name or path.name)
+            return DecodedFile(decode_report(read_report(stream, report.repaired), report, options), (report,))
+    recordings: list[RecordingLog] = []
+    reports: list[FileReport] = []
+    with ZipFiles(path, options.archive) as files:
+        members = report_members(files, damaged=True)
+        for number, member in enumerate(members, start=1):
+            report = FileReport(name or path.name if len(members) == 1 else f"report {number}")
+            reports.append(report)
+            try:
+                with files.open(member) as stream:
+                    found = decode_report(read_report(stream, report.repaired), report, options, _next_run(recordings))
+            except UndecodableFile as error:
+                if len(members) == 1:
+                    raise
+                reports[-1] = FileReport(report.name, problem=error.stored)
+                continue
+            recordings.extend(found)
+        others = len(files.names()) - len(members)
+        if reports:
+            reports[0].ignored.extend(files.ignored)
+        if reports and others:
+            reports[0].ignored.append(f"{others} file{'s' if others > 1 else ''} that are no session report")
+    if not any(r.problem is None for r in reports):
+        raise UndecodableFile("no Percept session report in here", "archive", "Zip the JSON files of the programmer.")
+    return DecodedFile(tuple(recordings), tuple(reports))
+
+
+def report_members(files: ZipFiles, *, damaged: bool = False) -> list[str]:
+    """Members of an archive that begin like a session report; with `damaged` also JSON files that cannot be read, so that they are told."""
+    out = []
+    for member in files.names():
+        try:
+            with files.open(member) as stream:
+                if looks_like_report(stream.read(65_536)):
+                    out.append(member)
+        except (UndecodableFile, *READ_ERRORS):
+            if damaged and member.lower().endswith(".json"):
+                out.append(member)
+    return out
+
+
+def _next_run(recordings: list[RecordingLog]) -> int:
+    return 1 + max((r.run for r in recordings if r.run is not None), default=-1)
+
+
+def decode_report(report: dict[str, Any], said: FileReport, options: DecodeOptions, first_run: int = 0) -> tuple[RecordingLog, ...]:
+    """The recordings of one report; what became of each section is added to `said`."""
+    device = device_name(report)
+    channels = time_domains("BrainSenseTimeDomain", report.get("BrainSenseTimeDomain"))
+    runs = pair_runs(channels, device_powers(report.get("BrainSenseLfp")), said)
+    recordings: list[RecordingLog] = []
+    for number, run in enumerate(runs):
+        recordings += _run_recordings(run, number, first_run, report, said, options)
+    if not runs:
+        said.flagged.append("no streaming run (BrainSenseTimeDomain, BrainSenseLfp) in this report: nothing in it can be a session")
+    recordings += _indefinite(report, said, options)
+    history = history_recording(report, said, options)
+    recordings += [history] if history is not None else []
+    _check_dates(report, recordings, said)
+    if not recordings:
+        said.flagged.append("a report without data: none of its sections holds samples, history or events")
+    return tuple(replace(r, device_key=device) for r in recordings)
+
+
+def device_name(report: dict[str, Any]) -> str | None:
+    """Serial number of the neurostimulator (or the pseudonym that took its place), None where it was removed."""
+    for part in ("Final", "Initial"):
+        serial = inside(report, "DeviceInformation", part, "NeurostimulatorSerialNumber")
+        if isinstance(serial, str) and serial.strip():
+            return serial.strip()[:80]
+    return None
+
+
+def pair_runs(channels: list[TimeDomain], powers: list[DevicePower], said: FileReport) -> list[Run]:
+    """Channels and powers that were streamed together, in the order of the file.
+
+    By ticks and channel: FirstPacketDateTime has seconds only and may differ by one within a run.
+    """
+    runs: list[Run] = []
+    for channel in channels:
+        run = next((r for r in runs if _same_run(r, channel)), None)
+        if run is None:
+            run = Run()
+            runs.append(run)
+        run.channels.append(channel)
+    for power in powers:
+        fitting = [r for r in runs if r.power is None and _fits(r, power)]
+        run = min(fitting, key=lambda r: _apart_s(r.first_packet, power.first_packet)) if fitting else None
+        if run is None:
+            run = Run()
+            runs.append(run)
+        elif _apart_s(run.first_packet, power.first_packet) > SAME_RUN_S:
+            said.flagged.append(
+                "a run's power is paired with its samples by ticks and channel, though the report dates them "
+                f"{_apart_s(run.first_packet, power.first_packet):.0f} s apart"
+            )
+        run.power = power
+    return runs
+
+
+def _same_run(run: Run, channel: TimeDomain) -> bool:
+    """Another channel of the run: other name, and ticks or else times that begin together."""
+    if any(c.channel == channel.channel for c in run.channels):
+        return False
+    other = run.channels[0]
+    if _apart_s(other.first_packet, channel.first_packet) > SAME_RUN_S:
+        return False
+    return other.ticked == channel.ticked and (not other.ticked or abs(other.begin_ms - channel.begin_ms) <= SAME_RUN_MS)
+
+
+def _fits(run: Run, power: DevicePower) -> bool:
+    """Power of the run: of one of its channels, and beginning with it, or, where the first values were lost, lying within it."""
+    first, last = float(power.ticks_ms[0]) - power.interval_ms, float(power.ticks_ms[-1])
+    named = {c.channel for c in run.channels}
+    if power.channels and not named & set(power.channels):
+        return False
+    apart_s = _apart_s(run.first_packet, power.first_packet)
+    if not run.channels[0].ticked:
+        return apart_s <= SAME_RUN_S
+    begin, end = run.span_ms
+    later_ms = abs(begin - first)
+    if later_ms <= SAME_RUN_MS:
+        return True
+    # ticks of two runs may cover the same range after the device has begun them anew: then the programmer's times differ
+    within = min(end, last) - max(begin, first) >= MOSTLY * min(end - begin, last - first)
+    return within and apart_s <= SAME_RUN_S + later_ms / 1000.0
+
+
+def _apart_s(one: datetime | None, other: datetime | None) -> float:
+    """Seconds between two times; 0 where either is not known."""
+    return abs((one - other).total_seconds()) if one and other else 0.0
+
+
+def _run_recordings(
+    run: Run, number: int, first_run: int, report: dict[str, Any], said: FileReport, options: DecodeOptions
+) -> list[RecordingLog]:
+    """One recording per side that streamed or was stimulated."""
+    begin, end = run.span_ms
+    rows = math.ceil((end - begin) / 1000.0 / options.period_s - 1e-6)
+    label = f"run {first_run + number + 1}"
+    leads = {side_of(word(lead.get("Hemisphere"))) for lead in entries(inside(report, "LeadConfiguration", "Final"))}
+    out = []
+    for side in (*SIDES, None):
+        channels = [c for c in run.channels if c.side == side]
+        traces = [t for c in channels for t in _beta(c, begin, rows, options)]
+        driven = False
+        if run.power is not None and side is not None:
+            traces += _power_traces(run.power, side, begin - run.power_origin_ms, rows, options)
+            driven = bool(np.nanmax(run.power.amplitude_ma[side], initial=0.0) > 0)
+        sensed = bool(channels) or any(t.stream == "band_power" for t in traces)
+        # the amplitude of a side without a lead is a row of zeros that means nothing
+        if not (sensed or driven or (traces and side in leads)):
+            continue
+        out.append(_recording(run, side, channels, traces, begin, end, first_run + number, options))
+        _describe(said, label, side, channels, traces, (end - begin) / 1000.0)
+    for note in dict.fromkeys(n for c in run.channels for n in c.notes):
+        said.repaired.append(f"{label}: {note}")
+    for note in run.power.notes if run.power else ():
+        said.repaired.append(f"{label}: {note}")
+    _check_lengths(run, label, said)
+    return out
+
+
+def _beta(channel: TimeDomain, begin: float, rows: int, options: DecodeOptions) -> list[TraceLog]:
+    said = {"contacts": channel.channel, "section": channel.section}
+    return time_domain_traces(channel.stretches(begin), channel.channel, rows, options, said)
+
+
+def _power_traces(power: DevicePower, side: Side, begin_ms: float, rows: int, options: DecodeOptions) -> list[TraceLog]:
+    """The device's band power of a sensed side, and its amplitude; the run begins `begin_ms` after the first interval does."""
+    t_s = (power.ticks_ms - (power.ticks_ms[0] - power.interval_ms) - begin_ms) / 1000.0
+    interval = np.full(t_s.size, power.interval_ms / 1000.0)
+    out = []
+    channel = power.channel_of(side)
+    if channel is not None and np.isfinite(power.power[side]).any():
+        means, covered = row_means(t_s, power.power[side], interval, rows, options.period_s)
+        set_to = details.snapshot(power.snapshot, side)
+        said = {"sensing_frequency_hz": set_to["sensing_frequency_hz"], "averaging_ms": set_to["averaging_ms"]}
+        out.append(step_trace(("band_power", channel, "device units"), "percept_lfp", means, covered, options, said))
+    if np.isfinite(power.amplitude_ma[side]).any():
+        means, covered = row_means(t_s, power.amplitude_ma[side], interval, rows, options.period_s)
+        out.append(step_trace(("amplitude", side, "mA"), "device_log", means, covered, options, {"origin": "BrainSenseLfp"}))
+    return out
+
+
+def _recording(
+    run: Run, side: Side | None, channels: list[TimeDomain], traces: list[TraceLog], begin: float, end: float, number: int | None,
+    options: DecodeOptions,
+) -> RecordingLog:  # fmt: skip
+    power = run.power
+    quality: dict[str, Any] = {
+        "valid_fraction": {f"{t.stream} {t.channel}": round(float(t.valid.mean()), 4) for t in traces if t.valid.size}
+    }
+    quality["time_domain"] = {
+        c.channel: {
+            "samples": int(c.values.size),
+            "missing_samples": c.lost,
+            "loss": round(c.lost / (c.lost + c.values.size), 6),
+            "rate_hz": c.rate_hz,
+            "loss_visible": c.ticked,
+        }
+        for c in channels
+    }
+    settings: dict[str, Any] = {"period_s": options.period_s, "section": channels[0].section if channels else "BrainSenseLfp"}
+    settings["first_tick_ms"] = float(begin)
+    if power is not None and side is not None:
+        settings["therapy"] = details.snapshot(power.snapshot, side)
+    return RecordingLog(
+        kind="percept",
+        device_key=None,
+        hemisphere=side,
+        clock="device",
+        started_at=run.first_packet,
+        duration_s=round((end - begin) / 1000.0, 4),
+        traces=tuple(traces),
+        events=(),
+        limits=details.limits(power.snapshot, side) if power is not None and side is not None else {},
+        settings=settings,
+        quality=quality,
+        fingerprint=_fingerprint(run, side, channels),
+        spectra=tuple(s for c in channels for s in channel_spectrum(c.stretches(begin), c.channel)),
+        run=number,
+    )
+
+
+def _fingerprint(run: Run, side: Side | None, channels: list[TimeDomain]) -> str:
+    parts: list[str | bytes | NDArray[Any]] = [str(run.first_packet), str(side)]
+    for channel in channels:
+        parts += [channel.section, channel.channel, channel.values, repr(channel.pieces)]
+    if run.power is not None and side is not None:
+        parts += [run.power.ticks_ms, run.power.power[side], run.power.amplitude_ma[side]]
+    return fingerprint("percept", parts)
+
+
+def _describe(
+    said: FileReport, label: str, side: Side | None, channels: list[TimeDomain], traces: list[TraceLog], length_s: float
+) -> None:  # fmt: skip
+    """One sentence per side of a run."""
+    parts = [f"{c.channel}: {c.values.size} samples at {c.rate_hz:g} Hz" for c in channels]
+    parts += [f"power of {t.channel}" for t in traces if t.stream == "band_power"]
+    parts += ["amplitude" for t in traces if t.stream == "amplitude"]
+    said.understood.append(f"{label}, {side or 'side unknown'}: {length_s:.1f} s, {', '.join(parts)}")
+    for c in channels:
+        if c.lost:
+            said.flagged.append(
+                f"{label}, {c.channel}: {100 * c.lost / (c.lost + c.values.size):.1f} % of the samples are missing ({c.lost})"
+            )
+        if not c.ticked:
+            said.flagged.append(f"{label}, {c.channel}: no ticks, so lost samples cannot be seen")
+        if not any(t.channel == c.channel and t.source == "time_domain" for t in traces):
+            said.flagged.append(f"{label}, {c.channel}: sampled too slowly for the beta band; left out")
+    if channels and not any(t.stream == "amplitude" for t in traces):
+        said.flagged.append(f"{label}, {side or 'side unknown'}: no amplitude was logged with it")
+
+
+def _check_lengths(run: Run, label: str, said: FileReport) -> None:
+    for c in run.channels:
+        if c.ticked and abs((c.end_ms - c.begin_ms) / 1000.0 - (c.values.size + c.lost) / c.rate_hz) > 1.0:
+            said.flagged.append(f"{label}, {c.channel}: ticks and number of samples disagree by more than 1 s")
+
+
+def _indefinite(report: dict[str, Any], said: FileReport, options: DecodeOptions) -> list[RecordingLog]:
+    """Recordings of indefinite streaming: up to six channels, no amplitude, so beta and spectra and no session."""
+    runs = pair_runs(time_domains("IndefiniteStreaming", report.get("IndefiniteStreaming")), [], said)
+    out = []
+    for run in runs:
+        begin, end = run.span_ms
+        rows = math.ceil((end - begin) / 1000.0 / options.period_s - 1e-6)
+        for side in (*SIDES, None):
+            channels = [c for c in run.channels if c.side == side]
+            traces = [t for c in channels for t in _beta(c, begin, rows, options)]
+            if channels:
+                out.append(_recording(run, side, channels, traces, begin, end, None, options))
+    if runs:
+        count = sum(len(r.channels) for r in runs)
+        kept = "beta and spectra kept, no session, because no amplitude is logged with it"
+        said.understood.append(f"IndefiniteStreaming: {len(runs)} runs, {count} channels; {kept}")
+        said.repaired.extend(dict.fromkeys(f"IndefiniteStreaming: {n}" for r in runs for c in r.channels for n in c.notes))
+    return out
+
+
+def _check_dates(report: dict[str, Any], recordings: list[RecordingLog], said: FileReport) -> None:
+    """Say where the report's own date is not that of its packets: it is known to be wrong in some versions."""
+    stated = moment(report.get("SessionDate"))
+    packets = [r.started_at for r in recordings if r.run is not None and r.started_at is not None]
+    if stated and packets and _apart_s(stated, packets[0]) > WRONG_DATE_S:
+        said.flagged.append(f"SessionDate says {stated:%Y-%m-%d}, the packets {packets[0]:%Y-%m-%d}: the packets' time is used")

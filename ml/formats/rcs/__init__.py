@@ -1,0 +1,1 @@
+"""Medtronic Summit RC+S session folders."""

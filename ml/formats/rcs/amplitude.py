@@ -1,0 +1,119 @@
+"""Delivered stimulation amplitude of an RC+S recording over time. Source: format notes, A.5 to A.7.
+
+Under embedded adaptive stimulation the adaptive log holds what was delivered, ramps included; otherwise the stimulation log does. Only
+enabled programs of the active group stimulate, and with therapy off the amplitude is 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.formats.rcs.packets.streams import Adaptive
+from ml.formats.rcs.packets.time import PacketTimes
+from ml.formats.rcs.settings import ADAPTIVE_BIT, Settings, Therapy
+
+HOLD_INTERVALS = 3.0
+"""A delivered amplitude is believed for this many update intervals; after a longer silence it is unknown."""
+
+UPPER_PLAUSIBLE_MA = 25.5
+"""One byte of 0.1 mA; 25.5 means hold, and nothing above can be set."""
+
+
+@dataclass(frozen=True, slots=True)
+class AmplitudeSteps:
+    """Amplitude per program: from `t_ms` (PC clock) [n] on, `amplitude_ma` [n, 4] holds; NaN where unknown."""
+
+    t_ms: NDArray[np.float64]
+    amplitude_ma: NDArray[np.float64]
+    programs: tuple[int, ...]
+    from_adaptive: bool
+    assumed_program: bool
+
+
+def delivered(therapy: Therapy) -> tuple[float, float, float, float]:
+    """Amplitude of the four programs under these settings, mA; NaN where unknown.
+
+    Without settings that say which programs are enabled, the first one is taken to be.
+    """
+    out = [0.0, 0.0, 0.0, 0.0]
+    if therapy.on is False:
+        return (0.0, 0.0, 0.0, 0.0)
+    if therapy.on is None or not therapy.programs:
+        return (np.nan, np.nan, np.nan, np.nan)
+    for p in stimulating(therapy):
+        amplitude = therapy.programs[p].amplitude_ma
+        out[p] = np.nan if amplitude is None or not 0 <= amplitude <= UPPER_PLAUSIBLE_MA else amplitude
+    return (out[0], out[1], out[2], out[3])
+
+
+def stimulating(therapy: Therapy) -> tuple[int, ...]:
+    """Enabled programs of the active group; the first one when no settings tell."""
+    enabled = [p.enabled for p in therapy.programs]
+    if enabled and all(value is None for value in enabled):
+        return (0,)
+    return tuple(p for p, value in enumerate(enabled) if value)
+
+
+def amplitude_steps(settings: Settings, adaptive: Adaptive | None, times: PacketTimes | None) -> AmplitudeSteps:
+    """The amplitude timeline of the whole recording."""
+    states = settings.therapy.states
+    base_t = np.array(settings.therapy.times_ms, dtype=np.float64)
+    base_v = np.array([delivered(state) for state in states], dtype=np.float64).reshape(-1, 4)
+    programs = tuple(sorted({p for state in states for p in stimulating(state)})) or ((0,) if states else ())
+    assumed = any(state.programs and all(p.enabled is None for p in state.programs) for state in states)
+    if adaptive is None or times is None:
+        return AmplitudeSteps(base_t, base_v, programs, False, assumed)
+    use = np.flatnonzero(np.isfinite(times.last_ms) & (adaptive.status_bits & ADAPTIVE_BIT > 0))
+    if use.size == 0:
+        return AmplitudeSteps(base_t, base_v, programs, False, assumed)
+    order = use[np.argsort(times.last_ms[use], kind="stable")]
+    t_ms = times.last_ms[order]
+    interval_ms = 1000.0 / adaptive.headers.rate_hz[order]
+    values = _masked(adaptive.amplitude_ma[order], t_ms, settings)
+    if not states:
+        programs, assumed = (0,), True
+    knots_t, knots_v = _with_adaptive(base_t, base_v, t_ms, interval_ms, values, settings)
+    return AmplitudeSteps(knots_t, knots_v, programs, True, assumed)
+
+
+def _masked(values: NDArray[np.float64], t_ms: NDArray[np.float64], settings: Settings) -> NDArray[np.float64]:
+    """Adaptive amplitudes with programs that do not stimulate, and times with therapy off, at 0."""
+    out = values.copy()
+    out[(out < 0) | (out >= UPPER_PLAUSIBLE_MA)] = np.nan
+    for i, time in enumerate(t_ms):
+        therapy = settings.therapy.at(float(time))
+        if therapy is not None and therapy.on is False:
+            out[i] = 0.0
+        elif therapy is not None and therapy.programs:
+            out[i, [p for p in range(4) if p not in stimulating(therapy)]] = 0.0
+    return out
+
+
+def _with_adaptive(
+    base_t: NDArray[np.float64],
+    base_v: NDArray[np.float64],
+    t_ms: NDArray[np.float64],
+    interval_ms: NDArray[np.float64],
+    values: NDArray[np.float64],
+    settings: Settings,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Put runs of adaptive updates over the stimulation log; between runs the log holds, or nothing is known while adaptive stays on."""
+    silence = np.flatnonzero(np.diff(t_ms) > HOLD_INTERVALS * interval_ms[:-1]) + 1
+    pieces_t, pieces_v = [], []
+    covered = np.zeros(base_t.size, dtype=bool)
+    for run in np.split(np.arange(t_ms.size), silence):
+        begin, end = t_ms[run[0]] - interval_ms[run[0]], t_ms[run[-1]] + interval_ms[run[-1]]
+        covered |= (base_t >= begin) & (base_t < end)
+        bits = getattr(settings.sensing.at(float(end)), "sense_bits", None)
+        still_on = run[-1] + 1 < t_ms.size and (bits is None or bits & ADAPTIVE_BIT > 0)
+        before = int(np.searchsorted(base_t, end, side="right")) - 1
+        after = np.full(4, np.nan) if still_on or before < 0 else base_v[before]
+        pieces_t.append(np.concatenate(([begin], t_ms[run][1:], [end])))
+        pieces_v.append(np.vstack((values[run], after)))
+    all_t = np.concatenate((base_t[~covered], *pieces_t))
+    all_v = np.vstack((base_v[~covered], *pieces_v))
+    order = np.argsort(all_t, kind="stable")
+    return all_t[order], all_v[order]

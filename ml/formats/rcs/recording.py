@@ -1,0 +1,234 @@
+"""One RC+S recording from its decoded streams: the common grid, traces, events, limits, quality and fingerprint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.formats.options import DecodeOptions
+from ml.formats.rcs.amplitude import AmplitudeSteps, amplitude_steps
+from ml.formats.rcs.beta import beta_traces, time_domain_spectra, time_domain_stretches
+from ml.formats.rcs.events import adaptive_events, note_events, stimulation_events
+from ml.formats.rcs.leads import described, hemisphere
+from ml.formats.rcs.packets.streams import Accel, Adaptive, Fft, Power, TimeDomain, TimeSync
+from ml.formats.rcs.packets.time import PacketHeaders, PacketTimes, reconstruct
+from ml.formats.rcs.quality import STEMS, describe_quality
+from ml.formats.rcs.settings import GROUPS, Settings, get, integer, number
+from ml.formats.rcs.traces import Grid, accel_traces, amplitude_traces, fft_results, power_traces
+from ml.formats.recording import FileReport, Hemisphere, RecordingLog, SpectrumLog, TraceLog, fingerprint
+
+MAX_ROWS = 100_000
+"""Rows a recording may have (55 h of 2 s steps): clocks that span more are wrong."""
+
+PRIMARY = ("time_domain", "power", "adaptive")
+"""Streams that say what was recorded; the others matter for identity only where none of these is there."""
+
+Report = Callable[[str], FileReport]
+Stream = TimeDomain | Power | Adaptive | Accel | Fft | TimeSync
+
+
+@dataclass(slots=True)
+class Streams:
+    """Everything decoded from one device folder; a stream whose file is missing is None."""
+
+    time_domain: TimeDomain | None
+    power: Power | None
+    adaptive: Adaptive | None
+    accel: Accel | None
+    fft: Fft | None
+    time_sync: TimeSync | None
+    settings: Settings
+    notes: list[Any]
+    infos: list[dict[str, Any]]
+    counts: dict[str, int]
+
+    def data(self) -> dict[str, Stream]:
+        """The streams whose file is there, by name."""
+        named: dict[str, Stream | None] = {name: getattr(self, name) for name in STEMS}
+        return {name: data for name, data in named.items() if data is not None}
+
+    def headers(self) -> dict[str, PacketHeaders]:
+        """Headers of the streams that hold packets."""
+        return {name: data.headers for name, data in self.data().items() if data.headers.size}
+
+
+def build_recording(streams: Streams, report: Report, options: DecodeOptions) -> RecordingLog:
+    """Put a recording together; what is left out is said in the report of the file it comes from."""
+    times = {name: reconstruct(headers) for name, headers in streams.headers().items()}
+    spans = _spans(streams.headers(), times, report, options)
+    times = {name: t for name, t in times.items() if name in spans}
+    main = {name: span for name, span in spans.items() if name in PRIMARY} or {n: s for n, s in spans.items() if n != "time_sync"}
+    start_ms = min((span[0] for span in main.values()), default=_first_record_ms(streams))
+    end_ms = max((span[1] for span in main.values()), default=start_ms)
+    duration_s = (end_ms - start_ms) / 1000.0
+    grid = Grid(start_ms, duration_s, max(0, math.ceil(duration_s / options.period_s - 1e-6)), options)
+    steps = amplitude_steps(streams.settings, streams.adaptive if "adaptive" in times else None, times.get("adaptive"))
+    traces, spectra = _traces(streams, times, steps, grid, report) if main else ([], [])
+    if not main:
+        report("RawDataTD").flagged.append("a recording without data: no stream holds a packet that can be placed in time")
+    quality = describe_quality(streams.data(), times, streams.counts, report)
+    quality["valid_fraction"] = {f"{t.stream} {t.channel}": round(float(t.valid.mean()), 4) for t in traces if t.valid.size}
+    quality["spike_packets"] = {t.channel: t.details["spike_packets"] for t in traces if t.details.get("spike_packets")}
+    device_clock = bool(main) and all(times[name].device_clock for name in main)
+    started = None if start_ms <= 0 else datetime.fromtimestamp(start_ms / 1000.0, UTC)
+    events = [*stimulation_events(streams.settings, grid), *note_events(streams.notes, steps, grid)]
+    if streams.adaptive is not None and "adaptive" in times:
+        events += adaptive_events(streams.adaptive, times["adaptive"], grid)
+    return RecordingLog(
+        kind="rcs",
+        device_key=_text(streams.infos, "DeviceId"),
+        hemisphere=_hemisphere(streams, report),
+        clock="device" if device_clock else "pc",
+        started_at=started,
+        duration_s=round(duration_s, 4),
+        traces=tuple(traces),
+        events=tuple(sorted(events, key=lambda event: event.t_s)),
+        limits=_limits(streams.settings),
+        settings=_summary(streams, grid),
+        quality=quality,
+        fingerprint=_fingerprint(streams),
+        spectra=tuple(spectra),
+    )
+
+
+def _hemisphere(streams: Streams, report: Report) -> Hemisphere | None:
+    """The side that the leads behind the sensed channels share, where the settings tell."""
+    subject = get(streams.settings.merged, "SubjectInfo")
+    keys: set[int] = set()
+    if streams.time_domain is not None:
+        keys |= {key for key, x in enumerate(streams.time_domain.samples) if x.size}
+    if streams.power is not None and streams.power.bands.size:
+        keys |= {i // 2 for i in range(8) if np.isfinite(streams.power.bands[:, i]).any()}
+    side = hemisphere(subject, keys)
+    if side is not None:
+        report("DeviceSettings").understood.append(f"leads on the {side} side")
+    elif any(described(subject)):
+        report("DeviceSettings").flagged.append("the leads of the sensed channels have no common side: name the hemisphere with the upload")
+    return side
+
+
+def _spans(
+    headers: dict[str, PacketHeaders], times: dict[str, PacketTimes], report: Report, options: DecodeOptions
+) -> dict[str, tuple[float, float]]:
+    """Begin and end of each stream, PC ms; a stream that lies impossibly far from the longest one is left out and said."""
+    spans: dict[str, tuple[float, float]] = {}
+    limit_ms = 1000.0 * MAX_ROWS * options.period_s
+    for name, head in headers.items():
+        placed = np.isfinite(times[name].last_ms)
+        if not placed.any():
+            continue
+        last = times[name].last_ms[placed]
+        first = last - 1000.0 * head.samples[placed] / head.rate_hz[placed]
+        spans[name] = (float(first.min()), float(last.max()))
+    spans = {name: span for name, span in spans.items() if _plausible(span, limit_ms, report(STEMS[name]))}
+    if spans:
+        anchor = max(spans.values(), key=lambda span: span[1] - span[0])[0]
+        far = [name for name, span in spans.items() if abs(span[0] - anchor) > limit_ms / 2]
+        for name in far:
+            report(STEMS[name]).flagged.append("its clock lies days away from the other streams; left out")
+            del spans[name]
+    return spans
+
+
+def _plausible(span: tuple[float, float], limit_ms: float, report: FileReport) -> bool:
+    if span[1] - span[0] <= limit_ms and 0 <= span[0] < 2.5e14:
+        return True
+    report.flagged.append("its packet times make no sense; left out")
+    return False
+
+
+def _first_record_ms(streams: Streams) -> float:
+    known = [*streams.settings.sensing.times_ms[:1], *streams.settings.therapy.times_ms[:1]]
+    return min(known, default=0.0)
+
+
+def _traces(
+    streams: Streams, times: dict[str, PacketTimes], steps: AmplitudeSteps, grid: Grid, report: Report
+) -> tuple[list[TraceLog], list[SpectrumLog]]:
+    traces: list[TraceLog] = []
+    spectra: list[SpectrumLog] = []
+    if streams.time_domain is not None and "time_domain" in times:
+        channels = time_domain_stretches(streams.time_domain, times["time_domain"], streams.settings)
+        traces += beta_traces(channels, grid, report("RawDataTD").flagged)
+        spectra += time_domain_spectra(channels)
+    if streams.power is not None and "power" in times:
+        traces += power_traces(streams.power, times["power"], streams.settings, grid, report("RawDataPower").flagged)
+    if streams.fft is not None and "fft" in times:
+        fft_traces, fft_spectra = fft_results(streams.fft, times["fft"], streams.settings, grid)
+        traces, spectra = traces + fft_traces, spectra + fft_spectra
+    if streams.accel is not None and "accel" in times:
+        traces += accel_traces(streams.accel, times["accel"], grid)
+    amplitude = amplitude_traces(steps, grid)
+    if not amplitude:
+        report("StimLog").flagged.append("no enabled program known: the recording has no amplitude trace")
+    if steps.assumed_program:
+        report("StimLog").flagged.append("no settings say which programs are enabled: program 0 is taken to be the one that stimulates")
+    return traces + amplitude, spectra
+
+
+def _limits(settings: Settings) -> dict[str, Any]:
+    """Clinician's amplitude limits of enabled programs, mA, by group and program."""
+    limits: dict[str, Any] = {}
+    for group in range(4):
+        for p in range(4):
+            if integer(get(settings.merged, f"TherapyConfigGroup{group}", "programs", p, "isEnabled")) != 0:
+                continue
+            low = number(get(settings.merged, f"AmplitudeLimitsGroup{group}", f"prog{p}LowerInMilliamps"))
+            high = number(get(settings.merged, f"AmplitudeLimitsGroup{group}", f"prog{p}UpperInMilliamps"))
+            if low is not None and high is not None:
+                limits.setdefault(f"group {GROUPS[group]}", {})[f"program {p}"] = {"lower_ma": low, "upper_ma": high}
+    return limits
+
+
+def _summary(streams: Streams, grid: Grid) -> dict[str, Any]:
+    """What sensing and detection were set to, in plain values."""
+    settings = streams.settings
+    sensing = [
+        {
+            "from_s": round((t - grid.start_ms) / 1000.0, 3),
+            "rates_hz": list(s.rates_hz),
+            "contacts": list(s.contacts),
+            "fft_interval_s": s.fft_interval_s,
+            "fft_size": s.fft_size,
+            "bands": [band.name if band is not None else None for band in s.bands],
+            "sense_bits": s.sense_bits,
+        }
+        for t, s in zip(settings.sensing.times_ms, settings.sensing.states, strict=True)
+    ]
+    return {
+        "period_s": grid.options.period_s,
+        "utc_offset_h": number(get(settings.merged, "UtcOffset")),
+        "adaptive_mode": integer(get(settings.merged, "AdaptiveConfig", "adaptiveMode")),
+        "ld0_thresholds": [number(get(settings.merged, "DetectionConfig", "Ld0", "biasTerm", i)) for i in range(2)],
+        "leads": described(get(settings.merged, "SubjectInfo")),
+        "sensing": sensing,
+    }
+
+
+def _text(infos: list[dict[str, Any]], key: str) -> str | None:
+    return next((info[key][:80] for info in infos if isinstance(info.get(key), str) and info[key]), None)
+
+
+def _fingerprint(streams: Streams) -> str:
+    """Over packets, settings times and stimulation; not over the device's name, nor anything that redaction changes."""
+    parts: list[str | bytes | NDArray[Any]] = []
+    headers = streams.headers()
+    told = {name: head for name, head in headers.items() if name in PRIMARY} or headers
+    for name, head in sorted(told.items()):
+        parts += [name, head.seconds, head.tick, head.sequence, head.gen_ms, head.samples]
+    if streams.time_domain is not None:
+        parts += list(streams.time_domain.samples)
+    if streams.power is not None:
+        parts.append(streams.power.bands)
+    if streams.adaptive is not None:
+        parts.append(streams.adaptive.amplitude_ma)
+    settings = streams.settings
+    parts += [np.array(settings.sensing.times_ms), np.array(settings.therapy.times_ms), repr(settings.therapy.states)]
+    parts.append(np.array(settings.record_times_ms))
+    return fingerprint("rcs", parts)

@@ -1,0 +1,271 @@
+"""Columns of a table: which header means what, in which unit, and their cells as numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.formats.options import DecodeOptions
+from ml.formats.recording import FileReport, UndecodableFile
+from ml.formats.tables.delimited import read_delimited
+from ml.formats.tables.numbers import column_name, known_unit, shown, unit_name
+
+TIME_NAMES = ("t_s", "t", "time_s", "time", "seconds", "t_sec")
+BETA_NAMES = ("beta", "p_beta", "beta_amplitude", "beta_power")
+LFP_NAMES = ("lfp", "raw_lfp", "lfp_raw", "local_field_potential")
+LFP_SCALE = {"nV": 1e-3, "uV": 1.0, "mV": 1e3, "V": 1e6}
+"""How many uV one of the unit is."""
+FRACTION_NAMES = ("amplitude_fraction", "fraction", "amp_fraction", "stim_fraction", "a")
+MILLIAMP_NAMES = ("amplitude_ma", "amp_ma", "stim_ma", "ma", "milliamps", "amplitude_milliamps")
+AMPLITUDE_NAMES = ("amplitude", "amp", "stimulation")
+"""Names that say what the column holds only together with a unit."""
+TIME_SCALE = {None: 1.0, "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3}
+PER_UNIT: dict[str, dict[str | None, float]] = {
+    "amplitude_ma": {None: 1.0, "mA": 1.0, "uA": 1000.0, "A": 1e-3},
+    "amplitude_fraction": {None: 1.0, "fraction": 1.0, "%": 100.0},
+}
+"""How many of the header's unit make 1 mA, or the fraction 1."""
+LARGEST = {"amplitude_ma": 25.5, "amplitude_fraction": 10.0}
+"""25.5 mA is the largest amplitude that a stimulator like RC+S or Percept can be set to; a fraction above 10 was meant as percent."""
+RATIO_SPREAD = 0.05
+"""mA per fraction may vary by this share, for rounded cells, and still be one cDBS amplitude."""
+LEAST_FRACTION = 0.05
+"""Below this fraction rounding alone moves the ratio."""
+NEEDED = "t_s, beta and amplitude_fraction (or amplitude_ma), or t_s and lfp with its unit"
+
+
+@dataclass(slots=True)
+class Columns:
+    """Columns found, as they are called in the file, and their cells in the header's unit as float64 [n] with NaN for missing."""
+
+    names: dict[str, str]
+    units: dict[str, str | None]
+    lines: NDArray[np.int64]
+    values: dict[str, NDArray[np.float64]]
+    ignored: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def label(self, role: str) -> str:
+        """The column as a stored file or report may call it: its role and the unit in brackets."""
+        unit = self.units[role]
+        return f"{role} [{unit}]" if unit else role
+
+    def error(self, what: str, role: str, mend: str, row: int | None = None, stored: str | None = None) -> UndecodableFile:
+        """An error at a column, and at the line of a row; `stored` is the text without the file's own words."""
+        line = "" if row is None else f"line {self.lines[row]}, "
+        return UndecodableFile(what, f"{line}column {self.names[role]}", mend, stored, f"{line}column {role}")
+
+
+def match_columns(headers: Sequence[str]) -> tuple[dict[str, int], dict[str, str | None], list[str], list[str]]:
+    """Which header is which: role -> index, role -> unit, the headers of no use, and sentences about what was adapted.
+
+    Raises:
+        UndecodableFile: a needed column is missing, named twice or in an unknown unit.
+    """
+    found: dict[str, int] = {}
+    units: dict[str, str | None] = {}
+    unused: list[str] = []
+    notes: list[str] = []
+    for index, header in enumerate(headers):
+        key, unit = column_name(header)
+        role = _role(key, unit)
+        if role is None:
+            unused.append(header.strip())
+            continue
+        if role in found:
+            what = f"two columns both give {role}"
+            raise UndecodableFile(f"{what}: {shown(headers[found[role]])} and {shown(header)}", "line 1", "Keep one of them.", what)
+        found[role], units[role] = index, _header_unit(role, unit, header, notes)
+    _check_complete(found, headers)
+    return found, units, unused, notes
+
+
+def _check_complete(found: dict[str, int], headers: Sequence[str]) -> None:
+    """Raise where a needed column is missing, naming its unit as the reason where that is all that is wrong."""
+    if "lfp" in found and "beta" in found:
+        what = "the table has both lfp and beta"
+        raise UndecodableFile(what, "line 1", "Upload either raw LFP, or beta per step: the service makes beta from LFP itself.")
+    missing = [role for role in ("t_s", "beta") if role not in found and not (role == "beta" and "lfp" in found)]
+    if "lfp" not in found and "amplitude_fraction" not in found and "amplitude_ma" not in found:
+        for header in headers:
+            key, unit = column_name(header)
+            if key in AMPLITUDE_NAMES and unit:
+                raise _unknown_unit("amplitude_ma", unit, header)
+        missing.append("amplitude_fraction (or amplitude_ma)")
+    if missing:
+        names = ", ".join(shown(h.strip()) for h in headers[:20]) or "none"
+        what = f"missing column {', '.join(missing)}"
+        raise UndecodableFile(f"{what}; found: {names}", "line 1", f"Name the columns {NEEDED}.", what)
+
+
+def _role(key: str, unit: str | None) -> str | None:
+    if key in TIME_NAMES:
+        return "t_s"
+    if key in BETA_NAMES:
+        return "beta"
+    if _is_lfp(key):
+        return "lfp"
+    if key in MILLIAMP_NAMES:
+        return "amplitude_ma"
+    if key in FRACTION_NAMES:
+        return "amplitude_fraction"
+    if key in AMPLITUDE_NAMES and unit is not None:
+        return next((role for role, known in PER_UNIT.items() if unit_name(unit) in known), None)
+    return None
+
+
+def _is_lfp(key: str) -> bool:
+    return key in LFP_NAMES or _lfp_suffix(key) is not None
+
+
+def _lfp_suffix(key: str) -> str | None:
+    """The unit that a name like `lfp_uv` ends with."""
+    return next((unit for unit in LFP_SCALE if key == f"lfp_{unit.lower()}"), None)
+
+
+def is_lfp(headers: Sequence[str]) -> bool:
+    """Whether a table with these headers holds raw LFP."""
+    return any(_is_lfp(column_name(header)[0]) for header in headers)
+
+
+def _header_unit(role: str, unit: str | None, header: str, notes: list[str]) -> str | None:
+    """The unit of a column in its one spelling. Raises UndecodableFile for a unit that its numbers cannot be converted from."""
+    if unit is None:
+        return _lfp_suffix(column_name(header)[0])
+    if role == "lfp":
+        if unit_name(unit) not in LFP_SCALE:
+            raise _unknown_unit(role, unit, header)
+        return unit_name(unit)
+    if role == "t_s":
+        if unit.lower() not in TIME_SCALE:
+            raise _unknown_unit(role, unit, header)
+        return unit.lower()
+    if role in PER_UNIT:
+        if unit_name(unit) not in PER_UNIT[role]:
+            raise _unknown_unit(role, unit, header)
+        return unit_name(unit)
+    known = known_unit(unit)
+    if known is None:
+        notes.append("the text in brackets after beta is no unit known here: beta was read as if its header stated none")
+    return known
+
+
+def _unknown_unit(role: str, unit: str, header: str) -> UndecodableFile:
+    mend = {
+        "t_s": "Give the time in seconds (s).",
+        "lfp": "Give the LFP in uV, and say so in the header: lfp [uV]. nV, mV and V are converted.",
+        "amplitude_ma": "Give the amplitude in mA, and say so in the header: amplitude (mA). uA and A are converted.",
+        "amplitude_fraction": "Give the fraction of the cDBS amplitude, 0 to 1, or percent with the header amplitude_fraction (%).",
+    }[role]
+    column = {"t_s": "time", "lfp": "LFP"}.get(role, "amplitude")
+    what = f"unknown unit {shown(unit)} of the {column} column"
+    return UndecodableFile(what, f"column {header.strip()}", mend, f"unknown unit of the {column} column", f"column {role}")
+
+
+def read_csv(path: Path, options: DecodeOptions) -> Columns:
+    """Cells of a text table; see `decode_csv`."""
+    table = read_delimited(path, lambda headers: options.max_lfp_rows if is_lfp(headers) else options.max_table_rows, NEEDED)
+    found, units, unused, notes = match_columns(table.headers)
+    table.notes.extend(notes)
+    decimal = table.decimal_mark(list(found.values()))
+    if decimal == ",":
+        table.notes.append("decimal comma read as decimal point")
+    values = {role: table.numbers(index, decimal, role) for role, index in found.items()}
+    names = {role: table.headers[index].strip() for role, index in found.items()}
+    return Columns(names, units, np.array(table.lines, dtype=np.int64), values, unused, table.notes)
+
+
+def read_parquet(path: Path, options: DecodeOptions) -> Columns:
+    """Columns of a Parquet table; see `decode_parquet`."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    mend = "Write the table again, for example with pandas' to_parquet."
+    try:
+        file = pq.ParquetFile(path)
+        headers = [str(n) for n in file.schema_arrow.names]
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise UndecodableFile("the Parquet file is damaged or cut", "file", mend) from error
+    most = options.max_lfp_rows if is_lfp(headers) else options.max_table_rows
+    if file.metadata.num_rows > most:
+        raise UndecodableFile(f"more than {most} rows", "file", "Upload one session per table.")
+    schema = file.schema_arrow
+    found, units, unused, notes = match_columns([_with_unit(schema.field(i)) for i in range(len(headers))])
+    for role, index in found.items():
+        kind = schema.field(index).type
+        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind) or pa.types.is_null(kind)):
+            what, where = f"the column holds {kind}, not numbers", f"column {headers[index]}"
+            raise UndecodableFile(what, where, "Store it as float64.", "the column holds no numbers", f"column {role}")
+    try:
+        table = file.read(columns=[headers[i] for i in found.values()])
+        values = {role: _arrow_floats(table.column(headers[i])) for role, i in found.items()}
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise UndecodableFile("the Parquet file is damaged or cut", "file", mend) from error
+    lines = np.arange(1, table.num_rows + 1, dtype=np.int64)
+    return Columns({role: headers[i] for role, i in found.items()}, units, lines, values, unused, notes)
+
+
+def _with_unit(column: Any) -> str:
+    """A Parquet column's header, with the unit of its metadata in brackets where the header itself states none."""
+    header = str(column.name)
+    unit = (column.metadata or {}).get(b"unit", b"").decode("utf-8", "replace").strip()
+    if not unit or column_name(header)[1] is not None or set(unit) & set("()[]"):
+        return header
+    return f"{header} [{unit}]"
+
+
+def _arrow_floats(column: object) -> NDArray[np.float64]:
+    import pyarrow as pa
+
+    floats = column.cast(pa.float64()).to_numpy()  # type: ignore[attr-defined]
+    floats = np.array(floats, dtype=np.float64)
+    floats[~np.isfinite(floats)] = np.nan
+    return floats
+
+
+def checked_amplitude(role: str, columns: Columns, report: FileReport) -> NDArray[np.float64]:
+    """An amplitude column's numbers [rows] in mA or as a fraction, NaN where there is none.
+
+    Raises:
+        UndecodableFile: an amplitude that no stimulator gives; names line and column.
+    """
+    values = columns.values[role]
+    if lost := int(np.sum(np.isnan(values))):
+        report.flagged.append(f"{lost} rows without a number in {role}: kept as gaps")
+    values = values / PER_UNIT[role][columns.units[role]]
+    if (negative := np.flatnonzero(values < 0)).size:
+        mend = "Amplitudes are 0 or more; leave the cell empty if unknown."
+        raise columns.error(f"negative amplitude {values[negative[0]]:g}", role, mend, int(negative[0]))
+    if (absurd := np.flatnonzero(values > LARGEST[role] * (1 + 1e-9))).size:
+        raise _absurd(role, float(values[absurd[0]]), columns, int(absurd[0]))
+    if role == "amplitude_fraction" and (above := int(np.sum(values > 1))):
+        report.flagged.append(f"{above} rows have an amplitude above the cDBS amplitude (fraction > 1); kept as they are")
+    return values
+
+
+def _absurd(role: str, value: float, columns: Columns, row: int) -> UndecodableFile:
+    largest = LARGEST[role]
+    if role == "amplitude_ma":
+        what = f"amplitude {value:g} mA, more than the {largest:g} mA that a stimulator can give"
+        mend = "Give mA; if the numbers are in uA, name the column amplitude (uA)."
+    else:
+        what = f"amplitude fraction {value:g}, more than {largest:g} times the cDBS amplitude"
+        mend = "Give 1 for the cDBS amplitude; name the column amplitude_fraction (%) for percent or amplitude_ma for mA."
+    return columns.error(what, role, mend, row)
+
+
+def compare_amplitudes(milliamps: NDArray[np.float64], fraction: NDArray[np.float64], report: FileReport) -> None:
+    """Say which of two amplitude columns is used, and whether both can be true for one cDBS amplitude."""
+    report.ignored.append("amplitude_fraction: amplitude_ma is given too and is what is stored")
+    both = np.isfinite(milliamps) & np.isfinite(fraction) & (fraction > LEAST_FRACTION)
+    if not both.any():
+        return
+    ratio = milliamps[both] / fraction[both]
+    if ratio.max() > (1 + RATIO_SPREAD) * ratio.min():
+        runs = f"runs from {ratio.min():.3g} to {ratio.max():.3g} mA"
+        report.flagged.append(f"amplitude_ma and amplitude_fraction disagree: their ratio, the cDBS amplitude, {runs}")

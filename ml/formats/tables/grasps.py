@@ -1,0 +1,107 @@
+"""Times of open fists in a hand-grasp test, the input of eq:grasp_speed. Source: format notes, A″."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.formats.options import DecodeOptions
+from ml.formats.recording import DecodedFile, FileReport, GraspLog, Hemisphere, UndecodableFile
+from ml.formats.tables.columns import BETA_NAMES
+from ml.formats.tables.delimited import TextTable, read_delimited
+from ml.formats.tables.numbers import column_name, shown
+from ml.qoc import PLAUSIBLE_INTERVAL_S
+
+SECONDS = frozenset({"t_s", "t", "time", "time_s", "open_fist_s", "seconds"})
+MICROSECONDS = frozenset({"t_us", "time_us", "timestamp_us", "open_fist_us", "microseconds"})
+TELLING = frozenset({"open_fist_s", "open_fist_us", "open_fist"})
+"""Names that no other table has for its times."""
+
+COUNTERS = frozenset({"", "n", "i", "index", "number", "grasp", "count", "unnamed:_0"})
+HANDS: dict[str, Hemisphere] = {"l": "left", "left": "left", "r": "right", "right": "right"}
+
+
+def looks_like_grasps(headers: Sequence[str]) -> bool:
+    """Whether a table with these headers is a grasp test: times and hands, or nothing but times."""
+    keys = [column_name(header)[0] for header in headers]
+    if any(key in BETA_NAMES or key.startswith(("lfp", "amplitude")) for key in keys):
+        return False
+    times = [key for key in keys if key in SECONDS | MICROSECONDS | TELLING]
+    others = [key for key in keys if key not in times and key not in COUNTERS and key != "hand"]
+    return bool(times) and ("hand" in keys or any(key in TELLING for key in keys) or not others)
+
+
+def decode_grasps(path: Path, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
+    """Decode a table of open-fist times (`t_s` or `t_us`, optional `hand`).
+
+    Implausible intervals (under 80 ms, over 3 s) are flagged and kept.
+
+    Raises:
+        UndecodableFile: no time column, text for a number, times that do not increase, an unknown hand; names line and column.
+    """
+    table = read_delimited(path, (options or DecodeOptions()).max_table_rows, "t_s (or t_us) and optionally hand")
+    names = [column_name(header) for header in table.headers]
+    column, scale = _time_column(table, names)
+    hand_column = next((i for i, (key, _) in enumerate(names) if key == "hand"), None)
+    times = table.numbers(column, table.decimal_mark([column]), "t_s") * scale
+    report = FileReport(name or path.name)
+    report.repaired.extend(table.notes)
+    others = len(names) - 1 - (hand_column is not None)
+    if others:
+        report.removed.append(f"{others} other column{'s' if others > 1 else ''}")
+    hands: dict[Hemisphere | None, list[int]] = {}
+    for i, row in enumerate(table.rows):
+        hands.setdefault(None if hand_column is None else _hand(row[hand_column], table.lines[i]), []).append(i)
+    logs = tuple(_one_hand(hand, np.array(rows), times, table, report) for hand, rows in hands.items())
+    if not logs:
+        raise UndecodableFile("the table has a header but no rows", "after line 1", "Add one row per open fist.")
+    return DecodedFile((), (report,), grasps=logs)
+
+
+def _time_column(table: TextTable, names: list[tuple[str, str | None]]) -> tuple[int, float]:
+    for i, (key, unit) in enumerate(names):
+        micro = unit is not None and unit.lower() in ("us", "µs", "μs")
+        if key in MICROSECONDS or (key in SECONDS | TELLING and micro):
+            return i, 1e-6
+        if key in SECONDS | TELLING and unit is not None and unit.lower() == "ms":
+            return i, 1e-3
+        if key in SECONDS | TELLING and (unit is None or unit.lower() in ("s", "sec", "seconds")):
+            return i, 1.0
+    found = ", ".join(shown(header.strip()) for header in table.headers[:20])
+    what = "no column of times"
+    raise UndecodableFile(f"{what}; found: {found}", "line 1", "Name the column t_s (seconds) or t_us (microseconds).", what)
+
+
+def _hand(cell: str, line: int) -> Hemisphere:
+    hand = HANDS.get(cell.strip().lower())
+    if hand is None:
+        raise UndecodableFile(f"unknown hand {shown(cell)}", f"line {line}, column hand", "Write L or R.", "unknown hand")
+    return hand
+
+
+def _one_hand(
+    hand: Hemisphere | None, rows: NDArray[np.int64], times: NDArray[np.float64], table: TextTable, report: FileReport
+) -> GraspLog:
+    t = times[rows]
+    bad = np.flatnonzero(np.isnan(t))
+    if bad.size:
+        where = f"line {table.lines[rows[bad[0]]]}, column of times"
+        raise UndecodableFile("an open fist without a time", where, "Delete the row or fill it in.")
+    intervals = np.diff(t)
+    back = np.flatnonzero(intervals <= 0)
+    if back.size:
+        line = table.lines[rows[back[0] + 1]]
+        mend = "Sort the rows by time; keep one row per open fist, and name the hand where both are in one table."
+        raise UndecodableFile("times must increase", f"line {line}, column of times", mend)
+    implausible = (intervals < PLAUSIBLE_INTERVAL_S[0]) | (intervals > PLAUSIBLE_INTERVAL_S[1])
+    whose = "" if hand is None else f"{hand} hand: "
+    report.understood.append(f"{whose}{t.size} open fists")
+    if t.size < 2:
+        report.flagged.append(f"{whose}fewer than two open fists: the grasp frequency is undefined")
+    if count := int(implausible.sum()):
+        low, high = PLAUSIBLE_INTERVAL_S
+        report.flagged.append(f"{whose}{count} intervals outside {low:g} to {high:g} s: kept, look at them")
+    return GraspLog(hand, t, implausible)

@@ -1,0 +1,156 @@
+"""Tables of raw LFP: `t_s`, `lfp` in a stated unit, and an amplitude where there is one. The session starts at `t_s` 0.
+
+The sampling rate is what the times say. Missing rows are gaps, which are never bridged.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.formats.beta import Stretch, channel_spectrum, step_trace, time_domain_traces
+from ml.formats.options import DecodeOptions
+from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
+from ml.formats.tables.columns import LFP_SCALE, TIME_SCALE, Columns, checked_amplitude, compare_amplitudes
+from ml.formats.tables.numbers import known_unit
+from ml.signals import row_means
+
+GAP = 1.5
+"""Two rows further apart than this many samples have a gap between them."""
+
+ROUND_RATE = 0.002
+"""A rate this close to a whole number of Hz is that number: times are written with few decimals."""
+
+MAX_JITTER = 0.5
+"""Samples may be this share of their distance away from an even clock; more is no evenly sampled signal."""
+
+LARGEST_UV = 1e6
+"""No electrode in a brain gives a volt."""
+
+MIN_ROWS = 8
+
+
+def decode_lfp(columns: Columns, options: DecodeOptions, report: FileReport) -> DecodedFile:
+    """A recording out of the columns of raw LFP.
+
+    Raises:
+        UndecodableFile: no unit, times that do not increase or are not even, a rate too low for the band, impossible values.
+    """
+    t_s = _times(columns)
+    unit = columns.units["lfp"] or known_unit(options.table_lfp_unit or "")
+    if unit not in LFP_SCALE:
+        mend = "Write the unit into the header, lfp [uV], or state it with the upload."
+        raise columns.error("the lfp column states no unit", "lfp", mend)
+    lfp = columns.values["lfp"] * LFP_SCALE[unit]
+    if (absurd := np.flatnonzero(np.abs(lfp) > LARGEST_UV)).size:
+        what = f"{lfp[absurd[0]]:g} uV, more than any electrode in a brain gives"
+        raise columns.error(what, "lfp", "Check the unit of the lfp column.", int(absurd[0]))
+    if lost := int(np.sum(np.isnan(lfp))):
+        report.flagged.append(f"{lost} rows without a number in lfp: gaps")
+    rate, cuts = _rate(t_s, columns, report)
+    if options.beta_high_hz >= rate / 2:
+        what = f"sampled at {rate:g} Hz, too slowly for a band up to {options.beta_high_hz:g} Hz"
+        raise columns.error(what, "t_s", "Upload the signal as it was recorded, or state a lower band in the participant's settings.")
+    period = options.period_s
+    # a sample at 0 belongs to the first step, unless there are samples before it
+    first = 1 if t_s[0] > -0.5 / rate else int(np.ceil(t_s[0] / period - 1e-9))
+    t0_s, rows = (first - 1) * period, int(np.ceil(t_s[-1] / period - 1e-9)) - first + 1
+    stretches = _stretches(t_s, lfp, rate, cuts)
+    details = {"column": columns.label("lfp"), "unit_from": "header" if columns.units["lfp"] else "options"}
+    traces = time_domain_traces(stretches, "lfp", rows, options, details, t0_s)
+    traces += _amplitude(columns, t_s, rate, rows, t0_s, options, report)
+    if len(traces) == 2:
+        report.flagged.append("no amplitude in the table: no policy can learn from this session until one is known")
+    seconds = sum(x.size for _, _, x in stretches) / rate
+    report.understood.append(
+        f"raw LFP in {unit} at {rate:g} Hz: {t_s.size} samples, {seconds:.1f} s of signal, {rows} steps of {period:g} s"
+    )
+    recording = RecordingLog(
+        kind="table",
+        device_key=None,
+        hemisphere=None,
+        clock="table",
+        started_at=None,
+        duration_s=float((first + rows - 1) * period) if rows else 0.0,
+        traces=tuple(traces),
+        events=(),
+        limits={},
+        settings={"period_s": period, "rate_hz": rate},
+        quality={f"{t.stream}.{t.channel}": {"valid_fraction": round(float(t.valid.mean()), 6)} for t in traces},
+        fingerprint=fingerprint("lfp table", [t_s, lfp, *(t.values for t in traces if t.stream == "amplitude")]),
+        spectra=tuple(channel_spectrum(stretches, "lfp")),
+    )
+    return DecodedFile((recording,), (report,))
+
+
+def _times(columns: Columns) -> NDArray[np.float64]:
+    """Times in s, there and increasing."""
+    t_s = columns.values["t_s"] * TIME_SCALE[columns.units["t_s"]]
+    if t_s.size < MIN_ROWS:
+        raise UndecodableFile(f"{t_s.size} rows are no signal", "after line 1", "Add one row per sample.")
+    if (empty := np.flatnonzero(np.isnan(t_s))).size:
+        raise columns.error("a row has no time", "t_s", "Give every row its t_s.", int(empty[0]))
+    if (back := np.flatnonzero(np.diff(t_s) <= 0)).size:
+        i = int(back[0]) + 1
+        what = f"times must increase: {t_s[i]:g} s comes after {t_s[i - 1]:g} s"
+        raise columns.error(what, "t_s", "Sort the rows; write the times with enough decimals to tell samples apart.", i)
+    if t_s[-1] <= 0:
+        raise columns.error("no row with t_s > 0", "t_s", "The session starts at 0; rows before it are its lead.")
+    if t_s[-1] - t_s[0] > 7 * 86_400:
+        raise columns.error(
+            f"the times span {t_s[-1] - t_s[0]:g} s, more than a week", "t_s", "Give t_s in seconds from the session's start."
+        )
+    return t_s
+
+
+def _rate(t_s: NDArray[np.float64], columns: Columns, report: FileReport) -> tuple[float, NDArray[np.int64]]:
+    """Samples per second, and the rows before which a gap ends. Says gaps and jitter; raises where the times are not even."""
+    steps = np.diff(t_s)
+    usual = float(np.median(steps))
+    inside = steps <= GAP * usual
+    # the median suffers from rounded times, the mean does not
+    usual = float(steps[inside].mean())
+    inside = steps <= GAP * usual
+    rate = 1.0 / usual
+    if abs(rate - round(rate)) <= ROUND_RATE * rate and round(rate) > 0:
+        rate = float(round(rate))
+    uneven = np.abs(steps - usual) > MAX_JITTER * usual
+    off = inside & uneven
+    if off.sum() > 0.01 * steps.size:
+        i = int(np.flatnonzero(off)[0]) + 1
+        what = f"times are not evenly spaced: {steps[i - 1]:g} s here, {usual:g} s on average"
+        raise columns.error(what, "t_s", "Write the times with enough decimals, one row per sample.", i)
+    cuts = np.flatnonzero(~inside) + 1
+    missing = int(np.rint(steps[~inside] * rate - 1).sum())
+    if cuts.size:
+        share = 100 * missing / (missing + t_s.size)
+        report.flagged.append(f"{cuts.size} gap{'s' if cuts.size > 1 else ''} in the times: {missing} samples ({share:.1f} %) are missing")
+    jitter = float(np.max(np.abs(steps[inside] - usual), initial=0.0))
+    if jitter > 0.1 * usual:
+        report.flagged.append(f"the times jitter by up to {1000 * jitter:.3g} ms around an even clock of {rate:g} Hz")
+    return rate, cuts
+
+
+def _stretches(t_s: NDArray[np.float64], lfp: NDArray[np.float64], rate: float, cuts: NDArray[np.int64]) -> list[Stretch]:
+    """Gap-free pieces; rows without a number are gaps too."""
+    good = np.isfinite(lfp)
+    edges = np.concatenate(([0], cuts, np.flatnonzero(np.diff(good.astype(np.int8))) + 1, [lfp.size]))
+    edges = np.unique(edges)
+    pairs = zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+    return [(float(t_s[begin]), rate, lfp[begin:end]) for begin, end in pairs if good[begin]]
+
+
+def _amplitude(
+    columns: Columns, t_s: NDArray[np.float64], rate: float, rows: int, t0_s: float, options: DecodeOptions, report: FileReport
+) -> list[TraceLog]:  # fmt: skip
+    """The amplitude column as means per step."""
+    given = {role: checked_amplitude(role, columns, report) for role in columns.values if role.startswith("amplitude")}
+    if len(given) == 2:
+        compare_amplitudes(given["amplitude_ma"], given.pop("amplitude_fraction"), report)
+    out = []
+    for role, values in given.items():
+        means, covered = row_means(np.maximum(t_s - t0_s, 0.0), values, np.full(t_s.size, 1.0 / rate), rows, options.period_s)
+        unit = "mA" if role == "amplitude_ma" else "fraction"
+        details = {"column": columns.label(role)}
+        out.append(step_trace(("amplitude", role, unit), "table", means, covered, options, details, t0_s + options.period_s))
+    return out

@@ -1,0 +1,95 @@
+"""Take identity out of tables before they are stored: known columns stay, as the numbers and classes that were read from them.
+
+The result decodes to the same recording, minutes or grasp tests; texts of the file do not survive at all.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ml.formats.options import DecodeOptions
+from ml.formats.recording import TREMOR_CLASSES, GraspLog, TremorLog
+from ml.formats.redaction import Redaction
+from ml.formats.tables.columns import Columns, read_csv, read_parquet
+from ml.formats.tables.grasps import decode_grasps
+from ml.formats.tables.steps import decode_columns
+from ml.formats.tables.strivepd import decode_strivepd
+
+TableKind = Literal["csv", "parquet", "tremor", "grasp"]
+
+
+def redact_table(source: Path, target: Path, kind: TableKind, options: DecodeOptions) -> Redaction:
+    """Write a table of the known columns alone; the same bytes in give the same bytes out.
+
+    Headers become the column's role with its unit in brackets, cells the numbers that were read. A table of steps or of raw LFP keeps its
+    line numbers; tremor becomes a wide export, a grasp test `t_s` and `hand`.
+
+    Args:
+        source: the uploaded table.
+        target: where the redacted table is written.
+        kind: what the table is.
+        options: choices of the decoder, which checks the table as the sender wrote it.
+
+    Raises:
+        UndecodableFile: the table cannot be decoded; nothing is written then.
+    """
+    if kind in ("tremor", "grasp"):
+        return _redact_outcomes(source, target, kind, options)
+    columns = read_csv(source, options) if kind == "csv" else read_parquet(source, options)
+    decode_columns(columns, options, "table")
+    if kind == "csv":
+        _write_csv(columns, target)
+    else:
+        _write_parquet(columns, target)
+    others = len(columns.ignored)
+    removed = [f"{others} other column{'s' if others != 1 else ''}"] if others else []
+    return Redaction(removed=removed, repaired=list(columns.notes))
+
+
+def _redact_outcomes(source: Path, target: Path, kind: str, options: DecodeOptions) -> Redaction:
+    decoded = decode_strivepd(source, options) if kind == "tremor" else decode_grasps(source, options)
+    report = decoded.reports[0]
+    lines = _tremor_lines(decoded.tremor[0]) if kind == "tremor" else _grasp_lines(decoded.grasps)
+    target.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    assumed = [text for text in report.flagged if "read as UTC" in text]
+    return Redaction(removed=list(report.removed), repaired=[*report.repaired, *assumed], ignored=list(report.ignored))
+
+
+def _tremor_lines(minutes: TremorLog) -> list[str]:
+    """A wide export with the length of each minute and all tremor together; times in Unix seconds."""
+    lines = [",".join(("time", "duration_s", *TREMOR_CLASSES, "any_tremor"))]
+    rows = zip(
+        minutes.start_unix_s.tolist(), minutes.duration_s.tolist(), minutes.fractions.tolist(), minutes.any_tremor.tolist(), strict=True
+    )
+    return lines + [",".join(map(_cell, (start, length, *shares, any_))) for start, length, shares, any_ in rows]
+
+
+def _grasp_lines(hands: tuple[GraspLog, ...]) -> list[str]:
+    if len(hands) == 1 and hands[0].hand is None:
+        return ["t_s", *(_cell(t) for t in hands[0].open_fist_s.tolist())]
+    return ["t_s,hand", *(f"{_cell(t)},{h.hand}" for h in hands for t in h.open_fist_s.tolist())]
+
+
+def _cell(value: float) -> str:
+    return "" if value != value else repr(value)
+
+
+def _write_csv(columns: Columns, target: Path) -> None:
+    with target.open("w", encoding="utf-8", newline="") as out:
+        out.write(",".join(columns.label(role) for role in columns.values) + "\n")
+        at = 2
+        for line, *cells in zip(columns.lines.tolist(), *(v.tolist() for v in columns.values.values()), strict=True):
+            # blank lines keep every row on its line, so that later reports name the line that the sender sees
+            out.write("\n" * (line - at) + ",".join(map(_cell, cells)) + "\n")
+            at = line + 1
+
+
+def _write_parquet(columns: Columns, target: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    arrays = {columns.label(role): pa.array(v, type=pa.float64(), mask=np.isnan(v)) for role, v in columns.values.items()}
+    pq.write_table(pa.table(arrays), target, store_schema=False)

@@ -1,0 +1,216 @@
+"""Minutes of tremor: StrivePD exports, wide (fractions per class) and long (seconds per severity), and tables of one class per minute.
+
+Source: format notes, A″.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.formats.options import DecodeOptions
+from ml.formats.recording import TREMOR_CLASSES, DecodedFile, FileReport, TremorLog, UndecodableFile
+from ml.formats.tables.delimited import TextTable, read_delimited
+from ml.formats.tables.numbers import NotANumber, column_name, parse_number, shown
+
+SUMMARY = "all"
+"""slight + mild + moderate + strong of the same minute: no class of its own, never added to the others."""
+
+MINUTE_S = 60.0
+SUM_TOLERANCE = 0.02
+EARLIEST_UNIX_S = 1e9
+"""September 2001: no watch measured tremor before, so a smaller number is no date."""
+
+LATEST_UNIX_S = 1e10
+TIME_NAMES = ("time", "minute_start", "start_utc", "minute_start_utc", "start", "start_time", "timestamp", "start_date", "startdate")
+CLASS_NAMES = ("class", "tremor_class", "tremor")
+LENGTH_NAMES = ("duration_s",)
+KNOWN = frozenset({*TREMOR_CLASSES, "severity", "duration", "duration_s", "measurement_duration_ns", "stream_type_id", "measurement"})
+WANTED = ", ".join(TREMOR_CLASSES)
+
+
+def looks_like_tremor(headers: Sequence[str]) -> bool:
+    """Whether a table with these headers holds minutes of tremor."""
+    keys = {column_name(header)[0] for header in headers}
+    named = {"mild", "moderate", "strong"} <= keys or "severity" in keys
+    return named or (bool(keys & set(CLASS_NAMES)) and bool(keys & set(TIME_NAMES)))
+
+
+def decode_strivepd(path: Path, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
+    """Decode minutes of tremor in any of three layouts, told apart by their columns.
+
+    Times are ISO 8601 or Unix time; a time without a zone is read as UTC, and that is said.
+
+    Raises:
+        UndecodableFile: none of the layouts, text for a number, an unreadable time; names line and column.
+    """
+    table = read_delimited(path, (options or DecodeOptions()).max_table_rows, "time and one column per class")
+    columns = {column_name(header)[0]: i for i, header in reversed(list(enumerate(table.headers)))}
+    report = FileReport(name or path.name)
+    report.repaired.extend(table.notes)
+    time = next((columns[key] for key in TIME_NAMES if key in columns), None)
+    if time is None:
+        found = ", ".join(shown(h.strip()) for h in table.headers[:20])
+        what = "no column of times"
+        raise UndecodableFile(f"{what}; found: {found}", "line 1", "Name it time or minute_start.", what)
+    of_class = next((columns[key] for key in CLASS_NAMES if key in columns), None)
+    used = {time, *(i for key, i in columns.items() if key in KNOWN)}
+    if set(TREMOR_CLASSES) <= set(columns):
+        minutes = _wide(table, columns, time, report)
+    elif {"severity", "duration"} <= set(columns):
+        minutes = _long(table, columns, time, report)
+    elif of_class is not None:
+        minutes = _by_class(table, columns, time, of_class, report)
+        used.add(of_class)
+    else:
+        mend = f"A wide export has the columns time, {WANTED}; a long one time, severity, duration; a table per minute minute_start, class."
+        raise UndecodableFile("no layout of a tremor export", "line 1", mend)
+    if others := len(table.headers) - len(used):
+        report.removed.append(f"{others} other column{'s' if others > 1 else ''}, such as patient and device identifiers")
+    if minutes.start_unix_s.size == 0:
+        raise UndecodableFile("the table holds no minute of tremor", "after line 1", "Upload the export as StrivePD wrote it.")
+    report.understood.append(f"{minutes.start_unix_s.size} minutes of tremor")
+    return DecodedFile((), (report,), tremor=(minutes,))
+
+
+def _wide(table: TextTable, columns: dict[str, int], time: int, report: FileReport) -> TremorLog:
+    decimal = table.decimal_mark([columns[c] for c in TREMOR_CLASSES])
+    start = _starts(table, time, report)
+    fractions = np.column_stack([table.numbers(columns[c], decimal, c) for c in TREMOR_CLASSES]) if table.rows else np.empty((0, 6))
+    outside = np.flatnonzero(((fractions < 0) | (fractions > 1 + SUM_TOLERANCE)).any(axis=1))
+    if outside.size:
+        line = f"line {table.lines[outside[0]]}"
+        mend = "Upload the export as StrivePD wrote it; its fractions lie between 0 and 1."
+        raise UndecodableFile("a fraction outside 0 to 1", line, mend)
+    off = np.abs(fractions.sum(axis=1) - 1.0) > SUM_TOLERANCE
+    if count := int(off.sum()):
+        report.flagged.append(f"{count} minutes whose fractions do not add up to 1: kept as they are")
+    told = table.numbers(columns["any_tremor"], decimal, "any_tremor") if "any_tremor" in columns else np.full(start.size, np.nan)
+    any_tremor = np.where(np.isfinite(told), told, fractions[:, 2:].sum(axis=1))
+    return _in_order(start, _lengths(table, columns), fractions, any_tremor, report)
+
+
+def _lengths(table: TextTable, columns: dict[str, int]) -> NDArray[np.float64]:
+    """Length of each row's minute, s; 60 where the table does not tell."""
+    if "duration_s" not in columns:
+        return np.full(len(table.rows), MINUTE_S)
+    length = table.numbers(columns["duration_s"], table.decimal_mark([columns["duration_s"]]), "duration_s")
+    return np.where(length > 0, length, MINUTE_S)
+
+
+def _by_class(table: TextTable, columns: dict[str, int], time: int, of_class: int, report: FileReport) -> TremorLog:
+    """One class per minute: that class has the whole minute."""
+    start = _starts(table, time, report)
+    fractions = np.zeros((start.size, len(TREMOR_CLASSES)))
+    for i, (row, line) in enumerate(zip(table.rows, table.lines, strict=True)):
+        name = row[of_class].strip().lower()
+        if name not in TREMOR_CLASSES:
+            where = f"line {line}, column {table.headers[of_class].strip()}"
+            what = "no class of tremor"
+            raise UndecodableFile(f"{shown(name)} is {what}", where, f"Write one of {WANTED}.", what, f"line {line}, column class")
+        fractions[i, TREMOR_CLASSES.index(name)] = 1.0
+    return _in_order(start, _lengths(table, columns), fractions, fractions[:, 2:].sum(axis=1), report)
+
+
+def _long(table: TextTable, columns: dict[str, int], time: int, report: FileReport) -> TremorLog:
+    """Rows of seconds per severity, gathered by minute; rows of percentages say the same again and are left out."""
+    seconds: dict[float, dict[str, float]] = defaultdict(dict)
+    lengths: dict[float, float] = {}
+    durations = table.numbers(columns["duration"], table.decimal_mark([columns["duration"]]), "duration")
+    length_ns = table.numbers(columns["measurement_duration_ns"], ".", "length") if "measurement_duration_ns" in columns else None
+    starts = _starts(table, time, report)
+    skipped = 0
+    for i, row in enumerate(table.rows):
+        severity = row[columns["severity"]].strip().lower()
+        if severity not in (*TREMOR_CLASSES, SUMMARY) or not _is_tremor_duration(row, columns) or not durations[i] >= 0:
+            skipped += 1
+            continue
+        start = float(starts[i])
+        if seconds[start].setdefault(severity, float(durations[i])) != durations[i]:
+            what = f"two rows give {severity} of one minute differently"
+            raise UndecodableFile(what, f"line {table.lines[i]}", "Keep one of them; a table holds the minutes of one watch.")
+        lengths[start] = MINUTE_S if length_ns is None or not length_ns[i] > 0 else float(length_ns[i]) / 1e9
+    if skipped:
+        report.ignored.append(f"{skipped} rows that are no seconds of tremor")
+    start_s = np.array(sorted(seconds), dtype=np.float64)
+    length = np.array([lengths[t] for t in start_s], dtype=np.float64)
+    table_s = [[_class_seconds(seconds[t], c) for c in TREMOR_CLASSES] for t in start_s]
+    fractions = np.array(table_s, dtype=np.float64).reshape(-1, 6) / length[:, None]
+    told = np.array([seconds[t].get(SUMMARY, np.nan) for t in start_s], dtype=np.float64) / length
+    any_tremor = np.where(np.isfinite(told), told, fractions[:, 2:].sum(axis=1))
+    if (beyond := np.flatnonzero((np.nansum(fractions, axis=1) > 1 + SUM_TOLERANCE) | (any_tremor > 1 + SUM_TOLERANCE))).size:
+        when = datetime.fromtimestamp(start_s[beyond[0]], UTC).isoformat()
+        raise UndecodableFile(f"the minute of {when} holds more seconds than it has", "column duration", "Give the duration in seconds.")
+    return _in_order(start_s, length, fractions, any_tremor, report)
+
+
+def _class_seconds(told: dict[str, float], name: str) -> float:
+    """Seconds of a class: no row for it means none, unless the minute tells nothing but the sum and that is not 0."""
+    if name in told:
+        return told[name]
+    only_sum = set(told) == {SUMMARY}
+    return float("nan") if only_sum and (told[SUMMARY] > 0 or name in ("unknown", "none")) else 0.0
+
+
+def _is_tremor_duration(row: list[str], columns: dict[str, int]) -> bool:
+    kind = row[columns["stream_type_id"]].strip().lower() if "stream_type_id" in columns else "duration"
+    measured = row[columns["measurement"]].strip().lower() if "measurement" in columns else "tremor"
+    return kind == "duration" and measured == "tremor"
+
+
+def _starts(table: TextTable, time: int, report: FileReport) -> NDArray[np.float64]:
+    """Unix times of the rows, [n]; says where a zone had to be assumed."""
+    zoneless = 0
+    out = np.empty(len(table.rows))
+    for i, (row, line) in enumerate(zip(table.rows, table.lines, strict=True)):
+        out[i], assumed = _unix_s(row[time], line)
+        zoneless += assumed
+    if zoneless:
+        report.flagged.append(f"{zoneless} times without a zone were read as UTC: check that they are")
+    return out
+
+
+def _unix_s(cell: str, line: int) -> tuple[float, bool]:
+    """Unix time of an ISO date, or of a number in s, ms, us or ns; and whether its zone was assumed."""
+    where, mend = f"line {line}, column time", "Give the time as ISO 8601 with its zone, or as Unix time."
+    try:
+        value = parse_number(cell)
+    except NotANumber:
+        try:
+            moment = datetime.fromisoformat(cell.strip())
+            zoned = moment.tzinfo is not None
+            value = (moment if zoned else moment.replace(tzinfo=UTC)).timestamp()
+        except (ValueError, OverflowError) as error:
+            raise UndecodableFile(f"{shown(cell)} is no time", where, mend, "a cell holds no time") from error
+        if not EARLIEST_UNIX_S <= value < LATEST_UNIX_S:
+            raise UndecodableFile("a time before any watch measured tremor", where, mend) from None
+        return value, not zoned
+    if value is None or value <= 0:
+        raise UndecodableFile("a minute has no time", where, mend)
+    for unit in (1.0, 1e3, 1e6, 1e9):
+        if EARLIEST_UNIX_S <= value / unit < LATEST_UNIX_S:
+            return value / unit, False
+    raise UndecodableFile(f"{value:g} is no date", where, mend, "a number that is no date")
+
+
+def _in_order(
+    start: NDArray[np.float64],
+    length: NDArray[np.float64],
+    fractions: NDArray[np.float64],
+    any_tremor: NDArray[np.float64],
+    report: FileReport,
+) -> TremorLog:
+    order = np.argsort(start, kind="stable")
+    start = start[order]
+    if undivided := int((np.isnan(fractions[:, 3:]).any(axis=1)).sum()):
+        report.flagged.append(f"{undivided} minutes tell only all tremor together: mild, moderate and strong are not known")
+    if overlaps := int(np.sum(np.diff(start) < length[order][:-1] - 1e-6)):
+        report.flagged.append(
+            f"{overlaps} minutes begin before the one before has ended: their times may have been rounded by a spreadsheet"
+        )
+    return TremorLog(start, length[order], fractions[order], any_tremor[order])

@@ -1,0 +1,1 @@
+"""Estimates held against actual returns, against each other, and combined."""

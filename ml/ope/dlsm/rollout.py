@@ -1,0 +1,172 @@
+"""Roll-outs of a fitted DLSM under many policies at once (eq:decoder)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ml.mdp import MdpSettings, step_reward
+from ml.ope.dlsm.batches import Scale
+from ml.ope.dlsm.networks import DlsmNetworks
+from ml.ope.linear.end_outcomes import LATE_STEPS, SUMMARIES
+from ml.policies.policy import Policy
+from ml.progress import Report, silent
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """Simulated sessions of P policies, M each; shape [P, M] unless said.
+
+    Attributes:
+        return_head: discounted step return by the learnt reward head's mean.
+        return_known: discounted step return by the known reward on sampled beta (never on its mean: a policy whose mean beta lies just
+            under the threshold would look perfect).
+        outcomes: r_end, grasp, rating, tremor in their units, [P, M, 4].
+        summaries: `end_outcomes.SUMMARIES` of every simulated session, [P, M, 5].
+        actions: one in `keep_every` of all actions, [P, K], for the coverage of the policy's own states.
+    """
+
+    return_head: Floats
+    return_known: Floats
+    outcomes: Floats
+    summaries: Floats
+    actions: Floats
+
+    @property
+    def sessions(self) -> int:
+        """M."""
+        return self.outcomes.shape[1]
+
+    @property
+    def amplitude(self) -> Floats:
+        """Mean a."""
+        return self.summaries[:, :, 0]
+
+    @property
+    def energy(self) -> Floats:
+        """Mean a^2."""
+        return self.summaries[:, :, 1]
+
+    @property
+    def beta(self) -> Floats:
+        """Mean sampled beta, participant's unit."""
+        return self.summaries[:, :, 2]
+
+
+def roll_out(
+    networks: DlsmNetworks,
+    policies: Sequence[Policy],
+    starts: Floats,
+    *,
+    scale: Scale,
+    settings: MdpSettings,
+    horizon: int,
+    per_policy: int,
+    seed: int,
+    prior: bool = False,
+    report: Report = silent,
+) -> Rollouts:
+    """Simulate every policy from the same starts with the same noise, so that differences between policies are the policies' own.
+
+    Args:
+        networks: a fitted DLSM.
+        policies: P policies.
+        starts: s_0 of the logged sessions, standardised, [n, W]; trajectory m starts from row m modulo n. With `prior` not used.
+        scale, settings: of the buffer.
+        horizon: H steps.
+        per_policy: M trajectories of each policy.
+        seed: of the noise.
+        prior: start from z_0 ~ N(0, I) and its own s_0 (paper) instead of q(z_0 | s_0).
+        report: told after every block.
+    """
+    block = max(1, networks.config.block // max(1, len(policies)))
+    rng = np.random.default_rng(seed)
+    parts = []
+    for first in range(0, per_policy, block):
+        count = min(block, per_policy - first)
+        rows = starts[(first + np.arange(count)) % len(starts)]
+        with torch.inference_mode():
+            parts.append(_roll_block(networks, policies, rows, scale, settings, horizon, rng, prior))
+        report((first + count) / per_policy, "rolling out policies")
+    joined = {
+        name: np.concatenate([getattr(p, name) for p in parts], axis=1)
+        for name in ("return_head", "return_known", "outcomes", "summaries", "actions")
+    }
+    return Rollouts(**joined)
+
+
+def _roll_block(
+    networks: DlsmNetworks,
+    policies: Sequence[Policy],
+    starts: Floats,
+    scale: Scale,
+    settings: MdpSettings,
+    horizon: int,
+    rng: np.random.Generator,
+    prior: bool,
+) -> Rollouts:
+    config, p, m = networks.config, len(policies), len(starts)
+    dtype = networks.decoder.bias.dtype
+
+    def shared(*shape: int) -> torch.Tensor:
+        """Noise for m trajectories, the same for every policy, [P m, ...]."""
+        return torch.as_tensor(rng.standard_normal((m, *shape)), dtype=dtype).repeat(p, *([1] * len(shape)))
+
+    if prior:
+        z = shared(config.latent)
+        mean, log_std = networks.first_state(z)
+        window = scale.raw_beta((mean + log_std.exp() * shared(networks.window)).numpy())
+    else:
+        mean, log_std = networks.first(torch.as_tensor(starts, dtype=dtype).repeat(p, 1))
+        z = mean + log_std.exp() * shared(config.latent)
+        window = scale.raw_beta(np.tile(starts, (p, 1)))
+    window = _within(window, scale)
+    h = torch.zeros(p * m, config.hidden, dtype=dtype)
+    c = torch.zeros_like(h)
+    pooled = torch.zeros_like(z)
+    sums = {name: np.zeros(p * m) for name in ("return_head", "return_known")}
+    summed, late = np.zeros((p * m, len(SUMMARIES))), min(LATE_STEPS, horizon)
+    kept, keep_every = [], max(1, horizon // 50)
+    for t in range(horizon):
+        a = np.concatenate([policy.act(window[i * m : (i + 1) * m]) for i, policy in enumerate(policies)])
+        action = torch.as_tensor(a, dtype=dtype)
+        z, h, c = networks.decoder.step(action.unsqueeze(1), z, h, c, shared(config.latent))
+        pooled += z
+        seen = networks.head_input(z, action)
+        mean, log_std = networks.state(seen)
+        drawn = mean + log_std.exp() * shared(networks.state_width)
+        if config.decode_all_window:
+            window = _within(scale.raw_beta(drawn.numpy()), scale)
+        else:
+            newest = _within(scale.raw_beta(drawn[:, -1:].numpy()), scale)
+            window = np.concatenate([window[:, 1:], newest], axis=1)
+        discount = settings.gamma**t
+        head = networks.reward(seen)[0].squeeze(1).numpy().astype(np.float64)
+        sums["return_head"] += discount * (head * scale.reward_std + scale.reward_mean)
+        sums["return_known"] += discount * step_reward(settings, window[:, -1], a)
+        in_the_end = a / late if t >= horizon - late else np.zeros_like(a)
+        above = window[:, -1] >= settings.xi_beta
+        summed += np.stack([a / horizon, a**2 / horizon, window[:, -1] / horizon, above / horizon, in_the_end], axis=1)
+        if t % keep_every == 0:
+            kept.append(a)
+    end_input = z if config.end_features == "final" else torch.cat([z, pooled / horizon], dim=1)
+    outcomes = networks.outcome(end_input)[0].numpy().astype(np.float64) * np.array(scale.outcome_std) + np.array(scale.outcome_mean)
+    return Rollouts(
+        outcomes=outcomes.reshape(p, m, -1),
+        summaries=summed.reshape(p, m, -1),
+        actions=np.stack(kept, axis=1).reshape(p, -1),
+        **{name: values.reshape(p, m) for name, values in sums.items()},
+    )
+
+
+def _within(beta: Floats, scale: Scale) -> Floats:
+    """Simulated beta kept within one logged range beyond the logged range, and above zero where the log is: a stop for wild models only."""
+    span = scale.beta_high - scale.beta_low
+    low = scale.beta_low - span
+    return np.clip(beta, max(low, 0.0) if scale.beta_low >= 0 else low, scale.beta_high + span)

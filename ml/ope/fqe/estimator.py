@@ -1,0 +1,356 @@
+"""Fitted Q evaluation with the horizon as an index, in closed form. Source: Le, Voloshin and Yue 2019; linear: Duan and Wang 2020.
+
+Q_tau(s, a) is the return of the next tau steps. It is linear in fixed features (polynomial ones and random tanh units), so that one
+backward step is one product with a small matrix: 300 steps cost milliseconds, refits on resampled sessions are affordable, and no
+stopping rule, target network or learning rate is left to choose. r_end is not discounted (gamma^299 = 0.05 would erase it): the summaries
+of a session that it follows are averages of steps, so their expectations are undiscounted Q functions of the same features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.mdp import MdpSettings
+from ml.ope.dlsm.batches import session_folds
+from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.fqe.steps import StepTable, TargetActions, ValueFeatures, fresh_memory, step_table
+from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
+from ml.ope.observed import day_noise
+from ml.ope.support.coverage import AmplitudeSupport
+from ml.policies.policy import Policy
+from ml.progress import Report, silent
+from ml.statistics.bootstrap import percentile_interval, resamples
+from ml.trajectories import ReplayBuffer
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+HEADS = ("reward", "amplitude", "energy", "beta", "above", "late amplitude")
+"""Discounted sum of rewards; sums of a, a^2, beta and of steps at or above the threshold; sum of a over the last `LATE_STEPS`."""
+
+PENALTIES = tuple(float(v) for v in 10.0 ** np.arange(-5.0, 0.0))
+"""Ridge penalties per logged step, on standardised features."""
+
+LARGEST_ROOT = 1.001
+"""Spectral radius of the transition matrix above which the penalty is raised: it would grow over the horizon."""
+
+CHECK_STEPS = 50
+"""Length of the returns on left-out sessions that choose the penalty."""
+
+
+def backward_induction(transition: Floats, reward: Floats, discount: Floats, counts: Floats) -> Floats:
+    """Weights of Q_0 ... Q_H.
+
+    Args:
+        transition: regression of the next step's features on this step's, [F, F]. reward: of the K rewards, [F, K].
+        discount: of each head, [K]. counts: 1 where head k is paid with tau steps to go (row tau - 1), else 0, [H, K].
+
+    Returns:
+        w_tau = counts_tau reward + discount transition w_{tau - 1}, w_0 = 0; shape [H + 1, F, K].
+    """
+    weights = np.zeros((len(counts) + 1, *reward.shape))
+    for tau, paid in enumerate(counts, start=1):
+        weights[tau] = reward * paid + (transition @ weights[tau - 1]) * discount
+    return weights
+
+
+def head_schedule(horizon: int, gamma: float) -> tuple[Floats, Floats]:
+    """Discounts [6] and payments [H, 6] of `HEADS`."""
+    counts = np.ones((horizon, len(HEADS)))
+    counts[LATE_STEPS:, -1] = 0.0
+    return np.array([gamma] + [1.0] * (len(HEADS) - 1)), counts
+
+
+@dataclass(frozen=True, kw_only=True)
+class FqeConfig:
+    """Settings of fitted Q evaluation.
+
+    Attributes:
+        members: sets of random features, whose values are averaged. units: random features of each.
+        refits: refits on resampled sessions, shared out over the members; they make the interval.
+        folds: groups of sessions that choose the penalty. seed: of features, resamples and folds.
+    """
+
+    members: int = 3
+    units: int = 48
+    refits: int = 60
+    folds: int = 4
+    seed: int = 0
+
+
+class Grams:
+    """Sums over the steps of each session that a regression on features needs: [n, F, F] and [n, F, K]."""
+
+    def __init__(self, table: StepTable, phi: Floats) -> None:
+        self.table, self.phi = table, phi
+        self.bounds = np.searchsorted(table.session, np.arange(table.sessions + 1))
+        self.square = self.product(phi)
+        rates = np.concatenate([table.rates, table.rates[:, 1:2]], axis=1)
+        self.reward = self.product(rates)
+
+    def product(self, other: Floats) -> Floats:
+        """Phi^T other, per session, [n, F, ...]."""
+        parts = [self.phi[i:j].T @ other[i:j] for i, j in zip(self.bounds, self.bounds[1:], strict=False)]
+        return np.stack(parts)
+
+    def solve(self, pick: Indices, penalty: float, *sides: Floats) -> tuple[Floats, ...]:
+        """Ridge regressions of per-session products [n, F, .] on the features, over the picked sessions; the constant is not penalised."""
+        gram = self.square[pick].sum(0)
+        ridge = np.full(len(gram), penalty * gram[0, 0])
+        ridge[0] = 1e-9 * gram[0, 0]
+        gram = gram + np.diag(ridge)
+        solved = np.linalg.solve(gram, np.concatenate([side[pick].sum(0) for side in sides], axis=1))
+        return tuple(np.split(solved, np.cumsum([side.shape[2] for side in sides])[:-1], axis=1))
+
+
+@dataclass(frozen=True)
+class QMember:
+    """One set of features over a buffer, and the penalty that predicts left-out sessions best."""
+
+    features: ValueFeatures
+    grams: Grams
+    penalty: float
+
+    def next_products(self, target: TargetActions) -> Floats:
+        """Phi^T Phi' under a policy, per session, [n, F, F]."""
+        return self.grams.product(self.features(self.grams.table.next_states, target.then, target.memory))
+
+    def weights(self, products: Floats, pick: Indices, horizon: int, gamma: float) -> tuple[Floats, float]:
+        """Weights of Q_0 ... Q_H for `HEADS`, [H + 1, F, 6], and the penalty used: raised until nothing grows over the horizon."""
+        discount, counts = head_schedule(horizon, gamma)
+        penalty = self.penalty
+        while True:
+            transition, reward = self.grams.solve(pick, penalty, products, self.grams.reward)
+            if spectral_radius(transition) <= LARGEST_ROOT or penalty >= 1e3:
+                return backward_induction(transition, reward, discount, counts), penalty
+            penalty *= 10.0
+
+
+def spectral_radius(matrix: Floats) -> float:
+    """Largest modulus of an eigenvalue."""
+    return float(np.abs(np.linalg.eigvals(matrix)).max())
+
+
+def fit_member(table: StepTable, folds: Sequence[Sequence[int]], gamma: float, units: int, seed: int) -> QMember:
+    """Features of one seed with the penalty whose predictions of `CHECK_STEPS`-step returns on left-out sessions are best."""
+    features = ValueFeatures(table, units, seed)
+    phi = features(table.states, table.actions, table.memory)
+    grams = Grams(table, phi)
+    rows, returns = logged_returns(table, gamma, CHECK_STEPS)
+    follows = table.follows >= 0
+    # The logged next step stands for the policy here: what is predicted is what the logged controllers went on to collect.
+    logged = Grams(replace_steps(table, follows), phi[follows])
+    products = logged.product(phi[table.follows[follows]])
+    errors = np.full(len(PENALTIES), np.inf)
+    discount, counts = np.array([gamma]), np.ones((CHECK_STEPS, 1))
+    for j, penalty in enumerate(PENALTIES if rows.size else ()):
+        squared = 0.0
+        for fold in folds:
+            rest = np.setdiff1d(np.arange(table.sessions), fold)
+            if rest.size == 0 or logged.square[rest, 0, 0].sum() < 1:
+                continue
+            transition, reward = logged.solve(rest, penalty, products, logged.reward[:, :, :1])
+            weights = backward_induction(transition, reward, discount, counts)[-1]
+            held = np.isin(table.session[rows], fold)
+            squared += float(np.sum((phi[rows[held]] @ weights[:, 0] - returns[held]) ** 2))
+        errors[j] = squared if np.isfinite(squared) else np.inf
+    best = int(np.argmin(errors)) if np.isfinite(errors).any() else 2
+    return QMember(features, grams, PENALTIES[best])
+
+
+def logged_returns(table: StepTable, gamma: float, steps: int) -> tuple[Indices, Floats]:
+    """Rows that are followed by enough usable steps, and the discounted sums of their next `steps` rewards."""
+    rewards = table.rates[:, 0]
+    if len(rewards) < steps:
+        return np.empty(0, dtype=np.int64), np.empty(0)
+    run = np.zeros(len(rewards), dtype=np.int64)
+    for k in range(len(rewards) - 2, -1, -1):
+        run[k] = run[k + 1] + 1 if table.follows[k] >= 0 else 0
+    rows = np.flatnonzero(run >= steps - 1)
+    sums = np.convolve(rewards, (gamma ** np.arange(steps))[::-1], mode="valid")
+    return rows, sums[rows]
+
+
+def replace_steps(table: StepTable, keep: NDArray[np.bool_]) -> StepTable:
+    """The table with some of its steps; `follows` loses its meaning and is -1."""
+    return StepTable(
+        table.scale,
+        table.states[keep],
+        table.next_states[keep],
+        table.actions[keep],
+        table.memory[keep],
+        table.rates[keep],
+        table.session[keep],
+        table.step[keep],
+        np.full(int(keep.sum()), -1, dtype=np.int64),
+        table.first_states,
+        table.first_session,
+        table.sessions,
+    )
+
+
+def summaries_of(sums: Floats, horizon: int) -> Floats:
+    """`end_outcomes.SUMMARIES` [..., 5] from sums over the horizon of `HEADS` [..., 6]."""
+    late = min(LATE_STEPS, horizon)
+    parts = [sums[..., 1] / horizon, sums[..., 2] / horizon, sums[..., 3] / horizon, sums[..., 4] / horizon, sums[..., 5] / late]
+    return np.stack(parts, axis=-1)
+
+
+def within_reach(
+    sums: Floats, settings: MdpSettings, horizon: int, beta_range: tuple[float, float], span: tuple[float, float] = (0.0, 1.0)
+) -> Floats:
+    """Sums of `HEADS` [..., 6] cut to what H steps can hold at all of a policy whose amplitudes lie within `span`."""
+    least, most = span
+    discounted = float(np.sum(settings.gamma ** np.arange(horizon)))
+    late = min(LATE_STEPS, horizon)
+    beta = beta_range[0] * horizon, beta_range[1] * horizon
+    low = [(settings.r_b - settings.c1 * most) * discounted, least * horizon, least**2 * horizon, beta[0], 0.0, least * late]
+    high = [(settings.r_a - settings.c1 * least) * discounted, most * horizon, most**2 * horizon, beta[1], horizon, most * late]
+    return np.asarray(np.clip(sums, low, high), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Fqe:
+    """The estimator."""
+
+    config: FqeConfig = field(default_factory=FqeConfig)
+    method: str = "fqe"
+
+    def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedFqe:
+        """Features and penalties; takes seconds, so nothing is kept in `checkpoint_dir`.
+
+        Raises:
+            ValueError: no usable step, or no session with a complete s_0.
+        """
+        table, c = step_table(buffer), self.config
+        folds = session_folds(buffer.sessions, c.folds, c.seed)
+        members = []
+        for m in range(c.members):
+            members.append(fit_member(table, folds, buffer.settings.gamma, c.units, c.seed + 1000 * m))
+            report((m + 1) / c.members, "choosing the penalty of the value function")
+        draws = resamples(table.sessions, c.refits, c.seed)
+        return FittedFqe(self.method, c, buffer, table, tuple(members), draws, fit_end_model(buffer), fit_end_model(buffer, draws))
+
+
+@dataclass(frozen=True)
+class FittedFqe:
+    """Features, penalties, and the resamples that every policy shares."""
+
+    method: str
+    config: FqeConfig
+    buffer: ReplayBuffer
+    table: StepTable
+    members: tuple[QMember, ...]
+    draws: Indices
+    end: EndModel
+    end_refits: EndModel
+
+    def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
+        """Estimate of every policy from the sessions' own s_0."""
+        horizon = checked_horizon(self.buffer, horizon_steps)
+        support = AmplitudeSupport(self.buffer)
+        estimates = {}
+        for k, (name, policy) in enumerate(policies.items()):
+            estimates[name] = self._estimate(policy, horizon, support)
+            report((k + 1) / len(policies), "evaluating value functions")
+        return estimates
+
+    def _estimate(self, policy: Policy, horizon: int, support: AmplitudeSupport) -> Estimate:
+        table, c, settings = self.table, self.config, self.buffer.settings
+        target = TargetActions.of(table, policy)
+        everything = np.arange(table.sessions)
+        starts = [m.features(table.first_states, target.first, fresh_memory(target.first)) for m in self.members]
+        products = [m.next_products(target) for m in self.members]
+        mains, penalties = [], []
+        for member, start, product in zip(self.members, starts, products, strict=True):
+            weights, penalty = member.weights(product, everything, horizon, settings.gamma)
+            mains.append(start.mean(0) @ weights[-1])
+            penalties.append(penalty)
+        refits = np.empty((c.refits, len(HEADS)))
+        for d, pick in enumerate(self.draws):
+            k = d % c.members
+            weights, _ = self.members[k].weights(products[k], pick, horizon, settings.gamma)
+            own = np.isin(table.first_session, pick)
+            refits[d] = starts[k][own if own.any() else slice(None)].mean(0) @ weights[-1]
+        beta_range = (table.scale.beta_low, table.scale.beta_high)
+        main = within_reach(np.mean(mains, axis=0), settings, horizon, beta_range, target.span)
+        refits = within_reach(refits, settings, horizon, beta_range, target.span)
+        extra = {
+            "penalty": penalties,
+            "member_values": [float(m[0]) for m in mains],
+            "raised_penalty": any(p > m.penalty for p, m in zip(penalties, self.members, strict=True)),
+        }
+        return value_estimate(self, main, refits, policy, horizon, support, extra)
+
+
+class ValueSource(Protocol):
+    """What `value_estimate` needs of a fitted method."""
+
+    @property
+    def method(self) -> str: ...
+    @property
+    def table(self) -> StepTable: ...
+    @property
+    def buffer(self) -> ReplayBuffer: ...
+    @property
+    def end(self) -> EndModel: ...
+    @property
+    def end_refits(self) -> EndModel: ...
+
+
+def value_estimate(
+    fitted: ValueSource,
+    main: Floats,
+    refits: Floats,
+    policy: Policy,
+    horizon: int,
+    support: AmplitudeSupport,
+    details: Mapping[str, object],
+    end_shift: tuple[float, Floats] | None = None,
+) -> Estimate:
+    """An estimate from sums of `HEADS` [6] and those of every refit [D, 6]; `end_shift` is added to r_end and to its refits [D]."""
+    with_end = fitted.end.seen[0]
+    summaries = summaries_of(main, horizon)
+    outcomes = fitted.end.predict(summaries)
+    shift, shifts = (0.0, np.zeros(len(refits))) if end_shift is None else end_shift
+    end = float(outcomes[0]) + shift if with_end else 0.0
+    draws = refits[:, 0].copy()
+    if with_end:
+        draws += fitted.end_refits.predict(summaries_of(refits, horizon))[:, 0] + shifts
+    value = float(main[0]) + end
+    noise, unknown = day_noise(fitted.buffer, horizon, len(draws), 0)
+    draws = draws - draws.mean()
+    interval = percentile_interval(np.add.outer(draws, noise).ravel() + value, LEVEL)
+    logged = support.of_policy(policy)
+    flags = list(logged.flags)
+    if not with_end:
+        flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+    flags += [unknown] if unknown else []
+    predicted = {"energy": float(summaries[1]), "mean_amplitude": float(summaries[0]), "mean_beta": float(summaries[2])}
+    predicted |= {name: float(outcomes[j]) for j, name in enumerate(OUTCOMES) if j and fitted.end.seen[j]}
+    return Estimate(
+        method=fitted.method,
+        value=value,
+        low=interval.low,
+        high=interval.high,
+        level=LEVEL,
+        standard_error=interval.standard_error,
+        step_return=float(main[0]),
+        end_reward=end if with_end else None,
+        predicted=predicted,
+        supported=logged.supported,
+        flags=tuple(flags),
+        n=fitted.table.sessions,
+        details={
+            "horizon_steps": horizon,
+            **details,
+            "coverage": logged.to_json(),
+            "draws": [round(float(d + value), 4) for d in draws],
+        },
+    )

@@ -1,0 +1,179 @@
+"""A buffer's usable steps in one table with memories of past amplitudes, and the features that value functions are linear in.
+
+The window of beta alone is no Markov state: stimulation acts over minutes. Exponential averages of the amplitudes so far are known in
+the log and under any policy, so they stand beside the window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.ope.dlsm.batches import Scale, learn_scale
+from ml.policies.policy import Policy
+from ml.trajectories import ReplayBuffer, SessionTrajectory
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+DECAYS = (0.8, 0.95, 0.985)
+"""Memories of past amplitudes: exponential averages with time constants of about 5, 20 and 66 steps."""
+
+RATES = ("reward", "amplitude", "energy", "beta", "above")
+"""Columns of `StepTable.rates`: r_k, a_k, a_k^2, beta of the row, and whether that beta is at or above the threshold."""
+
+
+def remember(memory: Floats, a: Floats) -> Floats:
+    """Memories [N, 3] after the amplitudes [N]."""
+    decay = np.array(DECAYS)
+    return memory * decay + (1 - decay) * a[:, None]
+
+
+def fresh_memory(a: Floats) -> Floats:
+    """Memories [N, 3] at a session's first step: as if its amplitude [N] had been on before."""
+    return np.tile(a[:, None], (1, len(DECAYS)))
+
+
+def held_amplitude(session: SessionTrajectory) -> Floats:
+    """Amplitudes [T] within [0, 1]; unknown ones held from before, those at the start from the first known (0 where none is)."""
+    a = np.clip(session.amplitude, 0.0, 1.0)
+    known = np.isfinite(a)
+    if not known.any():
+        return np.zeros(session.steps)
+    last = np.maximum.accumulate(np.where(known, np.arange(a.size), -1))
+    return np.asarray(a[np.where(last < 0, int(np.argmax(known)), last)], dtype=np.float64)
+
+
+def memories(a: Floats) -> Floats:
+    """Memories [T, 3] of a session's amplitudes [T], each row with its own step in it."""
+    result = np.empty((a.size, len(DECAYS)))
+    result[0] = a[0]
+    for k in range(1, a.size):
+        result[k] = remember(result[k - 1 : k], a[k : k + 1])[0]
+    return result
+
+
+@dataclass(frozen=True)
+class StepTable:
+    """Usable steps, session by session; N steps, n sessions, window W.
+
+    Attributes:
+        scale: standardisation of beta.
+        states, next_states: s_k and s_{k+1}, participant's unit, [N, W].
+        actions: a_k, [N]. memory: memories of the amplitudes up to and with a_k, [N, 3].
+        rates: `RATES`, [N, 5].
+        session: index of the session, [N]. step: k, [N].
+        follows: row of the next step of the same session where that is usable too, else -1, [N].
+        first_states: s_0 of the sessions without gaps in it, [m, W]. first_session: their indices, [m].
+        sessions: n.
+    """
+
+    scale: Scale
+    states: Floats
+    next_states: Floats
+    actions: Floats
+    memory: Floats
+    rates: Floats
+    session: Indices
+    step: Indices
+    follows: Indices
+    first_states: Floats
+    first_session: Indices
+    sessions: int
+
+
+def step_table(buffer: ReplayBuffer, scale: Scale | None = None) -> StepTable:
+    """The table of a buffer. Raises ValueError when no step is usable or no session starts without gaps."""
+    settings = buffer.settings
+    scale = learn_scale(buffer) if scale is None else scale
+    steps = buffer.transitions()
+    memory = np.concatenate([memories(held_amplitude(s))[s.usable()] for s in buffer.sessions])
+    beta = steps.next_states[:, -1]
+    rates = np.stack([steps.rewards, steps.actions, steps.actions**2, beta, (beta >= settings.xi_beta).astype(np.float64)], axis=1)
+    next_row = np.arange(1, len(beta) + 1)
+    joined = np.append((np.diff(steps.session) == 0) & (np.diff(steps.step) == 1), False)
+    starts = [(i, s.lead_beta) for i, s in enumerate(buffer.sessions) if np.isfinite(s.lead_beta).all()]
+    if not starts:
+        raise ValueError("no session has a complete window of beta before its first step: there is no s_0 to start from")
+    return StepTable(
+        scale=scale,
+        states=steps.states,
+        next_states=steps.next_states,
+        actions=steps.actions,
+        memory=memory,
+        rates=rates,
+        session=steps.session,
+        step=steps.step,
+        follows=np.where(joined, next_row, -1),
+        first_states=np.stack([lead for _, lead in starts]),
+        first_session=np.array([i for i, _ in starts], dtype=np.int64),
+        sessions=len(buffer.sessions),
+    )
+
+
+class ValueFeatures:
+    """Features of (s, a, memory) that a value function is linear in: polynomial ones, and random tanh units of a few summaries.
+
+    Args:
+        table: whose steps set the scales.
+        units: number of random units. seed: of their weights.
+    """
+
+    def __init__(self, table: StepTable, units: int = 48, seed: int = 0) -> None:
+        self.scale = table.scale
+        rng = np.random.default_rng([seed, 0xFEA7])
+        self._inner = rng.normal(size=(_SUMMARIES, units)) * np.array([1, 1, 1, 2, 1, 1, 1])[:, None] / 2
+        self._offset = rng.uniform(-1.5, 1.5, units)
+        self._centre, self._spread = np.zeros(1), np.ones(1)
+        raw = self._raw(table.states, table.actions, table.memory)
+        self._centre, self._spread = raw.mean(0), np.maximum(raw.std(0), 1e-6)
+        self._spread[raw.std(0) < 1e-6] = 1.0
+
+    def __call__(self, states: Floats, actions: Floats, memory: Floats) -> Floats:
+        """Features [N, F], the first of them constant, the others centred and of unit spread over the logged steps."""
+        raw = self._raw(states, actions, memory)
+        return np.concatenate([np.ones((len(raw), 1)), (raw - self._centre) / self._spread], axis=1)
+
+    def _raw(self, states: Floats, a: Floats, memory: Floats) -> Floats:
+        window = self.scale.beta(states)
+        newest = window[:, -1]
+        columns = [window, np.stack([a, a**2, a * newest], axis=1), memory, memory**2, memory * newest[:, None]]
+        level = np.stack([newest, window[:, -3:].mean(1), window.mean(1)], axis=1)
+        inputs = np.concatenate([level, 3 * (a[:, None] - 0.5), 3 * (memory - 0.5)], axis=1)
+        return np.concatenate([*columns, np.tanh(inputs @ self._inner + self._offset)], axis=1)
+
+
+_SUMMARIES = 3 + 1 + len(DECAYS)
+
+
+@dataclass(frozen=True)
+class TargetActions:
+    """What a policy does at the states of a table; computed once, because the policy is fixed.
+
+    Attributes:
+        at: pi(s_k), [N]. then: pi(s_{k+1}), [N]. memory: of that next step, [N, 3]. first: pi(s_0), [m].
+    """
+
+    at: Floats
+    then: Floats
+    memory: Floats
+    first: Floats
+
+    @classmethod
+    def of(cls, table: StepTable, policy: Policy) -> TargetActions:
+        """Actions of a policy on a table."""
+        then = _act(policy, table.next_states)
+        return cls(_act(policy, table.states), then, remember(table.memory, then), _act(policy, table.first_states))
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Least and largest amplitude that the policy asks for in a logged state."""
+        asked = np.concatenate([self.at, self.then, self.first])
+        return float(asked.min()), float(asked.max())
+
+
+def _act(policy: Policy, states: NDArray[Any]) -> Floats:
+    return np.clip(np.asarray(policy.act(states.copy()), dtype=np.float64), 0.0, 1.0)

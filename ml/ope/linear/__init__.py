@@ -1,0 +1,1 @@
+"""Replay of logged sessions under another policy in a linear model of beta."""

@@ -1,0 +1,195 @@
+"""A linear model of beta: the answer to the amplitude, levels of visits and sessions, and an autoregression around them.
+
+    y_t = mu + visit + session + g(amplitudes up to t) . beta + eta_t,    eta_t = sum over l <= W of phi_l eta_{t-l} + e_t
+
+y is standardised (log) beta. Regressing beta on its own past alone would take sessions of different level for a slow walk and forget what
+the amplitude does; with levels as random effects the answer to the amplitude is read off within sessions, where random amplitudes are
+an experiment, and between sessions as far as sessions of one visit differ little. Estimated by turns: the mixed model on rows filtered
+by phi (Cochrane and Orcutt 1949; generalised least squares), then phi on what it leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.ope.dlsm.batches import Scale
+from ml.ope.fqe.steps import fresh_memory, held_amplitude, memories
+from ml.statistics.mixed import MixedFit, MixedModel, Sums
+from ml.trajectories import ReplayBuffer, SessionTrajectory
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+TURNS = 3
+LARGEST_ROOT = 0.98
+"""No autoregression keeps a root of larger modulus: its memory would outlast 50 steps."""
+
+DOSE_RATIO = 1e4
+"""Prior variance of the fall of beta from no stimulation to cDBS, in innovation variances: next to flat."""
+
+SATURATION = 0.3
+NOISE_LIMIT = 3.0
+ANSWERS = 7
+
+
+def answers(a: Floats, memory: Floats) -> Floats:
+    """What beta answers to, [N, 7]: the dose (average over about 20 steps), three differences in timing from it, three curvatures.
+
+    Args:
+        a: amplitude, [N]. memory: memories of amplitudes with a in them, [N, 3]; `ml.ope.fqe.steps.DECAYS`.
+    """
+    dose = memory[:, 1]
+    timing = [a - dose, memory[:, 0] - dose, memory[:, 2] - dose]
+    saturating = 4 * (dose / (dose + SATURATION) - dose / (1 + SATURATION))
+    return np.stack([dose, *timing, 4 * (dose**2 - dose), 4 * (a**2 - a), saturating], axis=1)
+
+
+def noise_features(a: Floats, predicted: Floats) -> Floats:
+    """Regressors of the log scale of an innovation, [..., 3], for amplitudes and predicted beta of one shape."""
+    return np.stack([np.ones_like(a), a, np.clip(predicted, -NOISE_LIMIT, NOISE_LIMIT)], axis=-1)
+
+
+@dataclass(frozen=True)
+class SessionTable:
+    """One session, standardised: beta [W + T] with the window before it first, answers [W + T, 7], amplitude and usable steps [T]."""
+
+    beta: Floats
+    answers: Floats
+    amplitude: Floats
+    usable: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, session: SessionTrajectory, scale: Scale) -> SessionTable:
+        """Tables of a session; before its first step the first amplitude counts as held."""
+        a = held_amplitude(session)
+        own = answers(a, memories(a))
+        lead = answers(a[:1], fresh_memory(a[:1]))
+        window = session.lead_beta.size
+        return cls(scale.beta(session.padded_beta), np.concatenate([np.repeat(lead, window, axis=0), own]), a, session.usable())
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """A fitted model; n sessions, D sets of coefficients.
+
+    Attributes:
+        phi: autoregression of eta on lags 1 ... W, [W].
+        beta: answers to the amplitude, [D, 7]. levels: mu + visit + session, [D, n].
+        noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
+        shares: lambda / (1 + lambda) of the visits' and the sessions' levels; how far they stand out of one step's noise.
+    """
+
+    phi: Floats
+    beta: Floats
+    levels: Floats
+    noise_weights: Floats
+    shares: dict[str, float]
+
+    def innovations(self, tables: Sequence[SessionTable]) -> list[Floats]:
+        """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
+        found = []
+        for i, table in enumerate(tables):
+            eta = table.beta - self.beta @ table.answers.T - self.levels[:, i : i + 1]
+            expected = self._expected(eta)
+            predicted = table.beta[self.phi.size :] - (eta[:, self.phi.size :] - expected)
+            scale = np.exp(noise_features(np.broadcast_to(table.amplitude, predicted.shape), predicted) @ self.noise_weights)
+            found.append(np.where(table.usable, (eta[:, self.phi.size :] - expected) / scale, np.nan))
+        return found
+
+    def _expected(self, eta: Floats) -> Floats:
+        """E[eta_t | its past], [D, T], from eta [D, W + T]."""
+        windows = np.lib.stride_tricks.sliding_window_view(eta, self.phi.size, axis=1)[:, :-1]
+        return np.asarray(windows @ self.phi[::-1], dtype=np.float64)
+
+
+def fit_dynamics(buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: int, seed: int) -> tuple[Dynamics, Dynamics]:
+    """The model at its posterior mean (D = 1), and `draws` of its coefficients from their posterior (phi and noise as in the first).
+
+    Raises:
+        ValueError: fewer than two sessions with usable steps.
+    """
+    with_steps = sum(bool(t.usable.any()) for t in tables)
+    if with_steps < 2:
+        raise ValueError(f"the linear model needs at least two sessions with usable steps; the buffer has {with_steps}")
+    window, visits = buffer.settings.window, np.array([s.visit for s in buffer.sessions])
+    own = (visits[:, None] == np.unique(visits)).astype(np.float64)
+    phi = np.zeros(window)
+    for _ in range(TURNS):
+        fit = _mixed(tables, own, phi)
+        beta, levels = _split(fit.coefficients[None], own)
+        phi = _autoregression(tables, beta[0], levels[0], window)
+    fit = _mixed(tables, own, phi)
+    beta, levels = _split(fit.coefficients[None], own)
+    shares = {name: fit.share(name) for name in ("visit", "session")}
+    mean = Dynamics(phi, beta, levels, _noise(tables, beta[0], levels[0], phi), shares)
+    drawn = _split(fit.draws(draws, np.random.default_rng([seed, 0xD7A])), own)
+    return mean, Dynamics(phi, *drawn, mean.noise_weights, shares)
+
+
+def largest_root(phi: Floats) -> float:
+    """Largest modulus of a root of the autoregression; 0 where there is none."""
+    roots = np.roots(np.concatenate([[1.0], -phi]))
+    return float(np.abs(roots).max()) if roots.size else 0.0
+
+
+def _mixed(tables: Sequence[SessionTable], own: Floats, phi: Floats) -> MixedFit:
+    """Mixed model of rows filtered by phi; columns: 1, answers, visits, sessions."""
+    n, visits = len(tables), own.shape[1]
+    rest, q = 1 - float(phi.sum()), 1 + ANSWERS + visits + n
+    gram, moment, square, rows = np.zeros((q, q)), np.zeros(q), 0.0, 0
+    for i, table in enumerate(tables):
+        y = _filtered(table.beta[:, None], phi)[table.usable, 0]
+        level = np.concatenate([own[i], np.arange(n) == i]) * rest
+        x = np.concatenate([np.full((y.size, 1), rest), _filtered(table.answers, phi)[table.usable], np.tile(level, (y.size, 1))], axis=1)
+        gram, moment, square, rows = gram + x.T @ x, moment + x.T @ y, square + float(y @ y), rows + y.size
+    first = 1 + ANSWERS
+    groups = {
+        "timing": (2, 3, 4),
+        "shape": (5, 6, 7),
+        "visit": tuple(range(first, first + visits)),
+        "session": tuple(range(first + visits, q)),
+    }
+    return MixedModel(q, groups, {1: DOSE_RATIO}).fit(Sums(gram, moment, square, rows))
+
+
+def _split(coefficients: Floats, own: Floats) -> tuple[Floats, Floats]:
+    """Answers [D, 7] and levels [D, n] from coefficients [D, q]."""
+    first = 1 + ANSWERS
+    visits = coefficients[:, first : first + own.shape[1]]
+    return coefficients[:, 1:first], coefficients[:, :1] + visits @ own.T + coefficients[:, first + own.shape[1] :]
+
+
+def _filtered(values: Floats, phi: Floats) -> Floats:
+    """v_t - sum over l of phi_l v_{t-l}, [T, k], from values [W + T, k]; NaN where one of them is."""
+    windows = np.lib.stride_tricks.sliding_window_view(values, phi.size, axis=0)[:-1]
+    return np.asarray(values[phi.size :] - windows @ phi[::-1], dtype=np.float64)
+
+
+def _autoregression(tables: Sequence[SessionTable], beta: Floats, levels: Floats, window: int) -> Floats:
+    """phi [W] by least squares on what levels and answers leave, its roots kept inside `LARGEST_ROOT`."""
+    gram, moment = 1.0 * np.eye(window), np.zeros(window)
+    for i, table in enumerate(tables):
+        eta = table.beta - table.answers @ beta - levels[i]
+        x = np.lib.stride_tricks.sliding_window_view(eta, window)[:-1][table.usable]
+        gram, moment = gram + x.T @ x, moment + x.T @ eta[window:][table.usable]
+    phi = np.asarray(np.linalg.solve(gram, moment)[::-1], dtype=np.float64)
+    root = largest_root(phi)
+    kappa = min(1.0, LARGEST_ROOT / root) if root > 0 else 1.0
+    return np.asarray(phi * kappa ** np.arange(1, window + 1), dtype=np.float64)
+
+
+def _noise(tables: Sequence[SessionTable], beta: Floats, levels: Floats, phi: Floats) -> Floats:
+    """Weights of the log scale of innovations, [3]."""
+    designs, logs = [], []
+    for i, table in enumerate(tables):
+        eta = (table.beta - table.answers @ beta - levels[i])[:, None]
+        innovation = _filtered(eta, phi)[table.usable, 0]
+        predicted = table.beta[phi.size :][table.usable] - innovation
+        designs.append(noise_features(table.amplitude[table.usable], predicted))
+        logs.append(np.log(np.maximum(np.abs(innovation), 1e-6)))
+    design, target = np.concatenate(designs), np.concatenate(logs)
+    return np.asarray(np.linalg.solve(design.T @ design + np.diag([1e-6, 10.0, 10.0]), design.T @ target), dtype=np.float64)

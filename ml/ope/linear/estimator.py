@@ -1,0 +1,243 @@
+"""Off-policy evaluation by replaying every logged session under another policy, in a linear model of beta with the known reward.
+
+The paper did not compare with it. A regression, no network, and hard to beat: every other method must earn its place against it. What a
+session had of its own (its level, its innovations in their order, what its outcomes had beyond the regression) stays with it, so that only
+what the amplitude changes has to be modelled: a policy that would have done what was done gets back exactly what was observed. The reward
+is that of the replayed beta, never of its mean. The dynamics are in `linear_dynamics`, the outcomes in `end_outcomes`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.mdp import step_reward
+from ml.ope.dlsm.batches import Scale, learn_scale, outcome_table, session_folds
+from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.fqe.steps import fresh_memory, remember
+from ml.ope.linear.dynamics import Dynamics, SessionTable, answers, fit_dynamics, largest_root, noise_features
+from ml.ope.linear.end_outcomes import EndModel, fit_end_model, summarise
+from ml.ope.linear.held_out import replay_skill
+from ml.ope.observed import MeanOverDays, mean_over_days
+from ml.ope.support.coverage import AmplitudeSupport
+from ml.policies.policy import Policy
+from ml.progress import Report, silent
+from ml.statistics.bootstrap import percentile_interval
+from ml.trajectories import ReplayBuffer
+
+Floats = NDArray[np.float64]
+
+BEYOND = 0.25
+"""Replayed beta may leave the logged range by this share of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearConfig:
+    """Settings of the linear model.
+
+    Attributes:
+        draws: draws of the coefficients from their posterior; every session is replayed with each.
+        most_rows: replayed sessions per policy at most; a longer record takes fewer draws, though never fewer than 20.
+        folds: groups of sessions for the held-out skill beside the estimates. seed: of draws and of innovations that are missing.
+    """
+
+    draws: int = 60
+    most_rows: int = 1500
+    folds: int = 5
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """The estimator."""
+
+    config: LinearConfig = field(default_factory=LinearConfig)
+    method: str = "linear"
+
+    def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedLinear:
+        """Fit dynamics and outcomes; takes seconds, so nothing is kept in `checkpoint_dir`.
+
+        Raises:
+            ValueError: fewer than two sessions with usable steps.
+        """
+        c, scale = self.config, learn_scale(buffer)
+        tables = [SessionTable.of(s, scale) for s in buffer.sessions]
+        draws = max(20, min(c.draws, c.most_rows // len(tables)))
+        main, drawn = fit_dynamics(buffer, tables, draws, c.seed)
+        report(0.4, "fitting the linear model")
+        skill = replay_skill(buffer, scale, session_folds(buffer.sessions, c.folds, c.seed))
+        report(0.8, "replaying left-out sessions")
+        severity = main.levels[0]
+        end, ends = fit_end_model(buffer, severity=severity), fit_end_model(buffer, draws=draws, seed=c.seed, severity=severity)
+        report(1.0, "fitting the linear model")
+        return FittedLinear(self.method, c, buffer, scale, tuple(tables), main, drawn, end, ends, skill)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """Logged sessions under other policies: P policies, D sets of coefficients, n sessions.
+
+    Attributes:
+        step_return, energy, amplitude, beta: discounted step return, mean a^2, mean a and mean beta, [P, D, n].
+        outcomes: r_end and QoCs, [P, D, n, 4]. actions: [P, D, n, H].
+    """
+
+    step_return: Floats
+    outcomes: Floats
+    energy: Floats
+    amplitude: Floats
+    beta: Floats
+    actions: Floats
+
+
+@dataclass(frozen=True)
+class FittedLinear:
+    """A fitted linear model, draws of its coefficients and its buffer."""
+
+    method: str
+    config: LinearConfig
+    buffer: ReplayBuffer
+    scale: Scale
+    tables: tuple[SessionTable, ...]
+    main: Dynamics
+    drawn: Dynamics
+    end: EndModel
+    ends: EndModel
+    skill: float | None
+
+    def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
+        """Replay every session under every policy with the fit (the value) and with draws of its coefficients (the interval)."""
+        horizon = checked_horizon(self.buffer, horizon_steps)
+        if not policies:
+            return {}
+        chosen = list(policies.values())
+        main = self.replay(chosen, self.main, self.end, horizon)
+        report(0.3, "replaying sessions in the linear model")
+        spread = self.replay(chosen, self.drawn, self.ends, horizon)
+        report(1.0, "replaying sessions in the linear model")
+        visits = np.array([s.visit for s in self.buffer.sessions])
+        days = mean_over_days(self._returns(main)[:, 0], visits, self.drawn.beta.shape[0], self.config.seed)
+        support = AmplitudeSupport(self.buffer)
+        return {n: self._estimate(i, p, main, spread, days, support, horizon) for i, (n, p) in enumerate(policies.items())}
+
+    def replay(self, policies: list[Policy], dynamics: Dynamics, end: EndModel, horizon: int) -> Replayed:
+        """Every session under every policy with every set of coefficients."""
+        p, d, n, w = len(policies), len(dynamics.beta), len(self.tables), self.buffer.settings.window
+        noise = self._innovations(dynamics, horizon)  # [D, n, H]
+        level, beta = dynamics.levels, dynamics.beta
+        lead = np.stack([t.beta[:w] for t in self.tables])
+        lead = np.where(np.isfinite(lead), lead, (dynamics.levels[:1] + dynamics.beta[:1, :1] * 0.65).T)
+        window = np.broadcast_to(lead, (p, d, n, w)).copy()
+        eta = np.empty((p, d, n, w))
+        low, high = self.scale.beta(np.array([self.scale.beta_low, self.scale.beta_high]))
+        low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
+        betas, actions = np.empty((horizon, p, d, n)), np.empty((horizon, p, d, n))
+        memory: Floats | None = None
+        for t in range(horizon):
+            raw = self.scale.raw_beta(window)
+            a = np.stack([policy.act(raw[k].reshape(-1, w)).reshape(d, n) for k, policy in enumerate(policies)])
+            memory = fresh_memory(a.ravel()) if memory is None else remember(memory, a.ravel())
+            rest = np.einsum("pdnj,dj->pdn", answers(a.ravel(), memory).reshape(p, d, n, -1), beta) + level
+            if t == 0:
+                eta[:] = window - rest[..., None]
+            predicted = rest + eta @ dynamics.phi[::-1]
+            newest = predicted + np.exp(noise_features(a, predicted) @ dynamics.noise_weights) * noise[:, :, t]
+            newest = np.clip(newest, low, high)
+            eta = np.concatenate([eta[..., 1:], (newest - rest)[..., None]], axis=-1)
+            window = np.concatenate([window[..., 1:], newest[..., None]], axis=-1)
+            betas[t], actions[t] = self.scale.raw_beta(newest), a
+        return self._replayed(np.moveaxis(betas, 0, -1), np.moveaxis(actions, 0, -1), end)
+
+    def _innovations(self, dynamics: Dynamics, horizon: int) -> Floats:
+        """Standardised innovations of every session over the horizon, [D, n, H].
+
+        Steps that a session lacks take a known one of the same session, or of any session where it has none.
+        """
+        found = dynamics.innovations(self.tables)
+        rng = np.random.default_rng([self.config.seed, 0x5E55])
+        every = np.concatenate([f[:, np.isfinite(f[0])] for f in found], axis=1)
+        noise = np.empty((len(dynamics.beta), len(found), horizon))
+        for i, own in enumerate(found):
+            known = np.flatnonzero(np.isfinite(own[0]))
+            source, pick = (own, known) if known.size else (every, np.arange(every.shape[1]))
+            noise[:, i] = source[:, rng.choice(pick, horizon)]
+            within = known[known < horizon]
+            noise[:, i, within] = own[:, within]
+        return noise
+
+    def _replayed(self, betas: Floats, actions: Floats, end: EndModel) -> Replayed:
+        settings, sessions = self.buffer.settings, self.buffer.sessions
+        discount = settings.gamma ** np.arange(betas.shape[-1])
+        returns = (discount * step_reward(settings, betas, actions)).sum(-1)
+        logged = np.stack([summarise(s.beta, s.amplitude, settings.xi_beta) for s in sessions])
+        model = end.with_weights(end.weights.reshape(-1, 1, *end.weights.shape[-2:]))  # [D, 1, 6, 4] against summaries [P, D, n, 5]
+        change = model.predict(summarise(betas, actions, settings.xi_beta))
+        known, seen = outcome_table(self.buffer), model.predict(logged[None])
+        own = np.where(np.isfinite(known), known - seen, 0.0)
+        return Replayed(returns, model.shifted(change, own), (actions**2).mean(-1), actions.mean(-1), betas.mean(-1), actions)
+
+    def _returns(self, replayed: Replayed) -> Floats:
+        return replayed.step_return + (replayed.outcomes[..., 0] if self.end.seen[0] else 0.0)
+
+    def _estimate(
+        self, i: int, policy: Policy, main: Replayed, spread: Replayed, days: MeanOverDays, support: AmplitudeSupport, horizon: int
+    ) -> Estimate:
+        weights = days.weights
+        with_end = self.end.seen[0]
+        step = float(main.step_return[i, 0] @ weights)
+        end = float(main.outcomes[i, 0, :, 0] @ weights) if with_end else None
+        value = step + (end or 0.0)
+        model = self._returns(spread)[i] @ weights
+        model = model - model.mean()
+        # Every pair of a draw of the model and a draw of the days: what is common to all policies widens the interval, but is no part of
+        # the kept draws.
+        interval = percentile_interval(np.add.outer(model, days.common + days.own[i]).ravel() + value, LEVEL)
+        logged, simulated = support.of_policy(policy), support.look(main.actions[i, 0, :, :: max(1, horizon // 50)])
+        flags = list(dict.fromkeys((*logged.flags, *simulated.flags)))
+        if not with_end:
+            flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+        flags += [days.unknown] if days.unknown else []
+        predicted = {
+            "energy": float(main.energy[i, 0] @ weights),
+            "mean_amplitude": float(main.amplitude[i, 0] @ weights),
+            "mean_beta": float(main.beta[i, 0] @ weights),
+        }
+        for j, name in enumerate(OUTCOMES):
+            if name != "r_end" and self.end.seen[j]:
+                predicted[name] = float(main.outcomes[i, 0, :, j] @ weights)
+        return Estimate(
+            method=self.method,
+            value=value,
+            low=interval.low,
+            high=interval.high,
+            level=LEVEL,
+            standard_error=interval.standard_error,
+            step_return=step,
+            end_reward=end,
+            predicted=predicted,
+            supported=logged.supported and simulated.supported,
+            flags=tuple(flags),
+            n=len(self.buffer.sessions),
+            details={
+                "horizon_steps": horizon,
+                "largest_root": largest_root(self.main.phi),
+                "level_shares": self.main.shares,
+                "coverage": logged.to_json(),
+                "coverage_simulated": simulated.to_json(),
+                "held_out": self._held_out(),
+                "draws": [round(float(v), 4) for v in value + model + days.own[i]],
+            },
+        )
+
+    def _held_out(self) -> dict[str, Any]:
+        with_end = self.end.seen[0]
+        return {
+            "replay_skill": self.skill,
+            "end_skill": float(self.end.skill[0]) if with_end else None,
+            "sessions": len(self.buffer.sessions),
+        }

@@ -1,0 +1,63 @@
+"""How well the linear model's free runs meet sessions that it has not learnt from: shown beside its estimates, no choice rests on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.ope.dlsm.batches import Scale
+from ml.ope.linear.dynamics import Dynamics, SessionTable, fit_dynamics
+from ml.trajectories import ReplayBuffer
+
+Floats = NDArray[np.float64]
+
+BLOCK = 30
+"""Steps whose mean beta is compared: single steps are noise, and the reward follows levels."""
+
+
+def replay_skill(buffer: ReplayBuffer, scale: Scale, folds: Sequence[Sequence[int]]) -> float | None:
+    """1 - error / error of the learnt sessions' mean beta, over block means of left-out sessions run freely under their own amplitudes.
+
+    A left-out session runs from its own s_0 at the level of its visit's other sessions. None where no session could be left out.
+    """
+    error, plain = 0.0, 0.0
+    for fold in folds:
+        rest = [k for k in range(len(buffer.sessions)) if k not in set(fold)]
+        tables = [SessionTable.of(buffer.sessions[k], scale) for k in rest]
+        held = [k for k in fold if np.isfinite(buffer.sessions[k].lead_beta).all() and buffer.sessions[k].usable().any()]
+        if not held or sum(bool(t.usable.any()) for t in tables) < 2:
+            continue
+        model, _ = fit_dynamics(replace(buffer, sessions=tuple(buffer.sessions[k] for k in rest)), tables, 1, 0)
+        mean = float(np.concatenate([t.beta[t.beta.size - t.usable.size :][t.usable] for t in tables]).mean())
+        visits = np.array([buffer.sessions[k].visit for k in rest])
+        for k in held:
+            same = visits == buffer.sessions[k].visit
+            level = float(model.levels[0, same].mean() if same.any() else model.levels[0].mean())
+            table = SessionTable.of(buffer.sessions[k], scale)
+            seen = np.where(table.usable, table.beta[-table.usable.size :], np.nan)
+            error += block_error(seen, mean_path(model, table, level))
+            plain += block_error(seen, np.full(seen.size, mean))
+    return 1 - error / plain if plain > 0 else None
+
+
+def mean_path(model: Dynamics, table: SessionTable, level: float) -> Floats:
+    """Mean of standardised beta, [T], from a session's first window under its logged amplitudes at a level."""
+    rest = table.answers @ model.beta[0] + level
+    window = model.phi.size
+    eta = np.concatenate([table.beta[:window] - rest[:window], np.zeros(table.usable.size)])
+    for t in range(window, eta.size):
+        eta[t] = eta[t - window : t] @ model.phi[::-1]
+    return np.asarray((rest + eta)[window:], dtype=np.float64)
+
+
+def block_error(seen: Floats, predicted: Floats) -> float:
+    """Sum over blocks of the squared difference of block means, for beta [T] with gaps; blocks that are mostly gaps are left out."""
+    total = 0.0
+    for start in range(0, seen.size, BLOCK):
+        known = np.isfinite(seen[start : start + BLOCK])
+        if known.sum() >= BLOCK // 3 or (known.any() and seen.size < BLOCK):
+            total += float((predicted[start : start + BLOCK][known].mean() - seen[start : start + BLOCK][known].mean()) ** 2)
+    return total

@@ -1,0 +1,1 @@
+"""What the logged data can say about a policy, before any estimate is made."""

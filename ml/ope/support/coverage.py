@@ -1,0 +1,129 @@
+"""What the logged data can say about a policy, before any number is believed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.policies.policy import Policy
+from ml.trajectories import ReplayBuffer
+
+NEIGHBOURHOOD = 0.05
+"""Logged amplitudes within this fraction of pi(s) count as its neighbours."""
+
+NEIGHBOUR_SHARE = 0.005
+"""Fewer neighbours than this share of all logged amplitudes: the data have next to nothing there."""
+
+UNSUPPORTED_SHARE = 0.20
+"""Above this share of steps at amplitudes that the data hold next to nothing of, a policy is not supported by the data."""
+
+NOTICE_SHARE = 0.05
+"""Above this share the page says so."""
+
+NO_CLOSED_LOOP = "no closed loop"
+
+SAME_AMPLITUDE = 0.02
+"""A policy whose middle 98 % of amplitudes lie closer together than this does not answer to beta."""
+
+AS_GOOD_AS_OFF = 0.10
+"""Below this amplitude a step is as good as without stimulation, for the warning on the page."""
+
+FEW_EFFECTIVE = 10.0
+"""Effective sessions below this: importance weights rest on a handful of sessions."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Coverage of one policy.
+
+    Attributes:
+        outside_range: share of states whose pi(s) lies outside the logged amplitudes.
+        thin: share of states whose pi(s) has next to no logged amplitude near it (this includes those outside).
+        logged_low, logged_high: range of the logged amplitudes.
+        n_states: states looked at.
+        spread: width of the middle 98 % of the policy's amplitudes. median: of its amplitudes. off: share of steps as good as without
+            stimulation.
+    """
+
+    outside_range: float
+    thin: float
+    logged_low: float
+    logged_high: float
+    n_states: int
+    spread: float
+    median: float
+    off: float
+
+    @property
+    def supported(self) -> bool:
+        """False when the policy works mostly where the data are silent."""
+        return self.thin <= UNSUPPORTED_SHARE
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """Failing and noteworthy checks, in words: what the data cannot say, and what a clinician should know before ticking it."""
+        found = []
+        if self.thin > NOTICE_SHARE:
+            verdict = "" if self.supported else "not supported by the data: "
+            found.append(
+                f"{verdict}in {100 * self.thin:.0f} % of steps the policy asks for amplitudes with hardly any logged step near them "
+                f"(logged steps span {self.logged_low:.2f} to {self.logged_high:.2f})"
+            )
+        if self.spread < SAME_AMPLITUDE:
+            found.append(f"{NO_CLOSED_LOOP}: about {100 * self.median:.0f} % of the cDBS amplitude whatever beta does")
+        if self.off > NOTICE_SHARE:
+            found.append(f"as good as no stimulation in {100 * self.off:.0f} % of steps (below {100 * AS_GOOD_AS_OFF:.0f} % of cDBS)")
+        return tuple(found)
+
+    def to_json(self) -> dict[str, Any]:
+        """All numbers, by name."""
+        return asdict(self)
+
+
+class AmplitudeSupport:
+    """Which amplitudes a buffer holds data of.
+
+    Raises:
+        ValueError: the buffer has no usable step.
+    """
+
+    def __init__(self, buffer: ReplayBuffer) -> None:
+        steps = buffer.transitions()
+        self.states = steps.states
+        self.sorted_actions = np.sort(steps.actions)
+
+    def look(self, amplitudes: NDArray[Any]) -> Coverage:
+        """Coverage of a set of chosen amplitudes, any shape."""
+        logged = self.sorted_actions
+        chosen = np.asarray(amplitudes, dtype=np.float64).ravel()
+        low, high = float(logged[0]), float(logged[-1])
+        outside = (chosen < low - 0.5 * NEIGHBOURHOOD) | (chosen > high + 0.5 * NEIGHBOURHOOD)
+        near = np.searchsorted(logged, chosen + NEIGHBOURHOOD, "right") - np.searchsorted(logged, chosen - NEIGHBOURHOOD, "left")
+        thin = outside | (near < NEIGHBOUR_SHARE * logged.size)
+        q01, median, q99 = (float(q) for q in np.quantile(chosen, (0.01, 0.5, 0.99)))
+        off = float(np.mean(chosen < AS_GOOD_AS_OFF))
+        return Coverage(float(outside.mean()), float(thin.mean()), low, high, chosen.size, q99 - q01, median, off)
+
+    def of_policy(self, policy: Policy) -> Coverage:
+        """Coverage of a policy over the states of the buffer."""
+        return self.look(policy.act(self.states))
+
+
+def coverage(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> dict[str, Coverage]:
+    """Coverage of every policy over the states of the buffer."""
+    support = AmplitudeSupport(buffer)
+    return {name: support.of_policy(policy) for name, policy in policies.items()}
+
+
+def effective_sample_size(log_weights: NDArray[Any]) -> tuple[float, float]:
+    """Effective sample size (sum w)^2 / sum w^2 and the largest weight's share, from log weights, shape [N]; 0 and 1 where all are zero."""
+    logs = np.asarray(log_weights, dtype=np.float64)
+    if logs.size == 0 or not np.isfinite(logs.max()):
+        return 0.0, 1.0
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    return float(1 / np.sum(weights**2)), float(weights.max())

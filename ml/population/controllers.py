@@ -1,0 +1,52 @@
+"""What runs a session: a policy or one of the fixed controllers, and what the device delivers of what it asks for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.policies.policy import Policy
+from ml.population.participants import ParticipantModel
+from ml.population.physiology import brain
+from ml.population.physiology.brain import STREAM_CONTROLLER
+
+Floats = NDArray[np.float64]
+FixedController = Literal["random", "cdbs", "no_dbs"]
+Controller = Policy | FixedController
+_FIXED: Final[dict[str, float]] = {"cdbs": 1.0, "no_dbs": 0.0}
+
+
+def chooser(controller: Controller, counters: NDArray[np.uint64], lower_bound: float) -> Callable[[Floats], Floats]:
+    """What to ask for at each step, from the beta windows [N, W]."""
+    if controller == "random":
+        if not 0 <= lower_bound < 1:
+            raise ValueError(f"the random controller needs a lower bound in [0, 1), not {lower_bound}")
+        return lambda states: np.array([lower_bound + (1 - lower_bound) * brain.uniform(row, STREAM_CONTROLLER) for row in counters])
+    if isinstance(controller, str):
+        if controller not in _FIXED:
+            raise ValueError(f"there is no controller {controller!r}; use 'random', 'cdbs', 'no_dbs' or a policy")
+        return lambda states: np.full(len(states), _FIXED[controller])
+    policy = controller
+
+    def act(states: Floats) -> Floats:
+        asked = np.asarray(policy.act(states.copy()), dtype=np.float64)
+        if asked.shape != (len(states),):
+            raise ValueError(f"the policy answered with shape {asked.shape} to {len(states)} states; it must give one amplitude for each")
+        if not bool(np.all((asked >= -1e-6) & (asked <= 1 + 1e-6))):
+            raise ValueError(f"the policy asked for an amplitude fraction outside [0, 1]: {asked.min()} to {asked.max()}")
+        return np.clip(asked, 0.0, 1.0)
+
+    return act
+
+
+def delivery(participant: ParticipantModel, resolution_ma: float | None, lower_bound: float) -> Callable[[Floats], Floats]:
+    """What the device delivers of what is asked, as fractions; rounding never goes below a random controller's bound."""
+    if resolution_ma is None:
+        return lambda asked: asked
+    unit = resolution_ma / participant.cdbs_amplitude_ma
+    lowest = math.ceil(lower_bound / unit - 1e-9)
+    return lambda asked: np.minimum(np.maximum(np.rint(asked / unit), lowest) * unit, 1.0)

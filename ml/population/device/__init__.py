@@ -1,0 +1,1 @@
+"""Simulated sessions written as real RC+S session folders."""

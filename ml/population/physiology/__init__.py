@@ -1,0 +1,1 @@
+"""Physiology of the detailed synthetic participants: beta activity, medication, symptoms."""

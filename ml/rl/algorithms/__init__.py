@@ -1,0 +1,1 @@
+"""Offline learning algorithms, one file each, and their registry."""

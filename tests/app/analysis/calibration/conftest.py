@@ -1,0 +1,4 @@
+"""Fixtures of stored evaluations."""
+
+from tests.app.evaluations import evaluate as evaluate
+from tests.app.evaluations import policies as policies

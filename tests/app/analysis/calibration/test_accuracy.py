@@ -1,0 +1,79 @@
+"""The metrics of the calibration against hand-computed values and against the one-at-a-time versions of `ml.ope.compare.metrics`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.analysis.calibration.accuracy import Pair, accuracies, mean_interval, rank_correlations, regrets
+from ml.ope.compare.metrics import accuracy, spearman
+
+
+def pair(predicted: float, *returns: float, visit: int = 2, reach: float = 5.0) -> Pair:
+    return Pair(visit, predicted, predicted - reach, predicted + reach, returns)
+
+
+def test_metrics_of_one_visit_are_those_of_the_paper() -> None:
+    # actual means 10, 20, 40; estimates 12, 30, 25: the second is taken for the best
+    pairs = [pair(12.0, 9.0, 11.0), pair(30.0, 20.0), pair(25.0, 38.0, 40.0, 42.0)]
+    overall, visit = accuracies("fqe", pairs)
+    assert (overall.visit, visit.visit, visit.policies, visit.sessions) == (None, 2, 3, 6)
+    for row in (overall, visit):
+        assert row.mae.value == pytest.approx((2 + 10 + 15) / 3)
+        assert row.mae_of_range.value == pytest.approx(9 / 30)
+        assert row.rank_correlation.value == pytest.approx(0.5)
+        assert row.rank_p == pytest.approx(1.0)  # every one of the 6 orders reaches |0.5|
+        assert row.regret.value == pytest.approx(20.0)
+        assert row.regret_of_range.value == pytest.approx(20 / 30)
+        assert row.regret_as_paper.value == pytest.approx(20 / 40)
+        assert row.coverage.value == pytest.approx(1 / 3)
+        assert row.mae.low is not None
+        assert row.mae.high is not None
+        assert row.mae.low <= row.mae.value <= row.mae.high
+
+
+def test_over_visits_the_regret_is_the_mean_of_visits_with_a_choice() -> None:
+    pairs = [
+        pair(1.0, 10.0), pair(2.0, 4.0),  # regret 6 of range 6
+        pair(1.0, 3.0, visit=3), pair(2.0, 5.0, visit=3),  # regret 0
+        pair(9.0, 1.0, visit=4),  # nothing to choose
+    ]  # fmt: skip
+    overall, *by_visit = accuracies("fqe", pairs)
+    assert [r.regret.value for r in by_visit] == [6.0, 0.0, None]
+    assert by_visit[2].regret.missing == "a ranking needs at least 2 policies at the visit; there is 1"
+    assert by_visit[2].rank_correlation.value is None
+    assert (overall.regret.value, overall.regret_of_range.value) == (3.0, 0.5)
+    alone = accuracies("fqe", [pair(9.0, 1.0)])[0]
+    assert (alone.mae.value, alone.regret.value, alone.rank_correlation.value) == (8.0, None, None)
+    assert "no visit has them" in alone.regret.missing
+
+
+def test_no_interval_is_given_where_sessions_or_resamples_are_too_few() -> None:
+    assert mean_interval([1.0, 2.0]) is None
+    low, high = mean_interval([1.0, 2.0, 3.0]) or (9.0, 9.0)
+    assert 1.0 <= low < 2.0 < high <= 3.0
+    two = accuracies("fqe", [pair(1.0, 10.0), pair(2.0, 4.0)])[0]
+    assert (two.mae.low, two.mae.high) == (None, None)
+    # one session each: which policy is better never changes in a resample, and the regret would seem sure
+    single = accuracies("fqe", [pair(1.0, 10.0), pair(2.0, 4.0), pair(3.0, 5.0)])[0]
+    assert (single.regret.value, single.regret.low) == (5.0, None)
+    assert single.mae.low is not None
+    several = accuracies("fqe", [pair(1.0, 10.0, 8.0), pair(2.0, 4.0, 12.0), pair(3.0, 5.0)])[0]
+    assert several.regret.low is not None
+
+
+def test_metrics_of_all_resamples_at_once_are_those_of_one_at_a_time() -> None:
+    rng = np.random.default_rng(3)
+    for size in (2, 3, 6):
+        means, estimated = np.round(rng.normal(size=(40, size)), 1), np.round(rng.normal(size=size), 1)
+        means[rng.random(means.shape) < 0.2] = np.nan
+        found, regret = rank_correlations(means, estimated), regrets(means, estimated)
+        for row, rho, lost in zip(means, found, regret, strict=True):
+            there = np.isfinite(row)
+            if there.sum() < 2:
+                assert np.isnan(lost)
+                assert np.isnan(rho)
+                continue
+            expected = spearman(row[there], estimated[there])
+            assert (np.isnan(rho) and expected is None) or rho == pytest.approx(expected)
+            assert lost == pytest.approx(accuracy(row[there], estimated[there]).regret)

@@ -1,0 +1,39 @@
+"""The table of trial time: minutes per controller and participant."""
+
+from __future__ import annotations
+
+import pytest
+
+from app.accounts.permissions import SYSTEM
+from app.analysis.trial_time.service import trial_time
+from app.study import repository as study
+from app.study.models import Controller
+
+
+def test_minutes_are_those_of_the_sessions_and_excluded_ones_are_counted_apart(upload, client, enrolled, db):
+    for controller, steps in (("random", 300), ("cdbs", 300), ("cdbs", 150), ("no_dbs", 150)):
+        upload(controller, steps=steps, level=0.0 if controller == "no_dbs" else 1.0)
+    bad = upload("cdbs", steps=60)
+    answer = client.patch(f"/api/v1/sessions/{bad}", json={"excluded_reason": "the lead moved", "reason": "seen on the trace"})
+    assert answer.status_code == 200, answer.text
+    table = trial_time(db, [study.participant_by_code(db, enrolled, SYSTEM)], SYSTEM)
+    (row,) = table.rows
+    found = {t.controller: (t.sessions, t.minutes) for t in row.tested}
+    assert found == {
+        Controller.CDBS: (2, pytest.approx(15)),
+        Controller.RL: (0, 0),
+        Controller.DISTILLED: (0, 0),
+        Controller.NO_DBS: (1, pytest.approx(5)),
+        Controller.RANDOM: (1, pytest.approx(10)),
+    }
+    assert row.excluded == 1
+    assert [(t.sessions, t.minutes) for t in table.totals] == list(found.values())
+    assert table.labels[:4] == ["cDBS", "RL", "Distilled RL", "No DBS"]
+
+
+def test_the_page_shows_minutes_and_n_for_every_participant(upload, client, enrolled):
+    upload("cdbs", steps=300)
+    page = client.get("/trial-time")
+    assert page.status_code == 200
+    assert "10 <span" in page.text
+    assert "(1)" in page.text

@@ -1,0 +1,80 @@
+"""Three policies made elsewhere, and evaluations with estimates of known values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import SYSTEM
+from app.evaluation.service import store_evaluation
+from app.learning.policies.baselines import constant_onnx, ensure_baselines
+from app.learning.snapshots.service import collect, take_snapshot
+from app.study.repository import participant_by_code
+from ml.ope.estimate import Estimate
+
+Upload = Callable[..., int]
+
+
+def estimate(method: str, value: float, *, supported: bool = True, spread: float = 1.0, draws: Sequence[float] = ()) -> dict[str, Any]:
+    return Estimate(
+        method=method,
+        value=value,
+        low=value - spread,
+        high=value + spread,
+        level=0.9,
+        standard_error=spread / 1.64,
+        step_return=value - 80,
+        end_reward=80.0,
+        predicted={"energy": 0.4, "mean_beta": 0.9, "grasp_hz": 2.1, "rating": 7.5, "tremor_percent": 12.0},
+        supported=supported,
+        flags=() if supported else ("not supported by the data: in 60 % of steps",),
+        n=100,
+        details={"draws": list(draws)} if draws else {},
+    ).to_json()
+
+
+@pytest.fixture
+def policies(client: TestClient, upload: Upload) -> list[int]:
+    """Ids of three policies made elsewhere, for a participant with four sessions."""
+    for controller in ("random", "random", "cdbs", "random"):
+        upload(controller)
+    ids = []
+    for k in range(3):
+        answer = client.post(
+            "/api/v1/participants/P1/policies", data={"name": f"p{k}"}, files={"file": (f"p{k}.onnx", constant_onnx(0.4 + 0.2 * k, 10))}
+        )
+        ids.append(int(answer.json()["id"]))
+    return ids
+
+
+@pytest.fixture
+def evaluate(db: Session, policies: list[int]) -> Callable[..., int]:
+    """Store an evaluation; `dlsm` values by policy, further methods by name."""
+
+    def store(dlsm: dict[int, dict[str, Any]], baselines: dict[float, float] | None = None, **others: dict[str, Any]) -> int:
+        db.rollback()
+        participant = participant_by_code(db, "P1", SYSTEM)
+        snapshot = take_snapshot(db, participant, SYSTEM)
+        made = {
+            p.config.get("amplitude"): p.id for p in ensure_baselines(db, participant, snapshot, collect(db, participant).buffer, "test")
+        }
+        table = {str(i): e for i, e in dlsm.items()}
+        table |= {str(made[a]): estimate("dlsm", v) for a, v in (baselines or {}).items()}
+        row = store_evaluation(
+            db,
+            job_id=None,
+            created_by="test",
+            snapshot=snapshot,
+            horizon_steps=snapshot.median_steps,
+            candidates=list(dlsm),
+            results={"dlsm": {"estimates": table}, **others},
+            config={},
+        )
+        db.commit()
+        return row.id
+
+    return store

@@ -1,0 +1,142 @@
+"""Plan pages as a browser without JavaScript uses them."""
+
+from __future__ import annotations
+
+from datetime import date, timedelta
+from typing import Any
+
+from fastapi.testclient import TestClient
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.planning.plans.models import Plan
+from app.study.models import Visit
+
+PAGE = {"Accept": "text/html"}
+
+
+def _post(client: TestClient, path: str, **fields: Any) -> Any:
+    return client.post(path, data=fields, headers=PAGE, follow_redirects=False)
+
+
+def test_the_page_of_a_visit_without_a_plan_offers_the_ranked_policies(client: TestClient, studied: Any) -> None:
+    page = client.get(f"/visits/{studied.visit}/plan", headers=PAGE)
+    assert page.status_code == 200
+    assert "<b>Not enough data.</b> Needed: a plan." in page.text
+    assert page.text.index("rl-01<") < page.text.index("rl-02<") < page.text.index("rl-01-small<")
+    assert "rl-00<" not in page.text  # retired
+    assert page.text.count('name="policy_ids"') == 4
+
+
+def test_draft_then_approve_with_forms_alone(client: TestClient, studied: Any, db: Session) -> None:
+    path = f"/visits/{studied.visit}/plan"
+    drafted = _post(
+        client, path, policy_ids=[str(i) for i in studied.policies[:2]], minutes_per_session="12,5", no_dbs="yes", seed="", note=""
+    )
+    assert (drafted.status_code, drafted.headers["location"]) == (303, f"{path}?done=drafted")
+    plan = db.scalars(select(Plan)).one()
+    assert [i.minutes for i in plan.items] == [12.5, 12.5, 12.5, 5]
+    page = client.get(f"{path}?done=drafted", headers=PAGE).text
+    for words in ("Plan drafted.", "Approve plan", "plan.pdf", "not approved yet", "<svg", "95.00", "93.00 to 96.50", "DLSM"):
+        assert words in page, words
+    approved = _post(client, f"{path}/approve", plan_id=str(plan.id))
+    assert (approved.status_code, approved.headers["location"]) == (303, f"{path}?done=approved")
+    page = client.get(path, headers=PAGE).text
+    assert "by admin@clinic.example" in page
+    assert "Approve plan" not in page
+    assert "Why the approved plan is replaced" in page
+
+
+def test_a_refused_form_comes_back_as_it_was_filled_in(client: TestClient, studied: Any, db: Session) -> None:
+    path = f"/visits/{studied.visit}/plan"
+    chosen = [str(i) for i in studied.policies]
+    page = _post(client, path, policy_ids=chosen, total_minutes="61", washout_minutes="3", note="keep me")
+    assert page.status_code == 422
+    assert "4 policies with the sessions around them take 88 minutes; the visit has 61." in page.text
+    assert "Choose at most 2 policies" in page.text
+    assert 'value="61"' in page.text
+    assert "keep me" in page.text
+    assert page.text.count(" checked>") == 4
+    assert db.scalars(select(Plan)).all() == []
+    nothing = _post(client, path, note="x")
+    assert nothing.status_code == 422
+    assert "at least one policy or one random session" in nothing.text
+    wrong = _post(client, path, policy_ids=["x"])
+    assert wrong.status_code == 422
+    spelled = _post(client, path, policy_ids=chosen[:1], washout_minutes="five")
+    assert "Washout" in spelled.text
+    assert "no number" in spelled.text
+
+
+def test_ticked_policies_of_the_ranking_go_to_the_first_open_visit(client: TestClient, studied: Any) -> None:
+    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[0])], evaluation_id=str(studied.evaluation))
+    assert (answer.status_code, answer.headers["location"]) == (303, f"/visits/{studied.visit}/plan?done=drafted")
+    assert client.get(f"/api/v1/visits/{studied.visit}/plan").json()["evaluation"]["id"] == studied.evaluation
+
+
+def test_ticked_policies_never_replace_an_approved_plan_unasked(client: TestClient, studied: Any, db: Session) -> None:
+    client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
+    client.post(f"/api/v1/visits/{studied.visit}/plan/approve")
+    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[1])])
+    made = db.scalars(select(Visit).where(Visit.number == 3)).one()
+    assert answer.headers["location"] == f"/visits/{made.id}/plan?done=drafted"
+    assert client.get(f"/api/v1/visits/{studied.visit}/plan").json()["status"] == "approved"
+
+
+def test_a_draft_can_make_its_visit(client: TestClient, studied: Any, db: Session) -> None:
+    day = (date.today() + timedelta(days=30)).isoformat()
+    policy = str(studied.policies[0])
+    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[policy], visit_id="new", visit_number="7", visit_date=day)
+    visit = db.scalars(select(Visit).where(Visit.number == 7)).one()
+    assert answer.headers["location"] == f"/visits/{visit.id}/plan?done=drafted"
+    assert visit.date is not None
+    assert visit.date.isoformat() == day
+    following = _post(client, "/participants/P1/plan/draft", policy_ids=[policy], visit_id="new", visit_number="", visit_date=day)
+    assert following.status_code == 303
+    assert db.scalars(select(Visit.number).order_by(Visit.number)).all() == [1, 2, 7, 8]
+
+
+def test_a_draft_that_fails_makes_no_visit(client: TestClient, studied: Any, db: Session) -> None:
+    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.retired)], visit_number="9")
+    assert answer.status_code == 422
+    assert "was retired" in answer.text
+    assert db.scalars(select(Visit).where(Visit.number == 9)).all() == []
+
+
+def test_a_visit_with_sessions_is_not_open_for_planning(client: TestClient, studied: Any) -> None:
+    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[0])], visit_id=str(studied.held_visit))
+    assert answer.status_code == 422
+    assert "it has sessions, lies in the past" in answer.text
+
+
+def test_the_list_shows_every_plan_and_the_open_visits(client: TestClient, studied: Any) -> None:
+    empty = client.get("/participants/P1/plans", headers=PAGE).text
+    assert "Nothing is planned for this participant. The next visit would be number 3." in empty
+    for _ in range(2):
+        client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
+    page = client.get("/participants/P1/plans", headers=PAGE).text
+    assert page.count("superseded") == 1
+    assert f'href="/visits/{studied.visit}/plan"' in page
+    assert f'href="/visits/{studied.held_visit}/plan"' not in page
+
+
+def test_a_viewer_sees_the_plan_and_no_buttons(client: TestClient, client_as, studied: Any) -> None:  # type: ignore[no-untyped-def]
+    client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
+    viewer = client_as("viewer")
+    page = viewer.get(f"/visits/{studied.visit}/plan", headers=PAGE).text
+    assert "Download PDF" in page
+    assert "Approve plan" not in page
+    assert "Draft plan" not in page
+    assert _post(viewer, f"/visits/{studied.visit}/plan", policy_ids=[str(studied.policies[0])]).status_code == 403
+    assert _post(viewer, f"/visits/{studied.visit}/plan/approve").status_code == 403
+
+
+def test_a_participant_without_policies_gets_a_visit_of_random_sessions(client: TestClient, enrolled: str) -> None:
+    visit = client.get(f"/api/v1/participants/{enrolled}/visits").json()["items"][0]["id"]
+    page = client.get(f"/visits/{visit}/plan").text
+    assert "A visit of random sessions fills the replay buffer first" in page
+    drafted = _post(client, f"/visits/{visit}/plan", random_sessions="3")
+    assert drafted.status_code == 303
+    plan = client.get(f"/api/v1/visits/{visit}/plan").json()
+    assert [s["controller"] for s in plan["sessions"]] == ["cdbs", "random", "random", "random"]
+    assert not any("ranking" in warning for warning in plan["warnings"])

@@ -1,0 +1,105 @@
+"""The printed sheet of a visit plan."""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from hypothesis import given
+from hypothesis import strategies as st
+from pypdf import PdfReader
+
+from app.planning.plans.latin import latin
+
+
+def _sheet(client: TestClient, visit_id: int) -> list[str]:
+    answer = client.get(f"/api/v1/visits/{visit_id}/plan.pdf")
+    assert answer.status_code == 200
+    assert answer.headers["content-type"] == "application/pdf"
+    pages = PdfReader(io.BytesIO(answer.content)).pages
+    assert all(round(float(p.mediabox.width)) == 842 and round(float(p.mediabox.height)) == 595 for p in pages)  # A4 landscape, points
+    return [re.sub(r"\s+", " ", p.extract_text()) for p in pages]
+
+
+def test_a_draft_says_so_and_holds_everything_that_the_clinic_needs(client: TestClient, studied: Any) -> None:
+    body = {"policy_ids": list(studied.policies), "seed": 7, "no_dbs": True, "note": "left hand only"}
+    plan = client.post(f"/api/v1/visits/{studied.visit}/plan", json=body).json()
+    (text,) = _sheet(client, studied.visit)
+    for words in (
+        "DRAFT",
+        "NOT APPROVED",
+        "Visit plan P1 visit 2",
+        "Note: left hand only",
+        "rl-01-small",
+        "95 (93 to 96.5)",
+        "0.40",
+        "Started",
+        "Rating",
+        "Grasp",
+        "Tremor",
+        "Stop rules",
+        "return to the clinical stimulation",
+        "name, signature, date",
+        "Page 1 of 1",
+        f"plan {plan['id']}, seed 7, evaluation {studied.evaluation}, snapshot {plan['evaluation']['snapshot_id']}",
+        "by admin@clinic.example",
+        "by DLSM, with its 90 % interval",
+        "! The data do not support the estimate of policy 'rl-02-small'",
+    ):
+        assert words in text, words
+    rows = [f"{s['position']} {int(s['start_minute']) // 60}:{int(s['start_minute']) % 60:02d} " for s in plan["sessions"]]
+    places = [text.index(row, text.index("Notes, adverse effects")) for row in rows]
+    assert places == sorted(places)
+
+
+def test_an_approved_sheet_has_no_watermark_and_names_who_approved(client: TestClient, studied: Any) -> None:
+    client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
+    client.post(f"/api/v1/visits/{studied.visit}/plan/approve")
+    (text,) = _sheet(client, studied.visit)
+    assert "DRAFT" not in text
+    assert "NOT APPROVED" not in text
+    assert "Approved by admin@clinic.example" in text
+
+
+def test_a_long_day_goes_over_pages_with_its_head_repeated(client: TestClient, studied: Any) -> None:
+    body = {"policy_ids": list(studied.policies), "random_sessions": 10, "total_minutes": 600, "note": "word " * 300}
+    client.post(f"/api/v1/visits/{studied.visit}/plan", json=body)
+    pages = _sheet(client, studied.visit)
+    assert len(pages) == 2
+    for number, text in enumerate(pages, start=1):
+        assert f"Page {number} of 2" in text
+        assert "Notes, adverse effects" in text
+        assert "DRAFT" in text
+
+
+def test_names_outside_latin_1_are_spelled(client: TestClient, studied: Any, external: int) -> None:
+    client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [external], "note": "雨 – β ≥ 2 µV"})
+    (text,) = _sheet(client, studied.visit)
+    assert re.search(rf'beta-Regler "Lódz" ?\(#{external}\)', text)
+    assert f"Policy 'beta-Regler \"Lódz\" (#{external})' is not in the ranking." in text
+    assert "Note: ? - beta >= 2 µV" in text
+
+
+@pytest.mark.parametrize(
+    ("text", "printed"),
+    [
+        ("β γ Ω", "beta gamma Omega"),
+        ("Łódź", "Lódz"),
+        ("a–b — “c”…", 'a-b - "c"...'),
+        ("çåß µ ±", "çåß µ ±"),
+        ("ﬁ", "fi"),
+        ("雨\x00\u200b", "?"),
+        ("ή", "eta"),
+    ],
+)
+def test_every_character_has_a_spelling_or_a_question_mark(text: str, printed: str) -> None:
+    assert latin(text) == printed
+
+
+@given(st.text())
+def test_whatever_is_typed_fits_the_built_in_fonts(text: str) -> None:
+    printed = latin(text)
+    assert printed.encode("latin-1").decode("latin-1") == printed

@@ -1,0 +1,138 @@
+"""A database that release 0.1.0 filled: it migrates to the present schema, and every page and every route that reads still answers.
+
+The dump holds what `betaloop demo` of 0.1.0 made, and some things done by hand: a bundle taken, a plan approved, sessions of its policies,
+proposals, a quarantine, a cancelled job. Its people are the demo's, its passwords were drawn for it, and its files are the small ones
+(distilled policies, snapshots); bytes of uploads and of large policies are not among them.
+"""
+
+from __future__ import annotations
+
+import lzma
+import re
+from collections.abc import Iterator
+from itertools import product
+from typing import Any
+
+import psycopg
+from fastapi.routing import iter_route_contexts
+from fastapi.testclient import TestClient
+from sqlalchemy import text
+
+import app.platform.database as database
+from app.accounts import repository as accounts_repository
+from app.accounts import service as accounts
+from app.main import create_app
+from app.platform.database import Base
+from app.platform.tables import load_tables
+from tests.conftest import RELEASED_DUMP
+
+PERSON = "admin@demo.example"
+PASSWORD = "a password of the test"
+
+# rows to open, by each part of a path; policies are those whose files are kept
+IDS = {
+    "code": "select code from participant where code in ('P1', 'P4')",
+    "visit_id": "select v.id from visit v join participant p on p.id = v.participant_id where p.code in ('P1', 'P4')",
+    "session_id": "select min(s.id) from session s group by s.visit_id, s.status, s.controller",
+    "upload_id": "select min(upload_id) from upload_file group by kind, status",
+    "policy_id": "select min(id) from policy where participant_id = 1 and kind in ('trained', 'distilled') group by kind union "
+    "select max(id) from policy where participant_id = 1 and kind = 'baseline'",
+    "snapshot_id": "select id from buffer_snapshot",
+    "sweep_id": "select id from sweep",
+    "job_id": "select id::text from job",
+}
+
+# what has no such record yet, and says so with 404: (route, rows)
+ABSENT = {
+    "/api/v1/participants/{code}/ranking": "select code from participant where id not in (select participant_id from evaluation)",
+    "/participants/{code}/ranking.csv": "select code from participant where id not in (select participant_id from evaluation)",
+    "/api/v1/visits/{visit_id}/plan": "select id from visit where id not in (select visit_id from plan)",
+    "/api/v1/visits/{visit_id}/plan.pdf": "select id from visit where id not in (select visit_id from plan)",
+    "/api/v1/proposals/{session_id}": "select id from session where status <> 'proposed'",
+    "/proposals/{session_id}": "select id from session where status <> 'proposed'",
+}
+# a proposed session is shown by its own page: (route, rows that are sent elsewhere)
+ELSEWHERE = {"/sessions/{session_id}": "select id from session where status = 'proposed'"}
+# pages for who is not signed in
+SIGNED_OUT = {"/sign-in"}
+
+
+def rows(query: str) -> list[Any]:
+    """The first column of a query's rows."""
+    with database.new_session() as db:
+        return sorted(db.scalars(text(query)))
+
+
+def readable(app: Any) -> set[str]:
+    """Paths of every route that answers GET, pages and interface."""
+    return {c.path for c in iter_route_contexts(app.routes) if c.path and "GET" in (getattr(c, "methods", None) or ())}
+
+
+def calls(path: str, ids: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:
+    """Every combination of rows that a path's parts can name and that belong together."""
+    names = re.findall(r"{(\w+)}", path)
+    unknown = set(names) - set(IDS)
+    assert not unknown, f"{path}: say in IDS which rows to open for {sorted(unknown)}"
+    for values in product(*(ids[name] for name in names)):
+        chosen = dict(zip(names, values, strict=True))
+        if "policy_id" in chosen and "code" in chosen and chosen["code"] != "P1":
+            continue  # all policies of IDS are P1's
+        yield chosen
+
+
+def opened(client: TestClient, path: str, values: dict[str, Any]) -> int:
+    """Status of a GET; an event stream is read to its first bytes."""
+    url = path.format(**values)
+    with client.stream("GET", url, follow_redirects=False) as answer:
+        if "text/event-stream" not in answer.headers.get("content-type", ""):
+            answer.read()
+        return answer.status_code
+
+
+def unexpected(client: TestClient, paths: set[str]) -> dict[str, int]:
+    """Addresses whose answer is not the one it should be."""
+    ids = {name: rows(query) for name, query in IDS.items()}
+    assert all(ids.values()), "the dump has rows of every kind"
+    found = {}
+    for path in sorted(paths):
+        absent, elsewhere = (rows(table[path]) if path in table else [] for table in (ABSENT, ELSEWHERE))
+        rights = set()
+        for values in calls(path, ids):
+            row = next(iter(values.values()), None)
+            right = 404 if row in absent else 303 if row in elsewhere or path in SIGNED_OUT else 200
+            rights.add(right)
+            status = opened(client, path, values)
+            if status != right:
+                found[f"{path.format(**values)} (not {right})"] = status
+        if 200 not in rights and path not in SIGNED_OUT:
+            found[f"{path}: no row of IDS can be opened"] = 404
+    return found
+
+
+def test_every_table_of_the_release_has_rows(released_database: str) -> None:
+    load_tables()
+    with psycopg.connect(released_database.replace("+psycopg", "")) as connection:
+        dumped = set(re.findall(r"^CREATE TABLE public\.(\w+)", lzma.decompress(RELEASED_DUMP.read_bytes()).decode(), re.MULTILINE))
+        empty = {t for t in dumped & set(Base.metadata.tables) if not connection.execute(f"select 1 from {t} limit 1").fetchone()}
+    assert empty == set()
+
+
+def test_every_page_of_a_released_study_opens(released_database: str) -> None:
+    app = create_app()
+    pages = {path for path in readable(app) if not path.startswith("/api/")}
+    with TestClient(app, base_url="http://testserver") as client:
+        with database.transaction("test") as db:
+            person = accounts_repository.user_by_email(db, PERSON)
+            assert person is not None
+            accounts.set_password(db, person, PASSWORD)
+        signed_in = client.post("/sign-in", data={"email": PERSON, "password": PASSWORD}, follow_redirects=False)
+        assert signed_in.status_code == 303
+        assert unexpected(client, pages) == {}
+
+
+def test_every_route_of_the_interface_reads_a_released_study(released_database: str) -> None:
+    app = create_app()
+    with database.transaction("test") as db:
+        token = accounts.create_token(db, PERSON, "tests")
+    with TestClient(app, headers={"Authorization": f"Bearer {token}"}) as client:
+        assert unexpected(client, {path for path in readable(app) if path.startswith("/api/")}) == {}

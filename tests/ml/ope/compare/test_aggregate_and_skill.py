@@ -1,0 +1,207 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from ml.ope.compare.aggregate import Aggregate, combine, convex_weights, error_matrix
+from ml.ope.compare.skill import Prediction, choose_default, lead, skills, with_held_out_error
+from ml.ope.estimate import Estimate
+from ml.ope.fqe.estimator import Fqe, FqeConfig
+from ml.ope.importance import ImportanceSampling
+from ml.ope.linear.estimator import LinearConfig, LinearModel
+from ml.policies.policy import ConstantPolicy
+from ml.qoc import Qoc
+
+
+def estimate(value, draws, method="linear", supported=True):
+    draws = np.asarray(draws, dtype=np.float64)
+    spread = float(draws.std()) or 1.0
+    return Estimate(
+        method, value, value - spread, value + spread, 0.9, spread, value, None, {}, supported, (), 9, {"draws": [float(d) for d in draws]}
+    )
+
+
+def test_weights_are_those_of_the_quadratic_programme():
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        half = rng.normal(size=(4, 6))
+        errors = half @ half.T
+        found = minimize(
+            lambda w, a=errors: w @ a @ w,
+            np.full(4, 0.25),
+            bounds=[(0, 1)] * 4,
+            constraints={"type": "eq", "fun": lambda w: w.sum() - 1},
+            options={"ftol": 1e-12},
+        )
+        weights = convex_weights(errors)
+        assert weights @ errors @ weights == pytest.approx(found.fun, rel=1e-4)
+        assert weights.sum() == pytest.approx(1.0)
+        assert (weights >= 0).all()
+
+
+def test_two_independent_methods_are_weighted_by_their_inverse_variances():
+    assert convex_weights(np.diag([1.0, 4.0])) == pytest.approx([0.8, 0.2], abs=1e-4)
+
+
+def test_known_bias_moves_weight_to_the_other_method_and_shared_draws_count_as_covariance():
+    rng = np.random.default_rng(1)
+    shared = rng.normal(size=100)
+    tables = {"a": {"p": estimate(1.0, shared)}, "b": {"p": estimate(3.0, shared + 0.1 * rng.normal(size=100), "b")}}
+    matrix = error_matrix(tables, ["a", "b"])
+    assert matrix[0, 1] == pytest.approx(matrix[0, 0], rel=0.2)
+    assert combine(tables, {"a": 0.0, "b": 5.0})["p"].details["weights"]["a"] > 0.95
+    assert combine(tables, {"a": 5.0, "b": 0.0})["p"].value > 2.8
+
+
+def test_methods_that_disagree_widen_the_combined_interval():
+    rng = np.random.default_rng(2)
+    tables = {"a": {"p": estimate(0.0, 0.1 * rng.normal(size=60))}, "b": {"p": estimate(10.0, 0.1 * rng.normal(size=60), "b")}}
+    combined = combine(tables)["p"]
+    assert combined.low < 0.5 < 9.5 < combined.high
+    assert combined.method == "aggregate"
+
+
+def test_a_method_that_supports_no_policy_takes_no_part():
+    draws = np.random.default_rng(3).normal(size=50)
+    tables = {"a": {"p": estimate(1.0, draws)}, "is": {"p": estimate(9.0, 0.001 * draws, "is", supported=False)}}
+    assert combine(tables)["p"].value == 1.0
+    with pytest.raises(ValueError, match="no method supports"):
+        combine({"is": tables["is"]})
+
+
+def test_the_aggregate_is_an_estimator_like_any_other(small_buffer):
+    parts = {"linear": LinearModel(LinearConfig(draws=20)), "fqe": Fqe(FqeConfig(members=1, refits=20))}
+    policies = {"half": ConstantPolicy(0.5), "full": ConstantPolicy(1.0)}
+    found = Aggregate(parts).fit(small_buffer).evaluate(policies, 30)
+    single = [p.fit(small_buffer).evaluate(policies, 30)["half"].value for p in parts.values()]
+    assert min(single) <= found["half"].value <= max(single)
+    assert sum(found["half"].details["weights"].values()) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_skill_numbers_are_those_of_counting_by_hand():
+    said, seen = [1.0, 5.0, 2.0], [0.0, 4.0, 2.0]
+    rows = tuple(Prediction("m", str(i), 1, a, b, None, True) for i, (a, b) in enumerate(zip(said, seen, strict=True)))
+    skill = skills(rows)[0]
+    assert skill.error == pytest.approx((1 + 1 + 0) / 3 / 4)
+    assert skill.bias == pytest.approx(np.sqrt(2 / 3))
+    assert skill.difference_error == pytest.approx((0 + 1 + 1) / 3 / 4)
+    assert skill.pairs_in_order == 1.0
+    assert skill.rank_correlation == 1.0
+
+
+def test_predictions_that_are_all_off_by_the_same_amount_lose_nothing_in_the_choice():
+    rows = tuple(Prediction("m", str(i), 1, v + 50.0, v, None, True) for i, v in enumerate([0.0, 1.0, 3.0]))
+    assert skills(rows)[0].difference_error == pytest.approx(0.0)
+
+
+def test_the_method_that_predicts_left_out_controllers_is_chosen_and_the_table_says_why(linear_simulator):
+    class Backwards:
+        """Says the opposite of a linear model."""
+
+        method = "fqe"
+
+        def fit(self, buffer, report=None, checkpoint_dir=None):
+            self.inner = LinearModel(LinearConfig(draws=20)).fit(buffer)
+            return self
+
+        def evaluate(self, policies, horizon_steps=None, report=None):
+            found = self.inner.evaluate(policies, horizon_steps)
+            return {n: replace(e, value=-e.value, step_return=-e.step_return) for n, e in found.items()}
+
+    buffer = linear_simulator.buffer(seed=0, n=16, steps=100)
+    candidates = {"fqe": Backwards(), "linear": LinearModel(LinearConfig(draws=20))}
+    choice = choose_default(buffer, candidates, aggregate=False)
+    assert choice.method == "linear"
+    assert choice.chosen_by_data
+    assert choice.table[0].method == "linear"
+    assert choice.table[0].difference_error < choice.table[1].difference_error
+    assert {p.controller for p in choice.predictions} == {"random", "cdbs", "rl", "other"}
+    json.dumps(choice.to_json())
+
+
+def test_the_lead_over_the_usual_first_is_the_mean_over_pairs_with_a_jackknife_over_controllers():
+    errors = {"linear": [0.0, 4.0, -2.0, 1.0], "fqe": [0.0, 1.0, 0.0, 1.0]}
+    rows = tuple(Prediction(m, str(c), 2, 10.0 * c + e, 10.0 * c, 1.0, True) for m, own in errors.items() for c, e in enumerate(own))
+
+    def by_hand(names):
+        pairs = [(i, j) for i in names for j in names if i < j]
+        return np.mean([abs(errors["linear"][i] - errors["linear"][j]) - abs(errors["fqe"][i] - errors["fqe"][j]) for i, j in pairs])
+
+    left = np.array([by_hand([c for c in range(4) if c != out]) for out in range(4)])
+    gain, error = lead(rows, "linear", "fqe")
+    assert gain == pytest.approx(by_hand(range(4)))
+    assert error == pytest.approx(np.sqrt(3 / 4 * np.sum((left - left.mean()) ** 2)))
+    assert lead(rows[:2] + rows[4:], "linear", "fqe") == (0.0, float("inf"))
+
+
+def test_a_method_takes_the_place_of_the_usual_first_only_by_more_than_a_standard_error(linear_simulator):
+    class Said:
+        """Predictions by the mean amplitude of the policy: exact to a slope and an offset of one controller."""
+
+        def __init__(self, method, slope, wrong):
+            self.method, self.slope, self.wrong = method, slope, wrong
+
+        def fit(self, buffer, report=None, checkpoint_dir=None):
+            self.kinds = {s.controller for s in buffer.sessions}
+            return self
+
+        def evaluate(self, policies, horizon_steps=None, report=None):
+            found = LinearModel(LinearConfig(draws=20)).fit(full).evaluate(policies, horizon_steps)
+            shift = self.wrong if "cdbs" not in self.kinds else 0.0
+            return {n: replace(e, value=self.slope * e.value + shift, step_return=self.slope * e.step_return) for n, e in found.items()}
+
+    full = linear_simulator.buffer(seed=0, n=16, steps=100)
+    clear = choose_default(full, {"linear": Said("linear", -1.0, 0.0), "fqe": Said("fqe", 1.0, 0.0)}, aggregate=False)
+    assert clear.method == "fqe"
+    assert "by more than a standard error better than linear" in clear.reason
+    hardly = choose_default(full, {"linear": Said("linear", 1.0, 0.4), "fqe": Said("fqe", 1.0, 0.0)}, aggregate=False)
+    assert hardly.method == "linear"
+
+
+def test_too_few_controllers_leave_the_choice_to_the_usual_order(linear_simulator):
+    sessions = tuple(s for s in linear_simulator.buffer(seed=0, n=10, steps=40).sessions if s.controller in ("random", "cdbs"))
+    buffer = replace(linear_simulator.buffer(seed=0, n=10, steps=40), sessions=sessions)
+    candidates = {"wis": ImportanceSampling("wis", draws=20), "linear": LinearModel(LinearConfig(draws=20))}
+    choice = choose_default(buffer, candidates)
+    assert (choice.method, choice.chosen_by_data) == ("linear", False)
+    assert "the data cannot choose" in choice.reason
+
+
+def test_a_method_that_cannot_work_is_named_with_its_reason(small_buffer):
+    class Broken:
+        method = "dlsm"
+
+        def fit(self, buffer, report=None, checkpoint_dir=None):
+            raise ValueError("needs more sessions")
+
+    bare = replace(small_buffer, sessions=tuple(replace(s, qoc=Qoc()) for s in small_buffer.sessions))
+    choice = choose_default(bare, {"dlsm": Broken(), "linear": LinearModel(LinearConfig(draws=20))})
+    assert choice.failed == {"dlsm": "needs more sessions"}
+    assert choice.method == "linear"
+
+
+def test_intervals_are_widened_by_errors_on_left_out_controllers_that_chance_does_not_explain():
+    exact = tuple(Prediction("m", str(i), 1, v + 3.0, v, 3.0, True) for i, v in enumerate([0.0, 5.0, 9.0]))
+    wrong = tuple(replace(p, observed_standard_error=0.0) for p in exact)
+    base = estimate(1.0, np.random.default_rng(0).normal(size=50))
+    assert with_held_out_error(base, skills(exact)[0].excess).low == pytest.approx(base.low)
+    wider = with_held_out_error(base, skills(wrong)[0].excess)
+    assert wider.value - wider.low == pytest.approx(np.hypot(base.value - base.low, 1.645 * 3.0))
+    assert wider.high - wider.value == pytest.approx(np.hypot(base.high - base.value, 1.645 * 3.0))
+    assert wider.details["held_out_error"] == pytest.approx(3.0)
+
+
+def test_a_controller_without_r_end_is_left_out_of_the_comparison_where_enough_others_have_it(linear_simulator):
+    buffer = linear_simulator.buffer(seed=0, n=16, steps=60)
+    bare = replace(buffer, sessions=tuple(replace(s, qoc=Qoc()) if s.controller == "other" else s for s in buffer.sessions))
+    linear = {"linear": LinearModel(LinearConfig(draws=20))}
+    found = choose_default(bare, linear, aggregate=False).predictions
+    assert {p.controller for p in found} == {"random", "cdbs", "rl"}
+    few = replace(bare, sessions=tuple(s for s in bare.sessions if s.controller != "rl"))
+    steps = choose_default(few, linear, aggregate=False).predictions
+    assert {p.controller for p in steps} == {"random", "cdbs", "other"}
+    assert all(p.observed < 0 for p in steps)  # step returns, every one of them; r_end is positive here
