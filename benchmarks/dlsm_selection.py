@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from ope import VISITS, Cells
-from simulators import STEPS, WORLDS
+from cells import Cells
+from simulators import STEPS, VISITS, WORLDS
 
 from ml.ope.compare.metrics import accuracy
 from ml.ope.dlsm.batches import learn_scale, make_batch

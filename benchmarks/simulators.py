@@ -22,6 +22,8 @@ from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 WINDOW, STEPS, NO_DBS_STEPS = 10, 300, 150
+VISITS = {"P1": 3, "P2": 4, "P3": 5, "P4": 6, "saturating": 4, "switching": 4}
+"""Visits of the data of each world."""
 Floats = np.ndarray
 Act = Callable[[Floats], Floats]
 

@@ -1,0 +1,119 @@
+"""How good estimates of candidates are in one world, and the means, medians and worst deciles over worlds.
+
+Shares are of the range of the candidates' true returns. Source of the metrics: Gao et al. 2023 (rank correlation, regret), SCOPE-RL
+(SharpeRatio@k), Gneiting and Raftery 2007 (interval score).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ml.ope.compare.metrics import spearman
+
+LEVEL = 0.90
+TOP = 3
+TEST_DRAWS = 50
+LARGEST_SHARPE = 10.0
+"""SharpeRatio@k is cut here: three policies of one return have no spread to divide by."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """A method's interval of one difference of returns, and what is true of it.
+
+    Attributes:
+        low, high: of `LEVEL`. truth: the true difference. standard_error: of the truth.
+    """
+
+    low: float
+    high: float
+    truth: float
+    standard_error: float
+
+    @property
+    def told(self) -> bool:
+        """Whether the interval leaves 0 out."""
+        return self.low > 0 or self.high < 0
+
+    @property
+    def right(self) -> bool | None:
+        """Whether the sign that is told is the true one; None where none is told or the truth is within its error of 0."""
+        if not self.told or abs(self.truth) < 2 * self.standard_error:
+            return None
+        return (self.low > 0) == (self.truth > 0)
+
+
+def interval_score(low: np.ndarray, high: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Width plus 2 / (1 - LEVEL) times the distance by which the truth is missed; small is good. Any shape."""
+    penalty = 2 / (1 - LEVEL)
+    return (high - low) + penalty * np.maximum(low - truth, 0) + penalty * np.maximum(truth - high, 0)
+
+
+def world_scores(
+    truth: Sequence[float], estimates: Sequence[Mapping[str, Any]], cdbs: float, places: Sequence[int] | None = None
+) -> dict[str, float | None]:
+    """Metrics over the candidates of one world.
+
+    Args:
+        truth: true returns on new days, [P]. estimates: `value, low, high, supported` of each. cdbs: true return of cDBS.
+        places: order that a page gives, 1 is first; the order of the values by default.
+    """
+    v = np.asarray(truth, dtype=np.float64)
+    said, low, high = (np.array([e[k] for e in estimates], dtype=np.float64) for k in ("value", "low", "high"))
+    supported = np.array([bool(e.get("supported", True)) for e in estimates])
+    order = -np.asarray(places, dtype=np.float64) if places is not None else said
+    spread = float(np.ptp(v))
+    top = np.argsort(-order, kind="stable")
+    first, best = int(top[0]), v[top[:TOP]]
+    missed = not low[first] <= v[first] <= high[first]
+    return {
+        "rank": spearman(v, order) or 0.0,
+        "rank supported": (spearman(v[supported], order[supported]) or 0.0) if supported.sum() >= 3 else None,
+        "regret": float(v.max() - v[first]) / spread,
+        "sharpe": min(max(best.max() - cdbs, 0.0) / max(float(best.std()), 1e-9), LARGEST_SHARPE),
+        "mae": float(np.abs(said - v).mean()) / spread,
+        "mae supported": float(np.abs(said - v)[supported].mean()) / spread if supported.any() else None,
+        "interval score": float(interval_score(low, high, v).mean()) / spread,
+        "width": float(np.median(high - low)) / spread,
+        "coverage": float(np.mean((low <= v) & (v <= high))),
+        "worst first": float(bool(v[first] <= v.min()) and missed),
+        "supported": float(supported.mean()),
+    }
+
+
+def scores_of_tests(
+    truth: Sequence[float], spread_of_returns: Sequence[float], cdbs: float, sessions: int, draws: int = 50
+) -> dict[str, Any]:
+    """Mean metrics of testing every candidate itself, each in its share of `sessions`, each on a day of its own."""
+    rng, v = np.random.default_rng(0), np.asarray(truth)
+    error = np.asarray(spread_of_returns) / np.sqrt(max(sessions / v.size, 1.0))
+    found = []
+    for _ in range(TEST_DRAWS):
+        said = v + error * rng.standard_normal(v.size)
+        rows = [{"value": s, "low": s - 1.645 * e, "high": s + 1.645 * e} for s, e in zip(said, error, strict=True)]
+        found.append(world_scores(truth, rows, cdbs))
+    return {k: float(np.mean([f[k] for f in found])) for k in found[0] if found[0][k] is not None}
+
+
+def over_worlds(values: Sequence[float | None], *, worst_is_low: bool) -> dict[str, float]:
+    """Mean with its standard error, median and worst decile; NaN where no world has the metric."""
+    x = np.array([v for v in values if v is not None], dtype=np.float64)
+    if x.size == 0:
+        return dict.fromkeys(("mean", "error", "median", "decile"), float("nan"))
+    error = float(x.std(ddof=1) / np.sqrt(x.size)) if x.size > 1 else float("nan")
+    return {
+        "mean": float(x.mean()),
+        "error": error,
+        "median": float(np.median(x)),
+        "decile": float(np.quantile(x, 0.1 if worst_is_low else 0.9)),
+    }
+
+
+def signs(told: Sequence[Told]) -> tuple[float, float]:
+    """Share of signs that are right among those told, and share of differences of which none is told; NaN without any."""
+    right = [t.right for t in told if t.right is not None]
+    return (float(np.mean(right)) if right else float("nan")), (1 - float(np.mean([t.told for t in told])) if told else float("nan"))

@@ -1,0 +1,271 @@
+"""Exploration designs: which amplitudes the random sessions of early visits try, laid out before the visit.
+
+Two designs, by their names:
+
+* `paper`: a new uniform draw on [B, 1] every step (Gao et al. 2023, section 6.1). The mean over a minute hardly ever leaves the middle.
+* `stratified`: each random session has a level of its own, stratified over [B, 1] across sessions and visits, and draws around it that are
+  held 10 to 60 s (log-uniform). A titration ladder (1, 0.8, 0.6, ..., two minutes each) may stand once in each visit.
+
+Safety comes before information: nothing is below B, and anything below `LOW_AMPLITUDE` lies in the last `LOW_SECONDS` of a session, so it
+lasts no longer than that and ends with the session. One hold is one decision: its density is conditional on the level and on which bound is
+in force, and is the density that `Decision.log_density` gives.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+DesignName = Literal["paper", "stratified"]
+
+LOW_AMPLITUDE: Final = 0.6
+"""Fraction of the cDBS amplitude below which a session may stay for `LOW_SECONDS` at most."""
+LOW_SECONDS: Final = 300.0
+HOLD_SECONDS: Final = (10.0, 60.0)
+SPREAD: Final = 0.12
+"""Draws around a level reach this far, as a fraction of the cDBS amplitude."""
+EVERYWHERE: Final = 0.2
+"""Share of draws that come from all of [B, 1], so that every amplitude has a density in every session."""
+LADDER_STEP: Final = 0.2
+LADDER_SECONDS: Final = 120.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DesignSettings:
+    """What a design needs to know.
+
+    Attributes:
+        name: `stratified` (the default) or `paper`. visits, sessions: early visits, and random sessions in each.
+        steps: T of a session. period_s: seconds per step. lower_bound: B, in [0, 1).
+        ladder: a titration ladder takes the place of the first random session of each visit (`stratified` alone).
+        seed: the same one gives the same design.
+
+    Raises:
+        ValueError: a value outside its range, or a ladder in the paper's design; the message names it.
+    """
+
+    visits: int
+    sessions: int
+    steps: int
+    name: DesignName = "stratified"
+    period_s: float = 2.0
+    lower_bound: float = 0.3
+    ladder: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for what in ("visits", "sessions", "steps"):
+            if getattr(self, what) < 1:
+                raise ValueError(f"a design needs at least one of its {what}, not {getattr(self, what)}")
+        if not 0 <= self.lower_bound < 1:
+            raise ValueError(f"lower_bound must lie in [0, 1), not {self.lower_bound}")
+        if not (math.isfinite(self.period_s) and self.period_s > 0):
+            raise ValueError(f"period_s must be above 0 s, not {self.period_s}")
+        if self.name not in ("paper", "stratified"):
+            raise ValueError(f"there is no design {self.name!r}; use 'stratified' or 'paper'")
+        if self.ladder and self.name == "paper":
+            raise ValueError("the paper's design has no titration ladder: choose the stratified design, or leave the ladder out")
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One amplitude that is held.
+
+    Attributes:
+        start, steps: first step and length. amplitude: fraction of cDBS.
+        log_density: of the amplitude given the session's level and the bound in force; None where nothing was drawn (ladder).
+    """
+
+    start: int
+    steps: int
+    amplitude: float
+    log_density: float | None
+
+
+@dataclass(frozen=True)
+class DesignedSession:
+    """One session of a design.
+
+    Attributes:
+        design: `paper`, `stratified` or `ladder`. visit: 1, 2, ... number: within the visit, 0, 1, ...
+        level: of the session; None where it has none. seed: of the design. decisions: in order, without gaps.
+    """
+
+    design: Literal["paper", "stratified", "ladder"]
+    visit: int
+    number: int
+    level: float | None
+    seed: int
+    decisions: tuple[Decision, ...]
+
+    @property
+    def amplitudes(self) -> Floats:
+        """Amplitude fraction of every step, [T]."""
+        return np.repeat([d.amplitude for d in self.decisions], [d.steps for d in self.decisions])
+
+
+def lay_out(settings: DesignSettings) -> tuple[DesignedSession, ...]:
+    """Every random session of the early visits, by visit and number."""
+    levels = stratified_levels(settings) if settings.name == "stratified" else None
+    result = []
+    for visit in range(1, settings.visits + 1):
+        for number in range(settings.sessions):
+            rng = np.random.default_rng([settings.seed, 0x6C6576, visit, number])
+            if levels is None:
+                result.append(_paper_session(settings, visit, number, rng))
+            elif settings.ladder and number == 0:
+                result.append(ladder_session(settings, visit, number))
+            else:
+                result.append(_held_session(settings, visit, number, float(levels[visit - 1, number - settings.ladder]), rng))
+    return tuple(result)
+
+
+def stratified_levels(settings: DesignSettings) -> Floats:
+    """Levels of the sessions, [visits, sessions without the ladder]: one in each of as many equal strata of [B, 1] as there are sessions.
+
+    Each visit has one level in each coarse stratum (as many as it has sessions), in random order; over the visits each fine stratum is
+    used once. Within its stratum a level is uniform, so that every level is uniform on [B, 1] by itself.
+    """
+    visits, sessions = settings.visits, settings.sessions - settings.ladder
+    if sessions == 0:
+        return np.empty((visits, 0))
+    rng = np.random.default_rng([settings.seed, 0x737472])
+    fine = np.stack([rng.permutation(visits) for _ in range(sessions)], axis=1)
+    place = np.arange(sessions) * visits + fine
+    levels = (place + rng.random(place.shape)) / (visits * sessions)
+    ordered = np.stack([row[rng.permutation(sessions)] for row in levels])
+    return np.asarray(settings.lower_bound + (1 - settings.lower_bound) * ordered)
+
+
+@dataclass(frozen=True)
+class DrawDensity:
+    """Density of held amplitudes around a level: uniform within `SPREAD` of it, mixed with a share of uniform on all of [low, 1].
+
+    Attributes:
+        level: of the session. low: the bound in force: B, or at least `LOW_AMPLITUDE` outside the last minutes of a session.
+
+    Raises:
+        ValueError: a bound or a level outside [0, 1].
+    """
+
+    level: float
+    low: float
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.low < 1 and 0 <= self.level <= 1):
+            raise ValueError(f"a level lies in [0, 1] and a bound in [0, 1), not {self.level} and {self.low}")
+
+    @property
+    def near(self) -> tuple[float, float]:
+        """Range of the draws around the level; a level below the bound is lifted to it."""
+        level = max(self.level, self.low)
+        return max(self.low, level - SPREAD), min(1.0, level + SPREAD)
+
+    def draw(self, rng: np.random.Generator) -> float:
+        """An amplitude."""
+        low, high = (self.low, 1.0) if rng.random() < EVERYWHERE else self.near
+        return float(rng.uniform(low, high))
+
+    def density(self, amplitude: NDArray[np.float64] | float) -> Floats:
+        """Density at amplitudes, any shape; integrates to 1 over [low, 1]."""
+        a = np.asarray(amplitude, dtype=np.float64)
+        low, high = self.near
+        everywhere = EVERYWHERE * ((a >= self.low) & (a <= 1)) / (1 - self.low)
+        return np.asarray(everywhere + (1 - EVERYWHERE) * ((a >= low) & (a <= high)) / (high - low))
+
+
+def hold_steps(rng: np.random.Generator, period_s: float) -> int:
+    """Length of one hold in steps, log-uniform between `HOLD_SECONDS`, at least one step."""
+    low, high = HOLD_SECONDS
+    seconds = low * (high / low) ** rng.random()
+    return max(1, round(seconds / period_s))
+
+
+def ladder_session(settings: DesignSettings, visit: int, number: int) -> DesignedSession:
+    """The titration ladder: 1, 0.8, 0.6, ... for two minutes each, down to B at the lowest and within the safety limit."""
+    length = max(1, int(LADDER_SECONDS / settings.period_s))
+    decisions: list[Decision] = []
+    low_s = 0.0
+    for rung in range(round(1 / LADDER_STEP) + 1):
+        amplitude = round(1.0 - LADDER_STEP * rung, 6)
+        low_s += length * settings.period_s * (amplitude < LOW_AMPLITUDE)
+        if amplitude < settings.lower_bound or low_s > LOW_SECONDS:
+            break
+        decisions.append(Decision(rung * length, length, amplitude, None))
+    return DesignedSession("ladder", visit, number, None, settings.seed, tuple(decisions))
+
+
+def _paper_session(settings: DesignSettings, visit: int, number: int, rng: np.random.Generator) -> DesignedSession:
+    low = settings.lower_bound
+    drawn = rng.uniform(low, 1.0, settings.steps)
+    decisions = tuple(Decision(k, 1, float(a), -math.log(1 - low)) for k, a in enumerate(drawn))
+    return DesignedSession("paper", visit, number, None, settings.seed, decisions)
+
+
+def _held_session(settings: DesignSettings, visit: int, number: int, level: float, rng: np.random.Generator) -> DesignedSession:
+    # Low amplitudes stand at the end: outcomes are taken there, and a session that is broken off has not been low for nothing.
+    low_begins = max(0, settings.steps - int(LOW_SECONDS / settings.period_s))
+    decisions: list[Decision] = []
+    k = 0
+    while k < settings.steps:
+        guarded = k < low_begins
+        end = low_begins if guarded else settings.steps
+        law = DrawDensity(level, max(settings.lower_bound, LOW_AMPLITUDE) if guarded else settings.lower_bound)
+        amplitude = law.draw(rng)
+        steps = min(hold_steps(rng, settings.period_s), end - k)
+        decisions.append(Decision(k, steps, amplitude, float(np.log(law.density(amplitude)))))
+        k += steps
+    return DesignedSession("stratified", visit, number, level, settings.seed, tuple(decisions))
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """What logged amplitudes say about how they were drawn.
+
+    Attributes:
+        kind: `every_step` (a new draw every step, as in the paper's design), `held` (draws that last), `constant`, or `unknown` with too
+            few known steps.
+        holds: (start, steps, amplitude) of every stretch of one amplitude; a gap of unknown amplitude ends a stretch.
+        repeats: share of known steps whose amplitude is that of the known step just before; None where no step follows a known one.
+    """
+
+    kind: Literal["every_step", "held", "constant", "unknown"]
+    holds: tuple[tuple[int, int, float], ...]
+    repeats: float | None
+
+
+HELD_SHARE: Final = 0.5
+"""From this share of repeated amplitudes on, draws count as held: rounding a new draw to a device's 0.1 mA repeats far fewer."""
+FEWEST_STEPS: Final = 10
+
+
+def recognise(amplitude: Sequence[float] | Floats, tolerance: float = 1e-6) -> Recognised:
+    """Whether the random amplitudes of a session without a stated design were drawn every step or held.
+
+    Args:
+        amplitude: fraction of cDBS per step, [T]; NaN where unknown.
+        tolerance: amplitudes closer than this are the same one; half the device's resolution where its log is rounded.
+    """
+    a = np.asarray(amplitude, dtype=np.float64)
+    known = np.isfinite(a)
+    follows = known[1:] & known[:-1]
+    same = follows & (np.abs(np.diff(np.where(known, a, 0.0))) <= tolerance)
+    starts = np.flatnonzero(known & np.concatenate([[True], ~same])) if a.size else np.empty(0, dtype=np.int64)
+    holds = []
+    for start in starts:
+        stop = int(start) + 1
+        while stop < a.size and same[stop - 1]:
+            stop += 1
+        holds.append((int(start), stop - int(start), float(a[start])))
+    repeats = float(same.sum() / follows.sum()) if follows.any() else None
+    if repeats is None or known.sum() < FEWEST_STEPS:
+        return Recognised("unknown", tuple(holds), repeats)
+    if np.ptp(a[known]) <= tolerance:
+        return Recognised("constant", tuple(holds), repeats)
+    return Recognised("held" if repeats >= HELD_SHARE else "every_step", tuple(holds), repeats)

@@ -1,0 +1,45 @@
+"""A virtual population: a distribution over patients at beta level (steps of 2 s), in three parts, with data, policies and true returns."""
+
+from ml.population.virtual.candidates import RelayPolicy, SmoothPolicy, draw_candidates
+from ml.population.virtual.patient import MECHANISMS, SHAPES, TREMORS, Patient, draw_patient
+from ml.population.virtual.sessions import Days, Sessions, new_days, simulate, visit_days
+from ml.population.virtual.world import (
+    PARTS,
+    WORLDS_PER_PART,
+    DataDesign,
+    Mean,
+    Part,
+    Truth,
+    World,
+    is_responder,
+    simple_policies,
+    within_margins,
+    world,
+)
+
+__all__ = [
+    "MECHANISMS",
+    "PARTS",
+    "SHAPES",
+    "TREMORS",
+    "WORLDS_PER_PART",
+    "DataDesign",
+    "Days",
+    "Mean",
+    "Part",
+    "Patient",
+    "RelayPolicy",
+    "Sessions",
+    "SmoothPolicy",
+    "Truth",
+    "World",
+    "draw_candidates",
+    "draw_patient",
+    "is_responder",
+    "new_days",
+    "simple_policies",
+    "simulate",
+    "visit_days",
+    "within_margins",
+    "world",
+]

@@ -1,0 +1,193 @@
+"""Sessions of a virtual patient: their days, their noise, and the loop with a controller. All sessions of a call advance together.
+
+A session depends on its own seeds alone, so it is the same alone and among thousands, and two controllers with one seed meet the same day
+and the same noise: differences of true returns have small errors.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.policies.policy import Policy
+from ml.population.virtual import _kernel, equations
+from ml.population.virtual.equations import CONSTANTS, GAIN, HALF, HOUR, LEVEL, NEED, NOISES, NORMALS, STATES
+from ml.population.virtual.patient import HYSTERESIS, OSCILLATOR, TOLERANCE, Patient
+
+Floats = NDArray[np.float64]
+
+WARM_STEPS: Final = 30
+"""Steps under cDBS before step 0; the last of them are the session's lead."""
+
+HOURS_OF_A_VISIT: Final = 2.0
+GRASP_NOISE_HZ, RATING_NOISE = 0.12, 0.5
+STEPS_PER_MINUTE, GRASP_STEPS = 30, 5
+OWN_NORMALS: Final = 5
+"""Normals of a session: its level, its first drift and activity, and the errors of grasp and rating."""
+MILD = 1.0
+"""Mean severity of a minute from which its tremor counts as mild."""
+
+_DAY_STREAM, _NORMAL_STREAM, _OWN_STREAM, _UNIFORM_STREAM = 1, 2, 3, 4
+
+
+@dataclass(frozen=True)
+class Days:
+    """On which days sessions take place.
+
+    Attributes:
+        effects: standard normals of the day of each session (level, gain, half, need), [n, 4]. hours: of the visit, [n].
+    """
+
+    effects: Floats
+    hours: Floats
+
+
+def new_days(key: int, first: int, n: int) -> Days:
+    """A day of its own for each of the sessions first ... first + n - 1, at a uniform hour of a visit."""
+    drawn = [_stream(key, _DAY_STREAM, i) for i in range(first, first + n)]
+    return Days(np.stack([g.standard_normal(4) for g in drawn]), np.array([g.uniform(0, HOURS_OF_A_VISIT) for g in drawn]))
+
+
+def visit_days(key: int, visits: NDArray[np.int64], hours: Floats) -> Days:
+    """The days of numbered visits, [n]; sessions of one visit share its day."""
+    effects = {int(v): _stream(key, _DAY_STREAM, -int(v)).standard_normal(4) for v in np.unique(visits)}
+    return Days(np.stack([effects[int(v)] for v in visits]), np.asarray(hours, dtype=np.float64))
+
+
+@dataclass(frozen=True)
+class Sessions:
+    """What n sessions did.
+
+    Attributes:
+        lead: beta before step 0 under cDBS, [n, W]. beta, amplitude: [n, T]. brady, tremor, overload: symptoms, [n, T].
+        grasp_hz, rating, tremor_percent: QoCs, [n].
+    """
+
+    lead: Floats
+    beta: Floats
+    amplitude: Floats
+    brady: Floats
+    tremor: Floats
+    overload: Floats
+    grasp_hz: Floats
+    rating: Floats
+    tremor_percent: Floats
+
+
+def simulate(
+    patient: Patient,
+    xi: float,
+    controller: Policy | Floats,
+    *,
+    days: Days,
+    key: int,
+    first: int = 0,
+    steps: int = 300,
+    window: int = 10,
+    readable: bool = False,
+) -> Sessions:
+    """Run sessions.
+
+    Args:
+        patient: who. xi: beta threshold, the unit of the burden of beta.
+        controller: a policy, or the amplitudes of every session, [n, steps].
+        days: of the n sessions. key: of the patient's streams; session i has number first + i.
+        steps: T. window: W, at most `WARM_STEPS`.
+        readable: run the equations in plain arrays instead of the compiled kernel (slow, the same numbers).
+
+    Raises:
+        ValueError: amplitudes outside [0, 1] or of another shape, or a window longer than the warm-up.
+    """
+    n, length = len(days.hours), WARM_STEPS + steps
+    if window > WARM_STEPS:
+        raise ValueError(f"a window of {window} steps is longer than the {WARM_STEPS} steps before a session")
+    if isinstance(controller, np.ndarray) and controller.shape != (n, steps):
+        raise ValueError(f"{n} sessions of {steps} steps need amplitudes of shape {(n, steps)}, not {controller.shape}")
+    noise, own = _noise(key, first, n, length)
+    constants = session_constants(patient, days, own)
+    state = _start(patient, constants, own)
+    amplitude = np.ones((n, length))
+    beta, brady, tremor, overload = (np.empty((n, length)) for _ in range(4))
+    for k in range(length):
+        if k >= WARM_STEPS:
+            t = k - WARM_STEPS
+            asked = controller[:, t] if isinstance(controller, np.ndarray) else controller.act(beta[:, k - window : k])
+            amplitude[:, k] = _checked(np.asarray(asked, dtype=np.float64), n)
+        if readable:
+            equations.step(patient, xi, constants, state, amplitude, k, noise, (beta, brady, tremor, overload))
+        else:
+            _kernel.advance(patient, xi, constants, state, amplitude, k, noise, beta, brady, tremor, overload)
+    run = [values[:, WARM_STEPS:] for values in (beta, amplitude, brady, tremor, overload)]
+    return Sessions(beta[:, WARM_STEPS - window : WARM_STEPS], *run, *quality(patient, own[:, -2:], *run[1:]))
+
+
+def session_constants(patient: Patient, days: Days, own: Floats) -> Floats:
+    """What differs from session to session, [n, CONSTANTS], out of the day's normals and the session's own, [n, >= 1]."""
+    result = np.empty((len(own), CONSTANTS))
+    result[:, LEVEL] = patient.day_level * days.effects[:, 0] + patient.session_level * own[:, 0]
+    result[:, GAIN] = np.exp(patient.day_gain * days.effects[:, 1])
+    result[:, HALF] = np.exp(patient.day_half * days.effects[:, 2])
+    result[:, NEED] = patient.day_need * days.effects[:, 3]
+    result[:, HOUR] = days.hours
+    return result
+
+
+def quality(patient: Patient, noise: Floats, amplitude: Floats, brady: Floats, tremor: Floats, overload: Floats) -> tuple[Floats, ...]:
+    """Grasp frequency (Hz), rating (1-10) and tremor (%) of sessions from their symptoms, [n, T] each; `noise` [n, 2] standard normals."""
+    late = brady[:, -GRASP_STEPS:].mean(axis=1)
+    grasp = patient.grasp_high - (patient.grasp_high - patient.grasp_low) * late + GRASP_NOISE_HZ * noise[:, 0]
+    score = 9.5 - 3.0 * brady.mean(axis=1) - 4.0 * np.minimum(tremor / 2.5, 1.0).mean(axis=1)
+    score -= 3.0 * patient.side * overload.mean(axis=1) + np.abs(np.diff(amplitude, axis=1)).mean(axis=1) + RATING_NOISE * noise[:, 1]
+    minutes = np.arange(0, tremor.shape[1], STEPS_PER_MINUTE)
+    lengths = np.diff(np.append(minutes, tremor.shape[1]))
+    counted = np.add.reduceat(tremor, minutes, axis=1) / lengths >= MILD
+    return np.clip(grasp, 0.1, 4.5), np.clip(np.round(score), 1, 10), 100 * (counted @ lengths) / tremor.shape[1]
+
+
+def _stream(key: int, stream: int, number: int) -> np.random.Generator:
+    return np.random.Generator(np.random.Philox(key=np.array([(key << 8) + stream, number % 2**64], dtype=np.uint64)))
+
+
+def _noise(key: int, first: int, n: int, length: int) -> tuple[Floats, Floats]:
+    """Noise of every step, [n, K, NOISES], and each session's own normals, [n, OWN_NORMALS]."""
+    # A stream for each kind: a longer session's noise then only goes on where a shorter one's ends, so length does not change beginnings.
+    noise, own = np.empty((n, length, NOISES)), np.empty((n, OWN_NORMALS))
+    for i in range(n):
+        noise[i, :, :NORMALS] = _stream(key, _NORMAL_STREAM, first + i).standard_normal((length, NORMALS))
+        own[i] = _stream(key, _OWN_STREAM, first + i).standard_normal(OWN_NORMALS)
+        noise[i, :, NORMALS:] = _stream(key, _UNIFORM_STREAM, first + i).random((length, NOISES - NORMALS))
+    return noise, own
+
+
+def _start(patient: Patient, constants: Floats, own: Floats) -> Floats:
+    """State under lasting cDBS, with drift and activity from their stationary distributions."""
+    state = np.zeros((len(own), STATES))
+    ones = np.ones(len(own))
+    full = equations.dose(patient.shape, ones, patient.half * constants[:, HALF], patient.steep)
+    relief = equations.dose(patient.sym_shape, ones, patient.sym_half * constants[:, HALF], patient.sym_steep)
+    for column, value in (
+        (equations.E_FAST, full),
+        (equations.E_SLOW, full),
+        (equations.S_FAST, relief),
+        (equations.S_SLOW, relief),
+        (equations.DRIFT, patient.drift_sd * own[:, 1]),
+        (equations.ACT, own[:, 2]),
+        (equations.BURDEN, 0.9 * ones),
+    ):
+        state[:, column] = value
+    # the mechanism's own state: the size of the oscillation; the play operator and the habit where full stimulation leaves them
+    at_rest: dict[int, float | Floats] = {OSCILLATOR: math.sqrt(patient.osc_base), HYSTERESIS: 1.0 - patient.play, TOLERANCE: full}
+    state[:, equations.MECHANISM] = at_rest.get(patient.kind, 0.0)
+    return state
+
+
+def _checked(asked: Floats, n: int) -> Floats:
+    if asked.shape != (n,):
+        raise ValueError(f"the controller answered with shape {asked.shape} to {n} sessions; it must give one amplitude for each")
+    if not bool(np.all((asked >= -1e-6) & (asked <= 1 + 1e-6))):
+        raise ValueError(f"the controller asked for an amplitude fraction outside [0, 1]: {asked.min()} to {asked.max()}")
+    return np.clip(asked, 0.0, 1.0)

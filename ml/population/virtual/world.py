@@ -1,0 +1,274 @@
+"""Worlds to measure evaluation and learning in: a virtual patient, the data of early visits, candidate policies, and their true returns.
+
+There are three parts. A is to develop on, B to report on, C is run once before a release. A world depends on its part and index alone.
+What is true in a world is for measuring: nothing may be fitted, chosen or tuned by it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.designs import DesignSettings, lay_out
+from ml.mdp import MdpSettings, step_reward
+from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
+from ml.population.virtual.candidates import draw_candidates
+from ml.population.virtual.patient import MECHANISMS, Patient, draw_patient
+from ml.population.virtual.sessions import Days, Sessions, new_days, simulate, visit_days
+from ml.qoc import Qoc
+from ml.trajectories import ReplayBuffer, SessionTrajectory
+
+Floats = NDArray[np.float64]
+Part = Literal["A", "B", "C"]
+DataDesign = Literal["paper", "stratified", "ladder"]
+
+PARTS: Final[dict[str, int]] = {"A": 11, "B": 23, "C": 37}
+WORLDS_PER_PART: Final = 60
+PER_OTHER_MECHANISM: Final = 4
+SILENT_BETA: Final = 7
+"""Graded worlds of a part whose beta hardly answers while symptoms do."""
+WITHOUT_END: Final = 0.1
+"""Share of worlds without an end-of-session reward: C2 to C4 are 0."""
+
+STEPS, NO_DBS_STEPS, PAUSE_H = 300, 150, 10 / 60
+VISITS, RANDOM_SESSIONS = 3, 4
+
+GRASP_SHARE, RATING_POINTS, TREMOR_POINTS, ENERGY_SAVED = 0.10, 1.0, 10.0, 0.20
+"""Margins of a responder against cDBS: grasp slower by a share, rating lower, tremor higher (percentage points); energy saved."""
+
+_DATA, _DATA_DAYS, _CALIBRATION = 1 << 40, 1 << 41, 1 << 42
+"""First session numbers of what is not truth on new days."""
+
+
+class Mean(NamedTuple):
+    """A mean over simulated sessions and its standard error."""
+
+    value: float
+    standard_error: float
+
+    @classmethod
+    def of(cls, values: Floats) -> Mean:
+        """Of values [n], n >= 2."""
+        return cls(float(values.mean()), float(values.std(ddof=1) / math.sqrt(values.size)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth:
+    """What a policy is worth, by Monte Carlo.
+
+    Attributes:
+        total: E[r_end + sum over t < H of gamma^t r_t]. step_return, end_reward: its parts. energy: mean squared amplitude fraction.
+        amplitude: mean fraction. beta: mean, uV. grasp_hz, rating, tremor_percent: QoCs.
+        returns: total return of every session, [n]; session i of two policies has the same day and noise.
+    """
+
+    total: Mean
+    step_return: Mean
+    end_reward: Mean
+    energy: Mean
+    amplitude: Mean
+    beta: Mean
+    grasp_hz: Mean
+    rating: Mean
+    tremor_percent: Mean
+    returns: Floats
+
+    def to_json(self) -> dict[str, Any]:
+        """Means and standard errors by name, and the standard deviation of returns between sessions."""
+        named = {k: list(v) for k, v in vars(self).items() if isinstance(v, Mean)}
+        return named | {"returns_sd": float(self.returns.std(ddof=1))}
+
+
+@dataclass(frozen=True)
+class World:
+    """One virtual patient with MDP settings.
+
+    Attributes:
+        part, index: which one. patient: its constants. settings: of its MDP; xi_beta is midway between beta under cDBS and under 0.3.
+        spread: standard deviation of beta, its unit. key: of its random streams.
+    """
+
+    part: str
+    index: int
+    patient: Patient
+    settings: MdpSettings
+    spread: float
+    key: int
+
+    @property
+    def name(self) -> str:
+        """Such as `A07-bursts`."""
+        return f"{self.part}{self.index:02d}-{self.patient.mechanism}"
+
+    @property
+    def modelled(self) -> bool:
+        """Whether the mechanism of beta is of the kind that the estimators assume."""
+        return self.patient.kind == 0
+
+    def run(self, controller: Policy | Floats, days: Days, first: int, steps: int = STEPS) -> Sessions:
+        """Sessions with the numbers from `first` on."""
+        s = self.settings
+        return simulate(self.patient, s.xi_beta, controller, days=days, key=self.key, first=first, steps=steps, window=s.window)
+
+    def data(self, design: DataDesign, seed: int = 0, visits: int = VISITS) -> ReplayBuffer:
+        """Early visits, each of two cDBS sessions, four random ones by the design, and five minutes without stimulation.
+
+        Whatever the design, the visits have the same days and take the same minutes: the ladder, where there is one, is one of the four.
+        """
+        rows = visit_plan(self.settings, design, seed, visits)
+        days = self.data_days(rows, seed)
+        sessions = []
+        for i, row in enumerate(rows):
+            own = Days(days.effects[i : i + 1], days.hours[i : i + 1])
+            run = self.run(row.amplitudes[None, :], own, _DATA + 4096 * seed + i, row.amplitudes.size)
+            qoc = Qoc(float(run.grasp_hz[0]), int(run.rating[0]), float(run.tremor_percent[0]))
+            bound = self.settings.lower_bound if row.controller == "random" and design == "paper" else None
+            sessions.append(
+                SessionTrajectory(
+                    session_id=i + 1,
+                    visit=row.visit,
+                    controller=row.controller,
+                    lead_beta=run.lead[0],
+                    beta=run.beta[0],
+                    amplitude=run.amplitude[0],
+                    qoc=qoc,
+                    random_lower_bound=bound,
+                )
+            )
+        return ReplayBuffer(self.settings, tuple(sessions), "uV", "table")
+
+    def data_days(self, rows: list[DataSession], seed: int) -> Days:
+        """Days of planned sessions."""
+        visits = np.array([row.visit for row in rows]) + 64 * seed
+        return visit_days(self.key, visits, np.array([row.hour for row in rows]))
+
+    def truth(self, policy: Policy, sessions: int = 300) -> Truth:
+        """True return on new days, each session on a day of its own."""
+        return _truth(self.settings, self.run(policy, new_days(self.key, 0, sessions), 0))
+
+    def truth_on_data_days(self, policy: Policy, sessions: int = 300, seed: int = 0, visits: int = VISITS) -> Truth:
+        """What the policy would have returned on the very days of `data(.., seed, visits)`, with other noise."""
+        days = self.data_days(visit_plan(self.settings, "paper", seed, visits), seed)
+        of = np.arange(sessions) % len(days.hours)
+        return _truth(self.settings, self.run(policy, Days(days.effects[of], days.hours[of]), _DATA_DAYS))
+
+    def candidates(self) -> dict[str, Policy]:
+        """The policies to be evaluated, the same ones whatever the data are."""
+        rng = np.random.default_rng([self.key, 0xCA4D])
+        return draw_candidates(rng, self.settings.xi_beta, self.spread, self.settings.window)
+
+
+@dataclass(frozen=True)
+class DataSession:
+    """One session of the data: visit, controller (`cdbs`, `random`, `no_dbs`), hour of the visit, amplitude of every step."""
+
+    visit: int
+    controller: str
+    hour: float
+    amplitudes: Floats
+
+
+def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int) -> list[DataSession]:
+    """Sessions of early visits in their order."""
+    laid = lay_out(
+        DesignSettings(
+            name="paper" if design == "paper" else "stratified",
+            visits=visits,
+            sessions=RANDOM_SESSIONS,
+            steps=STEPS,
+            period_s=settings.period_s,
+            lower_bound=settings.lower_bound,
+            ladder=design == "ladder",
+            seed=seed,
+        )
+    )
+    rows: list[DataSession] = []
+    for visit in range(1, visits + 1):
+        random = [("random", s.amplitudes) for s in laid if s.visit == visit]
+        cdbs, off = ("cdbs", np.ones(STEPS)), ("no_dbs", np.zeros(NO_DBS_STEPS))
+        slots = [cdbs, *random[:2], cdbs, *random[2:], off]
+        rows += [DataSession(visit, name, k * (STEPS * 2 / 3600 + PAUSE_H), a) for k, (name, a) in enumerate(slots)]
+    return rows
+
+
+@lru_cache(maxsize=256)
+def world(part: Part, index: int) -> World:
+    """World `index` of a part.
+
+    Raises:
+        ValueError: no such part, or an index outside it.
+    """
+    if part not in PARTS or not 0 <= index < WORLDS_PER_PART:
+        raise ValueError(f"there is no world {index} in part {part!r}: parts are A, B and C, indices 0 to {WORLDS_PER_PART - 1}")
+    kind, silent = mechanisms_of(part)[index]
+    rng = np.random.default_rng([PARTS[part], index, 0x776F])
+    patient = draw_patient(kind, rng, silent_beta=silent)
+    lower_bound = float(rng.choice((0.3, 0.3, 0.3, 0.4)))
+    weight = 0.0 if rng.random() < WITHOUT_END else 10.0
+    key = PARTS[part] * 1000 + index
+    days = new_days(key, _CALIBRATION, 100)
+    full, low = (simulate(patient, 1.0, ConstantPolicy(a), days=days, key=key, first=_CALIBRATION).beta for a in (1.0, 0.3))
+    settings = MdpSettings(xi_beta=float(full.mean() + low.mean()) / 2, c2=weight, c3=weight, c4=weight, lower_bound=lower_bound)
+    return World(part, index, patient, settings, float(np.concatenate([full, low]).std()), key)
+
+
+def mechanisms_of(part: str) -> list[tuple[int, bool]]:
+    """Mechanism and whether beta is silent, for every world of a part: the same numbers of each in every part, in an order of its own."""
+    others = [(kind, False) for kind in range(1, len(MECHANISMS))] * PER_OTHER_MECHANISM
+    graded = [(0, k < SILENT_BETA) for k in range(WORLDS_PER_PART - len(others))]
+    both = others + graded
+    return [both[i] for i in np.random.default_rng([PARTS[part], 0x6D65]).permutation(len(both))]
+
+
+def _truth(settings: MdpSettings, run: Sessions) -> Truth:
+    discount = settings.gamma ** np.arange(run.beta.shape[1])
+    steps = (step_reward(settings, run.beta, run.amplitude) * discount).sum(axis=1)
+    ends = end_rewards(settings, run.grasp_hz, run.rating, run.tremor_percent)
+    return Truth(
+        total=Mean.of(steps + ends),
+        step_return=Mean.of(steps),
+        end_reward=Mean.of(ends),
+        energy=Mean.of((run.amplitude**2).mean(axis=1)),
+        amplitude=Mean.of(run.amplitude.mean(axis=1)),
+        beta=Mean.of(run.beta.mean(axis=1)),
+        grasp_hz=Mean.of(run.grasp_hz),
+        rating=Mean.of(run.rating),
+        tremor_percent=Mean.of(run.tremor_percent),
+        returns=steps + ends,
+    )
+
+
+def end_rewards(settings: MdpSettings, grasp_hz: Floats, rating: Floats, tremor_percent: Floats) -> Floats:
+    """`ml.mdp.end_reward` of many sessions, [n]."""
+    tremor = tremor_percent / 100 if settings.tremor_as_fraction else tremor_percent
+    return np.asarray(settings.c2 * grasp_hz + settings.c3 * rating - settings.c4 * tremor)
+
+
+def within_margins(policy: Truth, cdbs: Truth) -> bool:
+    """Whether all three QoCs are truly no worse than under cDBS by more than the margins."""
+    return (
+        policy.grasp_hz.value >= (1 - GRASP_SHARE) * cdbs.grasp_hz.value
+        and policy.rating.value >= cdbs.rating.value - RATING_POINTS
+        and policy.tremor_percent.value <= cdbs.tremor_percent.value + TREMOR_POINTS
+    )
+
+
+def simple_policies(settings: MdpSettings, spread: float) -> dict[str, Policy]:
+    """Constants and proportional controllers that decide who is a responder."""
+    constants: dict[str, Policy] = {f"constant {a:.2f}": ConstantPolicy(a) for a in (0.4, 0.5, 0.6, 0.7, 0.8, 0.89)}
+    xi = settings.xi_beta
+    return constants | {
+        f"proportional {floor:.1f}": ProportionalPolicy(xi - 0.7 * spread, xi + 0.7 * spread, floor, settings.window)
+        for floor in (0.3, 0.5, 0.7)
+    }
+
+
+def is_responder(truths: Mapping[str, Truth], cdbs: Truth) -> bool:
+    """Whether one of these policies is truly within the margins and saves `ENERGY_SAVED` of the energy of cDBS."""
+    return any(t.energy.value <= (1 - ENERGY_SAVED) * cdbs.energy.value and within_margins(t, cdbs) for t in truths.values())
