@@ -1,0 +1,361 @@
+"""Simulated studies in which nothing is to be found, and studies at the margin: do the tests keep their level, do the intervals cover?
+
+    python benchmarks/null_studies.py --quick
+    python benchmarks/null_studies.py [--studies 2000] [--json FILE]
+
+A study is one participant's visits with sessions of one controller and of cDBS. Every scenario adds to the noise of sessions what visits bring: days
+that differ, a controller that does better on some days and worse on others (its average effect being what is tested), drift over the day,
+ties, arms of different size, missing values, arms on different visits. The paper's test (all sessions as independent) is printed beside the primary
+one. CPU seconds of one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ml.statistics.association import within_visits
+from ml.statistics.effects import cliffs_delta, energy_saving
+from ml.statistics.mixed_visits import linear_comparison, rating_comparison, tremor_comparison
+from ml.statistics.noninferiority import Inconclusive, NonInferiorAndSaving, Outcome, assess
+from ml.statistics.ranksum import rank_sum
+from ml.statistics.stratified import aligned_rank_test, shift_interval, van_elteren
+from ml.statistics.visits import Average, Measurements, Unavailable, average, primary, visit_contrasts
+
+out = sys.stdout.write
+ALPHA, LEVEL = 0.05, 0.95
+MINUTES = 10
+METRICS = ("grasp", "beta", "rating", "tremor", "energy")
+CONTINUOUS = ("grasp", "beta", "energy")
+RESOLUTION = {"rating": 1.0, "tremor": 100 / MINUTES}
+
+
+@dataclass(frozen=True)
+class World:
+    """One scenario.
+
+    Attributes:
+        visits, each: visits, and sessions of either arm at each.
+        day, slope: standard deviations of visits' levels and of the controller's effect between visits, in those of a session.
+        drift: change from the first to the last session of a visit, in the same.
+        design: `shuffled`, `alternating` (cDBS between any two), `cdbs_first` (alternating from cDBS on, so that the controller comes later),
+            `apart` (every visit has one arm), `uneven` (one to five sessions of either arm).
+        missing: share of values that are missing. heavy: noise of Student's t with 3 degrees of freedom.
+    """
+
+    visits: int = 5
+    each: int = 3
+    day: float = 1.5
+    slope: float = 0.0
+    drift: float = 0.0
+    design: str = "shuffled"
+    missing: float = 0.0
+    heavy: bool = False
+
+
+WORLDS = {
+    "plain": World(day=0.0),
+    "days": World(),
+    "days, 3 visits": World(visits=3),
+    "days, 8 visits": World(visits=8),
+    "days, 1 v 1": World(visits=6, each=1),
+    "day x dose": World(slope=1.0),
+    "day x dose, 3 visits": World(visits=3, slope=1.0),
+    "day x dose, 8 visits": World(visits=8, slope=1.0),
+    "strong day x dose": World(visits=6, slope=3.0),
+    "drift, shuffled": World(drift=2.0),
+    "drift, alternating": World(drift=2.0, design="alternating"),
+    "drift, cDBS first": World(drift=2.0, design="cdbs_first"),
+    "drift, cDBS first, 3": World(visits=3, drift=2.0, design="cdbs_first"),
+    "imbalance": World(visits=6, design="uneven"),
+    "imbalance, dose": World(visits=6, slope=1.0, design="uneven"),
+    "missing 30 %": World(each=4, missing=0.3),
+    "heavy tails": World(heavy=True),
+    "all of it": World(visits=6, slope=0.7, drift=1.0, design="uneven", missing=0.2, heavy=True),
+    "arms apart": World(visits=6, each=4, design="apart"),
+}
+
+
+def layout(world: World, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Visit, arm and place in the visit of every session."""
+    visit, tested, order = [], [], []
+    for v in range(world.visits):
+        if world.design == "apart":
+            arm = np.full(world.each, v % 2 == 1)
+        elif world.design == "uneven":
+            arm = rng.permutation(np.repeat([False, True], rng.integers(1, 6, 2)))
+        elif world.design == "alternating":
+            arm = np.resize([True, False], 2 * world.each - 1)
+        elif world.design == "cdbs_first":
+            arm = np.resize([False, True], 2 * world.each)
+        else:
+            arm = rng.permutation(np.repeat([False, True], world.each))
+        visit += [v] * arm.size
+        tested += arm.tolist()
+        order += range(arm.size)
+    return np.array(visit), np.array(tested, dtype=bool), np.array(order, dtype=float)
+
+
+def latent(world: World, effect: float, rng: np.random.Generator, design: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    """What a continuous metric is made of, in standard deviations of a session."""
+    visit, tested, order = design
+    noise = rng.standard_t(3, visit.size) / np.sqrt(3) if world.heavy else rng.standard_normal(visit.size)
+    last = np.array([max(order[visit == v].max(), 1) for v in visit])
+    level = world.day * rng.standard_normal(world.visits)
+    slope = effect + world.slope * rng.standard_normal(world.visits)
+    return level[visit] + slope[visit] * tested + world.drift * order / last + noise
+
+
+def measure(metric: str, z: np.ndarray, design: tuple[np.ndarray, np.ndarray, np.ndarray], world: World, rng: np.random.Generator):
+    """A metric of the study; symmetric in its latent value, so that a null of the latent value is one of the metric."""
+    visit, tested, order = design
+    value = {
+        "grasp": lambda: 2.3 + 0.15 * z,
+        "beta": lambda: 1.0 + 0.12 * z,
+        "rating": lambda: np.clip(np.round(7 + 0.8 * z), 1, 10),
+        "tremor": lambda: 100 * rng.binomial(MINUTES, 1 / (1 + np.exp(1.5 - 0.8 * z))) / MINUTES,
+        "energy": lambda: 1.0 + 0.05 * z,
+    }[metric]()
+    value = np.where(rng.random(value.size) < world.missing, np.nan, value)
+    return Measurements.of(value, visit, tested, order=order, resolution=RESOLUTION.get(metric, 0.0))
+
+
+def naive(data: Measurements) -> tuple[bool | None, bool | None]:
+    """The paper's test of all sessions: rejected, and whether its interval covers no difference."""
+    known = data.measured()
+    x, y = known.value[known.tested], known.value[~known.tested]
+    if not x.size or not y.size:
+        return None, None
+    result = rank_sum(x, y, LEVEL)
+    return result.p_value < ALPHA, result.low <= 0 <= result.high
+
+
+class Tally:
+    """Shares of studies, each with its number."""
+
+    def __init__(self) -> None:
+        self.counts: dict[tuple[str, ...], list[int]] = {}
+
+    def add(self, key: tuple[str, ...], hit: bool | None) -> None:
+        if hit is not None:
+            cell = self.counts.setdefault(key, [0, 0])
+            cell[0] += int(hit)
+            cell[1] += 1
+
+    def share(self, *key: str) -> tuple[float, int]:
+        hits, number = self.counts.get(key, [0, 0])
+        return (hits / number if number else float("nan")), number
+
+
+def within_two_errors(share: float, number: int, level: float = ALPHA) -> bool:
+    """Whether a rate is no higher than its level by more than two Monte Carlo standard errors."""
+    return share <= level + 2 * np.sqrt(level * (1 - level) / number)
+
+
+def null_studies(studies: int, tally: Tally) -> None:
+    """Every scenario with no average effect."""
+    for name, world in WORLDS.items():
+        rng = np.random.default_rng(sum(map(ord, name)))
+        for study in range(studies):
+            design = layout(world, rng)
+            for metric in METRICS:
+                data = measure(metric, latent(world, 0.0, rng, design), design, world, rng)
+                one_null(name, metric, data, tally, study, thorough=study < studies // 5)
+
+
+def one_null(name: str, metric: str, data: Measurements, tally: Tally, seed: int, *, thorough: bool) -> None:
+    """All tests of one metric; `thorough` adds the slower ones."""
+    found = primary(data, LEVEL)
+    shown = isinstance(found, Average)
+    tally.add((name, metric, "available"), shown)
+    # A study that gives no evidence rejects nothing.
+    tally.add((name, metric, "primary"), shown and found.p_value < ALPHA)
+    tally.add((name, metric, "primary cover"), found.low <= 0 <= found.high if shown else None)
+    plain, plain_cover = naive(data)
+    tally.add((name, metric, "naive"), plain)
+    tally.add((name, metric, "naive cover"), plain_cover)
+    for label, test in (("van elteren", van_elteren(data)), ("aligned", aligned_rank_test(data))):
+        tally.add((name, metric, label), None if isinstance(test, Unavailable) else test.p_value < ALPHA)
+    delta = cliffs_delta(data, LEVEL)
+    tally.add((name, metric, "delta cover"), delta.low <= 0 <= delta.high if isinstance(delta, Average) else None)
+    if metric == "energy":
+        saved = energy_saving(data, LEVEL, draws=999, seed=seed)
+        tally.add((name, metric, "saving cover"), None if isinstance(saved, Unavailable) else saved.low <= 0 <= saved.high)
+    if metric == "beta":  # against a metric that has nothing to do with it
+        x = np.random.default_rng(seed).standard_normal(data.value.size)
+        link = within_visits(x, data.value, data.visit, LEVEL)
+        tally.add((name, metric, "slope cover"), None if isinstance(link, Unavailable) else link.low <= 0 <= link.high)
+    if thorough:
+        shift = shift_interval(data, LEVEL)
+        tally.add((name, metric, "shift cover"), None if isinstance(shift, Unavailable) else shift.low <= 0 <= shift.high)
+        model = mixed(metric, data)
+        tally.add((name, metric, "mixed cover"), None if model is None else model.low <= 0 <= model.high)
+
+
+def mixed(metric: str, data: Measurements) -> Average | None:
+    """The effect of the mixed model that the metric calls for."""
+    if metric == "rating":
+        found = rating_comparison(data)
+    elif metric == "tremor":
+        counts = Measurements.of(np.round(data.value * MINUTES / 100), data.visit, data.tested)
+        found = tremor_comparison(counts, np.where(np.isfinite(data.value), float(MINUTES), 0.0))
+    else:
+        found = linear_comparison(data)
+    return None if isinstance(found, Unavailable) else found.effect
+
+
+MARGINS = {"grasp": 0.2, "rating": 0.2, "tremor": 15.0}
+"""Hz; probability; per cent."""
+
+
+def margin_studies(studies: int, tally: Tally) -> None:
+    """Grasp exactly at its margin, or everything equal to cDBS; energy saved by a third."""
+    for visits in (1, 2, 3, 4, 6, 8, 12):
+        for slope in (0.0, 0.5):
+            for stops in (0.0, 0.05):
+                for at_margin in (True, False):
+                    world = World(visits=visits, each=4, slope=slope)
+                    rng = np.random.default_rng(visits)
+                    for study in range(studies):
+                        verdict = judged(world, at_margin, stops, rng, study)
+                        key = (f"{visits} visits", f"day x dose {slope:g}", f"stopped {stops:.0%}", "at margin" if at_margin else "equal")
+                        tally.add((*key, "non-inferior"), verdict[0])
+                        tally.add((*key, "and saving"), verdict[1])
+
+
+def judged(world: World, at_margin: bool, stops: float, rng: np.random.Generator, seed: int) -> tuple[bool, bool]:
+    """Whether non-inferiority is shown, and whether the saving is shown too."""
+    design = layout(world, rng)
+    visit, tested, order = design
+    stopped = (rng.random(visit.size) < stops) & tested
+    small = World(visits=world.visits, each=world.each, day=1.0, slope=world.slope)
+    data = {m: measure(m, latent(small, 0.0, rng, design), design, small, rng) for m in MARGINS}
+    if at_margin:
+        moved = data["grasp"].value - MARGINS["grasp"] * tested
+        data["grasp"] = Measurements.of(moved, visit, tested, order=order)
+    outcomes = [
+        Outcome("grasp", data["grasp"], stopped, MARGINS["grasp"], True),
+        Outcome("rating", data["rating"], stopped, MARGINS["rating"], True, "win_probability", 1.0),
+        Outcome("tremor", data["tremor"], stopped, MARGINS["tremor"], False, "difference", 100.0),
+    ]
+    energy = np.where(tested, 0.65, 1.0) + np.where(tested, 0.05, 0.01) * rng.standard_normal(visit.size)
+    result = assess(outcomes, Measurements.of(energy, visit, tested), stopped, alpha=ALPHA, seed=seed, plan=False)
+    saving = isinstance(result.verdict, NonInferiorAndSaving)
+    shown = saving or (isinstance(result.verdict, Inconclusive) and result.verdict.open == ("energy",))
+    return shown, saving
+
+
+def power_studies(studies: int, tally: Tally) -> None:
+    """Power of the primary test, of the exact one within visits and of the paper's, for an effect of one standard deviation of a session."""
+    for visits in (3, 4, 6, 8):
+        for slope in (0.0, 0.5):
+            world, rng = World(visits=visits, each=4, slope=slope), np.random.default_rng(visits)
+            for _ in range(studies):
+                design = layout(world, rng)
+                data = measure("grasp", latent(world, 1.0, rng, design), design, world, rng)
+                key = f"{visits} visits, day x dose {slope:g}"
+                found, exact = primary(data, LEVEL), van_elteren(data)
+                tally.add((key, "primary"), isinstance(found, Average) and found.p_value < ALPHA)
+                tally.add((key, "van elteren"), not isinstance(exact, Unavailable) and exact.p_value < ALPHA)
+                tally.add((key, "naive"), naive(data)[0])
+
+
+def degenerate() -> int:
+    """Studies that hold nothing to test: how many got an answer other than a typed one. Any crash ends the benchmark."""
+    visit, arms = np.repeat(np.arange(5), 4), np.tile([False, True], 10)
+    nan = np.full(20, np.nan)
+    cases = {
+        "all tied": Measurements.of(np.ones(20), visit, arms),
+        "one session": Measurements.of([1.0], [1], [True]),
+        "nothing": Measurements.of([], [], []),
+        "no value": Measurements.of(nan, visit, arms),
+        "one visit": Measurements.of(np.arange(20.0), np.zeros(20), arms),
+        "one arm": Measurements.of(np.arange(20.0), visit, np.zeros(20)),
+        "arms apart": Measurements.of(np.arange(20.0), visit, visit % 2 == 0),
+    }
+    wrong = 0
+    for data in cases.values():
+        answers = [average(visit_contrasts(data)), primary(data), cliffs_delta(data), energy_saving(data), linear_comparison(data)]
+        typed = isinstance(answers[1], Unavailable) and isinstance(answers[4], Unavailable)
+        wrong += not typed
+    return wrong
+
+
+def show_null(tally: Tally, studies: int) -> dict[str, float]:
+    """The table of null studies and its worst cells."""
+    out(f"null studies, {studies} of each scenario; share rejected at {ALPHA:g} (worst metric), intervals of {LEVEL:g} (lowest-highest metric)\n")
+    labels = ("primary", "van elteren", "aligned", "naive")
+    out(f"{'':<24}" + "".join(f"{label:>12}" for label in labels) + f"{'cover':>14}{'delta':>14}{'mixed':>14}{'shift':>14}{'naive':>14}\n")
+    worst, level_kept = 0.0, True
+    coverage: dict[str, list[float]] = {"low": [], "high": []}
+    for name, world in WORLDS.items():
+        cells = [max((tally.share(name, m, label)[0] for m in METRICS), default=float("nan")) for label in labels]
+        out(f"{name:<24}" + "".join(f"{c:>12.3f}" for c in cells))
+        for label in ("primary", "delta", "mixed", "shift", "naive"):
+            shares = [s for m in METRICS for s, n in [tally.share(name, m, f"{label} cover")] if n]
+            out(f"{f'{min(shares):.3f}-{max(shares):.3f}' if shares else '-':>14}")
+        out("\n")
+        for metric in METRICS:
+            share, number = tally.share(name, metric, "primary")
+            worst = max(worst, share)
+            level_kept &= within_two_errors(share, number)
+            for label in ("primary cover", "saving cover", "slope cover"):
+                cover, found = tally.share(name, metric, label)
+                if found:
+                    coverage["low"].append(cover)
+                    if metric in CONTINUOUS and world.visits >= 5:
+                        coverage["high"].append(cover)
+    out("saving (energy) and within-visit slope (beta), coverage: ")
+    out(", ".join(f"{n}: {tally.share(n, 'energy', 'saving cover')[0]:.3f} {tally.share(n, 'beta', 'slope cover')[0]:.3f}" for n in WORLDS) + "\n\n")
+    return {
+        "worst_primary_type1": worst,
+        "primary_level_kept": float(level_kept),
+        "coverage_low": min(coverage["low"]),
+        "coverage_high": max(coverage["high"]),
+    }
+
+
+def show_margin(tally: Tally) -> dict[str, float]:
+    """Non-inferiority at the margin and where nothing is lost."""
+    out("non-inferiority shown: grasp exactly at its margin (an error) | nothing lost (power), of it with the saving shown\n")
+    worst, few = 0.0, 0.0
+    for key in sorted({k[:3] for k in tally.counts if k[0].endswith("visits") and len(k) == 5}, key=lambda k: (int(k[0].split()[0]), k)):
+        wrong = tally.share(*key, "at margin", "non-inferior")[0]
+        right, saving = (tally.share(*key, "equal", label)[0] for label in ("non-inferior", "and saving"))
+        worst = max(worst, wrong)
+        if int(key[0].split()[0]) < 3:
+            few = max(few, wrong, right)
+        out(f"  {', '.join(key):<42}{wrong:>8.3f} |{right:>8.3f}{saving:>8.3f}\n")
+    return {"non_inferior_at_margin": worst, "non_inferior_below_three_visits": few}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="150 studies of each scenario")
+    parser.add_argument("--studies", type=int, default=2000)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    studies = 150 if arguments.quick else arguments.studies
+    start = time.process_time()
+    tally = Tally()
+    null_studies(studies, tally)
+    margin_studies(studies // 2, tally)
+    power_studies(studies // 4, tally)
+    figures = show_null(tally, studies) | show_margin(tally) | {"degenerate_answers_wrong": float(degenerate())}
+    out("\npower for an effect of one standard deviation of a session, 4 sessions of either arm a visit: primary, van Elteren, the paper's\n")
+    for key in dict.fromkeys(k[0] for k in tally.counts if len(k) == 2):
+        out(f"  {key:<28}" + "".join(f"{tally.share(key, label)[0]:>8.3f}" for label in ("primary", "van elteren", "naive")) + "\n")
+    figures["cpu_s"] = time.process_time() - start
+    out(json.dumps(figures, indent=1) + "\n")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
