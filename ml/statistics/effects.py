@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.statistics.bootstrap import resamples
-from ml.statistics.visits import Average, Measurements, Reason, Unavailable, VisitContrasts, average, visit_contrasts
+from ml.statistics.visits import Average, Measurements, Reason, Unavailable, VisitContrasts, average, primary, visit_contrasts
 
 Floats = NDArray[np.float64]
 
@@ -48,9 +48,9 @@ def cliffs_delta(data: Measurements, level: float = 0.95) -> Average | Unavailab
     """Cliff's delta within visits: how much more often the controller's value is the higher one than the lower one (Cliff 1993).
 
     Returns:
-        The average over visits, between -1 and 1 with its interval cut there; or why there is none, as in `visits.average`.
+        The average over visits, between -1 and 1 with its interval cut there; or why there is none, as in `visits.primary`.
     """
-    wins = average(visit_contrasts(data, "win_probability"), level)
+    wins = primary(data, level, "win_probability")
     if isinstance(wins, Unavailable):
         return wins
     low, high = max(-1.0, 2 * wins.low - 1), min(1.0, 2 * wins.high - 1)
@@ -69,7 +69,7 @@ def saving_contrasts(energy: Measurements) -> VisitContrasts | Unavailable:
     plain = visit_contrasts(energy)
     if isinstance(plain, Unavailable):
         return plain
-    means = np.array([p.value[~p.tested].mean() for p in energy.by_visit()])
+    means = np.array([energy.value[two].mean() for _, _, two in energy.arms])
     if not (means > 0).all():
         return Unavailable(Reason.NOT_IDENTIFIED)
     return replace(plain, contrast=-plain.contrast / means, floor=plain.floor / means**2)

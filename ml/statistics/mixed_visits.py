@@ -69,9 +69,8 @@ def linear_comparison(data: Measurements, policy: Integers | None = None, level:
     if scale <= 1e-12 * max(1.0, float(np.abs(prepared.data.value).max())):
         return Unavailable(Reason.NO_VARIANCE)
     found = MixedModel(design.shape[1], prepared.groups, {}).restricted(Sums.of(design, y / scale))
-    effect = student(
-        scale * found.coefficients[EFFECT], scale**2 * found.covariance[EFFECT, EFFECT], prepared.contrasts, level, Adjustment.NONE
-    )
+    estimate, variance = scale * float(found.coefficients[EFFECT]), scale**2 * float(found.covariance[EFFECT, EFFECT])
+    effect = student(estimate, variance, prepared.contrasts, level, Adjustment.NONE)
     if isinstance(effect, Unavailable):
         return effect
     session_sd = scale * float(np.sqrt(found.variance))
@@ -114,7 +113,7 @@ def tremor_comparison(
         return prepared
     total = minutes[watched][prepared.rows]
     count = prepared.data.value
-    if count.sum() <= 0 or count.sum() >= total.sum():
+    if (count == 0).all() or (count == total).all():
         return Unavailable(Reason.NO_VARIANCE)
     q = prepared.design.shape[1]
     design = np.concatenate([prepared.design, np.eye(count.size)], axis=1)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ml.statistics.effects import Saving, energy_saving, saving_contrasts
 from ml.statistics.multiplicity import holm
 from ml.statistics.power import MOST_VISITS, Posterior, Target, first_reaching, posterior, success
-from ml.statistics.visits import Average, Measurements, Reason, Scale, Unavailable, VisitContrasts, average, visit_contrasts
+from ml.statistics.visits import Average, Measurements, Reason, Scale, Unavailable, primary
 
 Floats = NDArray[np.float64]
 
@@ -216,12 +216,11 @@ def counted_energy(energy: Measurements, stopped: NDArray[np.bool_], rule: Failu
 
 def _outcome(outcome: Outcome, rule: FailureRule, level: float) -> OutcomeResult:
     counted = outcome.counted(rule)
-    contrasts = visit_contrasts(counted, outcome.scale)
     found: Average | Unavailable
-    if isinstance(contrasts, VisitContrasts) and contrasts.visits < LEAST_VISITS:
-        found = Unavailable(Reason.TOO_FEW_VISITS, contrasts.visits, LEAST_VISITS)
+    if len(counted.arms) in range(1, LEAST_VISITS):
+        found = Unavailable(Reason.TOO_FEW_VISITS, len(counted.arms), LEAST_VISITS)
     else:
-        found = average(contrasts, level)
+        found = primary(counted, level, outcome.scale)
     failures = int(np.sum(outcome.stopped & outcome.data.tested))
     missing = int(np.sum(~np.isfinite(counted.value)))
     if isinstance(found, Unavailable):
@@ -271,7 +270,7 @@ def _energy_posterior(energy: Measurements, seed: int) -> Posterior | Unavailabl
     if isinstance(shares, Unavailable):
         return shares
     value = np.full(energy.value.shape, np.nan)
-    for part in energy.by_visit():
-        rows = energy.visit == part.visit[0]
-        value[rows] = -energy.value[rows] / part.value[~part.tested].mean()
+    for visit, _, two in energy.arms:
+        rows = energy.visit == visit
+        value[rows] = -energy.value[rows] / energy.value[two].mean()
     return posterior(replace(energy, value=value), seed=seed)

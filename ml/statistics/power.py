@@ -165,5 +165,5 @@ def _within(data: Measurements, contrasts: VisitContrasts, scale: Scale) -> tupl
     if scale == "win_probability":
         # The Mann-Whitney variance of U / (n m) is (n + m + 1) / (12 n m), that is 1/12 (1/n + 1/m) but for the third of its terms.
         return KNOWN_DEGREES / 12, KNOWN_DEGREES
-    arms = [arm for p in data.by_visit() for arm in (p.value[p.tested], p.value[~p.tested])]
+    arms = [data.value[rows] for _, one, two in data.arms for rows in (one, two)]
     return float(sum(np.sum((a - a.mean()) ** 2) for a in arms)), int(contrasts.n_tested.sum() + contrasts.n_cdbs.sum()) - len(arms)

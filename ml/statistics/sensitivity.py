@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ml.statistics.visits import (
     Adjustment,
     Average,
+    Floats,
+    Integers,
     Measurements,
     Reason,
     Unavailable,
@@ -18,8 +19,6 @@ from ml.statistics.visits import (
     average,
     visit_contrasts,
 )
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -77,10 +76,10 @@ def bracketed(data: Measurements, level: float = 0.95) -> Average | Unavailable:
     if isinstance(contrasts, Unavailable):
         return contrasts
     visits, found, n_tested, n_cdbs = [], [], [], []
-    for part in data.by_visit():
-        differences, used = _against_neighbours(part)
+    for visit, one, two in data.arms:
+        differences, used = _against_neighbours(data.value, data.order, one, two)
         if differences:
-            visits.append(int(part.visit[0]))
+            visits.append(visit)
             found.append(float(np.mean(differences)))
             n_tested.append(len(differences))
             n_cdbs.append(len(used))
@@ -102,16 +101,16 @@ def _after_tested(data: Measurements) -> Floats:
     return after
 
 
-def _against_neighbours(part: Measurements) -> tuple[list[float], set[int]]:
+def _against_neighbours(value: Floats, order: Floats, one: Integers, two: Integers) -> tuple[list[float], set[int]]:
     """Differences of the bracketed sessions of a visit from their neighbours, and which cDBS sessions were used."""
-    order = np.asarray(part.order)
-    cdbs = np.flatnonzero(~part.tested & np.isfinite(order))
-    differences, used = [], set()
-    for i in np.flatnonzero(part.tested & np.isfinite(order)):
+    cdbs = two[np.isfinite(order[two])]
+    differences: list[float] = []
+    used: set[int] = set()
+    for i in one[np.isfinite(order[one])]:
         before, after = cdbs[order[cdbs] < order[i]], cdbs[order[cdbs] > order[i]]
         if before.size and after.size:
             b, a = int(before[np.argmax(order[before])]), int(after[np.argmin(order[after])])
             nearness = (order[i] - order[b]) / (order[a] - order[b])
-            differences.append(float(part.value[i] - (1 - nearness) * part.value[b] - nearness * part.value[a]))
+            differences.append(float(value[i] - (1 - nearness) * value[b] - nearness * value[a]))
             used |= {a, b}
     return differences, used

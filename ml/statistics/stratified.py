@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from ml.statistics.ranksum import u_distribution, u_distribution_given_ties
-from ml.statistics.visits import Measurements, Reason, Unavailable
+from ml.statistics.visits import Measurements, Unavailable
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -173,12 +173,7 @@ class _Stratum:
 
 
 def _strata(data: Measurements) -> list[tuple[Floats, Floats]] | Unavailable:
-    parts = data.by_visit()
-    if not parts:
-        known = data.measured()
-        empty = not known.tested.any() or known.tested.all()
-        return Unavailable(Reason.NO_SESSION if empty else Reason.NO_VISIT_WITH_BOTH_ARMS, 0, 1)
-    return [(p.value[p.tested], p.value[~p.tested]) for p in parts]
+    return [(data.value[one], data.value[two]) for _, one, two in data.arms] or data.no_evidence()
 
 
 def _weights(strata: Sequence[tuple[Floats, Floats]]) -> list[int]:

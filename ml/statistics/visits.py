@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -128,16 +129,24 @@ class Measurements:
             self.resolution,
         )
 
-    def measured(self) -> Measurements:
-        """The sessions that have a value."""
-        known = np.isfinite(self.value)
-        return self if known.all() else self.take(known)
+    @cached_property
+    def arms(self) -> tuple[tuple[int, Integers, Integers], ...]:
+        """Of every visit with both arms: its number, and the rows of the measured sessions of the controller and of cDBS."""
+        known = np.flatnonzero(np.isfinite(self.value))
+        known = known[np.argsort(self.visit[known], kind="stable")]
+        starts = np.flatnonzero(np.diff(self.visit[known], prepend=np.nan)) if known.size else known
+        found = []
+        for rows in np.split(known, starts[1:]):
+            tested = self.tested[rows]
+            if tested.any() and not tested.all():
+                found.append((int(self.visit[rows[0]]), rows[tested], rows[~tested]))
+        return tuple(found)
 
-    def by_visit(self) -> list[Measurements]:
-        """The measured sessions of every visit that has both arms, by visit number."""
-        known = self.measured()
-        parts = [known.take(known.visit == v) for v in np.unique(known.visit)]
-        return [p for p in parts if p.tested.any() and not p.tested.all()]
+    def no_evidence(self) -> Unavailable:
+        """Why no visit has both arms."""
+        tested = self.tested[np.isfinite(self.value)]
+        one_arm = not tested.any() or tested.all()
+        return Unavailable(Reason.NO_SESSION if one_arm else Reason.NO_VISIT_WITH_BOTH_ARMS, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -207,12 +216,9 @@ def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitCon
     Returns:
         The contrasts, or why there is none: no session of an arm, or no visit with both.
     """
-    parts = data.by_visit()
-    if not parts:
-        known = data.measured()
-        empty = not known.tested.any() or known.tested.all()
-        return Unavailable(Reason.NO_SESSION if empty else Reason.NO_VISIT_WITH_BOTH_ARMS, 0, 1)
-    pairs = [(p.value[p.tested], p.value[~p.tested]) for p in parts]
+    if not data.arms:
+        return data.no_evidence()
+    pairs = [(data.value[one], data.value[two]) for _, one, two in data.arms]
     n_tested = np.array([x.size for x, _ in pairs], dtype=np.int64)
     n_cdbs = np.array([y.size for _, y in pairs], dtype=np.int64)
     if scale == "difference":
@@ -223,7 +229,7 @@ def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitCon
         contrast = np.array([win_probability(x, y) for x, y in pairs])
         # A visit tells the probability no finer than by half a pair.
         floor = (0.5 / (n_tested * n_cdbs)) ** 2
-    visits = np.array([p.visit[0] for p in parts], dtype=np.int64)
+    visits = np.array([v for v, _, _ in data.arms], dtype=np.int64)
     return VisitContrasts(visits, contrast, n_tested, n_cdbs, floor, 0.0 if scale == "difference" else 0.5)
 
 
@@ -272,16 +278,16 @@ def order_imbalance(data: Measurements) -> float | None:
     if data.order is None:
         return None
     found = []
-    for part in data.by_visit():
-        place = np.asarray(part.order)
-        spread = float(place.std())
+    for _, one, two in data.arms:
+        first, second = data.order[one], data.order[two]
+        spread = float(np.concatenate([first, second]).std())
         if not np.isfinite(spread):
             return None
-        found.append((place[part.tested].mean() - place[~part.tested].mean()) / spread if spread > 0 else 0.0)
+        found.append((first.mean() - second.mean()) / spread if spread > 0 else 0.0)
     return float(np.mean(found)) if found else None
 
 
-def primary(data: Measurements, level: float = 0.95) -> Average | Unavailable:
+def primary(data: Measurements, level: float = 0.95, scale: Scale = "difference") -> Average | Unavailable:
     """The primary comparison: the average over visits, adjusted for the order where the design puts one arm later than the other.
 
     Returns:
@@ -290,20 +296,23 @@ def primary(data: Measurements, level: float = 0.95) -> Average | Unavailable:
     """
     imbalance = order_imbalance(data)
     if imbalance is not None and abs(imbalance) > UNBALANCED:
-        adjusted = adjusted_average(data, [np.asarray(data.order)], Adjustment.ORDER, level)
+        adjusted = adjusted_average(data, [np.asarray(data.order)], Adjustment.ORDER, level, scale)
         if isinstance(adjusted, Average):
             return adjusted
-    return average(visit_contrasts(data), level)
+    return average(visit_contrasts(data, scale), level)
 
 
-def adjusted_average(data: Measurements, covariates: list[Floats], adjustment: Adjustment, level: float = 0.95) -> Average | Unavailable:
+def adjusted_average(
+    data: Measurements, covariates: list[Floats], adjustment: Adjustment, level: float = 0.95, scale: Scale = "difference"
+) -> Average | Unavailable:
     """Average over visits of contrasts freed from covariates whose slopes are common to all visits and arms.
 
     The slopes come from what varies within one arm of one visit. They tie the contrasts of the visits together, so that the variance is
-    that of leaving out one visit at a time (the cluster jackknife, CV3 of MacKinnon, Nielsen and Webb 2023).
+    that of leaving out one visit at a time, slopes included (the cluster jackknife, CV3 of MacKinnon, Nielsen and Webb 2023).
 
     Args:
         data: sessions of both arms. covariates: each [n], as `data`; sessions with an unknown one are left out.
+        scale: as in `visit_contrasts`, of the values less what the covariates explain.
 
     Returns:
         The average, or why there is none: as in `average`, or slopes that the sessions do not identify.
@@ -311,32 +320,41 @@ def adjusted_average(data: Measurements, covariates: list[Floats], adjustment: A
     known = np.isfinite(data.value) & np.all(np.isfinite(covariates), axis=0)
     table = np.column_stack([c[known] for c in covariates])
     kept = data.take(known)
-    contrasts = visit_contrasts(kept)
+    contrasts = visit_contrasts(kept, scale)
     if isinstance(contrasts, Unavailable):
         return contrasts
-    if contrasts.visits < 2:
-        return Unavailable(Reason.TOO_FEW_VISITS, contrasts.visits, 2)
-    # Of each visit: its covariates' contrast, and the sums of squares and products within its arms.
-    shifts, grams, moments = [], [], []
-    for v in contrasts.visit:
-        mine = kept.visit == v
-        one, two = mine & kept.tested, mine & ~kept.tested
-        shifts.append(table[one].mean(0) - table[two].mean(0))
+    n = contrasts.visits
+    if n < 2:
+        return Unavailable(Reason.TOO_FEW_VISITS, n, 2)
+    slopes = _common_slopes(kept, table)
+    if slopes is None:
+        return Unavailable(Reason.NOT_IDENTIFIED)
+    # Contrasts [V + 1, V]: with the slopes of all visits, and with those of all but one.
+    if scale == "difference":
+        shift = np.array([table[one].mean(0) - table[two].mean(0) for _, one, two in kept.arms])
+        freed = contrasts.contrast - slopes @ shift.T
+    else:
+        values = kept.value - slopes @ table.T
+        freed = np.array([[win_probability(row[one], row[two]) for _, one, two in kept.arms] for row in values])
+    estimate = float(freed[0].mean())
+    without = (freed[1:].sum(1) - np.diag(freed[1:])) / (n - 1)
+    variance = (n - 1) / n * float(np.sum((without - without.mean()) ** 2))
+    return student(estimate, max(variance, float(contrasts.floor.mean()) / n), contrasts, level, adjustment)
+
+
+def _common_slopes(data: Measurements, table: Floats) -> Floats | None:
+    """Slopes on covariates [n, c] within arms of visits, of all visits and without each, [V + 1, c]; None where they are not identified."""
+    grams, moments = [], []
+    for _, one, two in data.arms:
         centred = np.concatenate([table[arm] - table[arm].mean(0) for arm in (one, two)])
-        values = np.concatenate([kept.value[arm] - kept.value[arm].mean() for arm in (one, two)])
+        values = np.concatenate([data.value[arm] - data.value[arm].mean() for arm in (one, two)])
         grams.append(centred.T @ centred)
         moments.append(centred.T @ values)
-    shift, gram, moment = np.array(shifts), np.array(grams), np.array(moments)
+    gram, moment = np.array(grams), np.array(moments)
     totals = np.concatenate([gram.sum(0)[None], gram.sum(0) - gram])
-    if min(_smallest_share(g, gram.sum(0)) for g in totals) < 1e-6:
-        return Unavailable(Reason.NOT_IDENTIFIED)
-    slopes = np.linalg.solve(totals, np.concatenate([moment.sum(0)[None], moment.sum(0) - moment])[..., None])[..., 0]
-    n = contrasts.visits
-    estimate = contrasts.contrast.mean() - shift.mean(0) @ slopes[0]
-    without = (contrasts.contrast.sum() - contrasts.contrast) / (n - 1) - np.sum((shift.sum(0) - shift) / (n - 1) * slopes[1:], axis=1)
-    variance = (n - 1) / n * float(np.sum((without - without.mean()) ** 2))
-    variance = max(variance, float(contrasts.floor.mean()) / n)
-    return student(float(estimate), variance, contrasts, level, adjustment)
+    if min(_smallest_share(g, totals[0]) for g in totals) < 1e-6:
+        return None
+    return np.asarray(np.linalg.solve(totals, np.concatenate([moment.sum(0)[None], moment.sum(0) - moment])[..., None])[..., 0])
 
 
 def _smallest_share(gram: Floats, whole: Floats) -> float:
