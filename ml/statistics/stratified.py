@@ -131,8 +131,9 @@ def shift_interval(data: Measurements, level: float = 0.95, *, seed: int = 0) ->
     weights = _weights(strata)
     pairs = [np.subtract.outer(x, y).ravel() for x, y in strata]
     differences, mass = np.concatenate(pairs), np.repeat(np.array(weights, dtype=np.float64), [p.size for p in pairs])
-    knots = _distinct(differences)
-    inversion = _Inversion(strata, weights, knots, (1 - level) / 2, seed)
+    if all(np.unique(arm).size == arm.size for pair in strata for arm in pair):
+        return _untied_interval(strata, weights, differences, mass, level, seed)
+    inversion = _Inversion(strata, weights, _distinct(differences), (1 - level) / 2, seed)
     low, high = inversion.end(upper=False), inversion.end(upper=True)
     return ShiftInterval(_weighted_median(differences, mass), low, high, level, inversion.method)
 
@@ -220,7 +221,9 @@ def _test(parts: Sequence[_Stratum], weights: Sequence[int], strata: Sequence[tu
     sizes = len(strata), sum(x.size for x, _ in strata), sum(y.size for _, y in strata)
     expected = float(sum(w * (p.scores.mean() * p.n_tested - p.lowest) for w, p in zip(weights, parts, strict=True)))
     if length > LARGEST_LATTICE or max(p.cost for p in parts) > LARGEST_TABLE:
-        greater, less = _drawn(parts, weights, observed, seed)
+        # The data count as one of the shufflings, which keeps the level.
+        drawn = _draws(parts, weights, seed)
+        greater, less = (1 + int(np.sum(drawn >= observed))) / (DRAWS + 1), (1 + int(np.sum(drawn <= observed))) / (DRAWS + 1)
         method, draws = Method.MONTE_CARLO, DRAWS
     else:
         null = _convolve([p.distribution() for p in parts], weights)
@@ -252,14 +255,14 @@ def _convolve(distributions: Sequence[Floats], weights: Sequence[int]) -> Floats
     return np.maximum(irfft(product, padded)[:length], 0.0)
 
 
-def _drawn(parts: Sequence[_Stratum], weights: Sequence[int], observed: int, seed: int) -> tuple[float, float]:
-    """One-sided p-values of random shufflings; the data count as one of them, which keeps the level."""
+def _draws(parts: Sequence[_Stratum], weights: Sequence[int], seed: int) -> Integers:
+    """The statistic of random shufflings, [DRAWS]."""
     rng = np.random.default_rng(seed)
-    total = np.zeros(DRAWS)
+    total = np.zeros(DRAWS, dtype=np.int64)
     for part, weight in zip(parts, weights, strict=True):
         shuffled = rng.permuted(np.tile(part.scores, (DRAWS, 1)), axis=1)
         total += weight * (shuffled[:, : part.n_tested].sum(1) - part.lowest)
-    return (1 + int(np.sum(total >= observed))) / (DRAWS + 1), (1 + int(np.sum(total <= observed))) / (DRAWS + 1)
+    return total
 
 
 def _distinct(values: Floats) -> Floats:
@@ -278,13 +281,39 @@ def _weighted_median(values: Floats, mass: Floats) -> float:
     return float((values[order[low]] + values[order[min(high, values.size - 1)]]) / 2)
 
 
+def _untied_interval(
+    strata: Sequence[tuple[Floats, Floats]], weights: Sequence[int], differences: Floats, mass: Floats, level: float, seed: int
+) -> ShiftInterval:
+    """The interval where no arm of a visit holds a value twice: the distribution is the same at every shift between two differences.
+
+    A shift that passes a difference of visit v takes 2 w_v off the statistic, so that the ends are differences counted off from outside.
+    """
+    order = np.argsort(differences, kind="stable")
+    ordered = np.concatenate([[-np.inf], differences[order], [np.inf]])
+    steps = 2 * np.cumsum(np.concatenate([[0.0], mass[order]])).astype(np.int64)
+    # Any values without a tie have the distribution.
+    ranked = [_wilcoxon(np.arange(float(x.size)), x.size + np.arange(float(y.size))) for x, y in strata]
+    tail = (1 - level) / 2 + ROUNDING
+    estimate = _weighted_median(differences, mass)
+    if int(steps[-1]) >= LARGEST_LATTICE or max(p.cost for p in ranked) > LARGEST_TABLE:
+        drawn = np.sort(_draws(ranked, weights, seed))
+        below = (1 + np.searchsorted(drawn, np.arange(steps[-1] + 1), side="right")) / (DRAWS + 1)
+        method = Method.MONTE_CARLO
+    else:
+        below = np.cumsum(_convolve([p.distribution() for p in ranked], weights))
+        method = Method.EXACT
+    # Beyond k differences the statistic is its largest value less steps[k]; without ties its distribution is symmetric.
+    low = int(np.flatnonzero(below[steps] > tail)[0])
+    high = int(np.flatnonzero(below[steps[-1] - steps] > tail)[-1])
+    return ShiftInterval(estimate, float(ordered[low]), float(ordered[high + 1]), level, method)
+
+
 class _Inversion:
     """The shifts that the test does not reject; place 2 k + 1 is the k-th knot, even places lie between knots and beyond the outermost."""
 
     def __init__(self, strata: Sequence[tuple[Floats, Floats]], weights: Sequence[int], knots: Floats, tail: float, seed: int) -> None:
         self.strata, self.weights, self.knots, self.tail, self.seed = strata, weights, knots, tail, seed
         self.tolerance = 1e-12 * max(1.0, float(np.abs(knots).max()))
-        self.continuous = all(np.unique(arm).size == arm.size for pair in strata for arm in pair)
         self.tested: dict[int, StratifiedTest] = {}
 
     @property
@@ -297,17 +326,13 @@ class _Inversion:
         outside, inside = (last, 0) if upper else (0, last)
         if self._accepted(outside, upper):
             return float("inf") if upper else float("-inf")
-        # Bisection between a rejected and an accepted place; the tail falls outwards but for the steps that ties make. Where no arm of a
-        # visit holds a value twice there are no such steps, and the places between knots are enough.
-        spacing = 2 if self.continuous else 1
-        while abs(outside - inside) > spacing:
-            middle = (outside + inside) // (2 * spacing) * spacing
+        # Bisection between a rejected and an accepted place; the tail falls outwards but for the steps that ties make.
+        while abs(outside - inside) > 1:
+            middle = (outside + inside) // 2
             if self._accepted(middle, upper):
                 inside = middle
             else:
                 outside = middle
-        if self.continuous:
-            return self._outer_edge(inside, upper)
         step = 1 if upper else -1
         for place in range(inside + step, inside + 5 * step, step):
             if 0 < place < last and self._accepted(place, upper):

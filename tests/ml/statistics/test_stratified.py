@@ -151,3 +151,28 @@ def test_all_values_equal_say_nothing():
     found = shift_interval(data)
     assert found.estimate == 0.0
     assert found.low <= 0 <= found.high
+
+
+def test_without_ties_the_counted_ends_are_those_of_asking_every_place():
+    rng = np.random.default_rng(8)
+    for _ in range(10):
+        visit = np.repeat(np.arange(4), [4, 9, 6, 5])
+        arms = np.concatenate([rng.permutation(np.resize([False, True, True], n)) for n in (4, 9, 6, 5)])
+        data = Measurements.of(rng.normal(size=24), visit, arms)
+        found = shift_interval(data)
+        strata = stratified._strata(data)
+        weights = stratified._weights(strata)
+        assert len(set(weights)) > 1
+        knots = np.sort(np.concatenate([np.subtract.outer(x, y).ravel() for x, y in strata]))
+        asked = stratified._Inversion(strata, weights, knots, 0.025, 0)
+        assert (found.low, found.high) == (asked.end(upper=False), asked.end(upper=True))
+
+
+def test_the_interval_of_shufflings_at_random_comes_near_the_exact_one(monkeypatch):
+    rng = np.random.default_rng(9)
+    data = Measurements.of(rng.normal(size=60), np.repeat(np.arange(6), 10), np.tile([False, True], 30))
+    exact = shift_interval(data)
+    monkeypatch.setattr(stratified, "LARGEST_LATTICE", 0)
+    drawn = shift_interval(data)
+    assert drawn.method is Method.MONTE_CARLO
+    assert (drawn.low, drawn.high) == pytest.approx((exact.low, exact.high), abs=0.15)
