@@ -27,7 +27,7 @@ from ml.statistics.association import within_visits
 from ml.statistics.effects import cliffs_delta, energy_saving
 from ml.statistics.mixed_visits import linear_comparison, rating_comparison, tremor_comparison
 from ml.statistics.noninferiority import Inconclusive, NonInferiorAndSaving, Outcome, assess
-from ml.statistics.ranksum import rank_sum
+from ml.statistics.ranksum import as_in_the_paper
 from ml.statistics.stratified import aligned_rank_test, shift_interval, van_elteren
 from ml.statistics.visits import Average, Measurements, Unavailable, average, primary, visit_contrasts
 
@@ -132,11 +132,9 @@ def measure(metric: str, z: np.ndarray, design: tuple[np.ndarray, np.ndarray, np
 
 def naive(data: Measurements) -> tuple[bool | None, bool | None]:
     """The paper's test of all sessions: rejected, and whether its interval covers no difference."""
-    known = np.isfinite(data.value)
-    x, y = data.value[known & data.tested], data.value[known & ~data.tested]
-    if not x.size or not y.size:
+    result = as_in_the_paper(data, LEVEL)
+    if isinstance(result, Unavailable):
         return None, None
-    result = rank_sum(x, y, LEVEL)
     return result.p_value < ALPHA, result.low <= 0 <= result.high
 
 

@@ -98,18 +98,22 @@ def fit(likelihood: Likelihood, start: Floats, fixed: Mapping[int, float], group
     covered = set(fixed).union(*map(set, groups.values())) if groups else set(fixed)
     if covered != set(range(start.size)):
         raise ValueError(f"columns {sorted(set(range(start.size)) - covered)} have neither a group nor a prior")
-    roots = dict.fromkeys(groups, 0.35)
+    places = dict.fromkeys(groups, 4)
     best, theta = -np.inf, start
-    for _ in range(4):
-        before = dict(roots)
+    for turn in range(5):
+        before = dict(places)
         for name in groups:
-            for root in ROOTS:
-                trial = roots | {name: float(root)}
-                value, mode, _ = _laplace(likelihood, theta, _precision(start.size, fixed, groups, trial), trial)
+            # First every third root, then those near the best one.
+            tried = range(1, ROOTS.size, 3) if turn == 0 else range(max(places[name] - 2, 0), min(places[name] + 3, ROOTS.size))
+            for place in tried:
+                trial = places | {name: place}
+                roots = {g: float(ROOTS[p]) for g, p in trial.items()}
+                value, mode, _ = _laplace(likelihood, theta, _precision(start.size, fixed, groups, roots), roots)
                 if value > best + 1e-9:
-                    best, roots, theta = value, trial, mode
-        if roots == before:
+                    best, places, theta = value, trial, mode
+        if places == before and turn > 0:
             break
+    roots = {g: float(ROOTS[p]) for g, p in places.items()}
     _, theta, information = _laplace(likelihood, theta, _precision(start.size, fixed, groups, roots), roots)
     return GeneralisedFit(theta, np.asarray(np.linalg.inv(information), dtype=np.float64), roots)
 

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
+from ml.statistics.visits import Measurements, Unavailable
+
 EXACT_UP_TO = 2500
 """Exact p-values while n_x * n_y stays at or below this; beyond it the normal approximation is good to more digits than are shown."""
 
@@ -79,6 +81,19 @@ def rank_sum(x: ArrayLike, y: ArrayLike, level: float = 0.95) -> RankSum:
         level=level,
         superiority=u / (x.size * y.size),
     )
+
+
+def as_in_the_paper(data: Measurements, level: float = 0.95) -> RankSum | Unavailable:
+    """The paper's test: all sessions of a controller against all of cDBS, whatever their visit.
+
+    Returns:
+        The test of the sessions that have a value, or that one of the arms has none.
+    """
+    known = np.isfinite(data.value)
+    x, y = data.value[known & data.tested], data.value[known & ~data.tested]
+    if not x.size or not y.size:
+        return data.no_evidence()
+    return rank_sum(x, y, level)
 
 
 def p_greater(x: ArrayLike, y: ArrayLike) -> float:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from ml.statistics.ranksum import p_greater, rank_sum, u_distribution
+from ml.statistics.ranksum import as_in_the_paper, p_greater, rank_sum, u_distribution
+from ml.statistics.visits import Measurements, Reason, Unavailable
 
 
 @pytest.mark.parametrize(("n_x", "n_y"), [(1, 1), (2, 5), (4, 4), (5, 3)])
@@ -69,6 +70,13 @@ def test_the_interval_of_the_shift_covers_the_true_shift_as_often_as_it_says():
     rng = np.random.default_rng(1)
     results = [rank_sum(rng.normal(1, 1, 7), rng.normal(0, 1, 9), level=0.9) for _ in range(1500)]
     assert 0.89 <= np.mean([r.low <= 1 <= r.high for r in results]) <= 0.96
+
+
+def test_the_papers_test_takes_all_sessions_whatever_their_visit_and_leaves_missing_values_out():
+    value, visit, arms = [1.0, 2.0, np.nan, 4.0, 3.5], [1, 1, 1, 2, 3], [0, 0, 1, 1, 1]
+    assert as_in_the_paper(Measurements.of(value, visit, arms)) == rank_sum([4.0, 3.5], [1.0, 2.0])
+    assert as_in_the_paper(Measurements.of(value[:3], visit[:3], arms[:3])) == Unavailable(Reason.NO_SESSION, 0, 1)
+    assert as_in_the_paper(Measurements.of([], [], [])).reason is Reason.NO_SESSION
 
 
 def test_an_empty_group_and_a_missing_measurement_are_refused_in_words():
