@@ -381,7 +381,11 @@ def show_margin(tally: Tally) -> dict[str, float]:
         if int(key[0].split()[0]) < 3:
             few = max(few, wrong, right)
         out(f"  {', '.join(key):<42}{wrong:>8.3f} |{right:>8.3f}{saving:>8.3f}\n")
-    return {"non_inferior_at_margin": worst, "non_inferior_below_three_visits": few}
+    pooled = []
+    for visits in {k[0] for k in tally.counts if len(k) == 5}:
+        cells = [c for k, c in tally.counts.items() if len(k) == 5 and k[0] == visits and k[3:] == ("at margin", "non-inferior")]
+        pooled.append(sum(c[0] for c in cells) / sum(c[1] for c in cells))
+    return {"non_inferior_at_margin": max(pooled), "non_inferior_at_margin_worst_cell": worst, "non_inferior_below_three_visits": few}
 
 
 def main() -> None:

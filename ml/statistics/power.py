@@ -118,7 +118,8 @@ def success(of: Posterior, target: Target, sessions_per_arm: float, *, seed: int
     squares = np.maximum(np.cumsum(values**2, axis=1) - count * mean**2, 0.0)
     n = count[of.contrasts.visits :]
     variance = squares[:, -most:] / np.maximum(n - 1, 1)
-    error = np.sqrt(np.maximum(variance, max(float(of.contrasts.floor.mean()), 1e-300)) / n)
+    floor = max(float(of.contrasts.floor.mean()), 1e-300)
+    error = np.sqrt((variance + floor if of.contrasts.null else np.maximum(variance, floor)) / n)
     t = (mean[:, -most:] - target.value) / error
     tail = target.alpha / 2 if target.alternative == "two_sided" else target.alpha
     critical = stdtrit(np.maximum(n - 1, 1), 1 - tail)

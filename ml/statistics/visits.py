@@ -171,6 +171,12 @@ class VisitContrasts:
     def visits(self) -> int:
         return self.contrast.size
 
+    @property
+    def variance(self) -> float:
+        """Of one contrast: at least the floor; a win probability, which moves in steps, has it added as a correction for continuity."""
+        spread, floor = float(self.contrast.var(ddof=1)), float(self.floor.mean())
+        return spread + floor if self.null else max(spread, floor)
+
 
 @dataclass(frozen=True)
 class Average:
@@ -252,8 +258,7 @@ def average(contrasts: VisitContrasts | Unavailable, level: float = 0.95) -> Ave
         return contrasts
     if contrasts.visits < 2:
         return Unavailable(Reason.TOO_FEW_VISITS, contrasts.visits, 2)
-    variance = max(float(contrasts.contrast.var(ddof=1)), float(contrasts.floor.mean())) / contrasts.visits
-    return student(float(contrasts.contrast.mean()), variance, contrasts, level, Adjustment.NONE)
+    return student(float(contrasts.contrast.mean()), contrasts.variance / contrasts.visits, contrasts, level, Adjustment.NONE)
 
 
 def student(estimate: float, variance: float, of: VisitContrasts, level: float, adjustment: Adjustment) -> Average | Unavailable:
@@ -339,7 +344,8 @@ def adjusted_average(
     estimate = float(freed[0].mean())
     without = (freed[1:].sum(1) - np.diag(freed[1:])) / (n - 1)
     variance = (n - 1) / n * float(np.sum((without - without.mean()) ** 2))
-    return student(estimate, max(variance, float(contrasts.floor.mean()) / n), contrasts, level, adjustment)
+    floor = float(contrasts.floor.mean()) / n
+    return student(estimate, variance + floor if contrasts.null else max(variance, floor), contrasts, level, adjustment)
 
 
 def _common_slopes(data: Measurements, table: Floats) -> Floats | None:
