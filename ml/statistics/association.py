@@ -1,8 +1,8 @@
 """Does one measurement of a session go with another, such as beta with a QoC or with amplitude: within visits and between them, kept apart.
 
 Within visits: the common slope after each visit's means are taken off, and the correlation of what is left (Bland and Altman 1995). Its
-interval is that of leaving out one visit at a time, on t with one degree of freedom fewer than effective visits, so that sessions of one
-visit never count as independent. Between visits: the same of the visits' means.
+interval is that of leaving out one visit at a time, on t with degrees of freedom between visits - 1 and effective visits - 1, so that
+sessions of one visit never count as independent. Between visits: the same of the visits' means.
 """
 
 from __future__ import annotations
@@ -102,9 +102,10 @@ def _jackknifed(total: Floats, without: Floats, visits: int, sessions: int, leve
     errors = [float(np.sqrt((visits - 1) / visits * np.sum((v - v.mean()) ** 2))) for v in (slopes, zs)]
     if errors[0] <= 1e-12 * abs(slope):
         return Unavailable(Reason.NO_VARIANCE)
-    # Visits in which x hardly varies tell little: the effective number of visits is that of equal shares of the spread of x.
+    # Visits in which x hardly varies tell little: the effective number of visits is that of equal shares of the spread of x. In simulations
+    # visits - 1 degrees covered .92-.95, effective visits - 1 .96-.99, their mean .94-.965.
     share = (total[0] - without[:, 0]) / total[0]
-    degrees = max(1 / float(share @ share) - 1, 1.0)
+    degrees = (visits - 1 + max(1 / float(share @ share) - 1, 1.0)) / 2
     q = float(stdtrit(degrees, (1 + level) / 2))
     p = 2 * float(stdtr(degrees, -abs(slope) / errors[0]))
     half = q * errors[1]

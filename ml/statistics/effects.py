@@ -99,10 +99,9 @@ def energy_saving(energy: Measurements, level: float = 0.95, *, draws: int = 199
     if shares.visits >= BOOTSTRAP_FROM:
         ratios = student_ratios(shares.contrast, draws, seed)
         top, bottom = np.quantile(ratios, [(1 + level) / 2, (1 - level) / 2])
-        # Resamples of few visits scatter less than visits do: neither end lies nearer than that of t.
-        low = min(low, whole.estimate - float(top) * whole.standard_error)
-        high = max(high, whole.estimate - float(bottom) * whole.standard_error)
-        p = max(p, float((1 + np.sum(ratios >= whole.estimate / whole.standard_error)) / (ratios.size + 1)))
+        low = whole.estimate - float(top) * whole.standard_error
+        high = whole.estimate - float(bottom) * whole.standard_error
+        p = float((1 + np.sum(ratios >= whole.estimate / whole.standard_error)) / (ratios.size + 1))
         method = SavingMethod.BOOTSTRAP
     return Saving(100 * whole.estimate, 100 * float(low), 100 * float(high), level, p, by_visit, visits, method)
 
