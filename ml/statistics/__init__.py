@@ -1,1 +1,1 @@
-"""Statistics of sessions: rank-sum tests between controllers and bootstraps that keep sessions whole."""
+"""Statistics of sessions and visits: controllers against cDBS, non-inferiority, planning, pooling, bootstraps that keep sessions whole."""

@@ -82,6 +82,20 @@ class MixedModel:
         weights /= weights.sum()
         return MixedFit(tuple(names), best, ratios, weights, means, factors, squares, problem.degrees)
 
+    def restricted(self, sums: Sums) -> RestrictedFit:
+        """Coefficients and their covariance at the lambdas of the largest restricted likelihood, without a prior of them.
+
+        Raises:
+            ValueError: no row.
+        """
+        if sums.rows < 1:
+            raise ValueError("a mixed model needs at least one row")
+        problem = _Problem(self, sums, prior=False)
+        best = problem.search(len(self.estimated))
+        _, means, factors, squares = problem.solve(best[None])
+        variance = float(squares[0]) / problem.degrees
+        return RestrictedFit(tuple(self.estimated), best, means[0], variance * factors[0] @ factors[0].T, variance)
+
     def conditional(self, sums: Sums, ratios: Floats) -> Floats:
         """Coefficients [q] at given lambdas, one per estimated group."""
         return _Problem(self, sums).solve(ratios[None])[1][0]
@@ -134,11 +148,28 @@ class MixedFit:
         return np.asarray(self.means[k] + sigma[:, None] * np.einsum("nij,nj->ni", self.factors[k], noise), dtype=np.float64)
 
 
+@dataclass(frozen=True)
+class RestrictedFit:
+    """Fit at the largest restricted likelihood.
+
+    Attributes:
+        groups: names of the estimated groups, G. ratios: their lambdas, [G]; at the lower end of the grid where the data show no such
+            variance.
+        coefficients: [q]. covariance: of them given the lambdas, [q, q]. variance: sigma^2.
+    """
+
+    groups: tuple[str, ...]
+    ratios: Floats
+    coefficients: Floats
+    covariance: Floats
+    variance: float
+
+
 class _Problem:
     """The equations of one data set, over the columns that vary at all."""
 
-    def __init__(self, model: MixedModel, sums: Sums) -> None:
-        self.q = model.columns
+    def __init__(self, model: MixedModel, sums: Sums, *, prior: bool = True) -> None:
+        self.q, self.prior = model.columns, prior
         # A column of zeros says nothing: its coefficient stays 0 and it counts in no likelihood.
         self.live = np.flatnonzero(np.diag(sums.gram) > 1e-12)
         place = {int(c): j for j, c in enumerate(self.live)}
@@ -166,7 +197,7 @@ class _Problem:
         counts = np.array([len(columns) for columns in self.groups], dtype=np.float64)
         log_det = 2 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(1) + np.log(ratios) @ counts
         # In log lambda the half-Cauchy of sqrt(lambda) has the density sqrt(lambda) / (1 + lambda).
-        prior = (0.5 * np.log(ratios) - np.log1p(ratios)).sum(1)
+        prior = (0.5 * np.log(ratios) - np.log1p(ratios)).sum(1) if self.prior else 0.0
         logs = prior - 0.5 * (log_det + self.degrees * np.log(squares))
         means, factors = np.zeros((len(ratios), self.q)), np.zeros((len(ratios), self.q, self.q))
         means[:, self.live] = np.einsum("kji,kj->ki", inverse, half)

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
+from ml.statistics.visits import Measurements, Unavailable
+
 EXACT_UP_TO = 2500
 """Exact p-values while n_x * n_y stays at or below this; beyond it the normal approximation is good to more digits than are shown."""
 
@@ -44,25 +46,6 @@ class RankSum:
     high: float
     level: float
     superiority: float
-
-
-@dataclass(frozen=True)
-class NonInferiority:
-    """Result of a one-sided test that x is not worse than y by the margin or more.
-
-    Attributes:
-        p_value: one-sided, of the null hypothesis that x is worse than y by at least `margin`.
-        margin: in the unit of the measurements, above zero.
-        non_inferior: True when p_value < alpha.
-        alpha: size of the test.
-        method: as in `RankSum`.
-    """
-
-    p_value: float
-    margin: float
-    non_inferior: bool
-    alpha: float
-    method: str
 
 
 def rank_sum(x: ArrayLike, y: ArrayLike, level: float = 0.95) -> RankSum:
@@ -100,21 +83,17 @@ def rank_sum(x: ArrayLike, y: ArrayLike, level: float = 0.95) -> RankSum:
     )
 
 
-def non_inferiority(x: ArrayLike, y: ArrayLike, margin: float, *, higher_is_better: bool, alpha: float = 0.05) -> NonInferiority:
-    """Rank-sum test that x is not worse than y by `margin` or more.
+def as_in_the_paper(data: Measurements, level: float = 0.95) -> RankSum | Unavailable:
+    """The paper's test: all sessions of a controller against all of cDBS, whatever their visit.
 
-    Raises:
-        ValueError: a margin that is not above zero, or a group `rank_sum` would refuse.
+    Returns:
+        The test of the sessions that have a value, or that one of the arms has none.
     """
-    if not margin > 0:
-        raise ValueError(f"a non-inferiority margin must be above 0, not {margin}")
-    x, y = _group(x, "first"), _group(y, "second")
-    if not higher_is_better:
-        x, y = -x, -y
-    x = x + margin
-    exact = _is_exact(x, y)
-    p = _tail(x, y, _u(x, y), exact)
-    return NonInferiority(p, margin, p < alpha, alpha, "exact" if exact else "normal approximation")
+    known = np.isfinite(data.value)
+    x, y = data.value[known & data.tested], data.value[known & ~data.tested]
+    if not x.size or not y.size:
+        return data.no_evidence()
+    return rank_sum(x, y, level)
 
 
 def p_greater(x: ArrayLike, y: ArrayLike) -> float:
@@ -188,7 +167,10 @@ def u_distribution_given_ties(n_x: int, sizes: tuple[int, ...]) -> NDArray[np.fl
         Probabilities of 2 U = 0 ... 2 n_x n_y, shape [2 n_x n_y + 1]. Doubled, because tied values have ranks of one half.
     """
     n = sum(sizes)
-    counts = np.zeros((n_x + 1, n * (n + 1) + 1))
+    if 2 * n_x > n:  # the smaller group makes the smaller table: what one group wins the other loses
+        return u_distribution_given_ties(n - n_x, sizes)[::-1]
+    # The rank sum is at least that of the lowest ranks, and no more than 2 n for each value (doubled).
+    counts = np.zeros((n_x + 1, 2 * n * n_x + 1))
     counts[0, 0] = 1.0
     below = 0
     for size in sizes:

@@ -3,8 +3,9 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import false_discovery_control
 
-from ml.statistics.multiplicity import holm
+from ml.statistics.multiplicity import benjamini_hochberg, holm
 
 
 def test_holm_agrees_with_a_worked_example():
@@ -21,3 +22,16 @@ def test_holm_agrees_with_its_definition(p_values):
     for place, i in enumerate(ranked):
         expected[i] = max(min(1.0, (m - k) * p_values[ranked[k]]) for k in range(place + 1))
     assert holm(p_values) == pytest.approx([expected[i] for i in range(m)])
+
+
+def test_benjamini_hochberg_agrees_with_a_worked_example():
+    # sorted .005 .01 .03 .04 times 4/1 4/2 4/3 4/4 is .02 .02 .04 .04
+    assert benjamini_hochberg([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.02, 0.04, 0.04, 0.02])
+    assert benjamini_hochberg([]) == []
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=12))
+def test_benjamini_hochberg_is_that_of_scipy_and_never_above_holm(p_values):
+    found = benjamini_hochberg(p_values)
+    assert found == pytest.approx(false_discovery_control(p_values).tolist())
+    assert all(b <= h + 1e-12 for b, h in zip(found, holm(p_values), strict=True))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from ml.statistics.ranksum import non_inferiority, p_greater, rank_sum, u_distribution
+from ml.statistics.ranksum import as_in_the_paper, p_greater, rank_sum, u_distribution
+from ml.statistics.visits import Measurements, Reason, Unavailable
 
 
 @pytest.mark.parametrize(("n_x", "n_y"), [(1, 1), (2, 5), (4, 4), (5, 3)])
@@ -71,20 +72,11 @@ def test_the_interval_of_the_shift_covers_the_true_shift_as_often_as_it_says():
     assert 0.89 <= np.mean([r.low <= 1 <= r.high for r in results]) <= 0.96
 
 
-def test_a_controller_as_good_as_the_other_is_non_inferior_at_a_wide_margin_and_not_at_a_narrow_one():
-    rng = np.random.default_rng(8)
-    x, y = rng.normal(2.0, 0.2, 12), rng.normal(2.0, 0.2, 12)
-    assert non_inferiority(x, y, 0.5, higher_is_better=True).non_inferior
-    assert not non_inferiority(x, y, 0.01, higher_is_better=True).non_inferior
-    assert non_inferiority(x, y, 0.5, higher_is_better=True).p_value == pytest.approx(
-        mannwhitneyu(x + 0.5, y, alternative="greater", method="exact").pvalue
-    )
-
-
-def test_where_less_is_better_a_higher_group_is_not_non_inferior():
-    tremor_x, tremor_y = np.arange(30.0, 40.0), np.arange(5.0, 15.0) + 0.5
-    assert not non_inferiority(tremor_x, tremor_y, 5.0, higher_is_better=False).non_inferior
-    assert non_inferiority(tremor_y, tremor_x, 5.0, higher_is_better=False).non_inferior
+def test_the_papers_test_takes_all_sessions_whatever_their_visit_and_leaves_missing_values_out():
+    value, visit, arms = [1.0, 2.0, np.nan, 4.0, 3.5], [1, 1, 1, 2, 3], [0, 0, 1, 1, 1]
+    assert as_in_the_paper(Measurements.of(value, visit, arms)) == rank_sum([4.0, 3.5], [1.0, 2.0])
+    assert as_in_the_paper(Measurements.of(value[:3], visit[:3], arms[:3])) == Unavailable(Reason.NO_SESSION, 0, 1)
+    assert as_in_the_paper(Measurements.of([], [], [])).reason is Reason.NO_SESSION
 
 
 def test_an_empty_group_and_a_missing_measurement_are_refused_in_words():
@@ -92,8 +84,6 @@ def test_an_empty_group_and_a_missing_measurement_are_refused_in_words():
         rank_sum([1.0], [])
     with pytest.raises(ValueError, match="leave sessions without a measurement out"):
         rank_sum([1.0, np.nan], [2.0])
-    with pytest.raises(ValueError, match="margin must be above 0"):
-        non_inferiority([1.0], [2.0], 0.0, higher_is_better=True)
 
 
 def test_the_one_sided_p_value_of_complete_separation_is_one_over_the_number_of_rankings():

@@ -45,3 +45,13 @@ def test_the_tied_distribution_sums_to_one_and_is_symmetric_for_symmetric_ties()
     p = u_distribution_given_ties(3, (2, 1, 2, 1, 2))
     assert p.sum() == pytest.approx(1.0)
     assert p == pytest.approx(p[::-1])
+
+
+@pytest.mark.parametrize(("n_x", "sizes"), [(6, (3, 2, 4)), (2, (3, 2, 4)), (5, (1, 1, 5, 1, 1))])
+def test_whichever_group_is_the_larger_every_choice_of_it_counts_the_same(n_x: int, sizes: tuple[int, ...]) -> None:
+    pooled = np.repeat(np.arange(len(sizes)), sizes)
+    counts = np.zeros(2 * n_x * (pooled.size - n_x) + 1)
+    for chosen in combinations(range(pooled.size), n_x):
+        x, y = pooled[list(chosen)], np.delete(pooled, list(chosen))
+        counts[2 * np.sum(x[:, None] > y) + np.sum(x[:, None] == y)] += 1
+    assert u_distribution_given_ties(n_x, sizes) == pytest.approx(counts / counts.sum(), abs=1e-14)

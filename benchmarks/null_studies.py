@@ -1,0 +1,418 @@
+"""Simulated studies in which nothing is to be found, and studies at the margin: do the tests keep their level, do the intervals cover?
+
+    python benchmarks/null_studies.py --quick
+    python benchmarks/null_studies.py [--studies 2000] [--workers 2] [--json FILE]
+
+A study is one participant's visits with sessions of one controller and of cDBS. Every scenario adds to the noise of sessions what visits
+bring: days that differ, a controller that does better on some days and worse on others (its average effect being what is tested), drift
+over the day,
+ties, arms of different size, missing values, arms on different visits. The paper's test (all sessions as independent) is printed beside
+the primary one. CPU seconds of one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ml.statistics.association import within_visits
+from ml.statistics.effects import cliffs_delta, energy_saving
+from ml.statistics.mixed_visits import linear_comparison, rating_comparison, tremor_comparison
+from ml.statistics.noninferiority import Inconclusive, NonInferiorAndSaving, Outcome, assess
+from ml.statistics.ranksum import as_in_the_paper
+from ml.statistics.stratified import aligned_rank_test, shift_interval, van_elteren
+from ml.statistics.visits import Average, Measurements, Unavailable, average, primary, visit_contrasts
+
+out = sys.stdout.write
+ALPHA, LEVEL = 0.05, 0.95
+MINUTES = 10
+METRICS = ("grasp", "beta", "rating", "tremor", "energy")
+CONTINUOUS = ("grasp", "beta", "energy")
+LAWS = (CONTINUOUS, ("rating",), ("tremor",))
+RESOLUTION = {"rating": 1.0, "tremor": 100 / MINUTES}
+
+
+@dataclass(frozen=True)
+class World:
+    """One scenario.
+
+    Attributes:
+        visits, each: visits, and sessions of either arm at each.
+        day, slope: standard deviations of visits' levels and of the controller's effect between visits, in those of a session.
+        drift: change from the first to the last session of a visit, in the same.
+        design: `shuffled`, `alternating` (cDBS between any two), `cdbs_first` (alternating from cDBS on, so that the controller comes
+            later), `apart` (every visit has one arm), `uneven` (one to five sessions of either arm).
+        missing: share of values that are missing. heavy: noise of Student's t with 3 degrees of freedom.
+    """
+
+    visits: int = 5
+    each: int = 3
+    day: float = 1.5
+    slope: float = 0.0
+    drift: float = 0.0
+    design: str = "shuffled"
+    missing: float = 0.0
+    heavy: bool = False
+
+
+WORLDS = {
+    "plain": World(day=0.0),
+    "days": World(),
+    "days, 3 visits": World(visits=3),
+    "days, 8 visits": World(visits=8),
+    "days, 1 v 1": World(visits=6, each=1),
+    "day x dose": World(slope=1.0),
+    "day x dose, 3 visits": World(visits=3, slope=1.0),
+    "day x dose, 8 visits": World(visits=8, slope=1.0),
+    "strong day x dose": World(visits=6, slope=3.0),
+    "drift, shuffled": World(drift=2.0),
+    "drift, alternating": World(drift=2.0, design="alternating"),
+    "drift, cDBS first": World(drift=2.0, design="cdbs_first"),
+    "drift, cDBS first, 3": World(visits=3, drift=2.0, design="cdbs_first"),
+    "imbalance": World(visits=6, design="uneven"),
+    "imbalance, dose": World(visits=6, slope=1.0, design="uneven"),
+    "missing 30 %": World(each=4, missing=0.3),
+    "heavy tails": World(heavy=True),
+    "all of it": World(visits=6, slope=0.7, drift=1.0, design="uneven", missing=0.2, heavy=True),
+    "arms apart": World(visits=6, each=4, design="apart"),
+}
+
+
+def layout(world: World, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Visit, arm and place in the visit of every session."""
+    visit, tested, order = [], [], []
+    for v in range(world.visits):
+        if world.design == "apart":
+            arm = np.full(world.each, v % 2 == 1)
+        elif world.design == "uneven":
+            arm = rng.permutation(np.repeat([False, True], rng.integers(1, 6, 2)))
+        elif world.design == "alternating":
+            arm = np.resize([True, False], 2 * world.each - 1)
+        elif world.design == "cdbs_first":
+            arm = np.resize([False, True], 2 * world.each)
+        else:
+            arm = rng.permutation(np.repeat([False, True], world.each))
+        visit += [v] * arm.size
+        tested += arm.tolist()
+        order += range(arm.size)
+    return np.array(visit), np.array(tested, dtype=bool), np.array(order, dtype=float)
+
+
+def latent(world: World, effect: float, rng: np.random.Generator, design: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    """What a continuous metric is made of, in standard deviations of a session."""
+    visit, tested, order = design
+    noise = rng.standard_t(3, visit.size) / np.sqrt(3) if world.heavy else rng.standard_normal(visit.size)
+    last = np.maximum(np.maximum.reduceat(order, np.flatnonzero(np.diff(visit, prepend=-1))), 1)[visit]
+    level = world.day * rng.standard_normal(world.visits)
+    slope = effect + world.slope * rng.standard_normal(world.visits)
+    return level[visit] + slope[visit] * tested + world.drift * order / last + noise
+
+
+def measure(metric: str, z: np.ndarray, design: tuple[np.ndarray, np.ndarray, np.ndarray], world: World, rng: np.random.Generator):
+    """A metric of the study; symmetric in its latent value, so that a null of the latent value is one of the metric."""
+    visit, tested, order = design
+    value = {
+        "grasp": lambda: 2.3 + 0.15 * z,
+        "beta": lambda: 1.0 + 0.12 * z,
+        "rating": lambda: np.clip(np.round(7 + 0.8 * z), 1, 10),
+        "tremor": lambda: 100 * rng.binomial(MINUTES, 1 / (1 + np.exp(1.5 - 0.8 * z))) / MINUTES,
+        "energy": lambda: 1.0 + 0.05 * z,
+    }[metric]()
+    value = np.where(rng.random(value.size) < world.missing, np.nan, value)
+    return Measurements.of(value, visit, tested, order=order, resolution=RESOLUTION.get(metric, 0.0))
+
+
+def naive(data: Measurements) -> tuple[bool | None, bool | None]:
+    """The paper's test of all sessions: rejected, and whether its interval covers no difference."""
+    result = as_in_the_paper(data, LEVEL)
+    if isinstance(result, Unavailable):
+        return None, None
+    return result.p_value < ALPHA, result.low <= 0 <= result.high
+
+
+class Tally:
+    """Shares of studies, each with its number."""
+
+    def __init__(self) -> None:
+        self.counts: dict[tuple[str, ...], list[int]] = {}
+
+    def add(self, key: tuple[str, ...], hit: bool | None) -> None:
+        if hit is not None:
+            cell = self.counts.setdefault(key, [0, 0])
+            cell[0] += int(hit)
+            cell[1] += 1
+
+    def merge(self, other: Tally) -> None:
+        for key, (hits, number) in other.counts.items():
+            cell = self.counts.setdefault(key, [0, 0])
+            cell[0] += hits
+            cell[1] += number
+
+    def share(self, *key: str) -> tuple[float, int]:
+        hits, number = self.counts.get(key, [0, 0])
+        return (hits / number if number else float("nan")), number
+
+    def pooled(self, name: str, metrics: tuple[str, ...], label: str) -> tuple[float, int]:
+        """Over metrics that follow the same law."""
+        cells = [self.counts.get((name, m, label), [0, 0]) for m in metrics]
+        number = sum(c[1] for c in cells)
+        return (sum(c[0] for c in cells) / number if number else float("nan")), number
+
+
+def error(number: int, level: float = ALPHA) -> float:
+    """Monte Carlo standard error of a share that is `level`."""
+    return float(np.sqrt(level * (1 - level) / number))
+
+
+def null_studies(name: str, studies: int) -> Tally:
+    """One scenario with no average effect. The slower analyses are made in every twentieth study, the paper's test in every fourth."""
+    tally, world, rng = Tally(), WORLDS[name], np.random.default_rng(sum(map(ord, name)))
+    for study in range(studies):
+        design = layout(world, rng)
+        for metric in METRICS:
+            # Energy follows from what the controller does: days and drift reach it through the controller alone.
+            mine = replace(world, day=0.0, drift=0.0) if metric == "energy" else world
+            data = measure(metric, latent(mine, 0.0, rng, design), design, world, rng)
+            one_null(name, metric, data, tally, study)
+    return tally
+
+
+def one_null(name: str, metric: str, data: Measurements, tally: Tally, study: int) -> None:
+    """All tests of one metric of one study."""
+    found = primary(data, LEVEL)
+    shown = isinstance(found, Average)
+    tally.add((name, metric, "available"), shown)
+    # A study that gives no evidence rejects nothing.
+    tally.add((name, metric, "primary"), shown and found.p_value < ALPHA)
+    tally.add((name, metric, "primary cover"), found.low <= 0 <= found.high if shown else None)
+    if study % 4 == 0:
+        plain, plain_cover = naive(data)
+        tally.add((name, metric, "naive"), plain)
+        tally.add((name, metric, "naive cover"), plain_cover)
+    delta = cliffs_delta(data, LEVEL)
+    tally.add((name, metric, "delta cover"), delta.low <= 0 <= delta.high if isinstance(delta, Average) else None)
+    if metric == "energy":
+        saved = energy_saving(data, LEVEL, draws=999, seed=study)
+        tally.add((name, metric, "saving cover"), None if isinstance(saved, Unavailable) else saved.low <= 0 <= saved.high)
+    if metric == "beta":  # against a metric that has nothing to do with it
+        x = np.random.default_rng(study).standard_normal(data.value.size)
+        link = within_visits(x, data.value, data.visit, LEVEL)
+        tally.add((name, metric, "slope cover"), None if isinstance(link, Unavailable) else link.low <= 0 <= link.high)
+    if study % 20 == 0:
+        for label, test in (("van elteren", van_elteren(data)), ("aligned", aligned_rank_test(data))):
+            tally.add((name, metric, label), None if isinstance(test, Unavailable) else test.p_value < ALPHA)
+        shift = shift_interval(data, LEVEL)
+        tally.add((name, metric, "shift cover"), None if isinstance(shift, Unavailable) else shift.low <= 0 <= shift.high)
+        model = mixed(metric, data)
+        tally.add((name, metric, "mixed cover"), None if model is None else model.low <= 0 <= model.high)
+
+
+def mixed(metric: str, data: Measurements) -> Average | None:
+    """The effect of the mixed model that the metric calls for."""
+    if metric == "rating":
+        found = rating_comparison(data)
+    elif metric == "tremor":
+        counts = Measurements.of(np.round(data.value * MINUTES / 100), data.visit, data.tested)
+        found = tremor_comparison(counts, np.where(np.isfinite(data.value), float(MINUTES), 0.0))
+    else:
+        found = linear_comparison(data)
+    return None if isinstance(found, Unavailable) else found.effect
+
+
+MARGINS = {"grasp": 0.2, "rating": 0.2, "tremor": 15.0}
+"""Hz; probability; per cent."""
+
+
+def margin_studies(visits: int, studies: int) -> Tally:
+    """Grasp exactly at its margin, or everything equal to cDBS; energy saved by a third."""
+    tally = Tally()
+    for slope, stops in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.05), (0.5, 0.05)):
+        world = World(visits=visits, each=4, slope=slope)
+        for kind, number in (("at margin", studies), ("equal", studies // 4)):
+            rng = np.random.default_rng(visits)
+            for study in range(number):
+                shown, saving = judged(world, kind == "at margin", stops, rng, study)
+                key = (f"{visits} visits", f"day x dose {slope:g}", f"stopped {stops:.0%}", kind)
+                tally.add((*key, "non-inferior"), shown)
+                tally.add((*key, "and saving"), saving)
+    return tally
+
+
+def judged(world: World, at_margin: bool, stops: float, rng: np.random.Generator, seed: int) -> tuple[bool, bool]:
+    """Whether non-inferiority is shown, and whether the saving is shown too."""
+    design = layout(world, rng)
+    visit, tested, order = design
+    stopped = (rng.random(visit.size) < stops) & tested
+    small = World(visits=world.visits, each=world.each, day=1.0, slope=world.slope)
+    data = {m: measure(m, latent(small, 0.0, rng, design), design, small, rng) for m in MARGINS}
+    if at_margin:
+        moved = data["grasp"].value - MARGINS["grasp"] * tested
+        data["grasp"] = Measurements.of(moved, visit, tested, order=order)
+    outcomes = [
+        Outcome("grasp", data["grasp"], stopped, MARGINS["grasp"], True),
+        Outcome("rating", data["rating"], stopped, MARGINS["rating"], True, "win_probability", 1.0),
+        Outcome("tremor", data["tremor"], stopped, MARGINS["tremor"], False, "difference", 100.0),
+    ]
+    energy = np.where(tested, 0.65, 1.0) + np.where(tested, 0.05, 0.01) * rng.standard_normal(visit.size)
+    result = assess(outcomes, Measurements.of(energy, visit, tested), stopped, alpha=ALPHA, seed=seed, plan=False)
+    saving = isinstance(result.verdict, NonInferiorAndSaving)
+    shown = saving or (isinstance(result.verdict, Inconclusive) and result.verdict.open == ("energy",))
+    return shown, saving
+
+
+def power_studies(visits: int, studies: int) -> Tally:
+    """Power of the primary test, the exact one within visits and the paper's for an effect of one standard deviation of a session."""
+    tally = Tally()
+    for slope in (0.0, 0.5):
+        world, rng = World(visits=visits, each=4, slope=slope), np.random.default_rng(visits)
+        for _ in range(studies):
+            design = layout(world, rng)
+            data = measure("grasp", latent(world, 1.0, rng, design), design, world, rng)
+            key = f"{visits} visits, day x dose {slope:g}"
+            found, exact = primary(data, LEVEL), van_elteren(data)
+            tally.add((key, "primary"), isinstance(found, Average) and found.p_value < ALPHA)
+            tally.add((key, "van elteren"), not isinstance(exact, Unavailable) and exact.p_value < ALPHA)
+            tally.add((key, "naive"), naive(data)[0])
+    return tally
+
+
+def degenerate() -> int:
+    """Studies that hold nothing to test: how many got an answer other than a typed one. Any crash ends the benchmark."""
+    visit, arms = np.repeat(np.arange(5), 4), np.tile([False, True], 10)
+    nan = np.full(20, np.nan)
+    cases = {
+        "all tied": Measurements.of(np.ones(20), visit, arms),
+        "one session": Measurements.of([1.0], [1], [True]),
+        "nothing": Measurements.of([], [], []),
+        "no value": Measurements.of(nan, visit, arms),
+        "one visit": Measurements.of(np.arange(20.0), np.zeros(20), arms),
+        "one arm": Measurements.of(np.arange(20.0), visit, np.zeros(20)),
+        "arms apart": Measurements.of(np.arange(20.0), visit, visit % 2 == 0),
+    }
+    wrong = 0
+    for data in cases.values():
+        answers = [average(visit_contrasts(data)), primary(data), cliffs_delta(data), energy_saving(data), linear_comparison(data)]
+        typed = isinstance(answers[1], Unavailable) and isinstance(answers[4], Unavailable)
+        wrong += not typed
+    return wrong
+
+
+def speed() -> dict[str, float]:
+    """CPU milliseconds of everything a page shows for four participants of 200 sessions: three controllers, five metrics each."""
+    rng = np.random.default_rng(0)
+    visit = np.repeat(np.arange(10), 20)
+    controller = np.concatenate([rng.permutation(np.resize([0, 1, 0, 2, 0, 3], 20)) for _ in range(10)])
+    spent = {"paper": 0.0, "primary": 0.0, "exact": 0.0, "interval of the shift": 0.0, "non-inferiority": 0.0, "mixed": 0.0}
+    for _ in range(4):
+        z = rng.standard_normal((len(METRICS), 200)) + rng.standard_normal((len(METRICS), 10))[:, visit]
+        for tested in (1, 2, 3):
+            rows = (controller == 0) | (controller == tested)
+            design = visit[rows], controller[rows] == tested, np.tile(np.arange(20.0), 10)[rows]
+            data = {m: measure(m, z[k][rows], design, World(), rng) for k, m in enumerate(METRICS)}
+            stopped = np.zeros(rows.sum(), dtype=bool)
+            outcomes = [Outcome(m, data[m], stopped, margin, m != "tremor") for m, margin in MARGINS.items()]
+            for label, work in (
+                ("paper", lambda d=data: [naive(v) for v in d.values()]),
+                ("primary", lambda d=data: [(primary(v), cliffs_delta(v)) for v in d.values()]),
+                ("exact", lambda d=data: [van_elteren(v) for v in d.values()]),
+                ("interval of the shift", lambda d=data: [shift_interval(v) for v in d.values()]),
+                ("non-inferiority", lambda d=data, o=outcomes, s=stopped: assess(o, d["energy"], s)),
+                ("mixed", lambda d=data: [mixed(m, v) for m, v in d.items()]),
+            ):
+                start = time.process_time()
+                work()
+                spent[label] += 1000 * (time.process_time() - start)
+    out(
+        "\nCPU ms for 4 participants x 200 sessions, 3 controllers, 5 metrics: "
+        + ", ".join(f"{k} {v:.0f}" for k, v in spent.items())
+        + "\n"
+    )
+    return {f"ms_{label.replace(' ', '_')}": value for label, value in spent.items()}
+
+
+def show_null(tally: Tally, studies: int) -> dict[str, float]:
+    """The table of null studies and its worst cells; a cell is a scenario and metrics of one law (the continuous ones, rating, tremor)."""
+    out(f"null studies, {studies} of each scenario; share rejected at {ALPHA:g} (worst cell), intervals of {LEVEL:g} (range of cells)\n")
+    labels, intervals = ("primary", "van elteren", "aligned", "naive"), ("primary", "delta", "saving", "slope", "mixed", "shift", "naive")
+    out(f"{'':<22}" + "".join(f"{label:>12}" for label in labels) + "".join(f"{label:>13}" for label in intervals) + "\n")
+    for name in WORLDS:
+        rates = [max(tally.pooled(name, law, label)[0] for law in LAWS) for label in labels]
+        out(f"{name:<22}" + "".join(f"{r:>12.3f}" for r in rates))
+        for label in intervals:
+            shares = [share for law in LAWS for share, n in [tally.pooled(name, law, f"{label} cover")] if n]
+            out(f"{f'{min(shares):.3f}-{max(shares):.3f}' if shares else '-':>13}")
+        out("\n")
+    rejected = [(name, law, *tally.pooled(name, law, "primary")) for name in WORLDS for law in LAWS]
+    above = [(n, law, r) for n, law, r, number in rejected if r > ALPHA + 2 * error(number)]
+    out(f"cells of the primary test above its level by more than two errors: {len(above)} of {len(rejected)}")
+    out(f" (chance alone: {0.0228 * len(rejected):.1f}) {', '.join(f'{n}/{law[0]} {r:.4f}' for n, law, r in above)}\n\n")
+    worst, number = max(r[2:] for r in rejected)
+    judged = ("primary", "delta", "saving", "slope")
+    covers = [tally.pooled(name, law, f"{label} cover") for name in WORLDS for law in LAWS for label in judged]
+    continuous = [
+        (n, *tally.pooled(n, CONTINUOUS, f"{c} cover")) for n, w in WORLDS.items() if w.visits >= 5 for c in ("primary", "saving", "slope")
+    ]
+    overall = [tally.pooled(n, METRICS, "primary") for n in WORLDS]
+    return {
+        "worst_primary_type1": worst,
+        "worst_primary_type1_error": error(number),
+        "worst_primary_type1_of_a_scenario": max(r for r, _ in overall),
+        "coverage_low": min(share for share, n in covers if n),
+        "coverage_high": max(share for _, share, n in continuous if n),
+    }
+
+
+def show_margin(tally: Tally) -> dict[str, float]:
+    """Non-inferiority at the margin and where nothing is lost."""
+    out("non-inferiority shown: grasp exactly at its margin (an error) | nothing lost (power), of it with the saving shown\n")
+    worst, few = 0.0, 0.0
+    for key in sorted({k[:3] for k in tally.counts if k[0].endswith("visits") and len(k) == 5}, key=lambda k: (int(k[0].split()[0]), k)):
+        wrong = tally.share(*key, "at margin", "non-inferior")[0]
+        right, saving = (tally.share(*key, "equal", label)[0] for label in ("non-inferior", "and saving"))
+        worst = max(worst, wrong)
+        if int(key[0].split()[0]) < 3:
+            few = max(few, wrong, right)
+        out(f"  {', '.join(key):<42}{wrong:>8.3f} |{right:>8.3f}{saving:>8.3f}\n")
+    pooled = []
+    for visits in {k[0] for k in tally.counts if len(k) == 5}:
+        cells = [c for k, c in tally.counts.items() if len(k) == 5 and k[0] == visits and k[3:] == ("at margin", "non-inferior")]
+        pooled.append(sum(c[0] for c in cells) / sum(c[1] for c in cells))
+    return {"non_inferior_at_margin": max(pooled), "non_inferior_at_margin_worst_cell": worst, "non_inferior_below_three_visits": few}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="150 studies of each scenario")
+    parser.add_argument("--studies", type=int, default=2000)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    studies = 150 if arguments.quick else arguments.studies
+    tally = Tally()
+    with ProcessPoolExecutor(arguments.workers) as pool:
+        running = [pool.submit(null_studies, name, studies) for name in WORLDS]
+        running += [pool.submit(margin_studies, v, studies // 2 if v > 2 else studies // 20) for v in (12, 8, 6, 4, 3, 2, 1)]
+        running += [pool.submit(power_studies, v, studies // 4) for v in (3, 4, 6, 8)]
+        for part in running:
+            tally.merge(part.result())
+    figures = show_null(tally, studies) | show_margin(tally) | {"degenerate_answers_wrong": float(degenerate())}
+    out("\npower for an effect of one standard deviation of a session, 4 sessions of either arm a visit: primary, van Elteren, paper's\n")
+    for key in dict.fromkeys(k[0] for k in tally.counts if len(k) == 2):
+        out(f"  {key:<28}" + "".join(f"{tally.share(key, label)[0]:>8.3f}" for label in ("primary", "van elteren", "naive")) + "\n")
+    figures |= speed()
+    figures["cpu_s"] = sum(os.times()[:4])
+    out(json.dumps(figures, indent=1) + "\n")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,276 @@
+"""Energy saved without loss: non-inferiority of every outcome first, then the saving.
+
+A controller is non-inferior where each outcome by itself is shown to be no worse than cDBS by its margin (intersection-union test, Berger
+1982: every outcome at the full level, all must pass). Only then is the saving tested, at the same level (gatekeeping, so that no correction
+is due). Sessions that were stopped for the patient's sake are failures and never missing. Fewer than three visits with both arms
+give no verdict, whatever they show. Margins are inputs: they are stated before the data are seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.statistics.effects import Saving, energy_saving, saving_contrasts
+from ml.statistics.multiplicity import holm
+from ml.statistics.power import MOST_VISITS, Posterior, Target, first_reaching, posterior, success
+from ml.statistics.visits import Average, Measurements, Reason, Scale, Unavailable, primary
+
+Floats = NDArray[np.float64]
+
+LEAST_VISITS = 3
+WANTED_POWER = 0.8
+ENERGY = "energy"
+
+
+class FailureRule(StrEnum):
+    """What a session that was stopped for the patient's sake counts as.
+
+    WORST_CASE: the failure value under the controller; under cDBS what was measured, so that no failure of cDBS helps the controller.
+    BOTH_ARMS: the failure value under either. AS_MEASURED: what was measured, or left out.
+    """
+
+    WORST_CASE = "worst_case"
+    BOTH_ARMS = "both_arms"
+    AS_MEASURED = "as_measured"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One outcome that must not get worse; n sessions.
+
+    Attributes:
+        name: of the outcome. data: values of both arms, NaN where not measured.
+        stopped: sessions stopped for the patient's sake, [n].
+        margin: largest loss that is accepted, above zero; in the unit of the values, or a probability below 0.5 for `win_probability`.
+        higher_is_better: direction. scale: of the contrast (`visits.visit_contrasts`).
+        failure: value of a failed session; None for the worst value measured in either arm.
+
+    Raises:
+        ValueError: a margin that is not above zero (or not below 0.5 for a probability), or `stopped` of another shape.
+    """
+
+    name: str
+    data: Measurements
+    stopped: NDArray[np.bool_]
+    margin: float
+    higher_is_better: bool
+    scale: Scale = "difference"
+    failure: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.margin > 0:
+            raise ValueError(f"the margin of {self.name} must be above 0, not {self.margin}")
+        if self.scale == "win_probability" and not self.margin < 0.5:
+            raise ValueError(f"the margin of {self.name} is a probability and must be below 0.5, not {self.margin}")
+        if self.stopped.shape != self.data.value.shape:
+            raise ValueError(f"`stopped` of {self.name} has the shape {self.stopped.shape}, its values {self.data.value.shape}")
+
+    def counted(self, rule: FailureRule) -> Measurements:
+        """The sessions with failures filled in, turned so that higher is better."""
+        sign = 1.0 if self.higher_is_better else -1.0
+        value = sign * self.data.value
+        if rule is not FailureRule.AS_MEASURED:
+            rows = self.stopped & self.data.tested if rule is FailureRule.WORST_CASE else self.stopped
+            known = value[np.isfinite(value)]
+            worst = sign * self.failure if self.failure is not None else float(known.min()) if known.size else np.nan
+            value = np.where(rows, worst, value)
+        return replace(self.data, value=value)
+
+    @property
+    def loss(self) -> float:
+        """The contrast that is to be excluded, higher being better."""
+        return (0.5 if self.scale == "win_probability" else 0.0) - self.margin
+
+
+@dataclass(frozen=True)
+class OutcomeResult:
+    """Non-inferiority of one outcome.
+
+    Attributes:
+        average: the average contrast, turned so that higher is better; or why there is none.
+        p_non_inferior: one-sided, of a loss of the margin or more. p_inferior: one-sided, of a loss of less than the margin. None without
+            average.
+        failures: failed sessions of the controller. missing: sessions without a value that are not failures.
+    """
+
+    name: str
+    margin: float
+    average: Average | Unavailable
+    p_non_inferior: float | None
+    p_inferior: float | None
+    failures: int
+    missing: int
+
+
+@dataclass(frozen=True)
+class NonInferiorAndSaving:
+    """No outcome is worse by its margin, and energy is saved: per cent with its interval."""
+
+    percent: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Inferior:
+    """Outcomes that are worse than cDBS by more than their margin."""
+
+    outcomes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Inconclusive:
+    """What is not shown.
+
+    Attributes:
+        open: outcomes (or `energy`) that are not shown yet.
+        more_visits: further visits after which a conclusion has a probability of `WANTED_POWER`; None where `MOST_VISITS` are not enough.
+        reason: why nothing could be tested; None where the tests were made.
+    """
+
+    open: tuple[str, ...]
+    more_visits: int | None
+    reason: Reason | None = None
+
+
+Verdict = NonInferiorAndSaving | Inferior | Inconclusive
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Verdict of the stated rule with everything behind it.
+
+    Attributes:
+        verdict: by `FailureRule.WORST_CASE`.
+        outcomes: in the order given. p_non_inferior: the largest of their p-values; None where one has none.
+        saving: also given where the gate before it is closed. sensitivity: verdicts under the other rules, without planning.
+    """
+
+    verdict: Verdict
+    outcomes: tuple[OutcomeResult, ...]
+    p_non_inferior: float | None
+    saving: Saving | Unavailable
+    alpha: float
+    sensitivity: tuple[tuple[FailureRule, Verdict], ...]
+
+
+def assess(
+    outcomes: Sequence[Outcome],
+    energy: Measurements,
+    stopped: NDArray[np.bool_],
+    *,
+    alpha: float = 0.05,
+    level: float = 0.95,
+    sessions_per_arm: int = 3,
+    seed: int = 0,
+    plan: bool = True,
+) -> Assessment:
+    """Non-inferiority of all outcomes, then the saving.
+
+    Args:
+        outcomes: at least one. energy: of every session; a stopped session of the controller saves nothing. stopped: of `energy`'s
+            sessions.
+        alpha: one-sided level of every test. level: coverage of the intervals. sessions_per_arm: in the further visits that are planned
+            for.
+        seed: of bootstrap and planning. plan: whether to simulate how many more visits it takes.
+
+    Raises:
+        ValueError: no outcome, or a level outside (0, 0.5).
+    """
+    if not outcomes:
+        raise ValueError("non-inferiority needs at least one outcome with its margin")
+    if not 0 < alpha < 0.5:
+        raise ValueError(f"the level of a one-sided test lies between 0 and 0.5, not at {alpha}")
+    rule = FailureRule.WORST_CASE
+    results = tuple(_outcome(o, rule, level) for o in outcomes)
+    spent = counted_energy(energy, stopped, rule)
+    saving = energy_saving(spent, level, seed=seed)
+    verdict = _verdict(results, saving, alpha)
+    if plan and isinstance(verdict, Inconclusive):
+        verdict = replace(verdict, more_visits=_more_visits(outcomes, spent, alpha, sessions_per_arm, seed))
+    others = []
+    for other in (FailureRule.BOTH_ARMS, FailureRule.AS_MEASURED):
+        found = tuple(_outcome(o, other, level) for o in outcomes)
+        others.append((other, _verdict(found, energy_saving(counted_energy(energy, stopped, other), level, seed=seed), alpha)))
+    p_values = [r.p_non_inferior for r in results if r.p_non_inferior is not None]
+    joint = max(p_values) if len(p_values) == len(results) else None
+    return Assessment(verdict, results, joint, saving, alpha, tuple(others))
+
+
+def counted_energy(energy: Measurements, stopped: NDArray[np.bool_], rule: FailureRule) -> Measurements:
+    """Energies in which a failed session of the controller takes what cDBS takes at that visit, or more where it did."""
+    if rule is FailureRule.AS_MEASURED:
+        return energy
+    value = energy.value.copy()
+    for i in np.flatnonzero(stopped & energy.tested):
+        same = energy.value[(energy.visit == energy.visit[i]) & ~energy.tested & np.isfinite(energy.value)]
+        if same.size:
+            value[i] = np.nanmax([same.mean(), energy.value[i]])
+    return replace(energy, value=value)
+
+
+def _outcome(outcome: Outcome, rule: FailureRule, level: float) -> OutcomeResult:
+    counted = outcome.counted(rule)
+    found: Average | Unavailable
+    if len(counted.arms) in range(1, LEAST_VISITS):
+        found = Unavailable(Reason.TOO_FEW_VISITS, len(counted.arms), LEAST_VISITS)
+    else:
+        found = primary(counted, level, outcome.scale)
+    failures = int(np.sum(outcome.stopped & outcome.data.tested))
+    missing = int(np.sum(~np.isfinite(counted.value)))
+    if isinstance(found, Unavailable):
+        return OutcomeResult(outcome.name, outcome.margin, found, None, None, failures, missing)
+    p = found.p_above(outcome.loss), found.p_below(outcome.loss)
+    return OutcomeResult(outcome.name, outcome.margin, found, *p, failures, missing)
+
+
+def _verdict(results: Sequence[OutcomeResult], saving: Saving | Unavailable, alpha: float) -> Verdict:
+    # That one outcome of several is inferior is a union: Holm keeps its level.
+    judged = [r for r in results if r.p_inferior is not None]
+    adjusted = holm([r.p_inferior for r in judged if r.p_inferior is not None])
+    worse = tuple(r.name for r, p in zip(judged, adjusted, strict=True) if p < alpha)
+    if worse:
+        return Inferior(worse)
+    unshown = tuple(r.name for r in results if r.p_non_inferior is None or not r.p_non_inferior < alpha)
+    if unshown:
+        reasons = [r.average.reason for r in results if isinstance(r.average, Unavailable)]
+        return Inconclusive(unshown, None, reasons[0] if reasons else None)
+    if isinstance(saving, Unavailable):
+        return Inconclusive((ENERGY,), None, saving.reason)
+    if len(saving.visits) < LEAST_VISITS:
+        return Inconclusive((ENERGY,), None, Reason.TOO_FEW_VISITS)
+    if not saving.p_value < alpha:
+        return Inconclusive((ENERGY,), None)
+    return NonInferiorAndSaving(saving.percent, saving.low, saving.high)
+
+
+def _more_visits(outcomes: Sequence[Outcome], energy: Measurements, alpha: float, sessions: int, seed: int) -> int | None:
+    """Fewest further visits after which all is shown with the wanted probability, outcomes taken as independent."""
+    chances = np.ones(MOST_VISITS)
+    for i, outcome in enumerate(outcomes):
+        found = posterior(outcome.counted(FailureRule.WORST_CASE), outcome.scale, seed=seed + i)
+        if isinstance(found, Unavailable):
+            return None
+        chances *= success(found, Target(outcome.loss, "greater", alpha, LEAST_VISITS), sessions, seed=seed + 100 + i).mean(0)
+    shares = _energy_posterior(energy, seed)
+    if isinstance(shares, Unavailable):
+        return None
+    chances *= success(shares, Target(0.0, "greater", alpha, LEAST_VISITS), sessions, seed=seed + 99).mean(0)
+    return first_reaching(chances, WANTED_POWER)
+
+
+def _energy_posterior(energy: Measurements, seed: int) -> Posterior | Unavailable:
+    """Posterior of the share saved: energies of each visit relative to the mean of its cDBS sessions."""
+    shares = saving_contrasts(energy)
+    if isinstance(shares, Unavailable):
+        return shares
+    value = np.full(energy.value.shape, np.nan)
+    for visit, _, two in energy.arms:
+        rows = energy.visit == visit
+        value[rows] = -energy.value[rows] / energy.value[two].mean()
+    return posterior(replace(energy, value=value), seed=seed)

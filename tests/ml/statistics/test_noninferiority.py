@@ -1,0 +1,180 @@
+"""Non-inferiority, then energy: the rules one by one, and the error at the margin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import ttest_1samp
+
+from ml.statistics.noninferiority import (
+    FailureRule,
+    Inconclusive,
+    Inferior,
+    NonInferiorAndSaving,
+    Outcome,
+    assess,
+    counted_energy,
+)
+from ml.statistics.visits import Measurements, Reason, visit_contrasts
+
+EACH = 3
+
+
+def design(visits):
+    return np.repeat(np.arange(visits), 2 * EACH), np.tile([False, True], visits * EACH)
+
+
+def study(visits=6, loss=0.0, seed=0, noise=0.05, saved=0.4, stopped=()):
+    rng = np.random.default_rng(seed)
+    visit, arms = design(visits)
+    flags = np.isin(np.arange(visit.size), stopped)
+    grasp = 2.3 + rng.normal(0, 0.2, visits)[visit] - loss * arms + rng.normal(0, noise, visit.size)
+    rating = np.clip(np.round(8 + rng.normal(0, 0.7, visit.size)), 1, 10)
+    tremor = np.clip(10 + rng.normal(0, 3, visit.size), 0, 100)
+    energy = Measurements.of(np.where(arms, 1 - saved, 1.0) + rng.normal(0, 0.03, visit.size), visit, arms)
+    outcomes = [
+        Outcome("grasp", Measurements.of(grasp, visit, arms), flags, 0.3, True),
+        Outcome("rating", Measurements.of(rating, visit, arms, resolution=1), flags, 1.5, True, failure=1.0),
+        Outcome("tremor", Measurements.of(tremor, visit, arms), flags, 10.0, False, failure=100.0),
+    ]
+    return outcomes, energy, flags
+
+
+def test_nothing_lost_and_energy_saved_is_the_verdict_with_its_per_cent():
+    found = assess(*study())
+    assert isinstance(found.verdict, NonInferiorAndSaving)
+    assert found.verdict.low < 40 < found.verdict.high
+    assert found.p_non_inferior == max(r.p_non_inferior for r in found.outcomes) < 0.05
+    assert [v for _, v in found.sensitivity] == [found.verdict, found.verdict]
+
+
+def test_each_p_value_is_the_one_sided_t_test_of_the_visits_against_the_margin():
+    outcomes, energy, flags = study(loss=0.1)
+    grasp = assess(outcomes, energy, flags).outcomes[0]
+    contrasts = visit_contrasts(outcomes[0].data).contrast
+    assert grasp.p_non_inferior == pytest.approx(ttest_1samp(contrasts, -0.3, alternative="greater").pvalue)
+    assert grasp.p_inferior == pytest.approx(ttest_1samp(contrasts, -0.3, alternative="less").pvalue)
+
+
+def test_where_less_is_better_more_is_a_loss():
+    outcomes, energy, flags = study()
+    worse = replace(outcomes[2], data=replace(outcomes[2].data, value=outcomes[2].data.value + 30 * outcomes[2].data.tested))
+    assert assess([worse], energy, flags).verdict == Inferior(("tremor",))
+    better = replace(outcomes[2], data=replace(outcomes[2].data, value=outcomes[2].data.value - 5 * outcomes[2].data.tested))
+    assert isinstance(assess([better], energy, flags).verdict, NonInferiorAndSaving)
+
+
+def test_one_outcome_beyond_its_margin_is_inferior_whatever_is_saved():
+    assert assess(*study(loss=0.8)).verdict == Inferior(("grasp",))
+
+
+def test_one_outcome_not_shown_leaves_all_open_and_names_the_visits_it_takes():
+    found = assess(*study(loss=0.12, noise=0.25, visits=4, seed=2)).verdict
+    assert isinstance(found, Inconclusive)
+    assert "grasp" in found.open
+    assert found.more_visits is None or found.more_visits >= 1
+    easy = assess(*study(visits=2, seed=3)).verdict
+    assert isinstance(easy, Inconclusive)
+    assert easy.more_visits is not None
+
+
+def test_energy_is_tested_only_behind_the_gate_and_is_open_where_nothing_is_saved():
+    outcomes, energy, flags = study(saved=0.0)
+    found = assess(outcomes, energy, flags)
+    assert isinstance(found.verdict, Inconclusive)
+    assert found.verdict.open == ("energy",)
+    closed = assess(*study(loss=0.3, seed=1))
+    assert closed.saving.p_value < 0.05
+    assert not isinstance(closed.verdict, NonInferiorAndSaving)
+
+
+@pytest.mark.parametrize("visits", [1, 2])
+def test_fewer_than_three_visits_with_both_arms_conclude_nothing(visits):
+    for loss in (0.0, 5.0):
+        found = assess(*study(visits=visits, noise=1e-6, loss=loss)).verdict
+        assert isinstance(found, Inconclusive)
+        assert found.reason is Reason.TOO_FEW_VISITS
+        assert found.more_visits is None or found.more_visits + visits >= 3
+
+
+def test_a_session_stopped_for_the_patients_sake_is_a_failure_even_where_its_values_are_missing():
+    outcomes, energy, flags = study(stopped=(1, 9))
+    missing = np.where(flags, np.nan, outcomes[1].data.value)
+    rating = replace(outcomes[1], data=replace(outcomes[1].data, value=missing))
+    assert rating.counted(FailureRule.WORST_CASE).value[[1, 9]].tolist() == [1.0, 1.0]
+    assert np.isnan(rating.counted(FailureRule.AS_MEASURED).value[1])
+    found = assess([outcomes[0], rating, outcomes[2]], energy, flags)
+    assert not isinstance(found.verdict, NonInferiorAndSaving)
+    assert [r.failures for r in found.outcomes] == [2, 2, 2]
+    assert [r.missing for r in found.outcomes] == [0, 0, 0]
+    assert isinstance(dict(found.sensitivity)[FailureRule.AS_MEASURED], NonInferiorAndSaving)
+
+
+def test_a_failure_without_a_stated_value_counts_as_the_worst_that_was_measured():
+    outcomes, _, _ = study(stopped=(1,))
+    value = outcomes[0].data.value
+    assert outcomes[0].counted(FailureRule.WORST_CASE).value[1] == value.min()
+    assert outcomes[0].counted(FailureRule.BOTH_ARMS).value[1] == value.min()
+    tremor = replace(outcomes[2], failure=None)
+    assert tremor.counted(FailureRule.WORST_CASE).value[1] == -tremor.data.value.max()
+
+
+def test_a_stopped_cdbs_session_helps_the_controller_only_where_both_arms_count():
+    outcomes, _, _ = study(stopped=(0,))
+    assert outcomes[1].counted(FailureRule.WORST_CASE).value[0] == outcomes[1].data.value[0]
+    assert outcomes[1].counted(FailureRule.BOTH_ARMS).value[0] == 1.0
+
+
+def test_a_stopped_session_saves_no_energy():
+    visit, arms = np.array([1, 1, 1, 2, 2]), np.array([False, True, True, False, True])
+    energy = Measurements.of([1.0, 0.2, 0.5, 0.9, np.nan], visit, arms)
+    stopped = np.array([False, True, False, False, True])
+    assert counted_energy(energy, stopped, FailureRule.WORST_CASE).value.tolist() == [1.0, 1.0, 0.5, 0.9, 0.9]
+    assert counted_energy(energy, stopped, FailureRule.AS_MEASURED) is energy
+
+
+def test_the_rating_may_be_judged_by_the_win_probability():
+    outcomes, energy, flags = study(visits=8)
+    rating = replace(outcomes[1], scale="win_probability", margin=0.3)
+    found = assess([rating], energy, flags)
+    assert found.outcomes[0].average.null == 0.5
+    assert isinstance(found.verdict, NonInferiorAndSaving)
+    assert assess([replace(rating, margin=0.01)], energy, flags).verdict.open == ("rating",)
+
+
+def test_at_the_margin_it_errs_no_more_than_its_level_even_where_effects_differ_between_visits():
+    wrong, number = 0, 400
+    rng = np.random.default_rng(5)
+    visit, arms = design(4)
+    energy = Measurements.of(np.where(arms, 0.6, 1.0) + 0.01 * rng.standard_normal(visit.size), visit, arms)
+    flags = np.zeros(visit.size, dtype=bool)
+    for _ in range(number):
+        grasp = rng.standard_normal(4)[visit] - (0.3 + 0.2 * rng.standard_normal(4)[visit]) * arms + 0.1 * rng.standard_normal(visit.size)
+        result = assess([Outcome("grasp", Measurements.of(grasp, visit, arms), flags, 0.3, True)], energy, flags, plan=False)
+        wrong += isinstance(result.verdict, NonInferiorAndSaving)
+    assert wrong / number <= 0.05 + 2 * np.sqrt(0.05 * 0.95 / number)
+
+
+@pytest.mark.parametrize("value", [np.nan, 1.0])
+def test_no_values_or_all_the_same_are_a_typed_answer(value):
+    visit, arms = design(4)
+    flags = np.zeros(visit.size, dtype=bool)
+    data = Measurements.of(np.full(visit.size, value), visit, arms)
+    found = assess([Outcome("grasp", data, flags, 0.3, True)], data, flags)
+    assert isinstance(found.verdict, Inconclusive)
+    assert found.verdict.reason is (Reason.NO_VARIANCE if value == 1.0 else Reason.NO_SESSION)
+    assert found.p_non_inferior is None
+
+
+def test_margins_that_mean_nothing_are_refused_in_words():
+    outcomes, energy, flags = study()
+    with pytest.raises(ValueError, match="margin of grasp must be above 0"):
+        replace(outcomes[0], margin=0.0)
+    with pytest.raises(ValueError, match=r"below 0\.5"):
+        replace(outcomes[1], scale="win_probability", margin=0.6)
+    with pytest.raises(ValueError, match="at least one outcome"):
+        assess([], energy, flags)
+    with pytest.raises(ValueError, match="between 0 and 0"):
+        assess(outcomes, energy, flags, alpha=0.5)
