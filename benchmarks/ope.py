@@ -124,7 +124,8 @@ def measure(world: World, seed: int, visits: int, run: Run) -> None:
     if cells.get(f"{prefix}/choice") is None:
         start = time.process_time()
         choice = choose_default(buffer, {m: e for m, e in quick_estimators(seed).items() if m not in run.skip}, seed=seed)
-        cells.add(f"{prefix}/choice", method=choice.method, reason=choice.reason, table=[s.to_json() for s in choice.table],
+        cells.add(f"{prefix}/choice", method=choice.method, reasons=[r.to_json() for r in choice.reasons],
+                  table=[s.to_json() for s in choice.table],
                   seconds=time.process_time() - start)  # fmt: skip
     tables = {m: estimates.get(m) or _restored(m, cells.get(f"{prefix}/{m}")) for m in panel}
     bias = {s["method"]: s["bias"] for s in cells.get(f"{prefix}/choice")["table"]}

@@ -25,8 +25,9 @@ from ml.mdp import step_reward
 from ml.ope.dlsm.batches import Batch, Scale, learn_scale, make_batch, session_folds
 from ml.ope.dlsm.heads import GaussianHead, gaussian_kl, gaussian_log_prob
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.flags import FEW_END_REWARDS
 from ml.ope.linear.end_outcomes import EndModel, fit_end_model, summarise
-from ml.ope.support.coverage import AmplitudeSupport
+from ml.ope.support.coverage import AmplitudeSupport, flags_of
 from ml.policies.policy import Policy
 from ml.progress import Report, part_of, silent
 from ml.trajectories import ReplayBuffer
@@ -249,9 +250,9 @@ class FittedDlmm:
         reach = float(norm.ppf((1 + LEVEL) / 2)) * error
         every = max(1, horizon // 50)
         logged, simulated = support.of_policy(policy), support.look(np.concatenate([r.actions[i][:, ::every] for r in runs]))
-        flags = list(dict.fromkeys((*logged.flags, *simulated.flags)))
+        flags = list(flags_of(logged, simulated))
         if not with_end:
-            flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+            flags.append(FEW_END_REWARDS)
         predicted = {
             "energy": float(np.mean([(r.actions[i] ** 2).mean() for r in runs])),
             "mean_amplitude": float(np.mean([r.actions[i].mean() for r in runs])),

@@ -19,7 +19,7 @@ from ml.ope.fqe.estimator import FittedFqe, Fqe, FqeConfig, QMember, head_schedu
 from ml.ope.fqe.steps import TargetActions, fresh_memory
 from ml.ope.importance import behaviour_densities, horizon_of_ten, kernel_log_density
 from ml.ope.linear.end_outcomes import summarise
-from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size
+from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size, few_effective
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.trajectories import ReplayBuffer
@@ -115,7 +115,7 @@ class FittedDoublyRobust:
         estimate = value_estimate(fqe, main, refits, policy, horizon, support, details, (shift, shifts))
         if effective >= FEW_EFFECTIVE:
             return estimate
-        flag = f"the correction of the value function rests on {effective:.1f} effective sessions of {table.sessions}"
+        flag = few_effective("few_sessions_behind_correction", effective, table.sessions)
         return replace(estimate, flags=(*estimate.flags, flag))
 
     def _log_ratios(self, target: TargetActions, horizon: int) -> tuple[Floats, Mask]:

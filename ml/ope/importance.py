@@ -18,7 +18,8 @@ from scipy.stats import norm
 
 from ml.ope.behaviour import Key, clones, controller_key, rule_of_thumb_bandwidth
 from ml.ope.estimate import LEVEL, Estimate, checked_horizon
-from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size
+from ml.ope.flags import Flag
+from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size, few_effective
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.statistics.bootstrap import bca_interval, percentile_interval, resamples
@@ -231,11 +232,11 @@ class FittedImportance:
         bca = bca_interval(draws, step + end_value, jackknife, LEVEL) if jackknife.size else None
         effective, largest = effective_sample_size(log_weights)
         logged = support.of_policy(policy)
-        flags = list(logged.flags)
+        flags = list(logged.flags())
         if effective < FEW_EFFECTIVE:
-            flags.append(f"not supported by the data: the weights rest on {effective:.1f} effective sessions of {len(end)}")
+            flags.append(few_effective("few_effective_sessions", effective, len(end), refuses=True))
         if not known.any():
-            flags.append("no session has an end-of-session reward: the estimate is the step return alone")
+            flags.append(Flag.of("no_end_reward"))
         return Estimate(
             method=config.method,
             value=step + end_value,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ml.mdp import MdpSettings
 from ml.ope.behaviour import Key, controllers
 from ml.ope.estimate import LEVEL
+from ml.ope.flags import DAYS_UNKNOWN, Flag
 from ml.ope.importance import per_trajectory
 from ml.statistics.bootstrap import Interval, session_bootstrap
 from ml.statistics.mixed import MixedModel, Sums
@@ -79,7 +80,7 @@ def observed(buffer: ReplayBuffer, horizon: int, seed: int = 0) -> dict[Key, Obs
     return result
 
 
-def day_noise(buffer: ReplayBuffer, horizon: int, draws: int, seed: int) -> tuple[Floats, str | None]:
+def day_noise(buffer: ReplayBuffer, horizon: int, draws: int, seed: int) -> tuple[Floats, Flag | None]:
     """What the few visits of a record leave open about the level of returns, as draws [draws] that all policies share.
 
     Resampling sessions alone takes the sessions of one day for independent; a bad day lowers them all. Returns less their controller's mean
@@ -103,7 +104,7 @@ def day_noise(buffer: ReplayBuffer, horizon: int, draws: int, seed: int) -> tupl
     values, numbers = np.array(left), np.array(visit)
     days = np.unique(numbers)
     if len(days) < 2 or len(values) <= len(days):
-        return np.zeros(draws), "how returns differ from day to day cannot be told from these sessions: the intervals leave it out"
+        return np.zeros(draws), DAYS_UNKNOWN
     sizes = np.array([(numbers == d).sum() for d in days], dtype=np.float64)
     means = np.array([values[numbers == d].mean() for d in days])
     within = sum(float(np.sum((values[numbers == d] - m) ** 2)) for d, m in zip(days, means, strict=True)) / (len(values) - len(days))
@@ -124,13 +125,13 @@ class MeanOverDays:
         weights: of the sessions in the mean, [n]; sessions of one visit share a weight, the smaller their own noise the more nearly equal
             the visits'.
         common: draws of the error of the mean that all policies share, [draws]. own: those of each policy's difference from it, [P, draws].
-        unknown: what cannot be told about days, in words; None where it can.
+        unknown: what cannot be told about days; None where it can.
     """
 
     weights: Floats
     common: Floats
     own: Floats
-    unknown: str | None
+    unknown: Flag | None
 
 
 def mean_over_days(returns: Floats, visits: NDArray[np.int64], draws: int, seed: int) -> MeanOverDays:
@@ -157,7 +158,7 @@ def mean_over_days(returns: Floats, visits: NDArray[np.int64], draws: int, seed:
         found = model.fit(Sums.of(design, values)).draws(draws, np.random.default_rng([seed, 0xDA7, k]))[:, 0]
         return np.asarray(found - found.mean(), dtype=np.float64)
 
-    flag = None if several else "how returns differ from day to day cannot be told from these sessions: the intervals leave it out"
+    flag = None if several else DAYS_UNKNOWN
     return MeanOverDays(weights, errors(middle, 0), np.stack([errors(r - middle, 1 + i) for i, r in enumerate(returns)]), flag)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -38,15 +37,6 @@ METHOD_SHORT: dict[str, str] = METHOD_NAMES | {
     "aggregate": "Combination",
 }
 """For the heads of wide tables."""
-
-_KEYS = re.compile(r"(?<![\w-])(?:" + "|".join(sorted(METHOD_NAMES, key=len, reverse=True)) + r")(?![\w-])(?! model| regression)")
-"""Keys as words of their own; "linear model" in a sentence is no key."""
-
-
-def in_words(sentence: str) -> str:
-    """A sentence of the science with the keys of methods replaced by their names."""
-    return _KEYS.sub(lambda found: METHOD_NAMES[found.group()], sentence)
-
 
 METHOD_WEIGHTS: dict[Method, float] = {
     "dlsm": 6.0, "linear": 2.0, "dlmm": 3.0, "fqe": 1.0, "wdr": 2.0, "dual_dice": 3.0, "wis": 1.0, "pdis": 1.0, "cwpdis": 1.0

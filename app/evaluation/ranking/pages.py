@@ -16,7 +16,7 @@ from app.evaluation.estimates.methods import METHOD_NAMES, METHOD_SHORT
 from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.api import csv_of
-from app.evaluation.schemas import DECISION_NAMES, RankingFilter, RankingOut
+from app.evaluation.schemas import DECISION_NAMES, FlagOut, RankedPolicy, RankingFilter, RankingOut
 from app.learning.snapshots.service import not_ready
 from app.platform.database import Db
 from app.platform.errors import NotFound
@@ -27,6 +27,7 @@ from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.service import may
+from ml.ope.flags import TEXT
 
 router = APIRouter()
 
@@ -63,6 +64,7 @@ def ranking_page(
         method_names=METHOD_NAMES,
         method_short=METHOD_SHORT,
         decision_names=DECISION_NAMES,
+        beside_decision=_beside_decision,
         coverage=coverage,
         rules=RULES,
         shown=shown,
@@ -80,6 +82,12 @@ def ranking_page(
 def ranking_csv(participant: CurrentParticipant, db: Db, caller: CurrentCaller, method: str | None = None) -> Response:
     """The ranking as CSV, by the method that the page ranks by."""
     return csv_of(ranking.current_ranking(db, participant, caller, method))
+
+
+def _beside_decision(policy: RankedPolicy) -> list[FlagOut]:
+    """A policy's flags that its decision does not rest on."""
+    named = {(r.code, r.value, r.limit) for r in policy.decision_reasons}
+    return [f for f in policy.flags if f.code == TEXT or (f.code, f.value, f.limit) not in named]
 
 
 def _live_jobs(db: Session, participant: Participant) -> list[Any]:

@@ -16,6 +16,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.evaluation.ranking.service import current_ranking
 from app.evaluation.schemas import METHOD_NAMES, RankingOut
+from app.evaluation.wording import sentence
 from app.learning import repository as learning
 from app.planning.plans import repository, service
 from app.planning.plans.schedule import most_policies, total_minutes
@@ -148,6 +149,7 @@ def _page(
         site=participant.site,
         view=view,
         ranking=ranking,
+        in_words=sentence,
         method=METHOD_NAMES.get(ranking.default_method, ranking.default_method) if ranking else "",
         plan_method=METHOD_NAMES.get(view.evaluation.default_method, view.evaluation.default_method) if view and view.evaluation else "",
         choices=choices,

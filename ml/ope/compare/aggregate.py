@@ -16,6 +16,7 @@ from scipy.optimize import nnls
 
 from ml.ope.estimate import LEVEL, Estimate, Fitted
 from ml.ope.estimate import Estimator as EstimatorOf
+from ml.ope.flags import distinct
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.statistics.bootstrap import percentile_interval
@@ -112,7 +113,7 @@ def _combined(parts: list[Estimate], methods: list[str], weights: Floats) -> Est
         step_return=step,
         end_reward=None if main.end_reward is None else value - step,
         supported=all(p.supported for p in used),
-        flags=tuple(dict.fromkeys(f for p in used for f in p.flags)),
+        flags=distinct(f for p in used for f in p.flags),
         details={
             "horizon_steps": main.details.get("horizon_steps"),
             "weights": {m: round(float(w), 4) for m, w in zip(methods, weights, strict=True)},

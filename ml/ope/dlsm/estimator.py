@@ -25,9 +25,10 @@ from ml.ope.dlsm.rollout import Rollouts, roll_out
 from ml.ope.dlsm.selection import Selection, SelectionRun, usable_folds
 from ml.ope.dlsm.training import Member, MemberTraining
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.flags import FEW_END_REWARDS, Flag
 from ml.ope.linear.end_outcomes import EndModel, fit_end_model
 from ml.ope.observed import day_noise
-from ml.ope.support.coverage import AmplitudeSupport, Coverage
+from ml.ope.support.coverage import AmplitudeSupport, Coverage, flags_of
 from ml.policies.policy import Policy
 from ml.progress import Report, part_of, silent
 from ml.trajectories import ReplayBuffer, content_hash, to_parquet
@@ -279,9 +280,9 @@ class FittedDlsm:
         reach = float(norm.ppf((1 + LEVEL) / 2)) * error
         seen = self.scale.outcome_seen
         logged, simulated = coverage
-        flags = list(dict.fromkeys((*logged.flags, *simulated.flags)))
+        flags = list(flags_of(logged, simulated))
         if not seen[0]:
-            flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+            flags.append(FEW_END_REWARDS)
         flags += [unknown] if (unknown := day_noise(self.buffer, horizon, 1, 0)[1]) else []
         skill = self.held_out_skill()
         flags += _warnings(skill)
@@ -331,11 +332,11 @@ class FittedDlsm:
         return predicted
 
 
-def _warnings(skill: dict[str, Any]) -> list[str]:
-    """What the held-out sessions hold against the model, in words."""
+def _warnings(skill: dict[str, Any]) -> list[Flag]:
+    """What the held-out sessions hold against the model."""
     found = []
     if skill["score"] >= 1:
-        found.append(f"left-out sessions are predicted no better than by the mean of the others (error {skill['score']:.2f} of that one's)")
+        found.append(Flag("no_better_than_mean", skill["score"], 1.0, "share"))
     if skill["answer_skill"] is not None and skill["answer_skill"] <= 0:
-        found.append("the model's answer to the amplitude is no better than none: in left-out sessions it misses how controllers differ")
+        found.append(Flag("no_answer_to_amplitude", skill["answer_skill"], 0.0, "skill"))
     return found

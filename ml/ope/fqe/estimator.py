@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ml.mdp import MdpSettings
 from ml.ope.dlsm.batches import session_folds
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.flags import FEW_END_REWARDS
 from ml.ope.fqe.steps import StepTable, TargetActions, ValueFeatures, fresh_memory, step_table
 from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
 from ml.ope.observed import day_noise
@@ -328,9 +329,9 @@ def value_estimate(
     draws = draws - draws.mean()
     interval = percentile_interval(np.add.outer(draws, noise).ravel() + value, LEVEL)
     logged = support.of_policy(policy)
-    flags = list(logged.flags)
+    flags = list(logged.flags())
     if not with_end:
-        flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+        flags.append(FEW_END_REWARDS)
     flags += [unknown] if unknown else []
     predicted = {"energy": float(summaries[1]), "mean_amplitude": float(summaries[0]), "mean_beta": float(summaries[2])}
     predicted |= {name: float(outcomes[j]) for j, name in enumerate(OUTCOMES) if j and fitted.end.seen[j]}

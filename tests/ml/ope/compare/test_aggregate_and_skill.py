@@ -157,7 +157,8 @@ def test_a_method_takes_the_place_of_the_usual_first_only_by_more_than_a_standar
     full = linear_simulator.buffer(seed=0, n=16, steps=100)
     clear = choose_default(full, {"linear": Said("linear", -1.0, 0.0), "fqe": Said("fqe", 1.0, 0.0)}, aggregate=False)
     assert clear.method == "fqe"
-    assert "by more than a standard error better than linear" in clear.reason
+    assert [r.code for r in clear.reasons] == ["difference_error", "beats_usual_order"]
+    assert clear.reasons[1].fact("method") == "linear"
     hardly = choose_default(full, {"linear": Said("linear", 1.0, 0.4), "fqe": Said("fqe", 1.0, 0.0)}, aggregate=False)
     assert hardly.method == "linear"
 
@@ -168,7 +169,7 @@ def test_too_few_controllers_leave_the_choice_to_the_usual_order(linear_simulato
     candidates = {"wis": ImportanceSampling("wis", draws=20), "linear": LinearModel(LinearConfig(draws=20))}
     choice = choose_default(buffer, candidates)
     assert (choice.method, choice.chosen_by_data) == ("linear", False)
-    assert "the data cannot choose" in choice.reason
+    assert [(r.code, r.value, r.limit) for r in choice.reasons] == [("too_few_controllers", 2, 3)]
 
 
 def test_a_method_that_cannot_work_is_named_with_its_reason(small_buffer):
