@@ -25,12 +25,11 @@ from figure import draw
 from ope_policies import fixed_policies, trained_policies
 from simulators import STEPS, WORLDS, World
 
-from ml.ope.compare.aggregate import METHOD as AGGREGATE
 from ml.ope.compare.aggregate import combine
 from ml.ope.compare.metrics import accuracy
 from ml.ope.compare.skill import choose_default, reach_with
 from ml.ope.estimate import Estimate
-from ml.ope.registry import estimators, quick_estimators
+from ml.ope.registry import AGGREGATE, estimators, quick_estimators
 from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer
 

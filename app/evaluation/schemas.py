@@ -7,8 +7,6 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field
 
-from app.evaluation.estimates.methods import METHOD_NAMES as METHOD_NAMES
-from app.evaluation.estimates.methods import METHODS as METHODS
 from app.evaluation.estimates.methods import Method as Method
 from app.evaluation.estimates.methods import Methods
 from app.learning.schemas import PolicyIds, Preset

@@ -11,7 +11,6 @@ from sqlalchemy.orm import Session
 from app.evaluation import repository
 from app.evaluation.estimates.choice import choose, combined, widened
 from app.evaluation.estimates.coverage import STORED, refused
-from app.evaluation.estimates.methods import AGGREGATE, METHOD_NAMES
 from app.evaluation.estimates.rows import row_of
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.service import current_ranking as current_ranking
@@ -24,6 +23,7 @@ from app.platform.jobs import service as jobs
 from app.study import repository as study_repository
 from app.study.models import Participant
 from ml.ope.estimate import Estimate
+from ml.ope.registry import AGGREGATE, shown
 
 
 def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams) -> list[Policy]:
@@ -97,7 +97,7 @@ def store_evaluation(
             estimates[AGGREGATE] = made["estimates"]
     estimates = refused(widened(estimates, skill), coverage)
     if not estimates:
-        reasons = "; ".join(f"{METHOD_NAMES.get(m, m)}: {reason}" for m, reason in failed.items())
+        reasons = "; ".join(f"{shown(m).name}: {reason}" for m, reason in failed.items())
         raise Invalid(f"No method could estimate these policies: {reasons}.", "Collect more sessions, then evaluate again.")
     ranked = {m: {i: e for i, e in table.items() if int(i) in set(candidates)} for m, table in estimates.items()}
     choice = choose({m: table for m, table in ranked.items() if table}, skill)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from app.evaluation.estimates.methods import METHOD_NAMES
 from ml.ope.flags import TEXT, Flag
+from ml.ope.registry import shown
 
 UNSUPPORTED = "not supported by the data"
 
@@ -50,7 +50,7 @@ def choice(reasons: Sequence[Flag]) -> str:
 
 def method_name(key: str) -> str:
     """What pages call a method; its key where this betaloop has no such method."""
-    return METHOD_NAMES.get(key, key)
+    return shown(key).name
 
 
 def signed(value: float) -> str:

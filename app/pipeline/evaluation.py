@@ -9,7 +9,6 @@ from sqlalchemy.orm import Session
 
 from app.evaluation import repository, service
 from app.evaluation.estimates import compute
-from app.evaluation.estimates.methods import AGGREGATE, METHOD_NAMES, METHOD_WEIGHTS, Method
 from app.evaluation.schemas import EvaluateParams
 from app.learning.models import BufferSnapshot
 from app.learning.policies.baselines import ensure_baselines
@@ -20,6 +19,7 @@ from app.pipeline import learning
 from app.pipeline.schemas import PipelineParams
 from app.platform import files
 from app.platform.jobs import JobContext, Priority, job_kind
+from ml.ope.registry import AGGREGATE, shown
 
 FIT_WEIGHT = 15.0
 COVERAGE_STEP = "coverage"
@@ -36,7 +36,7 @@ def declare_evaluation(job: JobContext, params: EvaluateParams, *, fit: bool) ->
     job.step("choose-policies", "Choose policies and references", weight=learning.STORE_WEIGHT)
     job.step(COVERAGE_STEP, "Check what the data can say about each policy", weight=COVERAGE_WEIGHT)
     for method in _fitted(params):
-        job.step(f"estimate/{method}", f"Estimate every policy: {METHOD_NAMES[method]}", weight=METHOD_WEIGHTS[method])
+        job.step(f"estimate/{method}", f"Estimate every policy: {shown(method).name}", weight=shown(method).weight)
     job.step(SKILL_STEP, "Hold the methods against controllers that were left out", weight=SKILL_WEIGHT)
     job.step("rank", "Store the estimates and rank", weight=learning.STORE_WEIGHT)
 
@@ -160,7 +160,7 @@ def _declare_fit(job: JobContext, params: EvaluateParams) -> None:
     job.step("store-models", "Store the models", weight=learning.STORE_WEIGHT)
 
 
-def _fitted(params: EvaluateParams) -> list[Method]:
+def _fitted(params: EvaluateParams) -> list[str]:
     """Methods with a compute step: all but the combination, which is computed from their estimates."""
     return [m for m in params.methods if m != AGGREGATE]
 

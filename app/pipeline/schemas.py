@@ -7,9 +7,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from app.evaluation.estimates.methods import METHOD_NAMES as METHOD_NAMES
-from app.evaluation.estimates.methods import METHODS as METHODS
-from app.evaluation.estimates.methods import Method as Method
 from app.evaluation.estimates.methods import Methods
 from app.evaluation.schemas import EvaluateParams
 from app.learning.schemas import DistilParams, SweepParams, TrainParams

@@ -23,6 +23,7 @@ from ml.ope.estimate import Estimate, checked_horizon
 from ml.ope.fqe.estimator import value_estimate, within_reach
 from ml.ope.fqe.steps import StepTable, TargetActions, ValueFeatures, fresh_memory, step_table
 from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
+from ml.ope.registry import Size
 from ml.ope.support.coverage import AmplitudeSupport
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
@@ -225,3 +226,8 @@ class FittedDualDice:
             ],
         }
         return value_estimate(self, main, refits, policy, horizon, support, details)
+
+
+def build(key: str, seed: int, size: Size) -> DualDice:
+    """The estimator at a size of `ml.ope.registry`."""
+    return DualDice(DiceConfig(seed=seed, members=1, updates=300) if size == "demo" else DiceConfig(seed=seed), key)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from scipy.stats import norm
 from ml.ope.behaviour import Key, clones, controller_key, rule_of_thumb_bandwidth
 from ml.ope.estimate import LEVEL, Estimate, checked_horizon
 from ml.ope.flags import Flag
+from ml.ope.registry import Size
 from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size, few_effective
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
@@ -280,3 +281,8 @@ def horizon_of_ten(log_ratio: Floats, mask: Mask) -> int:
         if effective_sample_size(cumulative[:, t])[0] < FEW_EFFECTIVE:
             return t
     return int(cumulative.shape[1])
+
+
+def build(key: str, seed: int, size: Size) -> ImportanceSampling:
+    """The estimator at a size of `ml.ope.registry`."""
+    return ImportanceSampling(cast(Weighting, key), draws=100 if size == "held_out" else 1000, seed=seed)

@@ -27,7 +27,6 @@ from app.analysis.calibration.schemas import (
     TestedPolicyOut,
 )
 from app.evaluation import repository
-from app.evaluation.estimates.methods import METHODS
 from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.actual import KNOWN_SHARE, QUANTITIES, Actual, actual
@@ -40,6 +39,7 @@ from app.study import service as study
 from app.study.models import Participant, StudySession, Visit
 from ml.mdp import MdpSettings
 from ml.ope.estimate import LEVEL, Estimate
+from ml.ope.registry import method_keys
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def calibration(db: Session, participant: Participant, caller: Caller) -> Calibr
         found, missed = _of_visit(loaded[before], visit)
         policies += found
         left_out += missed
-    methods = [m for m in METHODS if any(m == q.method for p in policies for q in p.predictions)]
+    methods = [m for m in method_keys() if any(m == q.method for p in policies for q in p.predictions)]
     unit = next((db.get_one(BufferSnapshot, b.evaluation.snapshot_id).beta_unit for b in loaded.values()), None)
     return CalibrationOut(
         participant=participant.code,
@@ -144,7 +144,7 @@ def _tested(before: _Before, visit: Visit, policy_id: int, ran: Sequence[Ran]) -
             )
         elif result.end_reward is None:
             reasons.append(f"session {session.session_id}: an outcome that r_end needs was not measured")
-    predictions = [_prediction(m, before.estimates[policy_id][m], results) for m in METHODS if m in before.estimates[policy_id]]
+    predictions = [_prediction(m, before.estimates[policy_id][m], results) for m in method_keys() if m in before.estimates[policy_id]]
     return TestedPolicyOut(
         visit=visit.number,
         visit_date=visit.date,

@@ -11,12 +11,12 @@ from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
-from app.evaluation.estimates.methods import AGGREGATE, METHOD_NAMES
 from ml.ope.compare.aggregate import combine
-from ml.ope.compare.ranking import PREFERENCE, default_method
+from ml.ope.compare.ranking import default_method
 from ml.ope.compare.skill import with_held_out_error
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag
+from ml.ope.registry import AGGREGATE, preference, shown
 
 Tables = Mapping[str, Mapping[str, Estimate]]
 
@@ -54,7 +54,7 @@ def choose(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, An
         reasons = [Flag.of("cannot_choose", text=str(outcome["failed"]))]
     else:
         reasons = stored_reasons(held)
-    usual = Flag.of("usual_order", methods=tuple(m for m in PREFERENCE if m in estimates))
+    usual = Flag.of("usual_order", methods=tuple(m for m in preference() if m in estimates))
     return result | {"method": default_method(estimates), "chosen_by_data": False, "reasons": [r.to_json() for r in (*reasons, usual)]}
 
 
@@ -139,7 +139,7 @@ def no_difference_error(predictions: Sequence[Mapping[str, Any]]) -> float | Non
 
 
 def _name(method: str) -> str:
-    return METHOD_NAMES.get(method, method)
+    return shown(method).name
 
 
 def _supports(table: Mapping[str, Estimate]) -> bool:

@@ -12,7 +12,7 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.evaluation.decision import RULES
 from app.evaluation.estimates import coverage
-from app.evaluation.estimates.methods import METHOD_NAMES, METHOD_SHORT
+from app.evaluation.estimates.methods import names
 from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.api import csv_of
@@ -27,6 +27,7 @@ from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.service import may
+from ml.ope import registry
 from ml.ope.flags import TEXT
 
 router = APIRouter()
@@ -61,8 +62,8 @@ def ranking_page(
         forest=charts.forest(found) if found else None,
         references=charts.shown_references(found) if found else [],
         label=charts.label,
-        method_names=METHOD_NAMES,
-        method_short=METHOD_SHORT,
+        method_names=names(),
+        method_short={m.key: m.short for m in registry.methods()},
         decision_names=DECISION_NAMES,
         beside_decision=_beside_decision,
         coverage=coverage,

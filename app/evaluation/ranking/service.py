@@ -13,7 +13,6 @@ from app.evaluation import repository, wording
 from app.evaluation.decision import Decided, decide, gain_over
 from app.evaluation.estimates.choice import stored_reasons
 from app.evaluation.estimates.coverage import coverage_by_policy, coverage_failed
-from app.evaluation.estimates.methods import METHODS
 from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.notes import ranking_notes
@@ -41,6 +40,7 @@ from app.study.models import Participant
 from ml.ope.compare.ranking import rank_policies
 from ml.ope.estimate import Estimate
 from ml.ope.flags import TEXT, distinct
+from ml.ope.registry import method_keys
 
 Table = dict[int, dict[str, Estimate]]
 
@@ -66,7 +66,7 @@ def current_ranking(
             f"Participant {participant.code} has no ranking yet.", "Start a job of kind 'pipeline', or 'evaluate' where there are policies."
         )
     table = _table(evaluation)
-    methods = [m for m in METHODS if any(m in by_method for by_method in table.values())]
+    methods = [m for m in method_keys() if any(m in by_method for by_method in table.values())]
     chosen = method or evaluation.default_method
     if chosen not in methods:
         raise Invalid(f"This ranking has no estimates by '{chosen}'.", f"Choose one of {', '.join(methods)}.")
@@ -166,7 +166,7 @@ def _rows(
                 supported=chosen.supported if chosen else False,
                 probability_best=place.probability_best if place else None,
                 retired=policy.retired_reason is not None,
-                estimates={m: estimate_out(table[i][m], EstimateOut) for m in METHODS if m in table[i]},
+                estimates={m: estimate_out(table[i][m], EstimateOut) for m in method_keys() if m in table[i]},
                 predicted=chosen.predicted if chosen else {},
                 flags=_flags(chosen, coverage.get(i), i in references),
                 coverage=coverage.get(i),

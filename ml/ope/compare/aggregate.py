@@ -17,13 +17,13 @@ from scipy.optimize import nnls
 from ml.ope.estimate import LEVEL, Estimate, Fitted
 from ml.ope.estimate import Estimator as EstimatorOf
 from ml.ope.flags import distinct
+from ml.ope.registry import AGGREGATE
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.statistics.bootstrap import percentile_interval
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
-METHOD = "aggregate"
 
 
 def error_matrix(estimates: Mapping[str, Mapping[str, Estimate]], methods: list[str], bias: Mapping[str, float] | None = None) -> Floats:
@@ -77,7 +77,7 @@ def combine(estimates: Mapping[str, Mapping[str, Estimate]], bias: Mapping[str, 
     Raises:
         ValueError: no method takes part, or no policy has been estimated by all that do.
     """
-    methods = [m for m, table in estimates.items() if m != METHOD and any(e.supported for e in table.values())]
+    methods = [m for m, table in estimates.items() if m != AGGREGATE and any(e.supported for e in table.values())]
     if not methods:
         raise ValueError("nothing to combine: no method supports any policy")
     policies = common_policies(estimates, methods)
@@ -105,7 +105,7 @@ def _combined(parts: list[Estimate], methods: list[str], weights: Floats) -> Est
     main = used[int(np.argmax([w for w in weights if w > 1e-6]))]
     return replace(
         main,
-        method=METHOD,
+        method=AGGREGATE,
         value=value,
         low=min(interval.low, value - 1.645 * between),
         high=max(interval.high, value + 1.645 * between),
@@ -128,7 +128,7 @@ class Aggregate:
     """Several estimators fitted and combined as one."""
 
     parts: Mapping[str, EstimatorOf]
-    method: str = METHOD
+    method: str = AGGREGATE
 
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedAggregate:
         """Fit every part. Raises ValueError as they do."""

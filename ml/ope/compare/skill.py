@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 
 from ml.ope.behaviour import Key, clones, controllers
-from ml.ope.compare.aggregate import METHOD as AGGREGATE
 from ml.ope.compare.aggregate import combine
 from ml.ope.compare.metrics import spearman
-from ml.ope.compare.ranking import PREFERENCE
 from ml.ope.estimate import Estimate, Estimator, checked_horizon
 from ml.ope.flags import Flag
 from ml.ope.observed import Observed, observed
+from ml.ope.registry import AGGREGATE, preference
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.trajectories import ReplayBuffer
@@ -34,7 +33,7 @@ NINETY = 1.645
 """Half-width of a normal's 90 % interval, the level of all estimates, in standard deviations."""
 
 NEEDED_LEAD = 1.0
-"""A method takes the place of the first of `PREFERENCE` only where its errors are smaller by more than so many standard errors."""
+"""A method takes the place of the first of the usual order only where its errors are smaller by more than so many standard errors."""
 
 
 @dataclass(frozen=True)
@@ -125,13 +124,13 @@ def choose_default(
     horizon = checked_horizon(buffer, horizon_steps)
     predictions, failed = held_out_predictions(buffer, estimators, policies or {}, horizon, aggregate, seed, report)
     table = sorted((s for s in skills(predictions)), key=lambda s: s.difference_error)
-    fallback = next((m for m in PREFERENCE if m in estimators and m not in failed), next(iter(estimators)))
+    fallback = next((m for m in preference() if m in estimators and m not in failed), next(iter(estimators)))
     most = max((s.controllers for s in table), default=0)
     if most < FEWEST_CONTROLLERS:
         reason = Flag("too_few_controllers", float(most), float(FEWEST_CONTROLLERS), "controllers")
         return Choice(fallback, False, (reason,), tuple(table), predictions, failed)
     full = [s for s in table if s.controllers == most]
-    order = {m: k for k, m in enumerate(PREFERENCE)}
+    order = {m: k for k, m in enumerate(preference())}
     first = min((s for s in full if s.method != AGGREGATE), key=lambda s: order.get(s.method, len(order)), default=full[0])
     leads = {s.method: lead(predictions, first.method, s.method) for s in full if s is not first}
     ahead = [s for s in full if s is not first and leads[s.method][0] > NEEDED_LEAD * leads[s.method][1]]

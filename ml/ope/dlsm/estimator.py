@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from ml.ope.behaviour import controller_key
-from ml.ope.dlsm.batches import Batch, Scale, learn_scale, make_batch
+from ml.ope.dlsm.batches import Batch, make_batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.held_out import HeldOut, shares
 from ml.ope.dlsm.rollout import Rollouts, roll_out
@@ -28,6 +28,8 @@ from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS, Flag
 from ml.ope.linear.end_outcomes import EndModel, fit_end_model
 from ml.ope.observed import day_noise
+from ml.ope.registry import Size
+from ml.ope.scale import Scale, learn_scale
 from ml.ope.support.coverage import AmplitudeSupport, Coverage, flags_of
 from ml.policies.policy import Policy
 from ml.progress import Report, part_of, silent
@@ -340,3 +342,8 @@ def _warnings(skill: dict[str, Any]) -> list[Flag]:
     if skill["answer_skill"] is not None and skill["answer_skill"] <= 0:
         found.append(Flag("no_answer_to_amplitude", skill["answer_skill"], 0.0, "skill"))
     return found
+
+
+def build(key: str, seed: int, size: Size) -> Dlsm:
+    """The estimator at a size of `ml.ope.registry`."""
+    return Dlsm(DlsmConfig.of_size(size, seed), key)

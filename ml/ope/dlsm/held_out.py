@@ -15,8 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings
-from ml.ope.dlsm.batches import Batch, Scale
+from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.networks import DlsmNetworks
+from ml.ope.scale import Scale
 
 Floats = NDArray[np.float64]
 

@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from ml.ope.behaviour import controller_key, controllers
-from ml.ope.dlsm.batches import Batch, Scale, session_folds
+from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.held_out import HeldOut, Shares, shares
 from ml.ope.dlsm.training import MemberTraining
+from ml.ope.scale import Scale, session_folds
 from ml.progress import Report, part_of, silent
 from ml.trajectories import ReplayBuffer
 

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from ml.ope.dlsm.batches import Batch, Scale
+from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.held_out import Constant, HeldOut, held_out
 from ml.ope.dlsm.networks import DlsmNetworks
+from ml.ope.scale import Scale
 from ml.progress import Report, silent
 from ml.trajectories import ReplayBuffer
 

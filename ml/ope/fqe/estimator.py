@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings
-from ml.ope.dlsm.batches import session_folds
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS
 from ml.ope.fqe.steps import StepTable, TargetActions, ValueFeatures, fresh_memory, step_table
 from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
 from ml.ope.observed import day_noise
+from ml.ope.registry import Size
+from ml.ope.scale import session_folds
 from ml.ope.support.coverage import AmplitudeSupport
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
@@ -355,3 +356,13 @@ def value_estimate(
             "draws": [round(float(d + value), 4) for d in draws],
         },
     )
+
+
+def build(key: str, seed: int, size: Size) -> Fqe:
+    """The estimator at a size of `ml.ope.registry`."""
+    configs = {
+        "full": FqeConfig(seed=seed),
+        "demo": FqeConfig(seed=seed, members=1, refits=30),
+        "held_out": FqeConfig(seed=seed, refits=25),
+    }
+    return Fqe(configs[size], key)

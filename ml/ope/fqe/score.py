@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.dlsm.batches import learn_scale, session_folds
 from ml.ope.estimate import checked_horizon
 from ml.ope.fqe.estimator import QMember, fit_member, summaries_of, within_reach
 from ml.ope.fqe.steps import TargetActions, fresh_memory, step_table
 from ml.ope.linear.end_outcomes import fit_end_model
+from ml.ope.scale import learn_scale, session_folds
 from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 

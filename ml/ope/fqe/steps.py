@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.dlsm.batches import Scale, learn_scale
+from ml.ope.scale import Scale, learn_scale
 from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 

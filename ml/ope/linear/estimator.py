@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.mdp import step_reward
-from ml.ope.dlsm.batches import Scale, learn_scale, outcome_table, session_folds
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS
 from ml.ope.fqe.steps import fresh_memory, remember
@@ -25,6 +24,8 @@ from ml.ope.linear.dynamics import Dynamics, SessionTable, answers, fit_dynamics
 from ml.ope.linear.end_outcomes import EndModel, fit_end_model, summarise
 from ml.ope.linear.held_out import replay_skill
 from ml.ope.observed import MeanOverDays, mean_over_days
+from ml.ope.registry import Size
+from ml.ope.scale import Scale, learn_scale, outcome_table, session_folds
 from ml.ope.support.coverage import AmplitudeSupport, flags_of
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
@@ -242,3 +243,8 @@ class FittedLinear:
             "end_skill": float(self.end.skill[0]) if with_end else None,
             "sessions": len(self.buffer.sessions),
         }
+
+
+def build(key: str, seed: int, size: Size) -> LinearModel:
+    """The estimator at a size of `ml.ope.registry`."""
+    return LinearModel(LinearConfig(seed=seed, draws=20) if size == "held_out" else LinearConfig(seed=seed), key)

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from ml.ope.compare.metrics import accuracy
-from ml.ope.dlsm.batches import learn_scale, make_batch
+from ml.ope.dlsm.batches import make_batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.estimator import Dlsm
 from ml.ope.dlsm.rollout import roll_out
 from ml.ope.dlsm.training import MemberTraining
 from ml.ope.flags import FEW_END_REWARDS
+from ml.ope.scale import learn_scale
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from ml.ope.dlsm.batches import learn_scale, make_batch
+from ml.ope.dlsm.batches import make_batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.estimator import Dlsm
 from ml.ope.dlsm.held_out import BLOCK, HeldOut, SessionError, block_error, shares
 from ml.ope.dlsm.selection import SelectionRun, leave_out
 from ml.ope.dlsm.training import MemberTraining
+from ml.ope.scale import learn_scale
 from ml.policies.policy import ConstantPolicy
 from ml.trajectories import ReplayBuffer
 
