@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +18,7 @@ from ml.ope.compare.skill import reach_with
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag
 from ml.ope.support.coverage import UNSUPPORTED_SHARE, thin
-
-FEWEST_DRAWS = 20
-"""Aligned draws below which a gain's interval comes from the two standard errors as if they were independent, which is wider."""
+from ml.returns import FEWEST_DRAWS, Gain, gain
 
 RATING_POINTS, TREMOR_POINTS, GRASP_SHARE = 1.0, 10.0, 0.10
 """A predicted rating lower, a tremor higher (percentage points of time) or a grasp slower by more than this is worse than under cDBS."""
@@ -41,16 +38,6 @@ RULES = (
 """What the page prints; `decide` follows them."""
 
 
-@dataclass(frozen=True)
-class Gain:
-    """Estimated return less that of a reference, with a two-sided interval of `level`."""
-
-    value: float
-    low: float
-    high: float
-    level: float
-
-
 def gain_over(policy: Estimate, reference: Estimate) -> Gain:
     """Difference of two estimates of one method: over their aligned draws, in which what both share cancels, where both kept them.
 
@@ -61,13 +48,13 @@ def gain_over(policy: Estimate, reference: Estimate) -> Gain:
     ours, theirs = (np.asarray(e.details.get("draws") or [], dtype=np.float64) for e in (policy, reference))
     tail = (1 - policy.level) / 2
     if ours.size == theirs.size >= FEWEST_DRAWS:
-        differences = ours - theirs
-        low, high = np.quantile(differences - differences.mean(), [tail, 1 - tail]) + value
-        below, above = max(value - float(low), 0.0), max(float(high) - value, 0.0)
-        return Gain(value, value - reach_with(below, unseen), value + reach_with(above, unseen), policy.level)
+        drawn = gain(ours, theirs, 1 - tail)
+        below, above = max(drawn.value - drawn.low, 0.0), max(drawn.high - drawn.value, 0.0)
+        error = math.hypot(drawn.standard_error, unseen)
+        return Gain(value, value - reach_with(below, unseen), error, value + reach_with(above, unseen), policy.level)
     errors = [math.sqrt(max(0.0, e.standard_error**2 - e.details.get("held_out_error", 0.0) ** 2)) for e in (policy, reference)]
     reach = reach_with(float(norm.ppf(1 - tail)) * math.hypot(*errors), unseen)
-    return Gain(value, value - reach, value + reach, policy.level)
+    return Gain(value, value - reach, math.hypot(*errors, unseen), value + reach, policy.level)
 
 
 class Decided(NamedTuple):
@@ -107,19 +94,19 @@ def decide(
         return Decided("needs_data", (Flag("reference_missing"),))
     if not reference.supported:
         return Decided("needs_data", (Flag("reference_unsupported"), *failing_checks(reference)))
-    gain = gain_over(own, reference)
+    over = gain_over(own, reference)
     widened = "held_out_difference_error" in own.details
     found = Flag.of(
-        "gain", gain.value, 0.0, "reward", low=gain.low, high=gain.high, level=gain.level, method=method, widened=widened
+        "gain", over.value, 0.0, "reward", low=over.low, high=over.high, level=over.level, method=method, widened=widened
     )  # fmt: skip
-    if gain.high < 0:
-        return Decided("reject", (found, Flag("all_below_zero", gain.high, 0.0, "reward")))
-    if gain.low <= 0:
-        return Decided("needs_data", (found, Flag("may_be_none", gain.low, 0.0, "reward")))
+    if over.high < 0:
+        return Decided("reject", (found, Flag("all_below_zero", over.high, 0.0, "reward")))
+    if over.low <= 0:
+        return Decided("needs_data", (found, Flag("may_be_none", over.low, 0.0, "reward")))
     doubts = (*_symptoms(own, reference), *_disagreement(estimates, cdbs, method), *_experience(own, tested))
     if doubts:
         return Decided("needs_data", (found, *doubts))
-    return Decided("test_next", (found, Flag("nothing_against", gain.low, 0.0, "reward")))
+    return Decided("test_next", (found, Flag("nothing_against", over.low, 0.0, "reward")))
 
 
 def failing_checks(estimate: Estimate) -> tuple[Flag, ...]:
@@ -160,9 +147,9 @@ def _disagreement(estimates: Mapping[str, Estimate], cdbs: Mapping[str, Estimate
         reference = cdbs.get(other)
         if other == method or reference is None or not (estimate.supported and reference.supported):
             continue
-        gain = gain_over(estimate, reference)
-        if gain.high < 0:
-            found.append(Flag.of("method_sees_loss", gain.value, 0.0, "reward", method=other, low=gain.low, high=gain.high))
+        over = gain_over(estimate, reference)
+        if over.high < 0:
+            found.append(Flag.of("method_sees_loss", over.value, 0.0, "reward", method=other, low=over.low, high=over.high))
     return found
 
 

@@ -23,6 +23,7 @@ from ml.ope.registry import Size
 from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size, few_effective
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
+from ml.returns import step_returns
 from ml.statistics.bootstrap import bca_interval, percentile_interval, resamples
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
@@ -46,10 +47,7 @@ def per_trajectory(log_ratio: Floats, mask: Mask, rewards: Floats, end: Floats, 
     Returns:
         Log weights [N] and returns [N]: discounted sums over the steps that count, rescaled to the whole horizon of T steps.
     """
-    discount = gamma ** np.arange(rewards.shape[1])
-    counted = np.where(mask, discount, 0.0).sum(1)
-    step = np.where(mask, rewards * discount, 0.0).sum(1) * discount.sum() / np.maximum(counted, 1e-300)
-    return np.where(mask, log_ratio, 0.0).sum(1), step + end
+    return np.where(mask, log_ratio, 0.0).sum(1), step_returns(rewards, mask, gamma)[0] + end
 
 
 def ordinary(log_weights: Floats, returns: Floats) -> float:

@@ -29,7 +29,7 @@ from app.analysis.calibration.schemas import (
 from app.evaluation import repository
 from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
-from app.evaluation.ranking.actual import KNOWN_SHARE, QUANTITIES, Actual, actual
+from app.evaluation.ranking.actual import QUANTITIES, Actual, actual
 from app.evaluation.ranking.results import Ran, sessions_that_ran
 from app.evaluation.ranking.service import is_cdbs
 from app.learning.models import BufferSnapshot, Policy
@@ -40,6 +40,7 @@ from app.study.models import Participant, StudySession, Visit
 from ml.mdp import MdpSettings
 from ml.ope.estimate import LEVEL, Estimate
 from ml.ope.registry import method_keys
+from ml.returns import KNOWN_SHARE
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from typing import Any
 
 from app.learning.models import Policy, Sweep
 from app.platform.web.charts import Chart, axis, figure
-from ml.rl.selection import Gain, surest
+from ml.returns import Gain
+from ml.rl.selection import surest
 from ml.rl.support import LARGEST_SHARE_BELOW
 
 PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")

@@ -20,7 +20,7 @@ from scipy.stats import norm
 from ml.ope.behaviour import controller_key
 from ml.ope.dlsm.batches import Batch, make_batch
 from ml.ope.dlsm.config import DlsmConfig
-from ml.ope.dlsm.held_out import HeldOut, shares
+from ml.ope.dlsm.held_out import FreeRuns, shares
 from ml.ope.dlsm.rollout import Rollouts, roll_out
 from ml.ope.dlsm.selection import Selection, SelectionRun, usable_folds
 from ml.ope.dlsm.training import Member, MemberTraining
@@ -127,7 +127,7 @@ class FittedDlsm:
     selection: Selection | None = None
 
     @property
-    def checks(self) -> tuple[HeldOut, ...]:
+    def checks(self) -> tuple[FreeRuns, ...]:
         """Held-out check of every member."""
         return tuple(m.check for m in self.members)
 

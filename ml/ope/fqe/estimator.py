@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ml.mdp import MdpSettings
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS
-from ml.ope.fqe.steps import StepTable, TargetActions, ValueFeatures, fresh_memory, step_table
+from ml.ope.fqe.steps import TargetActions, UsableSteps, ValueFeatures, fresh_memory, usable_steps
 from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
 from ml.ope.observed import day_noise
 from ml.ope.registry import Size
@@ -89,7 +89,7 @@ class FqeConfig:
 class Grams:
     """Sums over the steps of each session that a regression on features needs: [n, F, F] and [n, F, K]."""
 
-    def __init__(self, table: StepTable, phi: Floats) -> None:
+    def __init__(self, table: UsableSteps, phi: Floats) -> None:
         self.table, self.phi = table, phi
         self.bounds = np.searchsorted(table.session, np.arange(table.sessions + 1))
         self.square = self.product(phi)
@@ -139,7 +139,7 @@ def spectral_radius(matrix: Floats) -> float:
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
-def fit_member(table: StepTable, folds: Sequence[Sequence[int]], gamma: float, units: int, seed: int) -> QMember:
+def fit_member(table: UsableSteps, folds: Sequence[Sequence[int]], gamma: float, units: int, seed: int) -> QMember:
     """Features of one seed with the penalty whose predictions of `CHECK_STEPS`-step returns on left-out sessions are best."""
     features = ValueFeatures(table, units, seed)
     phi = features(table.states, table.actions, table.memory)
@@ -166,7 +166,7 @@ def fit_member(table: StepTable, folds: Sequence[Sequence[int]], gamma: float, u
     return QMember(features, grams, PENALTIES[best])
 
 
-def logged_returns(table: StepTable, gamma: float, steps: int) -> tuple[Indices, Floats]:
+def logged_returns(table: UsableSteps, gamma: float, steps: int) -> tuple[Indices, Floats]:
     """Rows that are followed by enough usable steps, and the discounted sums of their next `steps` rewards."""
     rewards = table.rates[:, 0]
     if len(rewards) < steps:
@@ -179,9 +179,9 @@ def logged_returns(table: StepTable, gamma: float, steps: int) -> tuple[Indices,
     return rows, sums[rows]
 
 
-def replace_steps(table: StepTable, keep: NDArray[np.bool_]) -> StepTable:
+def replace_steps(table: UsableSteps, keep: NDArray[np.bool_]) -> UsableSteps:
     """The table with some of its steps; `follows` loses its meaning and is -1."""
-    return StepTable(
+    return UsableSteps(
         table.scale,
         table.states[keep],
         table.next_states[keep],
@@ -230,7 +230,7 @@ class Fqe:
         Raises:
             ValueError: no usable step, or no session with a complete s_0.
         """
-        table, c = step_table(buffer), self.config
+        table, c = usable_steps(buffer), self.config
         folds = session_folds(buffer.sessions, c.folds, c.seed)
         members = []
         for m in range(c.members):
@@ -247,7 +247,7 @@ class FittedFqe:
     method: str
     config: FqeConfig
     buffer: ReplayBuffer
-    table: StepTable
+    table: UsableSteps
     members: tuple[QMember, ...]
     draws: Indices
     end: EndModel
@@ -297,7 +297,7 @@ class ValueSource(Protocol):
     @property
     def method(self) -> str: ...
     @property
-    def table(self) -> StepTable: ...
+    def table(self) -> UsableSteps: ...
     @property
     def buffer(self) -> ReplayBuffer: ...
     @property

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from ml.ope.estimate import checked_horizon
 from ml.ope.flags import Flag
-from ml.ope.fqe.steps import StepTable, memories, step_table
+from ml.ope.fqe.steps import UsableSteps, memories, usable_steps
 from ml.ope.importance import ImportanceSampling, horizon_of_ten
 from ml.ope.support.coverage import (
     FEW_EFFECTIVE,
@@ -157,7 +157,7 @@ def diagnose(
 ) -> dict[str, Diagnostics]:
     """Every check of every policy. Raises ValueError when the buffer has no usable step or no session with a complete s_0."""
     horizon = checked_horizon(buffer, horizon_steps)
-    support, table = AmplitudeSupport(buffer), step_table(buffer)
+    support, table = AmplitudeSupport(buffer), usable_steps(buffer)
     weights = ImportanceSampling("wis").fit(buffer)
     near = _Neighbours(table)
     bounds = [s.random_lower_bound for s in buffer.sessions if s.random_lower_bound is not None]
@@ -203,7 +203,7 @@ def _failing(amplitudes: Coverage, far: float) -> tuple[Flag, ...]:
 class _Neighbours:
     """Nearest logged pairs of (level of beta, amplitude), each axis in its own spread; 95 % of the logged pairs are within 1."""
 
-    def __init__(self, table: StepTable) -> None:
+    def __init__(self, table: UsableSteps) -> None:
         keep = np.unique(np.linspace(0, len(table.actions) - 1, MOST_PAIRS).astype(np.int64))
         self._states, self._session = table.states[keep], table.session[keep]
         levels = self._levels(table, self._states)
@@ -242,6 +242,6 @@ class _Neighbours:
         return result
 
     @staticmethod
-    def _levels(table: StepTable, states: Floats) -> Floats:
+    def _levels(table: UsableSteps, states: Floats) -> Floats:
         window = table.scale.beta(states)
         return np.column_stack([window[:, -1], window.mean(1)])
