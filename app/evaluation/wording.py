@@ -109,6 +109,7 @@ def _sessions_changed(flag: Flag) -> str:
         "included": "newly included",
         "decoded": "decoded anew",
         "cdbs": "with another cDBS amplitude",
+        "moved": "with other steps: its times, control channel or controller were corrected",
     }
     return f"{count(int(_value(flag)), 'session', 'sessions')} {what[flag.fact('change')]}"
 
@@ -216,7 +217,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     # of a ranking that the study has left behind
     "settings_changed": lambda f: f"settings version {_value(f):.0f} is in force; this ranking used version {f.limit:.0f}",
     "sessions_changed": _sessions_changed,
-    "data_changed": lambda f: "the data of its sessions have changed since",
+    "no_threshold": lambda f: "the participant has no beta threshold xi_beta any more",
     "policies_missing": _policies_missing,
     # notes above a ranking, whole sentences
     "none_supported": lambda f: "No candidate is supported by the data: these estimates cannot say whether one improves on cDBS.",

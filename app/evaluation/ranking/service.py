@@ -32,7 +32,6 @@ from app.evaluation.schemas import (
 )
 from app.evaluation.serializers import estimate_out, flag_out, reason_out
 from app.learning.models import BufferSnapshot, Policy
-from app.learning.snapshots.service import Collection, collect
 from app.platform.errors import Invalid, NotFound
 from app.study import repository as study_repository
 from app.study import service as study
@@ -70,11 +69,6 @@ def current_ranking(
     chosen = method or evaluation.default_method
     if chosen not in methods:
         raise Invalid(f"This ranking has no estimates by '{chosen}'.", f"Choose one of {', '.join(methods)}.")
-    try:
-        present: Collection | None = collect(db, participant)
-        trouble = None
-    except Invalid as error:
-        present, trouble = None, str(error)
     policies = repository.policies_by_id(db, list(table))
     snapshot = db.get_one(BufferSnapshot, evaluation.snapshot_id)
     settings = study.mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
@@ -82,8 +76,7 @@ def current_ranking(
     tested = results_by_policy(sessions_that_ran(db, snapshot, caller), settings, evaluation.horizon_steps, cdbs)
     rows = _rows(evaluation, table, policies, chosen, tested)
     candidates, references = [r for r in rows if r.reference is None], [r for r in rows if r.reference is not None]
-    reasons = [trouble] if trouble else []
-    reasons += [wording.sentence(r) for r in stale_reasons(db, participant, evaluation, present)]
+    reasons = [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation)]
     return RankingOut(
         participant=participant.code,
         evaluation_id=evaluation.id,
