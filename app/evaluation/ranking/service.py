@@ -16,7 +16,7 @@ from app.evaluation.estimates.coverage import coverage_by_policy, coverage_faile
 from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.notes import ranking_notes
-from app.evaluation.ranking.results import results_by_policy, sessions_that_ran
+from app.evaluation.ranking.results import driven_sessions, results_by_policy
 from app.evaluation.ranking.staleness import stale_reasons
 from app.evaluation.schemas import (
     ChoiceOut,
@@ -73,7 +73,7 @@ def current_ranking(
     snapshot = db.get_one(BufferSnapshot, evaluation.snapshot_id)
     settings = study.mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
     cdbs = next((i for i, p in policies.items() if is_cdbs(p)), None)
-    tested = results_by_policy(sessions_that_ran(db, snapshot, caller), settings, evaluation.horizon_steps, cdbs)
+    tested = results_by_policy(driven_sessions(db, snapshot, caller), settings, evaluation.horizon_steps, cdbs)
     rows = _rows(evaluation, table, policies, chosen, tested)
     candidates, references = [r for r in rows if r.reference is None], [r for r in rows if r.reference is not None]
     reasons = [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation)]

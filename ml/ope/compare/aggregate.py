@@ -7,21 +7,16 @@ showed of each method's bias is added where it is known.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from ml.ope.estimate import LEVEL, Estimate, Fitted
-from ml.ope.estimate import Estimator as EstimatorOf
+from ml.ope.estimate import LEVEL, Estimate
 from ml.ope.flags import distinct
 from ml.ope.registry import AGGREGATE
-from ml.policies.policy import Policy
-from ml.progress import Report, silent
 from ml.statistics.bootstrap import percentile_interval
-from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
 
@@ -121,34 +116,3 @@ def _combined(parts: list[Estimate], methods: list[str], weights: Floats) -> Est
             "draws": [round(float(d), 4) for d in np.asarray(draws)],
         },
     )
-
-
-@dataclass(frozen=True)
-class Aggregate:
-    """Several estimators fitted and combined as one."""
-
-    parts: Mapping[str, EstimatorOf]
-    method: str = AGGREGATE
-
-    def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedAggregate:
-        """Fit every part. Raises ValueError as they do."""
-        fitted = {}
-        for k, (name, part) in enumerate(self.parts.items()):
-            fitted[name] = part.fit(buffer, checkpoint_dir=checkpoint_dir)
-            report((k + 1) / len(self.parts), "fitting the methods to combine")
-        return FittedAggregate(fitted)
-
-
-@dataclass(frozen=True)
-class FittedAggregate:
-    """The fitted parts."""
-
-    parts: Mapping[str, Fitted]
-
-    def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
-        """Combined estimates. Raises ValueError where nothing can be combined."""
-        estimates = {}
-        for k, (name, part) in enumerate(self.parts.items()):
-            estimates[name] = part.evaluate(policies, horizon_steps)
-            report((k + 1) / len(self.parts), "combining methods")
-        return combine(estimates) if policies else {}

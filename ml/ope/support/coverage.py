@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -130,12 +129,6 @@ def few_effective(code: str, effective: float, sessions: int, *, refuses: bool =
         code: what rests on them. effective: sample size. sessions: that were weighted. refuses: whether nothing else speaks.
     """
     return Flag.of(code, effective, FEW_EFFECTIVE, "sessions", refuses=refuses, sessions=float(sessions))
-
-
-def coverage(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> dict[str, Coverage]:
-    """Coverage of every policy over the states of the buffer."""
-    support = AmplitudeSupport(buffer)
-    return {name: support.of_policy(policy) for name, policy in policies.items()}
 
 
 def effective_sample_size(log_weights: NDArray[Any]) -> tuple[float, float]:
