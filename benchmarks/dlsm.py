@@ -20,11 +20,12 @@ from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 
 from ml.mdp import MdpSettings
-from ml.ope.dlsm.batches import Batch, Scale
+from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.networks import DlsmNetworks, LatentRecurrence, Noise
 from ml.ope.dlsm.recurrence import bounded
 from ml.ope.dlsm.rollout import roll_out
+from ml.ope.scale import Scale
 
 WINDOW, BATCH, LATENT, HIDDEN = 10, 64, 16, 64
 CONFIG = DlsmConfig(

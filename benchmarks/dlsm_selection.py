@@ -28,10 +28,11 @@ from cells import Cells
 from simulators import STEPS, VISITS, WORLDS
 
 from ml.ope.compare.metrics import accuracy
-from ml.ope.dlsm.batches import learn_scale, make_batch
+from ml.ope.dlsm.batches import make_batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.estimator import Dlsm
 from ml.ope.dlsm.selection import SelectionRun
+from ml.ope.scale import learn_scale
 from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 

@@ -108,9 +108,3 @@ def end_reward(settings: MdpSettings, qoc: Qoc) -> float | None:
             return None
         total += weight * float(value)
     return total
-
-
-def discounted_sum(rewards: NDArray[Any], gamma: float, horizon_steps: int | None = None) -> float:
-    """Sum over t < H of gamma^t r_t along the last axis of a single session, shape [T]; H defaults to T."""
-    rewards = np.asarray(rewards, dtype=np.float64)[:horizon_steps]
-    return float(np.sum(rewards * gamma ** np.arange(rewards.size)))

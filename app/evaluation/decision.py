@@ -1,4 +1,4 @@
-"""Whether a policy should be tested next, needs more data, or should be rejected: stated rules, each with its reason in words.
+"""Whether a policy should be tested next, needs more data, or should be rejected: stated rules, each with its reasons as typed flags.
 
 No rule looks at one number alone. The measure is the gain over cDBS, because what a method gets wrong for all policies cancels in it, and
 its lower 95 % bound, because a policy that may be worse than today's treatment has no claim to a patient's time.
@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import norm
 
-from app.evaluation.estimates.methods import METHOD_NAMES
 from app.evaluation.schemas import Decision, TestedBefore
 from ml.ope.compare.skill import reach_with
 from ml.ope.estimate import Estimate
-from ml.ope.support.coverage import UNSUPPORTED_SHARE
-
-FEWEST_DRAWS = 20
-"""Aligned draws below which a gain's interval comes from the two standard errors as if they were independent, which is wider."""
+from ml.ope.flags import Flag
+from ml.ope.support.coverage import UNSUPPORTED_SHARE, thin
+from ml.returns import FEWEST_DRAWS, Gain, gain
 
 RATING_POINTS, TREMOR_POINTS, GRASP_SHARE = 1.0, 10.0, 0.10
 """A predicted rating lower, a tremor higher (percentage points of time) or a grasp slower by more than this is worse than under cDBS."""
@@ -40,16 +38,6 @@ RULES = (
 """What the page prints; `decide` follows them."""
 
 
-@dataclass(frozen=True)
-class Gain:
-    """Estimated return less that of a reference, with a two-sided interval of `level`."""
-
-    value: float
-    low: float
-    high: float
-    level: float
-
-
 def gain_over(policy: Estimate, reference: Estimate) -> Gain:
     """Difference of two estimates of one method: over their aligned draws, in which what both share cancels, where both kept them.
 
@@ -60,13 +48,20 @@ def gain_over(policy: Estimate, reference: Estimate) -> Gain:
     ours, theirs = (np.asarray(e.details.get("draws") or [], dtype=np.float64) for e in (policy, reference))
     tail = (1 - policy.level) / 2
     if ours.size == theirs.size >= FEWEST_DRAWS:
-        differences = ours - theirs
-        low, high = np.quantile(differences - differences.mean(), [tail, 1 - tail]) + value
-        below, above = max(value - float(low), 0.0), max(float(high) - value, 0.0)
-        return Gain(value, value - reach_with(below, unseen), value + reach_with(above, unseen), policy.level)
+        drawn = gain(ours, theirs, 1 - tail)
+        below, above = max(drawn.value - drawn.low, 0.0), max(drawn.high - drawn.value, 0.0)
+        error = math.hypot(drawn.standard_error, unseen)
+        return Gain(value, value - reach_with(below, unseen), error, value + reach_with(above, unseen), policy.level)
     errors = [math.sqrt(max(0.0, e.standard_error**2 - e.details.get("held_out_error", 0.0) ** 2)) for e in (policy, reference)]
     reach = reach_with(float(norm.ppf(1 - tail)) * math.hypot(*errors), unseen)
-    return Gain(value, value - reach, value + reach, policy.level)
+    return Gain(value, value - reach, math.hypot(*errors, unseen), value + reach, policy.level)
+
+
+class Decided(NamedTuple):
+    """A decision and what it rests on, in the order in which it was looked at; `wording.decision` makes a sentence of it."""
+
+    decision: Decision
+    reasons: tuple[Flag, ...]
 
 
 def decide(
@@ -77,8 +72,8 @@ def decide(
     retired_reason: str | None = None,
     tested: TestedBefore | None = None,
     unchecked: str | None = None,
-) -> tuple[Decision, str]:
-    """The decision on one candidate and its reason.
+) -> Decided:
+    """The decision on one candidate and its reasons.
 
     Args:
         estimates: of the candidate, by method. cdbs: of the cDBS reference, by method; empty where it has none.
@@ -87,79 +82,80 @@ def decide(
         unchecked: why what the data cover could not be checked; None where it was.
     """
     if retired_reason:
-        return "reject", f"retired: {retired_reason}"
+        return Decided("reject", (Flag.of("retired", text=retired_reason),))
     own, reference = estimates.get(method), cdbs.get(method)
-    name = METHOD_NAMES.get(method, method)
     if own is None:
-        return "needs_data", f"{name} has no estimate of it"
+        return Decided("needs_data", (Flag.of("no_estimate", method=method),))
     if not own.supported:
-        return "needs_data", failing_check(own)
+        return Decided("needs_data", failing_checks(own))
     if unchecked is not None:
-        return "needs_data", f"what the data cover could not be checked: {unchecked}"
-    if reference is None or not reference.supported:
-        why = "has no estimate" if reference is None else f"is itself {failing_check(reference)}"
-        return "needs_data", f"the cDBS reference, which it is held against, {why}"
-    gain = gain_over(own, reference)
-    words = f"gain over cDBS {_signed(gain.value)}, {100 * gain.level:.0f} % interval {_signed(gain.low)} to {_signed(gain.high)}"
-    if "held_out_difference_error" not in own.details:
-        words += f" (not widened: how {name} errs on controllers that it has not seen is not known)"
-    if gain.high < 0:
-        return "reject", f"{words}: all of it below 0"
-    if gain.low <= 0:
-        return "needs_data", f"{words}: it may be none"
-    doubts = [*_symptoms(own, reference), *_disagreement(estimates, cdbs, method), *_experience(own, tested)]
+        return Decided("needs_data", (Flag.of("coverage_unchecked", text=unchecked),))
+    if reference is None:
+        return Decided("needs_data", (Flag("reference_missing"),))
+    if not reference.supported:
+        return Decided("needs_data", (Flag("reference_unsupported"), *failing_checks(reference)))
+    over = gain_over(own, reference)
+    widened = "held_out_difference_error" in own.details
+    found = Flag.of(
+        "gain", over.value, 0.0, "reward", low=over.low, high=over.high, level=over.level, method=method, widened=widened
+    )  # fmt: skip
+    if over.high < 0:
+        return Decided("reject", (found, Flag("all_below_zero", over.high, 0.0, "reward")))
+    if over.low <= 0:
+        return Decided("needs_data", (found, Flag("may_be_none", over.low, 0.0, "reward")))
+    doubts = (*_symptoms(own, reference), *_disagreement(estimates, cdbs, method), *_experience(own, tested))
     if doubts:
-        return "needs_data", f"{words}, but {'; '.join(doubts)}"
-    return "test_next", f"{words}: its lower 95 % bound is above 0, and no other check speaks against it"
+        return Decided("needs_data", (found, *doubts))
+    return Decided("test_next", (found, Flag("nothing_against", over.low, 0.0, "reward")))
 
 
-def failing_check(estimate: Estimate) -> str:
-    """Why an estimate is not supported: its flag that says so, else what its simulated sessions showed, which flags may leave out."""
-    named = next((flag for flag in estimate.flags if "not supported" in flag), None)
-    if named is not None:
-        return named
-    thin = (estimate.details.get("coverage_simulated") or {}).get("thin", 0.0)
-    if thin > UNSUPPORTED_SHARE:
-        return (
-            f"not supported by the data: in {100 * thin:.0f} % of the steps of its simulated sessions it asks for amplitudes with "
-            "hardly any logged step near them"
-        )
-    return "; ".join(("not supported by the data", *estimate.flags))
+def failing_checks(estimate: Estimate) -> tuple[Flag, ...]:
+    """Why an estimate is not supported: the first flag that refuses it, else what its simulated sessions showed, else all that is known.
+
+    Estimates stored by betaloop 0.1.0 have sentences for flags, and only their numbers are looked at.
+    """
+    refusing = next((flag for flag in estimate.flags if flag.refuses), None)
+    if refusing is not None:
+        return (refusing,)
+    share = (estimate.details.get("coverage_simulated") or {}).get("thin", 0.0)
+    if share > UNSUPPORTED_SHARE:
+        return (thin(share, "simulated"),)
+    return (Flag("not_supported"), *estimate.flags)
 
 
-def _symptoms(own: Estimate, reference: Estimate) -> list[str]:
-    ours, theirs = own.predicted, reference.predicted
+def _symptoms(own: Estimate, reference: Estimate) -> list[Flag]:
+    checks = (
+        ("rating_lower", "rating", "points", -1, RATING_POINTS, 0.0),
+        ("tremor_higher", "tremor_percent", "percent of time", 1, TREMOR_POINTS, 0.0),
+        ("grasp_slower", "grasp_hz", "Hz", -1, 0.0, GRASP_SHARE),
+    )
     found = []
-    if "rating" in ours and "rating" in theirs and ours["rating"] < theirs["rating"] - RATING_POINTS:
-        found.append(f"its rating is predicted at {ours['rating']:.1f} against {theirs['rating']:.1f} under cDBS")
-    if "tremor_percent" in ours and "tremor_percent" in theirs and ours["tremor_percent"] > theirs["tremor_percent"] + TREMOR_POINTS:
-        found.append(f"its tremor is predicted at {ours['tremor_percent']:.0f} % against {theirs['tremor_percent']:.0f} % under cDBS")
-    if "grasp_hz" in ours and "grasp_hz" in theirs and ours["grasp_hz"] < theirs["grasp_hz"] * (1 - GRASP_SHARE):
-        found.append(f"its grasp is predicted at {ours['grasp_hz']:.2f} Hz against {theirs['grasp_hz']:.2f} Hz under cDBS")
+    for code, name, unit, worse, points, share in checks:
+        ours, theirs = own.predicted.get(name), reference.predicted.get(name)
+        if ours is None or theirs is None:
+            continue
+        limit = theirs * (1 + worse * share) + worse * points
+        if worse * (ours - limit) > 0:
+            found.append(Flag.of(code, ours, limit, unit, cdbs=theirs))
     return found
 
 
-def _disagreement(estimates: Mapping[str, Estimate], cdbs: Mapping[str, Estimate], method: str) -> list[str]:
+def _disagreement(estimates: Mapping[str, Estimate], cdbs: Mapping[str, Estimate], method: str) -> list[Flag]:
     """Other methods that support both and whose whole interval of the gain lies below 0."""
     found = []
     for other, estimate in estimates.items():
         reference = cdbs.get(other)
         if other == method or reference is None or not (estimate.supported and reference.supported):
             continue
-        gain = gain_over(estimate, reference)
-        if gain.high < 0:
-            found.append(f"{METHOD_NAMES.get(other, other)} sees a loss ({_signed(gain.low)} to {_signed(gain.high)})")
+        over = gain_over(estimate, reference)
+        if over.high < 0:
+            found.append(Flag.of("method_sees_loss", over.value, 0.0, "reward", method=other, low=over.low, high=over.high))
     return found
 
 
-def _experience(own: Estimate, tested: TestedBefore | None) -> list[str]:
+def _experience(own: Estimate, tested: TestedBefore | None) -> list[Flag]:
     if tested is None or tested.sessions_with_return < FEWEST_TESTED or tested.mean_return is None or own.end_reward is None:
         return []
     if tested.mean_return >= own.low:
         return []
-    return [f"its {tested.sessions_with_return} sessions returned {tested.mean_return:.1f} on average, below the estimate's {own.low:.1f}"]
-
-
-def _signed(value: float) -> str:
-    shown = round(value, 1)
-    return f"{shown:+.1f}".replace("-", "\N{MINUS SIGN}") if shown else "0.0"
+    return [Flag.of("returned_less", tested.mean_return, own.low, "reward", sessions=float(tested.sessions_with_return))]

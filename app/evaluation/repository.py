@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import datetime
+from typing import Any
 
-from sqlalchemy import Select, select, text
+from sqlalchemy import Select, or_, select, text
 from sqlalchemy.orm import Session, selectinload
 
 from app.evaluation.models import Evaluation
 from app.learning.models import Policy
+from app.platform.audit import AuditEvent
 
 
 def newest_evaluation(db: Session, participant_id: int) -> Evaluation | None:
@@ -41,6 +43,30 @@ def evaluation_times(db: Session, participant_id: int) -> dict[int, datetime]:
 def policies_by_id(db: Session, ids: Sequence[int]) -> dict[int, Policy]:
     """Policies by their number."""
     return {p.id: p for p in db.scalars(select(Policy).where(Policy.id.in_(ids)))}
+
+
+def changed_since(
+    db: Session, entity: str, column: str, ids: Collection[int], moment: datetime
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Rows as they were at a moment and as they are now, of those that the audit trail has a change of since.
+
+    Changes are chained from row to row, not by key, because a key may change too. What was changed back stands on both sides.
+
+    Args:
+        entity: the table. column: of it, whose value is one of `ids`.
+    """
+    mine = or_(AuditEvent.before[column].as_integer().in_(ids), AuditEvent.after[column].as_integer().in_(ids))
+    query = select(AuditEvent).where(AuditEvent.entity == entity, AuditEvent.at > moment, mine).order_by(AuditEvent.id)
+    then: list[dict[str, Any]] = []
+    now: list[dict[str, Any]] = []
+    for event in db.scalars(query):
+        if event.before is not None and event.before in now:
+            now.remove(event.before)
+        elif event.before is not None:
+            then.append(event.before)
+        if event.after is not None:
+            now.append(event.after)
+    return then, now
 
 
 def _evaluations() -> Select[Evaluation]:

@@ -7,8 +7,6 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field
 
-from app.evaluation.estimates.methods import METHOD_NAMES as METHOD_NAMES
-from app.evaluation.estimates.methods import METHODS as METHODS
 from app.evaluation.estimates.methods import Method as Method
 from app.evaluation.estimates.methods import Methods
 from app.learning.schemas import PolicyIds, Preset
@@ -29,18 +27,38 @@ RANKING_KINDS = ("pipeline", "evaluate")
 """Kinds of job that end with a ranking."""
 
 
-class EstimateOut(Model):
-    """One method's estimate of E[r_end + sum over t < H of gamma^t r_t], unnormalised."""
+class ReasonOut(Model):
+    """A finding as values, for programs; `code` says what was found."""
+
+    code: str
+    value: float | None = Field(description="What was measured; null where the finding has no number.")
+    limit: float | None = Field(description="What the value is held against.")
+    unit: str
+
+
+class FlagOut(ReasonOut):
+    """A finding about an estimate or a policy, with its sentence; `text` for a sentence that betaloop 0.1.0 stored."""
+
+    text: str = Field(description="For people. Its wording may change; programs read the other fields.")
+
+
+class EstimateSummary(Model):
+    """What every view of an estimate has."""
 
     value: float
     low: float
     high: float
     level: float
+    supported: bool
+    flags: list[FlagOut]
+
+
+class EstimateOut(EstimateSummary):
+    """One method's estimate of E[r_end + sum over t < H of gamma^t r_t], unnormalised."""
+
     standard_error: float | None
     step_return: float | None
     end_reward: float | None
-    supported: bool
-    flags: list[str]
     predicted: dict[str, float]
     n: int | None
 
@@ -98,9 +116,9 @@ class CoverageOut(Model):
     supported: bool
     sessions: int = Field(description="Sessions that have importance weights.")
     checks: list[CheckOut]
-    failing: list[str] = Field(description="Checks that refuse the policy, in words.")
-    notes: list[str] = Field(description="To be known before it is picked; no refusal.")
-    weights_failing: list[str] = Field(description="Why importance sampling cannot speak about it.")
+    failing: list[FlagOut] = Field(description="Checks that refuse the policy.")
+    notes: list[FlagOut] = Field(description="To be known before it is picked; no refusal.")
+    weights_failing: list[FlagOut] = Field(description="Why importance sampling cannot speak about it.")
 
 
 class RankedPolicy(Model):
@@ -120,12 +138,13 @@ class RankedPolicy(Model):
     predicted: dict[str, float] = Field(
         description="By the ranking's method: energy, mean_amplitude, mean_beta, grasp_hz, rating, tremor_percent."
     )
-    flags: list[str]
+    flags: list[FlagOut]
     coverage: CoverageOut | None = Field(description="Null for an evaluation that did not check it, and where it could not be checked.")
     tested: TestedBefore | None
     gain: GainOut | None = Field(description="Over cDBS by the ranking's method; null where one of the two has no estimate.")
-    decision: Decision | None = Field(description="By stated rules, in `decision_reason`; null for references.")
-    decision_reason: str
+    decision: Decision | None = Field(description="By stated rules; null for references.")
+    decision_reasons: list[ReasonOut] = Field(description="What the decision rests on; empty for references.")
+    decision_reason: str = Field(description="The reasons in words.")
 
 
 class RankedSnapshot(Model):
@@ -174,7 +193,8 @@ class ChoiceOut(Model):
 
     method: str
     chosen_by_data: bool = Field(description="False: a stated order decided, for the reason given.")
-    reason: str
+    reasons: list[ReasonOut] = Field(description="Why; empty for a choice that betaloop 0.1.0 stored, which has words alone.")
+    reason: str = Field(description="The reasons in words.")
     table: list[SkillOut] = Field(description="Best first.")
     no_difference_error: float | None = Field(
         None, description="Error of differences of a prediction that all controllers return the same: a method above it has no skill."

@@ -9,10 +9,9 @@ from sqlalchemy.orm import Session
 
 from app.evaluation import repository
 from app.evaluation.estimates.choice import choose, combined, widened
-from app.evaluation.estimates.coverage import STORED, refused, told_apart
-from app.evaluation.estimates.methods import AGGREGATE, METHOD_NAMES
-from app.evaluation.estimates.rows import as_estimate
-from app.evaluation.models import EstimateRow, Evaluation
+from app.evaluation.estimates.coverage import STORED, refused
+from app.evaluation.estimates.rows import row_of
+from app.evaluation.models import Evaluation
 from app.evaluation.ranking.service import current_ranking as current_ranking
 from app.evaluation.schemas import EvaluateParams
 from app.learning import repository as learning
@@ -23,6 +22,7 @@ from app.platform.jobs import service as jobs
 from app.study import repository as study_repository
 from app.study.models import Participant
 from ml.ope.estimate import Estimate
+from ml.ope.registry import AGGREGATE, shown
 
 
 def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams) -> list[Policy]:
@@ -85,9 +85,8 @@ def store_evaluation(
         if known is not None:
             return known
     estimates: dict[str, dict[str, Estimate]] = {
-        m: {i: as_estimate(e) for i, e in r["estimates"].items()} for m, r in results.items() if r.get("estimates")
+        m: {i: Estimate.from_json(e) for i, e in r["estimates"].items()} for m, r in results.items() if r.get("estimates")
     }
-    estimates = told_apart(estimates)
     failed = {m: str(r["failed"]) for m, r in results.items() if "failed" in r}
     if AGGREGATE in config.get("methods", []):
         made = combined(estimates, skill)
@@ -97,7 +96,7 @@ def store_evaluation(
             estimates[AGGREGATE] = made["estimates"]
     estimates = refused(widened(estimates, skill), coverage)
     if not estimates:
-        reasons = "; ".join(f"{METHOD_NAMES.get(m, m)}: {reason}" for m, reason in failed.items())
+        reasons = "; ".join(f"{shown(m).name}: {reason}" for m, reason in failed.items())
         raise Invalid(f"No method could estimate these policies: {reasons}.", "Collect more sessions, then evaluate again.")
     ranked = {m: {i: e for i, e in table.items() if int(i) in set(candidates)} for m, table in estimates.items()}
     choice = choose({m: table for m, table in ranked.items() if table}, skill)
@@ -114,24 +113,7 @@ def store_evaluation(
         code_version=jobs.code_version(),
         created_by=created_by,
     )
-    row.estimates = [_estimate_row(int(policy_id), e) for table in estimates.values() for policy_id, e in table.items()]
+    row.estimates = [row_of(int(policy_id), e) for table in estimates.values() for policy_id, e in table.items()]
     db.add(row)
     db.flush()
     return row
-
-
-def _estimate_row(policy_id: int, e: Estimate) -> EstimateRow:
-    return EstimateRow(
-        policy_id=policy_id,
-        method=e.method,
-        value=e.value,
-        # an interval of a skewed bootstrap may miss the estimate itself; the table keeps it inside
-        low=min(e.low, e.value),
-        high=max(e.high, e.value),
-        level=e.level,
-        standard_error=e.standard_error,
-        supported=e.supported,
-        flags=list(e.flags),
-        predicted={name: v for name, v in e.predicted.items() if v is not None},
-        details={**e.details, "step_return": e.step_return, "end_reward": e.end_reward, "n": e.n},
-    )

@@ -14,7 +14,9 @@ from sqlalchemy.orm import Session
 from app import __version__
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
+from app.evaluation import wording
 from app.evaluation.estimates.coverage import coverage_by_policy
+from app.evaluation.estimates.rows import estimate_of
 from app.learning.models import Policy
 from app.overview import repository
 from app.platform.errors import BetaloopError
@@ -86,7 +88,7 @@ def _policy_row(p: Policy) -> tuple[Any, ...]:
 def _estimate_rows(db: Session, participant: Participant) -> list[tuple[Any, ...]]:
     return [
         (e.id, e.snapshot_id, e.settings_version_id, e.horizon_steps, e.gamma, r.policy_id, r.method, r.value, r.low, r.high, r.level,
-         r.supported, "; ".join(map(str, r.flags)))
+         r.supported, wording.joined(estimate_of(r).flags))
         for e, r in repository.estimates(db, participant.id)
     ]  # fmt: skip
 

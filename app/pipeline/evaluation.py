@@ -9,7 +9,6 @@ from sqlalchemy.orm import Session
 
 from app.evaluation import repository, service
 from app.evaluation.estimates import compute
-from app.evaluation.estimates.methods import AGGREGATE, METHOD_NAMES, METHOD_WEIGHTS, Method
 from app.evaluation.schemas import EvaluateParams
 from app.learning.models import BufferSnapshot
 from app.learning.policies.baselines import ensure_baselines
@@ -17,6 +16,7 @@ from app.learning.snapshots.buffers import read_buffer
 from app.pipeline.stages import STORE_WEIGHT, ComputeStep, participant_of, plan_on_snapshot
 from app.platform import files
 from app.platform.jobs import JobContext
+from ml.ope.registry import AGGREGATE, shown
 
 FIT_WEIGHT = 15.0
 COVERAGE_STEP = "coverage"
@@ -43,7 +43,7 @@ def declare_evaluation(job: JobContext, params: EvaluateParams, *, fit: bool) ->
     job.step("choose-policies", "Choose policies and references", weight=STORE_WEIGHT)
     job.step(COVERAGE_STEP, "Check what the data can say about each policy", weight=COVERAGE_WEIGHT)
     for method in _fitted(params):
-        job.step(f"estimate/{method}", f"Estimate every policy: {METHOD_NAMES[method]}", weight=METHOD_WEIGHTS[method])
+        job.step(f"estimate/{method}", f"Estimate every policy: {shown(method).name}", weight=shown(method).weight)
     job.step(SKILL_STEP, "Hold the methods against controllers that were left out", weight=SKILL_WEIGHT)
     job.step("rank", "Store the estimates and rank", weight=STORE_WEIGHT)
 
@@ -125,7 +125,7 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
     return job.transact("rank", store)
 
 
-def _fitted(params: EvaluateParams) -> list[Method]:
+def _fitted(params: EvaluateParams) -> list[str]:
     """Methods with a compute step: all but the combination, which is computed from their estimates."""
     return [m for m in params.methods if m != AGGREGATE]
 

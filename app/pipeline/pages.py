@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
-from app.evaluation.estimates.methods import METHOD_NAMES, METHODS, QUICK_METHODS
+from app.evaluation.estimates.methods import names as method_names
 from app.learning import repository as learning
 from app.learning.schemas import ALGORITHM_NAMES, AlgorithmName
 from app.learning.snapshots.service import not_ready
@@ -29,6 +29,7 @@ from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.service import may
+from ml.ope import registry as estimators
 
 router = APIRouter()
 
@@ -130,7 +131,7 @@ def _jobs(
         given=given or {},
         algorithms=TRAINABLE,
         given_algorithms=(given or {}).get("algorithms", ["ddpg"]),
-        methods=[(m, METHOD_NAMES[m], m in QUICK_METHODS) for m in METHODS],
+        methods=estimators.methods(),
         given_methods=(given or {}).get("methods", []),
         workers=len(jobs.live_workers(db, job_service.STALE_S)),
         trained=[p for p in learning.candidates(db, participant.id) if p.kind == "trained"],
@@ -145,5 +146,5 @@ def _titles() -> dict[str, str]:
 
 def _in_words(params: dict[str, Any]) -> dict[str, Any]:
     """What was asked for, with methods and algorithms by their names."""
-    names = {"methods": METHOD_NAMES, "algorithms": ALGORITHM_NAMES}
+    names = {"methods": method_names(), "algorithms": ALGORITHM_NAMES}
     return {k: [str(names[k].get(one, one)) for one in v] if k in names else v for k, v in params.items()}

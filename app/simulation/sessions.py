@@ -19,10 +19,11 @@ from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Controller, Participant, StudySession, Visit
 from app.study.schemas import QocIn
-from ml.mdp import discounted_sum, end_reward, step_reward
+from ml.mdp import end_reward, step_reward
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.population import SimulatedSession, run_session
 from ml.population.controllers import Controller as CohortController
+from ml.returns import ActualReturn, step_return
 
 RESOLUTION_MA = 0.1
 """What an RC+S delivers."""
@@ -96,13 +97,12 @@ def hold(db: Session, participant: Participant, visit: Visit, placed: PlacedSess
 
 
 def actual_return(db: Session, session: StudySession) -> float | None:
-    """What a session brought: r_end plus its discounted step rewards, steps of unknown reward left out; None without its QoCs."""
+    """What a session brought over all its steps, by the rule of `ml.returns` for gaps; None without its QoCs or with too many gaps."""
     settings = study.mdp_settings(session.visit.participant.current_settings)
     table = study.session_data(db, session).table
     during = table.t_s > 0
     rewards = step_reward(settings, table.beta[during], table.fraction[during])
-    end = end_reward(settings, study.qoc_of(session))
-    return None if end is None else end + discounted_sum(np.nan_to_num(rewards), settings.gamma)
+    return ActualReturn(step_return(rewards, settings.gamma, rewards.size), end_reward(settings, study.qoc_of(session))).value
 
 
 def _session_at(db: Session, visit: Visit, position: int) -> StudySession | None:

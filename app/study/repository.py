@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -132,6 +133,28 @@ def traces_of_recording(db: Session, recording_id: int) -> Sequence[Trace]:
     return db.scalars(
         select(Trace).where(Trace.recording_id == recording_id, Trace.decode_version == newest).order_by(Trace.stream, Trace.channel)
     ).all()
+
+
+@dataclass(frozen=True)
+class TraceHead:
+    """A trace without its values."""
+
+    id: int
+    recording_id: int
+    stream: str
+    channel: str
+    decode_version: int
+
+
+def trace_heads(db: Session, recording_ids: Collection[int]) -> dict[int, list[TraceHead]]:
+    """The traces of recordings in their newest decode version, by recording, in the order of `traces_of_recording`; no values are read."""
+    columns = (Trace.id, Trace.recording_id, Trace.stream, Trace.channel, Trace.decode_version)
+    query = select(*columns).where(Trace.recording_id.in_(recording_ids)).order_by(Trace.stream, Trace.channel)
+    found: dict[int, list[TraceHead]] = {}
+    for row in db.execute(query):
+        found.setdefault(row.recording_id, []).append(TraceHead(*row))
+    newest = {i: max(head.decode_version for head in heads) for i, heads in found.items()}
+    return {i: [head for head in heads if head.decode_version == newest[i]] for i, heads in found.items()}
 
 
 def recording_by_fingerprint(db: Session, participant_id: int, fingerprint: str) -> Recording | None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ AMPLITUDE_STREAM = "amplitude"
 
 MOST_STEPS = 1_000_000
 """Steps of a session that are laid out: at 2 s three weeks. A session of more has a wrong begin or end."""
+AnyTrace = TypeVar("AnyTrace", Trace, repository.TraceHead)
 
 
 @dataclass(frozen=True)
@@ -71,9 +74,7 @@ def step_table(db: Session, session: StudySession, settings: SettingsVersion) ->
     for segment in session.segments:
         if not segment.is_control:
             continue
-        traces = repository.traces_of_recording(db, segment.recording_id)
-        found = _control_trace(session, traces)
-        driving = next((t for t in traces if t.stream == AMPLITUDE_STREAM), None)
+        found, driving = _chosen(session, repository.traces_of_recording(db, segment.recording_id))
         origin = session_offset_s(session, segment.recording_id)
         if found is not None:
             _place(beta, t_s, found, origin, period)
@@ -83,6 +84,34 @@ def step_table(db: Session, session: StudySession, settings: SettingsVersion) ->
             amplitude_trace = driving
     cdbs = cdbs_amplitude.of_session(session, settings, amplitude_program(amplitude_trace) if amplitude_trace else 0)
     return _table(t_s, beta, amount, beta_trace, amplitude_trace, cdbs)
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What the step table of a session is read from; the numbers of its traces and the cDBS amplitude in force, mA."""
+
+    beta_trace_id: int | None
+    amplitude_trace_id: int | None
+    cdbs_ma: float | None
+
+
+def sources(session: StudySession, settings: SettingsVersion, heads: Mapping[int, Sequence[repository.TraceHead]]) -> Sources:
+    """What `step_table` would read now; no trace is read for it.
+
+    Args:
+        session, settings: as for `step_table`. heads: of `repository.trace_heads`, by recording.
+
+    Raises:
+        Invalid: as `app.study.cdbs_amplitude.stated_at`.
+    """
+    beta: repository.TraceHead | None = None
+    amplitude: repository.TraceHead | None = None
+    for segment in session.segments:
+        if segment.is_control:
+            found, driving = _chosen(session, heads.get(segment.recording_id, []))
+            beta, amplitude = found or beta, driving or amplitude
+    cdbs = cdbs_amplitude.of_session(session, settings, amplitude_program(amplitude) if amplitude else 0)
+    return Sources(beta.id if beta else None, amplitude.id if amplitude else None, cdbs)
 
 
 def shown_table(session: StudySession, settings: SettingsVersion, trace: Trace, amplitude: Trace | None) -> StepTable:
@@ -104,7 +133,7 @@ def shown_table(session: StudySession, settings: SettingsVersion, trace: Trace, 
     return _table(t_s, beta, amount, trace, amplitude, cdbs)
 
 
-def amplitude_program(trace: Trace) -> int:
+def amplitude_program(trace: Trace | repository.TraceHead) -> int:
     """The stimulation program of an amplitude trace; 0 where it names none."""
     word, _, number = trace.channel.rpartition(" ")
     return int(number) if word == "program" and number.isdecimal() else 0
@@ -143,11 +172,13 @@ def session_offset_s(session: StudySession, recording_id: int) -> float:
     return min(s.start_s for s in session.segments if s.recording_id == recording_id)
 
 
-def _control_trace(session: StudySession, traces: object) -> Trace | None:
-    candidates = [t for t in traces if t.stream == session.control_stream]  # type: ignore[attr-defined]
+def _chosen(session: StudySession, traces: Sequence[AnyTrace]) -> tuple[AnyTrace | None, AnyTrace | None]:
+    """The trace of the session's control channel and that of its amplitude, among those of one recording."""
+    candidates = [t for t in traces if t.stream == session.control_stream]
     if session.control_channel is not None:
         candidates = [t for t in candidates if t.channel == session.control_channel]
-    return candidates[0] if candidates else None
+    driving = next((t for t in traces if t.stream == AMPLITUDE_STREAM), None)
+    return candidates[0] if candidates else None, driving
 
 
 def _place(into: NDArray[np.float64], t_s: NDArray[np.float64], trace: Trace, origin_s: float, period_s: float) -> None:

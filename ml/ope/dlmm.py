@@ -22,11 +22,14 @@ from scipy.stats import norm
 from torch import Tensor, nn
 
 from ml.mdp import step_reward
-from ml.ope.dlsm.batches import Batch, Scale, learn_scale, make_batch, session_folds
+from ml.ope.dlsm.batches import Batch, make_batch
 from ml.ope.dlsm.heads import GaussianHead, gaussian_kl, gaussian_log_prob
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.flags import FEW_END_REWARDS
 from ml.ope.linear.end_outcomes import EndModel, fit_end_model, summarise
-from ml.ope.support.coverage import AmplitudeSupport
+from ml.ope.registry import Size
+from ml.ope.scale import Scale, learn_scale, session_folds
+from ml.ope.support.coverage import AmplitudeSupport, flags_of
 from ml.policies.policy import Policy
 from ml.progress import Report, part_of, silent
 from ml.trajectories import ReplayBuffer
@@ -116,6 +119,11 @@ class Dlmm:
 
     config: DlmmConfig = field(default_factory=DlmmConfig)
     method: str = "dlmm"
+
+    @property
+    def successive_members(self) -> int:
+        """Members that learn one after the other, each with a learning curve of its own."""
+        return self.config.members
 
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedDlmm:
         """Train the members; seconds each, so nothing is kept in `checkpoint_dir`.
@@ -249,9 +257,9 @@ class FittedDlmm:
         reach = float(norm.ppf((1 + LEVEL) / 2)) * error
         every = max(1, horizon // 50)
         logged, simulated = support.of_policy(policy), support.look(np.concatenate([r.actions[i][:, ::every] for r in runs]))
-        flags = list(dict.fromkeys((*logged.flags, *simulated.flags)))
+        flags = list(flags_of(logged, simulated))
         if not with_end:
-            flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+            flags.append(FEW_END_REWARDS)
         predicted = {
             "energy": float(np.mean([(r.actions[i] ** 2).mean() for r in runs])),
             "mean_amplitude": float(np.mean([r.actions[i].mean() for r in runs])),
@@ -287,3 +295,8 @@ class FittedDlmm:
 
 def _single(values: Floats) -> Tensor:
     return torch.as_tensor(values, dtype=torch.float32)
+
+
+def build(key: str, seed: int, size: Size) -> Dlmm:
+    """The estimator at a size of `ml.ope.registry`."""
+    return Dlmm(DlmmConfig(members=1, updates=800, rollouts=64, seed=seed) if size == "demo" else DlmmConfig(seed=seed), key)

@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.dlsm.batches import outcome_table
 from ml.ope.estimate import Estimate, checked_horizon
 from ml.ope.fqe.estimator import FittedFqe, Fqe, FqeConfig, QMember, head_schedule, value_estimate, within_reach
 from ml.ope.fqe.steps import TargetActions, fresh_memory
 from ml.ope.importance import behaviour_densities, horizon_of_ten, kernel_log_density
 from ml.ope.linear.end_outcomes import summarise
-from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size
+from ml.ope.registry import Size
+from ml.ope.scale import outcome_table
+from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size, few_effective
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.trajectories import ReplayBuffer
@@ -115,7 +116,7 @@ class FittedDoublyRobust:
         estimate = value_estimate(fqe, main, refits, policy, horizon, support, details, (shift, shifts))
         if effective >= FEW_EFFECTIVE:
             return estimate
-        flag = f"the correction of the value function rests on {effective:.1f} effective sessions of {table.sessions}"
+        flag = few_effective("few_sessions_behind_correction", effective, table.sessions)
         return replace(estimate, flags=(*estimate.flags, flag))
 
     def _log_ratios(self, target: TargetActions, horizon: int) -> tuple[Floats, Mask]:
@@ -171,3 +172,9 @@ class _View:
             paid = rates[rows] * counts[left - 1] + discount * (self.then[rows] @ weights[left - 1])
             result[table.session[rows], t] = paid - self.member.grams.phi[rows] @ weights[left]
         return result
+
+
+def build(key: str, seed: int, size: Size) -> DoublyRobust:
+    """The estimator at a size of `ml.ope.registry`."""
+    members, refits = {"full": (3, 30), "demo": (1, 20), "held_out": (1, 25)}[size]
+    return DoublyRobust(FqeConfig(seed=seed, members=members, refits=refits), method=key)

@@ -21,8 +21,9 @@ from torch import Tensor
 
 from ml.ope.estimate import Estimate, checked_horizon
 from ml.ope.fqe.estimator import value_estimate, within_reach
-from ml.ope.fqe.steps import StepTable, TargetActions, ValueFeatures, fresh_memory, step_table
+from ml.ope.fqe.steps import TargetActions, UsableSteps, ValueFeatures, fresh_memory, usable_steps
 from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
+from ml.ope.registry import Size
 from ml.ope.support.coverage import AmplitudeSupport
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
@@ -152,7 +153,7 @@ class DualDice:
         Raises:
             ValueError: no usable step, or no session with a complete s_0.
         """
-        table, c = step_table(buffer), self.config
+        table, c = usable_steps(buffer), self.config
         draws = resamples(table.sessions, c.refits, c.seed)
         inputs = ValueFeatures(table, 0, c.seed)
         report(1.0, "inputs of the density ratios")
@@ -166,7 +167,7 @@ class FittedDualDice:
     method: str
     config: DiceConfig
     buffer: ReplayBuffer
-    table: StepTable
+    table: UsableSteps
     inputs: ValueFeatures
     draws: Indices
     end: EndModel
@@ -225,3 +226,8 @@ class FittedDualDice:
             ],
         }
         return value_estimate(self, main, refits, policy, horizon, support, details)
+
+
+def build(key: str, seed: int, size: Size) -> DualDice:
+    """The estimator at a size of `ml.ope.registry`."""
+    return DualDice(DiceConfig(seed=seed, members=1, updates=300) if size == "demo" else DiceConfig(seed=seed), key)

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Protocol
 
+from ml.ope.flags import Flag
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.trajectories import ReplayBuffer
 
 LEVEL = 0.90
 """Coverage of the intervals that estimators report."""
+
+STORED_VERSION = 2
+"""Version of `Estimate.to_json`. Version 1, of betaloop 0.1.0, does not name itself and holds its flags as sentences."""
 
 OUTCOMES = ("r_end", "grasp_hz", "rating", "tremor_percent")
 """End-of-session outcomes, in the order of every array that holds them."""
@@ -34,7 +38,7 @@ class Estimate:
         predicted: what the method predicts besides: `energy` (mean a^2), `mean_amplitude`, `mean_beta` (participant's unit), `grasp_hz`,
             `rating`, `tremor_percent`; a key is absent where the method cannot say.
         supported: False when the data cannot speak about this policy.
-        flags: the reasons and warnings, in words.
+        flags: the reasons why the data cannot speak, and warnings.
         n: sessions or roll-outs behind the value.
         details: everything else, JSON-able; `draws` (aligned over the policies of one method) feeds the probability of being best.
     """
@@ -49,7 +53,7 @@ class Estimate:
     end_reward: float | None
     predicted: dict[str, float]
     supported: bool
-    flags: tuple[str, ...]
+    flags: tuple[Flag, ...]
     n: int
     details: dict[str, Any] = field(default_factory=dict)
 
@@ -59,8 +63,22 @@ class Estimate:
                 raise ValueError(f"{self.method}: {name} of an estimate must be finite, not {getattr(self, name)}")
 
     def to_json(self) -> dict[str, Any]:
-        """Every field, JSON-able."""
-        return asdict(self) | {"flags": list(self.flags)}
+        """Every field and the version of their form, JSON-able."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return values | {"flags": [flag.to_json() for flag in self.flags], "version": STORED_VERSION}
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> Estimate:
+        """The inverse of `to_json`, for every version.
+
+        Raises:
+            ValueError: a later version than this betaloop knows.
+        """
+        version = stored.get("version", 1)
+        if version > STORED_VERSION:
+            raise ValueError(f"an estimate of form {version} was stored by a later betaloop; this one reads up to form {STORED_VERSION}")
+        values = {f.name: stored[f.name] for f in fields(cls)}
+        return cls(**values | {"flags": tuple(Flag.from_json(flag) for flag in stored["flags"])})
 
 
 class Fitted(Protocol):

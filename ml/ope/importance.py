@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,12 @@ from scipy.stats import norm
 
 from ml.ope.behaviour import Key, clones, controller_key, rule_of_thumb_bandwidth
 from ml.ope.estimate import LEVEL, Estimate, checked_horizon
-from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size
+from ml.ope.flags import Flag
+from ml.ope.registry import Size
+from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size, few_effective
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
+from ml.returns import step_returns
 from ml.statistics.bootstrap import bca_interval, percentile_interval, resamples
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
@@ -44,10 +47,7 @@ def per_trajectory(log_ratio: Floats, mask: Mask, rewards: Floats, end: Floats, 
     Returns:
         Log weights [N] and returns [N]: discounted sums over the steps that count, rescaled to the whole horizon of T steps.
     """
-    discount = gamma ** np.arange(rewards.shape[1])
-    counted = np.where(mask, discount, 0.0).sum(1)
-    step = np.where(mask, rewards * discount, 0.0).sum(1) * discount.sum() / np.maximum(counted, 1e-300)
-    return np.where(mask, log_ratio, 0.0).sum(1), step + end
+    return np.where(mask, log_ratio, 0.0).sum(1), step_returns(rewards, mask, gamma)[0] + end
 
 
 def ordinary(log_weights: Floats, returns: Floats) -> float:
@@ -231,11 +231,11 @@ class FittedImportance:
         bca = bca_interval(draws, step + end_value, jackknife, LEVEL) if jackknife.size else None
         effective, largest = effective_sample_size(log_weights)
         logged = support.of_policy(policy)
-        flags = list(logged.flags)
+        flags = list(logged.flags())
         if effective < FEW_EFFECTIVE:
-            flags.append(f"not supported by the data: the weights rest on {effective:.1f} effective sessions of {len(end)}")
+            flags.append(few_effective("few_effective_sessions", effective, len(end), refuses=True))
         if not known.any():
-            flags.append("no session has an end-of-session reward: the estimate is the step return alone")
+            flags.append(Flag.of("no_end_reward"))
         return Estimate(
             method=config.method,
             value=step + end_value,
@@ -279,3 +279,8 @@ def horizon_of_ten(log_ratio: Floats, mask: Mask) -> int:
         if effective_sample_size(cumulative[:, t])[0] < FEW_EFFECTIVE:
             return t
     return int(cumulative.shape[1])
+
+
+def build(key: str, seed: int, size: Size) -> ImportanceSampling:
+    """The estimator at a size of `ml.ope.registry`."""
+    return ImportanceSampling(cast(Weighting, key), draws=100 if size == "held_out" else 1000, seed=seed)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ml.mdp import MdpSettings
 from ml.ope.behaviour import Key, controllers
 from ml.ope.estimate import LEVEL
-from ml.ope.importance import per_trajectory
+from ml.ope.flags import DAYS_UNKNOWN, Flag
+from ml.returns import actual_return
 from ml.statistics.bootstrap import Interval, session_bootstrap
 from ml.statistics.mixed import MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -28,7 +29,7 @@ class Observed:
 
     Attributes:
         controller: kind and policy. n: sessions.
-        value: mean return over the horizon; steps that a session lacks are taken like those that it has.
+        value: mean return over the horizon, by the rule of `ml.returns` for steps that a session lacks.
         step_return: mean of the steps' part. end_reward: mean r_end of the sessions that have one; None where none has.
         standard_error: of `value`, over sessions; None for a single one.
         interval: BCa bootstrap over sessions; None below `FEWEST_FOR_INTERVAL`.
@@ -44,26 +45,19 @@ class Observed:
 
 
 def session_returns(sessions: list[SessionTrajectory], settings: MdpSettings, horizon: int) -> tuple[Floats, Floats]:
-    """Discounted step returns over the horizon, and r_end (NaN where not measured), [n] each; sessions need a usable step within it."""
-    mask, rewards = np.zeros((len(sessions), horizon), dtype=bool), np.zeros((len(sessions), horizon))
-    for i, s in enumerate(sessions):
-        k = np.flatnonzero(s.usable())
-        k = k[k < horizon]
-        mask[i, k] = True
-        rewards[i, k] = s.rewards(settings)[k]
-    _, steps = per_trajectory(np.zeros_like(rewards), mask, rewards, np.zeros(len(sessions)), settings.gamma)
-    ends = [s.end_reward(settings) for s in sessions]
-    return steps, np.array([np.nan if e is None else e for e in ends], dtype=np.float64)
+    """Actual step returns over the horizon and r_end of the sessions that have a step return; r_end is NaN where not measured, [n] each."""
+    found = [a for a in (actual_return(s, settings, horizon) for s in sessions) if a.step_return is not None]
+    ends = [np.nan if a.end_reward is None else a.end_reward for a in found]
+    return np.array([a.step_return for a in found], dtype=np.float64), np.array(ends, dtype=np.float64)
 
 
 def observed(buffer: ReplayBuffer, horizon: int, seed: int = 0) -> dict[Key, Observed]:
-    """Every controller of a buffer that has a usable step within the horizon."""
+    """Every controller of a buffer with a session that has a step return over the horizon."""
     result = {}
     for key, indices in controllers(buffer).items():
-        sessions = [buffer.sessions[i] for i in indices if buffer.sessions[i].usable()[:horizon].any()]
-        if not sessions:
+        steps, ends = session_returns([buffer.sessions[i] for i in indices], buffer.settings, horizon)
+        if not steps.size:
             continue
-        steps, ends = session_returns(sessions, buffer.settings, horizon)
         known = np.isfinite(ends)
         end = float(ends[known].mean()) if known.any() else None
         # A session without r_end takes the mean of the others, so that it still counts for the steps.
@@ -79,7 +73,7 @@ def observed(buffer: ReplayBuffer, horizon: int, seed: int = 0) -> dict[Key, Obs
     return result
 
 
-def day_noise(buffer: ReplayBuffer, horizon: int, draws: int, seed: int) -> tuple[Floats, str | None]:
+def day_noise(buffer: ReplayBuffer, horizon: int, draws: int, seed: int) -> tuple[Floats, Flag | None]:
     """What the few visits of a record leave open about the level of returns, as draws [draws] that all policies share.
 
     Resampling sessions alone takes the sessions of one day for independent; a bad day lowers them all. Returns less their controller's mean
@@ -92,7 +86,7 @@ def day_noise(buffer: ReplayBuffer, horizon: int, draws: int, seed: int) -> tupl
     groups = [i for i in controllers(buffer).values() if len({buffer.sessions[k].visit for k in i}) > 1]
     left, visit = [], []
     for indices in groups:
-        sessions = [buffer.sessions[i] for i in indices if buffer.sessions[i].usable()[:horizon].any()]
+        sessions = [s for s in (buffer.sessions[i] for i in indices) if actual_return(s, buffer.settings, horizon).step_return is not None]
         if len(sessions) < 2:
             continue
         steps, ends = session_returns(sessions, buffer.settings, horizon)
@@ -103,7 +97,7 @@ def day_noise(buffer: ReplayBuffer, horizon: int, draws: int, seed: int) -> tupl
     values, numbers = np.array(left), np.array(visit)
     days = np.unique(numbers)
     if len(days) < 2 or len(values) <= len(days):
-        return np.zeros(draws), "how returns differ from day to day cannot be told from these sessions: the intervals leave it out"
+        return np.zeros(draws), DAYS_UNKNOWN
     sizes = np.array([(numbers == d).sum() for d in days], dtype=np.float64)
     means = np.array([values[numbers == d].mean() for d in days])
     within = sum(float(np.sum((values[numbers == d] - m) ** 2)) for d, m in zip(days, means, strict=True)) / (len(values) - len(days))
@@ -124,13 +118,13 @@ class MeanOverDays:
         weights: of the sessions in the mean, [n]; sessions of one visit share a weight, the smaller their own noise the more nearly equal
             the visits'.
         common: draws of the error of the mean that all policies share, [draws]. own: those of each policy's difference from it, [P, draws].
-        unknown: what cannot be told about days, in words; None where it can.
+        unknown: what cannot be told about days; None where it can.
     """
 
     weights: Floats
     common: Floats
     own: Floats
-    unknown: str | None
+    unknown: Flag | None
 
 
 def mean_over_days(returns: Floats, visits: NDArray[np.int64], draws: int, seed: int) -> MeanOverDays:
@@ -157,35 +151,5 @@ def mean_over_days(returns: Floats, visits: NDArray[np.int64], draws: int, seed:
         found = model.fit(Sums.of(design, values)).draws(draws, np.random.default_rng([seed, 0xDA7, k]))[:, 0]
         return np.asarray(found - found.mean(), dtype=np.float64)
 
-    flag = None if several else "how returns differ from day to day cannot be told from these sessions: the intervals leave it out"
+    flag = None if several else DAYS_UNKNOWN
     return MeanOverDays(weights, errors(middle, 0), np.stack([errors(r - middle, 1 + i) for i, r in enumerate(returns)]), flag)
-
-
-def empirical_bernstein(values: Floats, low: float, high: float, level: float = LEVEL) -> tuple[float, float]:
-    """Interval of a mean of independent values within [low, high] at any sample size (Maurer and Pontil 2009, theorem 4, both sides).
-
-    Args:
-        values: [n], n at least 2. low, high: the range that the values can have, not the one that they had.
-
-    Raises:
-        ValueError: fewer than two values, or one outside the range.
-    """
-    n, log = _checked(values, low, high, level)
-    half = math.sqrt(2 * float(values.var(ddof=1)) * log / n) + 7 * (high - low) * log / (3 * (n - 1))
-    return max(low, float(values.mean()) - half), min(high, float(values.mean()) + half)
-
-
-def hoeffding(values: Floats, low: float, high: float, level: float = LEVEL) -> tuple[float, float]:
-    """Interval of a mean of independent values within [low, high]: half-width (high - low) sqrt(log(2 / (1 - level)) / (2 n))."""
-    n, log = _checked(values, low, high, level)
-    half = (high - low) * math.sqrt((log - math.log(2)) / (2 * n))
-    return max(low, float(values.mean()) - half), min(high, float(values.mean()) + half)
-
-
-def _checked(values: Floats, low: float, high: float, level: float) -> tuple[int, float]:
-    """Number of values and log(4 / (1 - level))."""
-    if values.size < 2:
-        raise ValueError(f"an interval of a mean needs at least two values, not {values.size}")
-    if float(values.min()) < low or float(values.max()) > high:
-        raise ValueError(f"values from {values.min():g} to {values.max():g} lie outside the stated range [{low:g}, {high:g}]")
-    return int(values.size), math.log(4 / (1 - level))

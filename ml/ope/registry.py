@@ -1,40 +1,141 @@
-"""The estimators of the ranking page, by their keys."""
+"""Methods of off-policy evaluation, one record each: schemas, jobs, pages, charts and comparisons derive from these.
+
+Adding a method takes its own file, with a factory, and one record here. Records name their factories, so that a process which computes
+nothing does not load what they need.
+"""
 
 from __future__ import annotations
 
-from ml.ope.dlmm import Dlmm, DlmmConfig
-from ml.ope.dlsm.config import DlsmConfig
-from ml.ope.dlsm.estimator import Dlsm
-from ml.ope.doubly_robust import DoublyRobust
-from ml.ope.dual_dice import DiceConfig, DualDice
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Literal
+
 from ml.ope.estimate import Estimator
-from ml.ope.fqe.estimator import Fqe, FqeConfig
-from ml.ope.importance import ImportanceSampling
-from ml.ope.linear.estimator import LinearConfig, LinearModel
+
+Family = Literal["model", "value", "density ratio", "importance weights", "combination"]
+Size = Literal["full", "demo", "held_out"]
+"""`full` for a study, `demo` for a first look, `held_out` where a method is fitted once for each controller that is left out."""
+
+Factory = Callable[[str, int, Size], Estimator]
+"""Makes the estimator of a key with a seed at a size."""
+
+AGGREGATE = "aggregate"
+"""Key of the combination of the others: not fitted, but computed from their estimates."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """One method of off-policy evaluation.
+
+    Attributes:
+        key: in the API, in jobs and in stored estimates.
+        name, short: for people; `short` is for the heads of wide tables.
+        family: what it learns.
+        needs: what the data must have for it, for people.
+        factory: `module:attribute` of a `Factory`; None for the combination.
+        held_out: whether it is fitted within seconds, so that it can be refitted without each controller and held against its sessions.
+        quick: whether the preset `quick` runs it where nothing is said: one method of every family.
+        preference: place in the usual order where the data choose no method; None for a method that is never taken by default.
+        weight: share of a job's progress that its step takes.
+        colour, symbol: of its marks in charts: a colour token of the pages, and a plotly symbol that has an open form.
+    """
+
+    key: str
+    name: str
+    short: str
+    family: Family
+    needs: str
+    factory: str | None
+    held_out: bool = False
+    quick: bool = False
+    preference: int | None = None
+    weight: float = 1.0
+    colour: str = "other"
+    symbol: str = "circle"
+
+
+_START, _DENSITY = "a session with a whole beta window before its first step", "sessions whose amplitudes vary"
+_IS = "ml.ope.importance:build"
+
+_METHODS: dict[str, Method] = {}
+
+
+def register(method: Method) -> None:
+    """Add a method, before the combination of all.
+
+    Raises:
+        ValueError: another method has its key.
+    """
+    if _METHODS.get(method.key, method) != method:
+        raise ValueError(f"two methods of evaluation have the key {method.key!r}")
+    _METHODS[method.key] = method
+
+
+def unregister(key: str) -> None:
+    """Take a method away again. Raises KeyError where there is none of that key."""
+    del _METHODS[key]
+
+
+# fmt: off
+for _method in (
+    Method(key="dlsm", name="DLSM", short="DLSM", family="model", needs="four sessions", factory="ml.ope.dlsm.estimator:build", quick=True, preference=2, weight=6.0, colour="rl", symbol="diamond"),  # noqa: E501
+    Method(key="linear", name="Linear model", short="Linear", family="model", needs="two sessions", factory="ml.ope.linear.estimator:build", held_out=True, quick=True, preference=1, weight=2.0, colour="distilled", symbol="square"),  # noqa: E501
+    Method(key="dlmm", name="DLMM", short="DLMM", family="model", needs="two sessions", factory="ml.ope.dlmm:build", weight=3.0, colour="accent", symbol="hexagram"),  # noqa: E501
+    Method(key="fqe", name="Fitted Q evaluation", short="FQE", family="value", needs=_START, factory="ml.ope.fqe.estimator:build", held_out=True, quick=True, preference=3, colour="cdbs", symbol="circle"),  # noqa: E501
+    Method(key="wdr", name="Weighted doubly robust", short="WDR", family="value", needs=_START, factory="ml.ope.doubly_robust:build", held_out=True, quick=True, preference=4, weight=2.0, colour="no_dbs", symbol="cross"),  # noqa: E501
+    Method(key="dual_dice", name="DualDICE", short="DualDICE", family="density ratio", needs=_START, factory="ml.ope.dual_dice:build", preference=7, weight=3.0, colour="warn", symbol="star"),  # noqa: E501
+    Method(key="wis", name="Weighted importance sampling", short="WIS", family="importance weights", needs=_DENSITY, factory=_IS, held_out=True, quick=True, preference=6, colour="random", symbol="triangle-up"),  # noqa: E501
+    Method(key="pdis", name="Per-decision importance sampling", short="PDIS", family="importance weights", needs=_DENSITY, factory=_IS, quick=True, preference=8, colour="other", symbol="x"),  # noqa: E501
+    Method(key="cwpdis", name="Consistent weighted per-decision importance sampling", short="CWPDIS", family="importance weights", needs=_DENSITY, factory=_IS, held_out=True, preference=5, colour="muted", symbol="triangle-down"),  # noqa: E501
+    Method(key=AGGREGATE, name="Combination of all methods", short="Combination", family="combination", needs="two other methods", factory=None, quick=True, colour="text", symbol="pentagon"),  # noqa: E501
+):
+    register(_method)
+# fmt: on
+
+
+def methods() -> tuple[Method, ...]:
+    """Every method in the order of the pages, the combination last."""
+    return tuple(sorted(_METHODS.values(), key=lambda m: m.family == "combination"))
+
+
+def method_keys() -> tuple[str, ...]:
+    """The keys of `methods`."""
+    return tuple(m.key for m in methods())
+
+
+def shown(key: str) -> Method:
+    """The record of a key for a page; a stored estimate of a method that this betaloop does not have stands under its key."""
+    unknown = Method(key=key, name=key, short=key, family="model", needs="", factory=None)
+    return _METHODS.get(key, unknown)
+
+
+def preference() -> tuple[str, ...]:
+    """The usual order, in which a method is taken for a ranking where the data do not decide; docs/evaluation.md has what is behind it."""
+    placed = [(m.preference, m.key) for m in methods() if m.preference is not None]
+    return tuple(key for _, key in sorted(placed))
+
+
+def build(key: str, seed: int, size: Size) -> Estimator:
+    """The estimator of a method.
+
+    Raises:
+        ValueError: there is no such method, or it is computed from the others.
+    """
+    found = _METHODS.get(key)
+    if found is None or found.factory is None:
+        fitted = ", ".join(m.key for m in methods() if m.factory)
+        raise ValueError(f"{key!r} is no method that can be fitted; these can: {fitted}")
+    module, attribute = found.factory.split(":")
+    factory: Factory = getattr(import_module(module), attribute)
+    return factory(key, seed, size)
 
 
 def estimators(seed: int = 0, *, demo: bool = False) -> dict[str, Estimator]:
-    """Every estimator at its default settings, or at settings for a quick demonstration."""
-    config = DlsmConfig.demo(seed) if demo else DlsmConfig(seed=seed)
-    return {
-        "dlsm": Dlsm(config),
-        "linear": LinearModel(LinearConfig(seed=seed)),
-        "dlmm": Dlmm(DlmmConfig(members=1, updates=800, rollouts=64, seed=seed) if demo else DlmmConfig(seed=seed)),
-        "fqe": Fqe(FqeConfig(seed=seed, members=1, refits=30) if demo else FqeConfig(seed=seed)),
-        "wdr": DoublyRobust(FqeConfig(seed=seed, members=1 if demo else 3, refits=20 if demo else 30)),
-        "dual_dice": DualDice(DiceConfig(seed=seed, members=1, updates=300) if demo else DiceConfig(seed=seed)),
-        "wis": ImportanceSampling("wis", seed=seed),
-        "pdis": ImportanceSampling("pdis", seed=seed),
-        "cwpdis": ImportanceSampling("cwpdis", seed=seed),
-    }
+    """Every method that is fitted, at its full size or at that of a demonstration."""
+    return {m.key: build(m.key, seed, "demo" if demo else "full") for m in methods() if m.factory}
 
 
 def quick_estimators(seed: int = 0) -> dict[str, Estimator]:
-    """The methods that are fitted within seconds, at settings for `skill.choose_default`, which fits each once per controller."""
-    return {
-        "linear": LinearModel(LinearConfig(seed=seed, draws=20)),
-        "fqe": Fqe(FqeConfig(seed=seed, refits=25)),
-        "wdr": DoublyRobust(FqeConfig(seed=seed, members=1, refits=25)),
-        "wis": ImportanceSampling("wis", seed=seed, draws=100),
-        "cwpdis": ImportanceSampling("cwpdis", seed=seed, draws=100),
-    }
+    """The methods that can be fitted once for each controller left out, at the size for that (`skill.choose_default`)."""
+    return {m.key: build(m.key, seed, "held_out") for m in methods() if m.held_out}

@@ -15,6 +15,7 @@ from app.learning.policies.baselines import constant_onnx, ensure_baselines
 from app.learning.snapshots.service import collect, take_snapshot
 from app.study.repository import participant_by_code
 from ml.ope.estimate import Estimate
+from ml.ope.support.coverage import thin
 
 Upload = Callable[..., int]
 
@@ -31,7 +32,7 @@ def estimate(method: str, value: float, *, supported: bool = True, spread: float
         end_reward=80.0,
         predicted={"energy": 0.4, "mean_beta": 0.9, "grasp_hz": 2.1, "rating": 7.5, "tremor_percent": 12.0},
         supported=supported,
-        flags=() if supported else ("not supported by the data: in 60 % of steps",),
+        flags=() if supported else (thin(0.6, "logged", low=0.3, high=1.0),),
         n=100,
         details={"draws": list(draws)} if draws else {},
     ).to_json()

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ml.mdp import MdpSettings, discounted_sum, end_reward, step_reward
+from ml.mdp import MdpSettings, end_reward, step_reward
 from ml.qoc import Qoc, grasp_frequency, tremor_percent
 
 PAPER = MdpSettings(xi_beta=1.0)
@@ -38,12 +38,6 @@ def test_a_missing_qoc_masks_r_end_unless_its_weight_is_zero() -> None:
     qoc = Qoc(rating=8)
     assert end_reward(PAPER, qoc) is None
     assert end_reward(MdpSettings(xi_beta=1.0, c2=0, c4=0), qoc) == pytest.approx(80)
-
-
-def test_a_return_is_the_discounted_sum_up_to_the_horizon() -> None:
-    rewards = np.array([1.0, 2.0, 4.0])
-    assert discounted_sum(rewards, 0.5) == pytest.approx(1 + 1 + 1)
-    assert discounted_sum(rewards, 0.5, horizon_steps=2) == pytest.approx(2)
 
 
 @given(beta=st.floats(0, 1e3), low=st.floats(0, 1), high=st.floats(0, 1))

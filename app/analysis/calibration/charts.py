@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from app.analysis.calibration.schemas import AccuracyOut, CalibrationOut, MethodMetricOut, PredictionOut, TestedPolicyOut
-from app.evaluation.estimates.methods import METHOD_NAMES, METHOD_SHORT
-from app.evaluation.ranking.charts import METHOD_STYLES
+from app.evaluation.ranking.charts import style
 from app.platform.web.charts import MUTED, Chart, axis, figure
+from ml.ope.registry import shown as method_of
 
 QUANTITY_NAMES = {
     "grasp_hz": ("Grasp frequency", "Hz"),
@@ -43,7 +43,7 @@ def returns(found: CalibrationOut, method: str) -> Chart:
     square = _square(bars, ends)
     rows = [
         [
-            label(p), METHOD_NAMES[m], q.predicted, q.low, q.high, q.actual, q.actual_low, q.actual_high, q.sessions,
+            label(p), method_of(m).name, q.predicted, q.low, q.high, q.actual, q.actual_low, q.actual_high, q.sessions,
             "whole return" if q.parts == "return" else "steps alone",
         ]
         for m in order
@@ -72,7 +72,7 @@ def returns(found: CalibrationOut, method: str) -> Chart:
 def metrics(found: CalibrationOut) -> Chart:
     """MAE, rank correlation and regret of every method over all visits, side by side, with session-bootstrap intervals."""
     rows = [m for m in found.metrics if m.visit is None]
-    names = [METHOD_SHORT[m.method] for m in rows]
+    names = [method_of(m.method).short for m in rows]
     data: list[dict[str, Any]] = []
     layout: dict[str, Any] = {}
     for k, (metric, (title, unit)) in enumerate(METRIC_NAMES.items()):
@@ -88,8 +88,8 @@ def metrics(found: CalibrationOut) -> Chart:
                 "error_x": _error_bars(values),
                 "marker": {
                     "size": 10,
-                    "color": [METHOD_STYLES[m.method]["color"] for m in rows],
-                    "symbol": [METHOD_STYLES[m.method]["symbol"] for m in rows],
+                    "color": [style(m.method)["color"] for m in rows],
+                    "symbol": [style(m.method)["symbol"] for m in rows],
                 },
                 "hovertemplate": "%{y}: %{x:.3g}<extra>" + title + "</extra>",
             }
@@ -112,7 +112,7 @@ def metrics(found: CalibrationOut) -> Chart:
             **layout,
         ),
         columns=columns,
-        rows=[[METHOD_NAMES[m.method], m.policies, m.sessions, *(v for name in METRIC_NAMES for v in _cells(m, name))] for m in rows],
+        rows=[[method_of(m.method).name, m.policies, m.sessions, *(v for name in METRIC_NAMES for v in _cells(m, name))] for m in rows],
         height=110 + 34 * len(rows),
     )
 
@@ -132,12 +132,12 @@ def over_visits(found: CalibrationOut, method: str) -> Chart | None:
         suffix = "" if k == 0 else str(k + 1)
         for name in sorted(found.methods, key=lambda m: m == method):
             own = [m for m in rows if m.method == name]
-            values, style, chosen = [getattr(m, metric) for m in own], METHOD_STYLES[name], name == method
+            values, marks, chosen = [getattr(m, metric) for m in own], style(name), name == method
             data.append(
                 {
                     "type": "scatter",
                     "mode": "lines+markers",
-                    "name": METHOD_SHORT[name],
+                    "name": method_of(name).short,
                     "legendgroup": name,
                     "showlegend": k == 0,
                     "opacity": 1.0 if chosen else 0.45,
@@ -145,9 +145,9 @@ def over_visits(found: CalibrationOut, method: str) -> Chart | None:
                     "y": [v.value for v in values],
                     "xaxis": f"x{suffix}",
                     "yaxis": f"y{suffix}",
-                    "line": {"color": style["color"], "width": 2.5 if chosen else 1.2},
-                    "marker": {"size": 9 if chosen else 6, "color": style["color"], "symbol": style["symbol"]},
-                    "hovertemplate": "visit %{x}: %{y:.3g}<extra>" + METHOD_NAMES[name] + "</extra>",
+                    "line": {"color": marks["color"], "width": 2.5 if chosen else 1.2},
+                    "marker": {"size": 9 if chosen else 6, "color": marks["color"], "symbol": marks["symbol"]},
+                    "hovertemplate": "visit %{x}: %{y:.3g}<extra>" + method_of(name).name + "</extra>",
                 }
                 | ({"error_y": _error_bars(values)} if chosen else {})
             )
@@ -164,7 +164,7 @@ def over_visits(found: CalibrationOut, method: str) -> Chart | None:
     return Chart(
         id="over-visits",
         title="Metrics visit by visit",
-        subtitle=f"strong: {METHOD_NAMES[method]}, {level} session bootstrap \u00b7 n = {len(visits)} visits, "
+        subtitle=f"strong: {method_of(method).name}, {level} session bootstrap \u00b7 n = {len(visits)} visits, "
         f"{sum(m.sessions for m in rows if m.method == method)} sessions \u00b7 a gap: too few policies at that visit",
         figure=figure(
             data,
@@ -174,7 +174,8 @@ def over_visits(found: CalibrationOut, method: str) -> Chart | None:
         ),
         columns=columns,
         rows=[
-            [m.visit, METHOD_NAMES[m.method], m.policies, m.sessions, *(v for name in METRIC_NAMES for v in _cells(m, name))] for m in rows
+            [m.visit, method_of(m.method).name, m.policies, m.sessions, *(v for name in METRIC_NAMES for v in _cells(m, name))]
+            for m in rows
         ],
         height=340,
     )
@@ -191,22 +192,22 @@ def quantities(found: CalibrationOut, method: str) -> list[Chart]:
         unit = unit or found.beta_unit or ""
         ends = [v for _, q in own for v in (q.predicted, q.actual)]
         square = _square(ends, ends)
-        style = METHOD_STYLES[method]
+        marks = style(method)
         trace = {
             "type": "scatter",
             "mode": "markers",
-            "name": METHOD_NAMES[method],
+            "name": method_of(method).name,
             "x": [q.predicted for _, q in own],
             "y": [q.actual for _, q in own],
             "text": [label(p) for p, _ in own],
-            "marker": {"size": 9, "color": style["color"], "symbol": ["circle" if p.reference else style["symbol"] for p, _ in own]},
+            "marker": {"size": 9, "color": marks["color"], "symbol": ["circle" if p.reference else marks["symbol"] for p, _ in own]},
             "hovertemplate": "%{text}: predicted %{x:.3g}, actual %{y:.3g}<extra></extra>",
         }
         charts.append(
             Chart(
                 id=f"actual-{name.replace('_', '-')}",
                 title=title,
-                subtitle=f"{unit}, {METHOD_NAMES[method]} \u00b7 {_n([(p, q.sessions) for p, q in own])}",
+                subtitle=f"{unit}, {method_of(method).name} \u00b7 {_n([(p, q.sessions) for p, q in own])}",
                 figure=figure(
                     [trace],
                     xaxis=axis("Predicted", unit, range=square["range"]),
@@ -239,7 +240,7 @@ def _square(values: Sequence[float], everything: Sequence[float]) -> dict[str, A
 
 
 def _trace(method: str, points: Sequence[Point], *, visible: bool) -> dict[str, Any]:
-    style = METHOD_STYLES[method]
+    marks = style(method)
 
     def bars(of: Callable[[PredictionOut], tuple[float | None, float, float | None]]) -> dict[str, Any]:
         """Error bars from (low, value, high); none where an end is unknown."""
@@ -249,23 +250,23 @@ def _trace(method: str, points: Sequence[Point], *, visible: bool) -> dict[str, 
             "symmetric": False,
             "array": [h - v if h is not None else 0.0 for _, v, h in ends],
             "arrayminus": [v - low if low is not None else 0.0 for low, v, _ in ends],
-            "color": style["color"],
+            "color": marks["color"],
             "thickness": 1,
         }
 
-    symbols = [("circle" if p.reference else style["symbol"]) + ("" if q.supported else "-open") for p, q in points]
+    symbols = [("circle" if p.reference else marks["symbol"]) + ("" if q.supported else "-open") for p, q in points]
     return {
         "type": "scatter",
         "mode": "markers",
-        "name": METHOD_SHORT[method],
+        "name": method_of(method).short,
         "visible": True if visible else "legendonly",
         "x": [q.predicted for _, q in points],
         "y": [q.actual for _, q in points],
         "text": [label(p) for p, _ in points],
         "error_x": bars(lambda q: (q.low, q.predicted, q.high)),
         "error_y": bars(lambda q: (q.actual_low, q.actual, q.actual_high)),
-        "marker": {"size": 10, "color": style["color"], "symbol": symbols},
-        "hovertemplate": "%{text}: predicted %{x:.2f}, actual %{y:.2f}<extra>" + METHOD_NAMES[method] + "</extra>",
+        "marker": {"size": 10, "color": marks["color"], "symbol": symbols},
+        "hovertemplate": "%{text}: predicted %{x:.2f}, actual %{y:.2f}<extra>" + method_of(method).name + "</extra>",
     }
 
 

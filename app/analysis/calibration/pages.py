@@ -11,7 +11,7 @@ from app.analysis.calibration.export import calibration_csv_of
 from app.analysis.calibration.service import calibration
 from app.analysis.calibration.wording import in_sentences
 from app.evaluation import repository
-from app.evaluation.estimates.methods import METHOD_NAMES
+from app.evaluation.estimates.methods import names
 from app.platform.database import Db
 from app.platform.errors import Invalid
 from app.platform.web.templates import render
@@ -38,7 +38,7 @@ def calibration_page(
         participant=participant,
         calibration=found,
         method=chosen,
-        method_names=METHOD_NAMES,
+        method_names=names(),
         sentences=in_sentences(found, chosen) if chosen else [],
         over_visits=calibration_charts.over_visits(found, chosen) if chosen else None,
         returns=calibration_charts.returns(found, chosen) if chosen else None,

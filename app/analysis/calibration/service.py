@@ -27,11 +27,10 @@ from app.analysis.calibration.schemas import (
     TestedPolicyOut,
 )
 from app.evaluation import repository
-from app.evaluation.estimates.methods import METHODS
 from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
-from app.evaluation.ranking.actual import KNOWN_SHARE, QUANTITIES, Actual, actual
-from app.evaluation.ranking.results import Ran, sessions_that_ran
+from app.evaluation.ranking.actual import QUANTITIES, Actual, actual
+from app.evaluation.ranking.results import DrivenSession, driven_sessions
 from app.evaluation.ranking.service import is_cdbs
 from app.learning.models import BufferSnapshot, Policy
 from app.study import blinding
@@ -40,6 +39,8 @@ from app.study import service as study
 from app.study.models import Participant, StudySession, Visit
 from ml.mdp import MdpSettings
 from ml.ope.estimate import LEVEL, Estimate
+from ml.ope.registry import method_keys
+from ml.returns import KNOWN_SHARE
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class _Before:
     settings: MdpSettings
     policies: Mapping[int, Policy]
     estimates: Mapping[int, Mapping[str, Estimate]]
-    ran: Sequence[Ran]
+    ran: Sequence[DrivenSession]
 
     @property
     def cdbs(self) -> int | None:
@@ -79,7 +80,7 @@ def calibration(db: Session, participant: Participant, caller: Caller) -> Calibr
         found, missed = _of_visit(loaded[before], visit)
         policies += found
         left_out += missed
-    methods = [m for m in METHODS if any(m == q.method for p in policies for q in p.predictions)]
+    methods = [m for m in method_keys() if any(m == q.method for p in policies for q in p.predictions)]
     unit = next((db.get_one(BufferSnapshot, b.evaluation.snapshot_id).beta_unit for b in loaded.values()), None)
     return CalibrationOut(
         participant=participant.code,
@@ -107,13 +108,13 @@ def _load(db: Session, participant: Participant, evaluation_id: int, caller: Cal
     for row in evaluation.estimates:
         estimates[row.policy_id][row.method] = estimate_of(row)
     settings = study.mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
-    ran = sessions_that_ran(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller)
+    ran = driven_sessions(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller)
     return _Before(evaluation, settings, repository.policies_by_id(db, list(estimates)), estimates, ran)
 
 
 def _of_visit(before: _Before, visit: Visit) -> tuple[list[TestedPolicyOut], list[str]]:
     """Every policy of a visit that the evaluation holds, and what of the visit it cannot be held against."""
-    by_policy: dict[int, list[Ran]] = defaultdict(list)
+    by_policy: dict[int, list[DrivenSession]] = defaultdict(list)
     missed: list[str] = []
     for session in (r for r in before.ran if r.visit == visit.number):
         policy_id = session.policy_id if session.policy_id is not None else before.cdbs
@@ -127,7 +128,7 @@ def _of_visit(before: _Before, visit: Visit) -> tuple[list[TestedPolicyOut], lis
     return [t for t in found if t.predictions], missed
 
 
-def _tested(before: _Before, visit: Visit, policy_id: int, ran: Sequence[Ran]) -> TestedPolicyOut:
+def _tested(before: _Before, visit: Visit, policy_id: int, ran: Sequence[DrivenSession]) -> TestedPolicyOut:
     policy, horizon = before.policies[policy_id], before.evaluation.horizon_steps
     results: list[Actual] = []
     reasons: list[str] = []
@@ -144,7 +145,7 @@ def _tested(before: _Before, visit: Visit, policy_id: int, ran: Sequence[Ran]) -
             )
         elif result.end_reward is None:
             reasons.append(f"session {session.session_id}: an outcome that r_end needs was not measured")
-    predictions = [_prediction(m, before.estimates[policy_id][m], results) for m in METHODS if m in before.estimates[policy_id]]
+    predictions = [_prediction(m, before.estimates[policy_id][m], results) for m in method_keys() if m in before.estimates[policy_id]]
     return TestedPolicyOut(
         visit=visit.number,
         visit_date=visit.date,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from app.analysis.calibration.schemas import AccuracyOut, CalibrationOut, PredictionOut
-from app.evaluation.estimates.methods import METHOD_NAMES
+from ml.ope.registry import shown
 
 CHANCE = 0.05
 """Permutation p-value below which an order is called better than chance."""
@@ -26,7 +26,7 @@ def in_sentences(found: CalibrationOut, method: str) -> list[str]:
     pairs = [q for p in found.policies if p.reference is None for q in p.predictions if q.method == method]
     visits = len({p.visit for p in found.policies if p.reference is None})
     return [
-        _distance(overall, pairs, visits, METHOD_NAMES[method]),
+        _distance(overall, pairs, visits, shown(method).name),
         _order(overall),
         *_choice(overall),
         _honesty(overall, found.level),

@@ -11,11 +11,12 @@ from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
-from app.evaluation.estimates.methods import AGGREGATE, METHOD_NAMES
 from ml.ope.compare.aggregate import combine
-from ml.ope.compare.ranking import PREFERENCE, default_method
+from ml.ope.compare.ranking import default_method
 from ml.ope.compare.skill import with_held_out_error
 from ml.ope.estimate import Estimate
+from ml.ope.flags import Flag
+from ml.ope.registry import AGGREGATE, preference, shown
 
 Tables = Mapping[str, Mapping[str, Estimate]]
 
@@ -28,8 +29,8 @@ def choose(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, An
         outcome: what the compute function `choose_method` gave; None where it was not run.
 
     Returns:
-        `method`, `chosen_by_data`, `reason`, `table` of held-out skill, `no_difference_error`, `predictions`, `failed` and `not_compared`,
-        the methods with estimates that were not held against left-out controllers.
+        `method`, `chosen_by_data`, `reasons` (flags as JSON), `table` of held-out skill, `no_difference_error`, `predictions`, `failed` and
+        `not_compared`, the methods with estimates that were not held against left-out controllers.
 
     Raises:
         ValueError: no method has any estimate.
@@ -44,24 +45,26 @@ def choose(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, An
         "not_compared": [m for m in estimates if m not in {row["method"] for row in table}],
     }
     if held.get("chosen_by_data"):
-        method, words = _by_skill(estimates, held, base)
+        method, reasons = _by_skill(estimates, held, base)
         if method is not None:
-            return result | {"method": method, "chosen_by_data": True, "reason": words}
+            return result | {"method": method, "chosen_by_data": True, "reasons": [r.to_json() for r in reasons]}
     elif outcome is None:
-        words = "No method was held against left-out controllers"
+        reasons = [Flag("not_compared")]
     elif "failed" in outcome:
-        words = f"The data cannot choose: {outcome['failed']}"
+        reasons = [Flag.of("cannot_choose", text=str(outcome["failed"]))]
     else:
-        # the science's sentence ends in what it would take; which method is taken is said here
-        words = str(held.get("reason", "the data cannot choose")).split(";")[0]
-        words = words[:1].upper() + words[1:]
-    order = ", ".join(_name(m) for m in PREFERENCE if m in estimates)
-    reason = f"{words}. Taken is the first method of the usual order that supports a candidate: {order}"
-    return result | {"method": default_method(estimates), "chosen_by_data": False, "reason": reason}
+        reasons = stored_reasons(held)
+    usual = Flag.of("usual_order", methods=tuple(m for m in preference() if m in estimates))
+    return result | {"method": default_method(estimates), "chosen_by_data": False, "reasons": [r.to_json() for r in (*reasons, usual)]}
 
 
-def _by_skill(estimates: Tables, held: Mapping[str, Any], base: float | None) -> tuple[str | None, str]:
-    """The most skilful method that supports a candidate with the reason in words; None with the reason against all of them.
+def stored_reasons(choice: Mapping[str, Any]) -> list[Flag]:
+    """The reasons of a stored choice; betaloop 0.1.0 stored one sentence."""
+    return [Flag.from_json(r) for r in choice.get("reasons", [choice["reason"]] if "reason" in choice else [])]
+
+
+def _by_skill(estimates: Tables, held: Mapping[str, Any], base: float | None) -> tuple[str | None, list[Flag]]:
+    """The most skilful method that supports a candidate with the reasons; None with the reasons against all of them.
 
     A method whose error of differences is no less than `base`, that of calling all controllers alike, has no skill to be chosen for.
     """
@@ -69,18 +72,16 @@ def _by_skill(estimates: Tables, held: Mapping[str, Any], base: float | None) ->
     errors = {row["method"]: float(row["difference_error"]) for row in held["table"] if row["controllers"] == most}
     skilled = [m for m in dict.fromkeys([first, *errors]) if m in errors and (base is None or errors[m] < base)]
     able = [m for m in skilled if _supports(estimates.get(m, {}))]
-    alike = "better than if it had said that all return the same"
     if not skilled:
-        return None, f"No method predicted left-out controllers {alike}"
+        return None, [Flag("no_skill")]
     if able[:1] == [first]:
-        return first, str(held["reason"])
-    what = "supports none of the candidates" if estimates.get(skilled[0]) else "has no estimate of these policies"
-    doubt = f"{_name(skilled[0])} predicted left-out controllers best, but {what}"
+        return first, stored_reasons(held)
+    doubt = Flag.of("best_supports_none" if estimates.get(skilled[0]) else "best_has_no_estimate", method=skilled[0])
     if not able:
-        return None, f"{doubt}, nor does another one that predicted them {alike}" if len(skilled) > 1 else doubt
+        return None, [doubt, Flag("nor_another")] if len(skilled) > 1 else [doubt]
     if able[0] == skilled[0]:
-        return able[0], f"{_name(able[0])} predicted the differences between left-out controllers {alike}"
-    return able[0], f"{doubt}; {_name(able[0])} is the best of those that support a candidate"
+        return able[0], [Flag.of("skilled", method=able[0])]
+    return able[0], [doubt, Flag.of("best_of_supporting", method=able[0])]
 
 
 def widened(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, dict[str, Estimate]]:
@@ -138,7 +139,7 @@ def no_difference_error(predictions: Sequence[Mapping[str, Any]]) -> float | Non
 
 
 def _name(method: str) -> str:
-    return METHOD_NAMES.get(method, method)
+    return shown(method).name
 
 
 def _supports(table: Mapping[str, Estimate]) -> bool:

@@ -5,19 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
-from app.evaluation.estimates.methods import AGGREGATE
 from app.learning.snapshots.buffers import read_buffer
 from app.platform import files
 from app.platform.jobs import StepReport, write_atomically
 from ml import progress
+from ml.ope.compare.skill import choose_default
+from ml.ope.dlsm.config import DlsmConfig
+from ml.ope.registry import AGGREGATE, Size, build, quick_estimators
+from ml.ope.support.diagnostics import diagnose
+from ml.policies.onnx_policy import OnnxPolicy
+from ml.policies.policy import Policy
+from ml.trajectories import ReplayBuffer
 
 if TYPE_CHECKING:
-    from ml.ope.dlsm.config import DlsmConfig
-    from ml.ope.estimate import Estimator
-    from ml.policies.policy import Policy
-    from ml.trajectories import ReplayBuffer
+    from ml.ope.dlsm.estimator import Dlsm
 
 FIT_SHARE = 0.5
 """Share of an evaluation step's progress that fitting takes."""
@@ -39,13 +42,8 @@ def fit_dlsm(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[
     Returns:
         `held_out_score` of the best check and the number of `checks`, or `failed` with the reason where these data cannot be fitted.
     """
-    import torch
-
-    from ml.ope.dlsm.estimator import Dlsm
-
-    torch.set_num_threads(1)
     buffer = read_buffer(params["snapshot_sha256"])
-    estimator = Dlsm(_dlsm_config(params))
+    estimator = cast("Dlsm", build("dlsm", params["seed"], _size(params)))
     try:
         member = estimator.fit_member(buffer, params["member"], report.curves(estimator.config.steps, "dlsm_"), workdir)
     except ValueError as error:
@@ -75,18 +73,13 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -
     """
     if "failed" in params:
         return {"failed": params["failed"]}
-    import torch
-
-    from ml.ope.dlmm import Dlmm
-
-    torch.set_num_threads(1)
     buffer = read_buffer(params["snapshot_sha256"])
-    estimator = _estimator(params)
+    estimator = build(params["method"], params["seed"], _size(params))
     for k, sha256 in enumerate(params.get("members", [])):
         write_atomically(workdir / member_file(k), files.read(sha256))
     policies = _policies(params["policies"], buffer)
-    # its members learn one after the other, those of DualDICE side by side
-    members = estimator.config.members if isinstance(estimator, Dlmm) else 1
+    # curves of members that learn one after the other; those of DualDICE learn side by side
+    members: int = getattr(estimator, "successive_members", 1)
 
     def part(first: float, share: float, what: str, curves: bool) -> progress.Report:
         def tell(fraction: float, message: str = "", **numbers: float) -> None:
@@ -119,11 +112,6 @@ def check_coverage(params: dict[str, Any], workdir: Path, report: StepReport) ->
         `policies`, by policy id what `ml.ope.support.diagnostics.Diagnostics` holds; or `failed` with the reason where these data cannot be
         checked.
     """
-    import torch
-
-    from ml.ope.support.diagnostics import diagnose
-
-    torch.set_num_threads(1)
     buffer = read_buffer(params["snapshot_sha256"])
     try:
         found = diagnose(buffer, _policies(params["policies"], buffer), params["horizon_steps"], report.curves(1.0))
@@ -143,12 +131,6 @@ def choose_method(params: dict[str, Any], workdir: Path, report: StepReport) -> 
     Returns:
         `choice`, as `ml.ope.compare.skill.Choice` has it, or `failed` with the reason where the data cannot choose.
     """
-    import torch
-
-    from ml.ope.compare.skill import choose_default
-    from ml.ope.registry import quick_estimators
-
-    torch.set_num_threads(1)
     buffer = read_buffer(params["snapshot_sha256"])
     quick = {name: e for name, e in quick_estimators(params["seed"]).items() if name in params["methods"]}
     if not quick:
@@ -171,28 +153,14 @@ def choose_method(params: dict[str, Any], workdir: Path, report: StepReport) -> 
 
 def dlsm_members(preset: str, seed: int) -> int:
     """Ensemble size of a preset."""
-    return _dlsm_config({"preset": preset, "seed": seed}).members
+    return DlsmConfig.of_size(_size({"preset": preset}), seed).members
 
 
-def _dlsm_config(params: dict[str, Any]) -> DlsmConfig:
-    from ml.ope.dlsm.config import DlsmConfig
-
-    return DlsmConfig.demo(params["seed"]) if params["preset"] == "quick" else DlsmConfig(seed=params["seed"])
-
-
-def _estimator(params: dict[str, Any]) -> Estimator:
-    from ml.ope.dlsm.estimator import Dlsm
-    from ml.ope.registry import estimators
-
-    quick, seed = params["preset"] == "quick", params["seed"]
-    if params["method"] == "dlsm":
-        return Dlsm(_dlsm_config(params))
-    return estimators(seed, demo=quick)[params["method"]]
+def _size(params: dict[str, Any]) -> Size:
+    return "demo" if params["preset"] == "quick" else "full"
 
 
 def _policies(named: list[dict[str, Any]], buffer: ReplayBuffer) -> dict[str, Policy]:
-    from ml.policies.onnx_policy import OnnxPolicy
-
     return {str(p["id"]): OnnxPolicy(files.read(p["sha256"]), buffer.settings.window) for p in named}
 
 

@@ -1,4 +1,4 @@
-"""What the data can say about each policy: checks that are made before any estimate, stored with the evaluation and told in words.
+"""What the data can say about each policy: checks that are made before any estimate and stored with the evaluation.
 
 A check that refuses a policy counts for every method; a note is to be known before the policy is picked and refuses nothing.
 """
@@ -11,8 +11,9 @@ from typing import Any
 
 from app.evaluation.models import Evaluation
 from app.evaluation.schemas import CheckOut, CoverageOut
+from app.evaluation.shown import flag_out
 from ml.ope.estimate import Estimate
-from ml.ope.support.coverage import Coverage
+from ml.ope.flags import Flag, distinct
 
 STORED = "coverage"
 """Member of an evaluation's diagnostics."""
@@ -87,7 +88,6 @@ CHECKS: dict[str, CheckText] = {
 }
 """In the order of the page; the names are those of `ml.ope.support.diagnostics`."""
 
-NOT_SUPPORTED = "not supported by the data"
 _SHARES = {"outside_range", "thin", "far", "below_random_bound", "unseen_dose", "largest_weight_share"}
 
 
@@ -102,30 +102,10 @@ def refused(estimates: Mapping[str, Mapping[str, Estimate]], outcome: Mapping[st
 
     def marked(policy_id: str, e: Estimate) -> Estimate:
         found = checked.get(policy_id) or {}
-        failing = [str(reason) for reason in found.get("failing", [])]
-        if not failing:
-            return e
-        return replace(e, supported=False, flags=(*failing, *(f for f in e.flags if f not in failing)))
+        failing = _flags(found, "failing")
+        return replace(e, supported=False, flags=distinct((*failing, *e.flags))) if failing else e
 
     return {m: {i: marked(i, e) for i, e in table.items()} for m, table in estimates.items()}
-
-
-def told_apart(estimates: Mapping[str, Mapping[str, Estimate]]) -> dict[str, dict[str, Estimate]]:
-    """The estimates with each flag that a method raised on its own simulated sessions saying so; the others are of the logged steps."""
-    return {m: {i: _told_apart(e) for i, e in table.items()} for m, table in estimates.items()}
-
-
-def _told_apart(e: Estimate) -> Estimate:
-    logged, simulated = e.details.get("coverage"), e.details.get("coverage_simulated")
-    if not logged or not simulated:
-        return e
-    own = set(Coverage(**simulated).flags) - set(Coverage(**logged).flags)
-    return replace(e, flags=tuple(_of_simulated(f) if f in own else f for f in e.flags))
-
-
-def _of_simulated(flag: str) -> str:
-    verdict, colon, rest = flag.rpartition(f"{NOT_SUPPORTED}: ")
-    return f"{verdict}{colon}in its simulated sessions, {rest}"
 
 
 def coverage_by_policy(evaluation: Evaluation) -> dict[int, CoverageOut]:
@@ -146,10 +126,14 @@ def _out(found: Mapping[str, Any]) -> CoverageOut:
         supported=bool(found["supported"]),
         sessions=found["sessions"],
         checks=checks,
-        failing=[str(f) for f in found["failing"]],
-        notes=[str(n) for n in found["notes"]],
-        weights_failing=[str(f) for f in found["weights_failing"]],
+        failing=[flag_out(f) for f in _flags(found, "failing")],
+        notes=[flag_out(f) for f in _flags(found, "notes")],
+        weights_failing=[flag_out(f) for f in _flags(found, "weights_failing")],
     )
+
+
+def _flags(found: Mapping[str, Any], name: str) -> list[Flag]:
+    return [Flag.from_json(stored) for stored in found.get(name, [])]
 
 
 def shown_value(check: CheckOut, sessions: int | None = None) -> str:

@@ -1,72 +1,57 @@
-"""The estimators that jobs run, by the keys of `ml.ope.registry`: what pages call them, and which of them a preset runs."""
+"""Methods of evaluation as the API takes them: their keys, and which of them a preset runs. `ml.ope.registry` has the methods."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
-AGGREGATE = "aggregate"
-"""The combination of the others: not fitted, but computed from their estimates."""
-
-Method = Literal["dlsm", "linear", "dlmm", "fqe", "wdr", "dual_dice", "wis", "pdis", "cwpdis", "aggregate"]
-METHODS: tuple[Method, ...] = ("dlsm", "linear", "dlmm", "fqe", "wdr", "dual_dice", "wis", "pdis", "cwpdis", "aggregate")
-QUICK_METHODS: tuple[Method, ...] = ("dlsm", "linear", "fqe", "wdr", "wis", "pdis", "aggregate")
-"""What the preset `quick` runs where nothing is said: one method of every family, so that a first ranking takes minutes."""
-
-METHOD_NAMES: dict[str, str] = {
-    "dlsm": "DLSM",
-    "linear": "Linear model",
-    "dlmm": "DLMM",
-    "fqe": "Fitted Q evaluation",
-    "wdr": "Weighted doubly robust",
-    "dual_dice": "DualDICE",
-    "wis": "Weighted importance sampling",
-    "pdis": "Per-decision importance sampling",
-    "cwpdis": "Consistent weighted per-decision importance sampling",
-    "aggregate": "Combination of all methods",
-}
-METHOD_SHORT: dict[str, str] = METHOD_NAMES | {
-    "linear": "Linear",
-    "fqe": "FQE",
-    "wdr": "WDR",
-    "wis": "WIS",
-    "pdis": "PDIS",
-    "cwpdis": "CWPDIS",
-    "aggregate": "Combination",
-}
-"""For the heads of wide tables."""
-
-_KEYS = re.compile(r"(?<![\w-])(?:" + "|".join(sorted(METHOD_NAMES, key=len, reverse=True)) + r")(?![\w-])(?! model| regression)")
-"""Keys as words of their own; "linear model" in a sentence is no key."""
+from ml.ope import registry
+from ml.ope.registry import AGGREGATE
 
 
-def in_words(sentence: str) -> str:
-    """A sentence of the science with the keys of methods replaced by their names."""
-    return _KEYS.sub(lambda found: METHOD_NAMES[found.group()], sentence)
+class _PublishedKeys:
+    """The keys of all methods as the enumeration of the JSON schema."""
+
+    def __get_pydantic_json_schema__(self, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return {**handler(core_schema), "enum": list(registry.method_keys())}
 
 
-METHOD_WEIGHTS: dict[Method, float] = {
-    "dlsm": 6.0, "linear": 2.0, "dlmm": 3.0, "fqe": 1.0, "wdr": 2.0, "dual_dice": 3.0, "wis": 1.0, "pdis": 1.0, "cwpdis": 1.0
-}  # fmt: skip
-"""Share of a job's progress that one method's step takes."""
+def _known(key: str) -> str:
+    if key not in registry.method_keys():
+        raise ValueError(f"'{key}' is no method of evaluation; choose among {', '.join(registry.method_keys())}")
+    return key
 
 
-def methods_of(preset: str) -> list[Method]:
+Method = Annotated[str, AfterValidator(_known), _PublishedKeys()]
+
+
+def quick_methods() -> list[str]:
+    """What the preset `quick` runs where nothing is said, so that a first ranking takes minutes."""
+    return [m.key for m in registry.methods() if m.quick]
+
+
+def methods_of(preset: str) -> list[str]:
     """What a preset runs where no methods are named."""
-    return list(QUICK_METHODS if preset == "quick" else METHODS)
+    return quick_methods() if preset == "quick" else list(registry.method_keys())
 
 
-def _checked(methods: list[Method]) -> list[Method]:
+def names() -> dict[str, str]:
+    """What pages call the methods, by key."""
+    return {m.key: m.name for m in registry.methods()}
+
+
+def _checked(methods: list[str]) -> list[str]:
     once = list(dict.fromkeys(methods))
     if AGGREGATE in once and len(once) < 3:
         raise ValueError("the combination needs the estimates of at least two other methods: name them too")
     return once
 
 
-def _of_preset(values: Mapping[str, Any]) -> list[Method]:
+def _of_preset(values: Mapping[str, Any]) -> list[str]:
     return methods_of(str(values.get("preset", "full")))
 
 
@@ -76,7 +61,7 @@ Methods = Annotated[
         default_factory=_of_preset,
         min_length=1,
         max_length=20,
-        description=f"Estimators to run; where not given, all for `full` and for `quick` {', '.join(QUICK_METHODS)}.",
+        description=f"Estimators to run; where not given, all for `full` and for `quick` {', '.join(quick_methods())}.",
     ),
     AfterValidator(_checked),
 ]

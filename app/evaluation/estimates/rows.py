@@ -1,34 +1,26 @@
-"""Estimates between their stored rows, JSON and the science's own type."""
+"""Estimates between the science's own type and their stored rows. A row has columns for what queries need; the rest is in `details`."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping
-from typing import Any
 
 from app.evaluation.models import EstimateRow
 from ml.ope.estimate import Estimate
 
+_COLUMNS = {column.key for column in EstimateRow.__table__.columns}
 
-def as_estimate(values: Mapping[str, Any]) -> Estimate:
-    """The inverse of `Estimate.to_json`."""
-    return Estimate(**{**values, "flags": tuple(values["flags"])})
+
+def row_of(policy_id: int, estimate: Estimate) -> EstimateRow:
+    """An estimate as it is stored."""
+    stored = estimate.to_json()
+    details = stored.pop("details") | {name: stored.pop(name) for name in list(stored) if name not in _COLUMNS}
+    # an interval of a skewed bootstrap may miss the estimate itself; the table keeps it inside
+    ends = {"low": min(estimate.low, estimate.value), "high": max(estimate.high, estimate.value)}
+    predicted = {name: v for name, v in estimate.predicted.items() if v is not None}
+    return EstimateRow(policy_id=policy_id, **stored | ends | {"predicted": predicted, "details": details})
 
 
 def estimate_of(row: EstimateRow) -> Estimate:
-    """A stored estimate as the science knows it."""
+    """A stored estimate of any version."""
     details = dict(row.details)
-    return Estimate(
-        method=row.method,
-        value=row.value,
-        low=row.low,
-        high=row.high,
-        level=row.level,
-        standard_error=row.standard_error or 0.0,
-        step_return=details.pop("step_return"),
-        end_reward=details.pop("end_reward"),
-        predicted={name: float(v) for name, v in row.predicted.items()},
-        supported=row.supported,
-        flags=tuple(row.flags),
-        n=details.pop("n"),
-        details=details,
-    )
+    apart = {name: details.pop(name) for name in ("step_return", "end_reward", "n", "version") if name in details}
+    stored = {name: getattr(row, name) for name in _COLUMNS} | apart | {"details": details}
+    return Estimate.from_json(stored | {"standard_error": row.standard_error or 0.0})

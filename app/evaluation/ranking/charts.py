@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from app.evaluation.estimates.methods import METHOD_NAMES, METHOD_SHORT
 from app.evaluation.schemas import RankedPolicy, RankingOut
 from app.platform.web.charts import Chart, axis, figure
+from ml.ope.registry import shown
 
-METHOD_STYLES = {
-    "dlsm": {"color": "token:rl", "symbol": "diamond"},
-    "linear": {"color": "token:distilled", "symbol": "square"},
-    "dlmm": {"color": "token:accent", "symbol": "hexagram"},
-    "fqe": {"color": "token:cdbs", "symbol": "circle"},
-    "wdr": {"color": "token:no_dbs", "symbol": "cross"},
-    "dual_dice": {"color": "token:warn", "symbol": "star"},
-    "wis": {"color": "token:random", "symbol": "triangle-up"},
-    "pdis": {"color": "token:other", "symbol": "x"},
-    "cwpdis": {"color": "token:muted", "symbol": "triangle-down"},
-    "aggregate": {"color": "token:text", "symbol": "pentagon"},
-}
+
+def style(method: str) -> dict[str, str]:
+    """Colour and symbol of a method's marks."""
+    found = shown(method)
+    return {"color": f"token:{found.colour}", "symbol": found.symbol}
 
 
 def shown_references(ranking: RankingOut) -> list[RankedPolicy]:
@@ -38,39 +31,39 @@ def label(policy: RankedPolicy) -> str:
 
 def forest(ranking: RankingOut) -> Chart:
     """Estimate and interval of every policy, best on top; the ranking's method is shown, the others wait in the legend."""
-    shown = [*ranking.policies, *shown_references(ranking)]
+    listed = [*ranking.policies, *shown_references(ranking)]
     data = []
     for method in sorted(ranking.methods, key=lambda m: m != ranking.default_method):
-        have = [p for p in shown if method in p.estimates]
+        have = [p for p in listed if method in p.estimates]
         estimates = [p.estimates[method] for p in have]
-        style = METHOD_STYLES[method]
+        marks = style(method)
         data.append(
             {
                 "type": "scatter",
                 "mode": "markers",
-                "name": METHOD_SHORT[method],
+                "name": shown(method).short,
                 "visible": True if method == ranking.default_method else "legendonly",
                 "x": [e.value for e in estimates],
                 "y": [label(p) for p in have],
                 "marker": {
                     "size": 10,
-                    "color": style["color"],
-                    "symbol": [style["symbol"] + ("" if e.supported else "-open") for e in estimates],
+                    "color": marks["color"],
+                    "symbol": [marks["symbol"] + ("" if e.supported else "-open") for e in estimates],
                 },
                 "error_x": {
                     "type": "data",
                     "symmetric": False,
                     "array": [e.high - e.value for e in estimates],
                     "arrayminus": [e.value - e.low for e in estimates],
-                    "color": style["color"],
+                    "color": marks["color"],
                 },
-                "hovertemplate": "%{y}: %{x:.2f}<extra>" + METHOD_NAMES[method] + "</extra>",
+                "hovertemplate": "%{y}: %{x:.2f}<extra>" + shown(method).name + "</extra>",
             }
         )
-    level = next((e.level for p in shown for e in p.estimates.values()), 0.9)
+    level = next((e.level for p in listed for e in p.estimates.values()), 0.9)
     rows = [
-        [label(p), p.rank, METHOD_NAMES[m], e.value, e.low, e.high, "yes" if e.supported else "no"]
-        for p in shown
+        [label(p), p.rank, shown(m).name, e.value, e.low, e.high, "yes" if e.supported else "no"]
+        for p in listed
         for m, e in p.estimates.items()
     ]
     return Chart(
@@ -81,10 +74,10 @@ def forest(ranking: RankingOut) -> Chart:
         figure=figure(
             data,
             xaxis=axis("Estimated return", "reward"),
-            yaxis=axis("", categoryorder="array", categoryarray=[label(p) for p in reversed(shown)], dtick=1),
+            yaxis=axis("", categoryorder="array", categoryarray=[label(p) for p in reversed(listed)], dtick=1),
             margin={"l": 150, "r": 16, "t": 12, "b": 44},
         ),
         columns=["Policy", "Rank", "Method", "Value (reward)", f"Low ({100 * level:.0f} %)", f"High ({100 * level:.0f} %)", "Supported"],
         rows=rows,
-        height=140 + 30 * len(shown),
+        height=140 + 30 * len(listed),
     )

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 
 from fastapi import Response
 
 from app.evaluation.estimates.coverage import CHECKS
-from app.evaluation.schemas import RankedPolicy, RankingOut, TestedBefore
+from app.evaluation.schemas import FlagOut, RankedPolicy, RankingOut, TestedBefore
 from app.platform.web.csv_files import download, safe_cell
 
 _PREDICTED = ("energy", "mean_amplitude", "mean_beta", "grasp_hz", "rating", "tremor_percent")
@@ -37,8 +38,12 @@ def to_csv(ranking: RankingOut) -> str:
         results = [getattr(p.tested, n) if p.tested else (0 if n.startswith("sessions") else None) for n in _TESTED]
         for method, e in p.estimates.items():
             numbers = [method, e.supported, *(getattr(e, n) for n in _NUMBERS), *(e.predicted.get(n) for n in _PREDICTED)]
-            out.writerow([safe_cell(cell) for cell in (*of_ranking, *of_policy, *numbers, "; ".join(e.flags), *results)])
+            out.writerow([safe_cell(cell) for cell in (*of_ranking, *of_policy, *numbers, _texts(e.flags), *results)])
     return sink.getvalue()
+
+
+def _texts(flags: Sequence[FlagOut]) -> str:
+    return "; ".join(flag.text for flag in flags)
 
 
 def _coverage_columns() -> list[str]:
@@ -50,7 +55,7 @@ def _coverage(p: RankedPolicy) -> list[object]:
     if p.coverage is None:
         return [None] * len(_coverage_columns())
     values = {c.name: c.value for c in p.coverage.checks}
-    return [p.coverage.supported, "; ".join(p.coverage.failing), "; ".join(p.coverage.notes), *(values.get(n) for n in _COVERAGE)]
+    return [p.coverage.supported, _texts(p.coverage.failing), _texts(p.coverage.notes), *(values.get(n) for n in _COVERAGE)]
 
 
 def csv_of(found: RankingOut) -> Response:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from app.evaluation.schemas import EstimateOut, RankedPolicy
+from ml.ope.flags import Flag
 
 
-def ranking_notes(policies: Sequence[RankedPolicy], references: Sequence[RankedPolicy], method: str) -> list[str]:
-    """Sentences above a ranking.
+def ranking_notes(policies: Sequence[RankedPolicy], references: Sequence[RankedPolicy], method: str) -> list[Flag]:
+    """What stands above a ranking.
 
     Args:
         policies: candidates; retired ones, and those without an estimate by the method, say nothing here.
@@ -20,34 +21,24 @@ def ranking_notes(policies: Sequence[RankedPolicy], references: Sequence[RankedP
     others = [(p, e) for p, e in present if not p.supported]
     notes = []
     if present and not supported:
-        notes.append("No candidate is supported by the data: these estimates cannot say whether one improves on cDBS.")
+        notes.append(Flag("none_supported"))
     cdbs = next((p.estimates[method] for p in references if p.reference == "cdbs" and method in p.estimates), None)
     if cdbs and supported:
         notes += _against_cdbs(cdbs, supported, all(e.value < cdbs.value for _, e in others))
-    passed = [f"{p.name} ({e.value:.1f})" for p, e in others if supported and e.value > min(s.value for _, s in supported)]
+    lowest = min((e.value for _, e in supported), default=float("inf"))
+    passed = tuple(f"{p.name} ({e.value:.1f})" for p, e in others if e.value > lowest)
     if passed:
-        notes.append(
-            "Policies that the data do not support stand below all supported ones, whatever their estimated value: "
-            + f"{', '.join(passed)}."
-        )
+        notes.append(Flag.of("placed_below", policies=passed))
     return notes
 
 
-def _against_cdbs(cdbs: EstimateOut, supported: Sequence[tuple[RankedPolicy, EstimateOut]], others_below: bool) -> list[str]:
+def _against_cdbs(cdbs: EstimateOut, supported: Sequence[tuple[RankedPolicy, EstimateOut]], above_all: bool) -> list[Flag]:
     """The best supported candidate against cDBS; nothing to say where its whole interval lies above that of cDBS."""
     best, e = max(supported, key=lambda pair: pair[1].value)
-    reference = "The cDBS reference" + ("" if cdbs.supported else ", which the data do not support,")
     overlap = e.low <= cdbs.high and cdbs.low <= e.high
     if cdbs.value >= e.value:
-        which = "candidate" if others_below else "supported candidate"
-        doubt = " The intervals overlap." if overlap else ""
-        return [
-            f"{reference} is estimated at {cdbs.value:.1f}, above every {which} (best: {best.name}, {e.value:.1f}): "
-            f"by this estimate no {which} improves on cDBS in return.{doubt}"
-        ]
+        known = cdbs.supported
+        return [Flag.of("cdbs_above", e.value, cdbs.value, "reward", best=best.name, supported=known, overlap=overlap, above_all=above_all)]
     if overlap:
-        return [
-            f"{reference} is estimated at {cdbs.value:.1f}, the best candidate, {best.name}, at {e.value:.1f}; the intervals overlap: "
-            "whether it improves on cDBS in return is open."
-        ]
+        return [Flag.of("cdbs_overlaps", e.value, cdbs.value, "reward", best=best.name, supported=cdbs.supported)]
     return []

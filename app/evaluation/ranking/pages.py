@@ -12,11 +12,11 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.evaluation.decision import RULES
 from app.evaluation.estimates import coverage
-from app.evaluation.estimates.methods import METHOD_NAMES, METHOD_SHORT
+from app.evaluation.estimates.methods import names
 from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.export import csv_of
-from app.evaluation.schemas import DECISION_NAMES, RANKING_KINDS, RankingFilter, RankingOut
+from app.evaluation.schemas import DECISION_NAMES, RANKING_KINDS, FlagOut, RankedPolicy, RankingFilter, RankingOut
 from app.learning.snapshots.service import not_ready
 from app.platform.database import Db
 from app.platform.errors import NotFound
@@ -28,6 +28,8 @@ from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.service import may
+from ml.ope import registry as estimators
+from ml.ope.flags import TEXT
 
 router = APIRouter()
 
@@ -64,9 +66,10 @@ def ranking_page(
         forest=charts.forest(found) if found else None,
         references=charts.shown_references(found) if found else [],
         label=charts.label,
-        method_names=METHOD_NAMES,
-        method_short=METHOD_SHORT,
+        method_names=names(),
+        method_short={m.key: m.short for m in estimators.methods()},
         decision_names=DECISION_NAMES,
+        beside_decision=_beside_decision,
         coverage=coverage,
         rules=RULES,
         shown=shown,
@@ -87,6 +90,12 @@ def ranking_page(
 def ranking_csv(participant: CurrentParticipant, db: Db, caller: CurrentCaller, method: str | None = None) -> Response:
     """The ranking as CSV, by the method that the page ranks by."""
     return csv_of(ranking.current_ranking(db, participant, caller, method))
+
+
+def _beside_decision(policy: RankedPolicy) -> list[FlagOut]:
+    """A policy's flags that its decision does not rest on."""
+    named = {(r.code, r.value, r.limit) for r in policy.decision_reasons}
+    return [f for f in policy.flags if f.code == TEXT or (f.code, f.value, f.limit) not in named]
 
 
 def _live_jobs(db: Session, participant: Participant) -> list[Any]:

@@ -23,7 +23,7 @@ from ml.trajectories import SessionTrajectory
 
 
 @dataclass(frozen=True)
-class Ran:
+class DrivenSession:
     """One session of a policy (or of cDBS) that may be held against estimates, or why it may not.
 
     Attributes:
@@ -40,7 +40,7 @@ class Ran:
     left_out: str | None
 
 
-def sessions_that_ran(db: Session, snapshot: BufferSnapshot, caller: Caller) -> list[Ran]:
+def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller) -> list[DrivenSession]:
     """Every confirmed session of a policy or of cDBS, by visit and order, under a snapshot's settings, unit and source of beta.
 
     The buffer's gate does not matter here: it guards what is learnt from, and these sessions are only looked at.
@@ -56,11 +56,11 @@ def sessions_that_ran(db: Session, snapshot: BufferSnapshot, caller: Caller) -> 
             continue
         read = _read(db, session, arm, version, snapshot)
         trajectory, reason = (None, read) if isinstance(read, str) else (read, None)
-        found.append(Ran(session.id, session.visit.number, arm.controller, arm.policy_id, trajectory, reason))
+        found.append(DrivenSession(session.id, session.visit.number, arm.controller, arm.policy_id, trajectory, reason))
     return found
 
 
-def results_by_policy(ran: list[Ran], settings: MdpSettings, horizon_steps: int, cdbs: int | None) -> dict[int, TestedBefore]:
+def results_by_policy(ran: list[DrivenSession], settings: MdpSettings, horizon_steps: int, cdbs: int | None) -> dict[int, TestedBefore]:
     """Actual results by policy, under the settings, horizon and discount of the estimates; those of cDBS under its reference's id."""
     results: dict[int, list[Actual]] = defaultdict(list)
     for session in ran:

@@ -9,20 +9,20 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.evaluation import repository
-from app.evaluation.decision import decide, gain_over
+from app.evaluation import repository, wording
+from app.evaluation.decision import Decided, decide, gain_over
+from app.evaluation.estimates.choice import stored_reasons
 from app.evaluation.estimates.coverage import coverage_by_policy, coverage_failed
-from app.evaluation.estimates.methods import METHODS, in_words
 from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.notes import ranking_notes
-from app.evaluation.ranking.results import results_by_policy, sessions_that_ran
+from app.evaluation.ranking.results import driven_sessions, results_by_policy
 from app.evaluation.ranking.staleness import stale_reasons
 from app.evaluation.schemas import (
     ChoiceOut,
     CoverageOut,
-    Decision,
     EstimateOut,
+    FlagOut,
     GainOut,
     RankedPolicy,
     RankedSnapshot,
@@ -30,15 +30,16 @@ from app.evaluation.schemas import (
     RankingOut,
     TestedBefore,
 )
+from app.evaluation.shown import estimate_out, flag_out, reason_out
 from app.learning.models import BufferSnapshot, Policy
-from app.learning.snapshots.service import Collection, collect
 from app.platform.errors import Invalid, NotFound
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Participant
 from ml.ope.compare.ranking import rank_policies
 from ml.ope.estimate import Estimate
-from ml.ope.support.coverage import NO_CLOSED_LOOP
+from ml.ope.flags import TEXT, distinct
+from ml.ope.registry import method_keys
 
 Table = dict[int, dict[str, Estimate]]
 
@@ -64,24 +65,18 @@ def current_ranking(
             f"Participant {participant.code} has no ranking yet.", "Start a job of kind 'pipeline', or 'evaluate' where there are policies."
         )
     table = _table(evaluation)
-    methods = [m for m in METHODS if any(m in by_method for by_method in table.values())]
+    methods = [m for m in method_keys() if any(m in by_method for by_method in table.values())]
     chosen = method or evaluation.default_method
     if chosen not in methods:
         raise Invalid(f"This ranking has no estimates by '{chosen}'.", f"Choose one of {', '.join(methods)}.")
-    try:
-        present: Collection | None = collect(db, participant)
-        trouble = None
-    except Invalid as error:
-        present, trouble = None, str(error)
     policies = repository.policies_by_id(db, list(table))
     snapshot = db.get_one(BufferSnapshot, evaluation.snapshot_id)
     settings = study.mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
     cdbs = next((i for i, p in policies.items() if is_cdbs(p)), None)
-    tested = results_by_policy(sessions_that_ran(db, snapshot, caller), settings, evaluation.horizon_steps, cdbs)
+    tested = results_by_policy(driven_sessions(db, snapshot, caller), settings, evaluation.horizon_steps, cdbs)
     rows = _rows(evaluation, table, policies, chosen, tested)
     candidates, references = [r for r in rows if r.reference is None], [r for r in rows if r.reference is not None]
-    reasons = [trouble] if trouble else []
-    reasons += stale_reasons(db, participant, evaluation, present)
+    reasons = [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation)]
     return RankingOut(
         participant=participant.code,
         evaluation_id=evaluation.id,
@@ -96,7 +91,7 @@ def current_ranking(
         stale=bool(reasons),
         stale_reasons=reasons,
         stale_reason="; ".join(reasons) or None,
-        notes=ranking_notes(candidates, references, chosen),
+        notes=[wording.sentence(n) for n in ranking_notes(candidates, references, chosen)],
         policies=[p for p in candidates if _passes(p, shown)],
         references=references,
         coverage_failed=coverage_failed(evaluation),
@@ -118,7 +113,7 @@ def evaluation_notes(db: Session, evaluation: Evaluation) -> list[str]:
     table = _table(evaluation)
     rows = _rows(evaluation, table, repository.policies_by_id(db, list(table)), evaluation.default_method, {})
     candidates, references = [r for r in rows if r.reference is None], [r for r in rows if r.reference is not None]
-    return ranking_notes(candidates, references, evaluation.default_method)
+    return [wording.sentence(n) for n in ranking_notes(candidates, references, evaluation.default_method)]
 
 
 def _table(evaluation: Evaluation) -> Table:
@@ -149,7 +144,7 @@ def _rows(
     for i in order:
         policy, place, chosen = policies[i], places.get(i), by_method.get(i)
         gain = gain_over(chosen, cdbs[method]) if chosen and method in cdbs and table[i] is not cdbs else None
-        decided: tuple[Decision | None, str] = (None, "")
+        decided: Decided | None = None
         if i in places:
             decided = decide(table[i], cdbs, method, retired_reason=policy.retired_reason, tested=tested.get(i), unchecked=unchecked)
         rows.append(
@@ -164,23 +159,25 @@ def _rows(
                 supported=chosen.supported if chosen else False,
                 probability_best=place.probability_best if place else None,
                 retired=policy.retired_reason is not None,
-                estimates={m: _estimate_out(table[i][m]) for m in METHODS if m in table[i]},
+                estimates={m: estimate_out(table[i][m], EstimateOut) for m in method_keys() if m in table[i]},
                 predicted=chosen.predicted if chosen else {},
                 flags=_flags(chosen, coverage.get(i), i in references),
                 coverage=coverage.get(i),
                 tested=tested.get(i),
                 gain=GainOut.model_validate(gain) if gain else None,
-                decision=decided[0],
-                decision_reason=decided[1],
+                decision=decided.decision if decided else None,
+                decision_reasons=[reason_out(r) for r in decided.reasons] if decided else [],
+                decision_reason=wording.decision(decided.reasons) if decided else "",
             )
         )
     return rows
 
 
-def _flags(estimate: Estimate | None, coverage: CoverageOut | None, is_reference: bool) -> list[str]:
+def _flags(estimate: Estimate | None, coverage: CoverageOut | None, is_reference: bool) -> list[FlagOut]:
     """What to know of a policy. That a reference holds one amplitude is its purpose and no warning."""
-    flags = [*(estimate.flags if estimate else ()), *(coverage.notes if coverage else ())]
-    return [f for f in dict.fromkeys(flags) if not (is_reference and f.startswith(NO_CLOSED_LOOP))]
+    own = distinct(estimate.flags) if estimate else ()
+    shown = [flag_out(f) for f in own if not (is_reference and f.code == "no_closed_loop")]
+    return shown + [note for note in (coverage.notes if coverage else ()) if note not in shown]
 
 
 def _reference(policy: Policy) -> str:
@@ -194,26 +191,13 @@ def is_cdbs(policy: Policy) -> bool:
     return policy.kind == "baseline" and policy.algorithm == "constant" and policy.config.get("amplitude") == 1.0
 
 
-def _estimate_out(e: Estimate) -> EstimateOut:
-    return EstimateOut(
-        value=e.value,
-        low=e.low,
-        high=e.high,
-        level=e.level,
-        standard_error=e.standard_error,
-        step_return=e.step_return,
-        end_reward=e.end_reward,
-        supported=e.supported,
-        flags=list(e.flags),
-        predicted=e.predicted,
-        n=e.n,
-    )
-
-
 def _choice_out(evaluation: Evaluation) -> ChoiceOut | None:
-    """The stored choice; its reason comes from the science, which knows methods by their keys."""
     choice = evaluation.diagnostics.get("choice")
-    return ChoiceOut.model_validate(choice | {"reason": in_words(choice["reason"])}) if choice else None
+    if not choice:
+        return None
+    reasons = stored_reasons(choice)
+    shown = [reason_out(r) for r in reasons if r.code != TEXT]
+    return ChoiceOut.model_validate(choice | {"reasons": shown, "reason": wording.choice(reasons)})
 
 
 def _snapshot_out(db: Session, row: BufferSnapshot) -> RankedSnapshot:

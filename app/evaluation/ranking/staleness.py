@@ -1,60 +1,119 @@
-"""Whether a ranking still speaks about the study as it is, and what has changed since where it does not."""
+"""Whether a ranking still speaks about the study as it is, and what has changed since where it does not, as typed flags.
+
+The snapshot's pins are held against the rows of today: settings version, sessions, QoC revisions, traces, cDBS amplitudes, the gate, and,
+by the audit trail, whatever else of a session decides on its steps. No trace and no buffer is read for it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from typing import Any
 
 from sqlalchemy.orm import Session
 
+from app.accounts.permissions import SYSTEM
+from app.evaluation import repository
 from app.evaluation.models import Evaluation
 from app.learning import repository as learning
+from app.learning.gate.service import LEARNED, gate
 from app.learning.models import BufferSnapshot, SnapshotSession
-from app.learning.snapshots.service import Collection, Member
+from app.platform.errors import Invalid
+from app.study import blinding
 from app.study import repository as study_repository
-from app.study.models import Participant
+from app.study.models import Participant, SettingsVersion, StudySession
+from app.study.traces import Sources, sources
+from ml.ope.flags import Flag
+
+NAMED = 5
+"""Policies that are named where a ranking lacks some."""
+
+OF_STEPS = ("controller", "policy_id", "duration_s", "control_stream", "control_channel")
+"""Columns of a session that its steps in a buffer depend on, beside what a snapshot pins."""
 
 
-def stale_reasons(db: Session, participant: Participant, evaluation: Evaluation, present: Collection | None) -> list[str]:
-    """Why the ranking no longer speaks about the study as it is, in words; empty when it does."""
-    reasons = []
-    snapshot = learning.snapshot_members(db, evaluation.snapshot_id)
-    if evaluation.settings_version_id != participant.current_settings.id:
+def stale_reasons(db: Session, participant: Participant, evaluation: Evaluation) -> list[Flag]:
+    """Why the ranking no longer speaks about the study as it is; empty when it does."""
+    reasons: list[Flag] = []
+    settings = participant.current_settings
+    if settings.xi_beta is None:
+        reasons.append(Flag("no_threshold"))
+    if evaluation.settings_version_id != settings.id:
         old = study_repository.settings_version(db, evaluation.settings_version_id).version
-        reasons.append(f"settings version {participant.current_settings.version} is in force; this ranking used version {old}")
-    row = db.get_one(BufferSnapshot, evaluation.snapshot_id)
-    if present is not None and present.pins_sha256 != row.pins_sha256:
-        changes = _changes(snapshot, present.members)
-        if changes or not reasons:
-            reasons += changes or ["the data of its sessions have changed since"]
+        reasons.append(Flag("settings_changed", float(settings.version), float(old)))
+    reasons += _changes(db, participant, db.get_one(BufferSnapshot, evaluation.snapshot_id))
     ranked = set(evaluation.diagnostics.get("candidates", []))
     missing = [p.name for p in learning.candidates(db, participant.id) if p.id not in ranked]
     if missing:
-        listed = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
-        reasons.append(f"{_count(len(missing), 'policy', 'policies')} not in it: {listed}")
+        reasons.append(Flag.of("policies_missing", float(len(missing)), None, "policies", names=tuple(missing[:NAMED])))
     return reasons
 
 
-def _changes(old: Sequence[SnapshotSession], new: Sequence[Member]) -> list[str]:
+def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot) -> list[Flag]:
     """What happened to the sessions since a snapshot."""
-    before = {m.session_id: m for m in old}
-    inside = {m.session.id: m for m in new}
-    both = [(before[i], inside[i]) for i in before.keys() & inside.keys()]
-    added = [m for i, m in inside.items() if i not in before]
-    found = {
-        f"newer: {_visits(added)}": len(added),
-        "no longer confirmed": len(before.keys() - inside.keys()),
-        "with corrected QoCs": sum((n.session.qoc.id if n.session.qoc else None) != o.qoc_id for o, n in both),
-        "newly left out": sum(n.left_out is not None and o.left_out_reason is None for o, n in both),
-        "newly included": sum(n.left_out is None and o.left_out_reason is not None for o, n in both),
-        "decoded anew": sum((n.table.beta_trace.id if n.table and n.table.beta_trace else None) != o.beta_trace_id for o, n in both),
-        "with another cDBS amplitude": sum((n.table.cdbs_ma if n.table else None) != o.cdbs_amplitude_ma for o, n in both),
+    sessions = study_repository.sessions_of_participant(db, participant.id)
+    before = {m.session_id: m for m in learning.snapshot_members(db, snapshot.id)}
+    now = {s.id: s for s in sessions}
+    added = [s for s in sessions if s.id not in before]
+    both = [(before[i], now[i]) for i in sorted(before.keys() & now.keys())]
+    heads = study_repository.trace_heads(db, {g.recording_id for s in sessions for g in s.segments})
+    moved, readmitted = _edited(db, [s for _, s in both], snapshot.created_at)
+    barrier = gate(db, participant, sessions)
+    opened = barrier.is_open and barrier.decision is not None and barrier.decision.created_at > snapshot.created_at
+    found = Counter({"newer": len(added), "unconfirmed": len(before.keys() - now.keys())})
+    for pinned, session in both:
+        learned = blinding.arm(session, SYSTEM).controller in LEARNED
+        shut_out = bool(session.excluded_reason) or (learned and not barrier.is_open)
+        free = session.id in readmitted or (learned and opened)
+        found["qoc"] += (session.qoc.id if session.qoc else None) != pinned.qoc_id
+        found["left_out"] += shut_out and pinned.left_out_reason is None
+        found["included"] += free and not shut_out and pinned.left_out_reason is not None
+        present = _sources(session, participant.current_settings, heads)
+        if present is not None and _was_read(pinned):
+            old = (pinned.beta_trace_id, pinned.amplitude_trace_id)
+            found["decoded"] += (present.beta_trace_id, present.amplitude_trace_id) != old
+            found["cdbs"] += present.cdbs_ma != pinned.cdbs_amplitude_ma
+    found["moved"] = len(moved)
+    visits = tuple(str(n) for n in sorted({s.visit.number for s in added}))
+    return [Flag.of("sessions_changed", float(n), None, "sessions", change=change, visits=visits) for change, n in found.items() if n]
+
+
+def _sources(session: StudySession, settings: SettingsVersion, heads: Mapping[int, Any]) -> Sources | None:
+    """What the session's steps are read from now; None where its side is not known, so that they cannot be read."""
+    try:
+        return sources(session, settings, heads)
+    except Invalid:
+        return None
+
+
+def _was_read(pinned: SnapshotSession) -> bool:
+    """Whether the snapshot could read the session's steps at all: what it could not read it has no pins of."""
+    return pinned.left_out_reason is None or any(
+        pin is not None for pin in (pinned.beta_trace_id, pinned.amplitude_trace_id, pinned.cdbs_amplitude_ma)
+    )
+
+
+def _edited(db: Session, sessions: Sequence[StudySession], moment: datetime) -> tuple[set[int], set[int]]:
+    """Sessions whose steps are other ones since a moment, and those that a person had excluded then and not any more."""
+    ids, visits = [s.id for s in sessions], {s.visit_id for s in sessions}
+    moved, readmitted = set(), set()
+    for before, after in _pairs(*repository.changed_since(db, "session", "id", ids, moment)):
+        if any(before[name] != after[name] for name in OF_STEPS):
+            moved.add(int(after["id"]))
+        if before["excluded_reason"] and not after["excluded_reason"]:
+            readmitted.add(int(after["id"]))
+    then, now = repository.changed_since(db, "session_segment", "session_id", ids, moment)
+    moved |= {int(row["session_id"]) for row in (*(r for r in then if r not in now), *(r for r in now if r not in then))}
+    renumbered = {
+        int(after["id"])
+        for before, after in _pairs(*repository.changed_since(db, "visit", "id", visits, moment))
+        if before["number"] != after["number"]
     }
-    return [f"{_count(n, 'session', 'sessions')} {what}" for what, n in found.items() if n]
+    return moved | {s.id for s in sessions if s.visit_id in renumbered}, readmitted
 
 
-def _visits(members: Sequence[Member]) -> str:
-    return "visit " + ", ".join(str(n) for n in sorted({m.session.visit.number for m in members}))
-
-
-def _count(n: int, one: str, many: str) -> str:
-    return f"{n} {one if n == 1 else many}"
+def _pairs(then: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """Rows that were there then and are there now."""
+    present = {row["id"]: row for row in now}
+    return [(row, present[row["id"]]) for row in then if row["id"] in present]

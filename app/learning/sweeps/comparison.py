@@ -8,8 +8,9 @@ from typing import Any
 
 from app.learning.models import Policy, Sweep
 from app.platform.web.charts import Chart, axis, figure
-from ml.ope.compare.selection import Gain, surest
+from ml.ope.compare.selection import surest
 from ml.policies.logged_range import LARGEST_SHARE_BELOW
+from ml.returns import Gain
 
 PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")
 DASHES = ("solid", "dash", "dot")

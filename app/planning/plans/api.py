@@ -7,6 +7,7 @@ from typing import Any
 from fastapi import APIRouter, Response
 
 from app.accounts.deps import CurrentCaller
+from app.evaluation.shown import estimate_out
 from app.planning.plans import service, sheet
 from app.planning.plans.schemas import Approval, PlanEstimateOut, PlanEvaluationOut, PlanIn, PlannedSessionOut, PlanOut
 from app.planning.plans.service import PlanLine, PlanView
@@ -96,6 +97,6 @@ def _session_out(line: PlanLine) -> PlannedSessionOut:
         policy=line.policy.name if line.policy else None,
         minutes=line.item.minutes,
         washout_minutes=line.item.washout_minutes,
-        estimate=PlanEstimateOut.model_validate(line.estimate) if line.estimate else None,
+        estimate=estimate_out(line.estimate, PlanEstimateOut) if line.estimate else None,
         predicted_energy=line.predicted_energy,
     )

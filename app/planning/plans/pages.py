@@ -15,7 +15,8 @@ from starlette.datastructures import FormData
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.evaluation.ranking.service import current_ranking
-from app.evaluation.schemas import METHOD_NAMES, RankingOut
+from app.evaluation.schemas import RankingOut
+from app.evaluation.wording import method_name, sentence
 from app.learning import repository as learning
 from app.planning.plans import repository, service
 from app.planning.plans.schedule import most_policies, total_minutes
@@ -148,8 +149,9 @@ def _page(
         site=participant.site,
         view=view,
         ranking=ranking,
-        method=METHOD_NAMES.get(ranking.default_method, ranking.default_method) if ranking else "",
-        plan_method=METHOD_NAMES.get(view.evaluation.default_method, view.evaluation.default_method) if view and view.evaluation else "",
+        in_words=sentence,
+        method=method_name(ranking.default_method) if ranking else "",
+        plan_method=method_name(view.evaluation.default_method) if view and view.evaluation else "",
         choices=choices,
         form_values=form,
         chosen=_chosen(view, values),

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from app.evaluation.schemas import EstimateSummary
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller
 
@@ -44,16 +45,10 @@ class Approval(Model):
     plan_id: Id | None = None
 
 
-class PlanEstimateOut(Model):
+class PlanEstimateOut(EstimateSummary):
     """What the pinned ranking states of a policy."""
 
     method: str
-    value: float
-    low: float
-    high: float
-    level: float
-    supported: bool
-    flags: list[str]
 
 
 class PlannedSessionOut(Model):

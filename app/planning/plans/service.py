@@ -12,7 +12,9 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation import repository as evaluations
-from app.evaluation.models import EstimateRow, Evaluation
+from app.evaluation import wording
+from app.evaluation.estimates.rows import estimate_of
+from app.evaluation.models import Evaluation
 from app.evaluation.ranking.service import current_ranking, evaluation_notes
 from app.learning import repository as learning
 from app.learning.models import Policy
@@ -25,6 +27,7 @@ from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import service as study
 from app.study.models import Controller, Participant, Visit
 from app.study.schemas import VisitIn
+from ml.ope.estimate import Estimate
 
 MAX_SEED = 2**31 - 1
 
@@ -42,7 +45,7 @@ class PlanLine:
     item: PlanItem
     start_minute: float
     policy: Policy | None
-    estimate: EstimateRow | None
+    estimate: Estimate | None
     predicted_energy: float | None
 
 
@@ -234,7 +237,7 @@ def _supersede(db: Session, visit: Visit, reason: str | None, caller: Caller) ->
 
 def _view(db: Session, plan: Plan, visit: Visit, caller: Caller) -> PlanView:
     evaluation = repository.evaluation(db, plan.evaluation_id) if plan.evaluation_id else None
-    estimates = {e.policy_id: e for e in evaluation.estimates if e.method == evaluation.default_method} if evaluation else {}
+    estimates = {e.policy_id: estimate_of(e) for e in evaluation.estimates if e.method == evaluation.default_method} if evaluation else {}
     policies = evaluations.policies_by_id(db, [i.policy_id for i in plan.items if i.policy_id is not None])
     lines, start = [], 0.0
     for item in plan.items:
@@ -246,7 +249,7 @@ def _view(db: Session, plan: Plan, visit: Visit, caller: Caller) -> PlanView:
     return PlanView(plan, visit, lines, evaluation, stale, _warnings(db, visit, plan, lines, evaluation, stale))
 
 
-def _energy(item: PlanItem, estimate: EstimateRow | None) -> float | None:
+def _energy(item: PlanItem, estimate: Estimate | None) -> float | None:
     fixed = {Controller.CDBS: 1.0, Controller.NO_DBS: 0.0}.get(Controller(item.controller))
     if fixed is not None or estimate is None:
         return fixed
@@ -276,7 +279,7 @@ def _warnings(
             continue
         if evaluation and line.estimate is None:
             warnings.append(f"Policy '{line.policy.name}' is not in the ranking.")
-        flags = "; ".join(map(str, line.estimate.flags)) if line.estimate else ""
+        flags = wording.joined(line.estimate.flags) if line.estimate else ""
         if line.estimate and not line.estimate.supported:
             warnings.append(f"The data do not support the estimate of policy '{line.policy.name}': {flags or 'no reason given'}.")
         elif flags:

@@ -10,7 +10,7 @@ from datetime import datetime
 from fpdf import FPDF, FontFace
 from fpdf.enums import XPos, YPos
 
-from app.evaluation.schemas import METHOD_NAMES
+from app.evaluation.wording import method_name
 from app.learning.models import Policy
 from app.planning.plans.latin import latin
 from app.planning.plans.service import PlanLine, PlanView
@@ -207,7 +207,7 @@ def _reading(pdf: _Sheet, view: PlanView) -> None:
     levels = {line.estimate.level for line in view.lines if line.estimate}
     sentences = []
     if evaluation and levels:
-        method = METHOD_NAMES.get(evaluation.default_method, evaluation.default_method)
+        method = method_name(evaluation.default_method)
         sentences.append(
             f"Estimated return: E[r_end + discounted step rewards] over {evaluation.horizon_steps} steps (gamma {evaluation.gamma:g}) by "
             f"{method}, with its {100 * min(levels):.0f} % interval, as ranked on {evaluation.created_at:%Y-%m-%d}. Energy of a policy: "

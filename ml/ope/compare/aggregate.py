@@ -7,22 +7,18 @@ showed of each method's bias is added where it is known.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from ml.ope.estimate import LEVEL, Estimate, Fitted
-from ml.ope.estimate import Estimator as EstimatorOf
-from ml.policies.policy import Policy
-from ml.progress import Report, silent
+from ml.ope.estimate import LEVEL, Estimate
+from ml.ope.flags import distinct
+from ml.ope.registry import AGGREGATE
 from ml.statistics.bootstrap import percentile_interval
-from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
-METHOD = "aggregate"
 
 
 def error_matrix(estimates: Mapping[str, Mapping[str, Estimate]], methods: list[str], bias: Mapping[str, float] | None = None) -> Floats:
@@ -76,7 +72,7 @@ def combine(estimates: Mapping[str, Mapping[str, Estimate]], bias: Mapping[str, 
     Raises:
         ValueError: no method takes part, or no policy has been estimated by all that do.
     """
-    methods = [m for m, table in estimates.items() if m != METHOD and any(e.supported for e in table.values())]
+    methods = [m for m, table in estimates.items() if m != AGGREGATE and any(e.supported for e in table.values())]
     if not methods:
         raise ValueError("nothing to combine: no method supports any policy")
     policies = common_policies(estimates, methods)
@@ -104,7 +100,7 @@ def _combined(parts: list[Estimate], methods: list[str], weights: Floats) -> Est
     main = used[int(np.argmax([w for w in weights if w > 1e-6]))]
     return replace(
         main,
-        method=METHOD,
+        method=AGGREGATE,
         value=value,
         low=min(interval.low, value - 1.645 * between),
         high=max(interval.high, value + 1.645 * between),
@@ -112,7 +108,7 @@ def _combined(parts: list[Estimate], methods: list[str], weights: Floats) -> Est
         step_return=step,
         end_reward=None if main.end_reward is None else value - step,
         supported=all(p.supported for p in used),
-        flags=tuple(dict.fromkeys(f for p in used for f in p.flags)),
+        flags=distinct(f for p in used for f in p.flags),
         details={
             "horizon_steps": main.details.get("horizon_steps"),
             "weights": {m: round(float(w), 4) for m, w in zip(methods, weights, strict=True)},
@@ -120,34 +116,3 @@ def _combined(parts: list[Estimate], methods: list[str], weights: Floats) -> Est
             "draws": [round(float(d), 4) for d in np.asarray(draws)],
         },
     )
-
-
-@dataclass(frozen=True)
-class Aggregate:
-    """Several estimators fitted and combined as one."""
-
-    parts: Mapping[str, EstimatorOf]
-    method: str = METHOD
-
-    def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedAggregate:
-        """Fit every part. Raises ValueError as they do."""
-        fitted = {}
-        for k, (name, part) in enumerate(self.parts.items()):
-            fitted[name] = part.fit(buffer, checkpoint_dir=checkpoint_dir)
-            report((k + 1) / len(self.parts), "fitting the methods to combine")
-        return FittedAggregate(fitted)
-
-
-@dataclass(frozen=True)
-class FittedAggregate:
-    """The fitted parts."""
-
-    parts: Mapping[str, Fitted]
-
-    def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
-        """Combined estimates. Raises ValueError where nothing can be combined."""
-        estimates = {}
-        for k, (name, part) in enumerate(self.parts.items()):
-            estimates[name] = part.evaluate(policies, horizon_steps)
-            report((k + 1) / len(self.parts), "combining methods")
-        return combine(estimates) if policies else {}

@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.estimate import Estimate
-
-PREFERENCE = ("linear", "dlsm", "fqe", "wdr", "cwpdis", "wis", "dual_dice", "pdis", "is")
-"""Order in which a method is taken for the ranking where the data do not decide; `docs/evaluation.md` has the measurements behind it."""
+from ml.ope.registry import preference
 
 
 @dataclass(frozen=True)
@@ -33,12 +31,12 @@ class Ranked:
 
 
 def default_method(estimates: Mapping[str, Mapping[str, Estimate]]) -> str:
-    """The method that the ranking rests on: the first of `PREFERENCE` that speaks about a policy as supported, else the first there is.
+    """The method that the ranking rests on: the first of the usual order that speaks about a policy as supported, else the first there is.
 
     Raises:
         ValueError: no method has any estimate.
     """
-    there = [m for m in (*PREFERENCE, *estimates) if estimates.get(m)]
+    there = [m for m in (*preference(), *estimates) if estimates.get(m)]
     if not there:
         raise ValueError("a ranking needs the estimates of at least one method")
     return next((m for m in there if any(e.supported for e in estimates[m].values())), there[0])

@@ -9,55 +9,13 @@ Thomas, Theocharous and Ghavamzadeh, AAAI 2015. Where no bound lies above the re
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.policies.policy import Policy
-
-LEVEL = 0.95
-"""One-sided level of a lower bound."""
-
-FEWEST_DRAWS = 20
-"""Draws below which a bound of `LEVEL` would be the least of them."""
-
-
-@dataclass(frozen=True)
-class Gain:
-    """Estimated return of a policy less that of the reference.
-
-    Attributes:
-        value: mean over the draws. low: one-sided lower bound of the level asked for. standard_error: deviation of the draws.
-    """
-
-    value: float
-    low: float
-    standard_error: float
-
-
-def gain(draws: NDArray[np.float64], reference: NDArray[np.float64], level: float = LEVEL) -> Gain:
-    """Gain of one policy over another.
-
-    Args:
-        draws, reference: bootstrap draws of both returns by one method, [D]; draw d of both rests on the same resampled sessions.
-        level: of the one-sided lower bound.
-
-    Raises:
-        ValueError: draws that are not aligned, not finite or too few; a level outside (0, 1).
-    """
-    if draws.shape != reference.shape or draws.ndim != 1 or draws.size < FEWEST_DRAWS:
-        raise ValueError(
-            f"a gain needs {FEWEST_DRAWS} draws or more of both policies, on the same resampled sessions, not {draws.shape} "
-            f"and {reference.shape}"
-        )
-    if not 0 < level < 1:
-        raise ValueError(f"the level of a lower bound lies between 0 and 1, not at {level}")
-    differences = draws - reference
-    if not np.isfinite(differences).all():
-        raise ValueError("a draw of a return is not finite")
-    return Gain(float(differences.mean()), float(np.quantile(differences, 1 - level)), float(differences.std(ddof=1)))
+from ml.returns import BOUND, Gain, gain
 
 
 def surest(gains: Mapping[str, Gain]) -> str | None:
@@ -82,7 +40,7 @@ class Evaluator(Protocol):
     def evaluate(self, policies: Mapping[str, Policy]) -> Mapping[str, Drawn]: ...
 
 
-def gains_over(fitted: Evaluator, policies: Mapping[str, Policy], reference: Policy, level: float = LEVEL) -> dict[str, Gain]:
+def gains_over(fitted: Evaluator, policies: Mapping[str, Policy], reference: Policy, level: float = BOUND) -> dict[str, Gain]:
     """Gain of every policy over the reference, by name. Raises ValueError where the method cannot evaluate or gives too few draws."""
     theirs = _draws(fitted, reference)
     return {name: gain(_draws(fitted, policy), theirs, level) for name, policy in policies.items()}

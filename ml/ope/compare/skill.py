@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from ml.ope.behaviour import Key, clones, controllers
-from ml.ope.compare.aggregate import METHOD as AGGREGATE
 from ml.ope.compare.aggregate import combine
 from ml.ope.compare.metrics import spearman
-from ml.ope.compare.ranking import PREFERENCE
 from ml.ope.estimate import Estimate, Estimator, checked_horizon
+from ml.ope.flags import Flag
 from ml.ope.observed import Observed, observed
+from ml.ope.registry import AGGREGATE, preference
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.trajectories import ReplayBuffer
@@ -33,7 +33,7 @@ NINETY = 1.645
 """Half-width of a normal's 90 % interval, the level of all estimates, in standard deviations."""
 
 NEEDED_LEAD = 1.0
-"""A method takes the place of the first of `PREFERENCE` only where its errors are smaller by more than so many standard errors."""
+"""A method takes the place of the first of the usual order only where its errors are smaller by more than so many standard errors."""
 
 
 @dataclass(frozen=True)
@@ -81,20 +81,20 @@ class Choice:
     """The method that the ranking should rest on.
 
     Attributes:
-        method: its key. chosen_by_data: False where the preference decided alone. reason: in words, for the page.
+        method: its key. chosen_by_data: False where the preference decided alone. reasons: what the choice rests on.
         table: skill of every method, best first. predictions: all of them. failed: methods that could not be fitted, with the reason.
     """
 
     method: str
     chosen_by_data: bool
-    reason: str
+    reasons: tuple[Flag, ...]
     table: tuple[Skill, ...]
     predictions: tuple[Prediction, ...]
     failed: Mapping[str, str]
 
     def to_json(self) -> dict[str, Any]:
         """Everything, JSON-able."""
-        return asdict(self) | {"failed": dict(self.failed)}
+        return asdict(self) | {"failed": dict(self.failed), "reasons": [reason.to_json() for reason in self.reasons]}
 
 
 def choose_default(
@@ -124,18 +124,18 @@ def choose_default(
     horizon = checked_horizon(buffer, horizon_steps)
     predictions, failed = held_out_predictions(buffer, estimators, policies or {}, horizon, aggregate, seed, report)
     table = sorted((s for s in skills(predictions)), key=lambda s: s.difference_error)
-    fallback = next((m for m in PREFERENCE if m in estimators and m not in failed), next(iter(estimators)))
+    fallback = next((m for m in preference() if m in estimators and m not in failed), next(iter(estimators)))
     most = max((s.controllers for s in table), default=0)
     if most < FEWEST_CONTROLLERS:
-        reason = f"the data cannot choose: {most} controllers could be left out, {FEWEST_CONTROLLERS} are needed; the usual order decides"
-        return Choice(fallback, False, reason, tuple(table), predictions, failed)
+        reason = Flag("too_few_controllers", float(most), float(FEWEST_CONTROLLERS), "controllers")
+        return Choice(fallback, False, (reason,), tuple(table), predictions, failed)
     full = [s for s in table if s.controllers == most]
-    order = {m: k for k, m in enumerate(PREFERENCE)}
+    order = {m: k for k, m in enumerate(preference())}
     first = min((s for s in full if s.method != AGGREGATE), key=lambda s: order.get(s.method, len(order)), default=full[0])
     leads = {s.method: lead(predictions, first.method, s.method) for s in full if s is not first}
     ahead = [s for s in full if s is not first and leads[s.method][0] > NEEDED_LEAD * leads[s.method][1]]
     chosen = ahead[0] if ahead else first
-    return Choice(chosen.method, True, _reason(chosen, first, full, most), tuple(table), predictions, failed)
+    return Choice(chosen.method, True, _reasons(chosen, first, full, most), tuple(table), predictions, failed)
 
 
 def lead(predictions: tuple[Prediction, ...], first: str, other: str) -> tuple[float, float]:
@@ -159,14 +159,13 @@ def lead(predictions: tuple[Prediction, ...], first: str, other: str) -> tuple[f
     return gain(common), float(np.sqrt((k - 1) / k * np.sum((left - left.mean()) ** 2)))
 
 
-def _reason(chosen: Skill, first: Skill, full: list[Skill], controllers: int) -> str:
-    text = (
-        f"{chosen.method} predicted the differences between {controllers} left-out controllers with a mean error of "
-        f"{100 * chosen.difference_error:.0f} % of their range (least of all: {100 * full[0].difference_error:.0f} %)"
-    )
+def _reasons(chosen: Skill, first: Skill, full: list[Skill], controllers: int) -> tuple[Flag, ...]:
+    """The chosen method's error of differences against the least of all, and how it stands to the first of the usual order."""
+    error, least = chosen.difference_error, full[0].difference_error
+    found = Flag.of("difference_error", error, least, "share of range", method=chosen.method, controllers=float(controllers))
     if chosen is not first:
-        return f"{text}, by more than a standard error better than {first.method}, the first of the usual order"
-    return text if full[0] is first else f"{text}; none was better by more than a standard error than this first of the usual order"
+        return found, Flag.of("beats_usual_order", method=first.method)
+    return (found,) if full[0] is first else (found, Flag("not_beaten"))
 
 
 def with_held_out_error(estimate: Estimate, error: float) -> Estimate:

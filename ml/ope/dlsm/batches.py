@@ -1,9 +1,9 @@
-"""A buffer's sessions as padded, standardised tensors, time first. Every scale comes from the data."""
+"""A buffer's sessions as padded, standardised tensors, time first."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,59 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ml.ope.estimate import OUTCOMES
-from ml.trajectories import ReplayBuffer, SessionTrajectory
+from ml.ope.scale import Scale, outcome_table
+from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
-
-FEWEST_OUTCOMES = 3
-"""Sessions that must have an outcome before anything is predicted about it."""
-
-
-@dataclass(frozen=True)
-class Scale:
-    """Standardisation learnt from a buffer.
-
-    Attributes:
-        log: True when beta enters as its logarithm: all valid amplitudes are positive and their logarithm is less skewed.
-        beta_mean, beta_std: of (log) beta. beta_low, beta_high: range of the raw beta, participant's unit.
-        reward_mean, reward_std: of the usable rewards.
-        outcome_mean, outcome_std: of `OUTCOMES`, four each; 0 and 1 where the outcome is not seen.
-        outcome_seen: which of `OUTCOMES` at least `FEWEST_OUTCOMES` sessions have.
-    """
-
-    log: bool
-    beta_mean: float
-    beta_std: float
-    beta_low: float
-    beta_high: float
-    reward_mean: float
-    reward_std: float
-    outcome_mean: tuple[float, ...]
-    outcome_std: tuple[float, ...]
-    outcome_seen: tuple[bool, ...]
-
-    def beta(self, raw: NDArray[Any]) -> Floats:
-        """Participant's unit to standardised."""
-        values = np.asarray(raw, dtype=np.float64)
-        if self.log:
-            values = np.log(np.maximum(values, 1e-3 * self.beta_low))
-        return (values - self.beta_mean) / self.beta_std
-
-    def raw_beta(self, scaled: NDArray[Any]) -> Floats:
-        """Standardised to the participant's unit."""
-        values = np.asarray(scaled, dtype=np.float64) * self.beta_std + self.beta_mean
-        return np.exp(values) if self.log else values
-
-    def to_json(self) -> dict[str, Any]:
-        """All numbers, by name."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> Scale:
-        """The inverse of `to_json`."""
-        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return cls(**fields)
 
 
 @dataclass(frozen=True)
@@ -114,42 +65,6 @@ class Batch:
         )
 
 
-def outcome_table(buffer: ReplayBuffer) -> Floats:
-    """`OUTCOMES` of every session, shape [n, 4]; NaN where not measured. r_end is NaN for all where C2 = C3 = C4 = 0 makes it 0 for all."""
-    settings = buffer.settings
-    weighted = settings.c2 + settings.c3 + settings.c4 > 0
-    rows = []
-    for s in buffer.sessions:
-        end = s.end_reward(settings) if weighted else 0.0
-        rows.append([np.nan if v is None else float(v) for v in (end, s.qoc.grasp_hz, s.qoc.rating, s.qoc.tremor_percent)])
-    return np.array(rows, dtype=np.float64)
-
-
-def learn_scale(buffer: ReplayBuffer) -> Scale:
-    """Standardisation of a buffer. Raises ValueError when it has no usable step."""
-    beta = np.concatenate([s.padded_beta for s in buffer.sessions])
-    beta = beta[np.isfinite(beta)]
-    rewards = buffer.transitions().rewards
-    log = bool(beta.min() > 0) and abs(_skewness(np.log(np.maximum(beta, 1e-300)))) < abs(_skewness(beta))
-    shown = np.log(beta) if log else beta
-    outcomes = outcome_table(buffer)
-    seen = [bool(np.isfinite(outcomes[:, j]).sum() >= FEWEST_OUTCOMES) for j in range(len(OUTCOMES))]
-    mean = np.array([outcomes[np.isfinite(outcomes[:, j]), j].mean() if seen[j] else 0.0 for j in range(len(OUTCOMES))])
-    std = np.array([outcomes[np.isfinite(outcomes[:, j]), j].std() if seen[j] else 1.0 for j in range(len(OUTCOMES))])
-    return Scale(
-        log=log,
-        beta_mean=float(shown.mean()),
-        beta_std=_positive(float(shown.std())),
-        beta_low=float(beta.min()),
-        beta_high=float(beta.max()),
-        reward_mean=float(rewards.mean()),
-        reward_std=_positive(float(rewards.std())),
-        outcome_mean=tuple(float(v) for v in mean),
-        outcome_std=tuple(_positive(float(v)) for v in std),
-        outcome_seen=tuple(seen),
-    )
-
-
 def make_batch(buffer: ReplayBuffer, scale: Scale, dtype: torch.dtype = torch.float32) -> Batch:
     """All sessions of a buffer as one padded batch."""
     settings, sessions = buffer.settings, buffer.sessions
@@ -186,13 +101,6 @@ def make_batch(buffer: ReplayBuffer, scale: Scale, dtype: torch.dtype = torch.fl
     )
 
 
-def session_folds(sessions: Sequence[SessionTrajectory], folds: int, seed: int) -> list[list[int]]:
-    """Indices of sessions in `folds` groups, every kind of controller spread over the groups as evenly as it goes."""
-    order = np.random.default_rng(seed).permutation(len(sessions))
-    ranked = sorted(order.tolist(), key=lambda i: sessions[i].controller)
-    return [sorted(ranked[k::folds]) for k in range(min(folds, len(sessions)))]
-
-
 def _held(values: Floats, start: float) -> Floats:
     """Gaps filled with the value before them; gaps at the start with the first valid value, or `start` where there is none."""
     valid = np.isfinite(values)
@@ -202,13 +110,3 @@ def _held(values: Floats, start: float) -> Floats:
         return np.full_like(values, start)
     last = np.maximum.accumulate(np.where(valid, np.arange(values.size), -1))
     return values[np.where(last < 0, int(np.argmax(valid)), last)]
-
-
-def _skewness(values: Floats) -> float:
-    centred = values - values.mean()
-    spread = float(np.sqrt(np.mean(centred**2)))
-    return float(np.mean(centred**3)) / spread**3 if spread > 0 else 0.0
-
-
-def _positive(value: float) -> float:
-    return value if value > 1e-12 else 1.0

@@ -13,6 +13,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
+from ml.ope.registry import Size
+
 Objective = Literal["posterior", "free_running", "sum"]
 OBJECTIVES: tuple[Objective, ...] = ("posterior", "free_running", "sum")
 
@@ -92,6 +94,11 @@ class DlsmConfig:
     def demo(cls, seed: int = 0) -> DlsmConfig:
         """Small and quick: about twenty sessions of 300 steps in well under a minute of one core."""
         return cls(members=2, rollouts=128, seed=seed)
+
+    @classmethod
+    def of_size(cls, size: Size, seed: int = 0) -> DlsmConfig:
+        """Settings at a size of `ml.ope.registry`."""
+        return cls.demo(seed) if size == "demo" else cls(seed=seed)
 
     def candidates(self) -> tuple[DlsmConfig, ...]:
         """What `select` chooses among: these settings with each objective, the own one first."""

@@ -18,16 +18,19 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from ml.ope.behaviour import controller_key
-from ml.ope.dlsm.batches import Batch, Scale, learn_scale, make_batch
+from ml.ope.dlsm.batches import Batch, make_batch
 from ml.ope.dlsm.config import DlsmConfig
-from ml.ope.dlsm.held_out import HeldOut, shares
+from ml.ope.dlsm.held_out import FreeRuns, shares
 from ml.ope.dlsm.rollout import Rollouts, roll_out
 from ml.ope.dlsm.selection import Selection, SelectionRun, usable_folds
 from ml.ope.dlsm.training import Member, MemberTraining
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.flags import FEW_END_REWARDS, Flag
 from ml.ope.linear.end_outcomes import EndModel, fit_end_model
 from ml.ope.observed import day_noise
-from ml.ope.support.coverage import AmplitudeSupport, Coverage
+from ml.ope.registry import Size
+from ml.ope.scale import Scale, learn_scale
+from ml.ope.support.coverage import AmplitudeSupport, Coverage, flags_of
 from ml.policies.policy import Policy
 from ml.progress import Report, part_of, silent
 from ml.trajectories import ReplayBuffer, content_hash, to_parquet
@@ -124,7 +127,7 @@ class FittedDlsm:
     selection: Selection | None = None
 
     @property
-    def checks(self) -> tuple[HeldOut, ...]:
+    def checks(self) -> tuple[FreeRuns, ...]:
         """Held-out check of every member."""
         return tuple(m.check for m in self.members)
 
@@ -279,9 +282,9 @@ class FittedDlsm:
         reach = float(norm.ppf((1 + LEVEL) / 2)) * error
         seen = self.scale.outcome_seen
         logged, simulated = coverage
-        flags = list(dict.fromkeys((*logged.flags, *simulated.flags)))
+        flags = list(flags_of(logged, simulated))
         if not seen[0]:
-            flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+            flags.append(FEW_END_REWARDS)
         flags += [unknown] if (unknown := day_noise(self.buffer, horizon, 1, 0)[1]) else []
         skill = self.held_out_skill()
         flags += _warnings(skill)
@@ -331,11 +334,16 @@ class FittedDlsm:
         return predicted
 
 
-def _warnings(skill: dict[str, Any]) -> list[str]:
-    """What the held-out sessions hold against the model, in words."""
+def _warnings(skill: dict[str, Any]) -> list[Flag]:
+    """What the held-out sessions hold against the model."""
     found = []
     if skill["score"] >= 1:
-        found.append(f"left-out sessions are predicted no better than by the mean of the others (error {skill['score']:.2f} of that one's)")
+        found.append(Flag("no_better_than_mean", skill["score"], 1.0, "share"))
     if skill["answer_skill"] is not None and skill["answer_skill"] <= 0:
-        found.append("the model's answer to the amplitude is no better than none: in left-out sessions it misses how controllers differ")
+        found.append(Flag("no_answer_to_amplitude", skill["answer_skill"], 0.0, "skill"))
     return found
+
+
+def build(key: str, seed: int, size: Size) -> Dlsm:
+    """The estimator at a size of `ml.ope.registry`."""
+    return Dlsm(DlsmConfig.of_size(size, seed), key)

@@ -15,8 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings
-from ml.ope.dlsm.batches import Batch, Scale
+from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.networks import DlsmNetworks
+from ml.ope.scale import Scale
 
 Floats = NDArray[np.float64]
 
@@ -129,7 +130,7 @@ def _contrast(errors: Sequence[SessionError], kinds: Mapping[int, object]) -> fl
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class FreeRuns:
     """Free runs of held-out sessions, their own actions replayed from q(z_0 | s_0).
 
     Attributes:
@@ -157,7 +158,7 @@ class HeldOut:
         return asdict(self)
 
     @classmethod
-    def from_json(cls, values: dict[str, Any]) -> HeldOut:
+    def from_json(cls, values: dict[str, Any]) -> FreeRuns:
         """The inverse of `to_json`."""
         fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         return cls(**fields | {"errors": tuple(SessionError(**e) for e in values["errors"])})
@@ -182,7 +183,7 @@ def held_out(
     settings: MdpSettings,
     draws: int,
     seed: int,
-) -> HeldOut:
+) -> FreeRuns:
     """Score a DLSM on sessions it did not learn from; the same seed gives every check the same noise.
 
     Raises:
@@ -202,7 +203,7 @@ def held_out(
     squared = (batch.outcomes.numpy() - run.outcomes) ** 2
     discount = settings.gamma ** np.arange(actual.shape[0])[:, None] * usable
     end = (batch.outcomes.numpy()[:, 0] - run.outcomes[:, 0]) * scale.outcome_std[0]
-    return HeldOut(
+    return FreeRuns(
         score=shares([errors]).score,
         errors=tuple(errors),
         error_head=_mean((actual - head) ** 2, usable),

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings, step_reward
-from ml.ope.dlsm.batches import Scale
 from ml.ope.dlsm.networks import DlsmNetworks
 from ml.ope.linear.end_outcomes import LATE_STEPS, SUMMARIES
+from ml.ope.scale import Scale
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 

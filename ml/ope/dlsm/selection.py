@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from ml.ope.behaviour import controller_key, controllers
-from ml.ope.dlsm.batches import Batch, Scale, session_folds
+from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.config import DlsmConfig
-from ml.ope.dlsm.held_out import HeldOut, Shares, shares
+from ml.ope.dlsm.held_out import FreeRuns, Shares, shares
 from ml.ope.dlsm.training import MemberTraining
+from ml.ope.scale import Scale, session_folds
 from ml.progress import Report, part_of, silent
 from ml.trajectories import ReplayBuffer
 
@@ -60,7 +61,7 @@ class SelectionRun:
         self.buffer, self.batch, self.scale = buffer, batch, scale
         self.candidates, self.seed, self.fingerprint = tuple(candidates), seed, fingerprint
         self.ways = leave_out(buffer, seed)
-        self.done: dict[str, HeldOut] = {}
+        self.done: dict[str, FreeRuns] = {}
 
     def run(self, checkpoint_dir: Path | None = None, report: Report = silent) -> Selection:
         """Train what is not finished and compare."""
@@ -79,7 +80,7 @@ class SelectionRun:
                 partial.unlink(missing_ok=True)
         return self._compare()
 
-    def _predict(self, i: int, left_out: list[int], fingerprint: str, checkpoint: Path | None, report: Report) -> HeldOut:
+    def _predict(self, i: int, left_out: list[int], fingerprint: str, checkpoint: Path | None, report: Report) -> FreeRuns:
         """Free runs of sessions that neither trained nor stopped the model."""
         config = self.candidates[i]
         held = usable_folds(self.buffer, config.held_out, self.seed, without=left_out)[0]
@@ -109,7 +110,7 @@ class SelectionRun:
         state = json.loads(path.read_text())
         if state["fingerprint"] != self.fingerprint:
             raise ValueError(f"{path.name} belongs to another buffer or other DLSM settings; give this fit an empty checkpoint folder")
-        self.done = {key: HeldOut.from_json(found) for key, found in state["done"].items()}
+        self.done = {key: FreeRuns.from_json(found) for key, found in state["done"].items()}
 
 
 def leave_out(buffer: ReplayBuffer, seed: int) -> list[list[list[int]]]:

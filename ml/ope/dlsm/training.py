@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from ml.ope.dlsm.batches import Batch, Scale
+from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.config import DlsmConfig
-from ml.ope.dlsm.held_out import Constant, HeldOut, held_out
+from ml.ope.dlsm.held_out import Constant, FreeRuns, held_out
 from ml.ope.dlsm.networks import DlsmNetworks
+from ml.ope.scale import Scale
 from ml.progress import Report, silent
 from ml.trajectories import ReplayBuffer
 
@@ -26,7 +27,7 @@ class Member:
     """A trained ensemble member: its networks at the best check, that check, and the course of training as (step, loss, score)."""
 
     networks: DlsmNetworks
-    check: HeldOut
+    check: FreeRuns
     course: tuple[tuple[int, float, float], ...]
 
 
@@ -68,7 +69,7 @@ class MemberTraining:
         self.picker = np.random.default_rng(seed)
         self.step, self.loss_sum, self.stale = 0, 0.0, 0
         self.course: list[tuple[int, float, float]] = []
-        self.best: HeldOut | None = None
+        self.best: FreeRuns | None = None
         self.best_weights: dict[str, torch.Tensor] = {}
 
     @property
@@ -124,7 +125,7 @@ class MemberTraining:
         else:
             self.stale += 1
 
-    def score(self, batch: Batch, sessions: tuple[int, ...]) -> HeldOut:
+    def score(self, batch: Batch, sessions: tuple[int, ...]) -> FreeRuns:
         """Free runs of sessions that were not learnt from."""
         draws = self.config.replay_draws
         return held_out(self.networks, batch, sessions, self.constant, self.scale, self.settings, draws, seed=self.seed)
@@ -170,5 +171,5 @@ class MemberTraining:
         progress = json.loads(state["progress"])
         self.step, self.loss_sum, self.stale = progress["step"], progress["loss_sum"], progress["stale"]
         self.course = [(int(s), float(loss), float(score)) for s, loss, score in progress["course"]]
-        self.best = None if progress["best"] is None else HeldOut.from_json(progress["best"])
+        self.best = None if progress["best"] is None else FreeRuns.from_json(progress["best"])
         self.best_weights = state["best_weights"]

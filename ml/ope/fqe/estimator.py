@@ -17,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings
-from ml.ope.dlsm.batches import session_folds
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
-from ml.ope.fqe.steps import StepTable, TargetActions, ValueFeatures, fresh_memory, step_table
+from ml.ope.flags import FEW_END_REWARDS
+from ml.ope.fqe.steps import TargetActions, UsableSteps, ValueFeatures, fresh_memory, usable_steps
 from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
 from ml.ope.observed import day_noise
+from ml.ope.registry import Size
+from ml.ope.scale import session_folds
 from ml.ope.support.coverage import AmplitudeSupport
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
@@ -87,7 +89,7 @@ class FqeConfig:
 class Grams:
     """Sums over the steps of each session that a regression on features needs: [n, F, F] and [n, F, K]."""
 
-    def __init__(self, table: StepTable, phi: Floats) -> None:
+    def __init__(self, table: UsableSteps, phi: Floats) -> None:
         self.table, self.phi = table, phi
         self.bounds = np.searchsorted(table.session, np.arange(table.sessions + 1))
         self.square = self.product(phi)
@@ -137,7 +139,7 @@ def spectral_radius(matrix: Floats) -> float:
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
-def fit_member(table: StepTable, folds: Sequence[Sequence[int]], gamma: float, units: int, seed: int) -> QMember:
+def fit_member(table: UsableSteps, folds: Sequence[Sequence[int]], gamma: float, units: int, seed: int) -> QMember:
     """Features of one seed with the penalty whose predictions of `CHECK_STEPS`-step returns on left-out sessions are best."""
     features = ValueFeatures(table, units, seed)
     phi = features(table.states, table.actions, table.memory)
@@ -164,7 +166,7 @@ def fit_member(table: StepTable, folds: Sequence[Sequence[int]], gamma: float, u
     return QMember(features, grams, PENALTIES[best])
 
 
-def logged_returns(table: StepTable, gamma: float, steps: int) -> tuple[Indices, Floats]:
+def logged_returns(table: UsableSteps, gamma: float, steps: int) -> tuple[Indices, Floats]:
     """Rows that are followed by enough usable steps, and the discounted sums of their next `steps` rewards."""
     rewards = table.rates[:, 0]
     if len(rewards) < steps:
@@ -177,9 +179,9 @@ def logged_returns(table: StepTable, gamma: float, steps: int) -> tuple[Indices,
     return rows, sums[rows]
 
 
-def replace_steps(table: StepTable, keep: NDArray[np.bool_]) -> StepTable:
+def replace_steps(table: UsableSteps, keep: NDArray[np.bool_]) -> UsableSteps:
     """The table with some of its steps; `follows` loses its meaning and is -1."""
-    return StepTable(
+    return UsableSteps(
         table.scale,
         table.states[keep],
         table.next_states[keep],
@@ -228,7 +230,7 @@ class Fqe:
         Raises:
             ValueError: no usable step, or no session with a complete s_0.
         """
-        table, c = step_table(buffer), self.config
+        table, c = usable_steps(buffer), self.config
         folds = session_folds(buffer.sessions, c.folds, c.seed)
         members = []
         for m in range(c.members):
@@ -245,7 +247,7 @@ class FittedFqe:
     method: str
     config: FqeConfig
     buffer: ReplayBuffer
-    table: StepTable
+    table: UsableSteps
     members: tuple[QMember, ...]
     draws: Indices
     end: EndModel
@@ -295,7 +297,7 @@ class ValueSource(Protocol):
     @property
     def method(self) -> str: ...
     @property
-    def table(self) -> StepTable: ...
+    def table(self) -> UsableSteps: ...
     @property
     def buffer(self) -> ReplayBuffer: ...
     @property
@@ -328,9 +330,9 @@ def value_estimate(
     draws = draws - draws.mean()
     interval = percentile_interval(np.add.outer(draws, noise).ravel() + value, LEVEL)
     logged = support.of_policy(policy)
-    flags = list(logged.flags)
+    flags = list(logged.flags())
     if not with_end:
-        flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+        flags.append(FEW_END_REWARDS)
     flags += [unknown] if unknown else []
     predicted = {"energy": float(summaries[1]), "mean_amplitude": float(summaries[0]), "mean_beta": float(summaries[2])}
     predicted |= {name: float(outcomes[j]) for j, name in enumerate(OUTCOMES) if j and fitted.end.seen[j]}
@@ -354,3 +356,13 @@ def value_estimate(
             "draws": [round(float(d + value), 4) for d in draws],
         },
     )
+
+
+def build(key: str, seed: int, size: Size) -> Fqe:
+    """The estimator at a size of `ml.ope.registry`."""
+    configs = {
+        "full": FqeConfig(seed=seed),
+        "demo": FqeConfig(seed=seed, members=1, refits=30),
+        "held_out": FqeConfig(seed=seed, refits=25),
+    }
+    return Fqe(configs[size], key)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.dlsm.batches import learn_scale, session_folds
 from ml.ope.estimate import checked_horizon
 from ml.ope.fqe.estimator import QMember, fit_member, summaries_of, within_reach
-from ml.ope.fqe.steps import TargetActions, fresh_memory, step_table
+from ml.ope.fqe.steps import TargetActions, fresh_memory, usable_steps
 from ml.ope.linear.end_outcomes import fit_end_model
+from ml.ope.scale import learn_scale, session_folds
 from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
@@ -55,7 +55,7 @@ def fqe_value(
     settings, sessions = buffer_train.settings, tuple(held_out_sessions)
     horizon = checked_horizon(buffer_train, horizon_steps)
     scale = learn_scale(buffer_train)
-    table = step_table(buffer_train, scale)
+    table = usable_steps(buffer_train, scale)
     member = fit_member(table, session_folds(buffer_train.sessions, 3, seed), settings.gamma, units, seed)
     target = TargetActions.of(table, policy)
     weights, _ = member.weights(member.next_products(target), np.arange(table.sessions), horizon, settings.gamma)
@@ -79,7 +79,7 @@ def _residual(
     usable = tuple(s for s in sessions if s.usable().any() and np.isfinite(s.lead_beta).all())
     if not usable:
         return 0.0
-    held = step_table(ReplayBuffer(buffer.settings, usable, buffer.beta_unit, buffer.beta_source), member.features.scale)
+    held = usable_steps(ReplayBuffer(buffer.settings, usable, buffer.beta_unit, buffer.beta_source), member.features.scale)
     target = TargetActions.of(held, policy)
     now = member.features(held.states, held.actions, held.memory) @ weights[-1][:, 0]
     then = member.features(held.next_states, target.then, target.memory) @ weights[-2][:, 0]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.dlsm.batches import Scale, learn_scale
+from ml.ope.scale import Scale, learn_scale
 from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
@@ -23,7 +23,7 @@ DECAYS = (0.8, 0.95, 0.985)
 """Memories of past amplitudes: exponential averages with time constants of about 5, 20 and 66 steps."""
 
 RATES = ("reward", "amplitude", "energy", "beta", "above")
-"""Columns of `StepTable.rates`: r_k, a_k, a_k^2, beta of the row, and whether that beta is at or above the threshold."""
+"""Columns of `UsableSteps.rates`: r_k, a_k, a_k^2, beta of the row, and whether that beta is at or above the threshold."""
 
 
 def remember(memory: Floats, a: Floats) -> Floats:
@@ -57,7 +57,7 @@ def memories(a: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class StepTable:
+class UsableSteps:
     """Usable steps, session by session; N steps, n sessions, window W.
 
     Attributes:
@@ -85,7 +85,7 @@ class StepTable:
     sessions: int
 
 
-def step_table(buffer: ReplayBuffer, scale: Scale | None = None) -> StepTable:
+def usable_steps(buffer: ReplayBuffer, scale: Scale | None = None) -> UsableSteps:
     """The table of a buffer. Raises ValueError when no step is usable or no session starts without gaps."""
     settings = buffer.settings
     scale = learn_scale(buffer) if scale is None else scale
@@ -98,7 +98,7 @@ def step_table(buffer: ReplayBuffer, scale: Scale | None = None) -> StepTable:
     starts = [(i, s.lead_beta) for i, s in enumerate(buffer.sessions) if np.isfinite(s.lead_beta).all()]
     if not starts:
         raise ValueError("no session has a complete window of beta before its first step: there is no s_0 to start from")
-    return StepTable(
+    return UsableSteps(
         scale=scale,
         states=steps.states,
         next_states=steps.next_states,
@@ -122,7 +122,7 @@ class ValueFeatures:
         units: number of random units. seed: of their weights.
     """
 
-    def __init__(self, table: StepTable, units: int = 48, seed: int = 0) -> None:
+    def __init__(self, table: UsableSteps, units: int = 48, seed: int = 0) -> None:
         self.scale = table.scale
         rng = np.random.default_rng([seed, 0xFEA7])
         self._inner = rng.normal(size=(_SUMMARIES, units)) * np.array([1, 1, 1, 2, 1, 1, 1])[:, None] / 2
@@ -163,7 +163,7 @@ class TargetActions:
     first: Floats
 
     @classmethod
-    def of(cls, table: StepTable, policy: Policy) -> TargetActions:
+    def of(cls, table: UsableSteps, policy: Policy) -> TargetActions:
         """Actions of a policy on a table."""
         then = _act(policy, table.next_states)
         return cls(_act(policy, table.states), then, remember(table.memory, then), _act(policy, table.first_states))

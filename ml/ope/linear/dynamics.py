@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.dlsm.batches import Scale
 from ml.ope.fqe.steps import fresh_memory, held_amplitude, memories
+from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedFit, MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.dlsm.batches import FEWEST_OUTCOMES, outcome_table
+from ml.ope.scale import FEWEST_OUTCOMES, outcome_table
 from ml.statistics.mixed import MixedFit, MixedModel, Sums
 from ml.trajectories import ReplayBuffer
 

@@ -17,14 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.mdp import step_reward
-from ml.ope.dlsm.batches import Scale, learn_scale, outcome_table, session_folds
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.flags import FEW_END_REWARDS
 from ml.ope.fqe.steps import fresh_memory, remember
 from ml.ope.linear.dynamics import Dynamics, SessionTable, answers, fit_dynamics, largest_root, noise_features
 from ml.ope.linear.end_outcomes import EndModel, fit_end_model, summarise
 from ml.ope.linear.held_out import replay_skill
 from ml.ope.observed import MeanOverDays, mean_over_days
-from ml.ope.support.coverage import AmplitudeSupport
+from ml.ope.registry import Size
+from ml.ope.scale import Scale, learn_scale, outcome_table, session_folds
+from ml.ope.support.coverage import AmplitudeSupport, flags_of
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.statistics.bootstrap import percentile_interval
@@ -198,9 +200,9 @@ class FittedLinear:
         # the kept draws.
         interval = percentile_interval(np.add.outer(model, days.common + days.own[i]).ravel() + value, LEVEL)
         logged, simulated = support.of_policy(policy), support.look(main.actions[i, 0, :, :: max(1, horizon // 50)])
-        flags = list(dict.fromkeys((*logged.flags, *simulated.flags)))
+        flags = list(flags_of(logged, simulated))
         if not with_end:
-            flags.append("fewer than three sessions have an end-of-session reward: the estimate is the step return alone")
+            flags.append(FEW_END_REWARDS)
         flags += [days.unknown] if days.unknown else []
         predicted = {
             "energy": float(main.energy[i, 0] @ weights),
@@ -241,3 +243,8 @@ class FittedLinear:
             "end_skill": float(self.end.skill[0]) if with_end else None,
             "sessions": len(self.buffer.sessions),
         }
+
+
+def build(key: str, seed: int, size: Size) -> LinearModel:
+    """The estimator at a size of `ml.ope.registry`."""
+    return LinearModel(LinearConfig(seed=seed, draws=20) if size == "held_out" else LinearConfig(seed=seed), key)

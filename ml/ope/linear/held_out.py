@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.dlsm.batches import Scale
 from ml.ope.linear.dynamics import Dynamics, SessionTable, fit_dynamics
+from ml.ope.scale import Scale
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.ope.flags import Fact, Flag, Source
 from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer
 
@@ -23,8 +23,6 @@ UNSUPPORTED_SHARE = 0.20
 
 NOTICE_SHARE = 0.05
 """Above this share the page says so."""
-
-NO_CLOSED_LOOP = "no closed loop"
 
 SAME_AMPLITUDE = 0.02
 """A policy whose middle 98 % of amplitudes lie closer together than this does not answer to beta."""
@@ -63,25 +61,30 @@ class Coverage:
         """False when the policy works mostly where the data are silent."""
         return self.thin <= UNSUPPORTED_SHARE
 
-    @property
-    def flags(self) -> tuple[str, ...]:
-        """Failing and noteworthy checks, in words: what the data cannot say, and what a clinician should know before ticking it."""
+    def flags(self, source: Source = "logged") -> tuple[Flag, ...]:
+        """Failing and noteworthy checks: what the data cannot say, and what a clinician should know before picking the policy.
+
+        Args:
+            source: of the steps that this is the coverage of.
+        """
         found = []
         if self.thin > NOTICE_SHARE:
-            verdict = "" if self.supported else "not supported by the data: "
-            found.append(
-                f"{verdict}in {100 * self.thin:.0f} % of steps the policy asks for amplitudes with hardly any logged step near them "
-                f"(logged steps span {self.logged_low:.2f} to {self.logged_high:.2f})"
-            )
+            found.append(thin(self.thin, source, low=self.logged_low, high=self.logged_high))
         if self.spread < SAME_AMPLITUDE:
-            found.append(f"{NO_CLOSED_LOOP}: about {100 * self.median:.0f} % of the cDBS amplitude whatever beta does")
+            found.append(Flag.of("no_closed_loop", self.median, None, "share", source=source))
         if self.off > NOTICE_SHARE:
-            found.append(f"as good as no stimulation in {100 * self.off:.0f} % of steps (below {100 * AS_GOOD_AS_OFF:.0f} % of cDBS)")
+            found.append(Flag.of("as_good_as_off", self.off, NOTICE_SHARE, "share", source=source, below=AS_GOOD_AS_OFF))
         return tuple(found)
 
     def to_json(self) -> dict[str, Any]:
         """All numbers, by name."""
         return asdict(self)
+
+
+def thin(share: float, source: Source, **span: Fact) -> Flag:
+    """Amplitudes with hardly any logged step near them in a share of the steps; `span` gives `low` and `high` of the logged ones."""
+    limit = UNSUPPORTED_SHARE
+    return Flag("thin", share, limit, "share", share > limit, source, tuple(span.items()))
 
 
 class AmplitudeSupport:
@@ -113,10 +116,19 @@ class AmplitudeSupport:
         return self.look(policy.act(self.states))
 
 
-def coverage(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> dict[str, Coverage]:
-    """Coverage of every policy over the states of the buffer."""
-    support = AmplitudeSupport(buffer)
-    return {name: support.of_policy(policy) for name, policy in policies.items()}
+def flags_of(logged: Coverage, simulated: Coverage) -> tuple[Flag, ...]:
+    """Flags of the logged steps under a policy, then what its simulated sessions show beyond them."""
+    known = {flag.rounded for flag in logged.flags()}
+    return (*logged.flags(), *(flag for flag in simulated.flags("simulated") if flag.rounded not in known))
+
+
+def few_effective(code: str, effective: float, sessions: int, *, refuses: bool = False) -> Flag:
+    """Importance weights that rest on a handful of sessions.
+
+    Args:
+        code: what rests on them. effective: sample size. sessions: that were weighted. refuses: whether nothing else speaks.
+    """
+    return Flag.of(code, effective, FEW_EFFECTIVE, "sessions", refuses=refuses, sessions=float(sessions))
 
 
 def effective_sample_size(log_weights: NDArray[Any]) -> tuple[float, float]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ml.ope.estimate import checked_horizon
-from ml.ope.fqe.steps import StepTable, memories, step_table
+from ml.ope.flags import Flag
+from ml.ope.fqe.steps import UsableSteps, memories, usable_steps
 from ml.ope.importance import ImportanceSampling, horizon_of_ten
 from ml.ope.support.coverage import (
     FEW_EFFECTIVE,
@@ -22,6 +23,7 @@ from ml.ope.support.coverage import (
     AmplitudeSupport,
     Coverage,
     effective_sample_size,
+    few_effective,
 )
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
@@ -80,8 +82,8 @@ class Diagnostics:
         far: share of pairs beyond `FAR`.
         unseen_dose: share of steps whose average amplitude of the last minute no session has come near. Random amplitudes
             cover every amplitude and yet one dose alone: what a lasting low one does is then a model's guess.
-        failing: checks that make the policy unsupported for methods that predict, in words. weights_failing: those that concern importance
-            weights alone.
+        failing: checks that make the policy unsupported for methods that predict. weights_failing: those that concern importance weights
+            alone.
     """
 
     amplitudes: Coverage
@@ -95,8 +97,8 @@ class Diagnostics:
     distance: float
     far: float
     unseen_dose: float
-    failing: tuple[str, ...]
-    weights_failing: tuple[str, ...]
+    failing: tuple[Flag, ...]
+    weights_failing: tuple[Flag, ...]
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -117,19 +119,13 @@ class Diagnostics:
         )
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """What is to be said though it makes no policy unsupported."""
+    def notes(self) -> tuple[Flag, ...]:
+        """What is to be known though it makes no policy unsupported."""
         found = []
         if self.below_random_bound is not None and self.below_random_bound > NOTICE_SHARE:
-            found.append(
-                f"in {100 * self.below_random_bound:.0f} % of steps the policy asks for less than {self.random_bound:.2f}, the least that "
-                "the random controller gave: only sessions of other controllers speak there"
-            )
+            found.append(Flag.of("below_random_bound", self.below_random_bound, NOTICE_SHARE, "share", bound=self.random_bound))
         if self.unseen_dose > NOTICE_SHARE:
-            found.append(
-                f"in {100 * self.unseen_dose:.0f} % of steps the policy's average amplitude over the last minute is one that no session "
-                "held: what it does there is a model's guess"
-            )
+            found.append(Flag("unseen_dose", self.unseen_dose, NOTICE_SHARE, "share"))
         return tuple(found)
 
     @property
@@ -138,8 +134,10 @@ class Diagnostics:
         return not self.failing
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers, by name, and every check."""
-        return asdict(self) | {"supported": self.supported, "notes": list(self.notes), "checks": [asdict(c) for c in self.checks]}
+        """All numbers, by name, every check and every flag."""
+        flags = {"failing": self.failing, "notes": self.notes, "weights_failing": self.weights_failing}
+        shown = {name: [flag.to_json() for flag in found] for name, found in flags.items()}
+        return asdict(self) | shown | {"supported": self.supported, "checks": [asdict(c) for c in self.checks]}
 
 
 def _refusal(name: str, value: float, limit: float) -> Check:
@@ -159,7 +157,7 @@ def diagnose(
 ) -> dict[str, Diagnostics]:
     """Every check of every policy. Raises ValueError when the buffer has no usable step or no session with a complete s_0."""
     horizon = checked_horizon(buffer, horizon_steps)
-    support, table = AmplitudeSupport(buffer), step_table(buffer)
+    support, table = AmplitudeSupport(buffer), usable_steps(buffer)
     weights = ImportanceSampling("wis").fit(buffer)
     near = _Neighbours(table)
     bounds = [s.random_lower_bound for s in buffer.sessions if s.random_lower_bound is not None]
@@ -185,34 +183,27 @@ def diagnose(
             far=far,
             unseen_dose=near.unseen_dose(policy),
             failing=_failing(amplitudes, far),
-            weights_failing=()
-            if effective >= FEW_EFFECTIVE
-            else (f"importance weights rest on {effective:.1f} effective sessions of {len(mask)}; {FEW_EFFECTIVE:.0f} are needed",),
+            weights_failing=() if effective >= FEW_EFFECTIVE else (few_effective("weights_need_sessions", effective, len(mask)),),
         )
     return result
 
 
-def _failing(amplitudes: Coverage, far: float) -> tuple[str, ...]:
+def _failing(amplitudes: Coverage, far: float) -> tuple[Flag, ...]:
     found = []
     if amplitudes.outside_range > LEAVES_SHARE:
-        found.append(
-            f"not supported by the data: in {100 * amplitudes.outside_range:.0f} % of steps the policy leaves the logged amplitudes "
-            f"({amplitudes.logged_low:.2f} to {amplitudes.logged_high:.2f})"
-        )
+        low, high = amplitudes.logged_low, amplitudes.logged_high
+        found.append(Flag.of("outside_range", amplitudes.outside_range, LEAVES_SHARE, "share", refuses=True, low=low, high=high))
     elif not amplitudes.supported:
-        found += [f for f in amplitudes.flags if f.startswith("not supported")]
+        found += [flag for flag in amplitudes.flags() if flag.refuses]
     if far > FAR_SHARE:
-        found.append(
-            f"not supported by the data: {100 * far:.0f} % of the policy's state-amplitude pairs lie further from any logged pair than "
-            f"{FAR:.0f} times the distance that holds 95 % of the logged ones"
-        )
+        found.append(Flag.of("far", far, FAR_SHARE, "share", refuses=True, times=FAR))
     return tuple(found)
 
 
 class _Neighbours:
     """Nearest logged pairs of (level of beta, amplitude), each axis in its own spread; 95 % of the logged pairs are within 1."""
 
-    def __init__(self, table: StepTable) -> None:
+    def __init__(self, table: UsableSteps) -> None:
         keep = np.unique(np.linspace(0, len(table.actions) - 1, MOST_PAIRS).astype(np.int64))
         self._states, self._session = table.states[keep], table.session[keep]
         levels = self._levels(table, self._states)
@@ -251,6 +242,6 @@ class _Neighbours:
         return result
 
     @staticmethod
-    def _levels(table: StepTable, states: Floats) -> Floats:
+    def _levels(table: UsableSteps, states: Floats) -> Floats:
         window = table.scale.beta(states)
         return np.column_stack([window[:, -1], window.mean(1)])

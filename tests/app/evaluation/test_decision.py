@@ -8,10 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from app.evaluation import wording
 from app.evaluation.decision import RULES, decide, gain_over
 from app.evaluation.schemas import TestedBefore
 from ml.ope.estimate import Estimate
+from ml.ope.flags import Flag
+from ml.ope.support.coverage import thin
 
+STORED_WORDS = Flag.of("text", text="in 13 % of steps")
 OUTCOMES = {"rating": 7.0, "tremor_percent": 20.0, "grasp_hz": 2.0}
 
 
@@ -54,13 +58,18 @@ def test_what_two_estimates_share_cancels_in_their_gain() -> None:
         (made(60.0), {"retired_reason": "battery"}, "reject", "retired: battery"),
         (made(40.0), {}, "reject", "all of it below 0"),
         (made(51.0), {}, "needs_data", "it may be none"),
-        (made(60.0, supported=False, flags=("not supported by the data: in 40 % of steps",)), {}, "needs_data", "in 40 % of steps"),
-        (made(40.0, supported=False, flags=("not supported by the data: x",)), {}, "needs_data", "not supported"),
+        (made(60.0, supported=False, flags=(thin(0.4, "logged"),)), {}, "needs_data", "in 40 % of steps"),
         (
-            made(40.0, supported=False, flags=("in 13 % of steps",), details={"coverage_simulated": {"thin": 0.32}}),
+            made(40.0, supported=False, flags=(STORED_WORDS,)),
             {},
             "needs_data",
-            "in 32 % of the steps of its simulated sessions",
+            "not supported by the data; in 13 % of steps",
+        ),
+        (
+            made(40.0, supported=False, flags=(STORED_WORDS,), details={"coverage_simulated": {"thin": 0.32}}),
+            {},
+            "needs_data",
+            "in its simulated sessions, in 32 % of steps",
         ),
         (made(60.0, predicted=OUTCOMES | {"rating": 5.9}), {}, "needs_data", "rating is predicted at 5.9 against 7.0"),
         (made(60.0, predicted=OUTCOMES | {"tremor_percent": 31.0}), {}, "needs_data", "tremor is predicted at 31 % against 20 %"),
@@ -72,22 +81,25 @@ def test_what_two_estimates_share_cancels_in_their_gain() -> None:
     ],
 )
 def test_a_decision_gives_the_rule_that_made_it(own: Estimate, more: dict[str, Any], decision: str, named: str) -> None:
-    found, reason = decide({"fqe": own}, CDBS, "fqe", **more)
-    assert (found, named in reason) == (decision, True), reason
+    found, reasons = decide({"fqe": own}, CDBS, "fqe", **more)
+    assert (found, named in wording.decision(reasons)) == (decision, True), reasons
 
 
 def test_another_method_that_sees_a_loss_asks_for_more_data() -> None:
-    found, reason = decide({"fqe": made(60.0), "linear": made(40.0, method="linear")}, CDBS, "fqe")
+    found, reasons = decide({"fqe": made(60.0), "linear": made(40.0, method="linear")}, CDBS, "fqe")
     assert found == "needs_data"
-    assert "Linear model sees a loss" in reason
+    assert reasons[-1].code == "method_sees_loss"
+    assert "Linear model sees a loss" in wording.decision(reasons)
     unsure = made(40.0, method="linear", supported=False)
     assert decide({"fqe": made(60.0), "linear": unsure}, CDBS, "fqe")[0] == "test_next"
 
 
 def test_without_a_supported_cdbs_reference_nothing_is_proposed() -> None:
     assert decide({"fqe": made(60.0)}, {}, "fqe")[0] == "needs_data"
-    found, reason = decide({"fqe": made(60.0)}, {"fqe": made(50.0, supported=False, flags=("not supported by the data: y",))}, "fqe")
-    assert (found, "is itself not supported by the data: y" in reason) == ("needs_data", True)
+    unsupported = {"fqe": made(50.0, supported=False, flags=(thin(0.4, "logged"),))}
+    found, reasons = decide({"fqe": made(60.0)}, unsupported, "fqe")
+    assert (found, [r.code for r in reasons]) == ("needs_data", ["reference_unsupported", "thin"])
+    assert "is itself not supported by the data: in 40 %" in wording.decision(reasons)
 
 
 def test_the_printed_rules_name_every_decision() -> None:

@@ -10,11 +10,12 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation.estimates.methods import METHODS, QUICK_METHODS
+from app.evaluation.estimates.methods import quick_methods
 from app.evaluation.schemas import EvaluateParams
 from app.evaluation.service import policies_to_rank
 from app.learning.policies.baselines import constant_onnx
 from app.study.repository import participant_by_code
+from ml.ope.registry import method_keys
 
 Upload = Callable[..., int]
 JOBS = "/api/v1/participants/P1/jobs"
@@ -38,8 +39,8 @@ def test_no_job_starts_without_a_threshold_and_the_answer_suggests_one(client: T
 def test_the_quick_preset_runs_its_own_methods_and_named_ones_are_run_once(client: TestClient, upload: Upload) -> None:
     upload("random")
     quick = client.post(JOBS, json={"kind": "pipeline", "preset": "quick"}).json()
-    assert quick["params"]["methods"] == list(QUICK_METHODS)
-    assert set(QUICK_METHODS) < set(METHODS)
+    assert quick["params"]["methods"] == quick_methods()
+    assert set(quick_methods()) < set(method_keys())
     named = client.post(JOBS, json={"kind": "pipeline", "preset": "quick", "methods": ["dual_dice", "wis", "dual_dice"]}).json()
     assert named["params"]["methods"] == ["dual_dice", "wis"]
 
@@ -57,7 +58,7 @@ def test_a_job_is_accepted_with_its_defaults_and_listed(client: TestClient, uplo
     assert answer.status_code == 202
     body = answer.json()
     assert (body["status"], body["progress"], body["participant"], body["created_by"]) == ("queued", 0.0, "P1", "admin@clinic.example")
-    assert (body["params"]["count"], body["params"]["preset"], body["params"]["methods"]) == (6, "full", list(METHODS))
+    assert (body["params"]["count"], body["params"]["preset"], body["params"]["methods"]) == (6, "full", list(method_keys()))
     assert client.get(f"/api/v1/jobs/{body['id']}").json() == body
     assert client.get(JOBS).json()["items"] == [body]
     assert client.get(JOBS, params={"status": "running"}).json()["total"] == 0
@@ -163,7 +164,7 @@ def test_the_form_runs_the_ticked_methods_and_the_preset_those_of_its_size(clien
         return found
 
     assert methods_of(methods=["wis", "dual_dice"]) == ["wis", "dual_dice"]
-    assert methods_of() == list(QUICK_METHODS)
+    assert methods_of() == quick_methods()
     refused = client.post("/participants/P1/jobs", data={"kind": "pipeline", "methods": ["wis", "aggregate"]})
     assert refused.status_code == 422
     assert "at least two other methods" in refused.text

@@ -8,6 +8,7 @@ import torch
 
 from ml.ope.compare.metrics import accuracy
 from ml.ope.dlmm import Dlmm, DlmmConfig, DlmmNetworks
+from ml.ope.flags import FEW_END_REWARDS
 from ml.policies.policy import ConstantPolicy
 from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer
@@ -72,12 +73,12 @@ class TwoFaced:
 def test_a_check_that_fails_in_simulated_sessions_is_shown_beside_a_flag_of_the_logged_ones(small_buffer):
     policies = {"two-faced": TwoFaced(len(small_buffer.transitions().states)), "half": ConstantPolicy(0.5)}
     found = Dlmm(TINY).fit(small_buffer).evaluate(policies, 20)
-    flags = " | ".join(found["two-faced"].flags)
-    assert "no closed loop: about 50 %" in flags
-    assert "as good as no stimulation in 100 %" in flags
-    assert "not supported by the data" in flags
+    flags = {(f.code, f.source): f for f in found["two-faced"].flags}
+    assert flags["no_closed_loop", "logged"].value == pytest.approx(0.5)
+    assert flags["as_good_as_off", "simulated"].value == 1.0
+    assert flags["thin", "simulated"].refuses
     assert not found["two-faced"].supported
-    assert sum("no closed loop" in flag for flag in found["half"].flags) == 1
+    assert [f.code for f in found["half"].flags].count("no_closed_loop") == 1
 
 
 def test_without_any_qoc_the_estimate_is_the_step_return_and_says_so(small_buffer):
@@ -85,7 +86,7 @@ def test_without_any_qoc_the_estimate_is_the_step_return_and_says_so(small_buffe
     estimate = Dlmm(TINY).fit(bare).evaluate({"half": ConstantPolicy(0.5)}, 20)["half"]
     assert estimate.end_reward is None
     assert estimate.value == pytest.approx(estimate.step_return)
-    assert any("step return alone" in flag for flag in estimate.flags)
+    assert FEW_END_REWARDS in estimate.flags
 
 
 def test_one_session_is_too_few(small_buffer):

@@ -113,7 +113,8 @@ def test_the_controller_that_made_the_data_gets_its_mean_return_whatever_the_val
 
 def test_few_effective_sessions_are_told_beside_the_value(small_buffer):
     estimate = DoublyRobust(FqeConfig(members=1, refits=2)).fit(small_buffer).evaluate({"half": ConstantPolicy(0.5)}, 40)["half"]
-    assert any("effective sessions of 9" in f for f in estimate.flags)
+    flag = next(f for f in estimate.flags if f.code == "few_sessions_behind_correction")
+    assert (flag.fact("sessions"), flag.limit, flag.refuses) == (9, 10, False)
     assert estimate.details["horizon_of_ten"] == 0
 
 

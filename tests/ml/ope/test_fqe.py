@@ -10,7 +10,7 @@ import pytest
 from ml.ope.compare.metrics import accuracy
 from ml.ope.fqe.estimator import Fqe, FqeConfig, backward_induction, head_schedule, logged_returns, spectral_radius, summaries_of
 from ml.ope.fqe.score import fqe_value
-from ml.ope.fqe.steps import TargetActions, fresh_memory, held_amplitude, memories, step_table
+from ml.ope.fqe.steps import TargetActions, fresh_memory, held_amplitude, memories, usable_steps
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer
@@ -131,7 +131,7 @@ def test_memories_are_the_exponential_averages_of_the_amplitudes_so_far(small_bu
 
 
 def test_logged_returns_are_the_discounted_sums_of_unbroken_steps(small_buffer):
-    table = step_table(small_buffer)
+    table = usable_steps(small_buffer)
     rows, returns = logged_returns(table, 0.9, 10)
     for row, value in zip(rows[::25], returns[::25], strict=True):
         assert table.session[row] == table.session[row + 9]

@@ -147,7 +147,8 @@ def test_an_estimate_shows_its_bandwidth_and_that_its_weights_rest_on_few_sessio
     estimate = ImportanceSampling("pdis", bandwidth=0.05).fit(small_buffer).evaluate({"half": ConstantPolicy(0.5)}, 40)["half"]
     assert estimate.details["bandwidth"] == 0.05
     assert not estimate.supported
-    assert any("effective sessions of 9" in flag for flag in estimate.flags)
+    flag = next(f for f in estimate.flags if f.code == "few_effective_sessions")
+    assert (flag.fact("sessions"), flag.limit, flag.refuses) == (9, 10, True)
 
 
 def test_sessions_of_unknown_density_can_be_left_out_and_none_left_is_an_error(small_buffer):

@@ -5,10 +5,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from ml.mdp import discounted_sum
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.population import PARTICIPANTS, true_return
 from ml.population.truth import sample_sessions
+from ml.returns import step_return
 
 
 def test_the_step_return_of_a_constant_amplitude_under_an_unreachable_threshold_has_a_closed_form():
@@ -27,7 +27,7 @@ def test_the_split_agrees_with_the_trajectories_one_by_one():
     truth = true_return(policy, "P2", settings, sessions=6, seed=4, steps=60)
     batch = sample_sessions(policy, "P2", sessions=6, seed=4, steps=60)
     trajectories = [batch.session(i).trajectory(i + 1) for i in range(6)]
-    steps = [discounted_sum(t.rewards(settings), settings.gamma) for t in trajectories]
+    steps = [step_return(t.rewards(settings), settings.gamma, t.steps) for t in trajectories]
     ends = [t.end_reward(settings) for t in trajectories]
     assert truth.step_return.mean == pytest.approx(np.mean(steps))
     assert truth.end_reward.mean == pytest.approx(np.mean(ends))

@@ -11,15 +11,15 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.evaluation.estimates.compute import choose_method, evaluate_method
-from app.evaluation.estimates.methods import AGGREGATE, METHODS
 from app.learning.policies.baselines import constant_onnx
 from app.platform import files
 from app.platform.jobs import StepReport
 from ml.mdp import MdpSettings
+from ml.ope import registry
 from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
 
-FITTED = [m for m in METHODS if m not in ("dlsm", AGGREGATE)]
+FITTED = [m for m in registry.method_keys() if m not in ("dlsm", registry.AGGREGATE)]
 
 
 def sessions(lead: float = 1.0) -> tuple[SessionTrajectory, ...]:

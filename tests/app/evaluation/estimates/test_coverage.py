@@ -8,7 +8,6 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,9 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.evaluation import wording
 from app.evaluation.estimates.compute import check_coverage
-from app.evaluation.estimates.coverage import CHECKS, VERDICTS, shown_limit, shown_value, told_apart
-from app.evaluation.estimates.rows import as_estimate
+from app.evaluation.estimates.coverage import CHECKS, VERDICTS, shown_limit, shown_value
 from app.evaluation.models import Evaluation
 from app.evaluation.schemas import CheckOut
 from app.evaluation.service import store_evaluation
@@ -31,18 +30,22 @@ from app.overview.export import export_participant
 from app.platform import files
 from app.platform.jobs import StepReport
 from app.study.repository import participant_by_code
-from ml.ope.support.coverage import AmplitudeSupport
+from ml.ope.flags import Flag
+from ml.ope.support.coverage import AmplitudeSupport, flags_of
 from ml.ope.support.diagnostics import diagnose
 from ml.policies.onnx_policy import OnnxPolicy
 from tests.app.evaluation.estimates.test_compute import buffer_of, call, sessions
 from tests.app.evaluations import estimate
 
 RANKING = "/api/v1/participants/P1/ranking"
+REFUSAL = Flag.of("outside_range", 0.4, 0.2, "share", refuses=True, low=0.3, high=1.0)
 REFUSED = "not supported by the data: in 40 % of steps the policy leaves the logged amplitudes (0.30 to 1.00)"
+NOTE = Flag("unseen_dose", 0.7, 0.05, "share")
 NOTED = "in 70 % of steps the policy's average amplitude over the last minute is one that no session held"
+FEW = Flag.of("weights_need_sessions", 1.23, 10.0, "sessions", sessions=4.0)
 
 
-def checked(*, failing: tuple[str, ...] = (), notes: tuple[str, ...] = ()) -> dict[str, Any]:
+def checked(*, failing: tuple[Flag, ...] = (), notes: tuple[Flag, ...] = ()) -> dict[str, Any]:
     """What `Diagnostics.to_json` gives of one policy."""
     values = {"outside_range": (0.4 if failing else 0.0, 0.2, "refused" if failing else "passed"), "thin": (0.1, 0.2, "noted")}
     values |= {"far": (0.004, 0.2, "passed"), "below_random_bound": (None, 0.05, "told")}
@@ -53,11 +56,9 @@ def checked(*, failing: tuple[str, ...] = (), notes: tuple[str, ...] = ()) -> di
         {"name": n, "value": v, "limit": limit, "at_least": n in ("effective_sessions", "horizon_of_ten"), "verdict": verdict}
         for n, (v, limit, verdict) in values.items()
     ]
-    few = ["importance weights rest on 1.2 effective sessions of 4; 10 are needed"]
-    return {
-        "supported": not failing, "sessions": 4, "checks": checks, "failing": list(failing), "notes": list(notes), "weights_failing": few,
-        "horizon_steps": 60,
-    }  # fmt: skip
+    flags = {"failing": failing, "notes": notes, "weights_failing": (FEW,)}
+    stored = {name: [flag.to_json() for flag in found] for name, found in flags.items()}
+    return {"supported": not failing, "sessions": 4, "checks": checks, "horizon_steps": 60} | stored
 
 
 @pytest.fixture
@@ -93,7 +94,7 @@ def test_the_compute_step_gives_what_the_science_finds(db: Session, tmp_path: Pa
         shown = {c["name"]: c["value"] for c in found[policy_id]["checks"]}
         assert shown["effective_sessions"] == pytest.approx(direct.effective_sessions)
         assert shown["far"] == pytest.approx(direct.far)
-        assert found[policy_id]["failing"] == list(direct.failing)
+        assert found[policy_id]["failing"] == [flag.to_json() for flag in direct.failing]
     assert {c["name"] for c in found["7"]["checks"]} == set(CHECKS)
     assert any("checking what the data cover" in (m.get("message") or "") for m in told)
 
@@ -107,30 +108,32 @@ def test_a_refused_policy_is_unsupported_by_every_method_and_ranks_after_all_oth
     client: TestClient, policies: list[int], store: Callable[..., Evaluation]
 ) -> None:
     a, b, c = policies
-    row = store(lambda ids: {"policies": {str(i): checked(failing=(REFUSED,) if i == b else ()) for i in ids}})
+    row = store(lambda ids: {"policies": {str(i): checked(failing=(REFUSAL,) if i == b else ()) for i in ids}})
     assert {(e.method, e.policy_id) for e in row.estimates if not e.supported} == {("dlsm", b), ("linear", b)}
     for method in ("dlsm", "linear"):
         body = client.get(RANKING, params={"method": method}).json()
         assert [(p["policy_id"], p["supported"]) for p in body["policies"]] == [(a, True), (c, True), (b, False)]
         refused = body["policies"][2]
         assert (refused["decision"], refused["decision_reason"]) == ("needs_data", REFUSED)
-        assert refused["flags"][0] == REFUSED
+        assert (refused["decision_reasons"], refused["flags"][0]["text"]) == (
+            [{"code": "outside_range", "value": 0.4, "limit": 0.2, "unit": "share"}], REFUSED
+        )  # fmt: skip
         assert refused["probability_best"] == 0.0
-        assert (refused["coverage"]["supported"], refused["coverage"]["failing"]) == (False, [REFUSED])
+        assert (refused["coverage"]["supported"], [f["text"] for f in refused["coverage"]["failing"]]) == (False, [REFUSED])
     assert [p["policy_id"] for p in client.get(RANKING, params={"supported": "true"}).json()["policies"]] == [a, c]
 
 
 def test_a_note_is_told_and_refuses_nothing(client: TestClient, policies: list[int], store: Callable[..., Evaluation]) -> None:
     a, b, _ = policies
-    store(lambda ids: {"policies": {str(i): checked(notes=(NOTED,) if i == b else ()) for i in ids}})
+    store(lambda ids: {"policies": {str(i): checked(notes=(NOTE,) if i == b else ()) for i in ids}})
     ranked = client.get(RANKING).json()["policies"]
     assert [(p["policy_id"], p["supported"], p["decision"]) for p in ranked[:2]] == [(b, True, "test_next"), (a, True, "test_next")]
-    assert (ranked[0]["flags"], ranked[1]["flags"]) == ([NOTED], [])
+    assert ([f["code"] for f in ranked[0]["flags"]], ranked[1]["flags"]) == (["unseen_dose"], [])
     assert NOTED in html.unescape(client.get("/participants/P1/ranking").text)
 
 
 def test_the_page_tells_the_checks_before_any_estimate(client: TestClient, policies: list[int], store: Callable[..., Evaluation]) -> None:
-    store(lambda ids: {"policies": {str(i): checked(failing=(REFUSED,) if i == policies[1] else (), notes=(NOTED,)) for i in ids}})
+    store(lambda ids: {"policies": {str(i): checked(failing=(REFUSAL,) if i == policies[1] else (), notes=(NOTE,)) for i in ids}})
     page = html.unescape(client.get("/participants/P1/ranking").text)
     block = page[page.index('id="coverage"') : page.index('id="forest"')]
     for text in ("What the data can say", "Outside the logged amplitudes", "at most 20 %", "40 %", "failed", "do not support it", "to know",
@@ -140,7 +143,7 @@ def test_the_page_tells_the_checks_before_any_estimate(client: TestClient, polic
 
 
 def test_the_csv_has_every_check_of_the_policy(client: TestClient, policies: list[int], store: Callable[..., Evaluation]) -> None:
-    store(lambda ids: {"policies": {str(i): checked(failing=(REFUSED,)) for i in ids if i == policies[1]}})
+    store(lambda ids: {"policies": {str(i): checked(failing=(REFUSAL,)) for i in ids if i == policies[1]}})
     rows = list(csv.DictReader(io.StringIO(client.get(RANKING, params={"format": "csv"}).text)))
     refused = next(r for r in rows if r["policy_id"] == str(policies[1]))
     assert (refused["coverage_supported"], refused["coverage_failing"]) == ("False", REFUSED)
@@ -153,7 +156,7 @@ def test_the_csv_has_every_check_of_the_policy(client: TestClient, policies: lis
 
 
 def test_the_participants_record_has_a_row_for_every_check(policies: list[int], store: Callable[..., Evaluation], db: Session) -> None:
-    row = store(lambda ids: {"policies": {str(i): checked(failing=(REFUSED,)) for i in ids if i == policies[1]}})
+    row = store(lambda ids: {"policies": {str(i): checked(failing=(REFUSAL,)) for i in ids if i == policies[1]}})
     record = export_participant(db, participant_by_code(db, "P1", SYSTEM), SYSTEM)
     with zipfile.ZipFile(io.BytesIO(record)) as archive:
         rows = list(csv.DictReader(io.StringIO(archive.read("P1/coverage.csv").decode())))
@@ -191,21 +194,13 @@ def test_an_evaluation_from_before_the_checks_still_shows(
 
 
 def test_what_a_method_saw_in_its_simulated_sessions_is_told_apart_from_the_logged_steps() -> None:
-    buffer = buffer_of(sessions())
-    support = AmplitudeSupport(buffer)
+    support = AmplitudeSupport(buffer_of(sessions()))
     logged, simulated = support.look(np.full(100, 0.6)), support.look(np.r_[np.full(70, 0.6), np.full(30, 0.15)])
-    flags = ("a warning of its own", *logged.flags, *simulated.flags)
-    e = replace(
-        as_estimate(estimate("dlsm", 1.0)), flags=flags, details={"coverage": logged.to_json(), "coverage_simulated": simulated.to_json()}
-    )
-    found = told_apart({"dlsm": {"1": e}, "wis": {"1": as_estimate(estimate("wis", 1.0))}})
-    assert found["dlsm"]["1"].flags == (
-        "a warning of its own",
+    assert [wording.sentence(flag) for flag in flags_of(logged, simulated)] == [
         "no closed loop: about 60 % of the cDBS amplitude whatever beta does",
         "not supported by the data: in its simulated sessions, in 30 % of steps the policy asks for amplitudes with hardly any logged step "
         "near them (logged steps span 0.00 to 1.00)",
-    )
-    assert found["wis"]["1"].flags == ()
+    ]
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,7 @@ def test_candidates_are_ranked_by_value_and_unsupported_ones_come_last(
     }  # fmt: skip
     assert best["predicted"]["energy"] == 0.4
     assert (body["horizon_steps"], body["gamma"], body["default_method"], body["stale"]) == (60, 0.99, "dlsm", False)
-    assert "60 % of steps" in body["policies"][2]["flags"][0]
+    assert "60 % of steps" in body["policies"][2]["flags"][0]["text"]
 
 
 def test_the_probability_of_being_best_counts_aligned_draws(client: TestClient, policies: list[int], evaluate: Callable[..., int]) -> None:

@@ -18,6 +18,7 @@ from app.study.models import Controller, Device, Participant, QocRevision, Recor
 from app.study.repository import participant_by_code
 from app.study.traces import pack
 from ml.ope.estimate import Estimate
+from ml.ope.flags import Flag
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def _estimate(value: float, energy: float, supported: bool = True) -> dict[str, 
         end_reward=90.0,
         predicted={"energy": energy},
         supported=supported,
-        flags=() if supported else ("far from the data",),
+        flags=() if supported else (Flag.of("text", text="far from the data"),),
         n=10,
         details={},
     ).to_json()

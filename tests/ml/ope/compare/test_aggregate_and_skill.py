@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from ml.ope.compare.aggregate import Aggregate, combine, convex_weights, error_matrix
+from ml.ope.compare.aggregate import combine, convex_weights, error_matrix
 from ml.ope.compare.skill import Prediction, choose_default, lead, skills, with_held_out_error
 from ml.ope.estimate import Estimate
 from ml.ope.fqe.estimator import Fqe, FqeConfig
@@ -73,11 +73,11 @@ def test_a_method_that_supports_no_policy_takes_no_part():
         combine({"is": tables["is"]})
 
 
-def test_the_aggregate_is_an_estimator_like_any_other(small_buffer):
+def test_fitted_methods_combine_to_an_estimate_among_theirs(small_buffer):
     parts = {"linear": LinearModel(LinearConfig(draws=20)), "fqe": Fqe(FqeConfig(members=1, refits=20))}
     policies = {"half": ConstantPolicy(0.5), "full": ConstantPolicy(1.0)}
-    found = Aggregate(parts).fit(small_buffer).evaluate(policies, 30)
-    single = [p.fit(small_buffer).evaluate(policies, 30)["half"].value for p in parts.values()]
+    tables = {name: part.fit(small_buffer).evaluate(policies, 30) for name, part in parts.items()}
+    found, single = combine(tables), [table["half"].value for table in tables.values()]
     assert min(single) <= found["half"].value <= max(single)
     assert sum(found["half"].details["weights"].values()) == pytest.approx(1.0, abs=1e-3)
 
@@ -157,7 +157,8 @@ def test_a_method_takes_the_place_of_the_usual_first_only_by_more_than_a_standar
     full = linear_simulator.buffer(seed=0, n=16, steps=100)
     clear = choose_default(full, {"linear": Said("linear", -1.0, 0.0), "fqe": Said("fqe", 1.0, 0.0)}, aggregate=False)
     assert clear.method == "fqe"
-    assert "by more than a standard error better than linear" in clear.reason
+    assert [r.code for r in clear.reasons] == ["difference_error", "beats_usual_order"]
+    assert clear.reasons[1].fact("method") == "linear"
     hardly = choose_default(full, {"linear": Said("linear", 1.0, 0.4), "fqe": Said("fqe", 1.0, 0.0)}, aggregate=False)
     assert hardly.method == "linear"
 
@@ -168,7 +169,7 @@ def test_too_few_controllers_leave_the_choice_to_the_usual_order(linear_simulato
     candidates = {"wis": ImportanceSampling("wis", draws=20), "linear": LinearModel(LinearConfig(draws=20))}
     choice = choose_default(buffer, candidates)
     assert (choice.method, choice.chosen_by_data) == ("linear", False)
-    assert "the data cannot choose" in choice.reason
+    assert [(r.code, r.value, r.limit) for r in choice.reasons] == [("too_few_controllers", 2, 3)]
 
 
 def test_a_method_that_cannot_work_is_named_with_its_reason(small_buffer):

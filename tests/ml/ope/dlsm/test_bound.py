@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from ml.ope.dlsm.batches import Batch, learn_scale, make_batch
+from ml.ope.dlsm.batches import Batch, make_batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.heads import gaussian_kl, gaussian_log_prob
 from ml.ope.dlsm.networks import DlsmNetworks, Noise
 from ml.ope.dlsm.recurrence import LOG_STD_BOUNDS
+from ml.ope.scale import learn_scale
 
 LINEAR = DlsmConfig(latent=1, hidden=2, heads=(), action_emission=False, end_features="final", objective="posterior")
 NOISES = {"p0": 0.7, "transition": 0.5, "state": 0.4, "reward": 0.6, "outcome": 0.9}

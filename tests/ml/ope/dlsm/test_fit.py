@@ -7,11 +7,13 @@ import pytest
 import torch
 
 from ml.ope.compare.metrics import accuracy
-from ml.ope.dlsm.batches import learn_scale, make_batch
+from ml.ope.dlsm.batches import make_batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.estimator import Dlsm
 from ml.ope.dlsm.rollout import roll_out
 from ml.ope.dlsm.training import MemberTraining
+from ml.ope.flags import FEW_END_REWARDS
+from ml.ope.scale import learn_scale
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 
@@ -128,12 +130,12 @@ class TwoFaced:
 def test_a_check_that_fails_in_simulated_sessions_is_shown_beside_a_flag_of_the_logged_ones(small_buffer):
     policies = {"two-faced": TwoFaced(len(small_buffer.transitions().states)), "half": ConstantPolicy(0.5)}
     found = Dlsm(TINY).fit(small_buffer).evaluate(policies, 20)
-    flags = " | ".join(found["two-faced"].flags)
-    assert "no closed loop: about 50 %" in flags
-    assert "as good as no stimulation in 100 %" in flags
-    assert "not supported by the data" in flags
+    flags = {(f.code, f.source): f for f in found["two-faced"].flags}
+    assert flags["no_closed_loop", "logged"].value == pytest.approx(0.5)
+    assert flags["as_good_as_off", "simulated"].value == 1.0
+    assert flags["thin", "simulated"].refuses
     assert not found["two-faced"].supported
-    assert sum("no closed loop" in flag for flag in found["half"].flags) == 1
+    assert [f.code for f in found["half"].flags].count("no_closed_loop") == 1
 
 
 def test_without_any_qoc_the_estimate_is_the_step_return_and_says_so(small_buffer):
@@ -141,7 +143,7 @@ def test_without_any_qoc_the_estimate_is_the_step_return_and_says_so(small_buffe
     estimate = Dlsm(TINY).fit(ReplayBuffer(small_buffer.settings, bare, "uV", "table")).evaluate(POLICIES, 20)["low"]
     assert estimate.end_reward is None
     assert estimate.value == estimate.step_return
-    assert any("fewer than three sessions have an end-of-session reward" in flag for flag in estimate.flags)
+    assert FEW_END_REWARDS in estimate.flags
 
 
 def test_gaps_in_beta_and_amplitude_do_not_stop_a_fit(small_buffer):
@@ -191,7 +193,7 @@ def test_a_rolled_out_window_shifts_by_one_beta_unless_the_whole_window_is_drawn
 def test_a_model_that_predicts_left_out_sessions_no_better_than_their_mean_says_so(small_buffer):
     unlearnt = Dlsm(replace(TINY, steps=1, learning_rate=1e-9)).fit(small_buffer).evaluate(POLICIES, 20)["low"]
     assert unlearnt.details["held_out"]["score"] > 1
-    assert any("no better than by the mean" in flag for flag in unlearnt.flags)
+    assert "no_better_than_mean" in {f.code for f in unlearnt.flags}
 
 
 @pytest.mark.parametrize(("answer", "said"), [(-0.5, True), (0.5, False)])
@@ -204,7 +206,7 @@ def test_a_model_that_answers_the_wrong_way_round_in_left_out_sessions_says_so(s
     members = tuple(replace(m, check=answering(m.check)) for m in fitted.members)
     estimate = replace(fitted, members=members).evaluate(POLICIES, 20)["low"]
     assert estimate.details["held_out"]["answer_skill"] == pytest.approx(1 - (1 - answer) ** 2)
-    assert any("answer to the amplitude" in flag for flag in estimate.flags) == said
+    assert ("no_answer_to_amplitude" in {f.code for f in estimate.flags}) == said
 
 
 @pytest.mark.slow

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from ml.ope.dlsm.batches import learn_scale, make_batch
+from ml.ope.dlsm.batches import make_batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.estimator import Dlsm
-from ml.ope.dlsm.held_out import BLOCK, HeldOut, SessionError, block_error, shares
+from ml.ope.dlsm.held_out import BLOCK, FreeRuns, SessionError, block_error, shares
 from ml.ope.dlsm.selection import SelectionRun, leave_out
 from ml.ope.dlsm.training import MemberTraining
+from ml.ope.scale import learn_scale
 from ml.policies.policy import ConstantPolicy
 from ml.trajectories import ReplayBuffer
 
@@ -179,4 +180,4 @@ def test_what_a_check_found_survives_its_way_through_json(small_buffer):
     )
     training.advance()
     training.check()
-    assert HeldOut.from_json(json.loads(json.dumps(training.best.to_json()))) == training.best
+    assert FreeRuns.from_json(json.loads(json.dumps(training.best.to_json()))) == training.best

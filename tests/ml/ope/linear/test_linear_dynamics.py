@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from ml.mdp import MdpSettings
-from ml.ope.dlsm.batches import learn_scale, session_folds
 from ml.ope.fqe.steps import memories
 from ml.ope.linear.dynamics import ANSWERS, LARGEST_ROOT, SessionTable, answers, fit_dynamics, noise_features
 from ml.ope.linear.estimator import LinearConfig, LinearModel
 from ml.ope.linear.held_out import block_error, mean_path, replay_skill
+from ml.ope.scale import learn_scale, session_folds
 from ml.policies.policy import ConstantPolicy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 

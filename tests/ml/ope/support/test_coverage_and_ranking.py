@@ -6,7 +6,7 @@ import pytest
 from ml.ope.compare.ranking import default_method, probability_best, rank_policies
 from ml.ope.estimate import Estimate
 from ml.ope.registry import estimators
-from ml.ope.support.coverage import AmplitudeSupport, coverage, effective_sample_size
+from ml.ope.support.coverage import AmplitudeSupport, effective_sample_size
 from ml.policies.policy import ConstantPolicy
 
 
@@ -16,12 +16,13 @@ def estimate(value, se=1.0, supported=True, draws=None, method="dlsm"):
 
 
 def test_a_policy_below_every_logged_amplitude_is_not_supported_and_the_flag_says_why(small_buffer):
-    seen = coverage(small_buffer, {"none": ConstantPolicy(0.0), "half": ConstantPolicy(0.5)})
+    support = AmplitudeSupport(small_buffer)
+    seen = {"none": support.of_policy(ConstantPolicy(0.0)), "half": support.of_policy(ConstantPolicy(0.5))}
     assert not seen["none"].supported
     assert seen["none"].outside_range == 1.0
-    assert "not supported by the data: in 100 % of steps" in seen["none"].flags[0]
+    assert (seen["none"].flags()[0].code, seen["none"].flags()[0].value, seen["none"].flags()[0].refuses) == ("thin", 1.0, True)
     assert seen["half"].supported
-    assert not any("not supported" in flag for flag in seen["half"].flags)
+    assert not any(flag.refuses for flag in seen["half"].flags())
 
 
 def test_an_amplitude_inside_the_range_but_in_a_gap_of_the_data_counts_as_thin(small_buffer):

@@ -24,14 +24,17 @@ def seen(linear_simulator):
 
 def test_a_policy_that_leaves_the_logged_amplitudes_fails_that_check_by_name(seen):
     assert not seen["none"].supported
-    assert "leaves the logged amplitudes (0.30 to 1.00)" in seen["none"].failing[0]
+    refusal = seen["none"].failing[0]
+    assert (refusal.code, refusal.limit, refusal.refuses) == ("outside_range", 0.2, True)
+    assert (refusal.fact("low"), refusal.fact("high")) == pytest.approx((0.3, 1.0), abs=0.005)
     assert seen["none"].below_random_bound == 1.0
 
 
 def test_a_policy_among_the_data_is_supported_though_its_weights_are_not(seen):
     for name in ("half", "adaptive"):
         assert seen[name].supported
-        assert "effective sessions of 20" in seen[name].weights_failing[0]
+        few = seen[name].weights_failing[0]
+        assert (few.code, few.fact("sessions"), few.refuses) == ("weights_need_sessions", 20, False)
         assert seen[name].effective_sessions < 10
         assert seen[name].horizon_of_ten < 50
         assert seen[name].below_random_bound == 0.0
@@ -63,7 +66,7 @@ def test_a_lasting_low_amplitude_is_unseen_where_random_sessions_only_passed_thr
     found = diagnose(random, {"low": ConstantPolicy(0.4), "middle": ConstantPolicy(0.65)})
     assert found["low"].amplitudes.supported
     assert found["low"].unseen_dose > 0.9
-    assert "no session held" in found["low"].notes[0]
+    assert [note.code for note in found["low"].notes] == ["unseen_dose"]
     assert found["middle"].notes == ()
 
 
@@ -90,8 +93,9 @@ def test_every_check_has_its_limit_and_only_refusals_make_a_policy_unsupported(s
 
 def test_amplitudes_below_the_random_controllers_are_noted_with_the_bound(seen):
     assert seen["low"].below_random_bound == 1.0
-    assert any("less than 0.30, the least that the random controller gave" in note for note in seen["low"].notes)
-    assert not any("random controller" in note for note in seen["half"].notes)
+    bounds = [note.fact("bound") for note in seen["low"].notes if note.code == "below_random_bound"]
+    assert bounds == [pytest.approx(0.3)]
+    assert not any(note.code == "below_random_bound" for note in seen["half"].notes)
 
 
 def test_without_random_sessions_the_share_below_their_bound_is_not_known(linear_simulator):

@@ -1,0 +1,100 @@
+"""What is to be known about an estimate as typed values. Whoever shows them makes the sentences; nothing here is read by people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Fact = float | str | tuple[str, ...] | None
+Source = Literal["logged", "simulated"]
+
+TEXT = "text"
+"""Code of a flag that betaloop 0.1.0 stored as a sentence: it can be shown, and nothing may be concluded from it."""
+
+
+@dataclass(frozen=True)
+class Flag:
+    """One finding about an estimate, a policy or a choice.
+
+    Attributes:
+        code: what was found, such as `thin`; `wording` of the service knows every code.
+        value: what was measured; None where the finding has no number.
+        limit: what the value is held against; None where there is no limit.
+        unit: of value and limit: `share`, `sessions`, `controllers`, `reward`, ...; empty without a value.
+        refuses: whether the data cannot speak about the policy because of it.
+        source: the steps that it is about: `logged` ones, or those that the method `simulated`.
+        facts: whatever else a sentence about it needs, by name.
+    """
+
+    code: str
+    value: float | None = None
+    limit: float | None = None
+    unit: str = ""
+    refuses: bool = False
+    source: Source = "logged"
+    facts: tuple[tuple[str, Fact], ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        code: str,
+        value: float | None = None,
+        limit: float | None = None,
+        unit: str = "",
+        *,
+        refuses: bool = False,
+        source: Source = "logged",
+        **facts: Fact,
+    ) -> Flag:
+        """A flag with its facts by name."""
+        return cls(code, value, limit, unit, refuses, source, tuple(facts.items()))
+
+    def fact(self, name: str) -> Any:
+        """One of the facts. Raises KeyError where the flag has none of that name."""
+        return dict(self.facts)[name]
+
+    @property
+    def rounded(self) -> tuple[object, ...]:
+        """Equal for two flags that differ by less than anyone would be shown: to two decimals, whatever steps they are about."""
+        return (self.code, self.refuses, _rounded(self.value), tuple((name, _rounded(v)) for name, v in self.facts))
+
+    def to_json(self) -> dict[str, Any]:
+        """Every field, JSON-able."""
+        return {
+            "code": self.code,
+            "value": self.value,
+            "limit": self.limit,
+            "unit": self.unit,
+            "refuses": self.refuses,
+            "source": self.source,
+            "facts": {name: list(v) if isinstance(v, tuple) else v for name, v in self.facts},
+        }
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any] | str) -> Flag:
+        """The inverse of `to_json`; a sentence of betaloop 0.1.0 becomes a flag of the code `text`, which refuses nothing."""
+        if isinstance(stored, str):
+            return cls.of(TEXT, text=stored)
+        facts = {name: tuple(v) if isinstance(v, list) else v for name, v in stored["facts"].items()}
+        plain = {name: stored[name] for name in ("value", "limit", "unit", "refuses", "source")}
+        return cls(stored["code"], **plain, facts=tuple(facts.items()))
+
+
+FEW_END_REWARDS = Flag("few_end_rewards", None, 3.0, "sessions")
+"""Fewer sessions than the limit have an end-of-session reward: the estimate is the step return alone."""
+
+DAYS_UNKNOWN = Flag("days_unknown")
+"""How returns differ from day to day cannot be told from these sessions: the intervals leave it out."""
+
+
+def distinct(flags: Iterable[Flag]) -> tuple[Flag, ...]:
+    """The flags in their order, each once; two that nobody could tell apart when shown are one."""
+    seen: dict[tuple[object, ...], Flag] = {}
+    for flag in flags:
+        seen.setdefault((flag.source, *flag.rounded), flag)
+    return tuple(seen.values())
+
+
+def _rounded(value: Fact) -> Fact:
+    return round(value, 2) if isinstance(value, float) else value

@@ -1,0 +1,99 @@
+"""Staleness is a matter of pins: rows are compared, no trace and no buffer is read, and what is taken back leaves nothing stale."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import SYSTEM
+from app.evaluation import repository, wording
+from app.evaluation.ranking.staleness import stale_reasons
+from app.learning.gate.service import decide
+from app.learning.models import GateChoice
+from app.study.models import StudySession, Trace
+from app.study.repository import participant_by_code, sessions_of_participant
+from tests.app.evaluations import estimate
+
+Upload = Callable[..., int]
+
+
+def stale(db: Session) -> list[str]:
+    db.rollback()
+    participant = participant_by_code(db, "P1", SYSTEM)
+    evaluation = repository.newest_evaluation(db, participant.id)
+    assert evaluation is not None
+    return [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation)]
+
+
+@pytest.fixture
+def evaluated(policies: list[int], evaluate: Callable[..., int]) -> int:
+    return evaluate({i: estimate("dlsm", 50.0) for i in policies})
+
+
+def test_no_trace_is_read_to_see_whether_a_ranking_is_stale(
+    client: TestClient, evaluated: int, db: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[int] = []
+
+    def values(trace: Trace) -> None:
+        read.append(trace.recording_id)
+        raise AssertionError("a trace was read")
+
+    monkeypatch.setattr("app.study.traces.unpack", values)
+    monkeypatch.setattr("app.learning.snapshots.service.collect", lambda *_: pytest.fail("the buffer was built again"))
+    assert stale(db) == []
+    assert read == []
+
+
+def test_the_ranking_reads_only_sessions_whose_results_it_shows(
+    client: TestClient, evaluated: int, db: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from app.study import traces
+
+    read: set[int] = set()
+    unpack = traces.unpack
+    monkeypatch.setattr(traces, "unpack", lambda trace: read.add(trace.recording_id) or unpack(trace))
+    assert client.get("/api/v1/participants/P1/ranking").json()["stale"] is False
+    sessions = sessions_of_participant(db, participant_by_code(db, "P1", SYSTEM).id)
+    assert len(sessions) == 4
+    assert read == {g.recording_id for s in sessions if s._controller == "cdbs" for g in s.segments}
+
+
+def test_corrected_steps_make_it_stale_and_taking_the_correction_back_does_not(evaluated: int, db: Session) -> None:
+    session = sessions_of_participant(db, participant_by_code(db, "P1", SYSTEM).id)[0]
+    number, seconds, segment = session.id, session.duration_s, session.segments[0]
+    start = segment.start_s
+    session.duration_s = seconds - 20
+    segment.start_s = start + 4
+    db.commit()
+    assert stale(db) == ["1 session with other steps: its times, control channel or controller were corrected"]
+    again = db.get_one(StudySession, number)
+    again.duration_s, again.segments[0].start_s = seconds, start
+    db.commit()
+    assert stale(db) == []
+
+
+def test_an_exclusion_that_is_taken_back_leaves_nothing_stale(client: TestClient, evaluated: int, db: Session) -> None:
+    client.patch("/api/v1/sessions/1", json={"excluded_reason": "tablet froze"})
+    assert stale(db) == ["1 session newly left out"]
+    client.patch("/api/v1/sessions/1", json={"excluded_reason": None})
+    assert stale(db) == []
+
+
+def test_a_gate_that_opens_lets_sessions_in_and_one_that_shuts_leaves_them_out(
+    client: TestClient, upload: Upload, policies: list[int], evaluate: Callable[..., int], db: Session
+) -> None:
+    upload("rl", policy=policies[0])
+    evaluate({i: estimate("dlsm", 50.0) for i in policies})
+    assert stale(db) == []
+    decide(db, participant_by_code(db, "P1", SYSTEM), GateChoice.OPEN, "reviewed by hand", SYSTEM)
+    db.commit()
+    assert stale(db) == ["1 session newly included"]
+    evaluate({i: estimate("dlsm", 50.0) for i in policies})
+    assert stale(db) == []
+    decide(db, participant_by_code(db, "P1", SYSTEM), GateChoice.SHUT, "an adverse event", SYSTEM)
+    db.commit()
+    assert stale(db) == ["1 session newly left out"]

@@ -1,0 +1,116 @@
+"""Sentences are made at the end: other words change no rank, no support and no decision, and every code has its sentence."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy.orm import Session
+
+from app.evaluation import wording
+from app.evaluation.estimates.rows import row_of
+from app.evaluation.models import EstimateRow, Evaluation
+from ml.ope.estimate import Estimate
+from ml.ope.flags import Flag, distinct
+from ml.ope.support.coverage import thin
+from tests.app.evaluations import estimate
+
+RANKING = "/api/v1/participants/P1/ranking"
+WORDS = ("text", "decision_reason", "reason", "notes", "stale_reasons", "stale_reason")
+
+
+def without_words(found: Any) -> Any:
+    """An answer of the API less what is for people."""
+    if isinstance(found, dict):
+        return {name: without_words(v) for name, v in found.items() if name not in WORDS}
+    return [without_words(v) for v in found] if isinstance(found, list) else found
+
+
+def test_reworded_sentences_change_no_rank_support_or_decision(
+    client: TestClient, policies: list[int], evaluate: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    a, b, c = policies
+    evaluate({a: estimate("dlsm", 60.0), b: estimate("dlsm", 99.0, supported=False), c: estimate("dlsm", 30.0)}, {1.0: 45.0, 0.7: 20.0})
+    before = client.get(RANKING).json()
+    assert [p["decision"] for p in before["policies"]] == ["test_next", "reject", "needs_data"]
+    page = client.get("/participants/P1/ranking").text
+    for name, made in inspect.getmembers(wording, inspect.isfunction):
+        if made.__module__ == wording.__name__:
+            monkeypatch.setattr(wording, name, lambda *_: "x")
+    monkeypatch.setattr(wording, "_SENTENCES", {})
+    after = client.get(RANKING).json()
+    assert {f["text"] for p in after["policies"] for f in p["flags"]} == {p["decision_reason"] for p in after["policies"]} == {"x"}
+    assert without_words(after) == without_words(before)
+    reworded = client.get("/participants/P1/ranking").text
+    assert reworded.count("not supported") >= 1
+    assert [page.count(f'value="{i}"') for i in policies] == [reworded.count(f'value="{i}"') for i in policies]
+
+
+def test_an_evaluation_of_0_1_0_opens_with_its_sentences_and_its_stored_support(
+    client: TestClient, policies: list[int], evaluate: Callable[..., int], db: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def as_of_old(policy_id: int, e: Estimate) -> EstimateRow:
+        row = row_of(policy_id, e)
+        row.details = {name: v for name, v in row.details.items() if name != "version"}
+        row.flags = [] if e.supported else ["far from the data, as somebody put it once"]
+        return row
+
+    monkeypatch.setattr("app.evaluation.service.row_of", as_of_old)
+    a, b, c = policies
+    evaluate({a: estimate("dlsm", 60.0), b: estimate("dlsm", 99.0, supported=False), c: estimate("dlsm", 50.0)}, {1.0: 45.0})
+    row = db.get_one(Evaluation, client.get(RANKING).json()["evaluation_id"])
+    choice = {name: v for name, v in row.diagnostics["choice"].items() if name != "reasons"}
+    row.diagnostics = row.diagnostics | {"choice": choice | {"reason": "linear erred least"}}
+    db.commit()
+    body = client.get(RANKING).json()
+    assert [(p["policy_id"], p["supported"], p["decision"]) for p in body["policies"]] == [
+        (a, True, "test_next"), (c, True, "test_next"), (b, False, "needs_data")
+    ]  # fmt: skip
+    assert body["policies"][2]["flags"] == [
+        {"code": "text", "value": None, "limit": None, "unit": "", "text": "far from the data, as somebody put it once"}
+    ]
+    assert body["policies"][2]["decision_reason"] == "not supported by the data; far from the data, as somebody put it once"
+    assert (body["choice"]["reasons"], body["choice"]["reason"]) == ([], "Linear erred least")
+    assert client.get("/participants/P1/ranking").status_code == 200
+
+
+def test_every_code_that_the_science_or_a_rule_makes_has_a_sentence() -> None:
+    root = Path(wording.__file__).parents[2]
+    sources = [*(root / "ml/ope").rglob("*.py"), *(root / "app/evaluation").rglob("*.py")]
+    made = {code for path in sources for code in re.findall(r'(?:Flag|Flag\.of|few_effective)\(\s*"([a-z_]+)"', path.read_text())}
+    assert {"thin", "far", "gain", "usual_order", "few_effective_sessions"} <= made
+    assert made <= set(wording._SENTENCES)
+
+
+def test_flags_survive_their_stored_form_and_are_told_once() -> None:
+    flag = Flag.of("usual_order", 0.25, None, "share", refuses=True, source="simulated", methods=("fqe", "linear"), low=0.1, widened=False)
+    assert Flag.from_json(flag.to_json()) == flag
+    one, alike, other = (thin(share, "logged", low=0.3, high=1.0) for share in (0.301, 0.302, 0.34))
+    assert distinct([one, alike, other, thin(0.301, "simulated", low=0.3, high=1.0)]) == (
+        one, other, thin(0.301, "simulated", low=0.3, high=1.0)
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("reasons", "read"),
+    [
+        ([Flag("no_skill")], "No method predicted left-out controllers better than if it had said that all return the same"),
+        (
+            [Flag.of("difference_error", 0.12, 0.1, "share of range", method="fqe", controllers=4.0), Flag("not_beaten")],
+            "Fitted Q evaluation predicted the differences between 4 left-out controllers with a mean error of 12 % of their range (least "
+            "of all: 10 %); none was better by more than a standard error than this first of the usual order",
+        ),
+        (
+            [Flag.of("difference_error", 0.1, 0.1, "", method="fqe", controllers=4.0), Flag.of("beats_usual_order", method="linear")],
+            "Fitted Q evaluation predicted the differences between 4 left-out controllers with a mean error of 10 % of their range (least "
+            "of all: 10 %), by more than a standard error better than Linear model, the first of the usual order",
+        ),
+    ],
+)
+def test_the_reasons_of_a_choice_read_as_one_sentence_with_methods_by_name(reasons: list[Flag], read: str) -> None:
+    assert wording.choice(reasons) == read
