@@ -85,7 +85,7 @@ def _resume_uploads() -> None:
 
 @app.command(epilog="Example: betaloop worker --slots 2")
 def worker(slots: Annotated[int | None, typer.Option(min=1, help="Compute steps side by side; BETALOOP_WORKER_SLOTS.")] = None) -> None:
-    """Run background jobs until told to stop; an interrupted job goes on where it was."""
+    """Run background jobs until stopped; an interrupted job continues where it was."""
     from app.platform.jobs.worker import run_worker
     from app.platform.migrate import migrate as bring_up_to_date
 

@@ -163,7 +163,7 @@ def read_tremor(
 
 
 def tremor_by_duration(fractions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shares of each minute as the watch told them, shape [n, 6]; shares that it did not tell are 0."""
+    """Shares of each minute as the watch reported them, shape [n, 6]; shares that it did not report are 0."""
     return np.nan_to_num(fractions, nan=0.0)
 
 

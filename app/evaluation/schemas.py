@@ -103,10 +103,10 @@ class CheckOut(Model):
         "`effective_sessions`, `largest_weight_share`, `horizon_of_ten` (steps)."
     )
     value: float | None = Field(description="Null where the data cannot tell.")
-    limit: float | None = Field(description="Null where the value is only told.")
+    limit: float | None = Field(description="Null where the value has no limit.")
     at_least: bool = Field(description="Whether the limit is the least value that passes; else it is the greatest.")
     verdict: Literal["passed", "refused", "weights", "noted", "told"] = Field(
-        description="`refused`: no method may speak about the policy; `weights`: importance sampling may not; `noted`: to be known."
+        description="`refused`: no method may speak about the policy; `weights`: importance sampling may not; `noted`: a remark that refuses nothing; `told`: a number without a limit."
     )
 
 

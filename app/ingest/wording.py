@@ -42,7 +42,7 @@ def _amplitude(facts: Mapping[str, Any]) -> str:
     return f"the sides do not agree, so that a person must say which controller it was ({each})"
 
 
-_NO_AMPLITUDE = "the file tells no amplitude"
+_NO_AMPLITUDE = "the file states no amplitude"
 
 
 def _course(c: Course) -> str:
@@ -68,13 +68,13 @@ def _course(c: Course) -> str:
 
 _SENTENCES: dict[Reason, Callable[[Mapping[str, Any]], str]] = {
     Reason.DAY_OF_VISIT: lambda f: f"recorded on {f['day']}, the day of visit {f['visit']}",
-    Reason.NO_DATE: lambda f: "the file tells no date: choose the visit",
+    Reason.NO_DATE: lambda f: "the file states no date: choose the visit",
     Reason.SEVERAL_VISITS: lambda f: f"{f['visits']} visits are dated {f['day']}: choose one",
     Reason.NO_VISIT_OF_DAY: lambda f: f"recorded on {f['day']}, and no visit has that date: choose the visit, or add it",
     Reason.AMPLITUDE: _amplitude,
     Reason.UNREADABLE: lambda f: f"its steps cannot be read: {f['detail']}",
     Reason.RECORDED_SIDE: lambda f: "of the recording that a controller could have seen",
-    Reason.NO_SIDE: lambda f: "the file tells no side",
+    Reason.NO_SIDE: lambda f: "the file states no side",
     Reason.CUT_OUT: lambda f: f"cut out of proposed session {f['session']}",
     Reason.SENTENCE: lambda f: str(f["text"]),
 }

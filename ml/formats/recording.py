@@ -1,7 +1,7 @@
 """What a decoder hands over: recordings with their 2 s traces and events, and one report per file.
 
 Everything here is plain data. Times are seconds in the recording's own clock unless a name says otherwise; where that clock starts is
-`RecordingLog.started_at` (UTC), when the file tells it.
+`RecordingLog.started_at` (UTC), when the file states it.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ class MeanOverDays:
         weights: of the sessions in the mean, [n]; sessions of one visit share a weight, the smaller their own noise the more nearly equal
             the visits'.
         common: draws of the error of the mean that all policies share, [draws]. own: those of each policy's difference from it, [P, draws].
-        unknown: what cannot be told about days; None where it can.
+        unknown: what the sessions leave open about days; None where nothing.
     """
 
     weights: Floats

@@ -77,7 +77,7 @@ def tremor_minutes(tremor: NDArray[np.float64]) -> tuple[str, ...]:
 
 
 def minute_seconds(minutes: tuple[str, ...], steps: int) -> dict[str, float]:
-    """Seconds of a session per tremor class; `steps` tells how long the last minute was."""
+    """Seconds of a session per tremor class; `steps` says how long the last minute was."""
     seconds: dict[str, float] = {}
     for i, name in enumerate(minutes):
         seconds[name] = seconds.get(name, 0.0) + PERIOD_S * min(STEPS_PER_MINUTE, steps - i * STEPS_PER_MINUTE)

@@ -233,7 +233,7 @@ def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitCon
         floor = data.resolution**2 / 12 * (1 / n_tested + 1 / n_cdbs)
     else:
         contrast = np.array([win_probability(x, y) for x, y in pairs])
-        # A visit tells the probability no finer than by half a pair.
+        # A visit resolves the probability no finer than by half a pair.
         floor = (0.5 / (n_tested * n_cdbs)) ** 2
     visits = np.array([v for v, _, _ in data.arms], dtype=np.int64)
     return VisitContrasts(visits, contrast, n_tested, n_cdbs, floor, 0.0 if scale == "difference" else 0.5)

@@ -34,9 +34,9 @@ def stratified(**changes):
 
 @given(seed=seeds, bound=bounds, visits=st.integers(1, 6), sessions=st.integers(1, 6), steps=st.integers(1, 600), ladder=st.booleans())
 def test_no_step_is_below_the_bound_and_low_ones_end_after_five_minutes(seed, bound, visits, sessions, steps, ladder):
-    laid = lay_out(stratified(seed=seed, lower_bound=bound, visits=visits, sessions=sessions, steps=steps, ladder=ladder))
-    assert [(s.visit, s.number) for s in laid] == [(v, n) for v in range(1, visits + 1) for n in range(sessions)]
-    for session in laid:
+    designed = lay_out(stratified(seed=seed, lower_bound=bound, visits=visits, sessions=sessions, steps=steps, ladder=ladder))
+    assert [(s.visit, s.number) for s in designed] == [(v, n) for v in range(1, visits + 1) for n in range(sessions)]
+    for session in designed:
         a = session.amplitudes
         assert a.min() >= bound
         assert a.max() <= 1
@@ -109,17 +109,17 @@ def test_decisions_have_no_gaps():
 
 
 def test_the_papers_design_draws_every_step_uniformly():
-    laid = lay_out(stratified(name="paper", visits=4, sessions=6, seed=3))
-    drawn = np.concatenate([s.amplitudes for s in laid])
-    assert all(d.steps == 1 and d.log_density == pytest.approx(-np.log(0.7)) for s in laid for d in s.decisions)
+    designed = lay_out(stratified(name="paper", visits=4, sessions=6, seed=3))
+    drawn = np.concatenate([s.amplitudes for s in designed])
+    assert all(d.steps == 1 and d.log_density == pytest.approx(-np.log(0.7)) for s in designed for d in s.decisions)
     assert kstest((drawn - 0.3) / 0.7, "uniform").pvalue > 0.01
-    assert all(s.level is None and s.design == "paper" for s in laid)
+    assert all(s.level is None and s.design == "paper" for s in designed)
 
 
 def test_sustained_doses_are_tried_by_the_stratified_design_and_not_by_the_papers():
     def widest(name):
-        laid = lay_out(stratified(name=name, seed=4))
-        return np.ptp([s.amplitudes[-150:].mean() for s in laid])
+        designed = lay_out(stratified(name=name, seed=4))
+        return np.ptp([s.amplitudes[-150:].mean() for s in designed])
 
     assert widest("paper") < 0.1
     assert widest("stratified") > 0.4

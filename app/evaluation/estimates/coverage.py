@@ -23,7 +23,7 @@ VERDICTS: dict[str, tuple[str, str]] = {
     "refused": ("failed", "bad"),
     "weights": ("too few", ""),
     "noted": ("to know", "warn"),
-    "told": ("told", ""),
+    "told": ("for information", ""),
 }
 """Word and tone of each verdict."""
 

@@ -93,7 +93,7 @@ def guess_visit(visits: Sequence[Visit], day: date | None, stated: Visit | None,
 
     Args:
         visits: of the participant, by number; at least one.
-        day: on which the recording was made, by the clock of the place where its file tells it.
+        day: on which the recording was made, by the clock of the place where its file states it.
     """
     if stated is not None:
         return VisitGuess(stated, False, BY_UPLOAD)

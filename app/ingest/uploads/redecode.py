@@ -208,7 +208,7 @@ def _refuse_shift(recording: Recording, fresh: RecordingLog, session_ids: Sequen
     if session_ids and recording.started_at is not None and began is not None:
         shift = (began - recording.started_at).total_seconds()
         if abs(shift) > 1.0:
-            raise Refused(f"recording {recording.id} would begin {shift:+.1f} s from where its sessions were laid: cut them anew by hand")
+            raise Refused(f"recording {recording.id} would begin {shift:+.1f} s from where its sessions were placed: cut them anew by hand")
 
 
 def _refuse_loss(

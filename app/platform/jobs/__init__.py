@@ -49,7 +49,7 @@ Rules
   commits. The audit trail names the person who submitted the job. Keep it short: no computing in it.
 * A compute function may be killed at any moment and called again with the same params and workdir: write checkpoints to another name
   and rename them (`write_atomically`). When the params differ (they are compared by hash), the workdir is emptied first.
-* Raise `JobError("what, where, how to mend it")` for errors that a person can mend; its text is shown as it is. Any other exception shows
+* Raise `JobError("what, where, what to do")` for errors that a person can correct; its text is shown as it is. Any other exception shows
   its last line and keeps the traceback in the step's log. A failed step raises `StepFailed` in the orchestration, which fails the job.
 * Do not catch `BaseException` in an orchestration: cancelling and stopping travel as such.
 * Records name functions by strings, so that the web service, which knows every kind, never loads torch; a compute module imports what it

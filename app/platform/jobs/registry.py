@@ -29,7 +29,7 @@ KIND_MODULES = ("app.pipeline.kinds",)
 Orchestration = Callable[["JobContext"], dict[str, Any]]
 ComputeFunction = Callable[[dict[str, Any], Path, "StepReport"], dict[str, Any]]
 Requirement = Callable[[Session, int, Any], object]
-"""Called with the participant's id and the checked params before a job is put on the queue; raises what the user must mend first."""
+"""Called with the participant's id and the checked params before a job is put on the queue; raises what the user must correct first."""
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")

@@ -64,7 +64,7 @@ def _secured(request: Request, response: Response) -> Response:
 
 
 def _cross_site(request: Request) -> BetaloopError | None:
-    """A browser tells where a request comes from; what changes data must come from our own pages.
+    """A browser states where a request comes from; what changes data must come from our own pages.
 
     A request with a bearer token and no cookie has no rights but the token's, which no other site can know: it may come from anywhere.
     """

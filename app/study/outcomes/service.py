@@ -87,7 +87,7 @@ def store_tremor(
     if same or different:
         said.append(
             f"{same + different} of these minutes came in other files too, {different} of them with other values: each counts once, "
-            "as the newest file tells it."
+            "as the newest file states it."
         )
     return said + _derive_overlapping(db, participant_id, spans)
 

@@ -74,13 +74,13 @@ def contradictions(db: Session, session: StudySession, visit_open: bool = False,
 
 
 def utc_offset_h(recording: Recording) -> float | None:
-    """Offset of the clock where a recording was made, hours, as its file tells; None where it tells none."""
+    """Offset of the clock where a recording was made, hours, as its file states; None where it states none."""
     hours = recording.details.get("settings", {}).get("utc_offset_h")
     return float(hours) if isinstance(hours, int | float) and -14 <= hours <= 14 else None
 
 
 def local_day(recording: Recording, moment: datetime) -> date:
-    """The day of a moment where the recording was made, by the offset that its file tells, else in UTC."""
+    """The day of a moment where the recording was made, by the offset that its file states, else in UTC."""
     hours = utc_offset_h(recording)
     return moment.astimezone(UTC if hours is None else timezone(timedelta(hours=hours))).date()
 

@@ -136,7 +136,7 @@ def _line(name: str, x: NDArray[np.float64], y: NDArray[np.float64], i: int, uni
 
 
 def _height(base: int, lines: Sequence[Any]) -> int:
-    """Room for a legend of several rows."""
+    """Space for a legend of several rows."""
     return base + 20 * max(0, (len(lines) - 1) // 4)
 
 

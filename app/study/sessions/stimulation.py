@@ -31,12 +31,12 @@ KNOWN_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Delivered:
-    """What one recording of a session tells of the stimulation: one side, or one program of a side.
+    """What one recording of a session holds of the stimulation: one side, or one program of a side.
 
     Attributes:
         name: of the side, for a sentence. hemisphere: where it is known.
         is_control: whether its recording is the one that the controller saw.
-        table: amplitudes on the session's grid; None where the recording tells none.
+        table: amplitudes on the session's grid; None where the recording holds none.
     """
 
     name: str

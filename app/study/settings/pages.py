@@ -81,6 +81,6 @@ def _suggestion(db: Session, participant: Participant, caller: Caller) -> float 
     try:
         return service.suggest_xi_beta(db, participant, caller)
     except Invalid as error:
-        # the session's own page says what is wrong with it; the settings must stay reachable, for they may be what mends it
+        # the session's own page says what is wrong with it; the settings must stay reachable, for they may be what corrects it
         log.info("no threshold suggested", participant=participant.code, reason=error.detail)
         return None

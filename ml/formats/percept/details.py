@@ -1,4 +1,4 @@
-"""What a Percept report tells beside its streams: therapy groups and their history, trends, snapshots, events, battery, in plain values.
+"""What a Percept report holds beside its streams: therapy groups and their history, trends, snapshots, events, battery, in plain values.
 
 Nothing in here quotes free text of the report: enumerations are reduced to known shapes, and names that a person may have typed (groups,
 events) to known words or numbers, so that a redacted report gives the same details as the original.

@@ -117,7 +117,7 @@ def find_sessions(files: Files, report: FileReport) -> list[SessionFiles]:
 
 
 def _opening(files: Files, name: str) -> Opening:
-    """The begin of a file; one that cannot be unpacked tells nothing here and is reported when it is read."""
+    """The begin of a file; one that cannot be unpacked says nothing here and is reported when it is read."""
     try:
         with files.open(name) as stream:
             return read_opening(stream.read(HEAD))

@@ -47,13 +47,13 @@ def _target(text: Any) -> str:
 
 
 def leads_only(record: dict[str, Any]) -> dict[str, Any]:
-    """The `SubjectInfo` entry of a settings record with its leads alone, empty where it tells of none."""
+    """The `SubjectInfo` entry of a settings record with its leads alone, empty where it names none."""
     found = clean_leads(record["SubjectInfo"]) if "SubjectInfo" in record else {}
     return {"SubjectInfo": found} if found else {}
 
 
 def sides(subject: Any) -> tuple[Hemisphere | None, ...]:
-    """Side of each lead, from its name and its code; None where neither tells, they differ, or no lead is there."""
+    """Side of each lead, from its name and its code; None where neither says, they differ, or no lead is there."""
     found = clean_leads(subject)
     out: list[Hemisphere | None] = []
     for i in range(LEADS):

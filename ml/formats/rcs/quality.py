@@ -44,7 +44,7 @@ class _Stream(Protocol):
 def describe_quality(
     streams: Mapping[str, _Stream], times: Mapping[str, PacketTimes], counts: Mapping[str, int], report: Callable[[str], FileReport]
 ) -> dict[str, Any]:
-    """Packets, loss and chunks per stream that was placed in time, and what else tells how far the recording can be trusted.
+    """Packets, loss and chunks per stream that was placed in time, and what else says how far the recording can be trusted.
 
     Args:
         streams: by name. times: of the streams with packets, by name.

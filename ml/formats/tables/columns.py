@@ -79,17 +79,17 @@ def check_reach(t_s: NDArray[np.float64], columns: Columns) -> None:
     far = np.flatnonzero(np.abs(t_s) > LONGEST_TABLE_S)
     if far.size == 0:
         return
-    row, mend = int(far[0]), "Give t_s in seconds from the session's start, one session per table: rows before the start are negative."
+    row, hint = int(far[0]), "Give t_s in seconds from the session's start, one session per table: rows before the start are negative."
     written = float(columns.values["t_s"][row])
     for unit, per_second in _UNIX_UNITS:
         seconds = written / per_second
         if _UNIX_SPAN_S[0] <= seconds <= _UNIX_SPAN_S[1]:
             when = f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
             what = f"the times are Unix {unit} ({written:.15g} is {when}), not seconds from the session's start"
-            mend = f"{mend} Subtract the time at which the controller was started, and state that time as the start of the session."
-            raise columns.error(what, "t_s", mend, row)
+            hint = f"{hint} Subtract the time at which the controller was started, and state that time as the start of the session."
+            raise columns.error(what, "t_s", hint, row)
     what = f"{t_s[row]:.9g} s lies more than a week from the session's start, t_s 0"
-    raise columns.error(what, "t_s", mend, row)
+    raise columns.error(what, "t_s", hint, row)
 
 
 def match_columns(headers: Sequence[str]) -> tuple[dict[str, int], dict[str, str | None], list[str], list[str]]:

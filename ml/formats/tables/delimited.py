@@ -83,7 +83,7 @@ def read_delimited(path: Path, max_rows: int | Callable[[Sequence[str]], int], n
 
     Args:
         path: the file.
-        max_rows: rows it may have, or what tells this by the headers.
+        max_rows: rows it may have, or a function that says so by the headers.
         needed: the columns that are expected, for the message about an empty file.
 
     Raises:

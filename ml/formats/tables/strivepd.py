@@ -149,7 +149,7 @@ def _long(table: TextTable, columns: dict[str, int], time: int, report: FileRepo
 
 
 def _class_seconds(seconds: dict[str, float], name: str) -> float:
-    """Seconds of a class: no row for it means none, unless the minute tells nothing but the sum and that is not 0."""
+    """Seconds of a class: no row for it means none, unless the minute states nothing but the sum and that is not 0."""
     if name in seconds:
         return seconds[name]
     only_sum = set(seconds) == {SUMMARY}

@@ -116,7 +116,7 @@ def _pieces(steps: int, per_step: int) -> list[slice]:
 
 
 def _starting_at_zero(steps: int, batch: int, width: int, like: Tensor) -> Tensor:
-    """Room for a state at times 0 ... T, [T + 1, B, n], of which only time 0 is filled, with zeros."""
+    """Uninitialised memory for a state at times 0 ... T, [T + 1, B, n], of which only time 0 is filled, with zeros."""
     states = like.new_empty(steps + 1, batch, width)
     states[0].zero_()
     return states
@@ -170,7 +170,7 @@ class _StochasticLstm(torch.autograd.Function):
         (steps, batch, latent), hidden, width = eps.shape, tanh_c.shape[2], acts.shape[2]
         pieces = _pieces(steps, batch * width)
         low, high = LOG_STD_BOUNDS
-        room = eps.new_empty(pieces[0].stop, batch, width), eps.new_empty(pieces[0].stop, batch, 2 * latent)
+        buffers = eps.new_empty(pieces[0].stop, batch, width), eps.new_empty(pieces[0].stop, batch, 2 * latent)
         d_carry, d_c = torch.zeros_like(carry[0]), torch.zeros_like(c[0])
         d_in, d_joint, d_out = torch.zeros_like(w_in), torch.zeros_like(joint), eps.new_zeros(latent + hidden, 2 * latent)
         d_bias, d_b_out = eps.new_zeros(width), eps.new_zeros(2 * latent)
@@ -178,7 +178,7 @@ class _StochasticLstm(torch.autograd.Function):
         above = [g.contiguous() for g in grads]
         transposed = _arrays(joint.t().contiguous(), w_out.t().contiguous())
         for t in reversed(pieces):
-            d_acts, d_heads = (r[: t.stop - t.start] for r in room)
+            d_acts, d_heads = (r[: t.stop - t.start] for r in buffers)
             given = _arrays(*(g[t] for g in above), acts[t], c[_states(t)], tanh_c[t], eps[t], share[t], std[t])
             stochastic_backward(*given, *transposed, *_arrays(d_acts, d_heads, d_carry, d_c), high - low)
             flat, flat_heads, states = _flat(d_acts), _flat(d_heads), carry[_states(t)]
@@ -228,13 +228,13 @@ class _Lstm(torch.autograd.Function):
         x, acts, hs, c, tanh_c, w_x, w_h = ctx.saved_tensors
         (steps, batch, hidden), above = tanh_c.shape, grads[0].contiguous()
         pieces = _pieces(steps, batch * 4 * hidden)
-        room = acts.new_empty(pieces[0].stop, batch, 4 * hidden)
+        buffer = acts.new_empty(pieces[0].stop, batch, 4 * hidden)
         d_h, d_c = torch.zeros_like(c[0]), torch.zeros_like(c[0])
         d_in, d_bias, d_w_h = torch.zeros_like(w_x), acts.new_zeros(4 * hidden), torch.zeros_like(w_h)
         d_x = torch.empty_like(x) if ctx.needs_input_grad[0] else None
         (back,) = _arrays(w_h.t().contiguous())
         for t in reversed(pieces):
-            d_acts = room[: t.stop - t.start]
+            d_acts = buffer[: t.stop - t.start]
             lstm_backward(*_arrays(above[t], acts[t], c[_states(t)], tanh_c[t]), back, *_arrays(d_acts, d_h, d_c))
             flat = _flat(d_acts)
             d_w_h.addmm_(_flat(hs[t]).t(), flat)

@@ -83,7 +83,7 @@ def roll_out(
         per_policy: M trajectories of each policy.
         seed: of the noise.
         prior: start from z_0 ~ N(0, I) and its own s_0 (paper) instead of q(z_0 | s_0).
-        report: told after every block.
+        report: called after every block.
     """
     block = max(1, networks.config.block // max(1, len(policies)))
     rng = np.random.default_rng(seed)

@@ -54,7 +54,7 @@ class Check:
         name: `outside_range`, `thin`, `far`, `below_random_bound`, `unseen_dose` (shares of steps), `distance` (95 % of the logged pairs
             are within 1), `effective_sessions`, `largest_weight_share` (share), `horizon_of_ten` (steps).
         value: None where the data cannot tell.
-        limit: what the value is held against; None where it is only told.
+        limit: what the value is held against; None where it has none.
         at_least: whether the limit is the least value that passes; else it is the greatest.
         verdict: `refused`: the data cannot speak about the policy. `weights`: importance weights cannot, models may. `noted`: to be known
             before a policy is picked, and no refusal. `told`: a number without a limit.

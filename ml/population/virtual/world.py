@@ -176,7 +176,7 @@ class DataSession:
 
 def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int) -> list[DataSession]:
     """Sessions of early visits in their order."""
-    laid = lay_out(
+    designed = lay_out(
         DesignSettings(
             name="paper" if design == "paper" else "stratified",
             visits=visits,
@@ -190,7 +190,7 @@ def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int
     )
     rows: list[DataSession] = []
     for visit in range(1, visits + 1):
-        random = [("random", s.amplitudes) for s in laid if s.visit == visit]
+        random = [("random", s.amplitudes) for s in designed if s.visit == visit]
         cdbs, off = ("cdbs", np.ones(STEPS)), ("no_dbs", np.zeros(NO_DBS_STEPS))
         slots = [cdbs, *random[:2], cdbs, *random[2:], off]
         rows += [DataSession(visit, name, k * (STEPS * 2 / 3600 + PAUSE_H), a) for k, (name, a) in enumerate(slots)]

@@ -1,4 +1,4 @@
-"""Sessions with a known start, and uploaded files of a watch and a hand tracker as the ingest room hands them over."""
+"""Sessions with a known start, and uploaded files of a watch and a hand tracker as the ingest phase hands them over."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings have clinical bounds, told with their unit; whatever is set, or was stored before there were bounds, no page answers 500."""
+"""Settings have clinical bounds, stated with their unit; whatever is set, or was stored before there were bounds, no page answers 500."""
 
 from __future__ import annotations
 

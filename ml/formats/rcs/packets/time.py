@@ -179,7 +179,7 @@ def _breaks(kept: PacketHeaders) -> NDArray[np.bool_]:
 
 
 def _device_ms(kept: PacketHeaders) -> NDArray[np.float64]:
-    """The device's own clock made continuous, ms after the first packet, [n]: ticks, with the rollovers that `timestamp` tells of.
+    """The device's own clock made continuous, ms after the first packet, [n]: ticks, with the rollovers that `timestamp` shows.
 
     A step is the one of its ticks that lies nearest to the step of `timestamp`, which is right to a second: forwards or backwards.
     """

@@ -39,7 +39,7 @@ def side(table: StepTable | None, name: str = "right side") -> Delivered:
         ([1.5, 1.5, 1.5], None, "50 % of the cDBS amplitude"),
         ([0, 0, 0, 0.1], None, "varies between 0 and 0.1 mA"),
         ([1.0, 3.0, 2.0], None, "varies between 1 and 3 mA"),
-        ([nan, nan], None, "tells no amplitude"),
+        ([nan, nan], None, "states no amplitude"),
         ([3.0, nan, nan, nan], None, "known in only 1 of 4 steps"),
     ],
 )
@@ -64,7 +64,7 @@ def test_without_a_stated_cdbs_amplitude_a_constant_one_proves_nothing_but_zero_
         (steps([3, 3, 3]), steps([0, 0, 0]), None, "right side: the amplitude is 0 in all 3 steps"),
         (steps([1, 3, 2]), steps([0, 0, 0]), None, "left side: the amplitude varies between 1 and 3 mA"),
         (steps([3, 3, 3]), steps([1.5, 1.5, 1.5]), None, "50 % of the cDBS amplitude"),
-        (steps([0, 0, 0]), None, None, "right side: the file tells no amplitude"),
+        (steps([0, 0, 0]), None, None, "right side: the file states no amplitude"),
     ],
 )
 def test_the_controller_is_guessed_from_every_side_or_left_open(
@@ -92,7 +92,7 @@ def test_the_stated_visit_wins_over_the_day() -> None:
 
 @pytest.mark.parametrize(
     ("day", "why"),
-    [(None, "tells no date"), (date(2026, 3, 9), "recorded on 2026-03-09, and no visit has that date")],
+    [(None, "states no date"), (date(2026, 3, 9), "recorded on 2026-03-09, and no visit has that date")],
 )
 def test_without_a_visit_of_that_day_the_choice_is_open_and_kept_in_the_newest_past_visit(day: date | None, why: str) -> None:
     guess = guess_visit(VISITS, day, None, TODAY)
@@ -114,7 +114,7 @@ def test_a_persons_word_is_told_from_a_guess_by_its_source_and_not_by_its_senten
     assert not guess_controller([side(steps([0, 0]))])[1].stated
 
 
-@pytest.mark.parametrize(("sentence", "stated"), [("as stated by a@clinic.example", True), ("the file tells no amplitude", False)])
+@pytest.mark.parametrize(("sentence", "stated"), [("as stated by a@clinic.example", True), ("the file states no amplitude", False)])
 def test_evidence_stored_as_a_sentence_is_still_read(sentence: str, stated: bool) -> None:
     evidence = Evidence.from_json(sentence)
     assert (evidence.stated, wording.reason(evidence)) == (stated, sentence)

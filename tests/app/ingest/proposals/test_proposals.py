@@ -53,7 +53,7 @@ def test_the_controller_is_proposed_by_plain_rules(send: Any, level: float, gues
 def test_a_table_tells_no_date_so_that_its_visit_is_open_unless_stated(send: Any) -> None:
     (proposal,) = send(("t.csv", steady(0))).json()["proposals"]
     assert proposal["visit_open"]
-    assert "tells no date" in proposal["evidence"]["visit"]
+    assert "states no date" in proposal["evidence"]["visit"]
     (stated,) = send(("u.csv", steady(0, beta=2.0)), visit=1).json()["proposals"]
     assert not stated["visit_open"]
 

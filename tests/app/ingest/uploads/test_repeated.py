@@ -1,4 +1,4 @@
-"""The same bytes again, of use or not: kept once, and told as what they are."""
+"""The same bytes again, of use or not: stored once, and reported as what they are."""
 
 from __future__ import annotations
 

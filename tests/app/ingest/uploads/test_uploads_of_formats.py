@@ -1,4 +1,4 @@
-"""Each format through the door of the service: what arrives is cleaned, decoded and stored."""
+"""Each format through the upload route: what arrives is cleaned, decoded and stored."""
 
 from __future__ import annotations
 

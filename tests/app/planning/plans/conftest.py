@@ -1,4 +1,4 @@
-"""A participant with sessions, a snapshot, policies and a ranking, made by the rooms that make them in a study."""
+"""A participant with sessions, a snapshot, policies and a ranking, made by the phases that make them in a study."""
 
 from __future__ import annotations
 
