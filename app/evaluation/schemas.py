@@ -106,7 +106,8 @@ class CheckOut(Model):
     limit: float | None = Field(description="Null where the value has no limit.")
     at_least: bool = Field(description="Whether the limit is the least value that passes; else it is the greatest.")
     verdict: Literal["passed", "refused", "weights", "noted", "told"] = Field(
-        description="`refused`: no method may speak about the policy; `weights`: importance sampling may not; `noted`: a remark that refuses nothing; `told`: a number without a limit."
+        description="`refused`: no method may speak about the policy; `weights`: importance sampling may not; `noted`: a remark that "
+        "refuses nothing; `told`: a number without a limit."
     )
 
 

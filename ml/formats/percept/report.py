@@ -110,7 +110,7 @@ def decode_percept(path: Path, options: DecodeOptions, name: str | None = None) 
 
 
 def report_members(files: ZipFiles, *, damaged: bool = False) -> list[str]:
-    """Members of an archive that begin like a session report; with `damaged` also JSON files that cannot be read, so that they are reported."""
+    """Members of an archive that begin like a session report; with `damaged` also JSON files that cannot be read, to report them."""
     out = []
     for member in files.names():
         try:

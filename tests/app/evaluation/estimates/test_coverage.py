@@ -1,4 +1,4 @@
-"""What the data can say stands before the estimates: stored with the evaluation, stated in words; a failed check counts for every method."""
+"""What the data can say stands before the estimates: stored with the evaluation, worded; a failed check counts for every method."""
 
 from __future__ import annotations
 
