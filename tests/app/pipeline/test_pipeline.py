@@ -18,9 +18,8 @@ from app.learning.snapshots.buffers import read_buffer
 from app.platform import files
 from app.study.repository import participant_by_code
 from ml.deploy.bundle import verify_bundle
-from ml.ope.compare.ranking import PREFERENCE
 from ml.ope.compare.skill import choose_default
-from ml.ope.registry import estimators, quick_estimators
+from ml.ope.registry import estimators, preference, quick_estimators
 from ml.ope.support.diagnostics import diagnose
 from ml.policies.onnx_policy import OnnxPolicy
 
@@ -83,7 +82,7 @@ def test_an_evaluation_gives_the_numbers_that_the_estimators_give(
     scores = {s["method"]: s["difference_error"] for s in ranking["choice"]["table"]}
     assert scores == {s.method: pytest.approx(s.difference_error) for s in choice.table}
     # where the data do not choose, the first of the stated order that supports the policy does
-    usual = [m for m in PREFERENCE if m in CHEAP]
+    usual = [m for m in preference() if m in CHEAP]
     supporting = [m for m in usual if policy["estimates"][m]["supported"]]
     expected = choice.method if ranking["choice"]["chosen_by_data"] else (supporting or usual)[0]
     assert ranking["default_method"] == ranking["choice"]["method"] == expected

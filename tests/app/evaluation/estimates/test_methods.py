@@ -17,9 +17,8 @@ from sqlalchemy.orm import Session
 
 from app.evaluation.estimates.compute import evaluate_method
 from app.evaluation.schemas import EvaluateParams
-from app.platform.jobs import Report, compute
-from app.platform.jobs.children.supervisor import Call, Nursery
-from app.platform.jobs.registry import compute_function
+from app.platform.jobs import StepReport
+from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall
 from ml.ope import registry
 from ml.ope.estimate import Estimate
 from ml.ope.registry import Method, Size
@@ -60,8 +59,7 @@ def build(key: str, seed: int, size: Size) -> MeanOfSessions:
     return MeanOfSessions(key)
 
 
-@compute("evaluate_mean_session")
-def evaluate_here(params: dict[str, Any], workdir: Path, report: Report) -> dict[str, Any]:
+def evaluate_here(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """`evaluate_method` in a child that knows the method of this file."""
     registry.register(MEAN)
     return evaluate_method(params, workdir, report)
@@ -77,12 +75,12 @@ def registered() -> Iterator[None]:
 def test_a_method_of_its_own_file_runs_in_a_child_process(db: Session, tmp_path: Path) -> None:
     db_call = call(db, buffer_of(sessions()), method=MEAN.key)
     db.commit()
-    nursery = Nursery()
+    children = ChildProcesses()
     try:
-        step = Call(compute_function("evaluate_mean_session"), db_call, tmp_path / "step", 2048)
-        outcome = nursery.run(step, lambda said: None, lambda: None)
+        step = ComputeCall("evaluate_mean_session", f"{__name__}:evaluate_here", db_call, tmp_path / "step", 2048)
+        outcome = children.run(step, lambda reported: None, lambda: None)
     finally:
-        nursery.close()
+        children.close()
     found = Estimate.from_json(outcome["result"]["estimates"]["7"])
     assert (found.method, found.n, found.supported) == (MEAN.key, 9, True)
     assert -1.3 * 50 < found.value < 0

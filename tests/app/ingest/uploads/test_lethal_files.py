@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.ingest.models import Upload, UploadFile
-from app.ingest.uploads.interrupted import take_up
+from app.ingest.uploads.interrupted import resume
 from app.platform.errors import Invalid
 from app.study import repository as study
 from app.study.models import Recording, SettingsVersion, StudySession
@@ -27,7 +27,7 @@ import io, os, signal, sys
 from app.accounts.permissions import SYSTEM
 from app.ingest.uploads import service
 from ml import formats
-from app.ingest.uploads.interrupted import take_up
+from app.ingest.uploads.interrupted import resume
 from app.ingest.sessions import StatedSession
 from app.platform.database import new_session
 from app.platform.tables import load_tables
@@ -40,7 +40,7 @@ if sys.argv[1] == "send":
         one = service.Incoming("t.csv", io.BytesIO(sys.argv[3].encode()))
         service.receive(db, participant_by_code(db, "P1", SYSTEM), StatedSession(), [one], SYSTEM)
 else:
-    list(take_up("test"))
+    list(resume("test"))
 """
 
 
@@ -52,13 +52,13 @@ def killed(action: str, where: str) -> None:
 def test_a_file_that_ends_the_service_twice_is_put_aside_and_can_be_read(client: TestClient, enrolled: str, db: Session) -> None:
     killed("send", "decode")
     killed("take up", "decode")
-    (taken,) = take_up("test")
+    (taken,) = resume("test")
     assert taken.done, taken.said
     (file,) = db.scalars(select(UploadFile))
     assert (file.status, file.quarantine_sha256 is not None) == ("failed", True)
     (row,) = client.get("/api/v1/participants/P1/quarantine").json()
     assert "the service ended 2 times while it read this file" in row["problem"]
-    assert list(take_up("test")) == [], "it is not taken up again"
+    assert list(resume("test")) == [], "it is not taken up again"
     assert client.post(f"/api/v1/uploaded-files/{file.id}/review").status_code == 200
     released = client.post(f"/api/v1/uploaded-files/{file.id}/release", json={"how": "read", "reason": "the service was mended"})
     assert released.status_code == 200, released.text
@@ -68,19 +68,19 @@ def test_a_file_that_ends_the_service_twice_is_put_aside_and_can_be_read(client:
 
 def test_a_file_whose_reading_ended_the_service_once_is_taken_up(client: TestClient, enrolled: str) -> None:
     killed("send", "decode")
-    assert [t.done for t in take_up("test")] == [True]
+    assert [t.done for t in resume("test")] == [True]
     assert len(client.get("/api/v1/participants/P1/proposals").json()) == 1
 
 
 def test_sessions_that_end_the_service_twice_are_not_made_a_third_time(client: TestClient, enrolled: str, db: Session) -> None:
     killed("send", "make_sessions")
     killed("take up", "make_sessions")
-    assert [t.done for t in take_up("test")] == [True]
+    assert [t.done for t in resume("test")] == [True]
     (upload,) = db.scalars(select(Upload))
     assert upload.status == "decoded"
     assert "The service ended 2 times while it made sessions" in repr(client.get(f"/api/v1/uploads/{upload.id}").json()["report"])
     assert client.get("/api/v1/participants/P1/proposals").json() == []
-    assert list(take_up("test")) == []
+    assert list(resume("test")) == []
 
 
 @pytest.mark.parametrize(
