@@ -25,11 +25,11 @@ import numpy as np
 
 from ml.statistics.association import within_visits
 from ml.statistics.effects import cliffs_delta, energy_saving
-from ml.statistics.mixed_visits import linear_comparison, rating_comparison, tremor_comparison
 from ml.statistics.noninferiority import Inconclusive, NonInferiorAndSaving, Outcome, assess
 from ml.statistics.ranksum import as_in_the_paper
-from ml.statistics.stratified import aligned_rank_test, shift_interval, van_elteren
-from ml.statistics.visits import Average, Measurements, Unavailable, average, primary, visit_contrasts
+from ml.statistics.within_visits.contrasts import Average, Measurements, Unavailable, average, primary, visit_contrasts
+from ml.statistics.within_visits.mixed_models import linear_comparison, rating_comparison, tremor_comparison
+from ml.statistics.within_visits.stratified import aligned_rank_test, shift_interval, van_elteren
 
 out = sys.stdout.write
 ALPHA, LEVEL = 0.05, 0.95

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
-from ml.statistics.visits import Integers, Reason, Unavailable
+from ml.statistics.within_visits.contrasts import Integers, Reason, Unavailable
 
 Floats = NDArray[np.float64]
 LEAST_VISITS = 3

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.statistics.bootstrap import resamples
-from ml.statistics.visits import Average, Measurements, Reason, Unavailable, VisitContrasts, average, primary, visit_contrasts
+from ml.statistics.within_visits.contrasts import (
+    Average,
+    Measurements,
+    Reason,
+    Unavailable,
+    VisitContrasts,
+    average,
+    primary,
+    visit_contrasts,
+)
 
 Floats = NDArray[np.float64]
 

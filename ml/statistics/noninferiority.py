@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ml.statistics.effects import Saving, energy_saving, saving_contrasts
 from ml.statistics.multiplicity import holm
 from ml.statistics.power import MOST_VISITS, Posterior, Target, first_reaching, posterior, success
-from ml.statistics.visits import Average, Measurements, Reason, Scale, Unavailable, primary
+from ml.statistics.within_visits.contrasts import Average, Measurements, Reason, Scale, Unavailable, primary
 
 Floats = NDArray[np.float64]
 

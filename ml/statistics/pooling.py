@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import bdtr, stdtr, stdtrit
 
-from ml.statistics.visits import Average, Reason, Unavailable
+from ml.statistics.within_visits.contrasts import Average, Reason, Unavailable
 
 Floats = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from ml.statistics.visits import Measurements, Reason, Scale, Unavailable, VisitContrasts, visit_contrasts
+from ml.statistics.within_visits.contrasts import Measurements, Reason, Scale, Unavailable, VisitContrasts, visit_contrasts
 
 Floats = NDArray[np.float64]
 Alternative = Literal["two_sided", "greater"]

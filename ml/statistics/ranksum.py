@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
-from ml.statistics.visits import Measurements, Unavailable
+from ml.statistics.within_visits.contrasts import Measurements, Unavailable
 
 EXACT_UP_TO = 2500
 """Exact p-values while n_x * n_y stays at or below this; beyond it the normal approximation is good to more digits than are shown."""

@@ -45,6 +45,18 @@ INTENDED: dict[str, str] = {
         ("components > schemas > Problem", "components > schemas > ProblemOut"),
         "API: the member `mend` of problem documents and of file reports is called `hint`.",
     ),
+    **dict.fromkeys(
+        (
+            "components > schemas > ChoiceOut",
+            "components > schemas > CoverageOut",
+            "components > schemas > EstimateOut",
+            "components > schemas > FlagOut",
+            "components > schemas > PlanEstimateOut",
+            "components > schemas > RankedPolicy",
+            "components > schemas > ReasonOut",
+        ),
+        "flags of estimates, rankings, plans and of what the data cover are objects `{code, value, limit, unit, text}`",
+    ),
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",
     "components > schemas > JobOut > required": "API: a job has `seconds_left`.",
 }

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import linregress
 
 from ml.statistics.association import between_visits, within_visits
-from ml.statistics.visits import Reason, Unavailable
+from ml.statistics.within_visits.contrasts import Reason, Unavailable
 
 
 def test_days_that_move_both_are_between_visits_and_not_within():

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import ttest_1samp
 
 from ml.statistics.effects import SavingMethod, cliffs_delta, energy_saving, saving_contrasts
-from ml.statistics.visits import Measurements, Reason, Unavailable
+from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavailable
 
 
 def energies(shares, each=2, unit=1.0):

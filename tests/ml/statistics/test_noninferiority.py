@@ -17,7 +17,7 @@ from ml.statistics.noninferiority import (
     assess,
     counted_energy,
 )
-from ml.statistics.visits import Measurements, Reason, visit_contrasts
+from ml.statistics.within_visits.contrasts import Measurements, Reason, visit_contrasts
 
 EACH = 3
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binomtest, t
 
 from ml.statistics.pooling import paule_mandel, pool, pool_estimates, sign_test
-from ml.statistics.visits import Measurements, Reason, Unavailable, primary
+from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavailable, primary
 
 
 def test_equal_errors_give_the_t_interval_of_the_estimates():

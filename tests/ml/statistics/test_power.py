@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import nct, t
 
 from ml.statistics.power import MOST_VISITS, Posterior, Target, posterior, power, success
-from ml.statistics.visits import Measurements, Reason, Unavailable, VisitContrasts
+from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavailable, VisitContrasts
 
 
 def study(visits=8, each=4, effect=0.5, between=0.5, seed=0):

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import mannwhitneyu
 
 from ml.statistics.ranksum import as_in_the_paper, p_greater, rank_sum, u_distribution
-from ml.statistics.visits import Measurements, Reason, Unavailable
+from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavailable
 
 
 @pytest.mark.parametrize(("n_x", "n_y"), [(1, 1), (2, 5), (4, 4), (5, 3)])

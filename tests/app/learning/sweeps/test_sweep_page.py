@@ -131,6 +131,6 @@ def buffer(upload: Upload, db: Session) -> ReplayBuffer:
 
 def test_cdbs_gains_nothing_over_itself_and_no_stimulation_loses_surely(buffer: ReplayBuffer) -> None:
     same, off = gains_over_cdbs(buffer, [ConstantPolicy(1.0), ConstantPolicy(0.0)])
-    assert same == {"value": 0.0, "low": 0.0, "standard_error": 0.0}
+    assert same == {"value": 0.0, "low": 0.0, "high": 0.0, "standard_error": 0.0, "level": 0.9}
     assert off is not None
     assert off["low"] < off["value"] < 0

@@ -115,6 +115,7 @@ def studied(db: Session, enrolled: str) -> Studied:
     visit = Visit(participant_id=participant.id, number=2, date=None)
     db.add(visit)
     db.flush()
+    db.commit()  # as in a study: what a snapshot rests on was written before its transaction began
     snapshot = take_snapshot(db, participant, SYSTEM)
     trained = [_policy(db, participant, snapshot, f"rl-0{i}", "trained") for i in (1, 2)]
     students = [_policy(db, participant, snapshot, f"{t.name}-small", "distilled", t.id) for t in trained]

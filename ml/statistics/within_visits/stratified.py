@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from ml.statistics.ranksum import u_distribution, u_distribution_given_ties
-from ml.statistics.visits import Measurements, Unavailable
+from ml.statistics.within_visits.contrasts import Measurements, Unavailable
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

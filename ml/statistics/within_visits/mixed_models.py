@@ -14,9 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.statistics.generalised import FLAT, WEAK, GeneralisedFit, Likelihood, binomial, cumulative, fit
 from ml.statistics.mixed import MixedModel, Sums
-from ml.statistics.visits import Adjustment, Average, Measurements, Reason, Unavailable, VisitContrasts, student, visit_contrasts
+from ml.statistics.within_visits.contrasts import (
+    Adjustment,
+    Average,
+    Measurements,
+    Reason,
+    Unavailable,
+    VisitContrasts,
+    student,
+    visit_contrasts,
+)
+from ml.statistics.within_visits.generalised import FLAT, WEAK, GeneralisedFit, Likelihood, binomial, cumulative, fit
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ml.statistics.visits import (
+from ml.statistics.within_visits.contrasts import (
     Adjustment,
     Average,
     Floats,

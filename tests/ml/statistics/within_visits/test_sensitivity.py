@@ -5,8 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ml.statistics.sensitivity import bracketed, carry_over_adjusted, medication_adjusted, order_adjusted, sensitivities
-from ml.statistics.visits import Adjustment, Average, Measurements, Reason, Unavailable, average, visit_contrasts
+from ml.statistics.within_visits.contrasts import (
+    Adjustment,
+    Average,
+    Measurements,
+    Reason,
+    Unavailable,
+    average,
+    visit_contrasts,
+)
+from ml.statistics.within_visits.sensitivity import (
+    bracketed,
+    carry_over_adjusted,
+    medication_adjusted,
+    order_adjusted,
+    sensitivities,
+)
 
 VISITS, EACH = 6, 4
 VISIT = np.repeat(np.arange(VISITS), 2 * EACH)

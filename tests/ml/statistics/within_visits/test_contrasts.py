@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import ttest_1samp
 
 from ml.statistics.ranksum import rank_sum
-from ml.statistics.visits import (
+from ml.statistics.within_visits.contrasts import (
     Adjustment,
     Average,
     Measurements,

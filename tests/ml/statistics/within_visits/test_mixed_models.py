@@ -7,9 +7,9 @@ import pytest
 from scipy.optimize import check_grad
 from scipy.special import expit
 
-from ml.statistics.generalised import binomial, cumulative, fit
-from ml.statistics.mixed_visits import linear_comparison, rating_comparison, tremor_comparison
-from ml.statistics.visits import Measurements, Reason, Unavailable, average, visit_contrasts
+from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavailable, average, visit_contrasts
+from ml.statistics.within_visits.generalised import binomial, cumulative, fit
+from ml.statistics.within_visits.mixed_models import linear_comparison, rating_comparison, tremor_comparison
 
 
 def layout(visits, each):

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu, rankdata
 
-from ml.statistics import stratified
 from ml.statistics.ranksum import rank_sum
-from ml.statistics.stratified import Method, aligned_rank_test, shift_interval, van_elteren
-from ml.statistics.visits import Measurements, Reason, Unavailable
+from ml.statistics.within_visits import stratified
+from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavailable
+from ml.statistics.within_visits.stratified import Method, aligned_rank_test, shift_interval, van_elteren
 
 
 def shufflings(data, score):
