@@ -20,7 +20,7 @@ from app.planning.bundles import service as bundles
 from app.platform.errors import NotFound
 from app.platform.jobs.models import Job
 from app.study.repository import participant_by_code
-from ml.rl.networks import MlpPolicy
+from ml.rl import MlpPolicy
 
 BUNDLE_FORM = {"data": {"min_ma": "0", "max_ma": "3", "ramp_ma_per_s": "1.5"}}
 PAIRS: dict[tuple[str, str], dict[str, Any]] = {
