@@ -46,6 +46,7 @@ def main() -> None:
     _end_in_order_on_signals()
     load_tables()
     try:
+        logs.configure_own()
         app(standalone_mode=True)
     except (BetaloopError, RuntimeError) as error:
         _say(f"betaloop: {error}")

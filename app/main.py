@@ -16,6 +16,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from starlette.concurrency import run_in_threadpool
 
 from app import __version__
+from app.platform import logs
 from app.platform.database import Db, check_connection
 from app.platform.files import remove_abandoned
 from app.platform.tables import load_tables
@@ -76,6 +77,7 @@ class _Static(StaticFiles):
 def create_app() -> FastAPI:
     """Build the service. The database is reached at the first request, not here."""
     load_tables()
+    logs.configure_own()
     app = FastAPI(
         title="betaloop", version=__version__, openapi_url="/api/v1/openapi.json", docs_url=None, redoc_url=None, lifespan=_lifespan
     )  # fmt: skip

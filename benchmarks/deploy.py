@@ -1,7 +1,7 @@
 """The paper's two tables of the deployed controller: how long one decision takes, and what it saves of energy and battery.
 
-    python benchmarks/deploy.py [--passes N] [--json]     microseconds per decision, one thread, batch 1
-    python benchmarks/deploy.py --energy                  closed loop on the synthetic participants; about two minutes
+    python benchmarks/deploy.py [--quick] [--passes N] [--json]     microseconds per decision, one thread, batch 1
+    python benchmarks/deploy.py --energy                            closed loop on the synthetic participants; about two minutes
 
 Full (400x300) and distilled (20x10) policies, by torch, onnxruntime, the numpy network and the whole Python controller (window update and
 safety envelope with it), and the C header (-O3; a whole decision too; float32 and whole numbers). `wall` is the time that passed, with the
@@ -23,7 +23,7 @@ import subprocess
 import tempfile
 import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -135,13 +135,15 @@ def measure(name: str, hidden: tuple[int, ...], passes: int) -> dict[str, tuple[
     return out
 
 
-def energies() -> list[dict[str, Any]]:
+def energies(codes: Iterable[str], updates: int) -> list[dict[str, Any]]:
     """Mean squared and mean amplitude over cDBS of each participant's controllers, [sessions of SESSION_STEPS], and battery life."""
     out = []
-    for code in PARTICIPANTS:
+    for code in codes:
         buffer = random_controller_buffer(code, visits=3, sessions_per_visit=6, steps=SESSION_STEPS, seed=2026)
         learner = ALGORITHMS["rebrac"]
-        config = learner.config(updates=5000, batch=64, actor_lr=3e-4, actor_penalty=0.1, aim="return", record_every=500, seed=0)
+        config = learner.config(
+            updates=updates, batch=64, actor_lr=3e-4, actor_penalty=0.1, aim="return", record_every=updates // 10, seed=0
+        )
         full = train(buffer, config).policy
         small = distil(full, buffer, DistilConfig()).policy
         lowest, rng = buffer.settings.lower_bound, np.random.default_rng(5)
@@ -193,13 +195,15 @@ def figures(values: Any) -> dict[str, float]:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="200 passes; with --energy one participant, 200 updates")
     parser.add_argument("--passes", type=int, default=2000, help="timed passes, at least 200 as in the paper")
     parser.add_argument("--energy", action="store_true", help="energy and battery instead of computation time")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.energy:
-        found = energies()
+        codes = list(PARTICIPANTS)
+        found = energies(codes[:1] if given.quick else codes, 200 if given.quick else 5000)
         if given.json:
             print(json.dumps(found, indent=1))
             return
@@ -211,7 +215,7 @@ def main() -> None:
                 f"{row['saved_sd']:>6.1f}{life:>21}"
             )
         return
-    passes = max(given.passes, 200)
+    passes = 200 if given.quick else max(given.passes, 200)
     rows = [("timer alone", "", *timed(lambda i: None, passes))]
     for name, hidden in (("full", TEACHER_HIDDEN), ("distilled", STUDENT_HIDDEN)):
         rows += [(name, runtime, wall, cpu) for runtime, (wall, cpu) in measure(name, hidden, passes).items()]

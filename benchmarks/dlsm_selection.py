@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from cells import Cells
-from simulators import STEPS, VISITS, WORLDS
+from support.cells import Cells
+from support.simulators import STEPS, VISITS, WORLDS
 
 from ml.ope.compare.metrics import accuracy
 from ml.ope.dlsm.batches import make_batch

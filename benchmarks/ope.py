@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from cells import Cells
-from looks import LookError, look, said
-from ope_cases import CDBS, DESIGNS, MATCHED, STEPS, Case, participant_case, virtual_case
-from ope_report import figures, report
-from page_order import NEEDED, page_order
+from support.cells import Cells
+from support.looks import LookError, look, said
+from support.ope_cases import CDBS, DESIGNS, MATCHED, STEPS, Case, participant_case, virtual_case
+from support.ope_report import figures, report
+from support.page_order import NEEDED, page_order
 
 from app.evaluation.decision import gain_over
 from ml.ope.estimate import Estimate, Estimator

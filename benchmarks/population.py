@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figure import draw
-from looks import look, said
+from support.figure import draw
+from support.looks import look, said
 
 from ml.ope.compare.metrics import accuracy
 from ml.ope.linear.estimator import LinearConfig, LinearModel

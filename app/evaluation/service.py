@@ -16,7 +16,7 @@ from app.evaluation.ranking.service import current_ranking as current_ranking
 from app.evaluation.schemas import EvaluateParams
 from app.learning import repository as learning
 from app.learning.models import BufferSnapshot, Policy
-from app.learning.policies.service import require_window, window_of
+from app.learning.policies.service import onnx_of, require_window, window_of
 from app.platform.errors import Invalid
 from app.platform.jobs import service as jobs
 from app.study import repository as study_repository
@@ -29,7 +29,7 @@ def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams) -
     """The candidates of an evaluation.
 
     Raises:
-        NotFound: no such policy. Invalid: there is none, or a retired one or one of another window is named.
+        NotFound: no such policy. Invalid: there is none, or a retired one or one of another window is named, or a stored file is missing.
     """
     window = db.get_one(Participant, participant_id).current_settings.window
     if not params.policies:
@@ -42,9 +42,12 @@ def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams) -
                 f"None of the {len(found)} policies takes windows of {window} beta amplitudes, as the settings say now.",
                 "Train policies with these settings, or set the window back.",
             )
+        for policy in fitting:
+            onnx_of(policy)
         return fitting
     chosen = learning.policies_named(db, participant_id, params.policies)
     for policy in chosen:
+        onnx_of(policy)
         require_window(policy, window)
         if policy.retired_reason:
             raise Invalid(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", "Leave it out, or take it back first.")

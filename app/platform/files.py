@@ -19,6 +19,7 @@ from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from app.platform.database import Base
+from app.platform.errors import BetaloopError
 from app.settings import get_settings, private_folder
 
 CHUNK = 1 << 20
@@ -38,8 +39,14 @@ class StoredFile(Base):
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
 
 
-class MissingFile(RuntimeError):
+class MissingFile(BetaloopError):
     """The database names bytes that the folder lacks, or that no longer have their hash."""
+
+    status = 409
+    title = "A stored file is missing or damaged"
+
+    def __init__(self, detail: str) -> None:
+        super().__init__(detail, "Ask your administrator to restore it from a backup of the data folder.")
 
 
 def path_of(sha256: str) -> Path:
@@ -172,10 +179,10 @@ def read(sha256: str) -> bytes:
     """
     path = path_of(sha256)
     if not path.exists():
-        raise MissingFile(f"File {sha256} is missing from {get_settings().files_dir}. Restore it from a backup of the data folder.")
+        raise MissingFile(f"The stored file {sha256} is missing.")
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != sha256:
-        raise MissingFile(f"File {sha256} in {get_settings().files_dir} is damaged: its bytes have another hash. Restore a backup.")
+        raise MissingFile(f"The stored file {sha256} is damaged: its bytes have another hash.")
     return content
 
 

@@ -1,9 +1,13 @@
-"""Logging: structlog for our own lines, the standard library's loggers at the same level."""
+"""Logging: structlog for our own lines, the standard library's loggers at the same level.
+
+Tracebacks are plain and hold no values of local variables: those may name a person, and drawing them takes tens of seconds.
+"""
 
 from __future__ import annotations
 
 import logging
 import sys
+from typing import Any
 
 import structlog
 
@@ -12,17 +16,32 @@ from app.settings import get_settings
 
 def configure() -> None:
     """Set up logging of this process; lines go to standard error, so that commands keep standard output for results."""
-    settings = get_settings()
-    level = logging.getLevelNamesMapping().get(settings.log_level.upper(), logging.INFO)
-    logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    renderer = structlog.processors.JSONRenderer() if settings.log_json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty())
+    logging.basicConfig(level=_level(), stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    configure_own()
+
+
+def configure_own() -> None:
+    """Set up our own lines alone, as every service and every command does; other libraries' loggers stay as they are."""
     structlog.configure(
-        wrapper_class=structlog.make_filtering_bound_logger(level),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        wrapper_class=structlog.make_filtering_bound_logger(_level()),
+        logger_factory=_to_standard_error,
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
             structlog.processors.format_exc_info,
-            renderer,
+            structlog.processors.JSONRenderer() if get_settings().log_json else _console(),
         ],
     )
+
+
+def _level() -> int:
+    return logging.getLevelNamesMapping().get(get_settings().log_level.upper(), logging.INFO)
+
+
+def _console() -> structlog.dev.ConsoleRenderer:
+    return structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback)
+
+
+def _to_standard_error(*_: Any) -> structlog.PrintLogger:
+    """Standard error as it is when a line is written: who redirects it later gets the lines too."""
+    return structlog.PrintLogger(sys.stderr)

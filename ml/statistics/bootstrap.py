@@ -66,7 +66,7 @@ def session_bootstrap(
         method: `percentile`, or `bca` (bias-corrected and accelerated; needs at least 3 sessions).
 
     Raises:
-        ValueError: a level outside (0, 1), or fewer than 3 sessions for BCa.
+        ValueError: a level outside (0, 1), draws that are not finite, or fewer than 3 sessions for BCa.
     """
     values = np.array([statistic(index) for index in resamples(n, draws, seed)])
     if method == "percentile":
@@ -79,10 +79,10 @@ def session_bootstrap(
 
 
 def percentile_interval(values: NDArray[Any], level: float) -> Interval:
-    """Percentile interval of bootstrap draws, shape [draws]."""
-    _check_level(level)
+    """Percentile interval of bootstrap draws, shape [draws]. Raises ValueError as `bca_interval` does."""
+    _check(level, values)
     tail = (1 - level) / 2
-    low, high = np.quantile(values, [tail, 1 - tail])
+    low, high = _quantiles(values, [tail, 1 - tail])
     return Interval(float(low), float(high), level, _spread(values), "percentile")
 
 
@@ -94,27 +94,52 @@ def bca_interval(values: NDArray[Any], estimate: float, jackknife: NDArray[Any],
         estimate: the statistic of the sessions as they are.
         jackknife: the statistic with one session left out, shape [n].
         level: coverage, between 0 and 1.
+
+    Returns:
+        The interval. Where bias and acceleration are so large that the correction reverses its direction (1 - a z <= 0 in eq. 14.10), it is
+        the percentile interval, and its `method` says so.
+
+    Raises:
+        ValueError: a level outside (0, 1), or values that are not finite.
     """
-    _check_level(level)
+    _check(level, values, jackknife, np.array([estimate]))
     # Half of the ties count, so that a discrete statistic is not taken for a biased one.
     share = (np.sum(values < estimate) + 0.5 * np.sum(values == estimate)) / values.size
     share = float(np.clip(share, 0.5 / values.size, 1 - 0.5 / values.size))
     bias = float(norm.ppf(share))
-    centred = jackknife.mean() - jackknife
+    # The acceleration has no unit: values near the largest number are scaled down before their powers are taken.
+    scaled, _ = _scaled(jackknife)
+    centred = scaled.mean() - scaled
     spread = float(np.sum(centred**2) ** 1.5)
     acceleration = float(np.sum(centred**3) / (6 * spread)) if spread > 0 else 0.0
     ends = []
     for tail in ((1 - level) / 2, (1 + level) / 2):
         z = bias + float(norm.ppf(tail))
+        if acceleration * z >= 1:
+            return percentile_interval(values, level)
         ends.append(float(norm.cdf(bias + z / (1 - acceleration * z))))
-    low, high = np.quantile(values, ends)
+    low, high = _quantiles(values, ends)
     return Interval(float(low), float(high), level, _spread(values), "bca")
 
 
 def _spread(values: NDArray[Any]) -> float:
-    return float(np.std(values, ddof=1)) if values.size > 1 else 0.0
+    scaled, factor = _scaled(values)
+    return float(np.std(scaled, ddof=1)) * factor if values.size > 1 else 0.0
 
 
-def _check_level(level: float) -> None:
+def _quantiles(values: NDArray[Any], shares: list[float]) -> Floats:
+    scaled, factor = _scaled(values)
+    return np.asarray(np.quantile(scaled, shares) * factor)
+
+
+def _scaled(values: NDArray[Any]) -> tuple[Floats, float]:
+    """Values of at most 2, and the power of two that they were divided by: neither sums nor squares of them overflow."""
+    exponent = min(int(np.frexp(np.abs(values).max(initial=0.0))[1]), 1023)
+    return np.ldexp(np.asarray(values, dtype=np.float64), -exponent), float(np.ldexp(1.0, exponent))
+
+
+def _check(level: float, *numbers: NDArray[Any]) -> None:
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")
+    if not all(np.isfinite(n).all() for n in numbers):
+        raise ValueError("an interval needs finite values: an estimate of some resample is infinite or not a number")

@@ -17,8 +17,8 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 def module(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     yield importlib.import_module
-    for name in [p.stem for p in BENCHMARKS.glob("*.py")]:
-        sys.modules.pop(name, None)
+    for name in [n for n in sys.modules if n.split(".")[0] == "support"]:
+        del sys.modules[name]
 
 
 def rows(values, half=1.0, supported=True):
@@ -26,7 +26,7 @@ def rows(values, half=1.0, supported=True):
 
 
 def test_perfect_estimates_have_perfect_scores(module):
-    found = module("ope_scores").world_scores([0.0, 5.0, 10.0, 4.0], rows([0.0, 5.0, 10.0, 4.0], 0.5), cdbs=4.0)
+    found = module("support.ope_scores").world_scores([0.0, 5.0, 10.0, 4.0], rows([0.0, 5.0, 10.0, 4.0], 0.5), cdbs=4.0)
     assert found["rank"] == 1
     assert found["regret"] == found["mae"] == found["worst first"] == 0
     assert found["coverage"] == 1
@@ -37,55 +37,55 @@ def test_perfect_estimates_have_perfect_scores(module):
 
 
 def test_a_confident_reversal_is_named_and_costs_the_range(module):
-    found = module("ope_scores").world_scores([0.0, 5.0, 10.0], rows([10.0, 5.0, 0.0], 1.0), cdbs=5.0)
+    found = module("support.ope_scores").world_scores([0.0, 5.0, 10.0], rows([10.0, 5.0, 0.0], 1.0), cdbs=5.0)
     assert found["rank"] == -1
     assert found["regret"] == 1
     assert found["worst first"] == 1
     assert found["mae"] == pytest.approx(20 / 30)
     # two of three are missed by 9; 20 times that each
     assert found["interval score"] == pytest.approx((2 + (20 * 9 * 2) / 3) / 10)
-    wide = module("ope_scores").world_scores([0.0, 5.0, 10.0], rows([10.0, 5.0, 0.0], 10.0), cdbs=5.0)
+    wide = module("support.ope_scores").world_scores([0.0, 5.0, 10.0], rows([10.0, 5.0, 0.0], 10.0), cdbs=5.0)
     assert wide["worst first"] == 0
 
 
 def test_a_pages_order_counts_before_its_values(module):
-    found = module("ope_scores").world_scores([0.0, 5.0, 10.0], rows([9.0, 1.0, 2.0]), cdbs=0.0, places=[3, 2, 1])
+    found = module("support.ope_scores").world_scores([0.0, 5.0, 10.0], rows([9.0, 1.0, 2.0]), cdbs=0.0, places=[3, 2, 1])
     assert found["rank"] == 1
     assert found["regret"] == 0
 
 
 def test_unsupported_candidates_count_in_all_and_not_among_supported(module):
     found = rows([0.0, 5.0, 10.0]) + rows([99.0], supported=False)
-    scores = module("ope_scores").world_scores([0.0, 5.0, 10.0, -5.0], found, cdbs=0.0)
+    scores = module("support.ope_scores").world_scores([0.0, 5.0, 10.0, -5.0], found, cdbs=0.0)
     assert scores["rank supported"] == 1
     assert scores["rank"] < 1
     assert scores["supported"] == 0.75
 
 
 def test_signs_are_told_right_wrong_or_not(module):
-    told = module("ope_scores").Told
+    told = module("support.ope_scores").Told
     right, wrong, silent, unclear = told(1, 2, 5, 1), told(1, 2, -5, 1), told(-1, 2, 5, 1), told(1, 2, 1, 1)
     assert (right.right, wrong.right, silent.right, unclear.right) == (True, False, None, None)
-    share, unknown = module("ope_scores").signs([right, right, wrong, silent, unclear])
+    share, unknown = module("support.ope_scores").signs([right, right, wrong, silent, unclear])
     assert share == pytest.approx(2 / 3)
     assert unknown == pytest.approx(0.2)
 
 
 def test_the_worst_decile_is_on_the_bad_side(module):
     values = list(range(11))
-    assert module("ope_scores").over_worlds(values, worst_is_low=True)["decile"] == 1
-    assert module("ope_scores").over_worlds([*values, None], worst_is_low=False)["decile"] == 9
+    assert module("support.ope_scores").over_worlds(values, worst_is_low=True)["decile"] == 1
+    assert module("support.ope_scores").over_worlds([*values, None], worst_is_low=False)["decile"] == 9
 
 
 def test_testing_more_sessions_ranks_better(module):
-    scores = module("ope_scores").scores_of_tests
+    scores = module("support.ope_scores").scores_of_tests
     few, many = (scores([0, 1, 2, 3, 4], [3.0] * 5, 0.0, n)["rank"] for n in (5, 500))
     assert few < many
     assert many > 0.95
 
 
 def test_looks_at_b_and_c_are_counted_and_c_is_run_once_per_release(module, tmp_path):
-    looks, file = module("looks"), tmp_path / "looks.json"
+    looks, file = module("support.looks"), tmp_path / "looks.json"
     file.write_text('{"B": [], "C": []}')
     looks.look("A", "a", file=file)
     looks.look("B", "b", file=file)
@@ -99,7 +99,7 @@ def test_looks_at_b_and_c_are_counted_and_c_is_run_once_per_release(module, tmp_
 
 
 def test_the_count_in_the_repository_can_be_read(module):
-    assert set(module("looks").counts()) == {"B", "C"}
+    assert set(module("support.looks").counts()) == {"B", "C"}
 
 
 class Known(dict):
@@ -126,7 +126,7 @@ def cells_of(name, values, flat=False):
 def test_figures_come_from_the_headline_and_the_baseline_from_the_papers_page(module, tmp_path):
     cells = Known(cells_of("A00", [0.0, 5.0, 10.0]) | cells_of("A01", [0.0, 5.0, 10.0], flat=True))
     text: list[str] = []
-    made = module("ope_report")
+    made = module("support.ope_report")
     summary = made.report(["A00", "A01"], cells, "page", tmp_path / "ope.svg", text.append)
     figures = made.figures(summary, "page", "page")
     contract = (
@@ -149,7 +149,7 @@ def test_the_page_puts_unsupported_candidates_last_whatever_their_values(module)
     buffer = world("A", 2).data("paper", visits=1)
     policies = {"in": ConstantPolicy(0.7), "below": ConstantPolicy(0.15), "high": ConstantPolicy(0.95)}
     tables = {"linear": estimators(0, demo=True)["linear"].fit(buffer).evaluate(policies, 300)}
-    page = module("page_order").page_order(buffer, tables, list(policies), 300)
+    page = module("support.page_order").page_order(buffer, tables, list(policies), 300)
     assert page.method == "linear"
     assert not page.estimates["below"].supported
     assert page.places["below"] == 3

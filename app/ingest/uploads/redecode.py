@@ -119,7 +119,7 @@ def _decoded(db: Session, file: UploadFile, participant: Participant) -> Decoded
     assert file.stored_sha256 is not None
     path = files.path_of(file.stored_sha256)
     if not path.exists() or files.hash_file(path)[0] != file.stored_sha256:
-        raise files.MissingFile(f"stored bytes {file.stored_sha256[:12]} are missing or damaged: restore a backup of the data folder")
+        raise files.MissingFile(f"The stored file {file.stored_sha256} is missing or damaged.")
     said = db.get_one(Upload, file.upload_id).stated
     beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
     decoded = formats.decode(path, cast(FileKind, file.kind), decode_options(participant, beta), name=file.name)

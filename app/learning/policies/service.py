@@ -35,7 +35,18 @@ UPLOAD_LIMIT = MAX_FILE_BYTES
 def window_of(policy: Policy) -> int:
     """W that a policy takes: what an uploaded one was tried with, else what its file says."""
     own = policy.config.get("window") if policy.kind == "external" else None
-    return int(own) if own else OnnxPolicy(files.read(policy.onnx_sha256)).window
+    return int(own) if own else OnnxPolicy(onnx_of(policy)).window
+
+
+def onnx_of(policy: Policy) -> bytes:
+    """The stored ONNX file of a policy. Raises Invalid, naming the policy, where it is missing or damaged."""
+    try:
+        return files.read(policy.onnx_sha256)
+    except files.MissingFile as error:
+        raise Invalid(
+            f"The stored file of policy '{policy.name}' is missing or damaged.",
+            "Ask your administrator to restore it from a backup of the data folder, or leave the policy out or retire it.",
+        ) from error
 
 
 def require_window(policy: Policy, window: int) -> None:

@@ -95,7 +95,7 @@ def _page(
         sides=sides,
         device=bundles.device_limits(db, participant, None),
         releases=repository.releases(db, policy.id),
-        may_state=bundles.may_state(participant, caller),
+        may_take=bundles.may_take(participant, caller),
         key=bundles.public_key(),
         problem=error.problem(request.url.path) if error else None,
         **facts,

@@ -16,13 +16,13 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import repository as learning
 from app.learning.models import BufferSnapshot, Policy
-from app.learning.policies.service import probe_windows
+from app.learning.policies.service import onnx_of, probe_windows
 from app.planning import wording
 from app.planning.bundles import repository
 from app.planning.bundles.models import BundleRelease
 from app.platform import files
 from app.platform.database import set_reason
-from app.platform.errors import Forbidden, Invalid
+from app.platform.errors import Invalid
 from app.settings import get_settings
 from app.study import cdbs_amplitude
 from app.study import repository as study_repository
@@ -78,13 +78,12 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
     Raises:
         NotFound: the policy is another participant's.
         Invalid: the cDBS amplitude or the unit of beta is not known, limits that contradict each other, or leave the stimulator's own.
-        Forbidden: limits stated by somebody who may only read.
+        Forbidden: the caller may only read.
     """
-    if limits.stated and not may_state(participant, caller):
-        raise Forbidden("You may not state the limits of a bundle.", "Ask a clinician or an engineer of the study.")
+    study.require(caller, can.TAKE_BUNDLES, participant)
     manifest, windows = _manifest(db, participant, policy, limits, hemisphere, caller)
     try:
-        content = build_bundle(files.read(policy.onnx_sha256), manifest, windows)
+        content = build_bundle(onnx_of(policy), manifest, windows)
     except (BundleError, PolicyFileError) as error:
         raise _unmade(policy, error) from error
     signed = sign(content, signing_key())
@@ -109,17 +108,17 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
 def preview(
     db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
 ) -> BundleManifest:
-    """What the bundle would say of itself, all but its files; nothing is stored. Raises as `bundle` does."""
+    """What the bundle would say of itself, all but its files; nothing is stored. Raises as `bundle` does, but whoever reads may look."""
     manifest, windows = _manifest(db, participant, policy, limits, hemisphere, caller)
     try:
-        return describe(files.read(policy.onnx_sha256), manifest, windows)
+        return describe(onnx_of(policy), manifest, windows)
     except (BundleError, PolicyFileError) as error:
         raise _unmade(policy, error) from error
 
 
-def may_state(participant: Participant, caller: Caller) -> bool:
-    """Whether somebody may state the limits of a bundle: those who may write into the study."""
-    return caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site.id)
+def may_take(participant: Participant, caller: Caller) -> bool:
+    """Whether somebody may take a bundle and state its limits."""
+    return study.may(caller, can.TAKE_BUNDLES, participant)
 
 
 def device_limits(db: Session, participant: Participant, hemisphere: Hemisphere | None) -> DeviceLimits | None:

@@ -110,10 +110,8 @@ def test_a_server_error_has_every_header_and_logs_no_values(
     sign_in: Callable[[str], TestClient],
     capsys: pytest.CaptureFixture[str],  # type: ignore[no-untyped-def]
 ) -> None:
-    import structlog
     from sqlalchemy import text
 
-    from app.platform import logs
     from app.platform.database import new_session
 
     patient = "-".join(("NAME", "OF", "PATIENT"))  # put together, for a traceback quotes lines of source
@@ -123,11 +121,7 @@ def test_a_server_error_has_every_header_and_logs_no_values(
         with new_session() as db:
             db.execute(text("select 1 / cast(:zero as integer), cast(:name as text)"), {"zero": 0, "name": patient})
 
-    logs.configure()
-    try:
-        answer = TestClient(service_app, raise_server_exceptions=False).get("/broken")
-    finally:
-        structlog.reset_defaults()
+    answer = TestClient(service_app, raise_server_exceptions=False).get("/broken")
     assert answer.status_code == 500
     assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
     assert answer.headers["X-Content-Type-Options"] == "nosniff"

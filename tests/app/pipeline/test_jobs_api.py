@@ -13,7 +13,9 @@ from app.accounts.permissions import SYSTEM
 from app.evaluation.estimates.methods import quick_methods
 from app.evaluation.schemas import EvaluateParams
 from app.evaluation.service import policies_to_rank
+from app.learning.models import Policy
 from app.learning.policies.baselines import constant_onnx
+from app.platform import files
 from app.study.repository import participant_by_code
 from ml.ope.registry import method_keys
 
@@ -49,6 +51,24 @@ def test_no_job_starts_without_a_usable_session(client: TestClient, enrolled: st
     answer = client.post(JOBS, json={"kind": "train"})
     assert answer.status_code == 422
     assert "no session that can enter a replay buffer" in answer.json()["detail"]
+    assert client.get(JOBS).json()["total"] == 0
+
+
+@pytest.mark.parametrize("window", [{"window": 10}, {}], ids=["window on its row", "window in its file"])
+@pytest.mark.parametrize("named", [False, True], ids=["every policy", "a named policy"])
+def test_no_evaluation_starts_where_a_policy_s_file_is_missing(
+    client: TestClient, upload: Upload, db: Session, named: bool, window: dict[str, int]
+) -> None:
+    upload("random")
+    policy = db.get_one(Policy, add_policy(client))
+    policy.config = window
+    db.commit()
+    files.path_of(policy.onnx_sha256).unlink()
+    answer = client.post(JOBS, json={"kind": "evaluate"} | ({"policies": [policy.id]} if named else {}))
+    assert answer.status_code == 422
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert "policy 'ext' is missing or damaged" in answer.json()["detail"]
+    assert "backup" in answer.json()["hint"]
     assert client.get(JOBS).json()["total"] == 0
 
 

@@ -44,6 +44,43 @@ def test_without_bias_and_skew_bca_is_the_percentile_interval():
     assert (bca.low, bca.high) == pytest.approx((percentile.low, percentile.high), abs=2e-3)
 
 
+@pytest.mark.parametrize("scale", [2.0**-500, 2.0**500, 2.0**1000], ids=["tiny", "huge", "near the largest number"])
+def test_intervals_have_no_unit_however_large_the_values(scale):
+    values = np.random.default_rng(2).exponential(size=40)
+
+    def means(unit, method):
+        return session_bootstrap(lambda i: float((values[i] * unit).mean()), 40, draws=500, method=method)
+
+    for method in ("bca", "percentile"):
+        plain, scaled = means(1.0, method), means(scale, method)
+        assert scaled.method == method
+        assert (scaled.low, scaled.high) == (plain.low * scale, plain.high * scale)
+        assert scaled.standard_error == pytest.approx(plain.standard_error * scale, rel=1e-12)
+
+
+def test_a_correction_that_reverses_gives_the_percentile_interval_and_says_so():
+    draws = np.linspace(0.0, 1.0, 10**5)
+    # every draw lies below the estimate, and one session of 500 carries all of it: bias 4.4, acceleration 0.17
+    one_of_many = np.append(np.ones(499), 0.0)
+    assert bca_interval(draws, 2.0, one_of_many, 0.8).method == "bca"
+    reversed_at = bca_interval(draws, 2.0, one_of_many, 0.999)
+    assert reversed_at == percentile_interval(draws, 0.999)
+    assert reversed_at.method == "percentile"
+
+
+@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan])
+def test_values_that_are_not_finite_have_no_interval(bad):
+    draws = np.arange(5.0)
+    for call in (
+        lambda: percentile_interval(np.append(draws, bad), 0.9),
+        lambda: bca_interval(np.append(draws, bad), 0.0, draws, 0.9),
+        lambda: bca_interval(draws, bad, draws, 0.9),
+        lambda: bca_interval(draws, 0.0, np.append(draws, bad), 0.9),
+    ):
+        with pytest.raises(ValueError, match="finite"):
+            call()
+
+
 def test_levels_outside_zero_and_one_and_empty_data_are_refused():
     with pytest.raises(ValueError, match="between 0 and 1"):
         percentile_interval(np.zeros(3), 1.0)

@@ -15,6 +15,7 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.learning.models import Policy
 from app.planning.bundles.repository import releases
 from app.planning.bundles.service import approvals, device_limits
 from app.platform import files
@@ -193,15 +194,33 @@ def test_the_same_bundle_taken_twice_stands_twice_in_the_audit_trail(client: Tes
     assert db.query(AuditEvent).filter(AuditEvent.entity == "stored_file", AuditEvent.reason.like("controller bundle%")).count() == 2
 
 
-def test_who_may_only_read_states_no_limits(client_as: Any, policy: int) -> None:
+def test_who_may_only_read_takes_no_bundle_and_leaves_no_trace(client_as: Any, policy: int, db: Session) -> None:
     viewer = client_as("viewer")
-    assert take(viewer, policy).status_code == 200
+    assert take(viewer, policy).status_code == 403
     assert take(viewer, policy, max_ma=3.2).status_code == 403
     page = viewer.get(f"/participants/P1/policies/{policy}/bundle")
     assert page.status_code == 200
     assert 'name="max_ma"' not in page.text
     typed = {"min_ma": "0.5", "max_ma": "3", "ramp_ma_per_s": "0.25"}
     assert viewer.post(f"/participants/P1/policies/{policy}/bundle", data=typed).status_code == 403
+    assert releases(db, policy) == []
+    for role in ("clinician", "engineer"):
+        assert take(client_as(role), policy, max_ma=3.2).status_code == 200
+    assert {release.created_by for release in releases(db, policy)} == {"clinician@clinic.example", "engineer@clinic.example"}
+
+
+@pytest.mark.parametrize("harm", ["missing", "damaged"])
+def test_a_policy_whose_stored_file_is_gone_is_named(client: TestClient, policy: int, db: Session, harm: str) -> None:
+    path = files.path_of(db.get_one(Policy, policy).onnx_sha256)
+    path.unlink() if harm == "missing" else path.write_bytes(b"other bytes")
+    answer = take(client, policy)
+    assert answer.status_code == 422
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert "policy 'lyon' is missing or damaged" in answer.json()["detail"]
+    assert "backup" in answer.json()["hint"]
+    page = client.get(f"/participants/P1/policies/{policy}/bundle")
+    assert page.status_code == 200
+    assert "is missing or damaged" in page.text
 
 
 def test_a_plain_network_made_elsewhere_leaves_with_its_c_header_and_the_page_says_why_another_does_not(

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from figure import draw
-from ope_scores import Told, over_worlds, scores_of_tests, signs, world_scores
+
+from .figure import draw
+from .ope_scores import Told, over_worlds, scores_of_tests, signs, world_scores
 
 DESIGNS = ("stratified", "paper")
 ORACLES = ("days alone", "tested")

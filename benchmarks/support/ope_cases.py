@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from ope_policies import fixed_policies
-from simulators import WORLDS as SIMULATORS
 
 from ml.policies.policy import ConstantPolicy, Policy
 from ml.population.virtual import Truth, is_responder, simple_policies, world
 from ml.population.virtual.world import STEPS, VISITS, visit_plan
 from ml.trajectories import ReplayBuffer
+
+from .ope_policies import fixed_policies
+from .simulators import WORLDS as SIMULATORS
 
 CDBS, MATCHED = "cDBS", "matched constant"
 DESIGNS = ("stratified", "paper")

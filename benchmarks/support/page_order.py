@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.evaluation.estimates.choice import choose, combined, widened
-from app.evaluation.estimates.methods import AGGREGATE
 from ml.ope.compare.ranking import rank_policies
 from ml.ope.compare.skill import choose_default
 from ml.ope.estimate import Estimate
-from ml.ope.registry import quick_estimators
+from ml.ope.registry import AGGREGATE, quick_estimators
 from ml.trajectories import ReplayBuffer
 
 NEEDED = tuple(quick_estimators())

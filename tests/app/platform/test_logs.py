@@ -1,0 +1,66 @@
+"""What is logged of an error: where it was raised, and no value of any variable."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import structlog
+import typer
+from fastapi.testclient import TestClient
+
+from app import cli
+from app.main import create_app
+from app.platform import logs
+from app.settings import get_settings
+
+PATIENT = "-".join(("NAME", "OF", "PATIENT"))  # put together, for a traceback quotes lines of source
+
+
+@pytest.fixture(autouse=True)
+def as_libraries_have_it() -> Iterator[None]:
+    """Logging as it is before betaloop has set it up; set up as for every other test at the end."""
+    structlog.reset_defaults()
+    yield
+    get_settings.cache_clear()
+    logs.configure_own()
+
+
+def fail() -> None:
+    named = PATIENT
+    raise ValueError(f"a name of {len(named)} letters")
+
+
+@pytest.mark.parametrize("as_json", [False, True], ids=["text", "json"])
+def test_a_service_logs_an_error_with_a_plain_traceback(
+    as_json: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("BETALOOP_LOG_JSON", str(as_json))
+    get_settings.cache_clear()
+    service = create_app()
+    service.get("/broken")(fail)
+    answer = TestClient(service, raise_server_exceptions=False).get("/broken")
+    assert answer.status_code == 500
+    printed = capsys.readouterr()
+    assert "a name of 15 letters" in printed.err
+    assert "in fail" in printed.err
+    assert PATIENT not in printed.out + printed.err
+    assert printed.err.lstrip().startswith("{") == as_json
+
+
+def test_a_command_logs_an_error_with_a_plain_traceback(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    commands = typer.Typer()
+
+    @commands.command()
+    def read() -> None:
+        try:
+            fail()
+        except ValueError:
+            structlog.get_logger().exception("could not be read")
+
+    monkeypatch.setattr(cli, "_end_in_order_on_signals", lambda: None)
+    monkeypatch.setattr(cli, "app", lambda **_: commands([], standalone_mode=False))
+    cli.main()
+    printed = capsys.readouterr()
+    assert "in fail" in printed.err
+    assert PATIENT not in printed.out + printed.err
