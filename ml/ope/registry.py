@@ -81,6 +81,7 @@ def unregister(key: str) -> None:
 for _method in (
     Method(key="dlsm", name="DLSM", short="DLSM", family="model", needs="four sessions", factory="ml.ope.dlsm.estimator:build", quick=True, preference=2, weight=6.0, colour="rl", symbol="diamond"),  # noqa: E501
     Method(key="linear", name="Linear model", short="Linear", family="model", needs="two sessions", factory="ml.ope.linear.estimator:build", held_out=True, quick=True, preference=1, weight=2.0, colour="distilled", symbol="square"),  # noqa: E501
+    Method(key="impulse", name="Impulse-response model", short="Impulse", family="model", needs="two sessions", factory="ml.ope.impulse.estimator:build", weight=2.0, colour="good", symbol="hourglass"),  # noqa: E501
     Method(key="dlmm", name="DLMM", short="DLMM", family="model", needs="two sessions", factory="ml.ope.dlmm:build", weight=3.0, colour="accent", symbol="hexagram"),  # noqa: E501
     Method(key="fqe", name="Fitted Q evaluation", short="FQE", family="value", needs=_START, factory="ml.ope.fqe.estimator:build", held_out=True, quick=True, preference=3, colour="cdbs", symbol="circle"),  # noqa: E501
     Method(key="wdr", name="Weighted doubly robust", short="WDR", family="value", needs=_START, factory="ml.ope.doubly_robust:build", held_out=True, quick=True, preference=4, weight=2.0, colour="no_dbs", symbol="cross"),  # noqa: E501

@@ -79,8 +79,11 @@ class MixedModel:
         ratios = np.array(points, dtype=np.float64).reshape(len(points), len(names))
         logs, means, factors, squares = problem.solve(ratios)
         weights = np.exp(logs - logs.max())
+        # every point stands for a cell of the grid, whose volume in log lambda is the product of its axes' spacings
+        cell = float(np.sum([np.log(max(np.log(axis.max() / axis.min()), 1e-9) / max(len(np.unique(axis)) - 1, 1)) for axis in axes]))
+        log_evidence = float(logs.max() + np.log(weights.sum()) + cell)
         weights /= weights.sum()
-        return MixedFit(tuple(names), best, ratios, weights, means, factors, squares, problem.degrees)
+        return MixedFit(tuple(names), best, ratios, weights, means, factors, squares, problem.degrees, log_evidence)
 
     def restricted(self, sums: Sums) -> RestrictedFit:
         """Coefficients and their covariance at the lambdas of the largest restricted likelihood, without a prior of them.
@@ -110,6 +113,8 @@ class MixedFit:
         ratios: lambdas, [K, G]. weights: posterior weight of each combination, [K].
         means: coefficients, [K, q]. factors: L with L L^T the covariance over sigma^2, [K, q, q].
         squares: residual sum of squares with its penalty, [K]. degrees: of freedom.
+        log_evidence: log of the restricted likelihood averaged over the lambdas' prior, up to a constant that is the same for designs of
+            the same rows and the same columns that are not shrunk.
     """
 
     groups: tuple[str, ...]
@@ -120,6 +125,7 @@ class MixedFit:
     factors: Floats
     squares: Floats
     degrees: int
+    log_evidence: float
 
     @property
     def coefficients(self) -> Floats:

@@ -57,6 +57,14 @@ INTENDED: dict[str, str] = {
         ),
         "flags of estimates, rankings, plans and of what the data cover are objects `{code, value, limit, unit, text}`",
     ),
+    **dict.fromkeys(
+        (
+            "components > schemas > EvaluateJob > properties > methods",
+            "components > schemas > PipelineJob > properties > methods",
+            "paths > /api/v1/participants/{code}/ranking > get > parameters > query method",
+        ),
+        "Evaluation: a further method by name, `impulse`",
+    ),
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",
     "components > schemas > JobOut > required": "API: a job has `seconds_left`.",
 }

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.fqe.steps import fresh_memory, held_amplitude, memories
+from ml.ope.fqe.steps import fresh_memory, held_amplitude, memories, remember
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedFit, MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -100,10 +100,33 @@ class Dynamics:
             found.append(np.where(table.usable, (eta[:, self.phi.size :] - expected) / scale, np.nan))
         return found
 
+    def response(self, first: Floats, steps: int) -> LinearResponse:
+        """The answer to amplitudes that come step by step, as if the first [P, D, n] had been on before."""
+        return LinearResponse(self.beta, first)
+
+    def usual_lead(self) -> Floats:
+        """Standardised beta of each session under the mean of the random amplitudes, [n]: where the window before it is not known."""
+        return np.asarray(self.levels[0] + self.beta[0, 0] * 0.65, dtype=np.float64)
+
     def _expected(self, eta: Floats) -> Floats:
         """E[eta_t | its past], [D, T], from eta [D, W + T]."""
         windows = np.lib.stride_tricks.sliding_window_view(eta, self.phi.size, axis=1)[:, :-1]
         return np.asarray(windows @ self.phi[::-1], dtype=np.float64)
+
+
+class LinearResponse:
+    """The answer of beta to amplitudes [P, D, n] as they come, with coefficients [D, 7]."""
+
+    def __init__(self, beta: Floats, first: Floats) -> None:
+        self._beta, self._shape, self._memory = beta, first.shape, fresh_memory(first.ravel())
+        self._started = False
+
+    def step(self, a: Floats) -> Floats:
+        """Answer [P, D, n] once the amplitudes a [P, D, n] are in force; the first call's are those it was made with."""
+        if self._started:
+            self._memory = remember(self._memory, a.ravel())
+        self._started = True
+        return np.einsum("pdnj,dj->pdn", answers(a.ravel(), self._memory).reshape(*self._shape, -1), self._beta)
 
 
 def fit_dynamics(buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: int, seed: int) -> tuple[Dynamics, Dynamics]:
@@ -121,11 +144,13 @@ def fit_dynamics(buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: in
     for _ in range(TURNS):
         fit = _mixed(tables, own, phi)
         beta, levels = _split(fit.coefficients[None], own)
-        phi = _autoregression(tables, beta[0], levels[0], window)
+        phi = autoregression(_residuals(tables, beta[0], levels[0]), [t.usable for t in tables], window)
     fit = _mixed(tables, own, phi)
     beta, levels = _split(fit.coefficients[None], own)
     shares = {name: fit.share(name) for name in ("visit", "session")}
-    mean = Dynamics(phi, beta, levels, _noise(tables, beta[0], levels[0], phi), shares)
+    usable, amplitudes = [t.usable for t in tables], [t.amplitude for t in tables]
+    noise = log_noise_weights(_residuals(tables, beta[0], levels[0]), [t.beta for t in tables], amplitudes, usable, phi)
+    mean = Dynamics(phi, beta, levels, noise, shares)
     drawn = _split(fit.draws(draws, np.random.default_rng([seed, 0xD7A])), own)
     return mean, Dynamics(phi, *drawn, mean.noise_weights, shares)
 
@@ -142,9 +167,9 @@ def _mixed(tables: Sequence[SessionTable], own: Floats, phi: Floats) -> MixedFit
     rest, q = 1 - float(phi.sum()), 1 + ANSWERS + visits + n
     gram, moment, square, rows = np.zeros((q, q)), np.zeros(q), 0.0, 0
     for i, table in enumerate(tables):
-        y = _filtered(table.beta[:, None], phi)[table.usable, 0]
+        y = filtered(table.beta[:, None], phi)[table.usable, 0]
         level = np.concatenate([own[i], np.arange(n) == i]) * rest
-        x = np.concatenate([np.full((y.size, 1), rest), _filtered(table.answers, phi)[table.usable], np.tile(level, (y.size, 1))], axis=1)
+        x = np.concatenate([np.full((y.size, 1), rest), filtered(table.answers, phi)[table.usable], np.tile(level, (y.size, 1))], axis=1)
         gram, moment, square, rows = gram + x.T @ x, moment + x.T @ y, square + float(y @ y), rows + y.size
     first = 1 + ANSWERS
     groups = {
@@ -163,33 +188,36 @@ def _split(coefficients: Floats, own: Floats) -> tuple[Floats, Floats]:
     return coefficients[:, 1:first], coefficients[:, :1] + visits @ own.T + coefficients[:, first + own.shape[1] :]
 
 
-def _filtered(values: Floats, phi: Floats) -> Floats:
+def filtered(values: Floats, phi: Floats) -> Floats:
     """v_t - sum over l of phi_l v_{t-l}, [T, k], from values [W + T, k]; NaN where one of them is."""
     windows = np.lib.stride_tricks.sliding_window_view(values, phi.size, axis=0)[:-1]
     return np.asarray(values[phi.size :] - windows @ phi[::-1], dtype=np.float64)
 
 
-def _autoregression(tables: Sequence[SessionTable], beta: Floats, levels: Floats, window: int) -> Floats:
-    """phi [W] by least squares on what levels and answers leave, its roots kept inside `LARGEST_ROOT`."""
+def autoregression(residuals: Sequence[Floats], usable: Sequence[NDArray[np.bool_]], window: int) -> Floats:
+    """phi [W] by least squares on what levels and answers leave of each session, [W + T], its roots kept inside `LARGEST_ROOT`."""
     gram, moment = 1.0 * np.eye(window), np.zeros(window)
-    for i, table in enumerate(tables):
-        eta = table.beta - table.answers @ beta - levels[i]
-        x = np.lib.stride_tricks.sliding_window_view(eta, window)[:-1][table.usable]
-        gram, moment = gram + x.T @ x, moment + x.T @ eta[window:][table.usable]
+    for eta, steps in zip(residuals, usable, strict=True):
+        x = np.lib.stride_tricks.sliding_window_view(eta, window)[:-1][steps]
+        gram, moment = gram + x.T @ x, moment + x.T @ eta[window:][steps]
     phi = np.asarray(np.linalg.solve(gram, moment)[::-1], dtype=np.float64)
     root = largest_root(phi)
     kappa = min(1.0, LARGEST_ROOT / root) if root > 0 else 1.0
     return np.asarray(phi * kappa ** np.arange(1, window + 1), dtype=np.float64)
 
 
-def _noise(tables: Sequence[SessionTable], beta: Floats, levels: Floats, phi: Floats) -> Floats:
-    """Weights of the log scale of innovations, [3]."""
+def log_noise_weights(
+    residuals: Sequence[Floats], betas: Sequence[Floats], amplitudes: Sequence[Floats], usable: Sequence[NDArray[np.bool_]], phi: Floats
+) -> Floats:
+    """Weights of the log scale of innovations, [3], from what levels and answers leave of each session, [W + T]."""
     designs, logs = [], []
-    for i, table in enumerate(tables):
-        eta = (table.beta - table.answers @ beta - levels[i])[:, None]
-        innovation = _filtered(eta, phi)[table.usable, 0]
-        predicted = table.beta[phi.size :][table.usable] - innovation
-        designs.append(noise_features(table.amplitude[table.usable], predicted))
+    for eta, beta, amplitude, steps in zip(residuals, betas, amplitudes, usable, strict=True):
+        innovation = filtered(eta[:, None], phi)[steps, 0]
+        designs.append(noise_features(amplitude[steps], beta[phi.size :][steps] - innovation))
         logs.append(np.log(np.maximum(np.abs(innovation), 1e-6)))
     design, target = np.concatenate(designs), np.concatenate(logs)
     return np.asarray(np.linalg.solve(design.T @ design + np.diag([1e-6, 10.0, 10.0]), design.T @ target), dtype=np.float64)
+
+
+def _residuals(tables: Sequence[SessionTable], beta: Floats, levels: Floats) -> list[Floats]:
+    return [table.beta - table.answers @ beta - levels[i] for i, table in enumerate(tables)]

@@ -8,10 +8,10 @@ is that of the replayed beta, never of its mean. The dynamics are in `linear_dyn
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from ml.mdp import step_reward
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS
-from ml.ope.fqe.steps import fresh_memory, remember
-from ml.ope.linear.dynamics import Dynamics, SessionTable, answers, fit_dynamics, largest_root, noise_features
+from ml.ope.linear.dynamics import SessionTable, fit_dynamics, largest_root, noise_features
 from ml.ope.linear.end_outcomes import EndModel, fit_end_model, summarise
 from ml.ope.linear.held_out import replay_skill
 from ml.ope.observed import MeanOverDays, mean_over_days
@@ -36,6 +35,40 @@ Floats = NDArray[np.float64]
 
 BEYOND = 0.25
 """Replayed beta may leave the logged range by this share of it."""
+
+
+class Response(Protocol):
+    """The answer of beta to amplitudes [P, D, n] as they come."""
+
+    def step(self, a: Floats) -> Floats:
+        """Answer [P, D, n] once the amplitudes a are in force."""
+
+
+class Replayable(Protocol):
+    """A model of beta that sessions can be replayed in; D sets of coefficients, n sessions.
+
+    Attributes:
+        phi: autoregression of what answer and level leave, [W]. levels: of the sessions, [D, n].
+        noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
+        shares: lambda / (1 + lambda) of the visits' and the sessions' levels.
+    """
+
+    @property
+    def phi(self) -> Floats: ...
+    @property
+    def levels(self) -> Floats: ...
+    @property
+    def noise_weights(self) -> Floats: ...
+    @property
+    def shares(self) -> dict[str, float]: ...
+    def innovations(self, tables: Sequence[Any]) -> list[Floats]:
+        """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
+
+    def response(self, first: Floats, steps: int) -> Response:
+        """The answer to amplitudes that come step by step, as if the first [P, D, n] had been on before."""
+
+    def usual_lead(self) -> Floats:
+        """Standardised beta of each session, [n], where the window before it is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,9 +138,9 @@ class FittedLinear:
     config: LinearConfig
     buffer: ReplayBuffer
     scale: Scale
-    tables: tuple[SessionTable, ...]
-    main: Dynamics
-    drawn: Dynamics
+    tables: tuple[Any, ...]
+    main: Replayable
+    drawn: Replayable
     end: EndModel
     ends: EndModel
     skill: float | None
@@ -123,28 +156,28 @@ class FittedLinear:
         spread = self.replay(chosen, self.drawn, self.ends, horizon)
         report(1.0, "replaying sessions in the linear model")
         visits = np.array([s.visit for s in self.buffer.sessions])
-        days = mean_over_days(self._returns(main)[:, 0], visits, self.drawn.beta.shape[0], self.config.seed)
+        days = mean_over_days(self._returns(main).mean(1), visits, len(self.drawn.levels), self.config.seed)
         support = AmplitudeSupport(self.buffer)
         return {n: self._estimate(i, p, main, spread, days, support, horizon) for i, (n, p) in enumerate(policies.items())}
 
-    def replay(self, policies: list[Policy], dynamics: Dynamics, end: EndModel, horizon: int) -> Replayed:
+    def replay(self, policies: list[Policy], dynamics: Replayable, end: EndModel, horizon: int) -> Replayed:
         """Every session under every policy with every set of coefficients."""
-        p, d, n, w = len(policies), len(dynamics.beta), len(self.tables), self.buffer.settings.window
+        p, d, n, w = len(policies), len(dynamics.levels), len(self.tables), self.buffer.settings.window
         noise = self._innovations(dynamics, horizon)  # [D, n, H]
-        level, beta = dynamics.levels, dynamics.beta
+        level = dynamics.levels
         lead = np.stack([t.beta[:w] for t in self.tables])
-        lead = np.where(np.isfinite(lead), lead, (dynamics.levels[:1] + dynamics.beta[:1, :1] * 0.65).T)
+        lead = np.where(np.isfinite(lead), lead, dynamics.usual_lead()[:, None])
         window = np.broadcast_to(lead, (p, d, n, w)).copy()
         eta = np.empty((p, d, n, w))
         low, high = self.scale.beta(np.array([self.scale.beta_low, self.scale.beta_high]))
         low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
         betas, actions = np.empty((horizon, p, d, n)), np.empty((horizon, p, d, n))
-        memory: Floats | None = None
+        response: Response | None = None
         for t in range(horizon):
             raw = self.scale.raw_beta(window)
             a = np.stack([policy.act(raw[k].reshape(-1, w)).reshape(d, n) for k, policy in enumerate(policies)])
-            memory = fresh_memory(a.ravel()) if memory is None else remember(memory, a.ravel())
-            rest = np.einsum("pdnj,dj->pdn", answers(a.ravel(), memory).reshape(p, d, n, -1), beta) + level
+            response = response or dynamics.response(a, horizon)
+            rest = response.step(a) + level
             if t == 0:
                 eta[:] = window - rest[..., None]
             predicted = rest + eta @ dynamics.phi[::-1]
@@ -155,7 +188,7 @@ class FittedLinear:
             betas[t], actions[t] = self.scale.raw_beta(newest), a
         return self._replayed(np.moveaxis(betas, 0, -1), np.moveaxis(actions, 0, -1), end)
 
-    def _innovations(self, dynamics: Dynamics, horizon: int) -> Floats:
+    def _innovations(self, dynamics: Replayable, horizon: int) -> Floats:
         """Standardised innovations of every session over the horizon, [D, n, H].
 
         Steps that a session lacks take a known one of the same session, or of any session where it has none.
@@ -163,7 +196,7 @@ class FittedLinear:
         found = dynamics.innovations(self.tables)
         rng = np.random.default_rng([self.config.seed, 0x5E55])
         every = np.concatenate([f[:, np.isfinite(f[0])] for f in found], axis=1)
-        noise = np.empty((len(dynamics.beta), len(found), horizon))
+        noise = np.empty((len(dynamics.levels), len(found), horizon))
         for i, own in enumerate(found):
             known = np.flatnonzero(np.isfinite(own[0]))
             source, pick = (own, known) if known.size else (every, np.arange(every.shape[1]))
@@ -191,27 +224,27 @@ class FittedLinear:
     ) -> Estimate:
         weights = days.weights
         with_end = self.end.seen[0]
-        step = float(main.step_return[i, 0] @ weights)
-        end = float(main.outcomes[i, 0, :, 0] @ weights) if with_end else None
+        step = float(main.step_return[i].mean(0) @ weights)
+        end = float(main.outcomes[i, :, :, 0].mean(0) @ weights) if with_end else None
         value = step + (end or 0.0)
         model = self._returns(spread)[i] @ weights
         model = model - model.mean()
         # Every pair of a draw of the model and a draw of the days: what is common to all policies widens the interval, but is no part of
         # the kept draws.
         interval = percentile_interval(np.add.outer(model, days.common + days.own[i]).ravel() + value, LEVEL)
-        logged, simulated = support.of_policy(policy), support.look(main.actions[i, 0, :, :: max(1, horizon // 50)])
+        logged, simulated = support.of_policy(policy), support.look(main.actions[i, :1, :, :: max(1, horizon // 50)])
         flags = list(flags_of(logged, simulated))
         if not with_end:
             flags.append(FEW_END_REWARDS)
         flags += [days.unknown] if days.unknown else []
         predicted = {
-            "energy": float(main.energy[i, 0] @ weights),
-            "mean_amplitude": float(main.amplitude[i, 0] @ weights),
-            "mean_beta": float(main.beta[i, 0] @ weights),
+            "energy": float(main.energy[i].mean(0) @ weights),
+            "mean_amplitude": float(main.amplitude[i].mean(0) @ weights),
+            "mean_beta": float(main.beta[i].mean(0) @ weights),
         }
         for j, name in enumerate(OUTCOMES):
             if name != "r_end" and self.end.seen[j]:
-                predicted[name] = float(main.outcomes[i, 0, :, j] @ weights)
+                predicted[name] = float(main.outcomes[i, :, :, j].mean(0) @ weights)
         return Estimate(
             method=self.method,
             value=value,

@@ -1,0 +1,317 @@
+"""Beta's response to the amplitude as an impulse response behind a dose shape, averaged over shapes and time scales by their evidence.
+
+    y_t = mu + visit + session + sum over k of g_k f(a_{t-k}) + eta_t,    eta_t = sum over l <= W of phi_l eta_{t-l} + e_t
+
+y is standardised (log) beta, f one of `SHAPES` with f(0) = 0 and f(1) = 1 (a Hammerstein model). The impulse response g is constant
+over each of `EDGES`' stretches of lags and has the stable-spline prior of first order, cov(g_i, g_j) = c alpha^max(i, j) (Pillonetto and De
+Nicolao 2010; Chen, Ohlsson and Ljung 2012): smooth, and fading with a time constant that alpha states, plus an immediate answer g_0 of its
+own size. Which shape and which alpha the data ask for is weighed by the marginal likelihood and not chosen: where amplitudes that were held
+only briefly cannot tell a slow answer from none, the draws hold both, and the interval of a sustained dose shows it. Levels of visits and
+sessions are random effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.ope.fqe.steps import held_amplitude
+from ml.ope.linear.dynamics import autoregression, filtered, log_noise_weights, noise_features
+from ml.ope.scale import Scale
+from ml.statistics.mixed import MixedFit, MixedModel, Sums
+from ml.trajectories import ReplayBuffer, SessionTrajectory
+
+Floats = NDArray[np.float64]
+
+EDGES = (0, 1, 2, 3, 4, 6, 9, 13, 19, 27, 39, 56, 81, 116, 166)
+"""First lag of every stretch of lags over which the impulse response is constant, and the lag at which it ends, steps."""
+STRETCHES = len(EDGES) - 1
+MEMORY = EDGES[-1]
+
+ALPHAS = (0.5, 0.75, 0.88, 0.94, 0.97, 0.985, 0.993)
+"""Decay per step of the prior's variance: time constants of 1.4 to 142 steps."""
+
+SHAPES = ("line", "hill", "threshold", "late")
+TURNS = 3
+FEWEST_WEIGHT = 1e-3
+"""Combinations below this share of the evidence are left out of the draws."""
+
+
+def dose(shape: str, a: Floats) -> Floats:
+    """f(a) of a dose shape for amplitude fractions a; 0 at 0 and 1 at 1."""
+    if shape == "line":
+        return a
+    if shape == "hill":
+        return np.asarray(a * 1.3 / (a + 0.3), dtype=np.float64)
+    if shape == "threshold":
+        low, high = 1 / (1 + np.exp(6.0)), 1 / (1 + np.exp(-6.0))
+        return np.asarray((1 / (1 + np.exp(-12.0 * (a - 0.5))) - low) / (high - low), dtype=np.float64)
+    if shape == "late":
+        return np.asarray(a**3, dtype=np.float64)
+    raise ValueError(f"there is no dose shape {shape!r}; there are {', '.join(SHAPES)}")
+
+
+@cache
+def prior_root(alpha: float) -> Floats:
+    """R [STRETCHES, STRETCHES + 1] with g = R u, u independent of one variance, where g has the stable-spline prior at `alpha`.
+
+    Columns of the design are means of f over a stretch of lags, so that a coefficient is the sum of the impulse response over the
+    stretch. R R^T is scaled so that the prior variance of the sustained answer, the sum of g, is 1. The last u is the immediate answer's
+    own, whose prior standard deviation is 0.3 of it.
+    """
+    starts, ends = np.array(EDGES[:-1]), np.array(EDGES[1:])
+    lags = np.arange(MEMORY)
+    kernel = alpha ** np.maximum(lags[:, None], lags[None, :])
+    member = (lags[None, :] >= starts[:, None]) & (lags[None, :] < ends[:, None])
+    sums = member.astype(np.float64)
+    covariance = sums @ kernel @ sums.T
+    covariance /= covariance.sum()
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    immediate = np.zeros((STRETCHES, 1))
+    immediate[0] = 0.3
+    return np.concatenate([root, immediate], axis=1)
+
+
+class LaggedMeans:
+    """Means of a signal over every stretch of lags, step by step, for rows side by side; before its start it has its first value."""
+
+    def __init__(self, first: Floats, steps: int) -> None:
+        self._sums = np.empty((MEMORY + steps + 1, *first.shape))
+        self._sums[: MEMORY + 1] = np.arange(MEMORY + 1).reshape(-1, *([1] * first.ndim)) * first
+        self._now = MEMORY
+
+    def step(self, value: Floats) -> Floats:
+        """Means [..., STRETCHES] with the newest value [...] at lag 0."""
+        self._now += 1
+        self._sums[self._now] = self._sums[self._now - 1] + value
+        at = self._now - np.array(EDGES)
+        return np.moveaxis((self._sums[at[:-1]] - self._sums[at[1:]]) / np.diff(EDGES).reshape(-1, *([1] * value.ndim)), 0, -1)
+
+
+def lagged_means(signal: Floats) -> Floats:
+    """`LaggedMeans` of a whole signal [T], [T, STRETCHES]."""
+    sums = np.concatenate([np.zeros(1), np.cumsum(np.concatenate([np.full(MEMORY, signal[0]), signal]))])
+    now = MEMORY + 1 + np.arange(signal.size)
+    at = now[:, None] - np.array(EDGES)
+    return np.asarray((sums[at[:, :-1]] - sums[at[:, 1:]]) / np.diff(EDGES), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class ResponseTable:
+    """One session, standardised: beta [W + T] with the window before it first, amplitude [T], means over stretches of lags by dose shape
+    [W + T, STRETCHES], usable steps [T].
+    """
+
+    beta: Floats
+    amplitude: Floats
+    means: dict[str, Floats]
+    usable: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, session: SessionTrajectory, scale: Scale) -> ResponseTable:
+        """Tables of a session; before its first step the first amplitude counts as held."""
+        a, window = held_amplitude(session), session.lead_beta.size
+        means = {shape: lagged_means(dose(shape, np.concatenate([np.full(window, a[0]), a]))) for shape in SHAPES}
+        return cls(scale.beta(session.padded_beta), a, means, session.usable())
+
+
+@dataclass(frozen=True)
+class Combination:
+    """One dose shape with one time scale: its share of the evidence and the posterior of its coefficients."""
+
+    shape: str
+    alpha: float
+    weight: float
+    fit: MixedFit
+
+
+@dataclass(frozen=True)
+class ImpulseDynamics:
+    """A fitted model, or draws from its posterior; n sessions, D sets of coefficients.
+
+    Attributes:
+        phi: autoregression of eta on lags 1 ... W, [W].
+        gains: sums of the impulse response over each stretch of lags, [D, STRETCHES].
+        shapes: dose shape of each set, [D] indices of `SHAPES`.
+        levels: mu + visit + session, [D, n].
+        noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
+        evidence: share of every (shape, alpha).
+        shares: lambda / (1 + lambda) of the visits' and the sessions' levels.
+    """
+
+    phi: Floats
+    gains: Floats
+    shapes: NDArray[np.int64]
+    levels: Floats
+    noise_weights: Floats
+    evidence: dict[tuple[str, float], float]
+    shares: dict[str, float]
+
+    @property
+    def sustained(self) -> Floats:
+        """Answer of standardised beta to a dose held for ever, from no stimulation to cDBS, [D]."""
+        return np.asarray(self.gains.sum(1), dtype=np.float64)
+
+    def rest(self, table: ResponseTable) -> Floats:
+        """The part of beta that answers to the amplitude, [D, W + T]."""
+        every = np.stack([table.means[shape] for shape in SHAPES])[self.shapes]
+        return np.einsum("dtk,dk->dt", every, self.gains)
+
+    def innovations(self, tables: Sequence[ResponseTable]) -> list[Floats]:
+        """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
+        found, w = [], self.phi.size
+        for i, table in enumerate(tables):
+            eta = table.beta - self.rest(table) - self.levels[:, i : i + 1]
+            windows = np.lib.stride_tricks.sliding_window_view(eta, w, axis=1)[:, :-1]
+            innovation = eta[:, w:] - windows @ self.phi[::-1]
+            predicted = table.beta[w:] - innovation
+            scale = np.exp(noise_features(np.broadcast_to(table.amplitude, predicted.shape), predicted) @ self.noise_weights)
+            found.append(np.where(table.usable, innovation / scale, np.nan))
+        return found
+
+    def usual_lead(self) -> Floats:
+        """Standardised beta of each session under the mean of the random amplitudes, [n]: where the window before it is not known."""
+        answer = [float(dose(SHAPES[s], np.array([0.65]))[0]) * g for s, g in zip(self.shapes, self.sustained, strict=True)]
+        return np.asarray((self.levels + np.array(answer)[:, None]).mean(0), dtype=np.float64)
+
+    def response(self, first: Floats, steps: int) -> Response:
+        """The answer to amplitudes that come step by step, first [P, D, n] before them."""
+        return Response(self, first, steps)
+
+
+class Response:
+    """The answer of beta to amplitudes [P, D, n] as they come."""
+
+    def __init__(self, dynamics: ImpulseDynamics, first: Floats, steps: int) -> None:
+        self._dynamics = dynamics
+        self._groups = [(SHAPES[s], np.flatnonzero(dynamics.shapes == s)) for s in np.unique(dynamics.shapes)]
+        self._means = [LaggedMeans(dose(shape, first[:, members]), steps) for shape, members in self._groups]
+
+    def step(self, a: Floats) -> Floats:
+        """Answer [P, D, n] once the amplitudes a [P, D, n] are in force."""
+        answer = np.empty_like(a)
+        for (shape, members), means in zip(self._groups, self._means, strict=True):
+            answer[:, members] = np.einsum("pdnk,dk->pdn", means.step(dose(shape, a[:, members])), self._dynamics.gains[members])
+        return answer
+
+
+def fit_impulse(buffer: ReplayBuffer, tables: Sequence[ResponseTable], draws: int, seed: int) -> ImpulseDynamics:
+    """`draws` sets of coefficients from the posterior over shapes, time scales and coefficients.
+
+    Raises:
+        ValueError: fewer than two sessions with usable steps.
+    """
+    with_steps = sum(bool(t.usable.any()) for t in tables)
+    if with_steps < 2:
+        raise ValueError(f"the response model needs at least two sessions with usable steps; the buffer has {with_steps}")
+    window, visits = buffer.settings.window, np.array([s.visit for s in buffer.sessions])
+    own = (visits[:, None] == np.unique(visits)).astype(np.float64)
+    phi = np.zeros(window)
+    best: Combination | None = None
+    for turn in range(TURNS):
+        candidates = ALPHAS if turn == 0 else _beside(best)
+        found = _weighed(tables, own, phi, SHAPES[:1] if turn == 0 else SHAPES[:2], candidates)
+        best = max(found, key=lambda c: c.weight)
+        residual = [_residual(t, best, own, i) for i, t in enumerate(tables)]
+        phi = autoregression(residual, [t.usable for t in tables], window)
+    combinations = _weighed(tables, own, phi, SHAPES, ALPHAS)
+    best = max(combinations, key=lambda c: c.weight)
+    noise = log_noise_weights(
+        [_residual(t, best, own, i) for i, t in enumerate(tables)], [t.beta for t in tables], [t.amplitude for t in tables],
+        [t.usable for t in tables], phi,
+    )  # fmt: skip
+    return _drawn(combinations, own, phi, noise, draws, seed)
+
+
+def _beside(best: Combination | None) -> tuple[float, ...]:
+    k = ALPHAS.index(best.alpha) if best else 0
+    return ALPHAS[max(0, k - 1) : k + 2]
+
+
+def _weighed(
+    tables: Sequence[ResponseTable], own: Floats, phi: Floats, shapes: Sequence[str], alphas: Sequence[float]
+) -> list[Combination]:
+    found: list[tuple[str, float, MixedFit]] = []
+    for shape in shapes:
+        sums = _sums(tables, own, phi, shape)
+        found += [(shape, alpha, _fit(sums, own, alpha)) for alpha in alphas]
+    logs = np.array([fit.log_evidence for _, _, fit in found])
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    return [Combination(s, a, float(w), f) for (s, a, f), w in zip(found, weights, strict=True)]
+
+
+def _sums(tables: Sequence[ResponseTable], own: Floats, phi: Floats, shape: str) -> Sums:
+    """Sums over rows filtered by phi; columns: 1, means over stretches, visits, sessions."""
+    n, visits = len(tables), own.shape[1]
+    rest, q = 1 - float(phi.sum()), 1 + STRETCHES + visits + n
+    gram, moment, square, rows = np.zeros((q, q)), np.zeros(q), 0.0, 0
+    for i, table in enumerate(tables):
+        y = filtered(table.beta[:, None], phi)[table.usable, 0]
+        level = np.concatenate([own[i], np.arange(n) == i]) * rest
+        x = np.concatenate(
+            [np.full((y.size, 1), rest), filtered(table.means[shape], phi)[table.usable], np.tile(level, (y.size, 1))], axis=1
+        )
+        gram, moment, square, rows = gram + x.T @ x, moment + x.T @ y, square + float(y @ y), rows + y.size
+    return Sums(gram, moment, square, rows)
+
+
+def _transform(own: Floats, alpha: float) -> Floats:
+    """Columns of the sums from (1, u, visits, sessions): [q, q + 1]."""
+    root, levels = prior_root(alpha), own.shape[1] + len(own)
+    result = np.zeros((1 + STRETCHES + levels, 1 + root.shape[1] + levels))
+    result[0, 0] = 1.0
+    result[1 : 1 + STRETCHES, 1 : 1 + root.shape[1]] = root
+    result[1 + STRETCHES :, 1 + root.shape[1] :] = np.eye(levels)
+    return result
+
+
+def _fit(sums: Sums, own: Floats, alpha: float) -> MixedFit:
+    change = _transform(own, alpha)
+    moved = Sums(change.T @ sums.gram @ change, change.T @ sums.moment, sums.square, sums.rows)
+    first, visits = 1 + STRETCHES + 1, own.shape[1]
+    groups = {
+        "response": tuple(range(1, first)),
+        "visit": tuple(range(first, first + visits)),
+        "session": tuple(range(first + visits, change.shape[1])),
+    }
+    return MixedModel(change.shape[1], groups, {}).fit(moved)
+
+
+def _split(coefficients: Floats, own: Floats, alpha: float) -> tuple[Floats, Floats]:
+    """Gains [D, STRETCHES] and levels [D, n] from coefficients [D, q + 1]."""
+    root = prior_root(alpha)
+    first = 1 + root.shape[1]
+    visits = coefficients[:, first : first + own.shape[1]]
+    return coefficients[:, 1:first] @ root.T, coefficients[:, :1] + visits @ own.T + coefficients[:, first + own.shape[1] :]
+
+
+def _residual(table: ResponseTable, chosen: Combination, own: Floats, i: int) -> Floats:
+    """eta [W + T] of a session at the posterior mean of a combination."""
+    gains, levels = _split(chosen.fit.coefficients[None], own, chosen.alpha)
+    return np.asarray(table.beta - table.means[chosen.shape] @ gains[0] - levels[0, i], dtype=np.float64)
+
+
+def _drawn(combinations: Sequence[Combination], own: Floats, phi: Floats, noise: Floats, draws: int, seed: int) -> ImpulseDynamics:
+    """Draws shared out over the combinations by their evidence (largest remainders, so that a rare one is not a matter of luck)."""
+    live = [c for c in combinations if c.weight >= FEWEST_WEIGHT]
+    shares = np.array([c.weight for c in live]) / sum(c.weight for c in live) * draws
+    counts = np.floor(shares).astype(int)
+    for k in np.argsort(shares - counts)[::-1][: draws - counts.sum()]:
+        counts[k] += 1
+    rng = np.random.default_rng([seed, 0x1A7])
+    gains, levels, shapes = [], [], []
+    for combination, count in zip(live, counts, strict=True):
+        if count:
+            g, own_levels = _split(combination.fit.draws(int(count), rng), own, combination.alpha)
+            gains.append(g)
+            levels.append(own_levels)
+            shapes += [SHAPES.index(combination.shape)] * int(count)
+    shares_of = {name: sum(c.weight * c.fit.share(name) for c in combinations) for name in ("visit", "session")}
+    evidence = {(c.shape, c.alpha): c.weight for c in combinations}
+    return ImpulseDynamics(phi, np.concatenate(gains), np.array(shapes), np.concatenate(levels), noise, evidence, shares_of)
