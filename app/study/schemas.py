@@ -89,7 +89,7 @@ class SettingsFields(Model):
     cdbs_amplitude_ma: Number | None = Field(None, description="cDBS amplitude where a visit states none, mA.")
     beta_low_hz: Number = Field(13.0, description="Lower edge of the beta band, Hz.")
     beta_high_hz: Number = Field(35.0, description="Upper edge of the beta band, Hz.")
-    min_valid_fraction: Number = Field(0.7, description="Share of its samples that a 2 s window needs to be valid.")
+    min_valid_fraction: Number = Field(0.7, description="Coverage: share of its samples that a 2 s window needs to be valid.")
     beta_measure: BetaMeasure = Field(
         "rms", description="Beta from time-domain LFP: 'rms' amplitude (in its unit) or 'power' (unit squared)."
     )
