@@ -9,6 +9,9 @@ and with the recording's gaps by two rules: `present` (`ml.signals.band_rows`: i
 
 `kept`: share of all rows that a coverage limit keeps. `error_sd`, `bias`: standard deviation and mean of (beta with gaps - beta without)
 over the mean beta, of the rows kept. `error_over_se`: standard deviation of the error over the row's own standard error; 1 if exact.
+`most_imputed`: how many imputed betas a state of W = 10 may hold. `usable`: share of steps whose state and next state are then whole, in
+sessions of 100 steps whose rows are valid where the recording's are (patterns in random order); `imputed_error`: RMS error of an imputed
+beta over the standard deviation of beta in its session; `state_error`: that of all values of the usable states.
 `cpu_ratio`: CPU seconds of the present rule over those of the former one.
 """
 
@@ -19,6 +22,7 @@ import json
 import os
 import time
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -33,6 +37,7 @@ from ml.formats.rcs.packets.streams import read_time_domain
 from ml.formats.rcs.packets.time import reconstruct
 from ml.formats.rcs.settings import follow
 from ml.signals import MIN_CYCLES, Stretch, band_pass, band_rows, row_of
+from ml.trajectories import SessionTrajectory
 
 Floats = NDArray[np.float64]
 OPTIONS = DecodeOptions()
@@ -48,6 +53,11 @@ class Rule:
 
     rows: list[Floats] = field(default_factory=list)
     cpu_s: float = 0.0
+    whole: list[Floats] = field(default_factory=list)
+
+    def betas(self) -> Iterator[tuple[Floats, Floats]]:
+        """Rows of each signal, and its beta without gaps; both over the mean."""
+        return zip(self.rows, self.whole, strict=True)
 
     def at(self, limit: float) -> dict[str, float]:
         """Figures of a coverage limit."""
@@ -122,7 +132,33 @@ def score(rate: float, there: NDArray[np.bool_], rng: np.random.Generator, prese
     present.cpu_s += between - began
     mean = whole.mean()
     present.rows.append(np.stack([found.covered, (found.rms - whole) / mean, found.rms_error / mean]))
+    present.whole.append(whole / mean)
     former.rows.append(np.stack([covered, (rms - whole) / mean, np.zeros(rows)]))
+
+
+def imputation(present: Rule, rng: np.random.Generator, sessions: int) -> dict[int, dict[str, float]]:
+    """What states gain and lose by so many imputed betas, at the default coverage."""
+    out = {}
+    parts = [(covered >= OPTIONS.min_valid_fraction - 1e-9, whole, whole + error) for (covered, error, _), whole in present.betas()]
+    drawn = [[parts[i] for i in rng.integers(len(parts), size=8)] for _ in range(sessions)]
+    for most in (0, 1, 2, 3, 4):
+        usable, squares, imputed = [], [], []
+        for chosen in drawn:
+            valid, whole, seen = (np.concatenate(x)[:110] for x in zip(*chosen, strict=True))
+            seen = np.where(valid, seen, np.nan)
+            s = SessionTrajectory(1, 1, "other", seen[:10], seen[10:], np.zeros(seen.size - 10), most_imputed=most)
+            spread = float(np.std(whole))
+            usable.append(s.usable().mean())
+            error = (s.padded_beta - whole) / spread
+            imputed.append(error[s.imputed] ** 2)
+            squares.append(np.lib.stride_tricks.sliding_window_view(error, 10)[:-1][s.usable()].ravel() ** 2)
+        errors = np.concatenate(imputed)
+        out[most] = {
+            "usable": float(np.mean(usable)),
+            "imputed_error": float(np.sqrt(errors.mean())) if errors.size else 0.0,
+            "state_error": float(np.sqrt(np.concatenate(squares).mean())),
+        }
+    return out
 
 
 def main() -> None:
@@ -150,13 +186,17 @@ def main() -> None:
         for limit, f in by_limit.items():
             over = f"{f['error_over_se']:10.2f}" if "error_over_se" in f else ""
             print(f"{name:<9}{limit:>6.2f}{100 * f['kept']:>9.1f}{100 * f['error_sd']:>13.2f}{100 * f['bias']:>9.2f}{over}")
+    states = imputation(present, rng, 40 if chosen.quick else 200)
+    print(f"{'most imputed':<13}{'usable, %':>10}{'imputed error, SD':>19}{'state error, SD':>17}")
+    for most, s in states.items():
+        print(f"{most:<13}{100 * s['usable']:>10.1f}{s['imputed_error']:>19.2f}{s['state_error']:>17.2f}")
     now, before = (figures[name][OPTIONS.min_valid_fraction] for name in ("present", "former"))
     ratios = {
         "kept": now["kept"] / before["kept"],
         "error_sd": now["error_sd"] / before["error_sd"],
         "cpu_ratio": present.cpu_s / former.cpu_s,
     }
-    print(json.dumps({"name": "beta_gaps", "figures": figures, "ratios": ratios}))
+    print(json.dumps({"name": "beta_gaps", "figures": figures, "most_imputed": states, "ratios": ratios}))
 
 
 if __name__ == "__main__":

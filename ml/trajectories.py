@@ -115,7 +115,7 @@ class SessionTrajectory:
 
     def usable(self) -> Mask:
         """Steps that may enter a buffer, shape [T]: state, next state and amplitude are known, beta is measured and 0 <= a <= 1."""
-        whole: Mask = np.isfinite(self.states()).all(axis=1)
+        whole = np.asarray(np.isfinite(self.states()).all(axis=1))
         amplitude_ok = (self.amplitude >= -AMPLITUDE_TOLERANCE) & (self.amplitude <= 1 + AMPLITUDE_TOLERANCE)
         return whole[:-1] & whole[1:] & amplitude_ok
 

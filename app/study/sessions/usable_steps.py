@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
@@ -112,7 +111,7 @@ def _reason(s: SessionTrajectory, table: StepTable, settings: SettingsVersion, v
     """Why a channel has no usable step, the first thing that would have to change."""
     if valid == 0:
         return f"none of its steps has a valid beta: measured samples cover less than {100 * settings.min_valid_fraction:g} % of each"
-    states: NDArray[np.bool_] = np.isfinite(s.states()).all(axis=1)
+    states = np.asarray(np.isfinite(s.states()).all(axis=1))
     windows = int(np.sum(states[:-1] & states[1:]))
     if windows == 0:
         imputed = f" with at most {s.most_imputed} missing among them" if s.most_imputed else " without a gap"

@@ -7,8 +7,6 @@ from typing import Any
 
 from fastapi.testclient import TestClient
 
-CDBS = {"cdbs": [{"hemisphere": h, "program": 0, "amplitude_ma": 3.0} for h in ("left", "right")]}
-
 
 def told(answer: dict[str, Any]) -> str:
     return " ".join(line for report in answer["report"] for line in (*report["understood"], *report["flagged"]))
@@ -57,3 +55,10 @@ def test_every_recording_shows_its_usable_steps_or_says_why_it_has_none(send: An
             assert "Usable steps: " in told(answer), path.name
         else:
             assert any(report["flagged"] or report["understood"] for report in answer["report"]), path.name
+
+
+def test_the_standard_error_of_beta_cannot_drive_a_controller(send: Any, client: TestClient, recordings: Path) -> None:
+    (session,) = send(montage(recordings), visit=1, controller="other").json()["sessions"]
+    refused = client.patch(f"/api/v1/sessions/{session['id']}", json={"control_stream": "beta_error", "control_channel": "key 2 +9-8"})
+    assert refused.status_code == 422
+    assert "beta_error" not in refused.json()["hint"]
