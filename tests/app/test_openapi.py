@@ -45,6 +45,8 @@ INTENDED: dict[str, str] = {
         ("components > schemas > Problem", "components > schemas > ProblemOut"),
         "API: the member `mend` of problem documents and of file reports is called `hint`.",
     ),
+    "components > schemas > ProposalOut": "API: a proposal has `usable_steps`.",
+    "components > schemas > UsableStepsOut": "API: a proposal has `usable_steps`.",
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",
     "components > schemas > JobOut > required": "API: a job has `seconds_left`.",
 }
