@@ -1,28 +1,53 @@
 """Beta amplitude from local field potentials, and averages per step of streams with gaps. P_beta: Gao et al. 2023, section 3.
 
-Row i of every result covers (t0 + i * period, t0 + (i + 1) * period]. Gaps are never bridged: a stretch of samples without a gap is
-filtered by itself, and a row that holds too few samples is NaN.
+Row i of every result covers (t0 + i * period, t0 + (i + 1) * period]. Short gaps are interpolated for the filter alone: only samples that
+were measured are scored, and a row without one is NaN.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfiltfilt, welch
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.linalg import toeplitz
+from scipy.signal import butter, fftconvolve, sosfiltfilt, welch
 
 FILTER_ORDER = 4
 MIN_CYCLES = 3.0
-"""A gap-free stretch shorter than this many cycles of the lower band edge says nothing about the band and is not counted."""
+"""A run with fewer samples than this many cycles of the lower band edge says nothing about the band and is not counted."""
+
+BRIDGE_S = 1.0
+"""The filter runs on over a gap up to this long; at the edges of a longer one it begins anew."""
+
+RESPONSE_CYCLES = 8.0
+"""Half length of the filter's impulse response that counts, in cycles of the band's width."""
+
+LEAST_PASSED = 1e-3
+"""Floor of the share of a band's power that reaches a sample between two gaps; guards against rounding alone."""
+
+BIN_S = 0.01
+MAX_BINS = 400
+"""Length of the pieces in which a row's standard error looks at what is missing, and the most of them per row."""
+
+MAX_LAG_S = 1.0
+"""Band-passed samples further apart than this are taken as independent."""
+
+ROWS_PER_PRODUCT = 2048
 
 EDGE_CYCLES = 2.0
 """Length of the odd mirror image put before and after a stretch, in cycles of the lower edge."""
 
 SEGMENTS_AT_ONCE = 512
 """Segments of a spectrum that are transformed together, so that a recording of hours needs no multiple of itself in memory."""
+
+
+Stretch = tuple[float, float, NDArray[np.float64]]
+"""A gap-free piece: time of its first sample in s, rate in Hz, samples [n]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +58,18 @@ class BandRows:
         rms: root mean square of the band-passed signal, unit of the samples; NaN where the row holds no usable sample.
         power: its square.
         covered: share of the row that usable samples cover, 0..1.
+        rms_error: standard error of `rms` as a measure of the whole row, for what is missing of it; 0 in a whole row, NaN where `rms` is.
     """
 
     rms: NDArray[np.float64]
     power: NDArray[np.float64]
     covered: NDArray[np.float64]
+    rms_error: NDArray[np.float64]
+
+    @property
+    def power_error(self) -> NDArray[np.float64]:
+        """Standard error of `power`, to first order."""
+        return 2.0 * self.rms * self.rms_error
 
 
 def band_pass(samples: NDArray[np.float64], rate_hz: float, low_hz: float, high_hz: float) -> NDArray[np.float64]:
@@ -81,7 +113,7 @@ def _edges_of_one_pass(rate_hz: float, low_hz: float, high_hz: float) -> tuple[f
 
 
 def band_rows(
-    stretches: Iterable[tuple[float, float, NDArray[np.float64]]],
+    stretches: Iterable[Stretch],
     rows: int,
     period_s: float,
     low_hz: float,
@@ -90,8 +122,17 @@ def band_rows(
 ) -> BandRows:
     """Band amplitude of a lossy signal per row.
 
+    Stretches of one rate with at most `BRIDGE_S` between them are filtered as one, with straight lines over the gaps. Only measured samples
+    count. Near a gap the filter lacks part of what it would have seen, so the sum of squares is divided by the share of a flat band's power
+    that the measured samples around each one pass on: without gaps that is the number of samples.
+
+    The standard error of a row is that of its power against the mean over the whole row, of a Gaussian signal whose band-passed
+    autocorrelation rho is that of the measured samples. A sample of which the share g is passed is sqrt(g) of the signal and lacks an
+    independent sqrt(1 - g), so that by the covariance of squares (Isserlis 1918, Biometrika 12, 134-139)
+    var / power^2 = sum_ij (d_i d_j + 2 c_i c_j) 2 rho_ij^2, with d = g / sum(g) - 1 / n and c = sqrt(g (1 - g)) / n.
+
     Args:
-        stretches: gap-free pieces (time of the first sample in s, rate in Hz, samples [n]), in any order; rates may differ.
+        stretches: gap-free pieces, in any order, not overlapping; rates may differ.
         rows: number of rows.
         period_s: length of a row, s.
         low_hz, high_hz: band edges, Hz.
@@ -100,19 +141,163 @@ def band_rows(
     Raises:
         ValueError: a band outside (0, rate / 2) of a stretch.
     """
-    energy = np.zeros(rows)
-    seconds = np.zeros(rows)
-    for start_s, rate_hz, samples in stretches:
-        if samples.size < MIN_CYCLES * rate_hz / low_hz:
+    bins = min(MAX_BINS, max(1, round(period_s / BIN_S)))
+    energy, seconds = np.zeros(rows), np.zeros(rows)
+    passed, mixed = np.zeros(rows * bins), np.zeros(rows * bins)
+    lags_s = period_s / bins * np.arange(bins, dtype=np.float64)
+    squared, weight = np.zeros(bins), 0.0
+    for run in _runs(stretches, low_hz):
+        if run.measured.sum() < MIN_CYCLES * run.rate_hz / low_hz:
             continue
-        filtered = band_pass(samples, rate_hz, low_hz, high_hz)
-        row = row_of(start_s + np.arange(samples.size) / rate_hz - t0_s, period_s)
-        inside = (row >= 0) & (row < rows)
-        energy += np.bincount(row[inside], weights=filtered[inside] ** 2 / rate_hz, minlength=rows)
-        seconds += np.bincount(row[inside], minlength=rows) / rate_hz
+        filtered = band_pass(run.bridged, run.rate_hz, low_hz, high_hz)[run.measured]
+        share = _passed(run, low_hz, high_hz)
+        piece = row_of(run.t_s - t0_s, period_s / bins)
+        inside = (piece >= 0) & (piece < rows * bins)
+        row = piece[inside] // bins
+        energy += np.bincount(row, weights=filtered[inside] ** 2 / run.rate_hz, minlength=rows)
+        seconds += np.bincount(row, minlength=rows) / run.rate_hz
+        passed += np.bincount(piece[inside], weights=share[inside] / run.rate_hz, minlength=rows * bins)
+        mixed += np.bincount(piece[inside], weights=np.sqrt(share * (1 - share))[inside] / run.rate_hz, minlength=rows * bins)
+        squared += filtered.size / run.rate_hz * _squared_correlation(run, filtered, lags_s)
+        weight += filtered.size / run.rate_hz
+    by_bin = passed.reshape(rows, bins)
+    correlation = squared / weight if weight else squared
     with np.errstate(invalid="ignore", divide="ignore"):
-        power = np.where(seconds > 0, energy / seconds, np.nan)
-    return BandRows(np.sqrt(power), power, np.minimum(seconds / period_s, 1.0))
+        power = np.where(seconds > 0, energy / by_bin.sum(axis=1), np.nan)
+    rms = np.sqrt(power)
+    error = 0.5 * rms * _relative_error(by_bin, mixed.reshape(rows, bins), correlation, period_s)
+    return BandRows(rms, power, np.minimum(seconds / period_s, 1.0), error)
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Stretches of one rate without a long gap between them.
+
+    Attributes:
+        rate_hz: samples per second.
+        bridged: samples with straight lines over the gaps, [m].
+        measured: which of them were measured, [m].
+        t_s: times of the measured ones, [n].
+    """
+
+    rate_hz: float
+    bridged: NDArray[np.float64]
+    measured: NDArray[np.bool_]
+    t_s: NDArray[np.float64]
+
+
+def _runs(stretches: Iterable[Stretch], low_hz: float) -> Iterator[_Run]:
+    """Runs of stretches of one rate, each stretch at its nearest place on the grid of that rate."""
+    by_rate: dict[float, list[Stretch]] = defaultdict(list)
+    for stretch in stretches:
+        if stretch[2].size:
+            by_rate[stretch[1]].append(stretch)
+    for rate_hz, own in by_rate.items():
+        together: list[Stretch] = []
+        end_s = -np.inf
+        for stretch in sorted(own, key=lambda s: s[0]):
+            if together and stretch[0] - end_s > BRIDGE_S:
+                yield _run(rate_hz, together, low_hz)
+                together = []
+            together.append(stretch)
+            end_s = max(end_s, stretch[0] + stretch[2].size / rate_hz)
+        yield _run(rate_hz, together, low_hz)
+
+
+def _run(rate_hz: float, stretches: list[Stretch], low_hz: float) -> _Run:
+    places, end = [], -np.inf
+    for start_s, _, samples in stretches:
+        place = int(max(np.rint(start_s * rate_hz), end))
+        places.append(place)
+        end = place + samples.size
+    index = np.concatenate([p - places[0] + np.arange(s[2].size) for p, s in zip(places, stretches, strict=True)])
+    samples = np.concatenate([s[2] for s in stretches])
+    t_s = np.concatenate([s[0] + np.arange(s[2].size) / rate_hz for s in stretches])
+    measured = np.zeros(int(index[-1]) + 1, dtype=bool)
+    measured[index] = True
+    bridged = np.zeros(measured.size)
+    bridged[index] = samples
+    _bridge(bridged, measured, max(1, round(rate_hz / low_hz)))
+    return _Run(rate_hz, bridged, measured, t_s)
+
+
+def _bridge(x: NDArray[np.float64], measured: NDArray[np.bool_], cycle: int) -> None:
+    """Straight lines over the gaps of x, [m], between the means of up to `cycle` samples on either side.
+
+    A mean over a cycle follows the slow background but not the band itself, nor noise, which a line from sample to sample would bring in.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], measured.astype(np.int8), [0]))))
+    begin, end = edges[::2], edges[1::2]
+    width = np.minimum(cycle, end - begin)
+    total = np.concatenate(([0.0], np.cumsum(x)))
+    head, tail = (total[begin + width] - total[begin]) / width, (total[end] - total[end - width]) / width
+    # the lines run between the middles of the means
+    middles = np.stack([begin + (width - 1) / 2, end - 1 - (width - 1) / 2], axis=1).ravel()
+    gap = np.flatnonzero(~measured)
+    x[gap] = np.interp(gap, middles, np.stack([head, tail], axis=1).ravel())
+
+
+def _passed(run: _Run, low_hz: float, high_hz: float) -> NDArray[np.float64]:
+    """Share of a flat band's power that reaches each measured sample, 0..1; 1 far from gaps. Beyond the run's ends nothing is missing."""
+    if run.measured.all():
+        return np.ones(run.t_s.size)
+    response = _squared_response(run.rate_hz, low_hz, high_hz)
+    around = np.pad(run.measured.astype(np.float64), response.size // 2, constant_values=1.0)
+    return np.clip(fftconvolve(around, response, mode="valid")[run.measured], LEAST_PASSED, 1.0)
+
+
+@lru_cache(maxsize=64)
+def _squared_response(rate_hz: float, low_hz: float, high_hz: float) -> NDArray[np.float64]:
+    """Square of the zero-phase filter's impulse response, of sum 1."""
+    half = int(np.ceil(RESPONSE_CYCLES * rate_hz / (high_hz - low_hz)))
+    impulse = np.zeros(2 * half + 1)
+    impulse[half] = 1.0
+    response: NDArray[np.float64] = band_pass(impulse, rate_hz, low_hz, high_hz) ** 2
+    return response / response.sum()
+
+
+def _squared_correlation(run: _Run, filtered: NDArray[np.float64], lags_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Square of the measured samples' autocorrelation, averaged over the lags around each of `lags_s`; shape as that."""
+    most = min(int(MAX_LAG_S * run.rate_hz), run.measured.size - 1)
+    length = next_fast_len(run.measured.size + most + 1, real=True)
+    signal, mask = np.zeros(run.measured.size), run.measured.astype(np.float64)
+    signal[run.measured] = filtered
+    products, pairs = (irfft(np.abs(rfft(x, length)) ** 2, length)[: most + 1] for x in (signal, mask))
+    if products[0] <= 0:
+        return np.zeros(lags_s.size)
+    # the same denominator at every lag but for the pairs that gaps leave: an estimate from few pairs is drawn to 0
+    rho = products / products[0] * pairs[0] / np.maximum(pairs, 0.5 * pairs[0])
+    width = lags_s[1] if lags_s.size > 1 else 2 * MAX_LAG_S
+    lag = np.arange(most + 1) / run.rate_hz
+    integral = np.concatenate(([0.0], np.cumsum(np.clip(rho, -1.0, 1.0) ** 2))) / run.rate_hz
+    edges = np.append(lag - 0.5 / run.rate_hz, lag[-1] + 0.5 / run.rate_hz)
+    between = lags_s[:, None] + width * np.array([-0.5, 0.5])
+    # lags are symmetric: what lies left of 0 is the mirror image of what lies right of it
+    value = np.sign(between) * np.interp(np.abs(between), edges, integral - 0.5 / run.rate_hz)
+    return np.asarray(np.maximum(np.diff(value, axis=1)[:, 0] / width, 0.0))
+
+
+def _relative_error(
+    passed: NDArray[np.float64], mixed: NDArray[np.float64], squared: NDArray[np.float64], period_s: float
+) -> NDArray[np.float64]:
+    """Standard error of each row's mean power over that power, [rows].
+
+    Args:
+        passed, mixed: sums of g and of sqrt(g (1 - g)) over the samples of each piece of a row, s, [rows, bins].
+        squared: rho^2 by the distance of two pieces, [bins].
+        period_s: length of a row, s.
+    """
+    covariance = 2.0 * toeplitz(squared)
+    in_row = passed.sum(axis=1)
+    out = np.where(in_row > 0, 0.0, np.nan)
+    partly = np.flatnonzero((in_row > 0) & (in_row < period_s * (1 - 1e-6)))
+    for first in range(0, partly.size, ROWS_PER_PRODUCT):
+        some = partly[first : first + ROWS_PER_PRODUCT]
+        weights = passed[some] / in_row[some, None] - 1.0 / passed.shape[1]
+        lost = np.sqrt(2.0) * mixed[some] / period_s
+        variance = sum(np.einsum("ri,ri->r", w @ covariance, w) for w in (weights, lost))
+        out[some] = np.sqrt(np.maximum(variance, 0.0))
+    return out
 
 
 def row_of(t_s: NDArray[np.float64], period_s: float) -> NDArray[np.int64]:

@@ -3,6 +3,10 @@
 Alignment, everywhere in betaloop: step k = 0, 1, ... is the row t_s = period (k + 1). It holds a_k, the amplitude in force over
 (period k, period (k + 1)], and the beta amplitude of that same window. The state s_k is the W beta amplitudes *before* that row,
 oldest first; r_k uses the row itself. Source: Gao et al. 2023, section 4.1.
+
+A window may hold a stated number of imputed beta amplitudes: between the session's mean and the line from the measured value before to the one
+after, as far as the session's beta carries over from row to row. They are marked, never a window's newest value, and never judged by a
+reward.
 """
 
 from __future__ import annotations
@@ -26,6 +30,31 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
+PRIOR_PAIRS = 10
+"""Pairs of unrelated rows that count beside the measured ones where autocorrelations are estimated: short sessions say little of them."""
+
+
+def _carried_over(deviations: Floats) -> float:
+    """Weight of the mean of both neighbours in the best linear prediction of a value between them, 0 to 1.
+
+    2 r_1 / (1 + r_2) with the autocorrelations at one and two rows: cov(d_t, m) / var(m) for m = (d_{t-1} + d_{t+1}) / 2. For longer gaps
+    it is an approximation.
+
+    Args:
+        deviations: of beta from the session's mean, [n]; NaN where not measured.
+    """
+    variance = float(np.nanmean(deviations**2))
+    if variance == 0:
+        return 0.0
+
+    def correlation(lag: int) -> float:
+        products = deviations[lag:] * deviations[:-lag]
+        measured = products[np.isfinite(products)]
+        return float(measured.sum()) / (variance * (measured.size + PRIOR_PAIRS))
+
+    return float(np.clip(2 * correlation(1) / max(1 + correlation(2), 0.1), 0.0, 1.0))
+
+
 @dataclass(frozen=True)
 class SessionTrajectory:
     """One session: W beta amplitudes before it, then T steps.
@@ -40,9 +69,10 @@ class SessionTrajectory:
         amplitude: amplitude fraction a_k, shape [T]; NaN where unknown. May exceed 1: such a step is not usable.
         qoc: end-of-session QoCs.
         random_lower_bound: B in force for a random session, so that its density 1 / (1 - B) on [B, 1] is known; else None.
+        most_imputed: how many imputed beta amplitudes a window may hold; 0 as in sessions of 0.1.0.
 
     Raises:
-        ValueError: arrays of unequal length, or a session without a step.
+        ValueError: arrays of unequal length, a session without a step, or as many imputed values as the window has.
     """
 
     session_id: int
@@ -54,12 +84,15 @@ class SessionTrajectory:
     qoc: Qoc = field(default_factory=Qoc)
     policy_id: int | None = None
     random_lower_bound: float | None = None
+    most_imputed: int = 0
 
     def __post_init__(self) -> None:
         if self.beta.shape != self.amplitude.shape or self.beta.ndim != 1:
             raise ValueError(f"session {self.session_id}: {self.beta.shape} beta rows against {self.amplitude.shape} amplitudes")
         if self.beta.size == 0:
             raise ValueError(f"session {self.session_id} has no step")
+        if not 0 <= self.most_imputed < max(1, self.lead_beta.size):
+            raise ValueError(f"session {self.session_id}: {self.most_imputed} imputed values of {self.lead_beta.size} in a window")
 
     @property
     def steps(self) -> int:
@@ -67,19 +100,52 @@ class SessionTrajectory:
         return int(self.beta.size)
 
     @property
-    def padded_beta(self) -> Floats:
-        """Lead and session in one array, shape [W + T]; s_k is `padded_beta[k : k + W]`."""
+    def measured_beta(self) -> Floats:
+        """Lead and session in one array as measured, shape [W + T]; NaN where invalid."""
         return np.concatenate([self.lead_beta, self.beta])
 
+    @property
+    def padded_beta(self) -> Floats:
+        """Lead and session, with imputed values in gaps of up to `most_imputed`, shape [W + T]; s_k is `padded_beta[k : k + W]`."""
+        return self._filled()[0]
+
+    @property
+    def imputed(self) -> Mask:
+        """Which of `padded_beta` are imputed, shape [W + T]."""
+        return self._filled()[1]
+
+    def _filled(self) -> tuple[Floats, Mask]:
+        beta = self.measured_beta
+        known = np.flatnonzero(~np.isnan(beta))
+        imputed = np.zeros(beta.size, dtype=bool)
+        if self.most_imputed == 0 or known.size < 2:
+            return beta, imputed
+        missing = np.flatnonzero(np.isnan(beta))
+        after = np.searchsorted(known, missing)
+        inside = (after > 0) & (after < known.size)
+        gap = known[np.minimum(after, known.size - 1)] - known[np.maximum(after - 1, 0)] - 1
+        imputed[missing[inside & (gap <= self.most_imputed)]] = True
+        level = float(beta[known].mean())
+        line = np.interp(np.flatnonzero(imputed), known, beta[known])
+        beta[imputed] = level + _carried_over(beta - level) * (line - level)
+        return beta, imputed
+
     def states(self) -> Floats:
-        """s_0 ... s_T, shape [T + 1, W], oldest beta first; NaN where a window holds an invalid beta."""
-        return sliding_window_view(self.padded_beta, self.lead_beta.size)
+        """s_0 ... s_T, shape [T + 1, W], oldest beta first; NaN where a window holds an invalid beta that may not be imputed in it."""
+        filled, imputed = self._filled()
+        window = self.lead_beta.size
+        states = sliding_window_view(filled, window)
+        if not imputed.any():
+            return states
+        marks = sliding_window_view(imputed, window)
+        refused: Mask = np.logical_or(marks[:, -1], marks.sum(axis=1) > self.most_imputed)
+        return np.where(refused[:, None], sliding_window_view(self.measured_beta, window), states)
 
     def usable(self) -> Mask:
-        """Steps that may enter a buffer, shape [T]: state, next beta and amplitude are known and 0 <= a <= 1."""
-        windows_ok = ~np.isnan(sliding_window_view(self.padded_beta, self.lead_beta.size + 1)).any(axis=1)
+        """Steps that may enter a buffer, shape [T]: state, next state and amplitude are known, beta is measured and 0 <= a <= 1."""
+        whole = np.asarray(np.isfinite(self.states()).all(axis=1))
         amplitude_ok = (self.amplitude >= -AMPLITUDE_TOLERANCE) & (self.amplitude <= 1 + AMPLITUDE_TOLERANCE)
-        return windows_ok & amplitude_ok
+        return whole[:-1] & whole[1:] & amplitude_ok
 
     def rewards(self, settings: MdpSettings) -> Floats:
         """r_k, shape [T]; NaN where beta or amplitude is unknown."""
@@ -158,7 +224,7 @@ class ReplayBuffer:
 
     def beta_scale(self) -> tuple[float, float]:
         """Mean and standard deviation of all valid beta amplitudes, for normalising network inputs."""
-        values = np.concatenate([s.padded_beta for s in self.sessions])
+        values = np.concatenate([s.measured_beta for s in self.sessions])
         values = values[~np.isnan(values)]
         std = float(values.std())
         return float(values.mean()), std if std > 0 else 1.0
@@ -169,6 +235,8 @@ class ReplayBuffer:
 
 
 _SCHEMA_VERSION = 1
+_IMPUTED_SCHEMA_VERSION = 2
+"""Of buffers whose windows may hold imputed values, which a reader of version 1 would not find. Values are stored as measured."""
 
 
 def to_parquet(buffer: ReplayBuffer) -> bytes:
@@ -181,10 +249,10 @@ def to_parquet(buffer: ReplayBuffer) -> bytes:
         lead = s.lead_beta.size
         columns["session_id"].append(np.full(lead + s.steps, s.session_id, dtype=np.int64))
         columns["step"].append(np.arange(-lead, s.steps, dtype=np.int32))
-        columns["beta"].append(s.padded_beta)
+        columns["beta"].append(s.measured_beta)
         columns["amplitude"].append(np.concatenate([np.full(lead, np.nan), s.amplitude]))
     meta = {
-        "schema_version": _SCHEMA_VERSION,
+        "schema_version": _IMPUTED_SCHEMA_VERSION if any(s.most_imputed for s in buffer.sessions) else _SCHEMA_VERSION,
         "settings": buffer.settings.to_json(),
         "beta_unit": buffer.beta_unit,
         "beta_source": buffer.beta_source,
@@ -204,8 +272,11 @@ def from_parquet(content: bytes) -> ReplayBuffer:
     if raw is None:
         raise ValueError("this Parquet file is not a betaloop buffer snapshot: its metadata lack the key 'betaloop'")
     meta = json.loads(raw)
-    if meta["schema_version"] != _SCHEMA_VERSION:
-        raise ValueError(f"buffer snapshot of schema version {meta['schema_version']}; this betaloop reads {_SCHEMA_VERSION}")
+    if meta["schema_version"] not in (_SCHEMA_VERSION, _IMPUTED_SCHEMA_VERSION):
+        raise ValueError(
+            f"buffer snapshot of schema version {meta['schema_version']}; "
+            f"this betaloop reads {_SCHEMA_VERSION} and {_IMPUTED_SCHEMA_VERSION}"
+        )
     ids = table["session_id"].to_numpy()
     step = table["step"].to_numpy()
     beta = table["beta"].to_numpy()
@@ -225,6 +296,7 @@ def from_parquet(content: bytes) -> ReplayBuffer:
                 amplitude=amplitude[body],
                 qoc=Qoc(**m["qoc"]),
                 random_lower_bound=m["random_lower_bound"],
+                most_imputed=m.get("most_imputed", 0),
             )
         )
     return ReplayBuffer(MdpSettings(**meta["settings"]), tuple(sessions), meta["beta_unit"], meta["beta_source"])
@@ -236,7 +308,8 @@ def content_hash(content: bytes) -> str:
 
 
 def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
-    return {
+    imputed = {"most_imputed": s.most_imputed} if s.most_imputed else {}
+    return imputed | {
         "session_id": s.session_id,
         "visit": s.visit,
         "controller": s.controller,

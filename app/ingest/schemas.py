@@ -70,6 +70,19 @@ class PartOut(Model):
     is_control: bool
 
 
+class UsableStepsOut(Model):
+    """Steps of one channel that can be learned from."""
+
+    stream: str
+    channel: str
+    source: str
+    is_control: bool = Field(description="The controller is taken to have seen this channel.")
+    steps: int = Field(description="Steps of the session.")
+    valid: int = Field(description="Steps with a valid beta.")
+    usable: int = Field(description="Steps that may enter a replay buffer.")
+    reason: str | None = Field(description="Why there are none; null where there are some.")
+
+
 class ProposalOut(Model):
     """A proposed session, and why it is proposed so."""
 
@@ -80,6 +93,7 @@ class ProposalOut(Model):
     evidence: dict[str, str] = Field(description="By field, why it is proposed so.")
     changed_by: str
     parts: list[PartOut]
+    usable_steps: list[UsableStepsOut] = Field(description="By channel of the control recording, the control channel first.")
 
 
 class ConfirmedOut(Model):

@@ -15,10 +15,9 @@ from app.platform.errors import Conflict, Invalid
 from app.study import blinding, cdbs_amplitude
 from app.study import repository as study
 from app.study.models import Controller, Hemisphere, Participant, Recording, SessionSegment, StudySession, Trace, Visit
+from app.study.sessions.usable_steps import CONTROL_STREAMS
 from app.study.traces import AMPLITUDE_STREAM, pack, unpack
 
-CONTROL_STREAMS = ("beta", "band_power")
-"""Streams that can drive a controller, in the order of preference where the participant's source does not decide."""
 TOGETHER = 0.5
 """Two recordings belong to one session when they share at least this part of the shorter one's time."""
 LONGEST_STEP_S = 60.0

@@ -73,6 +73,7 @@ class SettingsVersion(Base):
         CheckConstraint("cdbs_amplitude_ma > 0", name="cdbs_amplitude"),
         CheckConstraint("beta_low_hz > 0 and beta_low_hz < beta_high_hz", name="beta_band"),
         CheckConstraint("min_valid_fraction > 0 and min_valid_fraction <= 1", name="min_valid"),
+        CheckConstraint("most_imputed >= 0", name="most_imputed"),
         CheckConstraint("beta_measure in ('rms', 'power')", name="beta_measure"),
     )
 
@@ -97,6 +98,7 @@ class SettingsVersion(Base):
     beta_low_hz: Mapped[float]
     beta_high_hz: Mapped[float]
     min_valid_fraction: Mapped[float]
+    most_imputed: Mapped[int] = mapped_column(SmallInteger, server_default="0")
     beta_measure: Mapped[str] = mapped_column(String(10), server_default="rms")
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))

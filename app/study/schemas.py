@@ -60,6 +60,7 @@ SETTING_BOUNDS = {
     "beta_low_hz": Bound(1, 500, "Hz"),
     "beta_high_hz": Bound(1, 500, "Hz"),
     "min_valid_fraction": Bound(0.01, 1),
+    "most_imputed": Bound(0, 10, "steps"),
 }
 """Clinical bounds of what may be set from now on; versions of before may lie outside of them, and are shown as they are."""
 
@@ -89,7 +90,10 @@ class SettingsFields(Model):
     cdbs_amplitude_ma: Number | None = Field(None, description="cDBS amplitude where a visit states none, mA.")
     beta_low_hz: Number = Field(13.0, description="Lower edge of the beta band, Hz.")
     beta_high_hz: Number = Field(35.0, description="Upper edge of the beta band, Hz.")
-    min_valid_fraction: Number = Field(0.7, description="Share of its samples that a 2 s window needs to be valid.")
+    min_valid_fraction: Number = Field(0.7, description="Coverage: share of its samples that a 2 s window needs to be valid.")
+    most_imputed: Int = Field(
+        1, description="Imputed beta amplitudes that a state may hold, never as its newest; 0 in settings made before there was a choice."
+    )
     beta_measure: BetaMeasure = Field(
         "rms", description="Beta from time-domain LFP: 'rms' amplitude (in its unit) or 'power' (unit squared)."
     )

@@ -19,7 +19,7 @@ from app.study import blinding, repository
 from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision, SettingsVersion, StudySession, Visit
 from app.study.outcomes import service as outcomes
 from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, ParticipantIn, QocIn, SessionChange, SettingsIn, VisitChange, VisitIn
-from app.study.traces import StepTable, step_table
+from app.study.traces import NO_CONTROL, StepTable, step_table
 from ml.mdp import MdpSettings
 from ml.qoc import Qoc
 
@@ -222,7 +222,7 @@ def _check_control(db: Session, session: StudySession, given: dict[str, Any]) ->
         return
     stream = given.get("control_stream") or session.control_stream
     channel = given.get("control_channel", session.control_channel)
-    traces = [t for s in session.segments for t in repository.traces_of_recording(db, s.recording_id)]
+    traces = [t for s in session.segments for t in repository.traces_of_recording(db, s.recording_id) if t.stream not in NO_CONTROL]
     if not any(t.stream == stream and channel in (None, t.channel) for t in traces):
         known = "; ".join(sorted({f"{t.stream} {t.channel}".strip() for t in traces})) or "none"
         raise Invalid(f"The session's recordings have no trace '{stream} {channel or ''}'.", f"Choose one of: {known}.")

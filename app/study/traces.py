@@ -13,9 +13,12 @@ from sqlalchemy.orm import Session
 from app.platform.errors import Invalid
 from app.study import cdbs_amplitude, repository
 from app.study.models import SettingsVersion, StudySession, Trace
+from ml.formats.beta import ERROR_STREAM
 from ml.mdp import AMPLITUDE_TOLERANCE
 
 AMPLITUDE_STREAM = "amplitude"
+NO_CONTROL = frozenset({AMPLITUDE_STREAM, ERROR_STREAM})
+"""Streams that no controller can have seen."""
 
 MOST_STEPS = 1_000_000
 """Steps of a session that are laid out: at 2 s three weeks. A session of more has a wrong begin or end."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from app.platform.errors import Invalid, NotFound
 from ml.deploy.manifest import BundleManifest
 from ml.deploy.runtime.envelope import BetaSample, Signal
-from ml.deploy.streaming import StreamingBeta, Stretch, split_by_period
+from ml.deploy.streaming import StreamingBeta, split_by_period
 from ml.formats import DecodeOptions, RecordingLog, TraceLog, UndecodableFile, decode, sniff
 from ml.formats.archive import FolderFiles, ZipFiles
 from ml.formats.rcs.beta import time_domain_stretches
@@ -33,6 +33,7 @@ from ml.formats.rcs.settings import follow
 from ml.formats.recording import FileReport
 from ml.formats.tables.delimited import read_delimited
 from ml.formats.tables.numbers import column_name, unit_name
+from ml.signals import Stretch, band_rows
 
 LFP_UNITS = {"uV": 1.0, "mV": 1000.0, "V": 1e6}
 _COHORT = re.compile(r"cohort:([A-Za-z0-9]+)(?::(\d{1,9}))?")
@@ -243,8 +244,6 @@ def _stream(stretches: list[Stretch], manifest: BundleManifest, count: int, stre
 
 
 def _offline(stretches: list[Stretch], manifest: BundleManifest, rows: int) -> NDArray[np.float64]:
-    from ml.signals import band_rows
-
     found = band_rows(stretches, rows, manifest.period_s, manifest.beta_low_hz, manifest.beta_high_hz)
     return np.where(found.covered >= manifest.min_valid_fraction - 1e-9, found.rms, np.nan)
 

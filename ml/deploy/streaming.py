@@ -1,10 +1,10 @@
 """P_beta as it is known at the end of each period: the definition of `ml/signals.py` without the samples that are yet to come.
 
-A period's value is the same zero-phase band-pass and the same root mean square over the same samples. What differs from the value that is
-computed afterwards: (1) the filter's right edge lies at the end of the period, where it is mirrored, instead of in the samples that follow;
-(2) its left edge lies `CONTEXT_S` before the period, instead of at the start of the gap-free stretch; (3) a stretch that has just begun
-after a gap is judged by what has come of it, so that one that is too short at the end of a period is not counted there, though it grows
-later. The measured effect stands in docs/deployment.md.
+A period's value is the same zero-phase band-pass and the same root mean square over the same samples, with the same lines over short gaps.
+What differs from the value that is computed afterwards: (1) the filter's right edge lies at the last sample of the period, where it is
+mirrored, instead of in the samples that follow; (2) its left edge lies `CONTEXT_S` before the period, instead of where the recording or a
+long gap left it; (3) samples that have just begun after a long gap are judged by what has come of them, so that too few at the end of a
+period are not counted there, though more follow. The measured effect stands in docs/deployment.md.
 """
 
 from __future__ import annotations
@@ -15,12 +15,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.signals import band_rows
+from ml.signals import Stretch, band_rows
 
 CONTEXT_S = 4.0
 """Samples before the period that the filter sees; 52 cycles of 13 Hz, after which it has forgotten where it began."""
-Stretch = tuple[float, float, NDArray[np.float64]]
-"""Time of the first sample in s, rate in Hz, samples [n] without a gap."""
 
 
 class StreamingBeta:
@@ -29,7 +27,7 @@ class StreamingBeta:
     Args:
         period_s: length of a period.
         low_hz, high_hz: band edges.
-        min_valid_fraction: share of a period's samples below which it has no value.
+        min_valid_fraction: coverage: share of a period's samples below which it has no value.
 
     Raises:
         ValueError: a value outside its range.

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import SpectrumLog, TraceLog, TraceSource
-from ml.signals import band_rows, spectrum
+from ml.signals import BandRows, Stretch, band_rows, spectrum
 
-Stretch = tuple[float, float, NDArray[np.float64]]
-"""A gap-free piece: time of its first sample in s, rate in Hz, samples in uV [n]."""
+ERROR_STREAM = "beta_error"
+"""Standard error of each row of `beta` for what is missing of it; there where something is."""
 
 
 def step_trace(
@@ -53,6 +53,8 @@ def time_domain_traces(
 ) -> list[TraceLog]:
     """RMS amplitude and power of one channel's beta band: the stream `beta` is the measure that the options name, the other is beside it.
 
+    Where rows are not whole, `beta_error` is the standard error of `beta`.
+
     Stretches sampled too slowly for the band are left out; none where all are.
 
     Args:
@@ -75,17 +77,19 @@ def time_domain_traces(
     }
     first = t0_s + options.period_s
     return [
-        step_trace(
-            (stream, channel, unit),
-            "time_domain",
-            found.rms if measure == "rms" else found.power,
-            found.covered,
-            options,
-            {**said, "measure": measure},
-            first,
-        )
-        for stream, unit, measure in options.beta_streams
+        step_trace((stream, channel, unit), "time_domain", values, found.covered, options, {**said, "measure": measure}, first)
+        for stream, unit, measure, values in beta_streams(found, options)
     ]
+
+
+def beta_streams(found: BandRows, options: DecodeOptions) -> list[tuple[str, str, str, NDArray[np.float64]]]:
+    """(stream, unit, measure, values [rows]) of samples in uV: both measures, and the error of `beta` where a valid row is not whole."""
+    valid = found.covered >= options.min_valid_fraction - 1e-9
+    streams = [(stream, unit, str(measure), getattr(found, measure)) for stream, unit, measure in options.beta_streams]
+    if np.any(found.rms_error[valid] > 0):
+        errors = found.rms_error if options.beta_measure == "rms" else found.power_error
+        streams.append((ERROR_STREAM, streams[0][1], f"standard error of {options.beta_measure}", errors))
+    return streams
 
 
 def channel_spectrum(stretches: Sequence[Stretch], channel: str) -> list[SpectrumLog]:

@@ -77,7 +77,7 @@ def outcome_table(buffer: ReplayBuffer) -> Floats:
 
 def learn_scale(buffer: ReplayBuffer) -> Scale:
     """Standardisation of a buffer. Raises ValueError when it has no usable step."""
-    beta = np.concatenate([s.padded_beta for s in buffer.sessions])
+    beta = np.concatenate([s.measured_beta for s in buffer.sessions])
     beta = beta[np.isfinite(beta)]
     rewards = buffer.transitions().rewards
     log = bool(beta.min() > 0) and abs(_skewness(np.log(np.maximum(beta, 1e-300)))) < abs(_skewness(beta))

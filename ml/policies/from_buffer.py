@@ -69,7 +69,7 @@ def proportional_from_buffer(
     """
     if not 0 <= low_quantile < high_quantile <= 1:
         raise ValueError(f"the quantiles must rise within [0, 1], not {low_quantile} and {high_quantile}")
-    beta = np.concatenate([session.padded_beta for session in buffer.sessions])
+    beta = np.concatenate([session.measured_beta for session in buffer.sessions])
     low, high = (float(q) for q in np.nanquantile(beta, [low_quantile, high_quantile]))
     if low >= high:
         raise ValueError(

@@ -65,6 +65,8 @@ INTENDED: dict[str, str] = {
         ),
         "Evaluation: a further method by name, `impulse`",
     ),
+    "components > schemas > ProposalOut": "API: a proposal has `usable_steps`.",
+    "components > schemas > UsableStepsOut": "API: a proposal has `usable_steps`.",
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",
     "components > schemas > JobOut > required": "API: a job has `seconds_left`.",
 }

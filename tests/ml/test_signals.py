@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ml.signals import SEGMENTS_AT_ONCE, band_pass, band_rows, row_means, row_of, spectrum, step_means
+from ml.signals import BRIDGE_S, SEGMENTS_AT_ONCE, band_pass, band_rows, row_means, row_of, spectrum, step_means
 
 RATE = 500.0
 LOW, HIGH = 13.0, 35.0
@@ -60,6 +60,74 @@ def test_a_stretch_too_short_for_the_band_is_not_counted():
     rows = band_rows([(1 / RATE, RATE, sine(22.0, 0.2))], 1, 2.0, LOW, HIGH)
     assert rows.covered[0] == 0
     assert np.isnan(rows.rms[0])
+
+
+def lossy(x, lost, start_s=1 / RATE, packet=25):
+    """Packets of x that are left when those numbered in `lost` are not there, as stretches; and which samples they hold."""
+    there = np.repeat(~np.isin(np.arange(x.size // packet), lost), packet)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], there.astype(np.int8), [0]))))
+    return [(start_s + a / RATE, RATE, x[a:b]) for a, b in zip(edges[::2], edges[1::2], strict=True)], there
+
+
+def random_losses(seconds, share, seed=0):
+    return np.flatnonzero(np.random.default_rng(seed).random(int(seconds * RATE / 25)) < share)
+
+
+def test_packets_too_short_to_be_filtered_alone_count_when_only_short_gaps_part_them():
+    pieces, there = lossy(sine(22.0, 20.0, 3.0), np.arange(3, 400, 4))  # 150 ms of every 200 ms
+    rows = band_rows(pieces, 10, 2.0, LOW, HIGH)
+    np.testing.assert_allclose(rows.covered, there.reshape(10, -1).mean(axis=1))
+    np.testing.assert_allclose(rows.rms, 3.0 / np.sqrt(2), rtol=0.06)
+
+
+def test_gaps_leave_the_mean_power_of_noise_unbiased():
+    noise = np.random.default_rng(8).normal(size=int(800 * RATE))
+    pieces, there = lossy(noise, random_losses(800.0, 0.3))
+    rows = band_rows(pieces, 400, 2.0, LOW, HIGH)
+    whole = band_rows([(1 / RATE, RATE, noise)], 400, 2.0, LOW, HIGH)
+    assert there.mean() == pytest.approx(0.7, abs=0.02)
+    assert rows.power.mean() == pytest.approx(whole.power.mean(), rel=0.025)
+
+
+def test_interpolated_samples_are_never_scored():
+    x = sine(22.0, 4.0)
+    rows = band_rows([(1 / RATE, RATE, x[:750]), (1 / RATE + 2.4, RATE, x[1200:])], 8, 0.5, LOW, HIGH)
+    np.testing.assert_allclose(rows.covered, [1, 1, 1, 0, 0.2, 1, 1, 1], atol=1e-9)
+    assert np.isnan(rows.rms[3])
+    assert np.isnan(rows.rms_error[3])
+
+
+def test_the_filter_begins_anew_after_a_long_gap():
+    x = np.random.default_rng(9).normal(size=4000)
+    first, second = (1 / RATE, RATE, x[:2000]), (4.0 + BRIDGE_S + 2 / RATE, RATE, x[2000:])
+    both = band_rows([second, first], 5, 2.0, LOW, HIGH)
+    np.testing.assert_array_equal(both.rms[:2], band_rows([first], 5, 2.0, LOW, HIGH).rms[:2])
+    np.testing.assert_array_equal(both.rms[3:], band_rows([second], 5, 2.0, LOW, HIGH).rms[3:])
+
+
+def test_stretches_between_the_ticks_of_the_grid_keep_all_their_samples():
+    x = sine(22.0, 4.0)
+    early = band_rows([(1 / RATE, RATE, x[:1000]), (1 / RATE + 2.0 - 0.4 / RATE, RATE, x[1000:])], 2, 2.0, LOW, HIGH)
+    np.testing.assert_allclose(early.covered, 1.0, atol=1e-3)
+    np.testing.assert_allclose(early.rms, np.sqrt(0.5), rtol=0.02)
+
+
+def test_a_whole_row_has_no_error_and_a_partial_one_has_that_of_what_is_missing():
+    noise = np.random.default_rng(10).normal(size=int(800 * RATE))
+    whole = band_rows([(1 / RATE, RATE, noise)], 400, 2.0, LOW, HIGH)
+    assert np.all(whole.rms_error == 0)
+    pieces, there = lossy(noise, random_losses(800.0, 0.3, seed=1))
+    rows = band_rows(pieces, 400, 2.0, LOW, HIGH)
+    partly = ~there.reshape(400, -1).all(axis=1)
+    assert 0.9 < np.std((rows.rms - whole.rms)[partly] / rows.rms_error[partly]) < 1.25
+    np.testing.assert_allclose(rows.power_error, 2 * rows.rms * rows.rms_error)
+
+
+def test_less_coverage_is_a_larger_error():
+    x = np.random.default_rng(11).normal(size=1000)
+    errors = [band_rows([(1 / RATE, RATE, x[:n])], 1, 2.0, LOW, HIGH).rms_error[0] for n in (1000, 900, 700, 400)]
+    assert errors[0] == 0
+    assert np.all(np.diff(errors) > 0)
 
 
 def test_stretches_of_different_rates_may_share_a_row():

@@ -72,6 +72,71 @@ def test_a_gap_spoils_every_window_that_holds_it_and_no_other() -> None:
     assert s.usable().tolist() == [True] * 4 + [False] * 4 + [True] * 2
 
 
+def test_a_window_may_hold_as_many_imputed_values_as_stated_but_not_as_its_newest() -> None:
+    s = session(steps=10, most_imputed=1)
+    s.beta[4] = np.nan
+    # step 4 has no beta, step 5 would have an imputed newest value
+    assert s.usable().tolist() == [True] * 4 + [False] * 2 + [True] * 4
+    assert np.flatnonzero(s.imputed).tolist() == [3 + 4]
+    mean = float(np.nanmean(s.measured_beta))
+    low, high = sorted((mean, 0.5))  # between the session's mean and the line from 0.4 to 0.6
+    assert low < s.states()[6][1] < high
+    assert s.states()[6][[0, 2]] == pytest.approx([0.4, 0.6])
+    assert np.isnan(s.states()[5]).tolist() == [False, False, True]
+    assert np.isnan(s.rewards(SETTINGS)).tolist() == [False] * 4 + [True] + [False] * 5
+    assert ReplayBuffer(SETTINGS, (s,), "uV", "table").transitions().step.tolist() == [0, 1, 2, 3, 6, 7, 8, 9]
+
+
+def autoregressive(rho: float) -> SessionTrajectory:
+    rng = np.random.default_rng(7)
+    beta = np.empty(40_000)
+    beta[0] = 0.0
+    for k in range(1, beta.size):
+        beta[k] = rho * beta[k - 1] + rng.standard_normal()
+    beta[50::9] = np.nan
+    return SessionTrajectory(1, 1, "other", beta[:3], beta[3:], np.zeros(beta.size - 3), most_imputed=1)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
+def test_an_imputed_value_is_the_best_linear_prediction_from_both_neighbours(rho: float) -> None:
+    """Of an autoregression of order 1: E[x_t | x_{t-1}, x_{t+1}] = rho (x_{t-1} + x_{t+1}) / (1 + rho^2)."""
+    s = autoregressive(rho)
+    k = np.flatnonzero(s.imputed)
+    measured = s.measured_beta
+    expected = rho * (measured[k - 1] + measured[k + 1]) / (1 + rho**2)
+    assert k.size > 4000
+    assert np.sqrt(np.mean((s.padded_beta[k] - expected) ** 2)) < 0.05 * np.nanstd(measured)
+
+
+def test_longer_gaps_and_two_gaps_in_one_window_need_a_higher_number() -> None:
+    long, two = session(steps=11, most_imputed=1), session(steps=11, most_imputed=1)
+    long.beta[[4, 5]] = np.nan
+    two.beta[[4, 6]] = np.nan
+    assert long.usable().tolist() == [True] * 4 + [False] * 5 + [True] * 2
+    assert two.usable().tolist() == [True] * 4 + [False] * 4 + [True] * 3
+    assert replace(long, most_imputed=2).usable().tolist() == [True] * 4 + [False] * 3 + [True] * 4
+
+
+def test_nothing_is_imputed_before_the_first_value_nor_with_none_allowed() -> None:
+    s = session(steps=6, lead_beta=np.array([0.1, np.nan, np.nan]), most_imputed=1)
+    assert not s.imputed.any()
+    assert s.usable().tolist() == [False] * 3 + [True] * 3
+    assert not session().imputed.any()
+
+
+def test_windows_cannot_be_imputed_altogether() -> None:
+    with pytest.raises(ValueError, match="3 imputed values of 3"):
+        session(most_imputed=3)
+
+
+def test_imputed_values_are_not_stored_but_their_number_is() -> None:
+    s = session(steps=10, most_imputed=1)
+    s.beta[4] = np.nan
+    again = from_parquet(to_parquet(ReplayBuffer(SETTINGS, (s,), "uV", "table"))).sessions[0]
+    assert np.isnan(again.beta[4])
+    assert again.usable().tolist() == s.usable().tolist()
+
+
 def test_a_session_without_a_lead_can_be_used_from_step_w_on() -> None:
     s = session(steps=6, lead_beta=np.full(3, np.nan))
     assert s.usable().tolist() == [False] * 3 + [True] * 3

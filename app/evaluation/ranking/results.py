@@ -90,7 +90,7 @@ def _read(db: Session, session: StudySession, arm: Arm, version: SettingsVersion
         table = step_table(db, session, version)
     except Invalid as error:
         return str(error)
-    read, trace = trajectory_of(session, table, arm, version.window), table.beta_trace
+    read, trace = trajectory_of(session, table, arm, version), table.beta_trace
     if not isinstance(read, str) and trace is not None and (trace.unit, trace.source) != (snapshot.beta_unit, snapshot.beta_source):
         return f"its beta is in {trace.unit} from {trace.source}, the estimates are in {snapshot.beta_unit} from {snapshot.beta_source}"
     return read

@@ -51,7 +51,7 @@ def correct_proposal(session: CurrentProposal, change: ProposalChange, db: Db, c
     """Correct a proposal without confirming it. 409 where somebody changed it after the stated version."""
     row = proposals.change(db, session, change, caller)
     db.commit()
-    return proposal_out(session, row, caller)
+    return proposal_out(db, session, row, caller)
 
 
 @router.post("/proposals/{session_id}/confirm", responses=problems(409))
@@ -68,7 +68,7 @@ def split_proposal(session: CurrentProposal, parts: SplitIn, db: Db, caller: Cur
     made = proposals.split(db, session, parts.version, parts.parts, caller)
     db.commit()
     behind = repository.proposals(db, [s.id for s in made])
-    return [proposal_out(s, behind[s.id], caller) for s in made]
+    return [proposal_out(db, s, behind[s.id], caller) for s in made]
 
 
 @router.post("/proposals/{session_id}/discard", status_code=204, responses=problems(409))
@@ -92,4 +92,4 @@ def attach_file(file_id: RowId, target: AttachIn, db: Db, caller: CurrentCaller)
 def _one(db: Session, session: StudySession, caller: Caller) -> ProposalOut:
     if session.status != "proposed":
         raise NotFound(f"Session {session.id} is confirmed; it is no proposal any more.", "Read it as a session.")
-    return proposal_out(session, repository.proposal(db, session.id, caller), caller)
+    return proposal_out(db, session, repository.proposal(db, session.id, caller), caller)

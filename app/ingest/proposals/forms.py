@@ -18,6 +18,7 @@ from app.platform.web.forms import parse
 from app.study import blinding
 from app.study import repository as study
 from app.study.models import Controller, SessionSegment, StudySession
+from app.study.sessions.usable_steps import UsableSteps
 
 LABELS = {
     "visit": "Visit", "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "from": "From", "to": "To",
@@ -36,6 +37,7 @@ class ProposalForm:
         clocked: whether times are dates and times of day; else minutes and seconds of the recording.
         why: by field, why it is proposed so.
         notes: contradictions that a person should look at.
+        usable: usable steps by channel, the control channel first.
         problem: why the form was refused.
     """
 
@@ -47,6 +49,7 @@ class ProposalForm:
     clocked: bool
     why: Mapping[str, str]
     notes: list[str]
+    usable: list[UsableSteps]
     reason: str = ""
     problem: dict[str, Any] | None = None
 

@@ -30,6 +30,7 @@ from app.study.deps import CurrentParticipant
 from app.study.models import Participant, StudySession
 from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions
+from app.study.sessions.usable_steps import usable_steps
 from app.study.wording import sentences
 
 router = APIRouter()
@@ -196,6 +197,7 @@ def _form(
         is_clocked(session),
         wording.reasons(proposal.evidence),
         sentences(contradictions(db, session, proposal.visit_open)),
+        usable_steps(db, session),
         sent.get(f"reason-{session.id}", "") if error else "",
         error.problem(request.url.path) if error else None,
     )

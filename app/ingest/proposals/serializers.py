@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
@@ -10,20 +12,22 @@ from app.ingest.models import SessionProposal
 from app.ingest.schemas import (
     PartOut,
     ProposalOut,
+    UsableStepsOut,
 )
 from app.study import repository as study
 from app.study.models import StudySession
 from app.study.serializers import session_out
+from app.study.sessions.usable_steps import usable_steps
 
 
 def proposals_out(db: Session, participant_id: int, caller: Caller) -> list[ProposalOut]:
     """All proposals of a participant for the API."""
     rows = study.proposals_of_participant(db, participant_id)
     behind = repository.proposals(db, [s.id for s in rows])
-    return [proposal_out(s, behind[s.id], caller) for s in rows if s.id in behind]
+    return [proposal_out(db, s, behind[s.id], caller) for s in rows if s.id in behind]
 
 
-def proposal_out(session: StudySession, row: SessionProposal, caller: Caller) -> ProposalOut:
+def proposal_out(db: Session, session: StudySession, row: SessionProposal, caller: Caller) -> ProposalOut:
     """A proposal for the API."""
     return ProposalOut(
         session=session_out(session, caller),
@@ -44,4 +48,5 @@ def proposal_out(session: StudySession, row: SessionProposal, caller: Caller) ->
             )
             for s in session.segments
         ],
+        usable_steps=[UsableStepsOut(**asdict(u)) for u in usable_steps(db, session)],
     )

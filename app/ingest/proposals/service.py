@@ -26,6 +26,7 @@ from app.study.models import Controller, Participant, Recording, StudySession
 from app.study.service import POLICY_CONTROLLERS
 from app.study.sessions.contradictions import contradictions, control_recording, local_day
 from app.study.sessions.stimulation import delivered
+from app.study.sessions.usable_steps import sentence, usable_steps
 from app.study.wording import sentences
 
 RESTS_ON = frozenset({"visit", "hemisphere", "start_s", "stop_s", "started_at", "controller"})
@@ -63,13 +64,13 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     guess = guess_visit(study.visits(db, participant.id, 1000, 0)[0], day, stated.visit)
     session = add_session(db, guess.visit, placement, stated.controller, stated.policy_id, stated.hemisphere, stated.counts)
     length = f"{session.duration_s / 60:.1f} min" if session.duration_s else "no data"
-    seen = _seen(session, placement)
+    seen, usable = _seen(session, placement), sentence(usable_steps(db, session))
     if stated.counts:
         said = (
             f"Session {session.id}: visit {guess.visit.number}, {stated.controller}, {length}, {seen} (recording {placement.control.id})."
         )
         flagged = [*placement.notes, *sessions.fix_milliamperes(db, session), *sentences(contradictions(db, session))]
-        return NewSession(session, group, [said, *outcomes_intake.derive(db, session)], flagged)
+        return NewSession(session, group, [said, usable, *outcomes_intake.derive(db, session)], flagged)
     evidence = {"visit": guess.why, "controller": BY_UPLOAD}
     controller = stated.controller
     if controller is None:
@@ -92,7 +93,7 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
         f"{'visit open' if guess.open else f'visit {guess.visit.number}'} ({wording.reason(guess.why)}), "
         f"{controller or 'controller open'} ({wording.reason(evidence['controller'])}), {length}, {seen}."
     )
-    return NewSession(session, group, [said], [*placement.notes, *sentences(contradictions(db, session, guess.open))])
+    return NewSession(session, group, [said, usable], [*placement.notes, *sentences(contradictions(db, session, guess.open))])
 
 
 def _seen(session: StudySession, placement: Placement) -> str:

@@ -112,7 +112,7 @@ def upload_out(db: Session, outcome: UploadOutcome, caller: Caller) -> UploadOut
         created_at=outcome.upload.created_at,
         created_by=outcome.upload.created_by,
         sessions=[session_out(s, caller) for s in sessions],
-        proposals=[proposal_out(s, behind[s.id], caller) for s in sessions if s.id in behind],
+        proposals=[proposal_out(db, s, behind[s.id], caller) for s in sessions if s.id in behind],
         files=[_file_out(f.name, f.row, f.duplicate, f.session_ids) for f in outcome.files],
         report=[FileReportOut.model_validate(r) for r in outcome.reports_for_sender],
     )

@@ -113,7 +113,7 @@ def collect(db: Session, participant: Participant) -> Collection:
     suggestion = study.suggest_xi_beta(db, participant, SYSTEM) if version.xi_beta is None else None
     settings = study.mdp_settings(version, suggestion)
     sessions = [s for s in study_repository.sessions_of_participant(db, participant.id) if s.status == "confirmed"]
-    read = [_read(db, session, settings) for session in sessions]
+    read = [_read(db, session, version) for session in sessions]
     unit, source = _signal(version, read)
     barrier = gate(db, participant, sessions)
     members = tuple(_pass_gate(_admit(m, unit, source), barrier) for m in read)
@@ -173,13 +173,13 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
     return db.get_one(BufferSnapshot, row_id)
 
 
-def _read(db: Session, session: StudySession, settings: MdpSettings) -> Member:
+def _read(db: Session, session: StudySession, version: SettingsVersion) -> Member:
     """The session's trajectory, or the first reason of its own against it."""
     try:
         table = study.session_data(db, session).table
     except Invalid as error:
         return Member(session, None, None, str(error))
-    trajectory = trajectory_of(session, table, blinding.arm(session, SYSTEM), settings.window, settings.lower_bound)
+    trajectory = trajectory_of(session, table, blinding.arm(session, SYSTEM), version, version.lower_bound)
     if isinstance(trajectory, str):
         return Member(session, table, None, trajectory)
     if not trajectory.usable().any():

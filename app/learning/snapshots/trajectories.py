@@ -6,24 +6,26 @@ import numpy as np
 
 from app.study import service as study
 from app.study.blinding import Arm
-from app.study.models import Controller, StudySession
+from app.study.models import Controller, SettingsVersion, StudySession
 from app.study.traces import StepTable
 from ml.trajectories import SessionTrajectory
 
 
 def trajectory_of(
-    session: StudySession, table: StepTable, arm: Arm, window: int, random_bound: float | None = None
+    session: StudySession, table: StepTable, arm: Arm, version: SettingsVersion, random_bound: float | None = None
 ) -> SessionTrajectory | str:
     """The session's steps after its start, with the window of beta before it; or why there are none.
 
     Args:
         session: its QoCs are taken in their newest revision. table: its steps, [window + T].
         arm: what drove it, as far as the asker may know.
-        window: W, steps of the state. random_bound: B in force, kept for a session of the random controller.
+        version: W, and how many steps of a state may be imputed (one is always measured).
+        random_bound: B in force, kept for a session of the random controller.
     """
     reason = own_reason(session, table)
     if reason is not None:
         return reason
+    window = version.window
     return SessionTrajectory(
         session_id=session.id,
         visit=session.visit.number,
@@ -34,6 +36,7 @@ def trajectory_of(
         amplitude=table.fraction[window:],
         qoc=study.qoc_of(session),
         random_lower_bound=random_bound if arm.controller is Controller.RANDOM else None,
+        most_imputed=min(version.most_imputed, window - 1),
     )
 
 

@@ -27,7 +27,7 @@ from app.study.service import SessionData
 from app.study.sessions import view as session_view
 from app.study.sessions.charts import operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
-from app.study.traces import AMPLITUDE_STREAM, session_offset_s
+from app.study.traces import NO_CONTROL, session_offset_s
 from app.study.wording import sentences
 from ml.energy import relative_energy
 
@@ -238,7 +238,7 @@ def _page(
         conflicts=operator_conflicts(events, origin),
         blocks=session_view.recording_blocks(session, recordings, traces, view.used),
         outcomes=session_view.outcomes_view(db, session),
-        streams=[t for r in recordings for t in traces[r.id] if t.stream != AMPLITUDE_STREAM],
+        streams=[t for r in recordings for t in traces[r.id] if t.stream not in NO_CONTROL],
         recordings=recordings,
         qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
         correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},

@@ -66,7 +66,12 @@ GROUPS = (
             SettingField("beta_high_hz", "Beta band to", "Upper edge of the band.", "Hz"),
             SettingField(
                 "min_valid_fraction", "Valid share of a window",
-                "A window with fewer valid samples than this share counts as missing, 0 to 1.",
+                "Coverage: a window whose measured samples cover less than this share counts as missing, 0 to 1.",
+            ),
+            SettingField(
+                "most_imputed", "Imputed beta in a state",
+                "Missing beta amplitudes of a state that may be taken from their neighbours, never the newest; 0 for none.",
+                "steps", attrs=_WHOLE,
             ),
             SettingField(
                 "beta_measure", "Measure of beta", "What is computed from time-domain LFP. Recordings decoded before keep theirs.",

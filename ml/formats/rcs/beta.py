@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.formats.beta import beta_streams
 from ml.formats.rcs.packets.streams import TimeDomain
 from ml.formats.rcs.packets.time import PacketTimes
 from ml.formats.rcs.settings import Sensing, Settings
@@ -100,7 +101,10 @@ def _joined(pieces: list[Stretch]) -> Stretch:
 
 
 def beta_traces(channels: dict[str, list[Stretch]], grid: Grid, notes: list[str]) -> list[TraceLog]:
-    """RMS amplitude (uV) and power (uV^2) of the beta band per channel and contact pair; the participant's measure is `beta`."""
+    """RMS amplitude (uV) and power (uV^2) of the beta band per channel and contact pair; the participant's measure is `beta`.
+
+    Where rows are not whole, `beta_error` is the standard error of `beta`.
+    """
     options = grid.options
     out: list[TraceLog] = []
     for channel, pieces in channels.items():
@@ -116,19 +120,21 @@ def beta_traces(channels: dict[str, list[Stretch]], grid: Grid, notes: list[str]
             "rates_hz": sorted({rate for _, rate, _ in fits}),
             "contacts": channel[len("key 0 ") :],
         }
-        for stream, unit, measure in options.beta_streams:
-            values = rows.rms if measure == "rms" else rows.power
+        for stream, unit, measure, values in beta_streams(rows, options):
             out.append(grid.trace((stream, channel, unit), "time_domain", values, rows.covered, {**details, "measure": measure}))
     return out
 
 
 def band_rows_in_blocks(stretches: list[Stretch], grid: Grid) -> BandRows:
-    """`ml.signals.band_rows` of samples in uV, a block of rows at a time; equal to filtering every stretch as a whole."""
+    """`ml.signals.band_rows` of samples in uV, a block of rows at a time.
+
+    Amplitudes equal those of the whole; the standard errors rest on the block's own autocorrelation.
+    """
     options = grid.options
     margin_s = MARGIN_CYCLES / (options.beta_high_hz - options.beta_low_hz) + 1.0
     begin_s = np.array([(start - grid.start_ms) / 1000.0 for start, _, _ in stretches])
     end_s = begin_s + np.array([x.size / rate for _, rate, x in stretches])
-    rms, power, covered = (np.empty(grid.rows) for _ in range(3))
+    out = BandRows(*(np.empty(grid.rows) for _ in range(4)))
     for first in range(0, grid.rows, ROWS_AT_ONCE):
         end = min(first + ROWS_AT_ONCE, grid.rows)
         low_s, high_s = first * options.period_s - margin_s, end * options.period_s + margin_s
@@ -142,9 +148,9 @@ def band_rows_in_blocks(stretches: list[Stretch], grid: Grid) -> BandRows:
         ahead = min(first, 1)
         t0_s = (first - ahead) * options.period_s
         rows = band_rows(block, end - first + ahead, options.period_s, options.beta_low_hz, options.beta_high_hz, t0_s)
-        for out, found in ((rms, rows.rms), (power, rows.power), (covered, rows.covered)):
-            out[first:end] = found[ahead:]
-    return BandRows(rms, power, covered)
+        for name in ("rms", "power", "covered", "rms_error"):
+            getattr(out, name)[first:end] = getattr(rows, name)[ahead:]
+    return out
 
 
 def time_domain_spectra(channels: dict[str, list[Stretch]]) -> list[SpectrumLog]:

@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.beta import Stretch, channel_spectrum, step_trace, time_domain_traces
+from ml.formats.beta import channel_spectrum, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
 from ml.formats.tables.columns import LFP_SCALE, TIME_SCALE, Columns, check_reach, checked_amplitude, compare_amplitudes
 from ml.formats.tables.numbers import known_unit
-from ml.signals import row_means
+from ml.signals import Stretch, row_means
 
 GAP = 1.5
 """Two rows further apart than this many samples have a gap between them."""

@@ -62,7 +62,7 @@ def test_the_past_is_forgotten_after_the_context():
     np.testing.assert_allclose(streamed([(0.0, RATE, x)], 20)[first:], streamed([(0.0, RATE, changed)], 20)[first:], rtol=1e-9)
 
 
-def test_a_lossy_period_has_no_value_and_gaps_are_not_bridged():
+def test_a_period_lost_for_the_most_part_has_no_value():
     x = bursts(40)
     kept = [(0.0, RATE, x[: int(9 * RATE)]), (11.0, RATE, x[int(11 * RATE) :])]
     values = streamed(kept, 20)
@@ -70,6 +70,17 @@ def test_a_lossy_period_has_no_value_and_gaps_are_not_bridged():
     assert np.isnan(values).tolist() == (later.covered < 0.7 - 1e-9).tolist()
     assert np.isnan(values[4:6]).all()
     assert np.isfinite(values[6:]).all()
+
+
+def test_short_gaps_are_bridged_in_time_as_they_are_afterwards():
+    x = bursts(200)
+    there = np.arange(x.size) % 50 < 38  # 152 ms of every 200 ms: none of it could be filtered alone
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], there.astype(np.int8), [0]))))
+    kept = [(a / RATE, RATE, x[a:b]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    values, later = streamed(kept, 100), band_rows(kept, 100, PERIOD, 13.0, 35.0)
+    assert np.isfinite(values).all()
+    assert np.corrcoef(values, later.rms)[0, 1] > 0.99
+    np.testing.assert_allclose(values.mean(), later.rms.mean(), rtol=0.01)
 
 
 def test_samples_that_come_in_small_packets_give_the_same():

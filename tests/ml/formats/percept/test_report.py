@@ -53,7 +53,10 @@ def test_power_and_amplitude_of_the_real_report_stand_beside_the_samples_they_ca
     decoded = decode(recordings / "percept/percept_session_report.zip")
     for run in range(4):
         right, left = of_side(decoded, "right", run), of_side(decoded, "left", run)
-        assert [(t.stream, t.unit, t.source) for t in right.traces] == [
+        errors = [t for t in right.traces if t.stream == "beta_error"]
+        assert [(t.unit, np.flatnonzero(t.values).tolist()) for t in errors] == [("uV", [t.values.size - 1]) for t in errors]
+        assert len(errors) == (run in (0, 3))  # their last period is cut, at 1.5 s of 2
+        assert [(t.stream, t.unit, t.source) for t in right.traces if t not in errors] == [
             ("beta", "uV", "time_domain"),
             ("beta_power", "uV2", "time_domain"),
             ("band_power", "device units", "percept_lfp"),

@@ -1,0 +1,126 @@
+"""How many steps of a session can be learned from, per channel that could have driven its controller, and why where there are none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from app.platform.errors import Invalid
+from app.study import repository
+from app.study.models import SettingsVersion, StudySession, Trace
+from app.study.traces import AMPLITUDE_STREAM, StepTable, shown_table
+from ml.trajectories import SessionTrajectory
+
+CONTROL_STREAMS = ("beta", "band_power")
+"""Streams that can drive a controller, in the order of preference where the participant's source does not decide."""
+
+
+@dataclass(frozen=True)
+class UsableSteps:
+    """Steps of one channel of a session.
+
+    Attributes:
+        stream, channel, source: of the trace. is_control: whether the controller is taken to have seen it.
+        steps: of the session. valid: with a valid beta. usable: that may enter a replay buffer.
+        reason: why there are none; None where there are some.
+    """
+
+    stream: str
+    channel: str
+    source: str
+    is_control: bool
+    steps: int
+    valid: int
+    usable: int
+    reason: str | None
+
+
+def usable_steps(db: Session, session: StudySession) -> list[UsableSteps]:
+    """Usable steps of every channel of the control recordings under the participant's present settings, the control channel first.
+
+    A session of several parts of recordings is counted by channel over all of them. Empty where no recording has such a channel.
+    """
+    settings = session.visit.participant.current_settings
+    found: dict[tuple[str, str], UsableSteps] = {}
+    for segment in session.segments:
+        if not segment.is_control:
+            continue
+        traces = repository.traces_of_recording(db, segment.recording_id)
+        amplitude = next((t for t in traces if t.stream == AMPLITUDE_STREAM), None)
+        candidates = [t for stream in CONTROL_STREAMS for t in traces if t.stream == stream]
+        for trace in candidates:
+            control = trace is _control(session, candidates)
+            one = _of_channel(session, settings, trace, amplitude, control)
+            before = found.get((trace.stream, trace.channel))
+            if before is None or one.usable > before.usable:
+                found[trace.stream, trace.channel] = one
+    return sorted(found.values(), key=lambda u: not u.is_control)
+
+
+def _control(session: StudySession, candidates: Sequence[Trace]) -> Trace | None:
+    named = (t for t in candidates if t.stream == session.control_stream and session.control_channel in (None, t.channel))
+    return next(named, None)
+
+
+def sentence(found: Sequence[UsableSteps]) -> str:
+    """Usable steps of a session in words: the control channel, and the others that have any."""
+    if not found:
+        return "Usable steps: none, because no recording has a beta amplitude or a band power."
+    first, rest = found[0], found[1:]
+    said = f"Usable steps: {first.usable} of {first.steps} on {_name(first)}"
+    said += f", because {first.reason}" if first.reason else ""
+    others = [f"{u.usable} on {_name(u)}" for u in rest if u.usable]
+    if others:
+        said += f"; {', '.join(others)}"
+    elif rest:
+        said += f"; none on {len(rest)} other channel{'s' if len(rest) > 1 else ''}"
+    return said + "."
+
+
+def _name(u: UsableSteps) -> str:
+    return f"{u.stream.replace('_', ' ')} {u.channel}".strip()
+
+
+def _of_channel(session: StudySession, settings: SettingsVersion, trace: Trace, amplitude: Trace | None, is_control: bool) -> UsableSteps:
+    named = (trace.stream, trace.channel, trace.source, is_control)
+    try:
+        table = shown_table(session, settings, trace, amplitude)
+    except Invalid as error:
+        return UsableSteps(*named, 0, 0, 0, f"{error.detail} {error.hint}".strip().rstrip("."))
+    steps = int(np.sum(table.t_s > 0))
+    if steps == 0:
+        return UsableSteps(*named, 0, 0, 0, "the session is shorter than one step")
+    trajectory = SessionTrajectory(
+        session_id=session.id,
+        visit=session.visit.number,
+        controller="other",
+        lead_beta=table.beta[: settings.window],
+        beta=table.beta[settings.window :],
+        amplitude=table.fraction[settings.window :],
+        most_imputed=min(settings.most_imputed, settings.window - 1),
+    )
+    usable = int(trajectory.usable().sum())
+    valid = int(np.sum(~np.isnan(trajectory.beta)))
+    return UsableSteps(*named, steps, valid, usable, None if usable else _reason(trajectory, table, settings, valid))
+
+
+def _reason(s: SessionTrajectory, table: StepTable, settings: SettingsVersion, valid: int) -> str:
+    """Why a channel has no usable step, the first thing that would have to change."""
+    if valid == 0:
+        return f"none of its steps has a valid beta: measured samples cover less than {100 * settings.min_valid_fraction:g} % of each"
+    states = np.asarray(np.isfinite(s.states()).all(axis=1))
+    windows = int(np.sum(states[:-1] & states[1:]))
+    if windows == 0:
+        imputed = f" with at most {s.most_imputed} missing among them" if s.most_imputed else " without a gap"
+        return f"its {valid} valid steps are nowhere {settings.window + 1} in a row{imputed}, as a state and its next beta need"
+    whole = f"{windows} steps have a whole state, but "
+    if table.amplitude_trace is None:
+        return whole + "no amplitude was recorded"
+    if np.isnan(s.amplitude).all():
+        if table.cdbs_ma is None and not np.isnan(table.amplitude_ma).all():
+            return whole + "nobody has stated the cDBS amplitude, which the amplitude is a fraction of"
+        return whole + "the amplitude is not known in any of them"
+    return whole + "each of them lacks an amplitude from 0 to the cDBS amplitude"
