@@ -4,8 +4,8 @@ Alignment, everywhere in betaloop: step k = 0, 1, ... is the row t_s = period (k
 (period k, period (k + 1)], and the beta amplitude of that same window. The state s_k is the W beta amplitudes *before* that row,
 oldest first; r_k uses the row itself. Source: Gao et al. 2023, section 4.1.
 
-A window may hold a stated number of imputed beta amplitudes: between the session's mean and the line from the measured value before to the one
-after, as far as the session's beta carries over from row to row. They are marked, never a window's newest value, and never judged by a
+A window may hold a stated number of imputed beta amplitudes: between the session's mean and the line from the measured value before to the
+one after, as far as the session's beta carries over from row to row. They are marked, never a window's newest value, and never judged by a
 reward.
 """
 
