@@ -24,6 +24,7 @@ from app.study import blinding, service
 from app.study import repository as study
 from app.study.models import Participant
 from app.study.schemas import SettingsOut
+from app.study.sessions.data import session_data
 
 _SESSION_COLUMNS = (
     "session_id", "visit", "date", "ordinal", "controller", "policy_id", "hemisphere", "started_at_utc", "duration_s", "beta_unit",
@@ -50,7 +51,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
     for session in study.sessions_of_participant(db, participant.id):
         arm, qoc = blinding.arm(session, caller), session.qoc
         try:
-            table, problem = service.session_data(db, session).table, None
+            table, problem = session_data(db, session).table, None
         except BetaloopError as error:
             table, problem = None, str(error)
         beta = table and table.beta_trace

@@ -19,6 +19,8 @@ from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Controller, Participant, StudySession, Visit
 from app.study.schemas import QocIn
+from app.study.sessions.data import qoc_of, session_data
+from app.study.threshold import mdp_settings
 from ml.mdp import end_reward, step_reward
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.population import SimulatedSession, run_session
@@ -43,7 +45,7 @@ class PlacedSession:
 
 def simulate(participant: Participant, visit: Visit, placed: PlacedSession, seed: int) -> SimulatedSession:
     """The session's numbers: the same whenever it is asked for."""
-    settings = study.mdp_settings(participant.current_settings)
+    settings = mdp_settings(participant.current_settings)
     controller: CohortController
     if placed.policy is not None:
         controller = OnnxPolicy(files.read(placed.policy.onnx_sha256), settings.window)
@@ -98,11 +100,11 @@ def hold(db: Session, participant: Participant, visit: Visit, placed: PlacedSess
 
 def actual_return(db: Session, session: StudySession) -> float | None:
     """What a session brought over all its steps, by the rule of `ml.returns` for gaps; None without its QoCs or with too many gaps."""
-    settings = study.mdp_settings(session.visit.participant.current_settings)
-    table = study.session_data(db, session).table
+    settings = mdp_settings(session.visit.participant.current_settings)
+    table = session_data(db, session).table
     during = table.t_s > 0
     rewards = step_reward(settings, table.beta[during], table.fraction[during])
-    return ActualReturn(step_return(rewards, settings.gamma, rewards.size), end_reward(settings, study.qoc_of(session))).value
+    return ActualReturn(step_return(rewards, settings.gamma, rewards.size), end_reward(settings, qoc_of(session))).value
 
 
 def _session_at(db: Session, visit: Visit, position: int) -> StudySession | None:

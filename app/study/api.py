@@ -27,6 +27,7 @@ from app.study.schemas import (
     VisitOut,
 )
 from app.study.serializers import outcome_out, participant_out, session_out, trace_out, visit_out
+from app.study.sessions.data import session_data
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
@@ -119,7 +120,7 @@ def change_session(session: CurrentSession, change: SessionChange, db: Db, calle
 @router.get("/sessions/{session_id}/trace")
 def read_trace(session: CurrentSession, db: Db) -> TraceOut:
     """Beta and amplitude on the 2 s grid; rows with t_s <= 0 are the window before the session."""
-    return trace_out(service.session_data(db, session))
+    return trace_out(session_data(db, session))
 
 
 @router.get("/sessions/{session_id}/qoc")

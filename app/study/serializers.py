@@ -19,7 +19,7 @@ from app.study.schemas import (
     TraceOut,
     VisitOut,
 )
-from app.study.service import SessionData
+from app.study.sessions.data import SessionData
 
 
 def outcome_out(session: StudySession, derived: outcome_values.Derived) -> OutcomeOut:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -19,13 +17,9 @@ from app.study import blinding, repository
 from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision, SettingsVersion, StudySession, Visit
 from app.study.outcomes import service as outcomes
 from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, ParticipantIn, QocIn, SessionChange, SettingsIn, VisitChange, VisitIn
-from app.study.traces import NO_CONTROL, StepTable, step_table
+from app.study.threshold import MDP_FIELDS
+from app.study.traces import NO_CONTROL
 from ml.mdp import MdpSettings
-from ml.qoc import Qoc
-
-MDP_FIELDS = (
-    "window", "period_s", "r_a", "r_b", "c1", "c2", "c3", "c4", "gamma", "lower_bound", "tremor_as_fraction",
-)  # fmt: skip
 
 RESERVED_CODES = {"new"}
 SIGNED_UNITS = {"dB", "z"}
@@ -61,49 +55,6 @@ def change_settings(db: Session, participant: Participant, change: SettingsIn, r
     if all(getattr(current, name) == value for name, value in values.items()):
         return current
     return _add_settings(db, participant, values, caller, reason)
-
-
-def mdp_settings(settings: SettingsVersion, suggestion: float | None = None) -> MdpSettings:
-    """The MDP of a settings version.
-
-    Raises:
-        Invalid: xi_beta is not set; names the suggestion from the data where there is one.
-    """
-    if settings.xi_beta is None:
-        hint = f" A suggestion from the data: {suggestion:.4g} {settings.beta_unit or ''}".rstrip() + "." if suggestion is not None else ""
-        raise Invalid(
-            f"Participant {settings.participant.code} has no beta threshold xi_beta yet; the paper gives no default.",
-            f"Set xi_beta in the participant's settings.{hint}",
-            suggested_xi_beta=suggestion,
-        )
-    return MdpSettings(xi_beta=settings.xi_beta, **{name: getattr(settings, name) for name in MDP_FIELDS})
-
-
-def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> float | None:
-    """A threshold from the data: midway between the median beta of cDBS sessions and that of no-DBS sessions, else the median of all.
-
-    Of confirmed sessions that are not excluded, with beta in the settings' unit and from their source; None where these leave it open and
-    the sessions have several, which are never mixed.
-    """
-    settings = participant.current_settings
-    groups: dict[Controller, list[np.ndarray[Any, Any]]] = {}
-    kinds: set[tuple[str, str]] = set()
-    for session in repository.sessions_of_participant(db, participant.id):
-        table = step_table(db, session, settings)
-        trace = table.beta_trace
-        if session.excluded_reason or trace is None:
-            continue
-        if (settings.beta_unit or trace.unit, settings.beta_source or trace.source) != (trace.unit, trace.source):
-            continue
-        kinds.add((trace.unit, trace.source))
-        groups.setdefault(blinding.arm(session, caller).controller, []).append(table.beta[~np.isnan(table.beta)])
-    if len(kinds) > 1:
-        return None
-    medians = {c: float(np.median(np.concatenate(b))) for c, b in groups.items() if sum(x.size for x in b)}
-    if Controller.CDBS in medians and Controller.NO_DBS in medians:
-        return (medians[Controller.CDBS] + medians[Controller.NO_DBS]) / 2
-    everything = [x for parts in groups.values() for x in parts if x.size]
-    return float(np.median(np.concatenate(everything))) if everything else None
 
 
 def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Caller) -> Visit:
@@ -226,52 +177,6 @@ def _check_control(db: Session, session: StudySession, given: dict[str, Any]) ->
     if not any(t.stream == stream and channel in (None, t.channel) for t in traces):
         known = "; ".join(sorted({f"{t.stream} {t.channel}".strip() for t in traces})) or "none"
         raise Invalid(f"The session's recordings have no trace '{stream} {channel or ''}'.", f"Choose one of: {known}.")
-
-
-@dataclass(frozen=True)
-class SessionData:
-    """A session with its step table under the participant's present settings."""
-
-    session: StudySession
-    settings: SettingsVersion
-    table: StepTable
-
-    @property
-    def threshold_mismatch(self) -> str:
-        """Why the participant's threshold says nothing about this trace; empty where it does. Units and sources are never mixed."""
-        trace, settings = self.table.beta_trace, self.settings
-        if trace is None or settings.xi_beta is None:
-            return ""
-        unstated = [name for name, value in (("unit", settings.beta_unit), ("source", settings.beta_source)) if not value]
-        if unstated:
-            return (
-                f"Nobody has stated the {' and the '.join(unstated)} of the threshold of {settings.xi_beta:g}; this trace is in "
-                f"{trace.unit} from {trace.source}. State unit and source in the participant's settings."
-            )
-        wanted = (settings.beta_unit, settings.beta_source)
-        if (trace.unit, trace.source) == wanted:
-            return ""
-        return (
-            f"The threshold of {settings.xi_beta:g} is in {wanted[0]} from {wanted[1]}; this trace is in {trace.unit} from {trace.source}. "
-            "They are not comparable."
-        )
-
-    @property
-    def threshold(self) -> float | None:
-        """xi_beta, where it is stated to be in the unit and from the source of this trace."""
-        return None if self.threshold_mismatch else self.settings.xi_beta
-
-
-def session_data(db: Session, session: StudySession) -> SessionData:
-    """Beta and amplitude of a session."""
-    settings = session.visit.participant.current_settings
-    return SessionData(session, settings, step_table(db, session, settings))
-
-
-def qoc_of(session: StudySession) -> Qoc:
-    """A session's QoCs as the science knows them."""
-    row = session.qoc
-    return Qoc() if row is None else Qoc(row.grasp_hz, row.rating, row.tremor_percent)
 
 
 def require(caller: Caller, permission: str, participant: Participant) -> None:

@@ -34,8 +34,8 @@ from ml.deploy.fixed_point import CutNetwork, quantise
 from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.onnx_mlp import NoPlainNetwork, mlp_of
 from ml.deploy.runtime.__main__ import check
+from ml.deploy.runtime.controller import BoundedController, WindowNetwork
 from ml.deploy.runtime.envelope import Signal
-from ml.deploy.runtime.loop import BoundedController, WindowNetwork
 from ml.deploy.runtime.network import MlpNetwork
 from ml.deploy.sheet import render
 from ml.deploy.windows import PolicyWindow

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.deploy.manifest import BundleManifest
+from ml.deploy.runtime.controller import BoundedController, WindowNetwork
 from ml.deploy.runtime.envelope import BetaSample, Signal, reason_names
-from ml.deploy.runtime.loop import BoundedController, WindowNetwork
 
 TOLERANCE = 1e-5
 """Largest difference between two runtimes on a test vector, amplitude fraction; times the cDBS amplitude, of a decision."""

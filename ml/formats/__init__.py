@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Literal
 
 from ml.formats.archive import ZipFiles
+from ml.formats.identity import redact
 from ml.formats.options import ArchiveLimits, DecodeOptions
-from ml.formats.percept import decode_percept, looks_like_report, redact_percept, report_members
-from ml.formats.rcs import decode_rcs, find_sessions, redact_rcs_zip
+from ml.formats.percept import decode_percept, looks_like_report, report_members
+from ml.formats.rcs import decode_rcs, find_sessions
 from ml.formats.recording import (
     DECODE_VERSION,
     TREMOR_CLASSES,
@@ -27,8 +28,8 @@ from ml.formats.recording import (
     TremorLog,
     UndecodableFile,
 )
-from ml.formats.redaction import REDACTOR_VERSION, Redaction
-from ml.formats.tables import TableKind, decode_table, kind_of_text, redact_table
+from ml.formats.redaction_record import REDACTOR_VERSION, Redaction
+from ml.formats.tables import TableKind, decode_table, kind_of_text
 
 __all__ = [
     "DECODE_VERSION",
@@ -97,27 +98,6 @@ def _kind_of_zip(path: Path) -> FileKind:
     except UndecodableFile:
         return "rcs"
     return "rcs"
-
-
-def redact(source: Path, target: Path, kind: FileKind, key: bytes, options: DecodeOptions | None = None) -> Redaction:
-    """Write a file without identity; the same bytes in give the same bytes out, and they decode to the same content.
-
-    Args:
-        source: the uploaded file.
-        target: where the redacted file is written.
-        kind: what it is, from `sniff`.
-        key: secret of the installation for pseudonyms of devices, at least 16 bytes.
-        options: choices of the decoder, which checks tables as the sender wrote them.
-
-    Raises:
-        UndecodableFile: it cannot be parsed, and so not be cleaned; nothing is written then.
-    """
-    options = options or DecodeOptions()
-    if kind == "rcs":
-        return redact_rcs_zip(source, target, key, options.archive)
-    if kind == "percept":
-        return redact_percept(source, target, key, options.archive)
-    return redact_table(source, target, kind, options)
 
 
 def decode(path: Path, kind: FileKind | None = None, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:

@@ -37,6 +37,7 @@ from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Participant, StudySession, Visit
+from app.study.threshold import mdp_settings
 from ml.mdp import MdpSettings
 from ml.ope.estimate import LEVEL, Estimate
 from ml.ope.registry import method_keys
@@ -107,7 +108,7 @@ def _load(db: Session, participant: Participant, evaluation_id: int, caller: Cal
     estimates: dict[int, dict[str, Estimate]] = defaultdict(dict)
     for row in evaluation.estimates:
         estimates[row.policy_id][row.method] = estimate_of(row)
-    settings = study.mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
+    settings = mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
     ran = driven_sessions(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller)
     return _Before(evaluation, settings, repository.policies_by_id(db, list(estimates)), estimates, ran)
 

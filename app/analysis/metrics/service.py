@@ -17,7 +17,7 @@ from app.platform.errors import Invalid
 from app.study import repository as study
 from app.study.blinding import CONTROLLER_NAMES, arm
 from app.study.models import Controller, Participant, SettingsVersion, StudySession
-from app.study.service import qoc_of, session_data
+from app.study.sessions.data import qoc_of, session_data
 from app.study.sessions.stimulation import MEAN_FRACTION, fits
 from ml.energy import relative_energy, saving_percent
 

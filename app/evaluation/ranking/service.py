@@ -36,6 +36,7 @@ from app.platform.errors import Invalid, NotFound
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Participant
+from app.study.threshold import mdp_settings
 from ml.ope.compare.ranking import rank_policies
 from ml.ope.estimate import Estimate
 from ml.ope.flags import TEXT, distinct
@@ -71,7 +72,7 @@ def current_ranking(
         raise Invalid(f"This ranking has no estimates by '{chosen}'.", f"Choose one of {', '.join(methods)}.")
     policies = repository.policies_by_id(db, list(table))
     snapshot = db.get_one(BufferSnapshot, evaluation.snapshot_id)
-    settings = study.mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
+    settings = mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
     cdbs = next((i for i, p in policies.items() if is_cdbs(p)), None)
     tested = results_by_policy(driven_sessions(db, snapshot, caller), settings, evaluation.horizon_steps, cdbs)
     rows = _rows(evaluation, table, policies, chosen, tested)

@@ -30,6 +30,7 @@ from app.study.deps import CurrentParticipant
 from app.study.models import Participant, StudySession
 from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions
+from app.study.sessions.data import session_data
 from app.study.sessions.usable_steps import usable_steps
 from app.study.wording import sentences
 
@@ -205,7 +206,7 @@ def _form(
 
 def _chart(db: Session, session: StudySession) -> Any:
     try:
-        data = study_service.session_data(db, session)
+        data = session_data(db, session)
     except Invalid:
         return None  # the proposal's notes say why its steps cannot be read
     return control_chart(data) if data.table.beta_trace or data.table.amplitude_trace else None

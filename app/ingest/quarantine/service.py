@@ -29,7 +29,7 @@ from app.study import service as study_service
 from app.study.models import Participant
 from ml import formats
 from ml.formats.recording import UndecodableFile
-from ml.formats.redaction import REDACTOR_VERSION
+from ml.formats.redaction_record import REDACTOR_VERSION
 
 
 def review(db: Session, file_id: int, caller: Caller) -> bytes:

@@ -31,7 +31,7 @@ from ml.formats.archive import ZipFiles
 from ml.formats.options import ArchiveLimits, DecodeOptions
 from ml.formats.rcs import find_sessions
 from ml.formats.recording import DecodedFile, FileReport, GraspLog, Problem, TraceLog, TraceSource, UndecodableFile
-from ml.formats.redaction import REDACTOR_VERSION, Redaction
+from ml.formats.redaction_record import REDACTOR_VERSION, Redaction
 from ml.formats.tables.numbers import unit_name
 
 log = structlog.get_logger()

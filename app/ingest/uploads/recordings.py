@@ -18,7 +18,7 @@ from app.study import repository as study
 from app.study.models import Device, Participant, Recording, Trace
 from app.study.traces import pack
 from ml.formats.recording import DECODE_VERSION, RecordingLog, TraceLog
-from ml.formats.redaction import pseudonym
+from ml.formats.redaction_record import pseudonym
 
 
 @dataclass

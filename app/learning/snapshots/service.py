@@ -28,6 +28,8 @@ from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Participant, SettingsVersion, StudySession
+from app.study.sessions.data import session_data
+from app.study.threshold import mdp_settings, suggest_xi_beta
 from app.study.traces import StepTable
 from ml.mdp import MdpSettings
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
@@ -110,8 +112,8 @@ def collect(db: Session, participant: Participant) -> Collection:
             (with the reasons).
     """
     version = participant.current_settings
-    suggestion = study.suggest_xi_beta(db, participant, SYSTEM) if version.xi_beta is None else None
-    settings = study.mdp_settings(version, suggestion)
+    suggestion = suggest_xi_beta(db, participant, SYSTEM) if version.xi_beta is None else None
+    settings = mdp_settings(version, suggestion)
     sessions = [s for s in study_repository.sessions_of_participant(db, participant.id) if s.status == "confirmed"]
     read = [_read(db, session, version) for session in sessions]
     unit, source = _signal(version, read)
@@ -176,7 +178,7 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
 def _read(db: Session, session: StudySession, version: SettingsVersion) -> Member:
     """The session's trajectory, or the first reason of its own against it."""
     try:
-        table = study.session_data(db, session).table
+        table = session_data(db, session).table
     except Invalid as error:
         return Member(session, None, None, str(error))
     trajectory = trajectory_of(session, table, blinding.arm(session, SYSTEM), version, version.lower_bound)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.study import service as study
 from app.study.blinding import Arm
 from app.study.models import Controller, SettingsVersion, StudySession
+from app.study.sessions.data import qoc_of
 from app.study.traces import StepTable
 from ml.trajectories import SessionTrajectory
 
@@ -34,7 +34,7 @@ def trajectory_of(
         lead_beta=table.beta[:window],
         beta=table.beta[window:],
         amplitude=table.fraction[window:],
-        qoc=study.qoc_of(session),
+        qoc=qoc_of(session),
         random_lower_bound=random_bound if arm.controller is Controller.RANDOM else None,
         most_imputed=min(version.most_imputed, window - 1),
     )

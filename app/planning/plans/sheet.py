@@ -12,7 +12,7 @@ from fpdf.enums import XPos, YPos
 
 from app.evaluation.wording import method_name
 from app.learning.models import Policy
-from app.planning.plans.latin import latin
+from app.planning.plans.latin1_text import latin
 from app.planning.plans.service import PlanLine, PlanView
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller

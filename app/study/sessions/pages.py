@@ -23,10 +23,10 @@ from app.study.deps import CurrentSession
 from app.study.form_changes import Shown, own_changes
 from app.study.models import QocRevision, Recording, StudySession
 from app.study.schemas import DerivedChoice, QocIn, SessionChange
-from app.study.service import SessionData
 from app.study.sessions import view as session_view
 from app.study.sessions.charts import operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
+from app.study.sessions.data import SessionData, session_data
 from app.study.traces import NO_CONTROL, session_offset_s
 from app.study.wording import sentences
 from ml.energy import relative_energy
@@ -213,7 +213,7 @@ def _page(
     traces = {r.id: repository.traces_of_recording(db, r.id) for r in recordings}
     data, trouble = None, None
     try:
-        data = service.session_data(db, session)
+        data = session_data(db, session)
     except BetaloopError as unreadable:
         trouble = unreadable.problem(request.url.path)
     view = session_view.shown_trace(session, data, traces, request.query_params.get("trace", ""))

@@ -16,8 +16,8 @@ from app.study.outcomes import values as outcome_values
 from app.study.outcomes.charts import grasp_chart, tremor_chart
 from app.study.outcomes.service import Disagreement
 from app.study.outcomes.values import Derived, GraspOutcome, TremorOutcome
-from app.study.service import SessionData
 from app.study.sessions.charts import control_chart
+from app.study.sessions.data import SessionData
 from app.study.sessions.recording_charts import Stretch, spectrum_charts, trace_charts, trace_name
 from app.study.sessions.recording_facts import (
     CLOCKS,

@@ -21,6 +21,7 @@ from app.study.models import Participant
 from app.study.schemas import SettingsIn
 from app.study.service import may
 from app.study.settings import form
+from app.study.threshold import suggest_xi_beta
 
 log = structlog.get_logger()
 
@@ -79,7 +80,7 @@ def _settings_page(
 
 def _suggestion(db: Session, participant: Participant, caller: Caller) -> float | None:
     try:
-        return service.suggest_xi_beta(db, participant, caller)
+        return suggest_xi_beta(db, participant, caller)
     except Invalid as error:
         # the session's own page says what is wrong with it; the settings must stay reachable, for they may be what corrects it
         log.info("no threshold suggested", participant=participant.code, reason=error.detail)

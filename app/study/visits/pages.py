@@ -26,6 +26,7 @@ from app.study.outcomes import values as outcome_values
 from app.study.schemas import CdbsAmplitudeModel, VisitIn
 from app.study.service import may
 from app.study.sessions import pages as session_pages
+from app.study.sessions.data import session_data
 from app.study.visits import form
 
 router = APIRouter()
@@ -121,7 +122,7 @@ def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str
     clashes = outcomes.disagreements(session, outcome_values.derive(db, session))
     row: dict[str, Any] = {"session": session, "arm": arm(session, caller), "summary": None, "problem": "", "clashes": clashes}
     try:
-        row["summary"] = session_pages.summarise(service.session_data(db, session))
+        row["summary"] = session_pages.summarise(session_data(db, session))
     except BetaloopError as error:
         row["problem"] = error.detail
     return row

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from .controller import BoundedController
 from .envelope import BetaSample, EnvelopeLimits, Signal, reason_names
-from .loop import BoundedController
 from .network import MlpNetwork, Output
 
 _LIMITS = ("min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s", "window", "period_s", "max_beta_age_s")

@@ -10,7 +10,8 @@ from collections.abc import Iterable
 from datetime import datetime
 from typing import Any
 
-from ml.formats.percept.report_json import SIDES, entries, finite, inside, moment, samples, side_of, word
+from ml.formats.percept.enums import word
+from ml.formats.percept.report_json import SIDES, entries, finite, inside, moment, samples, side_of
 from ml.formats.recording import EventLog
 
 EVENT_WORDS = (

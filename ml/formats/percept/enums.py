@@ -6,6 +6,7 @@ The words are those of the format notes, of real reports and of what public tool
 from __future__ import annotations
 
 import re
+from typing import Any
 
 TYPES = frozenset(
     re.findall(
@@ -65,3 +66,12 @@ def _parts(piece: str) -> list[str]:
     """`SessionStart` as two words; what is not made of letters alone stays whole."""
     found = _WORD.findall(piece)
     return found if "".join(found) == piece and piece else [piece]
+
+
+_LAST_PART = re.compile(r"[A-Za-z]{1,40}[._]([A-Za-z0-9_]{1,60})")
+
+
+def word(value: Any) -> str | None:
+    """The last part of an enumeration, `GroupIdDef.GROUP_A` or `GroupIdDef_GROUP_A` being `GROUP_A`; None for what is no enumeration."""
+    match = _LAST_PART.fullmatch(value) if isinstance(value, str) else None
+    return match[1] if match else None

@@ -22,7 +22,7 @@ from ml.formats.percept.keys import KEYS
 from ml.formats.percept.report import report_members
 from ml.formats.percept.report_json import HINT, SECTIONS, channel_names, moment, read_report
 from ml.formats.recording import UndecodableFile
-from ml.formats.redaction import Redaction, pseudonym
+from ml.formats.redaction_record import Redaction, pseudonym
 
 EPOCH = (1980, 1, 1, 0, 0, 0)
 SERIAL = "NeurostimulatorSerialNumber"

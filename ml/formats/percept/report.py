@@ -20,8 +20,9 @@ from ml.formats.archive import READ_ERRORS, ZipFiles
 from ml.formats.beta import channel_spectrum, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
 from ml.formats.percept import details
+from ml.formats.percept.enums import word
 from ml.formats.percept.history import history_recording
-from ml.formats.percept.report_json import SIDES, entries, inside, looks_like_report, moment, read_report, side_of, word
+from ml.formats.percept.report_json import SIDES, entries, inside, looks_like_report, moment, read_report, side_of
 from ml.formats.percept.streams import DevicePower, Side, TimeDomain, device_powers, time_domains
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
 from ml.signals import row_means

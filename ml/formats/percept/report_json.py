@@ -45,7 +45,6 @@ _OPEN_STRING = re.compile(r'"(?:[^"\\]++|\\.)*+\\?\Z', re.DOTALL)
 _INF = re.compile(r"(?<=[\[:,\s])([+-]?)(?:INF|Inf|inf)(?=[\],}\s])")
 _CONTACT = r"(?:ZERO|ONE|TWO|THREE|FOUR|FIVE|SIX|SEVEN|EIGHT|NINE|TEN|ELEVEN)(?:_?[ABC])?"
 _CHANNEL = re.compile(rf"(?:ELECTRODE_)?{_CONTACT}(?:_(?:AND|{_CONTACT}|LEFT|RIGHT|RING|SEGMENT)){{0,8}}")
-_ENUM = re.compile(r"[A-Za-z]{1,40}[._]([A-Za-z0-9_]{1,60})")
 
 
 def looks_like_report(head: bytes) -> bool:
@@ -161,12 +160,6 @@ def moment(value: Any) -> datetime | None:
     except (ValueError, OverflowError):
         return None
     return when if 1990 <= when.year <= 2200 else None
-
-
-def word(value: Any) -> str | None:
-    """The last part of an enumeration, `GroupIdDef.GROUP_A` or `GroupIdDef_GROUP_A` being `GROUP_A`; None for what is no enumeration."""
-    match = _ENUM.fullmatch(value) if isinstance(value, str) else None
-    return match[1] if match else None
 
 
 def side_of(value: Any) -> Literal["left", "right"] | None:

@@ -14,18 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.percept.report_json import (
-    SIDES,
-    channel_names,
-    entries,
-    finite,
-    inside,
-    moment,
-    packet_list,
-    samples,
-    side_of,
-    word,
-)
+from ml.formats.percept.enums import word
+from ml.formats.percept.report_json import SIDES, channel_names, entries, finite, inside, moment, packet_list, samples, side_of
 
 Side = Literal["left", "right"]
 TURN_MS = 65_536 * 50.0

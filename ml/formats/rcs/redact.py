@@ -25,7 +25,7 @@ from ml.formats.rcs.opening import NAMED
 from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
 from ml.formats.rcs.packets.scan import Batch, scan
 from ml.formats.recording import FileReport, UndecodableFile
-from ml.formats.redaction import PSEUDONYM, Redaction, pseudonym
+from ml.formats.redaction_record import PSEUDONYM, Redaction, pseudonym
 
 DEFLATE_LEVEL = 1
 """Packing is what cleaning an archive takes longest over: level 6 takes five times as long and saves a fifth."""

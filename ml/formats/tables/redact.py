@@ -12,7 +12,7 @@ import numpy as np
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import TREMOR_CLASSES, GraspLog, TremorLog
-from ml.formats.redaction import Redaction
+from ml.formats.redaction_record import Redaction
 from ml.formats.tables.columns import Columns, read_csv, read_parquet
 from ml.formats.tables.grasps import decode_grasps
 from ml.formats.tables.steps import decode_columns

@@ -10,11 +10,12 @@ from app.study import service
 from app.study.models import StudySession
 from app.study.schemas import SettingsIn
 from app.study.sessions.charts import control_chart
+from app.study.sessions.data import session_data
 from app.study.sessions.pages import summarise
 
 
 def test_a_threshold_with_stated_unit_and_source_counts(db: Session, study_session: StudySession) -> None:
-    data = service.session_data(db, study_session)
+    data = session_data(db, study_session)
     assert (data.threshold, data.threshold_mismatch) == (1.0, "")
     chart = control_chart(data).figure
     assert "threshold 1 uV" in [t.get("name") for t in chart["data"]]
@@ -33,7 +34,7 @@ def test_without_a_stated_unit_and_source_no_threshold_is_drawn_and_no_share_is_
     db: Session, study_session: StudySession, left_open: dict[str, None], named: str
 ) -> None:
     service.change_settings(db, study_session.visit.participant, SettingsIn(**left_open), "unknown", SYSTEM)
-    data = service.session_data(db, study_session)
+    data = session_data(db, study_session)
     assert data.threshold is None
     said = f"Nobody has stated {named} the threshold of 1; this trace is in uV from table."
     assert data.threshold_mismatch == f"{said} State unit and source in the participant's settings."

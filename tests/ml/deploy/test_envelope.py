@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ml.deploy.runtime.controller import BoundedController
 from ml.deploy.runtime.envelope import BetaSample, EnvelopeLimits, Reason, Signal, reason_names
-from ml.deploy.runtime.loop import BoundedController
 from ml.deploy.windows import PolicyWindow
 from ml.policies.policy import ConstantPolicy
 

@@ -23,8 +23,8 @@ from ml.deploy.c_header import comment, float_header, self_test, string_literal
 from ml.deploy.fixed_point import SCORE_LIMIT, WANTED_BOUND, CutNetwork, _quantise, quantise
 from ml.deploy.manifest import BundleError
 from ml.deploy.onnx_mlp import mlp_of
+from ml.deploy.runtime.controller import BoundedController
 from ml.deploy.runtime.envelope import BetaSample, Signal
-from ml.deploy.runtime.loop import BoundedController
 from ml.deploy.runtime.network import MlpNetwork
 from ml.deploy.vectors import Step, edge_windows, session
 from ml.deploy.windows import PolicyWindow

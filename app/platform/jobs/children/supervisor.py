@@ -20,7 +20,7 @@ from typing import Any
 
 import psutil
 
-from app.platform.jobs.children.process import params_hash, stored_result, too_much_memory
+from app.platform.jobs.children.child import params_hash, stored_result, too_much_memory
 from app.platform.jobs.children.report import write_atomically
 from app.platform.jobs.context import StepOutcome
 from app.settings import private_folder
@@ -125,7 +125,7 @@ class ChildProcesses:
             "BETALOOP_WORKER_PID": str(os.getpid()),
             "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
         }
-        command = [sys.executable, "-m", "app.platform.jobs.children.process", call.name, str(call.workdir.resolve())]
+        command = [sys.executable, "-m", "app.platform.jobs.children.child", call.name, str(call.workdir.resolve())]
         with log.open("ab") as out:
 
             def start() -> _Child:

@@ -90,7 +90,7 @@ class Jobs:
         found = []
         for process in psutil.Process(worker.pid).children(recursive=True):
             with contextlib.suppress(psutil.Error):  # ended between two looks
-                if "app.platform.jobs.children.process" in process.cmdline():
+                if "app.platform.jobs.children.child" in process.cmdline():
                     found.append(process)
         return found
 

@@ -16,7 +16,7 @@ from sqlalchemy import text
 from app.platform.database import transaction
 from app.platform.errors import NotFound
 from app.platform.jobs import JobContext, StepFailed, StepReport, registry, repository, write_atomically
-from app.platform.jobs.children.process import params_hash
+from app.platform.jobs.children.child import params_hash
 from app.platform.jobs.children.slots import Slots
 from app.platform.jobs.children.supervisor import ChildMessages, ChildProcesses, ComputeCall
 from app.platform.jobs.errors import JobCancelled

@@ -149,5 +149,5 @@ def test_the_web_process_takes_no_job(jobs):
     time.sleep(2.0)
     job = jobs.get(job_id)
     assert (job.status, job.started_at) == ("queued", None)
-    computing = [p for p in psutil.Process(os.getpid()).children() if "app.platform.jobs.children.process" in " ".join(p.cmdline())]
+    computing = [p for p in psutil.Process(os.getpid()).children() if "app.platform.jobs.children.child" in " ".join(p.cmdline())]
     assert computing == []

@@ -5,9 +5,10 @@ import zipfile
 
 import pytest
 
-from ml.formats import UndecodableFile, decode, redact, sniff
+from ml.formats import UndecodableFile, decode, sniff
+from ml.formats.identity import redact
 from ml.formats.percept.enums import is_known
-from ml.formats.redaction import pseudonym
+from ml.formats.redaction_record import pseudonym
 
 KEY = b"a key of the clinic's own"
 SECRETS = ("Ada", "Lovelace", "MRN4711", "NPX799999H", "LEAD4711", "Ockham", "2020-02-20", "1815", "4711", "1990-12-10")

@@ -7,8 +7,10 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from ml.formats import DecodeOptions, decode, redact, sniff
-from ml.formats.percept.report_json import channel_names, packet_list, side_of, word
+from ml.formats import DecodeOptions, decode, sniff
+from ml.formats.identity import redact
+from ml.formats.percept.enums import word
+from ml.formats.percept.report_json import channel_names, packet_list, side_of
 from ml.formats.percept.streams import device_powers, time_domains
 from ml.signals import band_pass
 

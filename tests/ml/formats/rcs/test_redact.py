@@ -9,7 +9,7 @@ import pytest
 
 from ml.formats import UndecodableFile, decode
 from ml.formats.rcs import redact_rcs_zip
-from ml.formats.redaction import pseudonym
+from ml.formats.redaction_record import pseudonym
 
 KEY = b"a key of the clinic's own"
 REAL = ["stim_sweep", "embedded_adaptive", "montage_packet_loss", "empty_streams"]

@@ -1,4 +1,4 @@
-"""The child process of one compute step: `python -m app.platform.jobs.children.process NAME WORKDIR`.
+"""The child process of one compute step: `python -m app.platform.jobs.children.child NAME WORKDIR`.
 
 It reads `params.json` from its folder, runs the function, and leaves `result.json` there by atomic rename. Progress goes as JSON lines to
 the file descriptor that BETALOOP_REPORT_FD names; what the function prints goes to `log.txt`. It dies with the worker that started it.
@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> int:
     """Run one call; 0 when it gave a result, 1 when it failed (the reason stands in result.json), 2 for wrong arguments."""
     _die_with_parent()
     if len(arguments) != 2:
-        sys.stderr.write("usage: python -m app.platform.jobs.children.process NAME WORKDIR\n")
+        sys.stderr.write("usage: python -m app.platform.jobs.children.child NAME WORKDIR\n")
         return 2
     name, workdir = arguments[0], Path(arguments[1])
     _be_modest()

@@ -1,0 +1,62 @@
+"""The beta threshold: in the settings of the MDP, and suggested from what sessions had."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import Caller
+from app.platform.errors import Invalid
+from app.study import blinding, repository
+from app.study.models import Controller, Participant, SettingsVersion
+from app.study.traces import step_table
+from ml.mdp import MdpSettings
+
+MDP_FIELDS = (
+    "window", "period_s", "r_a", "r_b", "c1", "c2", "c3", "c4", "gamma", "lower_bound", "tremor_as_fraction",
+)  # fmt: skip
+
+
+def mdp_settings(settings: SettingsVersion, suggestion: float | None = None) -> MdpSettings:
+    """The MDP of a settings version.
+
+    Raises:
+        Invalid: xi_beta is not set; names the suggestion from the data where there is one.
+    """
+    if settings.xi_beta is None:
+        hint = f" A suggestion from the data: {suggestion:.4g} {settings.beta_unit or ''}".rstrip() + "." if suggestion is not None else ""
+        raise Invalid(
+            f"Participant {settings.participant.code} has no beta threshold xi_beta yet; the paper gives no default.",
+            f"Set xi_beta in the participant's settings.{hint}",
+            suggested_xi_beta=suggestion,
+        )
+    return MdpSettings(xi_beta=settings.xi_beta, **{name: getattr(settings, name) for name in MDP_FIELDS})
+
+
+def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> float | None:
+    """A threshold from the data: midway between the median beta of cDBS sessions and that of no-DBS sessions, else the median of all.
+
+    Of confirmed sessions that are not excluded, with beta in the settings' unit and from their source; None where these leave it open and
+    the sessions have several, which are never mixed.
+    """
+    settings = participant.current_settings
+    groups: dict[Controller, list[np.ndarray[Any, Any]]] = {}
+    kinds: set[tuple[str, str]] = set()
+    for session in repository.sessions_of_participant(db, participant.id):
+        table = step_table(db, session, settings)
+        trace = table.beta_trace
+        if session.excluded_reason or trace is None:
+            continue
+        if (settings.beta_unit or trace.unit, settings.beta_source or trace.source) != (trace.unit, trace.source):
+            continue
+        kinds.add((trace.unit, trace.source))
+        groups.setdefault(blinding.arm(session, caller).controller, []).append(table.beta[~np.isnan(table.beta)])
+    if len(kinds) > 1:
+        return None
+    medians = {c: float(np.median(np.concatenate(b))) for c, b in groups.items() if sum(x.size for x in b)}
+    if Controller.CDBS in medians and Controller.NO_DBS in medians:
+        return (medians[Controller.CDBS] + medians[Controller.NO_DBS]) / 2
+    everything = [x for parts in groups.values() for x in parts if x.size]
+    return float(np.median(np.concatenate(everything))) if everything else None
