@@ -102,7 +102,7 @@ def _children(logs: Path, host: str, port: int) -> Iterator[list[subprocess.Pope
     private_folder(logs)
     commands = {"web": ["serve", "--host", host, "--port", str(port)], "worker": ["worker"]}
     children: list[subprocess.Popen[bytes]] = []
-    previous = [(number, signal.signal(number, _interrupt)) for number in (signal.SIGTERM, signal.SIGHUP)]
+    previous = [(number, signal.signal(number, _interrupt)) for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)]
     try:
         for name, arguments in commands.items():
             with (logs / f"{name}.log").open("ab") as log:

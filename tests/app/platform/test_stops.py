@@ -53,11 +53,17 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def _as_a_background_job() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # what a shell without job control gives to a command that ends in `&`
+
+
 def start(data: Path, *command: str) -> subprocess.Popen[bytes]:
     env = {k: v for k, v in os.environ.items() if not k.startswith("BETALOOP_") or k == "BETALOOP_SERVER_USER"}
     env |= {"BETALOOP_DATA_DIR": str(data), "PYTHONPATH": str(ROOT)}
     with (data / "said.txt").open("wb") as out:
-        return subprocess.Popen([sys.executable, "-m", "app.cli", *command], cwd=ROOT, stdout=out, stderr=out, env=env)
+        return subprocess.Popen(
+            [sys.executable, "-m", "app.cli", *command], cwd=ROOT, stdout=out, stderr=out, env=env, preexec_fn=_as_a_background_job
+        )
 
 
 def wait_for(data: Path, sentence: str, process: subprocess.Popen[bytes]) -> None:
