@@ -61,13 +61,13 @@ class ChildMessages:
 
     def add(self, line: str) -> None:
         """Take in one line of the pipe."""
-        message = json.loads(line)
-        self.progress = message.get("progress", self.progress)
-        self.message = message.get("message", self.message)
-        if "points" in message:
-            self.points = (self.points or []) + message["points"]
-        if "log" in message:
-            self.logs = [*(self.logs or []), message["log"]]
+        members: dict[str, Any] = json.loads(line)
+        self.progress = members.get("progress", self.progress)
+        self.message = members.get("message", self.message)
+        if (points := members.get("points")) is not None:
+            self.points = (self.points or []) + points
+        if (log := members.get("log")) is not None:
+            self.logs = [*(self.logs or []), log]
 
     def __bool__(self) -> bool:
         return any(part is not None for part in (self.progress, self.message, self.points, self.logs))
