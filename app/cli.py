@@ -130,7 +130,7 @@ def where(as_json: AsJson = False) -> None:
 @user_app.command("add", epilog="Example: betaloop user add ada@clinic.example --role clinician")
 def user_add(
     email: Annotated[str, typer.Argument(help="E-mail address to sign in with.")],
-    role: Annotated[Role, typer.Option(help="viewer, clinician, engineer or admin.")],
+    role: Annotated[Role, typer.Option(help="blinded_assessor, viewer, clinician, engineer or admin.")],
     study: Annotated[str | None, typer.Option(help="Code of the study, where there are several.")] = None,
     password_file: Annotated[
         Path | None, typer.Option(help="File with the password; asked for when left out ('-': standard input).")

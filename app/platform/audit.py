@@ -42,6 +42,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "cdbs_amplitude": (),
     "device": (),
     "visit": (),
+    "visit_lock": (),
     "session": (),
     "recording": ("details",),
     "session_segment": (),

@@ -8,6 +8,7 @@ from app.accounts.deps import CurrentCaller
 from app.platform.database import Db
 from app.platform.web.schemas import Page, PagingQuery, problems
 from app.study import repository, service
+from app.study.blinding import require_known
 from app.study.deps import CurrentParticipant, CurrentSession, CurrentVisit
 from app.study.outcomes import values as outcome_values
 from app.study.schemas import (
@@ -24,10 +25,13 @@ from app.study.schemas import (
     TraceOut,
     VisitChange,
     VisitIn,
+    VisitLockIn,
+    VisitLockOut,
     VisitOut,
 )
 from app.study.serializers import outcome_out, participant_out, session_out, trace_out, visit_out
 from app.study.sessions.data import session_data
+from app.study.visits import service as visits
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
@@ -96,6 +100,28 @@ def change_visit(visit: CurrentVisit, change: VisitChange, db: Db, caller: Curre
     return visit_out(visit, visit.participant.code)
 
 
+@router.get("/visits/{visit_id}/locks")
+def list_locks(visit: CurrentVisit) -> list[VisitLockOut]:
+    """When a visit was locked and unlocked, oldest first; the last one holds."""
+    return [VisitLockOut.model_validate(row) for row in visit.locks]
+
+
+@router.post("/visits/{visit_id}/lock", responses=problems(409))
+def lock_visit(visit: CurrentVisit, why: VisitLockIn, db: Db, caller: CurrentCaller) -> VisitLockOut:
+    """Close the data of a visit for changes; blinded assessors see its controllers from now on."""
+    row = visits.lock(db, visit, why.reason, caller)
+    db.commit()
+    return VisitLockOut.model_validate(row)
+
+
+@router.post("/visits/{visit_id}/unlock", responses=problems(409))
+def unlock_visit(visit: CurrentVisit, why: VisitLockIn, db: Db, caller: CurrentCaller) -> VisitLockOut:
+    """Open the data of a visit for corrections."""
+    row = visits.unlock(db, visit, why.reason, caller)
+    db.commit()
+    return VisitLockOut.model_validate(row)
+
+
 @router.get("/visits/{visit_id}/sessions")
 def list_sessions(visit: CurrentVisit, db: Db, caller: CurrentCaller, paging: PagingQuery) -> Page[SessionOut]:
     """Confirmed sessions of a visit, in order; proposals stand under the participant's."""
@@ -118,8 +144,9 @@ def change_session(session: CurrentSession, change: SessionChange, db: Db, calle
 
 
 @router.get("/sessions/{session_id}/trace")
-def read_trace(session: CurrentSession, db: Db) -> TraceOut:
+def read_trace(session: CurrentSession, db: Db, caller: CurrentCaller) -> TraceOut:
     """Beta and amplitude on the 2 s grid; rows with t_s <= 0 are the window before the session."""
+    require_known(session.visit, caller)
     return trace_out(session_data(db, session))
 
 

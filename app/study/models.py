@@ -151,6 +151,27 @@ class Visit(Base):
     participant: Mapped[Participant] = relationship(back_populates="visits")
     sessions: Mapped[list[StudySession]] = relationship(back_populates="visit", order_by="StudySession.ordinal")
     cdbs_amplitudes: Mapped[list[CdbsAmplitude]] = relationship()
+    locks: Mapped[list[VisitLock]] = relationship(back_populates="visit", order_by="VisitLock.id")
+
+    @property
+    def locked(self) -> bool:
+        """Whether the visit's data are closed for changes, and open to blinded assessors."""
+        return bool(self.locks) and self.locks[-1].locked
+
+
+class VisitLock(Base):
+    """A visit was locked or unlocked, by whom, when and why. Rows are only added; the newest one holds."""
+
+    __tablename__ = "visit_lock"
+    __table_args__ = (CheckConstraint("reason <> ''", name="reason"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    visit_id: Mapped[int] = mapped_column(ForeignKey("visit.id"), index=True)
+    locked: Mapped[bool]
+    reason: Mapped[str] = mapped_column(Text)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+    visit: Mapped[Visit] = relationship(back_populates="locks")
 
 
 class StudySession(Base):
@@ -168,6 +189,8 @@ class StudySession(Base):
         CheckConstraint("duration_s >= 0", name="duration"),
         CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"),
         CheckConstraint("excluded_reason is null or excluded_reason <> ''", name="excluded_reason"),
+        CheckConstraint("stopped_reason is null or stopped_reason <> ''", name="stopped_reason"),
+        CheckConstraint("medication_h >= 0 and medication_h <= 72", name="medication"),
         CheckConstraint(TIME_CHECK, name="started_at"),
     )
 
@@ -183,6 +206,10 @@ class StudySession(Base):
     control_stream: Mapped[str] = mapped_column(String(40), server_default="beta")
     control_channel: Mapped[str | None] = mapped_column(String(80))
     excluded_reason: Mapped[str | None] = mapped_column(Text)
+    stopped_reason: Mapped[str | None] = mapped_column(Text)
+    """Why it was stopped for the patient's sake: a failure of its controller, never a missing value. None where it was not."""
+    medication_h: Mapped[float | None]
+    """Hours from the last dose of medication to the session's start; None where nobody stated it."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     visit: Mapped[Visit] = relationship(back_populates="sessions")
     segments: Mapped[list[SessionSegment]] = relationship(

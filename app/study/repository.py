@@ -25,6 +25,7 @@ from app.study.models import (
     Trace,
     TremorSeries,
     Visit,
+    VisitLock,
 )
 
 CONFIRMED = StudySession.status == "confirmed"
@@ -95,6 +96,25 @@ def visit_by_number(db: Session, participant_id: int, number: int) -> Visit | No
     return db.scalar(select(Visit).where(Visit.participant_id == participant_id, Visit.number == number))
 
 
+def locked_visits(db: Session, participant_id: int) -> Sequence[int]:
+    """Visits of a participant that are locked now."""
+    newest = (
+        select(VisitLock.visit_id, VisitLock.locked)
+        .join(VisitLock.visit)
+        .where(Visit.participant_id == participant_id)
+        .distinct(VisitLock.visit_id)
+        .order_by(VisitLock.visit_id, VisitLock.id.desc())
+        .subquery()
+    )
+    return db.scalars(select(newest.c.visit_id).where(newest.c.locked)).all()
+
+
+def lock_row(db: Session, visit: Visit) -> None:
+    """Hold a visit for this transaction and read its locks again, so that two people at once are asked in turn."""
+    db.execute(select(Visit.id).where(Visit.id == visit.id).with_for_update())
+    db.expire(visit, ["locks"])
+
+
 def session(db: Session, session_id: int, caller: Caller) -> StudySession:
     """A session with its QoCs, segments and visit. Raises NotFound."""
     row = db.scalar(_sessions().join(Participant.site).where(StudySession.id == session_id, in_scope(caller)))
@@ -133,6 +153,17 @@ def traces_of_recording(db: Session, recording_id: int) -> Sequence[Trace]:
     return db.scalars(
         select(Trace).where(Trace.recording_id == recording_id, Trace.decode_version == newest).order_by(Trace.stream, Trace.channel)
     ).all()
+
+
+def traces_of_recordings(db: Session, recording_ids: Collection[int]) -> dict[int, list[Trace]]:
+    """The same of many recordings at once, by recording; read only, and not the session's own rows."""
+    columns = [c for c in Trace.__table__.columns if c.name != "details"]
+    query = select(*columns).where(Trace.recording_id.in_(recording_ids)).order_by(Trace.stream, Trace.channel)
+    found: dict[int, list[Any]] = {}
+    for row in db.execute(query):
+        found.setdefault(row.recording_id, []).append(row)
+    newest = {i: max(t.decode_version for t in traces) for i, traces in found.items()}
+    return {i: [t for t in traces if t.decode_version == newest[i]] for i, traces in found.items()}
 
 
 @dataclass(frozen=True)
