@@ -12,7 +12,6 @@ READ_ARMS = "arms:read"  # which controller a session had, also before its visit
 WRITE_STUDY = "study:write"  # participants, visits, sessions, QoCs
 WRITE_QOC = "qoc:write"
 LOCK_VISIT = "visit:lock"
-LOCK_MARGINS = "margins:lock"
 WRITE_SETTINGS = "settings:write"
 UPLOAD = "upload"
 DECIDE_QUARANTINE = "quarantine:decide"  # may see what could not be freed of identity
@@ -27,7 +26,7 @@ MANAGE_ACCOUNTS = "accounts:write"
 _BLINDED = frozenset({READ, WRITE_QOC})
 _VIEWER = frozenset({READ, READ_ARMS})
 _STAFF = _VIEWER | {WRITE_STUDY, WRITE_QOC, WRITE_SETTINGS, UPLOAD, RUN_JOBS, DRAFT_PLAN, TAKE_BUNDLES, READ_AUDIT}
-_CLINICIAN = _STAFF | {DECIDE_QUARANTINE, APPROVE_PLAN, LOCK_VISIT, LOCK_MARGINS}
+_CLINICIAN = _STAFF | {DECIDE_QUARANTINE, APPROVE_PLAN, LOCK_VISIT}
 _ENGINEER = _STAFF | {WRITE_POLICIES}
 PERMISSIONS: dict[Role, frozenset[str]] = {
     Role.BLINDED_ASSESSOR: _BLINDED,

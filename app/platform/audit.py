@@ -40,6 +40,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "participant": (),
     "settings_version": (),
     "margins_version": (),
+    "margins_lock": (),
     "cdbs_amplitude": (),
     "device": (),
     "visit": (),

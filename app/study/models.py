@@ -52,6 +52,7 @@ class Participant(Base):
     site: Mapped[Site] = relationship()
     settings: Mapped[list[SettingsVersion]] = relationship(back_populates="participant", order_by="SettingsVersion.version")
     margins: Mapped[list[MarginsVersion]] = relationship(back_populates="participant", order_by="MarginsVersion.version")
+    margins_locks: Mapped[list[MarginsLock]] = relationship(back_populates="participant", order_by="MarginsLock.id")
     visits: Mapped[list[Visit]] = relationship(back_populates="participant", order_by="Visit.number")
 
     @property
@@ -146,6 +147,25 @@ class MarginsVersion(Base):
     created_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
     participant: Mapped[Participant] = relationship(back_populates="margins")
+
+
+class MarginsLock(Base):
+    """Margins were fixed before the sessions that they judge: what is recorded later confirms, what was recorded before explores.
+
+    Rows are only added; the newest one holds.
+    """
+
+    __tablename__ = "margins_lock"
+    __table_args__ = (CheckConstraint("reason <> ''", name="reason"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    margins_version_id: Mapped[int] = mapped_column(ForeignKey("margins_version.id"))
+    reason: Mapped[str] = mapped_column(Text)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+    participant: Mapped[Participant] = relationship(back_populates="margins_locks")
+    margins: Mapped[MarginsVersion] = relationship()
 
 
 class CdbsAmplitude(Base):

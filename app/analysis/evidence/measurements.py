@@ -32,7 +32,9 @@ class Chosen:
     policy: NDArray[np.int64]
 
 
-def choose(sessions: Sequence[Facts], metric: str, is_tested: Callable[[Facts], bool], value: Callable[[Facts], float] | None = None) -> Chosen:
+def choose(
+    sessions: Sequence[Facts], metric: str, is_tested: Callable[[Facts], bool], value: Callable[[Facts], float] | None = None
+) -> Chosen:
     """One metric of the sessions that `is_tested` names and of all cDBS sessions; `value` gives another number than the metric's."""
     taken = tuple(s for s in sessions if s.controller is Controller.CDBS or is_tested(s))
     read = value or (lambda s: s.values.get(metric, float("nan")))

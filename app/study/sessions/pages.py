@@ -150,9 +150,7 @@ def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
     try:
         service.require(caller, can.WRITE_STUDY, session.visit.participant)
         changes.refuse_conflicts()
-        fields: dict[str, Any] = {n: changes.fields[n] for n in ("controller", "hemisphere", *_CONDITIONS) if n in changes.fields} | {
-            "reason": reason
-        }
+        fields: dict[str, Any] = {n: changes.fields[n] for n in _STATED if n in changes.fields} | {"reason": reason}
         if "policy" in changes.fields:
             policy = changes.fields["policy"]
             fields["policy_id"] = _policy_id(db, session, policy) if policy else ""
