@@ -40,6 +40,7 @@ API_MODULES = (
     "app.pipeline.api",
     "app.planning.plans.api",
     "app.planning.bundles.api",
+    "app.analysis.primary.api",
     "app.analysis.metrics.api",
     "app.analysis.calibration.api",
 )
@@ -60,6 +61,7 @@ PAGE_MODULES = (
     "app.pipeline.pages",
     "app.planning.plans.pages",
     "app.planning.bundles.pages",
+    "app.analysis.primary.pages",
     "app.analysis.metrics.pages",
     "app.analysis.calibration.pages",
     "app.overview.overview",

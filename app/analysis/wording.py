@@ -36,8 +36,9 @@ FAMILY = (
     "Hochberg: a value below .05 there is a lead to follow, not a result."
 )
 STRATEGY = (
-    "A controller counts with every session of it, whichever policy ran, so that nothing is selected by its outcome. A single policy "
-    "is judged by the sessions recorded after it was last put on an approved plan; what was known before may have picked it, and does not count."
+    "A controller counts with every session of it, whichever policy ran, so that nothing is selected by its outcome. A single policy is "
+    "judged by the sessions recorded after it was last put on an approved plan; what was known before may have picked it, and does "
+    "not count."
 )
 ADJUSTMENTS = {
     Adjustment.NONE: "Not adjusted",
@@ -117,10 +118,12 @@ def verdict_sentence(name: str, found: Verdict, visits: int) -> str:
 
 
 def _more(found: Inconclusive) -> str:
+    few = f"nothing is concluded from fewer than {LEAST_VISITS} visits with both arms" if found.reason is Reason.TOO_FEW_VISITS else ""
     if found.more_visits is not None:
-        return f"{_n(found.more_visits, 'more visit')} with both arms would settle it with a probability of 80 %, if what was seen holds"
-    if found.reason is Reason.TOO_FEW_VISITS:
-        return f"nothing is concluded from fewer than {LEAST_VISITS} visits with both arms"
+        more = f"{_n(found.more_visits, 'more visit')} with both arms would settle it with a probability of 80 %, if what was seen holds"
+        return f"{few}; {more}" if few else more
+    if few:
+        return few
     if found.reason is not None:
         return "too little was measured to say how many visits it takes"
     return f"by what was seen so far, {MOST_VISITS} more visits would not settle it"
@@ -142,8 +145,10 @@ def verdict_kind(result: VerdictResult, locked: LockedMargins) -> str:
 def disagreement(found: Comparison) -> str:
     """Where the paper's test and the primary one differ; empty where they agree."""
     if found.disagreement is Disagreement.PAPER_ONLY:
-        return "The paper's test is below .05 and the primary one is not: to take sessions of one day as independent makes days look like "
+        return (
+            "The paper's test is below .05 and the primary one is not: to take sessions of one day as independent makes days look like "
             "evidence."
+        )
     if found.disagreement is Disagreement.PRIMARY_ONLY:
         return "The primary test is below .05 and the paper's is not: differences between days hide what is the same within them."
     if found.disagreement is Disagreement.NO_PRIMARY:

@@ -23,7 +23,8 @@ class Chosen:
     """The sessions of a comparison, aligned with its measurements, n of them.
 
     Attributes:
-        data: values of one metric. sessions: the facts, [n]. stopped: stopped for the patient's sake, [n]. policy: numbers, 0 for none, [n].
+        data: values of one metric. sessions: the facts, [n]. stopped: stopped for the patient's sake, [n].
+        policy: numbers, 0 for none, [n].
     """
 
     data: Measurements
@@ -32,15 +33,12 @@ class Chosen:
     policy: NDArray[np.int64]
 
 
-def choose(
-    sessions: Sequence[Facts], metric: str, is_tested: Callable[[Facts], bool], value: Callable[[Facts], float] | None = None
-) -> Chosen:
-    """One metric of the sessions that `is_tested` names and of all cDBS sessions; `value` gives another number than the metric's."""
+def choose(sessions: Sequence[Facts], metric: str, is_tested: Callable[[Facts], bool]) -> Chosen:
+    """One metric of the sessions that `is_tested` names and of all cDBS sessions."""
     taken = tuple(s for s in sessions if s.controller is Controller.CDBS or is_tested(s))
-    read = value or (lambda s: s.values.get(metric, float("nan")))
     hours = [float("nan") if s.medication_h is None else s.medication_h for s in taken]
     data = Measurements.of(
-        [read(s) for s in taken],
+        [s.values.get(metric, float("nan")) for s in taken],
         [s.visit for s in taken],
         [s.controller is not Controller.CDBS for s in taken],
         order=[float(s.ordinal) for s in taken],

@@ -17,7 +17,7 @@ from app.study.deps import CurrentParticipant
 router = APIRouter()
 
 
-@router.get("/participants/{code}/analyses")
+@router.get("/participants/{code}/analyses/paper")
 def analyses(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """The five metrics by controller, with tests, tables and limits."""
     analysis = view(service.five_metrics(db, participant, caller))

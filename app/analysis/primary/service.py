@@ -81,21 +81,17 @@ def result_of(found: Primary, key: str) -> ControllerResult:
     return result
 
 
-@dataclass(frozen=True)
-class Models:
-    """Mixed models of one controller, by metric."""
-
-    controller: Controller
-    fits: tuple[tuple[str, MixedComparison | Unavailable], ...]
+MixedFits = tuple[tuple[str, MixedComparison | Unavailable], ...]
 
 
-def mixed_models(found: Primary, controllers: Sequence[Controller]) -> tuple[Models, ...]:
-    """Mixed models with policies nested in the controller: linear, ordinal for the rating, minutes for tremor. Slow: up to a second."""
+def mixed_models(found: Primary, controller: Controller) -> MixedFits:
+    """Mixed models by metric, policies nested in the controller: linear, ordinal for the rating, minutes for tremor. Slow: up to 0.3 s."""
+    return kept(("mixed", found.evidence.key, controller), lambda: tuple((m, _fit(found.sessions, m, controller)) for m in METRICS))
 
-    def compute() -> tuple[Models, ...]:
-        return tuple(Models(c, tuple((m, _fit(found.sessions, m, c)) for m in METRICS)) for c in controllers)
 
-    return kept(("mixed", found.evidence.key, tuple(controllers)), compute)
+def policy_names(db: Session, participant: Participant) -> dict[int, str]:
+    """Names of a participant's policies."""
+    return repository.policy_names(db, participant.id)
 
 
 def _fit(sessions: Sequence[Facts], metric: str, controller: Controller) -> MixedComparison | Unavailable:
