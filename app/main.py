@@ -42,6 +42,10 @@ API_MODULES = (
     "app.planning.bundles.api",
     "app.analysis.primary.api",
     "app.analysis.metrics.api",
+    "app.analysis.pooled.api",
+    "app.analysis.evaluations.api",
+    "app.analysis.energy.api",
+    "app.analysis.biomarker.api",
     "app.analysis.calibration.api",
 )
 PAGE_MODULES = (
@@ -63,6 +67,10 @@ PAGE_MODULES = (
     "app.planning.bundles.pages",
     "app.analysis.primary.pages",
     "app.analysis.metrics.pages",
+    "app.analysis.pooled.pages",
+    "app.analysis.evaluations.pages",
+    "app.analysis.energy.pages",
+    "app.analysis.biomarker.pages",
     "app.analysis.calibration.pages",
     "app.overview.overview",
     "app.overview.participant",

@@ -17,6 +17,7 @@ from ml.statistics.noninferiority import (
     NonInferiorAndSaving,
     Verdict,
 )
+from ml.statistics.pooling import Summary
 from ml.statistics.power import MOST_VISITS
 from ml.statistics.within_visits.contrasts import Adjustment, Reason, Unavailable
 
@@ -172,6 +173,22 @@ def left_out(excluded: Excluded) -> str:
         LeftOut.UNREADABLE: f"cannot be read: {excluded.detail}",
         LeftOut.HIDDEN: "hidden from you until its visit is locked",
     }[excluded.why]
+
+
+def no_association(why: Unavailable) -> str:
+    """Why two measurements are not set against each other."""
+    if why.reason is Reason.TOO_FEW_VISITS:
+        return f"{_n(why.found, 'visit')} with what it takes; {why.needed} are needed."
+    return "One of the two hardly varies, or one visit alone carries it." if why.reason is Reason.NO_VARIANCE else unavailable(why)
+
+
+def no_population_claim(found: Summary) -> str:
+    """What a summary of so few participants does not say."""
+    k = found.participants
+    floor = f"With {k} participants the two-sided sign test cannot go below {found.smallest_sign_p:.3g}".replace("0.", ".")
+    if found.population_claim:
+        return f"{floor}; the summary describes these {k} participants, and their spread is shown beside it."
+    return f"{floor}: the summary describes these {k} participants and claims nothing about other people."
 
 
 def _listed(names: Sequence[str]) -> str:

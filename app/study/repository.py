@@ -99,14 +99,9 @@ def visit_by_number(db: Session, participant_id: int, number: int) -> Visit | No
 def locked_visits(db: Session, participant_id: int) -> Sequence[int]:
     """Visits of a participant that are locked now."""
     newest = (
-        select(VisitLock.visit_id, VisitLock.locked)
-        .join(VisitLock.visit)
-        .where(Visit.participant_id == participant_id)
-        .distinct(VisitLock.visit_id)
-        .order_by(VisitLock.visit_id, VisitLock.id.desc())
-        .subquery()
+        select(func.max(VisitLock.id)).join(VisitLock.visit).where(Visit.participant_id == participant_id).group_by(VisitLock.visit_id)
     )
-    return db.scalars(select(newest.c.visit_id).where(newest.c.locked)).all()
+    return db.scalars(select(VisitLock.visit_id).where(VisitLock.id.in_(newest), VisitLock.locked)).all()
 
 
 def lock_row(db: Session, visit: Visit) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Collection
 from typing import Any
 
 from sqlalchemy import ColumnElement, Select, String, cast, func, literal, literal_column, select, union_all
+from sqlalchemy.dialects.postgresql import JSONPATH
 from sqlalchemy.orm import Session
 
 from app.study.models import (
@@ -45,7 +46,7 @@ def fingerprint(db: Session, participant_id: int) -> str:
 
 def stimulation_events(db: Session, recording_ids: Collection[int]) -> dict[int, list[dict[str, Any]]]:
     """Logged states of the stimulation by recording, in time order: `t_s` and `data` with `rate_hz` and `programs`."""
-    events = func.jsonb_path_query_array(Recording.details, cast(literal(STIMULATION_EVENTS), literal_column("jsonpath").type))
+    events = func.jsonb_path_query_array(Recording.details, cast(literal(STIMULATION_EVENTS), JSONPATH))
     rows = db.execute(select(Recording.id, events).where(Recording.id.in_(recording_ids)))
     return {row[0]: sorted(row[1], key=lambda e: e.get("t_s") or 0.0) for row in rows}
 
@@ -53,3 +54,13 @@ def stimulation_events(db: Session, recording_ids: Collection[int]) -> dict[int,
 def _versions(name: str, key: Any, mine: ColumnElement[bool]) -> Select[Any]:
     version = cast(key, String).op("||")(literal(":")).op("||")(cast(literal_column(f"{name}.xmin"), String))
     return select(func.md5(func.coalesce(func.string_agg(version, literal(",")), literal("")))).select_from(key.class_).where(mine)
+
+
+def spans(db: Session, session_ids: Collection[int]) -> dict[tuple[int, int], tuple[float, float]]:
+    """Where sessions lie in their recordings, s: by session and recording, from the first start to the last stop."""
+    rows = db.execute(
+        select(SessionSegment.session_id, SessionSegment.recording_id, func.min(SessionSegment.start_s), func.max(SessionSegment.stop_s))
+        .where(SessionSegment.session_id.in_(session_ids))
+        .group_by(SessionSegment.session_id, SessionSegment.recording_id)
+    )
+    return {(row[0], row[1]): (row[2], row[3]) for row in rows}
