@@ -312,8 +312,8 @@ def export_(
     to: Annotated[Path | None, typer.Option(help="Zip to write; CODE.zip when left out.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write everything of a participant as a zip of tables (CSV) and settings (JSON)."""
-    from app.overview.export import export_participant
+    """Write everything of a participant as a zipped Frictionless data package, with a script that recomputes its primary tables."""
+    from app.overview.package.export import export_participant
     from app.study import repository as study
 
     target = to or Path(f"{code}.zip")

@@ -74,6 +74,7 @@ PAGE_MODULES = (
     "app.analysis.calibration.pages",
     "app.overview.overview",
     "app.overview.participant",
+    "app.overview.package.pages",
 )
 
 

@@ -98,9 +98,7 @@ def visit_by_number(db: Session, participant_id: int, number: int) -> Visit | No
 
 def locked_visits(db: Session, participant_id: int) -> Sequence[int]:
     """Visits of a participant that are locked now."""
-    newest = (
-        select(func.max(VisitLock.id)).join(VisitLock.visit).where(Visit.participant_id == participant_id).group_by(VisitLock.visit_id)
-    )
+    newest = select(func.max(VisitLock.id)).join(VisitLock.visit).where(Visit.participant_id == participant_id).group_by(VisitLock.visit_id)
     return db.scalars(select(VisitLock.visit_id).where(VisitLock.id.in_(newest), VisitLock.locked)).all()
 
 

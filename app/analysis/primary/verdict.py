@@ -40,7 +40,8 @@ class VerdictResult:
     Attributes:
         confirmatory: every session that it rests on began, and was recorded, after the lock.
         assessment: of those sessions; None where no outcome was ever measured.
-        visits: with both arms, among the sessions that it rests on. left_to_exploration: visits of before the lock.
+        visits: with both arms, among the sessions that it rests on. drawn_from: all visits of these sessions.
+        left_to_exploration: visits of before the lock.
         margin: by outcome, in its unit. stopped: sessions of the controller that were stopped for the patient's sake.
     """
 
@@ -48,6 +49,7 @@ class VerdictResult:
     confirmatory: bool
     assessment: Assessment | None
     visits: tuple[int, ...]
+    drawn_from: tuple[int, ...]
     left_to_exploration: tuple[int, ...]
     margin: dict[str, float]
     stopped: tuple[int, ...]
@@ -94,6 +96,7 @@ def _judge(
         confirmatory,
         result,
         tuple(sorted(seen)),
+        tuple(sorted(used)),
         tuple(sorted({s.visit for s in everything if tested(s)} - used)),
         {o.name: o.margin for o in outcomes if o is not None},
         tuple(s.session_id for s in sessions if tested(s) and s.stopped is not None),

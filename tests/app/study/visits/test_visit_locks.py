@@ -10,6 +10,7 @@ from fastapi.testclient import TestClient
 from app.accounts.blinded import is_open
 
 Upload = Callable[..., int]
+Clients = Callable[[str], TestClient]
 
 
 def lock(client: TestClient, visit: int = 1, what: str = "lock", reason: str = "data complete"):  # type: ignore[no-untyped-def]
@@ -45,7 +46,7 @@ def test_uploads_that_would_count_in_a_locked_visit_are_refused(client: TestClie
         upload("rl", level=0.6)
 
 
-def test_the_page_of_a_visit_locks_and_unlocks(client: TestClient, upload: Upload, client_as: Callable[[str], TestClient]) -> None:
+def test_the_page_of_a_visit_locks_and_unlocks(client: TestClient, upload: Upload, client_as: Clients) -> None:
     session = upload("cdbs")
     visit = client.get(f"/api/v1/sessions/{session}").json()["visit_id"]
     assert "Lock this visit" in client.get(f"/visits/{visit}").text
@@ -57,7 +58,7 @@ def test_the_page_of_a_visit_locks_and_unlocks(client: TestClient, upload: Uploa
     assert engineer.post(f"/api/v1/visits/{visit}/unlock", json={"reason": "x"}).status_code == 403
 
 
-def test_a_blinded_assessor_learns_what_ran_once_the_visit_is_locked(client: TestClient, upload: Upload, client_as: Callable[[str], TestClient]) -> None:  # fmt: skip
+def test_a_blinded_assessor_learns_what_ran_once_the_visit_is_locked(client: TestClient, upload: Upload, client_as: Clients) -> None:
     sessions = [upload("cdbs"), upload("rl", level=0.6)]
     blinded = client_as("blinded_assessor")
     visit = blinded.get("/api/v1/participants/P1/visits").json()["items"][0]["id"]
@@ -87,7 +88,7 @@ def test_a_blinded_assessor_learns_what_ran_once_the_visit_is_locked(client: Tes
     assert blinded.get("/api/v1/participants/P1/analyses").json()["controllers"] == []
 
 
-def test_a_blinded_assessor_enters_qocs_without_the_controller(client: TestClient, upload: Upload, client_as: Callable[[str], TestClient]) -> None:  # fmt: skip
+def test_a_blinded_assessor_enters_qocs_without_the_controller(client: TestClient, upload: Upload, client_as: Clients) -> None:
     session = upload("rl", level=0.6, qoc={})
     blinded = client_as("blinded_assessor")
     done = blinded.post(f"/sessions/{session}/qoc", data={"revision": "0", "rating": "6"}, follow_redirects=False)
@@ -98,7 +99,7 @@ def test_a_blinded_assessor_enters_qocs_without_the_controller(client: TestClien
     assert 'class="controller' not in wrong.text
 
 
-def test_whatever_is_not_listed_is_closed_to_blinded_assessors(client: TestClient, upload: Upload, client_as: Callable[[str], TestClient]) -> None:  # fmt: skip
+def test_whatever_is_not_listed_is_closed_to_blinded_assessors(client: TestClient, upload: Upload, client_as: Clients) -> None:
     session = upload("rl", level=0.6)
     blinded = client_as("blinded_assessor")
     visit = client.get(f"/api/v1/sessions/{session}").json()["visit_id"]
