@@ -92,7 +92,7 @@ def read_visit(visit: CurrentVisit) -> VisitOut:
     return visit_out(visit, visit.participant.code)
 
 
-@router.patch("/visits/{visit_id}")
+@router.patch("/visits/{visit_id}", responses=problems(409))
 def change_visit(visit: CurrentVisit, change: VisitChange, db: Db, caller: CurrentCaller) -> VisitOut:
     """Correct a visit: its date, its note, its cDBS amplitudes; amplitude fractions of its sessions follow."""
     service.change_visit(db, visit, change, caller)
@@ -135,7 +135,7 @@ def read_session(session: CurrentSession, caller: CurrentCaller) -> SessionOut:
     return session_out(session, caller)
 
 
-@router.patch("/sessions/{session_id}")
+@router.patch("/sessions/{session_id}", responses=problems(409))
 def change_session(session: CurrentSession, change: SessionChange, db: Db, caller: CurrentCaller) -> SessionOut:
     """Correct a session: its controller, channel, hemisphere, or whether it counts."""
     service.change_session(db, session, change, caller)
@@ -156,7 +156,7 @@ def read_qoc(session: CurrentSession) -> QocOut | None:
     return QocOut.model_validate(session.qoc) if session.qoc else None
 
 
-@router.put("/sessions/{session_id}/qoc")
+@router.put("/sessions/{session_id}/qoc", responses=problems(409))
 def record_qoc(session: CurrentSession, values: QocIn, db: Db, caller: CurrentCaller) -> QocOut:
     """Enter or correct the QoCs of a session."""
     row = service.record_qoc(db, session, values, caller)
@@ -170,7 +170,7 @@ def read_outcomes(session: CurrentSession, db: Db) -> list[OutcomeOut]:
     return [outcome_out(session, d) for d in outcome_values.derive(db, session)]
 
 
-@router.post("/sessions/{session_id}/outcomes")
+@router.post("/sessions/{session_id}/outcomes", responses=problems(409))
 def take_outcome(session: CurrentSession, choice: DerivedChoice, db: Db, caller: CurrentCaller) -> QocOut:
     """Put the value that the files give in the place of a typed one; `value` is the one that was read before."""
     row = service.take_derived(db, session, choice, caller)

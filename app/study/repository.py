@@ -15,7 +15,6 @@ from app.accounts.permissions import Caller
 from app.platform.audit import AuditEvent
 from app.platform.errors import NotFound
 from app.study.models import (
-    GraspTest,
     Participant,
     QocRevision,
     Recording,
@@ -23,10 +22,10 @@ from app.study.models import (
     SettingsVersion,
     StudySession,
     Trace,
-    TremorSeries,
     Visit,
     VisitLock,
 )
+from app.study.outcomes.models import GraspTest, TremorSeries
 
 CONFIRMED = StudySession.status == "confirmed"
 """Condition on `StudySession`: only what a person has confirmed counts in buffers, analyses, rankings and exports."""

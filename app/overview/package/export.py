@@ -1,4 +1,4 @@
-"""A participant's record as a Frictionless data package, for statisticians: plain tables, their dictionary, and a script that checks them."""
+"""A participant's record as a Frictionless data package: tables, their dictionary, and a script that checks them."""
 
 from __future__ import annotations
 

@@ -52,10 +52,11 @@ def metrics(folder: Path) -> list[dict[str, Any]]:
         mine = steps.get(s["session_id"], [])
         a = np.array([number(r["amplitude_fraction"]) for r in mine])
         beta = np.array([number(r["beta"]) for r in mine])
-        values = {name: number(s[column]) for name, column in COLUMNS.items()}
+        values: dict[str, float] = {name: number(s[column]) for name, column in COLUMNS.items()}
         values["energy"] = float(np.nanmean(a**2)) if known(a) else math.nan
         values["mean_beta"] = float(np.nanmean(beta)) if known(beta) and s["beta_compared"] == "true" else math.nan
-        found.append({**s, **values, "visit": int(s["visit"]), "order": float(s["ordinal"])})
+        session: dict[str, Any] = dict(s)
+        found.append(session | values | {"visit": int(s["visit"]), "order": float(s["ordinal"])})
     return found
 
 
@@ -246,7 +247,8 @@ def main(folder: Path) -> int:
         again = noninferiority(sessions, r, float(r["grasp_share"]))
         named = f"{r['controller']} {r['outcome']}"
         wrong += [f"{named} {n}: {r[n]} stored, {again.get(n)} here" for n in ("estimate", "p_non_inferior") if differs(r[n], again.get(n))]
-    print("\n".join(wrong) if wrong else f"{count} rows of primary.csv and noninferiority.csv recomputed: all agree.")
+    said = "\n".join(wrong) if wrong else f"{count} rows of primary.csv and noninferiority.csv recomputed: all agree."
+    sys.stdout.write(f"{said}\n")
     return 1 if wrong else 0
 
 

@@ -18,9 +18,10 @@ from sqlalchemy.orm import Session
 from app.platform.database import set_reason
 from app.platform.errors import Invalid
 from app.study import repository
-from app.study.models import GraspTest, Hemisphere, QocRevision, StudySession, TremorSeries
+from app.study.models import Hemisphere, QocRevision, StudySession
 from app.study.outcomes import tremor
 from app.study.outcomes import values as outcome_values
+from app.study.outcomes.models import GraspTest, TremorSeries
 from app.study.outcomes.tremor import Minutes
 from app.study.outcomes.values import Derived
 from ml.qoc import TREMOR_CLASSES
