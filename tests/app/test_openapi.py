@@ -107,9 +107,13 @@ INTENDED: dict[str, str] = {
             "components > schemas > VisitRowOut",
             "paths > /api/v1/analyses",
             "paths > /api/v1/participants/{code}/analyses",
+            "paths > /api/v1/participants/{code}/analyses/beta",
+            "paths > /api/v1/participants/{code}/analyses/energy",
+            "paths > /api/v1/participants/{code}/analyses/evaluations",
+            "paths > /api/v1/participants/{code}/analyses/primary",
         ),
-        "API: analyses within the visit (`analyses/primary`), of energy, of beta, of methods by seed, and of all participants (`/analyses`), as "
-        "JSON, CSV and SVG",
+        "API: analyses within the visit (`analyses/primary`), of energy, of beta, of methods by seed, and of all participants "
+        "(`/analyses`), as JSON, CSV and SVG",
     ),
     **dict.fromkeys(
         (
