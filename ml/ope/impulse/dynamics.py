@@ -13,7 +13,7 @@ sessions are random effects.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -93,9 +93,10 @@ class LaggedMeans:
         return np.moveaxis((self._sums[at[:-1]] - self._sums[at[1:]]) / np.diff(EDGES).reshape(-1, *([1] * value.ndim)), 0, -1)
 
 
-def lagged_means(signal: Floats) -> Floats:
-    """`LaggedMeans` of a whole signal [T], [T, STRETCHES]."""
-    sums = np.concatenate([np.zeros(1), np.cumsum(np.concatenate([np.full(MEMORY, signal[0]), signal]))])
+def lagged_means(signal: Floats, before: float | None = None) -> Floats:
+    """`LaggedMeans` of a whole signal [T] after the value `before` it (its first one where that is None), [T, STRETCHES]."""
+    first = signal[0] if before is None else before
+    sums = np.concatenate([np.zeros(1), np.cumsum(np.concatenate([np.full(MEMORY, first), signal]))])
     now = MEMORY + 1 + np.arange(signal.size)
     at = now[:, None] - np.array(EDGES)
     return np.asarray((sums[at[:, :-1]] - sums[at[:, 1:]]) / np.diff(EDGES), dtype=np.float64)
@@ -113,10 +114,11 @@ class ResponseTable:
     usable: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, session: SessionTrajectory, scale: Scale) -> ResponseTable:
-        """Tables of a session; before its first step the first amplitude counts as held."""
+    def of(cls, session: SessionTrajectory, scale: Scale, before: float | None = None) -> ResponseTable:
+        """Tables of a session after the dose `before` (`ml.ope.lead`); its own first amplitude where that is None."""
         a, window = held_amplitude(session), session.lead_beta.size
-        means = {shape: lagged_means(dose(shape, np.concatenate([np.full(window, a[0]), a]))) for shape in SHAPES}
+        first = a[0] if before is None else before
+        means = {shape: lagged_means(dose(shape, np.concatenate([np.full(window, first), a]))) for shape in SHAPES}
         return cls(scale.beta(session.padded_beta), a, means, session.usable())
 
 
@@ -142,6 +144,7 @@ class ImpulseDynamics:
         noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
         evidence: share of every (shape, alpha).
         shares: lambda / (1 + lambda) of the visits' and the sessions' levels.
+        before: dose before every session; None: each session's first amplitude.
     """
 
     phi: Floats
@@ -151,6 +154,7 @@ class ImpulseDynamics:
     noise_weights: Floats
     evidence: dict[tuple[str, float], float]
     shares: dict[str, float]
+    before: float | None = None
 
     @property
     def sustained(self) -> Floats:
@@ -180,17 +184,17 @@ class ImpulseDynamics:
         return np.asarray((self.levels + np.array(answer)[:, None]).mean(0), dtype=np.float64)
 
     def response(self, first: Floats, steps: int) -> Response:
-        """The answer to amplitudes that come step by step, first [P, D, n] before them."""
-        return Response(self, first, steps)
+        """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
+        return Response(self, first if self.before is None else np.full_like(first, self.before), steps)
 
 
 class Response:
     """The answer of beta to amplitudes [P, D, n] as they come."""
 
-    def __init__(self, dynamics: ImpulseDynamics, first: Floats, steps: int) -> None:
+    def __init__(self, dynamics: ImpulseDynamics, before: Floats, steps: int) -> None:
         self._dynamics = dynamics
         self._groups = [(SHAPES[s], np.flatnonzero(dynamics.shapes == s)) for s in np.unique(dynamics.shapes)]
-        self._means = [LaggedMeans(dose(shape, first[:, members]), steps) for shape, members in self._groups]
+        self._means = [LaggedMeans(dose(shape, before[:, members]), steps) for shape, members in self._groups]
 
     def step(self, a: Floats) -> Floats:
         """Answer [P, D, n] once the amplitudes a [P, D, n] are in force."""
@@ -200,8 +204,13 @@ class Response:
         return answer
 
 
-def fit_impulse(buffer: ReplayBuffer, tables: Sequence[ResponseTable], draws: int, seed: int) -> ImpulseDynamics:
+def fit_impulse(
+    buffer: ReplayBuffer, tables: Sequence[ResponseTable], draws: int, seed: int, before: float | None = None
+) -> ImpulseDynamics:
     """`draws` sets of coefficients from the posterior over shapes, time scales and coefficients.
+
+    Args:
+        before: the dose before every session that the tables were made with.
 
     Raises:
         ValueError: fewer than two sessions with usable steps.
@@ -225,7 +234,7 @@ def fit_impulse(buffer: ReplayBuffer, tables: Sequence[ResponseTable], draws: in
         [_residual(t, best, own, i) for i, t in enumerate(tables)], [t.beta for t in tables], [t.amplitude for t in tables],
         [t.usable for t in tables], phi,
     )  # fmt: skip
-    return _drawn(combinations, own, phi, noise, draws, seed)
+    return replace(_drawn(combinations, own, phi, noise, draws, seed), before=before)
 
 
 def _beside(best: Combination | None) -> tuple[float, ...]:

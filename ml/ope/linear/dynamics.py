@@ -11,7 +11,7 @@ by phi (Cochrane and Orcutt 1949; generalised least squares), then phi on what i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,11 +63,12 @@ class SessionTable:
     usable: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, session: SessionTrajectory, scale: Scale) -> SessionTable:
-        """Tables of a session; before its first step the first amplitude counts as held."""
+    def of(cls, session: SessionTrajectory, scale: Scale, before: float | None = None) -> SessionTable:
+        """Tables of a session after the dose `before` (`ml.ope.lead`); its own first amplitude where that is None."""
         a = held_amplitude(session)
-        own = answers(a, memories(a))
-        lead = answers(a[:1], fresh_memory(a[:1]))
+        own = answers(a, memories(a, before))
+        first = a[:1] if before is None else np.array([before])
+        lead = answers(first, fresh_memory(first))
         window = session.lead_beta.size
         return cls(scale.beta(session.padded_beta), np.concatenate([np.repeat(lead, window, axis=0), own]), a, session.usable())
 
@@ -81,6 +82,7 @@ class Dynamics:
         beta: answers to the amplitude, [D, 7]. levels: mu + visit + session, [D, n].
         noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
         shares: lambda / (1 + lambda) of the visits' and the sessions' levels; how far they stand out of one step's noise.
+        before: dose before every session; None: each session's first amplitude. log_evidence: of the fit, up to a constant of the rows.
     """
 
     phi: Floats
@@ -88,6 +90,8 @@ class Dynamics:
     levels: Floats
     noise_weights: Floats
     shares: dict[str, float]
+    before: float | None = None
+    log_evidence: float = 0.0
 
     def innovations(self, tables: Sequence[SessionTable]) -> list[Floats]:
         """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
@@ -101,8 +105,8 @@ class Dynamics:
         return found
 
     def response(self, first: Floats, steps: int) -> LinearResponse:
-        """The answer to amplitudes that come step by step, as if the first [P, D, n] had been on before."""
-        return LinearResponse(self.beta, first)
+        """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
+        return LinearResponse(self.beta, first if self.before is None else np.full_like(first, self.before))
 
     def usual_lead(self) -> Floats:
         """Standardised beta of each session under the mean of the random amplitudes, [n]: where the window before it is not known."""
@@ -115,22 +119,24 @@ class Dynamics:
 
 
 class LinearResponse:
-    """The answer of beta to amplitudes [P, D, n] as they come, with coefficients [D, 7]."""
+    """The answer of beta to amplitudes [P, D, n] as they come after those `before` them, with coefficients [D, 7]."""
 
-    def __init__(self, beta: Floats, first: Floats) -> None:
-        self._beta, self._shape, self._memory = beta, first.shape, fresh_memory(first.ravel())
-        self._started = False
+    def __init__(self, beta: Floats, before: Floats) -> None:
+        self._beta, self._shape, self._memory = beta, before.shape, fresh_memory(before.ravel())
 
     def step(self, a: Floats) -> Floats:
-        """Answer [P, D, n] once the amplitudes a [P, D, n] are in force; the first call's are those it was made with."""
-        if self._started:
-            self._memory = remember(self._memory, a.ravel())
-        self._started = True
+        """Answer [P, D, n] once the amplitudes a [P, D, n] are in force."""
+        self._memory = remember(self._memory, a.ravel())
         return np.einsum("pdnj,dj->pdn", answers(a.ravel(), self._memory).reshape(*self._shape, -1), self._beta)
 
 
-def fit_dynamics(buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: int, seed: int) -> tuple[Dynamics, Dynamics]:
+def fit_dynamics(
+    buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: int, seed: int, before: float | None = None
+) -> tuple[Dynamics, Dynamics]:
     """The model at its posterior mean (D = 1), and `draws` of its coefficients from their posterior (phi and noise as in the first).
+
+    Args:
+        before: the dose before every session that the tables were made with.
 
     Raises:
         ValueError: fewer than two sessions with usable steps.
@@ -150,9 +156,9 @@ def fit_dynamics(buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: in
     shares = {name: fit.share(name) for name in ("visit", "session")}
     usable, amplitudes = [t.usable for t in tables], [t.amplitude for t in tables]
     noise = log_noise_weights(_residuals(tables, beta[0], levels[0]), [t.beta for t in tables], amplitudes, usable, phi)
-    mean = Dynamics(phi, beta, levels, noise, shares)
+    mean = Dynamics(phi, beta, levels, noise, shares, before, fit.log_evidence)
     drawn = _split(fit.draws(draws, np.random.default_rng([seed, 0xD7A])), own)
-    return mean, Dynamics(phi, *drawn, mean.noise_weights, shares)
+    return mean, replace(mean, beta=drawn[0], levels=drawn[1])
 
 
 def largest_root(phi: Floats) -> float:
