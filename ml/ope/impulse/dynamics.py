@@ -13,14 +13,14 @@ sessions are random effects.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.fqe.steps import held_amplitude
-from ml.ope.linear.dynamics import autoregression, filtered, log_noise_weights, noise_features
+from ml.ope.linear.dynamics import autoregression, level_model, level_sums, log_noise_weights, noise_features
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedFit, MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -145,6 +145,7 @@ class ImpulseDynamics:
         evidence: share of every (shape, alpha).
         shares: lambda / (1 + lambda) of the visits' and the sessions' levels.
         before: dose before every session; None: each session's first amplitude.
+        ratios: likeliest lambdas of every (shape, alpha).
     """
 
     phi: Floats
@@ -155,6 +156,7 @@ class ImpulseDynamics:
     evidence: dict[tuple[str, float], float]
     shares: dict[str, float]
     before: float | None = None
+    ratios: dict[tuple[str, float], Floats] = field(default_factory=dict)
 
     @property
     def sustained(self) -> Floats:
@@ -195,6 +197,14 @@ class Response:
         self._dynamics = dynamics
         self._groups = [(SHAPES[s], np.flatnonzero(dynamics.shapes == s)) for s in np.unique(dynamics.shapes)]
         self._means = [LaggedMeans(dose(shape, before[:, members]), steps) for shape, members in self._groups]
+        self._before = before
+
+    def lasting(self) -> Floats:
+        """Answer [P, D, n] before the first amplitudes."""
+        answer = np.empty_like(self._before)
+        for shape, members in self._groups:
+            answer[:, members] = dose(shape, self._before[:, members]) * self._dynamics.sustained[members, None]
+        return answer
 
     def step(self, a: Floats) -> Floats:
         """Answer [P, D, n] once the amplitudes a [P, D, n] are in force."""
@@ -247,7 +257,7 @@ def _weighed(
 ) -> list[Combination]:
     found: list[tuple[str, float, MixedFit]] = []
     for shape in shapes:
-        sums = _sums(tables, own, phi, shape)
+        sums = Sums.pooled(response_sums(tables, own, phi, shape))
         found += [(shape, alpha, _fit(sums, own, alpha)) for alpha in alphas]
     logs = np.array([fit.log_evidence for _, _, fit in found])
     weights = np.exp(logs - logs.max())
@@ -255,41 +265,28 @@ def _weighed(
     return [Combination(s, a, float(w), f) for (s, a, f), w in zip(found, weights, strict=True)]
 
 
-def _sums(tables: Sequence[ResponseTable], own: Floats, phi: Floats, shape: str) -> Sums:
-    """Sums over rows filtered by phi; columns: 1, means over stretches, visits, sessions."""
-    n, visits = len(tables), own.shape[1]
-    rest, q = 1 - float(phi.sum()), 1 + STRETCHES + visits + n
-    gram, moment, square, rows = np.zeros((q, q)), np.zeros(q), 0.0, 0
-    for i, table in enumerate(tables):
-        y = filtered(table.beta[:, None], phi)[table.usable, 0]
-        level = np.concatenate([own[i], np.arange(n) == i]) * rest
-        x = np.concatenate(
-            [np.full((y.size, 1), rest), filtered(table.means[shape], phi)[table.usable], np.tile(level, (y.size, 1))], axis=1
-        )
-        gram, moment, square, rows = gram + x.T @ x, moment + x.T @ y, square + float(y @ y), rows + y.size
-    return Sums(gram, moment, square, rows)
+def response_sums(tables: Sequence[ResponseTable], own: Floats, phi: Floats, shape: str) -> list[Sums]:
+    """Sums of every session over rows filtered by phi; columns: 1, means over stretches of lags, visits, sessions."""
+    return [level_sums(t.beta, t.means[shape], t.usable, own, i, phi) for i, t in enumerate(tables)]
 
 
-def _transform(own: Floats, alpha: float) -> Floats:
-    """Columns of the sums from (1, u, visits, sessions): [q, q + 1]."""
+def moved(sums: Sums, own: Floats, alpha: float) -> Sums:
+    """Sums for the columns (1, u, visits, sessions), of which `prior_root` makes the impulse response."""
     root, levels = prior_root(alpha), own.shape[1] + len(own)
-    result = np.zeros((1 + STRETCHES + levels, 1 + root.shape[1] + levels))
-    result[0, 0] = 1.0
-    result[1 : 1 + STRETCHES, 1 : 1 + root.shape[1]] = root
-    result[1 + STRETCHES :, 1 + root.shape[1] :] = np.eye(levels)
-    return result
+    change = np.zeros((1 + STRETCHES + levels, 1 + root.shape[1] + levels))
+    change[0, 0] = 1.0
+    change[1 : 1 + STRETCHES, 1 : 1 + root.shape[1]] = root
+    change[1 + STRETCHES :, 1 + root.shape[1] :] = np.eye(levels)
+    return Sums(change.T @ sums.gram @ change, change.T @ sums.moment, sums.square, sums.rows)
+
+
+def response_model(own: Floats) -> MixedModel:
+    """The mixed model of the columns (1, u, visits, sessions)."""
+    return level_model((("response", tuple(range(1, 2 + STRETCHES))),), STRETCHES + 1, own, {})
 
 
 def _fit(sums: Sums, own: Floats, alpha: float) -> MixedFit:
-    change = _transform(own, alpha)
-    moved = Sums(change.T @ sums.gram @ change, change.T @ sums.moment, sums.square, sums.rows)
-    first, visits = 1 + STRETCHES + 1, own.shape[1]
-    groups = {
-        "response": tuple(range(1, first)),
-        "visit": tuple(range(first, first + visits)),
-        "session": tuple(range(first + visits, change.shape[1])),
-    }
-    return MixedModel(change.shape[1], groups, {}).fit(moved)
+    return response_model(own).fit(moved(sums, own, alpha))
 
 
 def _split(coefficients: Floats, own: Floats, alpha: float) -> tuple[Floats, Floats]:
@@ -323,4 +320,5 @@ def _drawn(combinations: Sequence[Combination], own: Floats, phi: Floats, noise:
             shapes += [SHAPES.index(combination.shape)] * int(count)
     shares_of = {name: sum(c.weight * c.fit.share(name) for c in combinations) for name in ("visit", "session")}
     evidence = {(c.shape, c.alpha): c.weight for c in combinations}
-    return ImpulseDynamics(phi, np.concatenate(gains), np.array(shapes), np.concatenate(levels), noise, evidence, shares_of)
+    ratios = {(c.shape, c.alpha): c.fit.likeliest for c in combinations}
+    return ImpulseDynamics(phi, np.concatenate(gains), np.array(shapes), np.concatenate(levels), noise, evidence, shares_of, ratios=ratios)

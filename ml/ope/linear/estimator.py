@@ -41,6 +41,9 @@ BEYOND = 0.25
 class Response(Protocol):
     """The answer of beta to amplitudes [P, D, n] as they come."""
 
+    def lasting(self) -> Floats:
+        """Answer [P, D, n] before the first of them."""
+
     def step(self, a: Floats) -> Floats:
         """Answer [P, D, n] once the amplitudes a are in force."""
 
@@ -180,10 +183,10 @@ class FittedLinear:
         for t in range(horizon):
             raw = self.scale.raw_beta(window)
             a = np.stack([policy.act(raw[k].reshape(-1, w)).reshape(d, n) for k, policy in enumerate(policies)])
-            response = response or dynamics.response(a, horizon)
+            if response is None:
+                response = dynamics.response(a, horizon)
+                eta[:] = window - (response.lasting() + level)[..., None]
             rest = response.step(a) + level
-            if t == 0:
-                eta[:] = window - rest[..., None]
             predicted = rest + eta @ dynamics.phi[::-1]
             newest = predicted + np.exp(noise_features(a, predicted) @ dynamics.noise_weights) * noise[:, :, t]
             newest = np.clip(newest, low, high)

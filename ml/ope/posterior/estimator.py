@@ -90,7 +90,7 @@ class Posterior:
         for k, fitter in enumerate(STRUCTURES.values()):
             fits.append(fitter(buffer, scale, draws, c.seed, before))
             report(0.4 * (k + 1) / len(STRUCTURES), "fitting the structures")
-        predictions = held_out(buffer, scale, STRUCTURES, before, c.seed)
+        predictions = held_out(buffer, scale, fits, c.seed)
         report(0.9, "predicting left-out sessions")
         shares = shared_out(predictions.weights, draws)
         severity = sum(predictions.weights[f.key] * f.drawn.levels.mean(0) for f in fits)

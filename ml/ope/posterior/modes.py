@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from ml.ope.fqe.steps import held_amplitude
-from ml.ope.linear.dynamics import autoregression, filtered, log_noise_weights, noise_features
+from ml.ope.linear.dynamics import autoregression, level_model, level_sums, log_noise_weights, noise_features
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedFit, MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -50,7 +50,7 @@ def polynomials(a: Floats) -> Floats:
 
 
 class Filters:
-    """Low-passed doses of rows side by side; `state` [..., COLUMNS] as if `first` [...] had been on for long."""
+    """Low-passed doses of rows side by side, at first as if `first` [...] had been on for long."""
 
     def __init__(self, first: Floats) -> None:
         self._passed = np.repeat(polynomials(first)[..., None, :], len(TIMES), axis=-2)  # [..., M, J]
@@ -61,7 +61,12 @@ class Filters:
         self._passed = KEEP[:, None] * self._passed + (1 - KEEP[:, None]) * polynomials(a)[..., None, :]
         gap = a[..., None] - self._sided
         self._sided = self._sided + np.where(gap > 0, RISE, FALL) * gap
-        return np.concatenate([self._passed.reshape(*a.shape, -1), self._sided], axis=-1)
+        return self.columns
+
+    @property
+    def columns(self) -> Floats:
+        """The columns now, [..., COLUMNS]."""
+        return np.concatenate([self._passed.reshape(*self._sided.shape[:-1], -1), self._sided], axis=-1)
 
 
 def columns_of(a: Floats, first: float) -> Floats:
@@ -145,6 +150,10 @@ class ModeResponse:
     def __init__(self, gains: Floats, first: Floats) -> None:
         self._gains, self._filters = gains, Filters(first)
 
+    def lasting(self) -> Floats:
+        """Answer [P, D, n] before the first amplitudes."""
+        return np.einsum("pdnk,dk->pdn", self._filters.columns, self._gains)
+
     def step(self, a: Floats) -> Floats:
         """Answer [P, D, n] once the amplitudes a are in force."""
         return np.einsum("pdnk,dk->pdn", self._filters.step(a), self._gains)
@@ -189,52 +198,29 @@ def fit_modes(buffer: ReplayBuffer, tables: Sequence[ModeTable], before: float |
     usable = [t.usable for t in tables]
     phi = np.zeros(window)
     for _ in range(TURNS):
-        fit = _mixed(tables, own, phi)
-        phi = autoregression(_residuals(tables, fit, own), usable, window)
-    fit = _mixed(tables, own, phi)
-    noise = log_noise_weights(_residuals(tables, fit, own), [t.beta for t in tables], [t.amplitude for t in tables], usable, phi)
+        _, coefficients = mode_model(own).likeliest(Sums.pooled(mode_sums(tables, own, phi)))
+        phi = autoregression(_residuals(tables, coefficients, own), usable, window)
+    fit = mode_model(own).fit(Sums.pooled(mode_sums(tables, own, phi)))
+    betas, amplitudes = [t.beta for t in tables], [t.amplitude for t in tables]
+    noise = log_noise_weights(_residuals(tables, fit.coefficients, own), betas, amplitudes, usable, phi)
     return FittedModes(fit, own, phi, noise, before)
 
 
-def _model(own: Floats) -> MixedModel:
-    n, visits = own.shape
-    j = POLYNOMIALS
-    first = 1 + COLUMNS
-    groups = {
-        "fast": tuple(1 + m * j for m in range(SLOW)),
-        "slow": tuple(1 + m * j for m in range(SLOW, len(TIMES))),
-        "shape": tuple(1 + m * j + k for m in range(len(TIMES)) for k in range(1, j)),
-        "sided": tuple(range(1 + j * len(TIMES), first)),
-        "visit": tuple(range(first, first + visits)),
-        "session": tuple(range(first + visits, first + visits + n)),
-    }
-    return MixedModel(first + visits + n, groups, {})
+def mode_model(own: Floats) -> MixedModel:
+    """The mixed model of the columns (1, modes, visits, sessions)."""
+    j, first = POLYNOMIALS, 1 + COLUMNS
+    groups = (
+        ("fast", tuple(1 + m * j for m in range(SLOW))),
+        ("slow", tuple(1 + m * j for m in range(SLOW, len(TIMES)))),
+        ("shape", tuple(1 + m * j + k for m in range(len(TIMES)) for k in range(1, j))),
+        ("sided", tuple(range(1 + j * len(TIMES), first))),
+    )
+    return level_model(groups, COLUMNS, own, {})
 
 
-def _mixed(tables: Sequence[ModeTable], own: Floats, phi: Floats) -> MixedFit:
-    return _model(own).fit(_sums(tables, own, phi))
-
-
-def _sums(tables: Sequence[ModeTable], own: Floats, phi: Floats) -> Sums:
-    """Sums over rows filtered by phi; columns: 1, modes, visits, sessions."""
-    n, visits = own.shape
-    rest, q = 1 - float(phi.sum()), 1 + COLUMNS + visits + n
-    gram, moment, square, rows = np.zeros((q, q)), np.zeros(q), 0.0, 0
-    inner = np.arange(1, 1 + COLUMNS)
-    for i, table in enumerate(tables):
-        y = filtered(table.beta[:, None], phi)[table.usable, 0]
-        modes = filtered(table.columns, phi)[table.usable]
-        # the levels' columns are constant over a session: of them only sums are needed
-        at = np.concatenate([[0], 1 + COLUMNS + np.flatnonzero(own[i]), [1 + COLUMNS + visits + i]])
-        total = modes.sum(0) * rest
-        gram[1 : 1 + COLUMNS, 1 : 1 + COLUMNS] += modes.T @ modes
-        gram[np.ix_(at, inner)] += total
-        gram[np.ix_(inner, at)] += total[:, None]
-        gram[np.ix_(at, at)] += rest**2 * y.size
-        moment[1 : 1 + COLUMNS] += modes.T @ y
-        moment[at] += rest * y.sum()
-        square, rows = square + float(y @ y), rows + y.size
-    return Sums(gram, moment, square, rows)
+def mode_sums(tables: Sequence[ModeTable], own: Floats, phi: Floats) -> list[Sums]:
+    """Sums of every session for `mode_model`."""
+    return [level_sums(t.beta, t.columns, t.usable, own, i, phi) for i, t in enumerate(tables)]
 
 
 def _split(coefficients: Floats, own: Floats) -> tuple[Floats, Floats]:
@@ -244,6 +230,6 @@ def _split(coefficients: Floats, own: Floats) -> tuple[Floats, Floats]:
     return coefficients[:, 1:first], coefficients[:, :1] + visits @ own.T + coefficients[:, first + own.shape[1] :]
 
 
-def _residuals(tables: Sequence[ModeTable], fit: MixedFit, own: Floats) -> list[Floats]:
-    gains, levels = _split(fit.coefficients[None], own)
+def _residuals(tables: Sequence[ModeTable], coefficients: Floats, own: Floats) -> list[Floats]:
+    gains, levels = _split(coefficients[None], own)
     return [table.beta - table.columns @ gains[0] - levels[0, i] for i, table in enumerate(tables)]
