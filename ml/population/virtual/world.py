@@ -24,7 +24,7 @@ from ml.population.virtual.patient import MECHANISMS, Patient, draw_patient
 from ml.population.virtual.sessions import Days, Sessions, new_days, simulate, visit_days
 from ml.population.virtual.traits import TRAITS, with_trait
 from ml.qoc import Qoc
-from ml.trajectories import ReplayBuffer, SessionTrajectory
+from ml.trajectories import Hold, ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
 Part = Literal["A", "B", "C"]
@@ -136,7 +136,7 @@ class World:
             own = Days(days.effects[i : i + 1], days.hours[i : i + 1])
             run = self.run(row.amplitudes[None, :], own, _DATA + 4096 * seed + i, row.amplitudes.size)
             qoc = Qoc(float(run.grasp_hz[0]), int(run.rating[0]), float(run.tremor_percent[0]))
-            bound = self.settings.lower_bound if row.controller == "random" and design == "paper" else None
+            bound = self.settings.lower_bound if row.controller == "random" else None
             sessions.append(
                 SessionTrajectory(
                     session_id=i + 1,
@@ -147,6 +147,7 @@ class World:
                     amplitude=run.amplitude[0],
                     qoc=qoc,
                     random_lower_bound=bound,
+                    holds=row.holds,
                 )
             )
         return ReplayBuffer(self.settings, tuple(sessions), "uV", "table")
@@ -174,12 +175,13 @@ class World:
 
 @dataclass(frozen=True)
 class DataSession:
-    """One session of the data: visit, controller (`cdbs`, `random`, `no_dbs`), hour of the visit, amplitude of every step."""
+    """One session of the data: visit, controller (`cdbs`, `random`, `no_dbs`), hour of the visit, amplitude of every step, held draws."""
 
     visit: int
     controller: str
     hour: float
     amplitudes: Floats
+    holds: tuple[Hold, ...] = ()
 
 
 def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int) -> list[DataSession]:
@@ -198,10 +200,11 @@ def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int
     )
     rows: list[DataSession] = []
     for visit in range(1, visits + 1):
-        random = [("random", s.amplitudes) for s in designed if s.visit == visit]
-        cdbs, off = ("cdbs", np.ones(STEPS)), ("no_dbs", np.zeros(NO_DBS_STEPS))
+        random = [("random", s.amplitudes, s.holds) for s in designed if s.visit == visit]
+        nothing: tuple[Hold, ...] = ()
+        cdbs, off = ("cdbs", np.ones(STEPS), nothing), ("no_dbs", np.zeros(NO_DBS_STEPS), nothing)
         slots = [cdbs, *random[:2], cdbs, *random[2:], off]
-        rows += [DataSession(visit, name, k * (STEPS * 2 / 3600 + PAUSE_H), a) for k, (name, a) in enumerate(slots)]
+        rows += [DataSession(visit, name, k * (STEPS * 2 / 3600 + PAUSE_H), a, holds) for k, (name, a, holds) in enumerate(slots)]
     return rows
 
 
