@@ -115,11 +115,11 @@ def draw_candidates(rng: np.random.Generator, xi: float, spread: float, window: 
     }
     # drawn whether they are taken or not, so that one of them does not change the others
     optional: dict[str, tuple[float, Policy]] = {
-        "relay": (0.7, relay()),
-        "near cDBS 3": (0.5, near_cdbs()),
-        "smooth any": (0.6, smooth(uniform(-1.5, 2.0), uniform(0.5, 3.0), False)),
+        "relay": (0.6, relay()),
+        "near cDBS 3": (0.7, near_cdbs()),
+        "smooth any": (0.5, smooth(uniform(-1.5, 2.0), uniform(0.5, 3.0), False)),
         "clone": (0.4, smooth(0.6, 0.4, True)),  # hardly moves from the mean of the random controller
-        "nearly off": (0.4, smooth(-3.0, 0.5, True)),
+        "nearly off": (0.3, smooth(-3.0, 0.5, True)),
     }
     taken = {name: policy for name, (share, policy) in optional.items() if rng.random() < share}
     return found | dict(list(taken.items())[: MOST - len(found)])

@@ -32,9 +32,9 @@ class _Draws:
 
 
 def _saturating(_: Patient, u: _Draws) -> Changes:
-    """A low dose does all that a high one does, and a little less does nothing."""
+    """A middle dose does all that a high one does, and a little less does nothing."""
     shape = u.one_of(HILL, THRESHOLD)
-    half = u(0.2, 0.45)
+    half = u(0.25, 0.55)
     return {
         "shape": shape,
         "half": half,
@@ -121,8 +121,8 @@ def _asymmetric(_: Patient, u: _Draws) -> Changes:
 
 
 def _artefact(p: Patient, u: _Draws) -> Changes:
-    """Stimulation leaks into the sensed beta at once, while it lowers beta itself over seconds and minutes."""
-    return {"leak": u(0.15, 0.4), "immediate": 0.0, "fast": p.fast + p.immediate / 2}
+    """Stimulation leaks into the sensed beta at once, while it lowers beta itself over seconds and, for the larger part, minutes."""
+    return {"leak": u(0.25, 0.5), "depth": max(p.depth, u(0.5, 0.8)), "immediate": 0.0, "fast": u(0.05, 0.4)}
 
 
 TRAITS: Final[dict[str, Callable[[Patient, _Draws], Changes]]] = {
