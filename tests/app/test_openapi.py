@@ -76,6 +76,9 @@ INTENDED: dict[str, str] = {
             "paths > /api/v1/sessions/{session_id}/conditions",
         ),
         "API: `GET` and `PUT /sessions/{id}/conditions` read and correct what a session ran under; a snapshot's session names the revision",
+    ),
+    **dict.fromkeys(
+        (
             "components > schemas > MarginsChange",
             "components > schemas > MarginsIn",
             "components > schemas > MarginsOut",

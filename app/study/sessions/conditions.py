@@ -13,9 +13,10 @@ from app.accounts.permissions import SYSTEM, Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import blinding, repository, service
-from app.study.models import Recording, SessionConditions, SettingsVersion, StudySession
+from app.study.models import Recording, SettingsVersion, StudySession
 from app.study.schemas import ConditionsChange, ConditionsFields
 from app.study.sessions import programming
+from app.study.sessions.models import SessionConditions
 from app.study.traces import AMPLITUDE_STREAM, StepTable, step_table
 
 OF_SETTINGS = ("lower_bound", "window", "period_s", "xi_beta")
