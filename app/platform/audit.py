@@ -39,6 +39,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "site": (),
     "participant": (),
     "settings_version": (),
+    "margins_version": (),
     "cdbs_amplitude": (),
     "device": (),
     "visit": (),

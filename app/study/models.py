@@ -51,7 +51,13 @@ class Participant(Base):
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     site: Mapped[Site] = relationship()
     settings: Mapped[list[SettingsVersion]] = relationship(back_populates="participant", order_by="SettingsVersion.version")
+    margins: Mapped[list[MarginsVersion]] = relationship(back_populates="participant", order_by="MarginsVersion.version")
     visits: Mapped[list[Visit]] = relationship(back_populates="participant", order_by="Visit.number")
+
+    @property
+    def current_margins(self) -> MarginsVersion:
+        """The newest margins and levels; a participant always has some."""
+        return self.margins[-1]
 
     @property
     def current_settings(self) -> SettingsVersion:
@@ -104,6 +110,42 @@ class SettingsVersion(Base):
     created_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
     participant: Mapped[Participant] = relationship(back_populates="settings")
+
+
+class MarginsVersion(Base):
+    """By how much an outcome may be worse than under cDBS, and how sure a proposal must be of it. Never changed, only followed.
+
+    `grasp_share` is a share of the grasp frequency under cDBS, `rating_points` points of the rating, `tremor_points` percentage points of
+    time with tremor. The levels: a policy is proposed for a test where it keeps all outcomes within the margins with probability
+    `test_within` and saves energy with `test_saves`; it is unsafe where an outcome lies beyond its margin with `unsafe_beyond`, or where
+    more than `nearly_off_share` of its steps are nearly off.
+    """
+
+    __tablename__ = "margins_version"
+    __table_args__ = (
+        UniqueConstraint("participant_id", "version"),
+        CheckConstraint("grasp_share > 0 and grasp_share < 1 and rating_points > 0 and tremor_points > 0", name="margins"),
+        CheckConstraint(
+            "test_within > 0 and test_within < 1 and test_saves > 0 and test_saves < 1 and unsafe_beyond > 0 and unsafe_beyond < 1"
+            " and nearly_off_share >= 0 and nearly_off_share < 1",
+            name="levels",
+        ),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    version: Mapped[int]
+    grasp_share: Mapped[float]
+    rating_points: Mapped[float]
+    tremor_points: Mapped[float]
+    test_within: Mapped[float]
+    test_saves: Mapped[float]
+    unsafe_beyond: Mapped[float]
+    nearly_off_share: Mapped[float]
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+    reason: Mapped[str | None] = mapped_column(Text)
+    participant: Mapped[Participant] = relationship(back_populates="margins")
 
 
 class CdbsAmplitude(Base):

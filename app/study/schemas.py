@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -65,9 +66,14 @@ SETTING_BOUNDS = {
 """Clinical bounds of what may be set from now on; versions of before may lie outside of them, and are shown as they are."""
 
 
-def _publish_bounds(schema: dict[str, Any]) -> None:
-    for name, bound in SETTING_BOUNDS.items():
-        schema["properties"][name] |= {"minimum": bound.low, "maximum": bound.high}
+def published(bounds: Mapping[str, Bound]) -> Callable[[dict[str, Any]], None]:
+    """What puts the bounds of a model's fields into its JSON schema."""
+
+    def publish(schema: dict[str, Any]) -> None:
+        for name, bound in bounds.items():
+            schema["properties"][name] |= {"minimum": bound.low, "maximum": bound.high}
+
+    return publish
 
 
 class SettingsFields(Model):
@@ -102,7 +108,7 @@ class SettingsFields(Model):
 class SettingsIn(SettingsFields):
     """Settings of a participant; what is left out keeps its present value (for a new participant: its default)."""
 
-    model_config = ConfigDict(json_schema_extra=_publish_bounds)
+    model_config = ConfigDict(json_schema_extra=published(SETTING_BOUNDS))
 
     @field_validator(*SETTING_BOUNDS)
     @classmethod

@@ -65,6 +65,15 @@ INTENDED: dict[str, str] = {
         ),
         "Evaluation: a further method by name, `impulse`",
     ),
+    **dict.fromkeys(
+        (
+            "components > schemas > MarginsChange",
+            "components > schemas > MarginsIn",
+            "components > schemas > MarginsOut",
+            "paths > /api/v1/participants/{code}/margins",
+        ),
+        "API: margins against cDBS and the levels of verdicts are read and set at `/participants/{code}/margins`.",
+    ),
     "components > schemas > ProposalOut": "API: a proposal has `usable_steps`.",
     "components > schemas > UsableStepsOut": "API: a proposal has `usable_steps`.",
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",

@@ -22,6 +22,7 @@ READABLE = (
     "/api/v1/participants",
     "/api/v1/participants/{code}",
     "/api/v1/participants/{code}/settings",
+    "/api/v1/participants/{code}/margins",
     "/api/v1/participants/{code}/visits",
     "/api/v1/visits/{visit_id}",
     "/api/v1/visits/{visit_id}/sessions",
@@ -55,6 +56,7 @@ ROLES: dict[tuple[str, str], set[str]] = {
     # method and path: roles that may
     ("post", "/api/v1/participants"): {"clinician", "engineer", "admin"},
     ("put", "/api/v1/participants/{code}/settings"): {"clinician", "engineer", "admin"},
+    ("put", "/api/v1/participants/{code}/margins"): {"clinician", "admin"},
     ("post", "/api/v1/participants/{code}/visits"): {"clinician", "engineer", "admin"},
     ("patch", "/api/v1/visits/{visit_id}"): {"clinician", "engineer", "admin"},
     ("patch", "/api/v1/sessions/{session_id}"): {"clinician", "engineer", "admin"},
@@ -130,6 +132,7 @@ class World:
             # members of `ids` that differ, and what is sent
             ("post", "/participants"): {"json": {"code": "Q1"}},
             ("put", "/participants/{code}/settings"): {"code": "P3", "json": {"settings": {"gamma": 0.9}}},
+            ("put", "/participants/{code}/margins"): {"json": {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}},
             ("post", "/participants/{code}/visits"): {"json": {"number": 77}},
             ("patch", "/visits/{visit_id}"): {"json": {"note": "tired", "reason": "forgotten"}},
             ("patch", "/sessions/{session_id}"): {"json": {"excluded_reason": "cable", "reason": "said so"}},
