@@ -85,6 +85,7 @@ class SessionTrajectory:
         random_lower_bound: B in force for a random session; else None.
         holds: decisions of a random session whose draws are held, in order and without gaps up to where it ended. Empty where every step is
             a decision of its own: a random session's density is then 1 / (1 - B) on [B, 1] at every step.
+        lead_amplitude: amplitude fraction in force just before step 0, where it is known; else None.
         most_imputed: how many imputed beta amplitudes a window may hold; 0 as in sessions of 0.1.0.
 
     Raises:
@@ -101,6 +102,7 @@ class SessionTrajectory:
     qoc: Qoc = field(default_factory=Qoc)
     policy_id: int | None = None
     random_lower_bound: float | None = None
+    lead_amplitude: float | None = None
     most_imputed: int = 0
     holds: tuple[Hold, ...] = ()
 
@@ -330,6 +332,7 @@ def from_parquet(content: bytes) -> ReplayBuffer:
                 amplitude=amplitude[body],
                 qoc=Qoc(**m["qoc"]),
                 random_lower_bound=m["random_lower_bound"],
+                lead_amplitude=m.get("lead_amplitude"),
                 most_imputed=m.get("most_imputed", 0),
                 holds=tuple(Hold(*h) for h in m.get("holds", ())),
             )
@@ -343,17 +346,15 @@ def content_hash(content: bytes) -> str:
 
 
 def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
-    imputed = {"most_imputed": s.most_imputed} if s.most_imputed else {}
-    held = {"holds": [[h.start, h.steps, h.log_density] for h in s.holds]} if s.holds else {}
-    return (
-        imputed
-        | held
-        | {
-            "session_id": s.session_id,
-            "visit": s.visit,
-            "controller": s.controller,
-            "policy_id": s.policy_id,
-            "random_lower_bound": s.random_lower_bound,
-            "qoc": {"grasp_hz": s.qoc.grasp_hz, "rating": s.qoc.rating, "tremor_percent": s.qoc.tremor_percent},
-        }
-    )
+    # members that are left out where they say nothing, so that the bytes of older buffers stay what they were
+    later: dict[str, Any] = {"most_imputed": s.most_imputed} if s.most_imputed else {}
+    later |= {"lead_amplitude": s.lead_amplitude} if s.lead_amplitude is not None else {}
+    later |= {"holds": [[h.start, h.steps, h.log_density] for h in s.holds]} if s.holds else {}
+    return later | {
+        "session_id": s.session_id,
+        "visit": s.visit,
+        "controller": s.controller,
+        "policy_id": s.policy_id,
+        "random_lower_bound": s.random_lower_bound,
+        "qoc": {"grasp_hz": s.qoc.grasp_hz, "rating": s.qoc.rating, "tremor_percent": s.qoc.tremor_percent},
+    }
