@@ -236,7 +236,8 @@ def make_up(part: str) -> list[tuple[int, str | None]]:
     others: list[tuple[int, str | None]] = []
     for kind in range(1, len(MECHANISMS)):
         others += [(kind, None), *((kind, next(rotation)) for _ in range(PER_OTHER_MECHANISM - 1))]
-    difficult: list[tuple[int, str | None]] = [(0, SILENT)] * SILENT_BETA + [(0, t) for t in traits for _ in range(PER_TRAIT)]
+    repeated = [SILENT] * SILENT_BETA + [t for t in traits for _ in range(PER_TRAIT)]
+    difficult: list[tuple[int, str | None]] = [(0, t) for t in repeated]
     ordinary: list[tuple[int, str | None]] = [(0, None)] * (WORLDS_PER_PART - len(others) - len(difficult))
     both = others + difficult + ordinary
     return [both[i] for i in np.random.default_rng([PARTS[part], 0x6D65]).permutation(len(both))]
