@@ -138,8 +138,14 @@ TRAITS: Final[dict[str, Callable[[Patient, _Draws], Changes]]] = {
 """By name, what a trait changes of a patient."""
 
 
+SECOND: Final = 0.4
+"""Share of the patients with a trait that have a second one."""
+
+
 def with_trait(patient: Patient, trait: str | None, rng: np.random.Generator) -> Patient:
-    """The patient with a trait; None leaves it ordinary.
+    """The patient with a trait, and with a share of `SECOND` a further one, which the first prevails over; None leaves it ordinary.
+
+    Unsteady days are no difficulty by themselves while all doses keep their order, so they always come with another trait.
 
     Raises:
         ValueError: there is no such trait.
@@ -148,4 +154,7 @@ def with_trait(patient: Patient, trait: str | None, rng: np.random.Generator) ->
         return patient
     if trait not in TRAITS:
         raise ValueError(f"there is no trait {trait!r}; there are {', '.join(TRAITS)}")
+    further = rng.choice([t for t in TRAITS if t not in (trait, "silent")])
+    if trait == "unsteady" or rng.random() < SECOND:
+        patient = patient._replace(**TRAITS[further](patient, _Draws(rng)))
     return patient._replace(**TRAITS[trait](patient, _Draws(rng)))
