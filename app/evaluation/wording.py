@@ -160,7 +160,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         "there is a model's guess"
     ),
     "few_near_sessions": lambda f: (
-        f"{_refusal(f)}{count(int(_value(f)), 'session', 'sessions')} came near what it would do, and {f.limit:.0f} on two visits are needed"
+        f"{_refusal(f)}{count(int(_value(f)), 'session', 'sessions')} came near what it would do; {f.limit:.0f} on two visits are needed"
     ),
     "few_near_visits": lambda f: (
         f"{_refusal(f)}all sessions that came near what it would do are of {count(int(_value(f)), 'visit', 'visits')}, "
