@@ -1,4 +1,4 @@
-"""Low-passes of polynomials of the dose against a readable loop, running twins, and sessions whose answer is known."""
+"""Low-passes of dose functions against a readable loop, running twins, and sessions whose answer is known."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from ml.ope.posterior.modes import (
     FALL_TIMES,
     ONE_SIDED,
     RISE,
+    SHAPES,
     TIMES,
     Filters,
     ModeTable,
     columns_of,
+    dose_functions,
     fit_modes,
-    polynomials,
 )
 from ml.ope.scale import learn_scale
 from ml.qoc import Qoc
@@ -29,24 +30,24 @@ from tests.ml.ope.posterior.known_system import KnownSystem
 def readable(a: np.ndarray, first: float) -> np.ndarray:
     """Columns by their definition, one step after the other."""
     rows = []
-    passed = {(m, j): float(polynomials(np.array(first))[j]) for m in range(len(TIMES)) for j in range(3)}
+    passed = {(m, j): float(dose_functions(np.array(first))[j]) for m in range(len(TIMES)) for j in range(SHAPES)}
     sided, falls, last = [first] * len(ONE_SIDED), [0.0] * len(FALL_TIMES), first
     for value in a:
         for (m, j), before in passed.items():
             keep = np.exp(-1 / TIMES[m]) if TIMES[m] else 0.0
-            passed[m, j] = keep * before + (1 - keep) * float(polynomials(np.array(value))[j])
+            passed[m, j] = keep * before + (1 - keep) * float(dose_functions(np.array(value))[j])
         for k, before in enumerate(sided):
             sided[k] = before + (RISE if value > before else FALL)[k] * (value - before)
         for k, time in enumerate(FALL_TIMES):
             falls[k] = np.exp(-1 / time) * falls[k] + (1 - np.exp(-1 / time)) * 5 * max(last - value, 0)
         last = value
-        rows.append([passed[m, j] for m in range(len(TIMES)) for j in range(3)] + sided + falls)
+        rows.append([passed[m, j] for m in range(len(TIMES)) for j in range(SHAPES)] + sided + falls)
     return np.array(rows)
 
 
 def test_bends_of_the_dose_are_none_at_both_ends() -> None:
-    ends = polynomials(np.array([0.0, 1.0]))
-    assert np.allclose(ends, [[0, 0, 0], [1, 0, 0]])
+    ends = dose_functions(np.array([0.0, 1.0]))
+    assert np.allclose(ends, [[0, 0, 0, 0], [1, 0, 0, 0]])
 
 
 @pytest.mark.parametrize("first", [0.0, 0.4, 1.0])
