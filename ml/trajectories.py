@@ -69,6 +69,7 @@ class SessionTrajectory:
         amplitude: amplitude fraction a_k, shape [T]; NaN where unknown. May exceed 1: such a step is not usable.
         qoc: end-of-session QoCs.
         random_lower_bound: B in force for a random session, so that its density 1 / (1 - B) on [B, 1] is known; else None.
+        lead_amplitude: amplitude fraction in force just before step 0, where it is known; else None.
         most_imputed: how many imputed beta amplitudes a window may hold; 0 as in sessions of 0.1.0.
 
     Raises:
@@ -84,6 +85,7 @@ class SessionTrajectory:
     qoc: Qoc = field(default_factory=Qoc)
     policy_id: int | None = None
     random_lower_bound: float | None = None
+    lead_amplitude: float | None = None
     most_imputed: int = 0
 
     def __post_init__(self) -> None:
@@ -296,6 +298,7 @@ def from_parquet(content: bytes) -> ReplayBuffer:
                 amplitude=amplitude[body],
                 qoc=Qoc(**m["qoc"]),
                 random_lower_bound=m["random_lower_bound"],
+                lead_amplitude=m.get("lead_amplitude"),
                 most_imputed=m.get("most_imputed", 0),
             )
         )
@@ -308,8 +311,10 @@ def content_hash(content: bytes) -> str:
 
 
 def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
-    imputed = {"most_imputed": s.most_imputed} if s.most_imputed else {}
-    return imputed | {
+    # members that are left out where they say nothing, so that the bytes of older buffers stay what they were
+    later: dict[str, Any] = {"most_imputed": s.most_imputed} if s.most_imputed else {}
+    later |= {"lead_amplitude": s.lead_amplitude} if s.lead_amplitude is not None else {}
+    return later | {
         "session_id": s.session_id,
         "visit": s.visit,
         "controller": s.controller,

@@ -105,6 +105,7 @@ def _sessions_changed(flag: Flag) -> str:
         "newer": "newer: visit " + ", ".join(flag.fact("visits")),
         "unconfirmed": "no longer confirmed",
         "qoc": "with corrected QoCs",
+        "conditions": "whose conditions were corrected",
         "left_out": "newly left out",
         "included": "newly included",
         "decoded": "decoded anew",
