@@ -30,6 +30,9 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
+FAILED = Qoc(grasp_hz=0.0, rating=1, tremor_percent=100.0)
+"""The worst QoCs there are: those of a session that was stopped for the participant's sake."""
+
 PRIOR_PAIRS = 10
 """Pairs of unrelated rows that count beside the measured ones where autocorrelations are estimated: short sessions say little of them."""
 
@@ -70,6 +73,7 @@ class SessionTrajectory:
         qoc: end-of-session QoCs.
         random_lower_bound: B in force for a random session, so that its density 1 / (1 - B) on [B, 1] is known; else None.
         lead_amplitude: amplitude fraction in force just before step 0, where it is known; else None.
+        stopped: ended for the participant's sake (they asked for it, an adverse event), which is a failure of what ran: see `counted_qoc`.
         most_imputed: how many imputed beta amplitudes a window may hold; 0 as in sessions of 0.1.0.
 
     Raises:
@@ -86,6 +90,7 @@ class SessionTrajectory:
     policy_id: int | None = None
     random_lower_bound: float | None = None
     lead_amplitude: float | None = None
+    stopped: bool = False
     most_imputed: int = 0
 
     def __post_init__(self) -> None:
@@ -153,9 +158,15 @@ class SessionTrajectory:
         """r_k, shape [T]; NaN where beta or amplitude is unknown."""
         return step_reward(settings, self.beta, self.amplitude)
 
+    @property
+    def counted_qoc(self) -> Qoc:
+        """The QoCs that count: `FAILED` of a session that was stopped, whatever was measured, except under cDBS, whose failures must not
+        help what is held against it; else as measured."""
+        return FAILED if self.stopped and self.controller != "cdbs" else self.qoc
+
     def end_reward(self, settings: MdpSettings) -> float | None:
-        """r_end, or None where a QoC it needs is missing."""
-        return end_reward(settings, self.qoc)
+        """r_end of the QoCs that count, or None where one it needs is missing."""
+        return end_reward(settings, self.counted_qoc)
 
 
 @dataclass(frozen=True)
@@ -239,6 +250,9 @@ class ReplayBuffer:
 _SCHEMA_VERSION = 1
 _IMPUTED_SCHEMA_VERSION = 2
 """Of buffers whose windows may hold imputed values, which a reader of version 1 would not find. Values are stored as measured."""
+_STOPPED_SCHEMA_VERSION = 3
+"""Of buffers with sessions that were stopped for the participant's sake, which an earlier reader would take as measured."""
+_READ = (_SCHEMA_VERSION, _IMPUTED_SCHEMA_VERSION, _STOPPED_SCHEMA_VERSION)
 
 
 def to_parquet(buffer: ReplayBuffer) -> bytes:
@@ -254,7 +268,7 @@ def to_parquet(buffer: ReplayBuffer) -> bytes:
         columns["beta"].append(s.measured_beta)
         columns["amplitude"].append(np.concatenate([np.full(lead, np.nan), s.amplitude]))
     meta = {
-        "schema_version": _IMPUTED_SCHEMA_VERSION if any(s.most_imputed for s in buffer.sessions) else _SCHEMA_VERSION,
+        "schema_version": _schema_version(buffer),
         "settings": buffer.settings.to_json(),
         "beta_unit": buffer.beta_unit,
         "beta_source": buffer.beta_source,
@@ -274,11 +288,8 @@ def from_parquet(content: bytes) -> ReplayBuffer:
     if raw is None:
         raise ValueError("this Parquet file is not a betaloop buffer snapshot: its metadata lack the key 'betaloop'")
     meta = json.loads(raw)
-    if meta["schema_version"] not in (_SCHEMA_VERSION, _IMPUTED_SCHEMA_VERSION):
-        raise ValueError(
-            f"buffer snapshot of schema version {meta['schema_version']}; "
-            f"this betaloop reads {_SCHEMA_VERSION} and {_IMPUTED_SCHEMA_VERSION}"
-        )
+    if meta["schema_version"] not in _READ:
+        raise ValueError(f"buffer snapshot of schema version {meta['schema_version']}; this betaloop reads {_READ[0]} to {_READ[-1]}")
     ids = table["session_id"].to_numpy()
     step = table["step"].to_numpy()
     beta = table["beta"].to_numpy()
@@ -299,10 +310,17 @@ def from_parquet(content: bytes) -> ReplayBuffer:
                 qoc=Qoc(**m["qoc"]),
                 random_lower_bound=m["random_lower_bound"],
                 lead_amplitude=m.get("lead_amplitude"),
+                stopped=m.get("stopped", False),
                 most_imputed=m.get("most_imputed", 0),
             )
         )
     return ReplayBuffer(MdpSettings(**meta["settings"]), tuple(sessions), meta["beta_unit"], meta["beta_source"])
+
+
+def _schema_version(buffer: ReplayBuffer) -> int:
+    if any(s.stopped for s in buffer.sessions):
+        return _STOPPED_SCHEMA_VERSION
+    return _IMPUTED_SCHEMA_VERSION if any(s.most_imputed for s in buffer.sessions) else _SCHEMA_VERSION
 
 
 def content_hash(content: bytes) -> str:
@@ -314,6 +332,7 @@ def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
     # members that are left out where they say nothing, so that the bytes of older buffers stay what they were
     later: dict[str, Any] = {"most_imputed": s.most_imputed} if s.most_imputed else {}
     later |= {"lead_amplitude": s.lead_amplitude} if s.lead_amplitude is not None else {}
+    later |= {"stopped": True} if s.stopped else {}
     return later | {
         "session_id": s.session_id,
         "visit": s.visit,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -27,29 +27,31 @@ HALVES: Final = (0.3, 0.5, 0.7, 0.9)
 SHAPES: Final[tuple[tuple[float, int], ...]] = ((0.0, 1), *((half, steep) for half in HALVES for steep in (2, 4)))
 """Dose shapes as (amplitude of half effect, steepness): the line, and Emax (Hill) curves that saturate early to late."""
 
-AMPLITUDE, ENERGY, OVER, BETA, ABOVE, DOSE = range(6)
-FEATURES: Final = 5 + len(SHAPES)
-"""Features of a step: a, a^2, over-stimulation, beta, beta at or above the threshold, and the dose by each of `SHAPES`."""
+ENERGY, OVER, BETA, ABOVE, DOSE = range(5)
+AMPLITUDE: Final = DOSE
+FEATURES: Final = DOSE + len(SHAPES)
+"""Features of a step: a^2, over-stimulation, beta, beta at or above the threshold, and the dose by each of `SHAPES`, a the first of them.
+All but beta lie within [0, 1] and those of the amplitude grow with it."""
 
 
-def effects(a: Floats) -> Floats:
-    """Dose by each of `SHAPES`, 0 without stimulation and 1 at the amplitude of cDBS; a of any shape, [..., len(SHAPES)]."""
+def each_feature(beta: Floats, amplitude: Floats, xi_beta: float) -> Iterator[Floats]:
+    """The `FEATURES` of steps one after the other, each of the shape of beta; the amplitude is cut to [0, 1]."""
+    a = np.clip(amplitude, 0.0, 1.0)
     square = a * a
+    yield square
+    yield np.maximum(0.0, square - TOLERATED) / (1 - TOLERATED)
+    yield beta
+    yield (beta >= xi_beta).astype(np.float64)
+    yield a
     fourth = square * square
-    result = np.empty((*a.shape, len(SHAPES)))
-    result[..., 0] = a
-    for k, (half, steep) in enumerate(SHAPES[1:], start=1):
+    for half, steep in SHAPES[1:]:
         power, level = (square, half**2) if steep == 2 else (fourth, half**4)
-        result[..., k] = (1 + level) * power / (level + power)
-    return result
+        yield (1 + level) * (1 - level / (level + power))
 
 
 def step_features(beta: Floats, amplitude: Floats, xi_beta: float) -> Floats:
-    """`FEATURES` of steps, [..., F]; the amplitude cut to [0, 1]. NaN where beta or amplitude is."""
-    a = np.clip(amplitude, 0.0, 1.0)
-    over = np.maximum(0.0, a * a - TOLERATED) / (1 - TOLERATED)
-    above = np.where(np.isfinite(beta), np.asarray(beta) >= xi_beta, np.nan)
-    return np.concatenate([np.stack([a, a * a, over, beta, above], axis=-1), effects(a)], axis=-1)
+    """`FEATURES` of steps, [..., F]; beta and amplitude must be known."""
+    return np.stack(list(each_feature(beta, amplitude, xi_beta)), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -89,14 +91,13 @@ def by_minute(beta: Floats, amplitude: Floats, settings: MdpSettings) -> Minutes
     features, counts = np.zeros((*shape, len(bounds), FEATURES)), np.zeros((*shape, len(bounds)))
     # minute by minute: all features of all steps at once would be gigabytes for replays of many draws
     for m, (i, j) in enumerate(bounds):
-        found = step_features(beta[..., i:j], amplitude[..., i:j], settings.xi_beta)
-        known = np.isfinite(beta[..., i:j]) & np.isfinite(amplitude[..., i:j])
+        b, a = np.ascontiguousarray(beta[..., i:j]), np.ascontiguousarray(amplitude[..., i:j])
+        known = (np.isfinite(b) & np.isfinite(a)).astype(np.float64)
         counts[..., m] = known.sum(-1)
-        if known.all():
-            features[..., m, :] = found.mean(-2)
-        else:
-            total = np.where(known[..., None], found, 0.0).sum(-2)
-            features[..., m, :] = total / np.maximum(counts[..., m, None], 1.0)
+        share = known / np.maximum(counts[..., m, None], 1.0)
+        b, a = np.where(known > 0, b, 0.0), np.where(known > 0, a, 0.0)
+        for k, values in enumerate(each_feature(b, a, settings.xi_beta)):
+            np.einsum("...t,...t->...", values, share, out=features[..., m, k])
     return with_shares(features, counts)
 
 

@@ -7,14 +7,14 @@ coefficients, and what the model gets wrong for both cancels in their difference
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings
 from ml.ope.outcomes.minutes import ABOVE, BETA, Minutes, of_buffer
-from ml.ope.outcomes.regressions import ORDER, Member, Outcome, Regression, Sessions, burden_of, fit
+from ml.ope.outcomes.regressions import ORDER, Outcome, Regression, Sessions, burden_of, fit
 from ml.ope.scale import FEWEST_OUTCOMES, outcome_table
 from ml.trajectories import ReplayBuffer
 
@@ -61,25 +61,26 @@ class EndModel:
         result = self._unseen(minutes.share.shape[:-1])
         tremor: Floats | None = None
         for outcome, r in self._ordered():
-            mean = sum(
-                (w * r.mean(m, minutes, burden, tremor, own) for w, m in zip(r.weights, r.members, strict=True)),
-                np.zeros(1),
-            )
+            mean = np.zeros(minutes.share.shape[:-1])
+            for weight, member in zip(r.weights, r.members, strict=True):
+                mean += weight * r.mean(member, minutes, burden, tremor, own)
             tremor = mean if outcome == "tremor" else tremor
             result[..., COLUMN[outcome]] = 100 * mean if outcome == "tremor" else mean
         return self.joined(result)
 
     def each(self, minutes: Minutes, own: Sessions | None = None) -> Floats:
-        """The same by every draw, for sessions [..., D, n], the d-th by draw d; [..., D, n, 4].
+        """The same by every draw: sessions [..., D, n] (the d-th by draw d) or [..., 1, n] (all by all); [..., D, n, 4].
 
         Raises:
-            ValueError: the sessions are not those of D draws, or the model has none.
+            ValueError: the model has no draws, or the sessions are those of another number of them.
         """
-        if self.draws == 0 or minutes.share.shape[-3] != self.draws:
-            raise ValueError(f"sessions of {minutes.share.shape[-3]} draws for an outcome model of {self.draws}")
-        result = self._unseen(minutes.share.shape[:-1])
+        *lead, given, n = minutes.share.shape[:-1]
+        if self.draws == 0 or given not in (1, self.draws):
+            raise ValueError(f"sessions of {given} draws for an outcome model of {self.draws}")
+        result = self._unseen((*lead, self.draws, n))
         for d in range(self.draws):
-            one = Minutes(minutes.features[..., d, :, :, :], minutes.share[..., d, :, :], minutes.late[..., d, :, :])
+            k = d if given > 1 else 0
+            one = Minutes(minutes.features[..., k, :, :, :], minutes.share[..., k, :, :], minutes.late[..., k, :, :])
             burden = burden_of(one, self.centre, self.spread)
             tremor: Floats | None = None
             for outcome, r in self._ordered():
@@ -107,6 +108,11 @@ class EndModel:
             found = np.where(p <= s, less, y + room * (p - s))
             result[..., column] = np.where(np.isfinite(y), found + low, predicted[..., column])
         return self.joined(result)
+
+    def part(self, first: int, number: int) -> EndModel:
+        """The same model with some of its draws; with none of them for `number` 0."""
+        chosen = {name: replace(r, drawn=r.drawn[first : first + number]) for name, r in self.regressions.items()}
+        return replace(self, regressions=chosen, draws=number)
 
     def joined(self, outcomes: Floats) -> Floats:
         """The outcomes with r_end made of the three QoCs."""
@@ -159,11 +165,6 @@ def fit_end_model(buffer: ReplayBuffer, draws: int = 0, seed: int = 0, severity:
     for outcome, r in regressions.items():
         share[COLUMN[outcome]] = r.day_share
     return EndModel(constants, regressions, unseen, centre, spread, sessions, draws, seen, skill, residual, share)
-
-
-def member_of(regression: Regression, d: int) -> Member:
-    """The d-th draw of an outcome."""
-    return regression.drawn[d]
 
 
 def _constants(settings: MdpSettings) -> Floats:

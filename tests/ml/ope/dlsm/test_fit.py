@@ -258,9 +258,10 @@ def test_outcomes_from_summaries_are_the_regressions_at_the_simulated_sessions(s
             per_policy=config.rollouts,
             seed=config.seed + 1000 + k,
         )
-        np.testing.assert_allclose(run.summaries[0, :, 0], 0.9)
-        np.testing.assert_allclose(run.summaries[0, :, 4], 0.9)
-        ends.append(fitted.end.predict(run.summaries)[:, :, 0].mean(1))
+        np.testing.assert_allclose(run.amplitude[0], 0.9)
+        np.testing.assert_allclose(run.energy[0], 0.81)
+        np.testing.assert_allclose(run.minutes.share.sum(-1), 1.0)
+        ends.append(fitted.end.predict(run.minutes)[:, :, 0].mean(1))
     for i, name in enumerate(POLICIES):
         assert found[name].end_reward == pytest.approx(np.mean(ends, axis=0)[i])
         assert found[name].details["end_source"] == "summaries"
