@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
+from starlette.datastructures import FormData
 
 from app.accounts import permissions as can
 from app.accounts import repository, service
@@ -14,14 +16,18 @@ from app.accounts.addresses import normal_address
 from app.accounts.deps import COOKIE, CurrentCaller
 from app.accounts.models import Role, User
 from app.accounts.permissions import Caller
-from app.platform.database import Db, set_actor
-from app.platform.errors import BetaloopError, Invalid, NotFound
+from app.platform.database import Db, new_session, set_actor
+from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany
 from app.platform.web.forms import FormValues
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.settings import get_settings
 
 router = APIRouter()
+
+MOST_WAITING = 100
+"""Sign-ins that may wait for their turn; more at once are asked to come back."""
+_passwords = CapacityLimiter(2)  # argon2 takes all of a core and 64 MiB each time
 
 
 @router.get("/sign-in")
@@ -34,21 +40,35 @@ def sign_in_page(request: Request, db: Db, next: str = "/") -> Response:
 
 
 @router.post("/sign-in")
-def sign_in(request: Request, db: Db, values: FormValues) -> Response:
-    """Open a browser session."""
+async def sign_in(request: Request, values: FormValues) -> Response:
+    """Open a browser session. Passwords are checked in threads of their own, a few at a time, so that many at once hold up nothing else."""
+    if _passwords.statistics().tasks_waiting >= MOST_WAITING:
+        return _sign_in_refused(
+            request, values, TooMany("Too many people sign in at the same moment.", "Wait a few seconds and try again.")
+        )
+    return await to_thread.run_sync(_sign_in, request, values, limiter=_passwords)
+
+
+def _sign_in(request: Request, values: FormData) -> Response:
     email, target = str(values.get("email", "")), local_path(str(values.get("next", "/")))
-    try:
-        set_actor(db, normal_address(email) or "unknown", request_id=request.state.request_id)
-        token = service.sign_in(db, email, str(values.get("password", "")))
-    except BetaloopError as error:
-        page = render(request, "accounts/sign_in.html", problem=error.problem(request.url.path), email=email, next=target)
-        return HTMLResponse(page, error.status)
-    db.commit()
+    with new_session() as db:
+        try:
+            set_actor(db, normal_address(email) or "unknown", request_id=request.state.request_id)
+            token = service.sign_in(db, email, str(values.get("password", "")))
+        except BetaloopError as error:
+            return _sign_in_refused(request, values, error)
+        db.commit()
     settings, answer = get_settings(), RedirectResponse(target, 303)
     answer.set_cookie(
         COOKIE, token, max_age=3600 * settings.session_max_hours, httponly=True, samesite="lax", secure=settings.cookie_secure
     )
     return answer
+
+
+def _sign_in_refused(request: Request, values: FormData, error: BetaloopError) -> Response:
+    email, target = str(values.get("email", "")), local_path(str(values.get("next", "/")))
+    page = render(request, "accounts/sign_in.html", problem=error.problem(request.url.path), email=email, next=target)
+    return HTMLResponse(page, error.status)
 
 
 @router.post("/sign-out")
