@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
@@ -18,6 +17,7 @@ from app.accounts.models import Role, User
 from app.accounts.permissions import Caller
 from app.platform.database import Db, new_session, set_actor
 from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany
+from app.platform.web.bounded import Bounded
 from app.platform.web.forms import FormValues
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
@@ -25,9 +25,7 @@ from app.settings import get_settings
 
 router = APIRouter()
 
-MOST_WAITING = 100
-"""Sign-ins that may wait for their turn; more at once are asked to come back."""
-_passwords = CapacityLimiter(2)  # argon2 takes all of a core and 64 MiB each time
+_passwords = Bounded(2, 100)  # argon2 takes all of a core and 64 MiB each time
 
 
 @router.get("/sign-in")
@@ -41,12 +39,11 @@ def sign_in_page(request: Request, db: Db, next: str = "/") -> Response:
 
 @router.post("/sign-in")
 async def sign_in(request: Request, values: FormValues) -> Response:
-    """Open a browser session. Passwords are checked in threads of their own, a few at a time, so that many at once hold up nothing else."""
-    if _passwords.statistics().tasks_waiting >= MOST_WAITING:
-        return _sign_in_refused(
-            request, values, TooMany("Too many people sign in at the same moment.", "Wait a few seconds and try again.")
-        )
-    return await to_thread.run_sync(_sign_in, request, values, limiter=_passwords)
+    """Open a browser session."""
+    try:
+        return await _passwords.run(_sign_in, request, values)
+    except TooMany as error:
+        return _sign_in_refused(request, values, error)
 
 
 def _sign_in(request: Request, values: FormData) -> Response:

@@ -61,7 +61,7 @@ def test_static_files_do_not_wait_for_passwords(service_app: object, slow_checks
 
 
 def test_more_than_can_wait_are_asked_to_come_back(service_app: object, slow_checks: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pages, "MOST_WAITING", 5)
+    monkeypatch.setattr(pages._passwords, "most", 7)
     monkeypatch.setattr(sys.modules[__name__], "CHECK_S", 0.5)
     answers: list[int] = []
     asyncio.run(_all_at_once(service_app, answers, []))
