@@ -67,6 +67,18 @@ INTENDED: dict[str, str] = {
     ),
     **dict.fromkeys(
         (
+            "components > schemas > ConditionsChange",
+            "components > schemas > ConditionsOut",
+            "components > schemas > DesignParameters",
+            "components > schemas > HoldModel",
+            "components > schemas > ProgramModel",
+            "components > schemas > SnapshotSessionOut",
+            "paths > /api/v1/sessions/{session_id}/conditions",
+        ),
+        "API: `GET` and `PUT /sessions/{id}/conditions` read and correct what a session ran under; a snapshot's session names the revision",
+    ),
+    **dict.fromkeys(
+        (
             "components > schemas > MarginsChange",
             "components > schemas > MarginsIn",
             "components > schemas > MarginsOut",
