@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
+from app.accounts.models import Role, Scope
 from app.accounts.permissions import SYSTEM
 from app.platform import logs
 from app.platform.database import database_place, supervise_database, transaction
@@ -151,11 +151,13 @@ def user_add(
 def token_create(
     email: Annotated[str, typer.Argument(help="E-mail address of the user.")],
     name: Annotated[str, typer.Option(help="What will use the token.")],
+    scope: Annotated[Scope, typer.Option(help="What it may do of what the user may.")] = Scope.FULL,
+    days: Annotated[int, typer.Option(help="Days after which it ends.")] = accounts.TOKEN_DAYS,
     as_json: AsJson = False,
 ) -> None:
     """Make an API token and print it; it is shown this once."""
     with transaction(ACTOR) as db:
-        token = accounts.create_token(db, email, name)
+        token = accounts.create_token(db, email, name, scope, days)
     _print({"email": email, "name": name, "token": token}, as_json, token)
 
 
