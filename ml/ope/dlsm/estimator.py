@@ -26,9 +26,9 @@ from ml.ope.dlsm.selection import Selection, SelectionRun, usable_folds
 from ml.ope.dlsm.training import Member, MemberTraining
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS, Flag
+from ml.ope.observed import day_noise
 from ml.ope.outcomes.minutes import Minutes
 from ml.ope.outcomes.model import EndModel, fit_end_model
-from ml.ope.observed import day_noise
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale
 from ml.ope.support.coverage import AmplitudeSupport, Coverage, flags_of
@@ -240,7 +240,7 @@ class FittedDlsm:
         if self.end_source == "latent" or not self.scale.outcome_seen[0]:
             return np.zeros((DRAWS, runs[0].outcomes.shape[0]))
         drawn = fit_end_model(self.buffer, draws=DRAWS, seed=self.config.seed)
-        # Of the mean minutes of each policy: what is common to its sessions moves its mean, and 200 draws of thousands of sessions are many.
+        # Of the mean minutes of each policy: what its sessions have in common moves its mean.
         means = np.mean([r.minutes.features.mean(1) for r in runs], axis=0)
         minutes = Minutes(means[None], runs[0].minutes.share[None, :, 0], runs[0].minutes.late[None, :, 0])
         ends = drawn.each(minutes)[:, :, 0]

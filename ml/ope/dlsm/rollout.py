@@ -95,8 +95,7 @@ def roll_out(
             parts.append(_roll_block(networks, policies, rows, scale, settings, horizon, rng, prior))
         report((first + count) / per_policy, "rolling out policies")
     joined = {
-        name: np.concatenate([getattr(p, name) for p in parts], axis=1)
-        for name in ("return_head", "return_known", "outcomes", "actions")
+        name: np.concatenate([getattr(p, name) for p in parts], axis=1) for name in ("return_head", "return_known", "outcomes", "actions")
     }
     minutes = (np.concatenate([getattr(p.minutes, name) for p in parts], axis=1) for name in ("features", "share", "late"))
     return Rollouts(**joined, minutes=Minutes(*minutes))

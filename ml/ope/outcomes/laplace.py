@@ -58,7 +58,7 @@ class Solved:
     """What was found for each of K regressions.
 
     Attributes:
-        mode: coefficients, [K, q]. factor: L^-T with L L^T the information, [K, q, q]. dispersion, degrees: with its degrees of freedom, [K].
+        mode: coefficients, [K, q]. factor: L^-T with L L^T the information, [K, q, q]. dispersion: [K]. degrees: of freedom of it.
         log_evidence: up to a common constant, [K].
     """
 
@@ -71,7 +71,7 @@ class Solved:
     def left_out(self, p: Problem, weights: Floats) -> Floats:
         """Expected outcome of every session from the others, [n], averaged by weights [K]: one Newton step from the mode of all."""
         result = np.zeros(len(p.y))
-        for k in np.flatnonzero(weights):
+        for k in np.flatnonzero(weights).tolist():
             jacobian, weight, residual = (v[0] for v in _terms(p.only(k), self.mode[k : k + 1], self.dispersion[k : k + 1]))
             away = jacobian @ self.factor[k] @ self.factor[k].T
             leverage = np.minimum(weight * np.sum(away * jacobian, axis=1), 0.99)
@@ -173,7 +173,7 @@ def _objective(p: Problem, theta: Floats, dispersion: Floats) -> Floats:
 
 
 def _terms(p: Problem, theta: Floats, dispersion: Floats) -> tuple[Floats, Floats, Floats]:
-    """Per session: slope of its mean (or predictor) J [K, n, q], weight w and residual r [K, n]; its score is J r, its information w J J^T."""
+    """Per session: slope J of its mean (or predictor) [K, n, q], weight w and residual r [K, n]. Score J r, information w J J^T."""
     eta, s = _eta(p, theta), dispersion[:, None]
     if p.kind == "binomial":
         each = expit(eta)

@@ -56,7 +56,7 @@ class EndModel:
     day_share: Floats
 
     def predict(self, minutes: Minutes, own: Sessions | None = None) -> Floats:
-        """Posterior mean [..., 4] for sessions of any leading shape; with `own`, the last of them are those sessions and not of a new day."""
+        """Posterior mean [..., 4] of sessions of any leading shape on a new day; with `own` their last axis is those sessions."""
         burden = burden_of(minutes, self.centre, self.spread)
         result = self._unseen(minutes.share.shape[:-1])
         tremor: Floats | None = None

@@ -184,7 +184,7 @@ def fit(
     def member(k: int, theta: Floats, dispersion: float) -> Member:
         return Member(grid[k][0], theta[: len(names)], theta[len(names) :], dispersion, float(day[k] ** 2))
 
-    kept = np.flatnonzero(weights)
+    kept = np.flatnonzero(weights).tolist()
     members = tuple(member(k, found.mode[k], float(found.dispersion[k])) for k in kept)
     drawn = tuple(member(k, theta, float(found.dispersion[k])) for k, theta in _drawn(found, weights, draws, rng))
     noise = found.dispersion * (np.pi**2 / 3 / np.mean(size) if outcome == "tremor" else 1.0)

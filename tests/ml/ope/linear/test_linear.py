@@ -70,9 +70,13 @@ def test_all_sessions_policies_and_draws_together_are_each_replayed_alone(small_
                 window, memory, eta, beta, chosen = list(table.beta[:10]), None, None, [], []
                 for t in range(30):
                     a = policy.act(fitted.scale.raw_beta(np.array([window])))
-                    memory = np.tile(a, 3) if memory is None else np.array([0.8, 0.95, 0.985]) * memory + np.array([0.2, 0.05, 0.015]) * a
+                    if memory is None:
+                        before = a if model.before is None else np.array([model.before])
+                        memory = np.tile(before, 3)
+                        lasting = float(answers(before, memory[None])[0] @ model.beta[d] + model.levels[d, i])
+                        eta = [v - lasting for v in window]
+                    memory = np.array([0.8, 0.95, 0.985]) * memory + np.array([0.2, 0.05, 0.015]) * a
                     rest = float(answers(a, memory[None])[0] @ model.beta[d] + model.levels[d, i])
-                    eta = [v - rest for v in window] if eta is None else eta
                     predicted = rest + sum(model.phi[k] * eta[-1 - k] for k in range(10))
                     newest = predicted + np.exp(noise_features(a, np.array([predicted]))[0] @ model.noise_weights) * noise[t]
                     eta, window = [*eta, newest - rest], [*window[1:], newest]
@@ -129,6 +133,28 @@ def test_a_buffer_without_outcomes_still_gives_a_step_return(small_buffer):
     estimate = fitted.evaluate({"half": ConstantPolicy(0.5)}, 30)["half"]
     assert estimate.end_reward is None
     assert estimate.value == estimate.step_return
+
+
+def test_where_no_qoc_counts_the_return_is_that_of_the_steps_and_nothing_is_missing(small_buffer):
+    nothing = replace(small_buffer, settings=replace(small_buffer.settings, c2=0.0, c3=0.0, c4=0.0))
+    estimate = LinearModel(LinearConfig(draws=20)).fit(nothing).evaluate({"half": ConstantPolicy(0.5)}, 30)["half"]
+    assert (estimate.end_reward, estimate.value) == (0.0, estimate.step_return)
+    assert "few_end_rewards" not in {f.code for f in estimate.flags}
+    assert {"grasp_hz", "rating", "tremor_percent"} <= estimate.predicted.keys()
+
+
+def test_a_stopped_session_lowers_the_estimate_and_the_flag_says_what_it_would_be_as_measured(linear_simulator):
+    whole = linear_simulator.buffer(seed=3, n=12, steps=60)
+    sessions = tuple(replace(s, stopped=s.controller == "other") for s in whole.sessions)
+    policies = {"low": ConstantPolicy(0.3)}
+    before = LinearModel(LinearConfig(draws=20)).fit(whole).evaluate(policies, 60)["low"]
+    after = LinearModel(LinearConfig(draws=20)).fit(replace(whole, sessions=sessions)).evaluate(policies, 60)["low"]
+    assert after.end_reward < before.end_reward - 5
+    flag = next(f for f in after.flags if f.code == "stopped_sessions")
+    assert flag.value == 1
+    assert flag.fact("counted") == pytest.approx(after.end_reward)
+    assert flag.fact("measured") == pytest.approx(before.end_reward, abs=0.5)  # visits are weighted anew
+    assert "stopped_sessions" not in {f.code for f in before.flags}
 
 
 def test_one_session_is_too_few(small_buffer):

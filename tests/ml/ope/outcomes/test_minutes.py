@@ -54,9 +54,7 @@ def test_every_dose_shape_rises_from_0_without_stimulation_to_1_at_cdbs():
 
 
 def test_a_shorter_session_has_no_share_in_minutes_that_it_did_not_last():
-    sessions = tuple(
-        SessionTrajectory(i, 1, "other", np.ones(10), np.ones(steps), np.full(steps, 0.5)) for i, steps in enumerate((90, 30))
-    )
+    sessions = tuple(SessionTrajectory(i, 1, "other", np.ones(10), np.ones(steps), np.full(steps, 0.5)) for i, steps in enumerate((90, 30)))
     found = of_buffer(ReplayBuffer(SETTINGS, sessions, "uV", "table"))
     np.testing.assert_allclose(found.share, [[1 / 3, 1 / 3, 1 / 3], [0, 0, 1]])
     np.testing.assert_allclose(found.late, [[0, 0.5, 0.5], [0, 0, 1]])

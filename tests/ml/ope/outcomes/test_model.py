@@ -174,7 +174,8 @@ def test_a_stopped_session_is_a_failure_of_what_ran_and_never_a_missing_one():
     ratings = np.full(20, 8.0)
     whole = buffer_of(doses, np.full(20, 2.0), np.arange(20) // 4, np.zeros(20), ALL, ratings)
     failed = tuple(replace(s, stopped=True, qoc=Qoc()) if s.amplitude[0] == 0.5 and s.visit < 3 else s for s in whole.sessions)
-    stopped, missing = (fit_end_model(replace(whole, sessions=tuple(replace(s, stopped=f and s.stopped) for s in failed))) for f in (True, False))
+    stopped = fit_end_model(replace(whole, sessions=failed))
+    missing = fit_end_model(replace(whole, sessions=tuple(replace(s, stopped=False) for s in failed)))
     before, after = missing.predict(at(0.5, 1.0))[:, 0], stopped.predict(at(0.5, 1.0))[:, 0]
     assert before[0] == pytest.approx(before[1], abs=3)
     assert after[0] < after[1] - 10
