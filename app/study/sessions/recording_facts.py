@@ -37,7 +37,8 @@ class StreamQuality:
 
     Attributes:
         name: of the stream. what: whether `count` and `missing` are packets or samples.
-        missing_s: signal that is missing, s. loss: its share of the signal, 0 to 1 (up to decode version 4: of packets). gaps: interruptions.
+        missing_s: signal that is missing, s. loss: its share of the signal, 0 to 1 (up to decode version 4: of packets).
+        gaps: interruptions.
         late, out_of_order, duplicates: packets that arrived late, after a later one, or twice.
         clock: what placed it in time. remarks: everything else, in words.
     """

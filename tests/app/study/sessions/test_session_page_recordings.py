@@ -71,7 +71,7 @@ def test_a_montage_shows_its_five_configurations_its_loss_and_its_gaps(page_of: 
     assert quality["time domain"][1].split()[0] == "2156"
     assert quality["time domain"][2:9] == ["335", "47.3", "23.2", "302", "0", "0", "0"]
     assert "Clock of the computer against the implant" in page
-    assert re.search(r"SD 3\d ms, \d+\.\d % of packets beyond 50 ms · drift -60 ppm", page)
+    assert re.search(r"SD 3\d ms, \d+\.\d % of packets beyond 50 ms · drift -\d\d ppm", page)
     configurations = table_after(page, "sensing configurations")
     assert len({row[1] for row in configurations}) == 5
     beta = trace(page, "Beta amplitude")
