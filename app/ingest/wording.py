@@ -19,6 +19,21 @@ def reason(evidence: Evidence) -> str:
     return _stated(evidence) if evidence.reason is Reason.STATED else _SENTENCES[evidence.reason](evidence.facts)
 
 
+AFTER_READER_ENDED = (
+    "It is kept encrypted. Send it again in smaller parts, or have BETALOOP_DECODE_MEMORY_MB or BETALOOP_DECODE_SECONDS raised and read it "
+    "again on the page of the quarantine."
+)
+
+
+def reader_ended(cause: str, memory_mb: int, cpu_s: int | None) -> str:
+    """Why a file could not be read, where that was ended by a limit."""
+    reasons = {
+        "memory": f"reading it takes more memory than the {memory_mb} MiB that one file may have",
+        "time": f"reading it takes longer than the {cpu_s} s of processor time that one file may have",
+    }
+    return reasons.get(cause, "the process that read it was ended")
+
+
 def unreadable(members: list[str]) -> list[str]:
     """Of files that could not be read, and are stored encrypted for that reason."""
     return [f"kept encrypted, because it could not be read: {member}" for member in members]

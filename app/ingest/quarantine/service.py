@@ -18,16 +18,14 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.ingest import encryption, repository
 from app.ingest.models import UploadFile
-from app.ingest.uploads import service
-from app.ingest.uploads.receiving import ASIDE, MEDIA_TYPE, BetaStated, Receiver, StoredContent
+from app.ingest.uploads import reading, service
+from app.ingest.uploads.receiving import ASIDE, MEDIA_TYPE, BetaStated, Receiver, StoredContent, twice
 from app.ingest.uploads.service import UploadOutcome
 from app.platform import files
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
-from app.settings import get_settings
 from app.study import service as study_service
 from app.study.models import Participant
-from ml import formats
 from ml.formats.recording import UndecodableFile
 from ml.formats.redaction_record import REDACTOR_VERSION
 
@@ -62,14 +60,15 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
     clean = files.draft_path()
     with _original(file) as original:
         try:
-            kind = formats.sniff(original)
-            redaction = formats.redact(original, clean, kind, get_settings().secret("pseudonyms"), options)
+            found = twice(lambda: reading.clean(original, clean, options))
+            if found.problem is not None:
+                raise found.problem
         except BaseException as error:
             clean.unlink(missing_ok=True)
             if not isinstance(error, UndecodableFile):
                 raise
             raise Invalid(f"It still cannot be read: {error.stored_what} ({error.stored_where}).", error.hint) from error
-    sealed = file.quarantine_sha256
+    kind, redaction, sealed = found.kind, found.redaction, file.quarantine_sha256
     stored = files.store(db, clean, MEDIA_TYPE).sha256
     file.kind, file.stored_sha256, file.redactor_version = kind, stored, REDACTOR_VERSION
     _decide(db, file, reason, caller)

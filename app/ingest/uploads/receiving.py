@@ -5,13 +5,12 @@ Which sessions come out is decided when all files of the upload are in; see `app
 
 from __future__ import annotations
 
-import zipfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 import structlog
 from sqlalchemy.orm import Session
@@ -19,17 +18,17 @@ from sqlalchemy.orm import Session
 from app.ingest import encryption, repository, wording
 from app.ingest.models import Upload, UploadFile
 from app.ingest.uploads import outcomes as outcomes_intake
-from app.ingest.uploads import recordings
+from app.ingest.uploads import reading, recordings
+from app.ingest.uploads.in_progress import tell
 from app.ingest.uploads.incoming import Incoming
+from app.ingest.uploads.reading import ReaderEnded, ReaderFault
 from app.platform import files
 from app.platform.errors import TooLarge
+from app.platform.jobs.children import child
 from app.settings import get_settings
 from app.study.models import Participant, Recording, SettingsVersion
-from ml import formats
-from ml.formats import FileKind
-from ml.formats.archive import ZipFiles
-from ml.formats.options import ArchiveLimits, DecodeOptions
-from ml.formats.rcs import find_sessions
+from ml.formats.archive import cleaned_suffix
+from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, GraspLog, Problem, TraceLog, TraceSource, UndecodableFile
 from ml.formats.redaction_record import REDACTOR_VERSION, Redaction
 from ml.formats.tables.numbers import unit_name
@@ -42,6 +41,7 @@ CUT_SHORT = UndecodableFile(
 )
 LETHAL = 2
 """So many times a process may end while it reads a file, or makes sessions of an upload; then that is not tried again by itself."""
+_Read = TypeVar("_Read")
 ENDED_THE_SERVICE = UndecodableFile(
     f"the service ended {LETHAL} times while it read this file: it may ask for more memory than there is",
     "file",
@@ -163,26 +163,32 @@ class Receiver:
             return FileOutcome(row.name, row, stored_reports(row), recordings=self._recordings(row))
         sealed = row.stored_sha256 is None or row.stored_sha256 == row.quarantine_sha256
         if not sealed and row.report.get(BEGUN, 0) >= LETHAL:
-            return self._put_aside(row)
+            return self._put_aside(row, self._content(row), ENDED_THE_SERVICE)
         # committed before the file is read, so that it is known whom to blame when that ends the process
         row.report = {BEGUN: row.report.get(BEGUN, 0) + 1}
         self.db.commit()
-        outcome = self.decode(
-            row.name, row, StoredContent(row.kind, row.stored_sha256, row.quarantine_sha256, Redaction(), CUT_SHORT if sealed else None)
-        )
+        outcome = self.decode(row.name, row, replace(self._content(row), problem=CUT_SHORT if sealed else None))
         if not outcome.same_bytes:
             outcome.reports[0].understood.append(RESUMED)
             store_reports(row, outcome.reports, known_recordings(row))
         return outcome
 
-    def _put_aside(self, row: UploadFile) -> FileOutcome:
-        """Into quarantine with a file that ends the process which reads it; a person decides on it there."""
-        assert row.stored_sha256 is not None
-        log.error("file put aside: reading it ended the service", upload_file=row.id, times=row.report[BEGUN])
-        stored = row.stored_sha256
-        if row.quarantine_sha256 is None:
-            row.quarantine_sha256, row.report = self._seal(files.path_of(stored)), {ASIDE: stored}
-        return self._failed(row.name, row, StoredContent(row.kind, stored, row.quarantine_sha256, Redaction(), None), ENDED_THE_SERVICE)
+    @staticmethod
+    def _content(row: UploadFile) -> StoredContent:
+        return StoredContent(row.kind, row.stored_sha256, row.quarantine_sha256, Redaction(), None)
+
+    def _put_aside(self, row: UploadFile, content: StoredContent, problem: UndecodableFile) -> FileOutcome:
+        """Into quarantine with a file that ends the processes which read it; a person decides on it there."""
+        assert content.stored_sha256 is not None
+        log.error("file put aside: reading it ended the reader", upload_file=row.id, why=problem.stored_what)
+        sealed = row.quarantine_sha256 is not None
+        if not sealed:
+            row.quarantine_sha256 = self._seal(files.path_of(content.stored_sha256))
+        row.report = _aside(row) if sealed else {ASIDE: content.stored_sha256}
+        return self._failed(row.name, row, replace(content, quarantine_sha256=row.quarantine_sha256), problem)
+
+    def _told(self, share: float | None, doing: str | None) -> None:
+        tell(self.upload.id, share, doing)
 
     def _store(self, raw: Path) -> StoredContent:
         """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted.
@@ -191,25 +197,29 @@ class Receiver:
         """
         clean = files.draft_path()
         try:
-            kind = formats.sniff(raw)
-            redaction = formats.redact(raw, clean, kind, get_settings().secret("pseudonyms"), self.options)
-        except UndecodableFile as error:
-            return self._quarantined(raw, clean, error)
-        except Exception as fault:
+            found = twice(lambda: reading.clean(raw, clean, self.options, str(self.upload.id), self._told))
+        except ReaderEnded as ended:
+            log.error("file put aside: cleaning it ended the reader", upload=self.upload.id, cause=ended.cause)
+            return self._quarantined(raw, clean, ended)
+        except ReaderFault as fault:
             # a fault of ours must not take the other files of the upload with it, and what it left behind may still name a person
-            log.exception("file could not be cleaned", upload=self.upload.id, fault=repr(fault))
+            log.error("file could not be cleaned", upload=self.upload.id, places=fault.places)
             hint = f"It is kept encrypted; tell your administrator: upload {self.upload.id}."
             return self._quarantined(
                 raw, clean, UndecodableFile("the service failed while it took identity out of this file", "file", hint)
             )
-        sealed = self._seal(raw) if redaction.unreadable else None
-        return StoredContent(kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, redaction, None)
+        except BaseException:
+            clean.unlink(missing_ok=True)
+            raise
+        if found.problem is not None:
+            return self._quarantined(raw, clean, found.problem, found.redaction)
+        sealed = self._seal(raw) if found.redaction.unreadable else None
+        return StoredContent(found.kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, found.redaction, None)
 
-    def _quarantined(self, raw: Path, clean: Path, problem: UndecodableFile) -> StoredContent:
+    def _quarantined(self, raw: Path, clean: Path, problem: UndecodableFile, redaction: Redaction | None = None) -> StoredContent:
         clean.unlink(missing_ok=True)
-        left_out = _left_out(raw, self.options.archive)
         sealed = self._seal(raw)
-        return StoredContent("unreadable", sealed, sealed, Redaction(ignored=left_out), problem)
+        return StoredContent("unreadable", sealed, sealed, redaction or Redaction(), problem)
 
     def _seal(self, raw: Path) -> str:
         return files.store(self.db, encryption.encrypt(raw), MEDIA_TYPE).sha256
@@ -219,24 +229,27 @@ class Receiver:
         if content.problem is not None or content.stored_sha256 is None:
             return self._failed(name, row, content, content.problem or CUT_SHORT)
         try:
+            if (known := self._known_meanwhile(name, row)) is not None:
+                return known
+            decoded = self._decoded(row, content)
             repository.lock_participant(self.db, self.participant.id)
             # asked again under the lock: somebody may have sent the same bytes meanwhile
-            if known := self._known(name, row.original_sha256):
-                self.db.delete(row)
-                self.db.commit()
+            if (known := self._known_meanwhile(name, row)) is not None:
                 return known
-            decoded = formats.decode(files.path_of(content.stored_sha256), cast(FileKind, content.kind), self.options, name=row.name)
             if content.kind in TABLES:
                 decoded = self._name_beta(decoded)
             stored = recordings.store(self.db, self.participant, row, decoded.recordings)
             tremor = outcomes_intake.take_tremor(self.db, row, decoded.tremor)
+        except ReaderEnded as ended:
+            return self._put_aside(row, content, ended)
         except UndecodableFile as error:
             self.db.rollback()
             return self._failed(name, row, content, error)
         except Exception as fault:
             # a fault of ours must not take the other files of the upload with it; the bytes are safe for a better decoder
             self.db.rollback()
-            log.exception("decoder failed", upload_file=row.id, kind=content.kind, fault=repr(fault))
+            places = fault.places if isinstance(fault, ReaderFault) else child.places(fault)
+            log.error("decoder failed", upload_file=row.id, kind=content.kind, places=places)
             ours = UndecodableFile("the decoder failed on this file", "file", f"Tell your administrator: upload file {row.id}.")
             return self._failed(name, row, content, ours)
         reports = list(decoded.reports)
@@ -246,6 +259,34 @@ class Receiver:
         self.db.commit()
         all_known = bool(stored.known) and not stored.fresh
         return FileOutcome(name, row, reports, all_known, recordings=[*stored.known, *stored.fresh], grasps=decoded.grasps)
+
+    def _known_meanwhile(self, name: str, row: UploadFile) -> FileOutcome | None:
+        """The outcome for a file whose bytes another upload has brought since; the row goes then."""
+        if (known := self._known(name, row.original_sha256)) is not None:
+            self.db.delete(row)
+            self.db.commit()
+        return known
+
+    def _decoded(self, row: UploadFile, content: StoredContent) -> DecodedFile:
+        """What a child makes of a stored file. One that ends it is read once more, which is known before, should that end us too.
+
+        Raises:
+            ReaderEnded: at the second time.
+        """
+        assert content.stored_sha256 is not None
+        path = files.path_of(content.stored_sha256)
+
+        def read() -> DecodedFile:
+            return reading.decode(path, content.kind, self.options, row.name, str(self.upload.id), self._told)
+
+        def again() -> bool:
+            begun = row.report.get(BEGUN, 1)
+            if begun < LETHAL:
+                row.report = {**_aside(row), BEGUN: begun + 1}
+                self.db.commit()
+            return bool(begun < LETHAL)
+
+        return twice(read, again)
 
     def _failed(self, name: str, row: UploadFile, content: StoredContent, problem: UndecodableFile) -> FileOutcome:
         report = FileReport(name=row.name, problem=problem.stored)
@@ -276,6 +317,21 @@ class Receiver:
     def _name_beta(self, decoded: DecodedFile) -> DecodedFile:
         """A table's beta under its source, with a sentence that says who stated unit and source."""
         return name_beta(decoded, self.beta, self.participant.current_settings)
+
+
+def twice(read: Callable[[], _Read], again: Callable[[], bool] = lambda: True) -> _Read:
+    """What a child reads. One that ends it may have met a machine in need: it is read once more, where `again()` holds.
+
+    Raises:
+        ReaderEnded: it ended that child too.
+    """
+    try:
+        return read()
+    except ReaderEnded as ended:
+        log.warning("reading a file ended the reader", cause=ended.cause)
+        if not again():
+            raise
+        return read()
 
 
 def name_beta(decoded: DecodedFile, beta: BetaStated, settings: SettingsVersion) -> DecodedFile:
@@ -309,8 +365,20 @@ def store_reports(
 ) -> None:
     """Store a file's reports, which of its recordings came before in other files, and which members could not be read (None: as stored)."""
     found = unreadable_members(row) if unreadable is None else list(unreadable)
-    aside = {ASIDE: row.report[ASIDE]} if ASIDE in (row.report or {}) else {}
-    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known), "unreadable": found, **aside}
+    for report in reports:
+        count_equal_lines(report)
+    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known), "unreadable": found, **_aside(row)}
+
+
+def _aside(row: UploadFile) -> dict[str, str]:
+    """The member `ASIDE` of a file's report, where it has one."""
+    return {ASIDE: row.report[ASIDE]} if ASIDE in (row.report or {}) else {}
+
+
+def count_equal_lines(report: FileReport) -> None:
+    """Make one line, with a count, of equal lines in each of a report's lists."""
+    for lines in (report.understood, report.repaired, report.ignored, report.flagged, report.removed):
+        lines[:] = [line if n == 1 else f"{line} ({n}×)" for line, n in Counter(lines).items()]
 
 
 def stored_reports(row: UploadFile) -> list[FileReport]:
@@ -358,21 +426,6 @@ def _add_redaction(report: FileReport, redaction: Redaction, notes: Sequence[str
     report.understood.extend(notes)
 
 
-def _left_out(path: Path, limits: ArchiveLimits) -> list[str]:
-    """Why members of an archive of no use were left out, counted, without their names, which may identify a person."""
-    if not zipfile.is_zipfile(path):
-        return []
-    listing = FileReport("archive")
-    try:
-        with ZipFiles(path, limits) as members:
-            find_sessions(members, listing)
-            reasons = Counter(member.reason for member in members.left_out)
-    except UndecodableFile:
-        return []  # the problem itself says what is wrong with the archive
-    return [*listing.ignored, *(f"{n} file{'s' if n > 1 else ''}: {reason}" for reason, n in sorted(reasons.items()))]
-
-
 def _harmless_name(name: str, kind: str) -> str:
-    """Names of files carry names of people; what stays is the kind and the ending."""
-    suffix = Path(name).suffix.lower()
-    return f"{kind}{suffix if len(suffix) <= 9 and suffix[1:].isalnum() else ''}"
+    """Names of files carry names of people; what stays is the kind, and the ending where it is a known one."""
+    return kind + cleaned_suffix(name)

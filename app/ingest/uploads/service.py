@@ -18,7 +18,8 @@ from app.ingest.proposals import service as proposals
 from app.ingest.repository import GRASP_KIND
 from app.ingest.sessions import StatedSession
 from app.ingest.uploads import outcomes as outcomes_intake
-from app.ingest.uploads.in_progress import in_progress
+from app.ingest.uploads import reading
+from app.ingest.uploads.in_progress import in_progress, tell_file
 from app.ingest.uploads.incoming import Incoming, arrange
 from app.ingest.uploads.receiving import (
     LETHAL,
@@ -36,8 +37,6 @@ from app.platform.web.schemas import sensible_time
 from app.study import repository as study
 from app.study import service as study_service
 from app.study.models import Controller, Hemisphere, Participant, StudySession
-from ml import formats
-from ml.formats import FileKind
 from ml.formats.options import BetaMeasure, DecodeOptions
 from ml.formats.recording import FileReport, Problem, UndecodableFile
 
@@ -160,7 +159,8 @@ def receive(
         receiver = Receiver(db, participant, upload, decode_options(participant, beta), beta)
         outcome = UploadOutcome(upload, participant, [], arranged.asides)
         refused: list[TooLarge] = []
-        for one in arranged.incoming:
+        for number, one in enumerate(arranged.incoming, start=1):
+            tell_file(upload.id, number, len(arranged.incoming))
             try:
                 outcome.files.append(receiver.receive(one))
             except TooLarge as error:
@@ -310,7 +310,7 @@ def attach_grasps(db: Session, file: UploadFile, session: StudySession) -> list[
     if file.session_id is not None and file.session_id != session.id:
         raise Conflict(f"File {file.id} belongs to session {file.session_id} already.", "Correct the QoCs of the session by hand instead.")
     try:
-        decoded = formats.decode(files.path_of(file.stored_sha256), cast(FileKind, file.kind), DecodeOptions(), name=file.name)
+        decoded = reading.decode(files.path_of(file.stored_sha256), file.kind, DecodeOptions(), file.name)
     except UndecodableFile as error:
         raise Invalid(f"File {file.id} cannot be read any more: {error.what} ({error.where}).", error.hint) from error
     return outcomes_intake.take_grasps(db, file, decoded.grasps, session)

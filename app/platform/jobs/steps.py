@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session
 from app.platform.database import new_session
 from app.platform.errors import BetaloopError
 from app.platform.jobs import engine, registry, repository
+from app.platform.jobs.children.child import ChildLimits
 from app.platform.jobs.children.slots import Slots
 from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall
 from app.platform.jobs.context import JobContext, StepOutcome
@@ -59,7 +60,7 @@ class JobSteps:
     def compute(self, key: str, name: str, params: dict[str, Any], skip: Callable[[], bool]) -> StepOutcome:
         """Run a compute function in a child process, unless `skip()` holds when its turn comes."""
         checked = _as_json(params, f"the params of step {key!r}")
-        call = ComputeCall(name, registry.compute_reference(name), checked, self.workdir(key), get_settings().job_memory_mb)
+        call = ComputeCall(name, registry.compute_reference(name), checked, self.workdir(key), ChildLimits(get_settings().job_memory_mb))
         with self.slots.hold(self.ledger.job_id, self.requests.check):
             if skip():
                 return {"ok": False, "skipped": True}
