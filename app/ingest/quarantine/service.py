@@ -19,7 +19,8 @@ from app.accounts.permissions import Caller
 from app.ingest import encryption, repository
 from app.ingest.models import UploadFile
 from app.ingest.uploads import reading, service
-from app.ingest.uploads.receiving import ASIDE, MEDIA_TYPE, BetaStated, Receiver, StoredContent, twice
+from app.ingest.uploads.receiving import MEDIA_TYPE, BetaStated, Receiver, StoredContent, twice
+from app.ingest.uploads.reports import ASIDE
 from app.ingest.uploads.service import UploadOutcome
 from app.platform import files
 from app.platform.database import now, set_reason

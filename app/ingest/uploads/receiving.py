@@ -5,23 +5,22 @@ Which sessions come out is decided when all files of the upload are in; see `app
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from copy import deepcopy
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar, cast
 
 import structlog
 from sqlalchemy.orm import Session
 
-from app.ingest import encryption, repository, wording
+from app.ingest import encryption, repository
 from app.ingest.models import Upload, UploadFile
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading, recordings
 from app.ingest.uploads.in_progress import tell
 from app.ingest.uploads.incoming import Incoming
 from app.ingest.uploads.reading import ReaderEnded, ReaderFault
+from app.ingest.uploads.reports import ASIDE, BEGUN, add_redaction, aside, known_recordings, store_reports, stored_reports
 from app.platform import files
 from app.platform.errors import TooLarge
 from app.platform.jobs.children import child
@@ -48,10 +47,6 @@ ENDED_THE_SERVICE = UndecodableFile(
     "Look at it on the page of the quarantine. Send it again with what is wrong mended, or read it again when the service was mended.",
 )
 RESUMED = "The service was stopped while it read this file and has read it from the kept bytes since; what was removed is not listed again."
-BEGUN = "begun"
-"""Member of a file's report: how often reading it was begun, while it is being read."""
-ASIDE = "aside_sha256"
-"""Member of a file's report: hash of its bytes without identity, where these are what the quarantine holds, and not the original."""
 TABLES = ("csv", "parquet")
 MEDIA_TYPE = "application/octet-stream"
 
@@ -184,7 +179,7 @@ class Receiver:
         sealed = row.quarantine_sha256 is not None
         if not sealed:
             row.quarantine_sha256 = self._seal(files.path_of(content.stored_sha256))
-        row.report = _aside(row) if sealed else {ASIDE: content.stored_sha256}
+        row.report = aside(row) if sealed else {ASIDE: content.stored_sha256}
         return self._failed(row.name, row, replace(content, quarantine_sha256=row.quarantine_sha256), problem)
 
     def _told(self, share: float | None, doing: str | None) -> None:
@@ -253,7 +248,7 @@ class Receiver:
             ours = UndecodableFile("the decoder failed on this file", "file", f"Tell your administrator: upload file {row.id}.")
             return self._failed(name, row, content, ours)
         reports = list(decoded.reports)
-        _add_redaction(reports[0], content.redaction, tremor)
+        add_redaction(reports[0], content.redaction, tremor)
         row.status = "decoded"
         store_reports(row, reports, [r.id for r in stored.known], content.redaction.unreadable)
         self.db.commit()
@@ -282,7 +277,7 @@ class Receiver:
         def again() -> bool:
             begun = row.report.get(BEGUN, 1)
             if begun < LETHAL:
-                row.report = {**_aside(row), BEGUN: begun + 1}
+                row.report = {**aside(row), BEGUN: begun + 1}
                 self.db.commit()
             return bool(begun < LETHAL)
 
@@ -290,7 +285,7 @@ class Receiver:
 
     def _failed(self, name: str, row: UploadFile, content: StoredContent, problem: UndecodableFile) -> FileOutcome:
         report = FileReport(name=row.name, problem=problem.stored)
-        _add_redaction(report, content.redaction, ())
+        add_redaction(report, content.redaction, ())
         before = repository.failed_file(self.db, self.participant.id, row) if row.decided_at is None else None
         if before is not None:
             return self._failed_before(name, row, before, report, problem)
@@ -360,70 +355,11 @@ def _stated_by_a_person(trace: TraceLog) -> bool:
     return trace.stream == "beta" and trace.source == "table"
 
 
-def store_reports(
-    row: UploadFile, reports: Sequence[FileReport], known: Sequence[int] = (), unreadable: Sequence[str] | None = None
-) -> None:
-    """Store a file's reports, which of its recordings came before in other files, and which members could not be read (None: as stored)."""
-    found = unreadable_members(row) if unreadable is None else list(unreadable)
-    for report in reports:
-        count_equal_lines(report)
-    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known), "unreadable": found, **_aside(row)}
-
-
-def _aside(row: UploadFile) -> dict[str, str]:
-    """The member `ASIDE` of a file's report, where it has one."""
-    return {ASIDE: row.report[ASIDE]} if ASIDE in (row.report or {}) else {}
-
-
-def count_equal_lines(report: FileReport) -> None:
-    """Make one line, with a count, of equal lines in each of a report's lists."""
-    for lines in (report.understood, report.repaired, report.ignored, report.flagged, report.removed):
-        lines[:] = [line if n == 1 else f"{line} ({n}×)" for line, n in Counter(lines).items()]
-
-
-def stored_reports(row: UploadFile) -> list[FileReport]:
-    """The reports of a file as they were stored."""
-    # a copy: sentences appended to the stored lists themselves would not be seen as a change, and not be written
-    stored = deepcopy(row.report.get("reports", []))
-    return [FileReport(**{**r, "problem": _stored_problem(r["problem"])}) for r in stored]
-
-
-def _stored_problem(stored: Mapping[str, str] | None) -> Problem | None:
-    """The problem of a stored report; version 0.1.0 called its hint `mend`."""
-    if stored is None:
-        return None
-    return Problem(stored["what"], stored["where"], stored["hint"] if "hint" in stored else stored["mend"])
-
-
-def unreadable_members(row: UploadFile) -> list[str]:
-    """Members of a stored file that could not be read, and why; in reports of version 0.1.0 they stand among the flags, behind a prefix."""
-    report = row.report or {}
-    found: list[str] | None = report.get("unreadable")
-    if found is not None:
-        return found
-    prefix = "kept encrypted, because it could not be read: "
-    return [s.removeprefix(prefix) for r in stored_reports(row) for s in r.flagged if s.startswith(prefix)]
-
-
-def known_recordings(row: UploadFile) -> list[int]:
-    """Recordings of a file that another file had brought before."""
-    found: list[int] = row.report.get("known_recordings", [])
-    return found
-
-
 def _stated_by(by_upload: str | None, by_settings: str | None) -> str:
     """Who stated a unit or a source."""
     if by_upload:
         return "as stated with the upload"
     return "as the participant's settings say" if by_settings else "because nobody stated one"
-
-
-def _add_redaction(report: FileReport, redaction: Redaction, notes: Sequence[str]) -> None:
-    """Add to a report what cleaning the file found, and what was made of it."""
-    for ours, found in ((report.removed, redaction.removed), (report.repaired, redaction.repaired), (report.ignored, redaction.ignored)):
-        ours.extend(sentence for sentence in found if sentence not in ours)
-    report.flagged.extend(wording.unreadable(redaction.unreadable))
-    report.understood.extend(notes)
 
 
 def _harmless_name(name: str, kind: str) -> str:

@@ -21,16 +21,8 @@ from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading
 from app.ingest.uploads.in_progress import in_progress, tell_file
 from app.ingest.uploads.incoming import Incoming, arrange
-from app.ingest.uploads.receiving import (
-    LETHAL,
-    BetaStated,
-    FileOutcome,
-    Receiver,
-    known_recordings,
-    store_reports,
-    stored_reports,
-    unreadable_members,
-)
+from app.ingest.uploads.receiving import LETHAL, BetaStated, FileOutcome, Receiver
+from app.ingest.uploads.reports import known_recordings, store_reports, stored_reports, unreadable_members
 from app.platform import files
 from app.platform.errors import BetaloopError, Conflict, Invalid, TooLarge
 from app.platform.web.schemas import sensible_time

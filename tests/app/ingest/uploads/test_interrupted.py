@@ -15,7 +15,7 @@ from app.accounts.permissions import SYSTEM
 from app.cli import app as command_line
 from app.ingest.models import Upload, UploadFile
 from app.ingest.sessions import StatedSession
-from app.ingest.uploads import service
+from app.ingest.uploads import reading, service
 from app.ingest.uploads.in_progress import in_progress, interrupted
 from app.ingest.uploads.interrupted import resume
 from app.ingest.uploads.receiving import Receiver
@@ -23,7 +23,6 @@ from app.ingest.uploads.service import Incoming
 from app.platform.database import new_session
 from app.study import repository as study
 from app.study.models import Controller
-from ml import formats
 from tests.app.ingest.conftest import steady
 
 
@@ -52,7 +51,7 @@ def cut_short(db: Session, monkeypatch: pytest.MonkeyPatch, where: Any, name: st
 
 @pytest.mark.parametrize(
     ("where", "name", "nth", "files"),
-    [(formats, "decode", 1, 1), (Receiver, "decode", 2, 2), (service, "make_sessions", 1, 2)],
+    [(reading, "decode", 1, 1), (Receiver, "decode", 2, 2), (service, "make_sessions", 1, 2)],
     ids=["while the first file is decoded", "before the second file is decoded", "before the sessions are made"],
 )
 def test_an_upload_that_was_cut_short_is_taken_up(
@@ -86,7 +85,7 @@ def test_what_the_sender_had_stated_holds_when_it_is_taken_up(
 
 
 def test_an_upload_that_is_still_coming_is_left_alone(enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    number = cut_short(db, monkeypatch, formats, "decode")
+    number = cut_short(db, monkeypatch, reading, "decode")
     with in_progress(number):
         assert interrupted(db) == []
         assert list(resume("test")) == []
@@ -95,7 +94,7 @@ def test_an_upload_that_is_still_coming_is_left_alone(enrolled: str, db: Session
 
 
 def test_the_command_takes_up_what_was_cut_short(enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    number = cut_short(db, monkeypatch, formats, "decode")
+    number = cut_short(db, monkeypatch, reading, "decode")
     result = CliRunner().invoke(command_line, ["ingest", "resume"])
     assert (result.exit_code, result.output) == (0, f"Upload {number}: files: 1, sessions: 1\n")
     assert CliRunner().invoke(command_line, ["ingest", "resume"]).output == "No upload was cut short.\n"
