@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from cryptography.fernet import InvalidToken
@@ -31,18 +31,18 @@ from ml.formats.recording import UndecodableFile
 from ml.formats.redaction_record import REDACTOR_VERSION
 
 
-def review(db: Session, file_id: int, caller: Caller) -> bytes:
-    """The original bytes, for a person to look at; the audit trail says who did. They may identify the participant.
+def review(db: Session, file_id: int, caller: Caller) -> Iterator[bytes]:
+    """The original bytes, piece by piece, for a person to look at; the audit trail says who did. They may identify the participant.
 
     Raises:
         Conflict: the file is not, or no longer, in quarantine.
     """
     file, _ = _held(db, file_id, caller)
-    with _original(file) as path:
-        content = path.read_bytes()
-    file.reviewed_by, file.reviewed_at = caller.label, now()
-    db.commit()
-    return content
+    with ExitStack() as held:
+        path = held.enter_context(_original(file))  # all of it is checked before the first byte leaves
+        file.reviewed_by, file.reviewed_at = caller.label, now()
+        db.commit()
+        return _pieces(path, held.pop_all())
 
 
 def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> UploadOutcome:
@@ -124,6 +124,12 @@ def _decide(db: Session, file: UploadFile, reason: str, caller: Caller) -> None:
     set_reason(db, reason)
     file.decided_by, file.decided_at, file.decision_reason = caller.label, now(), reason
     db.flush()
+
+
+def _pieces(path: Path, held: ExitStack) -> Iterator[bytes]:
+    with held, path.open("rb") as source:
+        while piece := source.read(files.CHUNK):
+            yield piece
 
 
 @contextmanager

@@ -42,11 +42,11 @@ LETHAL = 2
 """So many times a process may end while it reads a file, or makes sessions of an upload; then that is not tried again by itself."""
 _Read = TypeVar("_Read")
 ENDED_THE_SERVICE = UndecodableFile(
-    f"the service ended {LETHAL} times while it read this file: it may ask for more memory than there is",
+    f"reading this file was cut short {LETHAL} times: the service, or what it rests on, stopped while it was read",
     "file",
     "Look at it on the page of the quarantine. Send it again with what is wrong mended, or read it again when the service was mended.",
 )
-RESUMED = "The service was stopped while it read this file and has read it from the kept bytes since; what was removed is not listed again."
+RESUMED = "Reading this file was cut short; it was read from the kept bytes since, and what was removed from it is not listed again."
 TABLES = ("csv", "parquet")
 MEDIA_TYPE = "application/octet-stream"
 
@@ -112,6 +112,8 @@ class Receiver:
     upload: Upload
     options: DecodeOptions
     beta: BetaStated
+    kept: list[int] = field(default_factory=list)
+    """Files of which the bytes are safe."""
 
     def receive(self, one: Incoming) -> FileOutcome:
         """Keep a file and decode it. Raises TooLarge."""
@@ -138,6 +140,7 @@ class Receiver:
         )
         self.db.add(row)
         self.db.commit()  # the bytes are safe from here on, whatever the decoder does with them
+        self.kept.append(row.id)
         return self.decode(name, row, content)
 
     def _known(self, name: str, sha256: str) -> FileOutcome | None:

@@ -18,11 +18,13 @@ from app.ingest.models import Upload, UploadFile
 from app.ingest.sessions import in_milliamperes
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading, recordings
+from app.ingest.uploads.reading import ReaderFault
 from app.ingest.uploads.receiving import TABLES, BetaStated, name_beta
 from app.ingest.uploads.service import decode_options
 from app.platform import files
 from app.platform.database import transaction
 from app.platform.errors import NotFound
+from app.platform.jobs.children.child import places
 from app.study import repository as study
 from app.study.models import Participant, Recording, StudySession, Trace
 from app.study.traces import AMPLITUDE_STREAM, unpack
@@ -83,8 +85,9 @@ def redecode(participant_id: int | None, upload_file_id: int | None, dry_run: bo
                 change.state, change.said = "failed", [str(error)]
             except Exception as fault:
                 # a fault of ours in one file must not keep the others at the old version
-                log.exception("redecoding failed", upload_file=file_id, fault=repr(fault))
-                change.state, change.said = "failed", [f"fault in the decoder: {fault!r}"]
+                where = fault.places if isinstance(fault, ReaderFault) else places(fault)
+                log.error("redecoding failed", upload_file=file_id, places=where)
+                change.state, change.said = "failed", [f"fault in the decoder: {where.split()[-1]}, see the log"]
         yield change
 
 

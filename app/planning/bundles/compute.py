@@ -6,19 +6,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from app.platform.jobs import StepReport
-from ml.deploy.bundle import build_bundle, describe
+from app.settings import stored_secret
+from ml.deploy.bundle import build_bundle, describe, sign
 from ml.deploy.manifest import BundleError, BundleManifest
 from ml.policies.onnx_policy import PolicyFileError
 
 
 def make(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
-    """Make a bundle, or only its manifest.
+    """Make and sign a bundle, which runs its policy to check it, or make only its manifest.
 
     Args:
         params: `file` (path of the policy), `manifest` (its JSON text), `windows` (list [M, W]), `target`: the file to write the bundle to,
-            None for the manifest alone.
+            None for the manifest alone; `secrets` and `key`: the folder of keys, and the name of the one to sign with.
         workdir, report: not used.
 
     Returns:
@@ -29,7 +31,8 @@ def make(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str,
     try:
         if params["target"] is None:
             return {"manifest": describe(policy, manifest, windows).to_bytes().decode()}
-        Path(params["target"]).write_bytes(build_bundle(policy, manifest, windows))
+        key = Ed25519PrivateKey.from_private_bytes(stored_secret(Path(params["secrets"]), params["key"]))
+        Path(params["target"]).write_bytes(sign(build_bundle(policy, manifest, windows), key))
     except (BundleError, PolicyFileError) as error:
         return {"refused": str(error)}
     return {}

@@ -89,10 +89,9 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
     study.require(caller, can.TAKE_BUNDLES, participant)
     manifest, windows = _manifest(db, participant, policy, limits, hemisphere, caller)
     try:
-        content = _built(policy, manifest, windows)
+        signed = _signed(policy, manifest, windows)
     except (BundleError, PolicyFileError) as error:
         raise _unmade(policy, error) from error
-    signed = sign(content, signing_key())
     set_reason(db, wording.release_reason(manifest))
     release = BundleRelease(
         participant_id=participant.id,
@@ -122,18 +121,18 @@ def preview(
         raise _unmade(policy, error) from error
 
 
-def _built(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64]) -> bytes:
-    """The unsigned bundle; a policy made elsewhere is run in a child, one of ours here. Raises BundleError, PolicyFileError."""
+def _signed(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64]) -> bytes:
+    """The signed bundle. A policy made elsewhere is run in a child, one of ours here. Raises BundleError, PolicyFileError."""
     content = onnx_of(policy)
     if policy.kind != FOREIGN:
-        return build_bundle(content, manifest, windows)
+        return sign(build_bundle(content, manifest, windows), signing_key())
     with files.draft_folder() as folder:
         _in_child(policy, manifest, windows, folder / "bundle.zip")
         return (folder / "bundle.zip").read_bytes()
 
 
 def _described(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64]) -> BundleManifest:
-    """The manifest alone, as `_built`."""
+    """The manifest alone, as `_signed`."""
     content = onnx_of(policy)
     if policy.kind != FOREIGN:
         return describe(content, manifest, windows)
@@ -146,6 +145,8 @@ def _in_child(policy: Policy, manifest: BundleManifest, windows: NDArray[np.floa
         "manifest": manifest.to_bytes().decode(),
         "windows": windows.tolist(),
         "target": None if target is None else str(target),
+        "secrets": str(get_settings().data_dir.resolve() / "secrets"),
+        "key": KEY,
     }
     found = foreign.run(MAKE, params)
     if "refused" in found:

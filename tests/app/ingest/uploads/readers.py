@@ -48,6 +48,15 @@ def sleep(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
     return {}
 
 
+def hold(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Report a share, and decode when somebody says so."""
+    report.progress(0.25, "decoding")
+    report.flush()
+    while not Path(params["source"]).with_name("go").exists():
+        time.sleep(0.05)
+    return compute.decode(params, workdir, report)
+
+
 def fault_of_rcs(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """Fail, as a decoder with a fault of ours does, and quote the file in the error."""
     if params["kind"] == "rcs":

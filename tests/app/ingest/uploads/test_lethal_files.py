@@ -71,7 +71,7 @@ def test_a_file_that_ends_the_service_twice_is_put_aside_and_can_be_read(client:
     (file,) = db.scalars(select(UploadFile))
     assert (file.status, file.quarantine_sha256 is not None) == ("failed", True)
     (row,) = client.get("/api/v1/participants/P1/quarantine").json()
-    assert "the service ended 2 times while it read this file" in row["problem"]
+    assert "reading this file was cut short 2 times" in row["problem"]
     assert list(resume("test")) == [], "it is not resumed again"
     assert client.post(f"/api/v1/uploaded-files/{file.id}/review").status_code == 200
     released = client.post(f"/api/v1/uploaded-files/{file.id}/release", json={"how": "read", "reason": "the service was repaired"})
