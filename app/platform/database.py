@@ -14,7 +14,7 @@ from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 
 from app.platform.embedded import place
-from app.platform.embedded_postgres import EmbeddedPostgres
+from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import Settings, get_settings
 
 NAMING = {

@@ -65,6 +65,27 @@ INTENDED: dict[str, str] = {
         ),
         "Evaluation: a further method by name, `impulse`",
     ),
+    **dict.fromkeys(
+        (
+            "components > schemas > ConditionsChange",
+            "components > schemas > ConditionsOut",
+            "components > schemas > DesignParameters",
+            "components > schemas > HoldModel",
+            "components > schemas > ProgramModel",
+            "components > schemas > SnapshotSessionOut",
+            "paths > /api/v1/sessions/{session_id}/conditions",
+        ),
+        "API: `GET` and `PUT /sessions/{id}/conditions` read and correct what a session ran under; a snapshot's session names the revision",
+    ),
+    **dict.fromkeys(
+        (
+            "components > schemas > MarginsChange",
+            "components > schemas > MarginsIn",
+            "components > schemas > MarginsOut",
+            "paths > /api/v1/participants/{code}/margins",
+        ),
+        "API: margins against cDBS and the levels of verdicts are read and set at `/participants/{code}/margins`.",
+    ),
     "components > schemas > ProposalOut": "API: a proposal has `usable_steps`.",
     "components > schemas > UsableStepsOut": "API: a proposal has `usable_steps`.",
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",
