@@ -47,7 +47,7 @@ ENDED_THE_SERVICE = UndecodableFile(
     "Look at it on the page of the quarantine. Send it again with what is wrong mended, or read it again when the service was mended.",
 )
 RESUMED = "Reading this file was cut short; it was read from the kept bytes since, and what was removed from it is not listed again."
-TABLES = ("csv", "parquet")
+TABLES = ("csv", "parquet", "control_log")
 MEDIA_TYPE = "application/octet-stream"
 
 
