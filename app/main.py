@@ -28,6 +28,7 @@ log = structlog.get_logger()
 
 API_MODULES = (
     "app.study.api",
+    "app.study.margins.api",
     "app.ingest.uploads.api",
     "app.ingest.proposals.api",
     "app.ingest.quarantine.api",
@@ -46,6 +47,7 @@ PAGE_MODULES = (
     "app.accounts.pages",
     "app.study.pages",
     "app.study.settings.pages",
+    "app.study.margins.pages",
     "app.study.visits.pages",
     "app.study.sessions.pages",
     "app.ingest.uploads.pages",

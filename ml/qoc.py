@@ -50,6 +50,28 @@ class Qoc:
             raise ValueError(f"tremor must lie between 0 and 100 %, not {self.tremor_percent}")
 
 
+@dataclass(frozen=True)
+class Margins:
+    """By how much an outcome may be worse than under cDBS and still count as no worse. The defaults are ours and no clinical standard.
+
+    Attributes:
+        grasp_share: slower grasp, share of the frequency under cDBS.
+        rating_points: lower rating, points of the scale of 1 to 10.
+        tremor_points: more tremor, percentage points of time.
+
+    Raises:
+        ValueError: a margin that is not above 0, or a share of 1 or more.
+    """
+
+    grasp_share: float = 0.10
+    rating_points: float = 1.0
+    tremor_points: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not (0 < self.grasp_share < 1 and self.rating_points > 0 and self.tremor_points > 0):
+            raise ValueError(f"margins must be above 0, and that of grasp below 1: {self}")
+
+
 def grasp_frequency(open_fist_s: NDArray[np.float64]) -> float:
     """Grasp frequency over one hand-grasp test (eq:grasp_speed).
 

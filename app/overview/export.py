@@ -22,6 +22,7 @@ from app.overview import repository
 from app.platform.errors import BetaloopError
 from app.study import blinding, service
 from app.study import repository as study
+from app.study.margins.schemas import MarginsOut
 from app.study.models import Participant
 from app.study.schemas import SettingsOut
 from app.study.sessions.data import session_data
@@ -69,6 +70,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
     contents = {
         "README.txt": _readme(participant),
         "settings.json": json.dumps(settings, indent=2),
+        "margins.json": json.dumps([MarginsOut.model_validate(m).model_dump(mode="json") for m in participant.margins], indent=2),
         "sessions.csv": _csv(_SESSION_COLUMNS, sessions),
         "steps.csv": _csv(_STEP_COLUMNS, steps),
         "policies.csv": _csv(_POLICY_COLUMNS, [_policy_row(p) for p in policies]),
@@ -131,4 +133,5 @@ def _readme(participant: Participant) -> str:
         "estimates.csv  every estimate: E[r_end + sum over t < H of gamma^t r_t] with its interval\n"
         "coverage.csv   what the data can say about each policy, checked before it was estimated\n"
         "settings.json  every settings version\n"
+        "margins.json   every version of the margins against cDBS and of the levels of verdicts\n"
     )

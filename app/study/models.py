@@ -11,6 +11,7 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.accounts.models import Site
 from app.platform.database import Base
+from app.study.sessions.models import SessionConditions
 
 
 class Controller(StrEnum):
@@ -51,7 +52,13 @@ class Participant(Base):
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     site: Mapped[Site] = relationship()
     settings: Mapped[list[SettingsVersion]] = relationship(back_populates="participant", order_by="SettingsVersion.version")
+    margins: Mapped[list[MarginsVersion]] = relationship(back_populates="participant", order_by="MarginsVersion.version")
     visits: Mapped[list[Visit]] = relationship(back_populates="participant", order_by="Visit.number")
+
+    @property
+    def current_margins(self) -> MarginsVersion:
+        """The newest margins and levels; a participant always has some."""
+        return self.margins[-1]
 
     @property
     def current_settings(self) -> SettingsVersion:
@@ -100,10 +107,47 @@ class SettingsVersion(Base):
     min_valid_fraction: Mapped[float]
     most_imputed: Mapped[int] = mapped_column(SmallInteger, server_default="0")
     beta_measure: Mapped[str] = mapped_column(String(10), server_default="rms")
+    pool_programmings: Mapped[bool] = mapped_column(server_default="false")
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
     participant: Mapped[Participant] = relationship(back_populates="settings")
+
+
+class MarginsVersion(Base):
+    """By how much an outcome may be worse than under cDBS, and how sure a proposal must be of it. Never changed, only followed.
+
+    `grasp_share` is a share of the grasp frequency under cDBS, `rating_points` points of the rating, `tremor_points` percentage points of
+    time with tremor. The levels: a policy is proposed for a test where it keeps all outcomes within the margins with probability
+    `test_within` and saves energy with `test_saves`; it is unsafe where an outcome lies beyond its margin with `unsafe_beyond`, or where
+    more than `nearly_off_share` of its steps are nearly off.
+    """
+
+    __tablename__ = "margins_version"
+    __table_args__ = (
+        UniqueConstraint("participant_id", "version"),
+        CheckConstraint("grasp_share > 0 and grasp_share < 1 and rating_points > 0 and tremor_points > 0", name="margins"),
+        CheckConstraint(
+            "test_within > 0 and test_within < 1 and test_saves > 0 and test_saves < 1 and unsafe_beyond > 0 and unsafe_beyond < 1"
+            " and nearly_off_share >= 0 and nearly_off_share < 1",
+            name="levels",
+        ),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    version: Mapped[int]
+    grasp_share: Mapped[float]
+    rating_points: Mapped[float]
+    tremor_points: Mapped[float]
+    test_within: Mapped[float]
+    test_saves: Mapped[float]
+    unsafe_beyond: Mapped[float]
+    nearly_off_share: Mapped[float]
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+    reason: Mapped[str | None] = mapped_column(Text)
+    participant: Mapped[Participant] = relationship(back_populates="margins")
 
 
 class CdbsAmplitude(Base):
@@ -189,11 +233,17 @@ class StudySession(Base):
         back_populates="session", order_by="SessionSegment.start_s", cascade="all, delete-orphan", passive_deletes=True
     )
     qocs: Mapped[list[QocRevision]] = relationship(back_populates="session", order_by="QocRevision.revision")
+    conditions_revisions: Mapped[list[SessionConditions]] = relationship(order_by="SessionConditions.revision")
 
     @property
     def qoc(self) -> QocRevision | None:
         """The newest revision of the session's QoCs."""
         return self.qocs[-1] if self.qocs else None
+
+    @property
+    def conditions(self) -> SessionConditions | None:
+        """What the session ran under, newest revision; None of a proposal, whose conditions are taken down when it is confirmed."""
+        return self.conditions_revisions[-1] if self.conditions_revisions else None
 
 
 class Recording(Base):

@@ -14,7 +14,8 @@ from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import blinding, repository
-from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision, SettingsVersion, StudySession, Visit
+from app.study.margins.schemas import MarginsFields
+from app.study.models import CdbsAmplitude, Controller, MarginsVersion, Participant, QocRevision, SettingsVersion, StudySession, Visit
 from app.study.outcomes import service as outcomes
 from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, ParticipantIn, QocIn, SessionChange, SettingsIn, VisitChange, VisitIn
 from app.study.threshold import MDP_FIELDS
@@ -29,7 +30,7 @@ POLICY_CONTROLLERS = {Controller.RL, Controller.DISTILLED, Controller.OTHER}
 
 
 def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
-    """Add a participant with its first settings version. Raises Conflict when the code is taken."""
+    """Add a participant with its first settings version and the default margins. Raises Conflict when the code is taken."""
     if draft.code.lower() in RESERVED_CODES:
         raise Invalid(f"'{draft.code}' cannot be a participant's code: it is the address of a page.", "Choose another code.")
     site = _site(db, draft.site, caller)
@@ -44,6 +45,8 @@ def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
             f"There is already a participant '{draft.code}' (capitals and small letters count as the same).", "Choose another code."
         ) from error
     _add_settings(db, participant, draft.settings.model_dump(), caller, reason=None)
+    participant.margins.append(MarginsVersion(version=1, created_by=caller.label, **MarginsFields().model_dump()))
+    db.flush()
     return participant
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from app.study.models import SettingsVersion
-from app.study.schemas import SettingsIn
+Row = TypeVar("Row")
 
 
 @dataclass(frozen=True)
@@ -77,6 +76,11 @@ GROUPS = (
                 "beta_measure", "Measure of beta", "What is computed from time-domain LFP. Recordings decoded before keep theirs.",
                 options=(("rms", "RMS amplitude, in the LFP's unit"), ("power", "power, in the LFP's unit squared")),
             ),
+            SettingField(
+                "pool_programmings", "Sessions of another programming",
+                "Contacts, pulse width and rate of the newest session count as the participant's. A fraction is another dose under others.",
+                options=(("no", "stay out of buffers"), ("yes", "enter buffers too")),
+            ),
         ),
     ),
     SettingGroup(
@@ -116,25 +120,25 @@ GROUPS = (
 LABELS = {f.name: f.label for group in GROUPS for f in group.fields}
 
 
-def texts(source: SettingsVersion | SettingsIn) -> dict[str, str]:
-    """The settings as the form's text."""
-    return {name: _text(getattr(source, name)) for name in LABELS}
+def texts(source: object, names: Iterable[str] = LABELS) -> dict[str, str]:
+    """The settings (or other named values of a row or API type) as the form's text."""
+    return {name: _text(getattr(source, name)) for name in names}
 
 
 @dataclass(frozen=True)
-class VersionChange:
-    """A settings version and what it changed: label, value before, value after."""
+class VersionChange(Generic[Row]):
+    """A version of settings or margins and what it changed: label, value before, value after."""
 
-    row: SettingsVersion
+    row: Row
     changes: list[tuple[str, str, str]]
 
 
-def history(versions: list[SettingsVersion]) -> list[VersionChange]:
+def history(versions: Sequence[Row], labels: Mapping[str, str] = LABELS) -> list[VersionChange[Row]]:
     """All versions, newest first, with their changes."""
     found = [VersionChange(versions[0], [])]
     for before, after in pairwise(versions):
-        old, new = texts(before), texts(after)
-        found.append(VersionChange(after, [(LABELS[n], old[n] or "—", new[n] or "—") for n in LABELS if old[n] != new[n]]))
+        old, new = texts(before, labels), texts(after, labels)
+        found.append(VersionChange(after, [(labels[n], old[n] or "—", new[n] or "—") for n in labels if old[n] != new[n]]))
     return found[::-1]
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
-from ml.formats.archive import READ_ERRORS, Files, FolderFiles, ZipFiles
+from ml.formats.archive import READ_ERRORS, Files, FolderFiles, ZipFiles, told
 from ml.formats.options import DecodeOptions
 from ml.formats.rcs.leads import leads_only
 from ml.formats.rcs.opening import HEAD, STEM_OF, Opening, group, read_opening
@@ -75,7 +75,7 @@ def decode_files(files: Files, options: DecodeOptions, name: str) -> DecodedFile
     """Decode every device folder among the files; see `decode_rcs`."""
     whole = FileReport(name)
     sessions = find_sessions(files, whole)
-    whole.ignored.extend(map(str, files.left_out))
+    whole.ignored.extend(told(files.left_out))
     if not sessions:
         raise UndecodableFile(
             "no RC+S session in here", name, "Zip the session's Device folder with its JSON files (DeviceSettings, StimLog, RawDataTD, …)."

@@ -1,0 +1,28 @@
+"""REST routes of margins and levels."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from app.accounts.deps import CurrentCaller
+from app.platform.database import Db
+from app.platform.web.schemas import problems
+from app.study.deps import CurrentParticipant
+from app.study.margins import service
+from app.study.margins.schemas import MarginsChange, MarginsOut
+
+router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
+
+
+@router.get("/participants/{code}/margins")
+def list_margins(participant: CurrentParticipant) -> list[MarginsOut]:
+    """All versions of the margins within which an outcome counts as no worse than under cDBS, oldest first; the last one holds."""
+    return [MarginsOut.model_validate(version) for version in participant.margins]
+
+
+@router.put("/participants/{code}/margins", responses=problems(409))
+def change_margins(participant: CurrentParticipant, change: MarginsChange, db: Db, caller: CurrentCaller) -> MarginsOut:
+    """Change margins or levels: a new version; members left out keep their value. Those who approve plans alone."""
+    row = service.change_margins(db, participant, change.margins, change.reason, caller)
+    db.commit()
+    return MarginsOut.model_validate(row)

@@ -1,0 +1,97 @@
+"""HTML page of a participant's margins and levels."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+
+from app.accounts import permissions as can
+from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
+from app.platform.database import Db
+from app.platform.errors import BetaloopError
+from app.platform.web.forms import FormValues, parse
+from app.platform.web.templates import render
+from app.study.deps import CurrentParticipant
+from app.study.form_changes import Shown, own_changes, reason_of
+from app.study.margins import service
+from app.study.margins.schemas import MarginsIn
+from app.study.models import Participant
+from app.study.service import may
+from app.study.settings.form import SettingField, SettingGroup, history, texts
+
+router = APIRouter()
+
+GROUPS = (
+    SettingGroup(
+        "Margins: no worse than under cDBS",
+        (
+            SettingField("grasp_share", "Grasp slower by", "Share of the grasp frequency under cDBS, 0.1 being 10 %.", "of cDBS"),
+            SettingField("rating_points", "Rating lower by", "On the participant's scale of 1 to 10.", "points"),
+            SettingField("tremor_points", "Tremor more by", "Of the time: 10 allows 30 % where cDBS has 20 %.", "% points"),
+        ),
+    ),
+    SettingGroup(
+        "When a policy is worth a test",
+        (
+            SettingField("test_within", "Within all margins with", "Probability from which a test is proposed.", "probability"),
+            SettingField("test_saves", "Saves energy with", "Probability of using less energy than cDBS.", "probability"),
+        ),
+    ),
+    SettingGroup(
+        "When a policy is unsafe",
+        (
+            SettingField("unsafe_beyond", "Beyond a margin with", "Probability that any outcome lies beyond its margin.", "probability"),
+            SettingField("nearly_off_share", "Nearly off in", "Largest share of steps below 0.2 of the cDBS amplitude.", "of steps"),
+        ),
+    ),
+)
+LABELS = {f.name: f.label for group in GROUPS for f in group.fields}
+
+
+@router.get("/participants/{code}/margins")
+def margins(request: Request, participant: CurrentParticipant, caller: CurrentCaller) -> HTMLResponse:
+    """Present margins and levels, each explained, and the versions before."""
+    return _page(request, participant, caller, texts(participant.current_margins, LABELS))
+
+
+@router.post("/participants/{code}/margins")
+def change_margins(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Make a new version of what the form changes."""
+    before = participant.current_margins.version
+    seen = str(values["version"]) if "version" in values else None
+    shown = [Shown(v.version, texts(v, LABELS), v.created_by) for v in participant.margins]
+    changes = own_changes(values, seen, shown, LABELS)
+    try:
+        changes.refuse_conflicts()
+        change = parse(MarginsIn, changes.fields, LABELS)
+        row = service.change_margins(db, participant, change, reason_of(values) or "", caller)
+    except BetaloopError as error:
+        db.rollback()
+        typed = texts(participant.current_margins, LABELS) | changes.fields
+        return _page(request, participant, caller, typed, error, reason_of(values))
+    db.commit()
+    return RedirectResponse(f"/participants/{participant.code}/margins?done={'changed' if row.version != before else 'same'}", 303)
+
+
+def _page(
+    request: Request,
+    participant: Participant,
+    caller: Caller,
+    values: dict[str, str],
+    error: BetaloopError | None = None,
+    reason: str | None = None,
+) -> HTMLResponse:
+    page = render(
+        request,
+        "study/margins.html",
+        participant=participant,
+        current=participant.current_margins,
+        values=values,
+        reason=reason,
+        groups=GROUPS,
+        history=history(participant.margins, LABELS),
+        may_write=may(caller, can.APPROVE_PLAN, participant),
+        problem=error.problem(request.url.path) if error else None,
+    )
+    return HTMLResponse(page, error.status if error else 200)

@@ -1,0 +1,60 @@
+"""API types of margins and levels."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+from pydantic import ConfigDict, Field, ValidationInfo, field_validator
+
+from app.platform.web.schemas import Model, Number, Text
+from app.study.schemas import Bound, published
+
+BOUNDS = {
+    "grasp_share": Bound(0.01, 0.5, "of the grasp frequency under cDBS"),
+    "rating_points": Bound(0.1, 5, "points"),
+    "tremor_points": Bound(0.5, 50, "percentage points"),
+    "test_within": Bound(0.5, 0.99),
+    "test_saves": Bound(0.5, 0.99),
+    "unsafe_beyond": Bound(0.05, 0.9),
+    "nearly_off_share": Bound(0, 0.9, "of the steps"),
+}
+"""What may be stated. A level of *unsafe* above 0.9 would let a policy pass that is nearly surely worse."""
+
+
+class MarginsFields(Model):
+    """By how much an outcome may be worse than under cDBS, and how sure a proposal must be of it."""
+
+    grasp_share: Number = Field(0.10, description="Grasp may be slower by this share of the frequency under cDBS.")
+    rating_points: Number = Field(1.0, description="The rating may be lower by this many points.")
+    tremor_points: Number = Field(10.0, description="Tremor may take up this many more percentage points of the time.")
+    test_within: Number = Field(0.8, description="Probability of keeping all outcomes within the margins from which a test is proposed.")
+    test_saves: Number = Field(0.9, description="Probability of using less energy than cDBS from which a test is proposed.")
+    unsafe_beyond: Number = Field(0.5, description="Probability that an outcome lies beyond its margin from which a policy is unsafe.")
+    nearly_off_share: Number = Field(0.2, description="Share of steps below 0.2 of the cDBS amplitude above which a policy is unsafe.")
+
+
+class MarginsIn(MarginsFields):
+    """Margins and levels; what is left out keeps its present value."""
+
+    model_config = ConfigDict(json_schema_extra=published(BOUNDS))
+
+    @field_validator(*BOUNDS)
+    @classmethod
+    def _within_bounds(cls, value: float, info: ValidationInfo) -> float:
+        return BOUNDS[str(info.field_name)].check(value)
+
+
+class MarginsOut(MarginsFields):
+    """A version of a participant's margins and levels."""
+
+    version: int
+    created_at: datetime
+    created_by: str
+    reason: str | None = Field(description="Null for the defaults of an enrolment.")
+
+
+class MarginsChange(Model):
+    """New margins or levels, and why."""
+
+    margins: MarginsIn
+    reason: Text = Field(max_length=1000)
