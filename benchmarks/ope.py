@@ -6,8 +6,8 @@
     python benchmarks/ope.py --participants --out FOLDER      the four detailed participants, paper's design
 
 Nothing is fitted or chosen by true returns; they are computed to measure with. Finished cells are lines of FOLDER/cells-*.jsonl, and a run
-that is started again skips them. CPU seconds of one thread. `page` is the order of the ranking page of 0.1.0; `days alone` is a perfect method that
-knows the days of the data and no others; `tested` tests the candidates themselves in as many sessions as the data hold.
+that is started again skips them. CPU seconds of one thread. `page` is the order of the ranking page of 0.1.0; `days alone` is a perfect
+method that knows the days of the data and no others; `tested` tests the candidates themselves in as many sessions as the data hold.
 """
 
 from __future__ import annotations
