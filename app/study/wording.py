@@ -20,11 +20,12 @@ def sentences(contradictions: Iterable[Contradiction]) -> list[str]:
 def drawn_words(drawn: Drawn) -> str:
     """How a random session's amplitudes were drawn."""
     holds = f", {len(drawn.holds)} held amplitudes" if drawn.holds else ""
+    held = f"the amplitudes are held ({len(drawn.holds)} of them) and not drawn every step"
     told = {
         "paper": "the paper's: a new draw every step",
         "stratified": "stratified" + ("" if drawn.level is None else f", level {drawn.level:.2f} of cDBS") + holds,
         "ladder": f"titration ladder{holds}",
-        "held": f"not stated; the amplitudes are held ({len(drawn.holds)} of them) and not drawn every step: their density is not known",
+        "held": f"not stated; {held}: their density is not known",
         "unstated": "not stated; taken for the paper's, a new draw every step, which the amplitudes do not contradict",
     }[drawn.kind]
     return told + (f", seed {drawn.seed}" if drawn.seed is not None else "")
