@@ -16,10 +16,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ml.trajectories import Hold
 
 Floats = NDArray[np.float64]
 DesignName = Literal["paper", "stratified"]
@@ -108,6 +111,11 @@ class DesignedSession:
     def amplitudes(self) -> Floats:
         """Amplitude fraction of every step, [T]."""
         return np.repeat([d.amplitude for d in self.decisions], [d.steps for d in self.decisions])
+
+    @property
+    def holds(self) -> tuple[Hold, ...]:
+        """Decisions as a `SessionTrajectory` keeps them: none in the paper's design, where every step is one."""
+        return () if self.design == "paper" else tuple(Hold(d.start, d.steps, d.log_density) for d in self.decisions)
 
 
 def lay_out(settings: DesignSettings) -> tuple[DesignedSession, ...]:
@@ -238,6 +246,17 @@ class Recognised:
     kind: Literal["every_step", "held", "constant", "unknown"]
     holds: tuple[tuple[int, int, float], ...]
     repeats: float | None
+
+
+def unstated_holds(recognised: Recognised, steps: int) -> tuple[Hold, ...]:
+    """The stretches of held draws as decisions of unknown density that leave out none of `steps`: unknown steps go on with the hold before.
+
+    One amplitude all along is one hold. Empty where the draws are not held.
+    """
+    if recognised.kind not in ("held", "constant"):
+        return ()
+    starts = [0, *(start for start, _, _ in recognised.holds[1:]), steps]
+    return tuple(Hold(start, stop - start, None) for start, stop in pairwise(starts))
 
 
 HELD_SHARE: Final = 0.5

@@ -46,6 +46,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "visit": (),
     "visit_lock": (),
     "session": (),
+    "session_conditions": (),
     "recording": ("details",),
     "session_segment": (),
     "trace": ("values_f32", "valid_bits"),

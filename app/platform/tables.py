@@ -14,6 +14,7 @@ TABLE_MODULES = (
     "app.accounts.models",
     "app.study.models",
     "app.study.outcomes.models",
+    "app.study.sessions.models",
     "app.ingest.models",
     "app.learning.models",
     "app.evaluation.models",

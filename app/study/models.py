@@ -11,6 +11,7 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.accounts.models import Site
 from app.platform.database import Base
+from app.study.sessions.models import SessionConditions
 
 
 class Controller(StrEnum):
@@ -82,6 +83,8 @@ class SettingsVersion(Base):
         CheckConstraint("min_valid_fraction > 0 and min_valid_fraction <= 1", name="min_valid"),
         CheckConstraint("most_imputed >= 0", name="most_imputed"),
         CheckConstraint("beta_measure in ('rms', 'power')", name="beta_measure"),
+        CheckConstraint("design in ('stratified', 'paper')", name="design"),
+        CheckConstraint("early_visits >= 1", name="early_visits"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
@@ -107,6 +110,10 @@ class SettingsVersion(Base):
     min_valid_fraction: Mapped[float]
     most_imputed: Mapped[int] = mapped_column(SmallInteger, server_default="0")
     beta_measure: Mapped[str] = mapped_column(String(10), server_default="rms")
+    design: Mapped[str] = mapped_column(String(20), server_default="paper")
+    design_ladder: Mapped[bool] = mapped_column(server_default="false")
+    early_visits: Mapped[int] = mapped_column(SmallInteger, server_default="3")
+    pool_programmings: Mapped[bool] = mapped_column(server_default="false")
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
@@ -278,11 +285,17 @@ class StudySession(Base):
         back_populates="session", order_by="SessionSegment.start_s", cascade="all, delete-orphan", passive_deletes=True
     )
     qocs: Mapped[list[QocRevision]] = relationship(back_populates="session", order_by="QocRevision.revision")
+    conditions_revisions: Mapped[list[SessionConditions]] = relationship(order_by="SessionConditions.revision")
 
     @property
     def qoc(self) -> QocRevision | None:
         """The newest revision of the session's QoCs."""
         return self.qocs[-1] if self.qocs else None
+
+    @property
+    def conditions(self) -> SessionConditions | None:
+        """What the session ran under, newest revision; None of a proposal, whose conditions are taken down when it is confirmed."""
+        return self.conditions_revisions[-1] if self.conditions_revisions else None
 
 
 class Recording(Base):

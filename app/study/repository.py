@@ -8,6 +8,7 @@ from datetime import datetime
 from typing import Any
 
 from sqlalchemy import ColumnElement, Select, column, false, func, or_, select, table, true
+from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.models import Site
@@ -207,7 +208,7 @@ def last_editor(db: Session, entity: str, row_id: int) -> str:
 def lock_session(db: Session, session: StudySession) -> None:
     """Lock a session and read its QoCs again, so that two corrections at once become two revisions and neither is lost."""
     db.execute(select(StudySession.id).where(StudySession.id == session.id).with_for_update())
-    db.expire(session, ["qocs"])
+    db.expire(session, ["qocs", "conditions_revisions"])
 
 
 def tremor_series(db: Session, participant_id: int, start: datetime, stop: datetime) -> Sequence[TremorSeries]:
@@ -271,6 +272,32 @@ def has_policy(db: Session, participant_id: int, policy_id: int) -> bool:
     return db.scalar(select(policies.c.id).where(policies.c.id == policy_id, policies.c.participant_id == participant_id)) is not None
 
 
+def released_limits(db: Session, policy_id: int, moment: datetime | None) -> tuple[float, float] | None:
+    """Amplitude limits, mA, of the newest bundle of a policy that was released before a moment; None where there is none.
+
+    Bundles belong to a later phase; of their table only the limits are needed here.
+    """
+    names = ("policy_id", "min_ma", "max_ma", "created_at")
+    releases = table("bundle_release", *(column(name) for name in names))
+    query = select(releases.c.min_ma, releases.c.max_ma).where(releases.c.policy_id == policy_id)
+    if moment is not None:
+        query = query.where(releases.c.created_at <= moment)
+    row = db.execute(query.order_by(releases.c.created_at.desc()).limit(1)).first()
+    return None if row is None else (float(row.min_ma), float(row.max_ma))
+
+
+def planned_designs(db: Session, visit_id: int) -> list[dict[str, Any]]:
+    """Designs of the random sessions in a visit's approved plan, by position; those that are drawn by the device have none.
+
+    Plans belong to a later phase; of their tables only the designs are needed here.
+    """
+    plans = table("plan", *(column(name) for name in ("id", "visit_id", "status")))
+    items = table("plan_item", *(column(name) for name in ("plan_id", "position")), column("design", JSONB))
+    query = select(items.c.design).join_from(items, plans, items.c.plan_id == plans.c.id)
+    query = query.where(plans.c.visit_id == visit_id, plans.c.status == "approved", items.c.design.is_not(None))
+    return [row for row in db.scalars(query.order_by(items.c.position)) if row["holds"]]
+
+
 def settings_version(db: Session, settings_version_id: int) -> SettingsVersion:
     """A settings version by its row number."""
     return db.get_one(SettingsVersion, settings_version_id)
@@ -290,6 +317,7 @@ def _sessions() -> Select[StudySession]:
             joinedload(StudySession.visit).joinedload(Visit.participant).joinedload(Participant.site),
             joinedload(StudySession.visit).selectinload(Visit.cdbs_amplitudes),
             selectinload(StudySession.qocs),
+            selectinload(StudySession.conditions_revisions),
             selectinload(StudySession.segments).joinedload(SessionSegment.recording),
         )
     )

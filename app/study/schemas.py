@@ -62,6 +62,7 @@ SETTING_BOUNDS = {
     "beta_high_hz": Bound(1, 500, "Hz"),
     "min_valid_fraction": Bound(0.01, 1),
     "most_imputed": Bound(0, 10, "steps"),
+    "early_visits": Bound(1, 20, "visits"),
 }
 """Clinical bounds of what may be set from now on; versions of before may lie outside of them, and are shown as they are."""
 
@@ -102,6 +103,18 @@ class SettingsFields(Model):
     )
     beta_measure: BetaMeasure = Field(
         "rms", description="Beta from time-domain LFP: 'rms' amplitude (in its unit) or 'power' (unit squared)."
+    )
+    design: Literal["stratified", "paper"] = Field(
+        "stratified",
+        description="How random sessions try amplitudes: 'stratified' levels with draws held 10-60 s, or 'paper', a new uniform draw every "
+        "step. Settings of before there was a choice have 'paper'.",
+    )
+    design_ladder: Bool = Field(False, description="Stratified design: the first random session of a visit is a titration ladder.")
+    early_visits: Int = Field(3, description="Stratified design: visits over which the levels of random sessions are spread.")
+    pool_programmings: Bool = Field(
+        False,
+        description="Sessions under other contacts, pulse widths or rates than the participant's newest enter buffers too; a clinician's "
+        "word, for the same fraction is another dose there.",
     )
 
 
@@ -286,6 +299,91 @@ class VisitLockOut(Model):
     reason: str
     created_at: datetime
     created_by: str
+
+
+class HoldModel(Model):
+    """One amplitude that a design held."""
+
+    start: Int = Field(ge=0, le=1_000_000, description="First step.")
+    steps: Int = Field(ge=1, le=1_000_000)
+    amplitude: Number = Field(ge=0, le=1, description="Fraction of the cDBS amplitude.")
+    log_density: Number | None = Field(description="Of the amplitude given the level and the bound in force; null where nothing was drawn.")
+
+
+class DesignParameters(Model):
+    """What a design drew for one session."""
+
+    level: Number | None = Field(None, ge=0, le=1, description="Of the session, fraction of the cDBS amplitude; null where it has none.")
+    holds: list[HoldModel] = Field(default_factory=list, max_length=10_000, description="In order, without gaps, the first from step 0.")
+
+    @field_validator("holds")
+    @classmethod
+    def _without_gaps(cls, value: list[HoldModel]) -> list[HoldModel]:
+        at = 0
+        for number, hold in enumerate(value, start=1):
+            if hold.start != at:
+                words = {"number": number, "start": hold.start, "at": at}
+                raise PydanticCustomError("gap", "hold {number} starts at step {start}; the one before ends at step {at}", words)
+            at += hold.steps
+        return value
+
+
+class ProgramModel(Model):
+    """One stimulation program as it was set; null or empty where it is not known."""
+
+    hemisphere: Hemisphere | None = None
+    group: Text | None = Field(None, max_length=10)
+    program: Int = Field(0, ge=0, le=3)
+    contacts: Text = Field("", max_length=200, description="With their signs, e.g. '+C-2'.")
+    pulse_width_us: Number | None = Field(None, gt=0, le=1000)
+    rate_hz: Number | None = Field(None, gt=0, le=1000)
+
+
+class ConditionsFields(Model):
+    """What a session ran under."""
+
+    lower_bound: Number = Field(description="B in force, fraction: random amplitudes were drawn from [B, 1].")
+    window: Int = Field(description="W, beta amplitudes in a state.")
+    period_s: Number = Field(description="Seconds per step.")
+    xi_beta: Number | None = Field(description="Beta threshold, in the unit of the settings of the time.")
+    min_ma: Number | None = Field(description="Lowest amplitude that limits allowed, mA.")
+    max_ma: Number | None = Field(description="Highest amplitude that limits allowed, mA.")
+    seed: Int | None = Field(description="Of the design.")
+    design: Literal["paper", "stratified", "ladder"] | None = Field(description="Of a random session; null where nobody stated one.")
+    design_parameters: DesignParameters
+    lead_amplitude_ma: Number | None = Field(description="Amplitude in force just before the session, mA.")
+    cdbs_amplitude_ma: Number | None = Field(description="cDBS amplitude when the session was confirmed, mA; for the record.")
+    programming: list[ProgramModel] = Field(description="Programs that stimulated, on every side that was recorded.")
+
+
+class ConditionsOut(ConditionsFields):
+    """Newest revision of a session's conditions."""
+
+    revision: int
+    origin: Literal["stated", "settings", "assumed"] = Field(
+        description="Who tells B, W, period and threshold: a person or plan, the settings in force when the session ran, or neither."
+    )
+    entered_by: str
+    reason: str | None
+    created_at: datetime
+
+
+class ConditionsChange(Model):
+    """What is stated of a session's conditions; what is left out stays."""
+
+    lower_bound: Number | None = Field(None, ge=0, lt=1)
+    window: Int | None = Field(None, ge=1, le=500)
+    period_s: Number | None = Field(None, gt=0, le=600)
+    xi_beta: Number | None = None
+    min_ma: Number | None = Field(None, ge=0, le=25.5)
+    max_ma: Number | None = Field(None, ge=0, le=25.5)
+    seed: Int | None = None
+    design: Literal["paper", "stratified", "ladder"] | None = None
+    design_parameters: DesignParameters | None = None
+    lead_amplitude_ma: Number | None = Field(None, ge=0, le=25.5)
+    cdbs_amplitude_ma: Number | None = Field(None, gt=0, le=25.5)
+    programming: list[ProgramModel] | None = Field(None, max_length=16)
+    reason: Text = Field(min_length=1, max_length=1000, description="Why; kept with the revision and in the audit trail.")
 
 
 class TraceOut(Model):

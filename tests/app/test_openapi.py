@@ -63,7 +63,19 @@ INTENDED: dict[str, str] = {
             "components > schemas > PipelineJob > properties > methods",
             "paths > /api/v1/participants/{code}/ranking > get > parameters > query method",
         ),
-        "Evaluation: a further method by name, `impulse`",
+        "Evaluation: further methods by name, `impulse` and `posterior`",
+    ),
+    **dict.fromkeys(
+        (
+            "components > schemas > ConditionsChange",
+            "components > schemas > ConditionsOut",
+            "components > schemas > DesignParameters",
+            "components > schemas > HoldModel",
+            "components > schemas > ProgramModel",
+            "components > schemas > SnapshotSessionOut",
+            "paths > /api/v1/sessions/{session_id}/conditions",
+        ),
+        "API: `GET` and `PUT /sessions/{id}/conditions` read and correct what a session ran under; a snapshot's session names the revision",
     ),
     **dict.fromkeys(
         (
@@ -73,6 +85,16 @@ INTENDED: dict[str, str] = {
             "paths > /api/v1/participants/{code}/margins",
         ),
         "API: margins against cDBS and the levels of verdicts are read and set at `/participants/{code}/margins`.",
+    ),
+    **dict.fromkeys(
+        (
+            "components > schemas > BoundOut",
+            "components > schemas > PlannedDesignOut",
+            "components > schemas > PlannedHoldOut",
+            "components > schemas > PlannedSessionOut > properties > design",
+            "components > schemas > PlannedSessionOut > required",
+        ),
+        "API: settings have `design`, `design_ladder` and `early_visits`, and a planned session has `design`.",
     ),
     "components > schemas > ProposalOut": "API: a proposal has `usable_steps`.",
     "components > schemas > UsableStepsOut": "API: a proposal has `usable_steps`.",

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ml.formats.rcs.amplitude import AmplitudeSteps, delivered, stimulating
 from ml.formats.rcs.labels import parse, render
 from ml.formats.rcs.packets.streams import Adaptive
 from ml.formats.rcs.packets.time import PacketTimes
-from ml.formats.rcs.settings import GROUPS, Settings, get, number
+from ml.formats.rcs.settings import GROUPS, Settings, get, integer, number
 from ml.formats.rcs.traces import Grid
 from ml.formats.recording import EventLog
 
 AMPLITUDE_TOLERANCE_MA = 0.05
 MAX_NOTES = 10_000
+CASE = 16
+"""Index of the case among the electrodes of a program; 0 to 15 are contacts. Source: format notes, A.5."""
 
 
 def stimulation_events(settings: Settings, grid: Grid) -> list[EventLog]:
@@ -25,7 +29,9 @@ def stimulation_events(settings: Settings, grid: Grid) -> list[EventLog]:
         programs = []
         for p in stimulating(state):
             program = state.programs[p]
-            programs.append({"program": p, "amplitude_ma": program.amplitude_ma, "pulse_width_us": program.pulse_width_us})
+            contacts = _contacts(settings, state.group, p)
+            set_to = {"amplitude_ma": program.amplitude_ma, "pulse_width_us": program.pulse_width_us, "contacts": contacts}
+            programs.append({"program": p, **set_to})
         total = delivered(state)
         known = all(np.isfinite(total))
         data: dict[str, Any] = {
@@ -44,6 +50,18 @@ def stimulation_events(settings: Settings, grid: Grid) -> list[EventLog]:
     return out
 
 
+def _contacts(settings: Settings, group: int | None, program: int) -> str:
+    """Stimulating contacts with their signs, such as `-2 +C` (C: the case); empty where the settings do not tell."""
+    electrodes = get(settings.merged, f"TherapyConfigGroup{group}", "programs", program, "electrodes", "electrodes")
+    signs = {0: "-", 1: "+"}
+    used = [
+        f"{signs[kind]}{'C' if i == CASE else i}"
+        for i, e in enumerate(electrodes if isinstance(electrodes, list) else ())
+        if get(e, "isOff") is False and (kind := integer(get(e, "electrodeType"))) in signs
+    ]
+    return " ".join(sorted(used, key=lambda name: name[0] == "+"))
+
+
 def adaptive_events(data: Adaptive, times: PacketTimes, grid: Grid) -> list[EventLog]:
     """Changes of the adaptive state; the first state is the first event."""
     placed = np.flatnonzero(np.isfinite(times.last_ms))
@@ -55,14 +73,20 @@ def adaptive_events(data: Adaptive, times: PacketTimes, grid: Grid) -> list[Even
     ]
 
 
-def note_events(records: list[Any], steps: AmplitudeSteps, grid: Grid) -> list[EventLog]:
-    """Operator's notes by the grammar of labels. `conflict` is true where the noted amplitude is not the device's at that time."""
+def note_events(
+    records: list[Any], steps: AmplitudeSteps, grid: Grid, of_pc_ms: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+) -> list[EventLog]:
+    """Operator's notes by the grammar of labels. `conflict` is true where the noted amplitude is not the device's at that time.
+
+    `of_pc_ms` brings the notes' PC times onto the recording's timeline.
+    """
     out = []
     for record in records[:MAX_NOTES]:
         event = get(record, "Event")
         t_ms = number(get(event, "UnixOnsetTime")) or number(get(record, "RecordInfo", "HostUnixTime"))
         if t_ms is None or not 0 < t_ms < 2.5e14:
             continue
+        t_ms = float(of_pc_ms(np.array([t_ms]))[0])
         found = parse(get(event, "EventType"), get(event, "EventSubType"), get(event, "EventName"))
         if "amplitude_ma" in found:
             device = _amplitude_at(steps, t_ms)
