@@ -38,15 +38,7 @@ def record(db: Session, session: StudySession, by: str, stated: ConditionsChange
         return session.conditions
     settings, in_force = settings_of(session)
     values: dict[str, Any] = {name: getattr(settings, name) for name in OF_SETTINGS}
-    values |= dict(zip(("min_ma", "max_ma"), _limits(db, session) or (None, None), strict=True))
-    values |= {"seed": None, "design": None, "design_parameters": {}}
-    values["programming"] = [p.as_json() for p in programming.of_session(session)]
-    try:
-        table = step_table(db, session, session.visit.participant.current_settings)
-        values |= {"lead_amplitude_ma": lead_amplitude_ma(table), "cdbs_amplitude_ma": table.cdbs_ma}
-    except Invalid:
-        # its steps cannot be read, for which its page and every buffer give the reason
-        values |= {"lead_amplitude_ma": None, "cdbs_amplitude_ma": None}
+    values |= {"seed": None, "design": None, "design_parameters": {}} | _of_recordings(db, session)
     given = _given(stated) if stated is not None else {}
     told = bool(given.keys() & set(OF_SETTINGS))
     origin = "stated" if told else "settings" if in_force else "assumed"
@@ -78,6 +70,27 @@ def change(db: Session, session: StudySession, wanted: ConditionsChange, caller:
     set_reason(db, wanted.reason)
     origin = "stated" if given.keys() & set(OF_SETTINGS) else known.origin
     return _add(db, session, merged, origin, caller.label, wanted.reason)
+
+
+def renew(db: Session, session: StudySession, by: str, reason: str) -> None:
+    """After the recordings of a session became other ones: what they tell of its conditions is taken from them; all else stays."""
+    known = record(db, session, by)
+    present = {name: getattr(known, name) for name in ConditionsFields.model_fields}
+    told = {name: value for name, value in _of_recordings(db, session).items() if value not in (None, [])}
+    if present | told != present:
+        _add(db, session, present | told, known.origin, by, reason)
+
+
+def _of_recordings(db: Session, session: StudySession) -> dict[str, Any]:
+    """What recordings, visit and bundles tell of a session's conditions."""
+    values: dict[str, Any] = dict(zip(("min_ma", "max_ma"), _limits(db, session) or (None, None), strict=True))
+    values["programming"] = [p.as_json() for p in programming.of_session(session)]
+    try:
+        table = step_table(db, session, session.visit.participant.current_settings)
+    except Invalid:
+        # its steps cannot be read, for which its page and every buffer give the reason
+        return values | {"lead_amplitude_ma": None, "cdbs_amplitude_ma": None}
+    return values | {"lead_amplitude_ma": lead_amplitude_ma(table), "cdbs_amplitude_ma": table.cdbs_ma}
 
 
 def settings_of(session: StudySession) -> tuple[SettingsVersion, bool]:
