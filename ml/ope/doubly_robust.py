@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ml.ope.estimate import Estimate, checked_horizon
 from ml.ope.fqe.estimator import FittedFqe, Fqe, FqeConfig, QMember, head_schedule, value_estimate, within_reach
-from ml.ope.fqe.steps import TargetActions, fresh_memory
+from ml.ope.fqe.steps import TargetActions
 from ml.ope.importance import behaviour_densities, horizon_of_ten, kernel_log_density, session_log_ratios
 from ml.ope.linear.end_outcomes import summarise
 from ml.ope.registry import Size
@@ -160,7 +160,7 @@ class _View:
     def __init__(self, member: QMember, fqe: FittedFqe, target: TargetActions) -> None:
         table = fqe.table
         self.member, self.table, self.span = member, table, target.span
-        self.start = member.features(table.first_states, target.first, fresh_memory(target.first))
+        self.start = member.features(table.first_states, target.first, table.first_memory(target.first))
         self.then = member.features(table.next_states, target.then, target.memory)
         self.products = member.grams.product(self.then)
         self._order = np.argsort(table.step, kind="stable")

@@ -63,7 +63,7 @@ INTENDED: dict[str, str] = {
             "components > schemas > PipelineJob > properties > methods",
             "paths > /api/v1/participants/{code}/ranking > get > parameters > query method",
         ),
-        "Evaluation: a further method by name, `impulse`",
+        "Evaluation: further methods by name, `impulse` and `posterior`",
     ),
     **dict.fromkeys(
         (

@@ -79,17 +79,19 @@ class Verdict:
 
 def of_logs(traces: Sequence[TraceLog]) -> dict[Channel, Rows]:
     """Traces as they were decoded, on their own clock."""
-    return {
-        (t.stream, t.channel): Rows(t.t_end_s, np.array(np.where(t.valid, t.values, np.nan), dtype=np.float64), t.dt_s, t.unit)
-        for t in traces
-        if t.stream != ERROR_STREAM
-    }
+    return {(t.stream, t.channel): Rows(t.t_end_s, _with_gaps(t), t.dt_s, t.unit) for t in traces if t.stream != ERROR_STREAM}
+
+
+def _with_gaps(trace: TraceLog) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = trace.values.astype(np.float64)
+    values[~trace.valid] = np.nan
+    return values
 
 
 def of_stored(traces: Sequence[Trace], ahead_s: float) -> dict[Channel, Rows]:
     """Stored traces on the clock of a recording that begins `ahead_s` after them."""
     return {
-        (t.stream, t.channel): Rows(t.first_end_s - ahead_s + t.dt_s * np.arange(t.n), unpack(t), t.dt_s, t.unit)
+        (t.stream, t.channel): Rows(t.first_end_s - ahead_s + t.dt_s * np.arange(t.n, dtype=np.float64), unpack(t), t.dt_s, t.unit)
         for t in traces
         if t.stream != ERROR_STREAM
     }
