@@ -16,7 +16,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.ingest.uploads.copies import Relation, Rows, relation
+from app.ingest.copies import Relation, Rows, relation
 from app.learning.snapshots.service import take_snapshot
 from app.study.models import Recording
 from app.study.repository import participant_by_code
