@@ -4,10 +4,10 @@
 
 `decode_vs_orjson`: RawDataTD.json from disk to float arrays, against `orjson.loads` of the same file with one array per channel (orjson is
 in the `bench` extra). `peak_rss_mb`: highest memory of a fresh process that decodes a session with a time-domain file of so many megabytes
-whole, traces and spectra included. `lfp_redact_s`, `lfp_decode_s`: CPU of cleaning a table of raw LFP, and of decoding it. `upload_quiet_s`, `upload_training_s`: wall seconds from sending a device recording (the montage of the
-test recordings, else a synthetic one) until its decoded session can be read over the API, median over fresh participants, on a service of
-its own, quiet and with a training job on its worker. `upload_cpu_s`: CPU seconds of the web process per upload, which a busy machine does
-not lengthen.
+whole, traces and spectra included. `lfp_redact_s`, `lfp_decode_s`: CPU of cleaning a table of raw LFP, and of decoding it.
+`upload_quiet_s`, `upload_training_s`: wall seconds from sending a device recording (the montage of the test recordings, else a synthetic
+one) until its decoded session can be read over the API, median over fresh participants, on a service of its own, quiet and with a training
+job on its worker. `upload_cpu_s`: CPU seconds of the web process per upload, which a busy machine does not lengthen.
 """
 
 from __future__ import annotations
