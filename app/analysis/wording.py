@@ -161,8 +161,10 @@ def lacking(found: Comparison) -> str:
     """Visits that give no primary evidence; empty where all do."""
     if not found.lacking_visits:
         return ""
-    word = "Visit" if len(found.lacking_visits) == 1 else "Visits"
-    return f"{word} {_numbers(found.lacking_visits)} lack one of the arms with this metric and give no primary evidence."
+    one = len(found.lacking_visits) == 1
+    lacks, give = ("lacks", "gives") if one else ("lack", "give")
+    visits = f"{'Visit' if one else 'Visits'} {_numbers(found.lacking_visits)}"
+    return f"{visits} {lacks} one of the arms with this metric and {give} no primary evidence."
 
 
 def left_out(excluded: Excluded) -> str:
