@@ -75,9 +75,7 @@ def serve(
     supervise_database()
     structlog.get_logger().info("database", lies_in=database_place())
     if (host or settings.host) not in LOOPBACK and not settings.cookie_secure:
-        structlog.get_logger().warning(
-            "other machines reach this service without TLS: use a TLS proxy and set BETALOOP_COOKIE_SECURE"
-        )
+        structlog.get_logger().warning("other machines reach this service without TLS: use a TLS proxy and set BETALOOP_COOKIE_SECURE")
     service = create_app()
     limited.prepare()  # before the first upload, which would wait for it
     # beside the service, for reading what a crash left behind may take minutes
