@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from ml.ope.posterior.further_sessions import sessions_to_tell
+from ml.mdp import MdpSettings
+from ml.ope.posterior.further_sessions import session_noise, sessions_to_tell
 from ml.ope.posterior.verdict import Levels
+from ml.qoc import Qoc
+from ml.trajectories import ReplayBuffer, SessionTrajectory
 from tests.ml.ope.posterior.draws import RANKS
 
 
