@@ -227,4 +227,4 @@ def _support(estimate: Estimate) -> Mapping[str, Any]:
 def _unsupported(own: Estimate) -> Flag:
     """The first finding that refuses the policy, or that too few sessions came near what it does."""
     refusing = next((flag for flag in own.flags if flag.refuses), None)
-    return refusing or Flag("few_sessions_near", _support(own).get("near_sessions"), 2.0, "sessions")
+    return refusing or Flag("few_near_sessions", _support(own).get("near_sessions"), 2.0, "sessions")
