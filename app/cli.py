@@ -18,10 +18,10 @@ from rich.console import Console
 from rich.table import Table
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
+from app.accounts.models import Role, Scope
 from app.accounts.permissions import SYSTEM
 from app.platform import logs
-from app.platform.database import database_place, transaction
+from app.platform.database import database_place, supervise_database, transaction
 from app.platform.errors import BetaloopError
 from app.platform.tables import load_tables
 from app.settings import get_settings
@@ -67,13 +67,14 @@ def serve(
     logs.configure()
     bring_up_to_date()
     settings = get_settings()
+    supervise_database()
     structlog.get_logger().info("database", lies_in=database_place())
     service = create_app()
     # beside the service, for reading what a crash left behind may take minutes
     threading.Thread(target=_resume_uploads, daemon=True).start()
     uvicorn.run(
         service, host=host or settings.host, port=port or settings.port, log_level=settings.log_level.lower(), access_log=False,
-        timeout_graceful_shutdown=3,
+        timeout_graceful_shutdown=3, timeout_keep_alive=75,
     )  # fmt: skip
 
 
@@ -94,6 +95,7 @@ def worker(slots: Annotated[int | None, typer.Option(min=1, help="Compute steps 
     bring_up_to_date()
     stop = threading.Event()
     _stop_on_signals(stop)
+    supervise_database(stop)
     run_worker(slots or get_settings().worker_slots, stop)
 
 
@@ -149,11 +151,13 @@ def user_add(
 def token_create(
     email: Annotated[str, typer.Argument(help="E-mail address of the user.")],
     name: Annotated[str, typer.Option(help="What will use the token.")],
+    scope: Annotated[Scope, typer.Option(help="What it may do of what the user may.")] = Scope.FULL,
+    days: Annotated[int, typer.Option(help="Days after which it ends.")] = accounts.TOKEN_DAYS,
     as_json: AsJson = False,
 ) -> None:
     """Make an API token and print it; it is shown this once."""
     with transaction(ACTOR) as db:
-        token = accounts.create_token(db, email, name)
+        token = accounts.create_token(db, email, name, scope, days)
     _print({"email": email, "name": name, "token": token}, as_json, token)
 
 

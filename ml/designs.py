@@ -21,6 +21,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.trajectories import Hold
+
 Floats = NDArray[np.float64]
 DesignName = Literal["paper", "stratified"]
 
@@ -108,6 +110,11 @@ class DesignedSession:
     def amplitudes(self) -> Floats:
         """Amplitude fraction of every step, [T]."""
         return np.repeat([d.amplitude for d in self.decisions], [d.steps for d in self.decisions])
+
+    @property
+    def holds(self) -> tuple[Hold, ...]:
+        """Decisions as a `SessionTrajectory` keeps them: none in the paper's design, where every step is one."""
+        return () if self.design == "paper" else tuple(Hold(d.start, d.steps, d.log_density) for d in self.decisions)
 
 
 def lay_out(settings: DesignSettings) -> tuple[DesignedSession, ...]:

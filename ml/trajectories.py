@@ -56,6 +56,20 @@ def _carried_over(deviations: Floats) -> float:
 
 
 @dataclass(frozen=True)
+class Hold:
+    """One decision of an exploration design: an amplitude that is drawn once and then held.
+
+    Attributes:
+        start, steps: first step and length. log_density: of the amplitude given the session's level and the bound in force; None where it
+            is not known (held draws of no stated design) or where nothing was drawn (a titration ladder).
+    """
+
+    start: int
+    steps: int
+    log_density: float | None
+
+
+@dataclass(frozen=True)
 class SessionTrajectory:
     """One session: W beta amplitudes before it, then T steps.
 
@@ -68,11 +82,15 @@ class SessionTrajectory:
         beta: beta amplitude of each step's row, shape [T]; NaN where invalid.
         amplitude: amplitude fraction a_k, shape [T]; NaN where unknown. May exceed 1: such a step is not usable.
         qoc: end-of-session QoCs.
-        random_lower_bound: B in force for a random session, so that its density 1 / (1 - B) on [B, 1] is known; else None.
+        random_lower_bound: B in force for a random session; else None.
+        holds: decisions of a random session whose draws are held, in order and without gaps up to where it ended. Empty where every step is
+            a decision of its own: a random session's density is then 1 / (1 - B) on [B, 1] at every step.
+        lead_amplitude: amplitude fraction in force just before step 0, where it is known; else None.
         most_imputed: how many imputed beta amplitudes a window may hold; 0 as in sessions of 0.1.0.
 
     Raises:
-        ValueError: arrays of unequal length, a session without a step, or as many imputed values as the window has.
+        ValueError: arrays of unequal length, a session without a step, as many imputed values as the window has, or holds that leave out
+            steps or go beyond the session.
     """
 
     session_id: int
@@ -84,7 +102,9 @@ class SessionTrajectory:
     qoc: Qoc = field(default_factory=Qoc)
     policy_id: int | None = None
     random_lower_bound: float | None = None
+    lead_amplitude: float | None = None
     most_imputed: int = 0
+    holds: tuple[Hold, ...] = ()
 
     def __post_init__(self) -> None:
         if self.beta.shape != self.amplitude.shape or self.beta.ndim != 1:
@@ -93,11 +113,19 @@ class SessionTrajectory:
             raise ValueError(f"session {self.session_id} has no step")
         if not 0 <= self.most_imputed < max(1, self.lead_beta.size):
             raise ValueError(f"session {self.session_id}: {self.most_imputed} imputed values of {self.lead_beta.size} in a window")
+        ends = [0, *(h.start + h.steps for h in self.holds)]
+        if any(h.start != end or h.steps < 1 for h, end in zip(self.holds, ends, strict=False)) or ends[-1] > self.steps:
+            raise ValueError(f"session {self.session_id}: its holds leave out steps or go beyond its {self.steps} steps")
 
     @property
     def steps(self) -> int:
         """T, number of steps."""
         return int(self.beta.size)
+
+    @property
+    def uniform_bound(self) -> float | None:
+        """B where every step's amplitude was drawn anew, uniform on [B, 1]; None for any other session."""
+        return None if self.holds else self.random_lower_bound
 
     @property
     def measured_beta(self) -> Floats:
@@ -237,6 +265,15 @@ class ReplayBuffer:
 _SCHEMA_VERSION = 1
 _IMPUTED_SCHEMA_VERSION = 2
 """Of buffers whose windows may hold imputed values, which a reader of version 1 would not find. Values are stored as measured."""
+_HELD_SCHEMA_VERSION = 3
+"""Of buffers with held draws, whose steps a reader of version 2 would take for decisions of their own."""
+
+
+def _schema_version(buffer: ReplayBuffer) -> int:
+    """The lowest version that tells all of a buffer, so that buffers of before keep their bytes and their names."""
+    if any(s.holds for s in buffer.sessions):
+        return _HELD_SCHEMA_VERSION
+    return _IMPUTED_SCHEMA_VERSION if any(s.most_imputed for s in buffer.sessions) else _SCHEMA_VERSION
 
 
 def to_parquet(buffer: ReplayBuffer) -> bytes:
@@ -252,7 +289,7 @@ def to_parquet(buffer: ReplayBuffer) -> bytes:
         columns["beta"].append(s.measured_beta)
         columns["amplitude"].append(np.concatenate([np.full(lead, np.nan), s.amplitude]))
     meta = {
-        "schema_version": _IMPUTED_SCHEMA_VERSION if any(s.most_imputed for s in buffer.sessions) else _SCHEMA_VERSION,
+        "schema_version": _schema_version(buffer),
         "settings": buffer.settings.to_json(),
         "beta_unit": buffer.beta_unit,
         "beta_source": buffer.beta_source,
@@ -272,10 +309,9 @@ def from_parquet(content: bytes) -> ReplayBuffer:
     if raw is None:
         raise ValueError("this Parquet file is not a betaloop buffer snapshot: its metadata lack the key 'betaloop'")
     meta = json.loads(raw)
-    if meta["schema_version"] not in (_SCHEMA_VERSION, _IMPUTED_SCHEMA_VERSION):
+    if not _SCHEMA_VERSION <= meta["schema_version"] <= _HELD_SCHEMA_VERSION:
         raise ValueError(
-            f"buffer snapshot of schema version {meta['schema_version']}; "
-            f"this betaloop reads {_SCHEMA_VERSION} and {_IMPUTED_SCHEMA_VERSION}"
+            f"buffer snapshot of schema version {meta['schema_version']}; this betaloop reads {_SCHEMA_VERSION} to {_HELD_SCHEMA_VERSION}"
         )
     ids = table["session_id"].to_numpy()
     step = table["step"].to_numpy()
@@ -296,7 +332,9 @@ def from_parquet(content: bytes) -> ReplayBuffer:
                 amplitude=amplitude[body],
                 qoc=Qoc(**m["qoc"]),
                 random_lower_bound=m["random_lower_bound"],
+                lead_amplitude=m.get("lead_amplitude"),
                 most_imputed=m.get("most_imputed", 0),
+                holds=tuple(Hold(*h) for h in m.get("holds", ())),
             )
         )
     return ReplayBuffer(MdpSettings(**meta["settings"]), tuple(sessions), meta["beta_unit"], meta["beta_source"])
@@ -308,8 +346,11 @@ def content_hash(content: bytes) -> str:
 
 
 def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
-    imputed = {"most_imputed": s.most_imputed} if s.most_imputed else {}
-    return imputed | {
+    # members that are left out where they say nothing, so that the bytes of older buffers stay what they were
+    later: dict[str, Any] = {"most_imputed": s.most_imputed} if s.most_imputed else {}
+    later |= {"lead_amplitude": s.lead_amplitude} if s.lead_amplitude is not None else {}
+    later |= {"holds": [[h.start, h.steps, h.log_density] for h in s.holds]} if s.holds else {}
+    return later | {
         "session_id": s.session_id,
         "visit": s.visit,
         "controller": s.controller,

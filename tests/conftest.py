@@ -23,7 +23,7 @@ from sqlalchemy.orm import Session
 
 import app.platform.database as database
 from app.accounts import service as accounts
-from app.platform.embedded_postgres import EmbeddedPostgres
+from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.files import path_of
 from app.platform.jobs import engine as jobs_engine
 from app.platform.migrate import migrate

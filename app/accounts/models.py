@@ -20,6 +20,15 @@ class Role(StrEnum):
     ADMIN = "admin"
 
 
+class Scope(StrEnum):
+    """What an API token may do of what its user may."""
+
+    FULL = "full"
+    READ = "read"
+    UPLOAD = "upload"
+    JOBS = "jobs"
+
+
 class Study(Base):
     """A trial under one protocol."""
 
@@ -94,13 +103,18 @@ class ApiToken(Base):
     """A bearer token of a user; only its hash is kept."""
 
     __tablename__ = "api_token"
-    __table_args__ = (UniqueConstraint("user_id", "name"),)
+    __table_args__ = (
+        UniqueConstraint("user_id", "name"),
+        CheckConstraint("scope in ('full', 'read', 'upload', 'jobs')", name="scope"),
+    )
 
     id: Mapped[int] = mapped_column(primary_key=True)
     user_id: Mapped[int] = mapped_column(ForeignKey("app_user.id", ondelete="CASCADE"), index=True)
     name: Mapped[str] = mapped_column(String(100))
+    scope: Mapped[Scope] = mapped_column(String(10), server_default=Scope.FULL)
     token_sha256: Mapped[str] = mapped_column(String(64), unique=True)
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    expires_at: Mapped[datetime | None]
     last_used_at: Mapped[datetime | None]
     revoked_at: Mapped[datetime | None]
     user: Mapped[User] = relationship()

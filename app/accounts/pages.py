@@ -7,21 +7,26 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
+from starlette.datastructures import FormData
 
 from app.accounts import permissions as can
 from app.accounts import repository, service
 from app.accounts.addresses import normal_address
 from app.accounts.deps import COOKIE, CurrentCaller
-from app.accounts.models import Role, User
+from app.accounts.models import Role, Scope, User
 from app.accounts.permissions import Caller
-from app.platform.database import Db, set_actor
-from app.platform.errors import BetaloopError, Invalid, NotFound
+from app.platform.database import Db, new_session, now, set_actor
+from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany
+from app.platform.web.bounded import Bounded
 from app.platform.web.forms import FormValues
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.settings import get_settings
 
 router = APIRouter()
+
+SCOPE_NAMES = {Scope.FULL: "all that I may", Scope.READ: "read", Scope.UPLOAD: "upload and read", Scope.JOBS: "jobs and read"}
+_passwords = Bounded(2, 100)  # argon2 takes all of a core and 64 MiB each time
 
 
 @router.get("/sign-in")
@@ -34,21 +39,34 @@ def sign_in_page(request: Request, db: Db, next: str = "/") -> Response:
 
 
 @router.post("/sign-in")
-def sign_in(request: Request, db: Db, values: FormValues) -> Response:
+async def sign_in(request: Request, values: FormValues) -> Response:
     """Open a browser session."""
-    email, target = str(values.get("email", "")), local_path(str(values.get("next", "/")))
     try:
-        set_actor(db, normal_address(email) or "unknown", request_id=request.state.request_id)
-        token = service.sign_in(db, email, str(values.get("password", "")))
-    except BetaloopError as error:
-        page = render(request, "accounts/sign_in.html", problem=error.problem(request.url.path), email=email, next=target)
-        return HTMLResponse(page, error.status)
-    db.commit()
+        return await _passwords.run(_sign_in, request, values)
+    except TooMany as error:
+        return _sign_in_refused(request, values, error)
+
+
+def _sign_in(request: Request, values: FormData) -> Response:
+    email, target = str(values.get("email", "")), local_path(str(values.get("next", "/")))
+    with new_session() as db:
+        try:
+            set_actor(db, normal_address(email) or "unknown", request_id=request.state.request_id)
+            token = service.sign_in(db, email, str(values.get("password", "")))
+        except BetaloopError as error:
+            return _sign_in_refused(request, values, error)
+        db.commit()
     settings, answer = get_settings(), RedirectResponse(target, 303)
     answer.set_cookie(
         COOKIE, token, max_age=3600 * settings.session_max_hours, httponly=True, samesite="lax", secure=settings.cookie_secure
     )
     return answer
+
+
+def _sign_in_refused(request: Request, values: FormData, error: BetaloopError) -> Response:
+    email, target = str(values.get("email", "")), local_path(str(values.get("next", "/")))
+    page = render(request, "accounts/sign_in.html", problem=error.problem(request.url.path), email=email, next=target)
+    return HTMLResponse(page, error.status)
 
 
 @router.post("/sign-out")
@@ -73,6 +91,7 @@ def account(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
 @router.post("/account/password")
 def change_password(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Change one's password; every browser session ends, also this one."""
+    caller.require_browser()
     try:
         if values.get("password") != values.get("again"):
             raise Invalid("The two new passwords differ.", "Type the same one twice.")
@@ -87,8 +106,9 @@ def change_password(request: Request, db: Db, caller: CurrentCaller, values: For
 @router.post("/account/tokens")
 def create_token(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Make an API token and show it this once."""
+    caller.require_browser()
     try:
-        token = service.create_token(db, caller.label, str(values.get("name", "")))
+        token = service.create_token(db, caller.label, str(values.get("name", "")), _scope(values), _days(values))
     except BetaloopError as error:
         db.rollback()
         return _account_page(request, db, caller, error)
@@ -99,6 +119,7 @@ def create_token(request: Request, db: Db, caller: CurrentCaller, values: FormVa
 @router.post("/account/tokens/{token_id}/revoke")
 def revoke_token(token_id: RowId, db: Db, caller: CurrentCaller) -> Response:
     """End one of one's own tokens."""
+    caller.require_browser()
     service.revoke_token(db, _own_id(caller), token_id)
     db.commit()
     return RedirectResponse("/account?done=revoked", 303)
@@ -114,6 +135,7 @@ def accounts(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
 @router.post("/accounts")
 def add_user(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Add a user to the study."""
+    caller.require_browser()
     fields = {name: str(values.get(name, "")) for name in ("email", "name", "role", "study")}
     try:
         caller.require(can.MANAGE_ACCOUNTS)
@@ -161,6 +183,20 @@ def local_path(target: str) -> str:
     return target if ok else "/"
 
 
+def _scope(values: FormData) -> Scope:
+    scope = str(values.get("scope", Scope.FULL))
+    if scope not in set(Scope):
+        raise Invalid("Choose what the token may do.", f"Known: {', '.join(Scope)}.")
+    return Scope(scope)
+
+
+def _days(values: FormData) -> int:
+    text = str(values.get("days", service.TOKEN_DAYS)).strip()
+    if not text.isdecimal():
+        raise Invalid(f"'{text[:20]}' is no number of days.", f"Give 1 to {service.MOST_TOKEN_DAYS}.")
+    return int(text[:6])
+
+
 def _own_id(caller: Caller) -> int:
     if caller.user_id is None:
         raise NotFound("The system itself has no account.")
@@ -168,6 +204,7 @@ def _own_id(caller: Caller) -> int:
 
 
 def _managed_user(db: Session, caller: Caller, user_id: int) -> User:
+    caller.require_browser()
     caller.require(can.MANAGE_ACCOUNTS)
     user = db.get(User, user_id)
     if user is None or not service.manages(caller, user):
@@ -178,6 +215,7 @@ def _managed_user(db: Session, caller: Caller, user_id: int) -> User:
 def _account_page(request: Request, db: Session, caller: Caller, error: BetaloopError | None = None, token: str = "") -> HTMLResponse:
     user = db.get_one(User, _own_id(caller))
     values = {"user": user, "tokens": repository.tokens_of(db, user.id), "token": token, "min_password": service.MIN_PASSWORD}
+    values |= {"scopes": SCOPE_NAMES, "days": service.TOKEN_DAYS, "most_days": service.MOST_TOKEN_DAYS, "now": now()}
     problem = error.problem(request.url.path) if error else None
     return HTMLResponse(render(request, "accounts/account.html", problem=problem, **values), error.status if error else 200)
 

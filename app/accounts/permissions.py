@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from app.accounts.models import Role
+from app.accounts.models import Role, Scope
 from app.platform.errors import Forbidden, NotFound
 
 READ = "read"
@@ -31,6 +31,14 @@ PERMISSIONS: dict[Role, frozenset[str]] = {
     Role.ADMIN: _CLINICIAN | _ENGINEER | {MANAGE_ACCOUNTS},
 }
 
+SCOPES: dict[Scope, frozenset[str] | None] = {
+    Scope.FULL: None,
+    Scope.READ: frozenset({READ}),
+    Scope.UPLOAD: frozenset({READ, UPLOAD}),
+    Scope.JOBS: frozenset({READ, RUN_JOBS}),
+}
+"""The permissions that a token's scope leaves of its user's; None leaves all."""
+
 
 @dataclass(frozen=True)
 class Grant:
@@ -52,11 +60,15 @@ class Caller:
     user_id: int | None
     grants: tuple[Grant, ...]
     is_system: bool = False
+    token_scope: Scope | None = None
+    """Of the API token that the request came with; None for a browser session."""
 
     def may(self, permission: str, study_id: int | None = None, site_id: int | None = None) -> bool:
         """Whether some grant that covers the site holds the permission; without a study: whether any grant does."""
         if self.is_system:
             return True
+        if self.token_scope is not None and (allowed := SCOPES[self.token_scope]) is not None and permission not in allowed:
+            return False
         return any(
             permission in PERMISSIONS[g.role]
             and (study_id is None or g.study_id == study_id)
@@ -70,7 +82,14 @@ class Caller:
             return
         if study_id is not None and not self.may(READ, study_id, site_id):
             raise NotFound("There is no such record, or you have no access to it.")
+        if self.token_scope not in (None, Scope.FULL):
+            raise Forbidden(f"A token for '{self.token_scope}' may not do this ('{permission}').", "Make one with a wider scope.")
         raise Forbidden(f"Your role does not include '{permission}'.", "Ask an administrator of the study for a role that does.")
+
+    def require_browser(self) -> None:
+        """Raises Forbidden for a token: passwords, tokens and accounts are changed by people who have signed in."""
+        if self.token_scope is not None:
+            raise Forbidden("A token may not change passwords, tokens or accounts.", "Sign in with a browser.")
 
     @property
     def role(self) -> Role | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import secrets
+from dataclasses import replace
 from datetime import timedelta
 from functools import lru_cache
 
@@ -13,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import repository
 from app.accounts.addresses import LONGEST_ADDRESS, normal_address
-from app.accounts.models import ApiToken, Membership, Role, SignIn, SignInAttempt, Study, User
+from app.accounts.models import ApiToken, Membership, Role, Scope, SignIn, SignInAttempt, Study, User
 from app.accounts.permissions import MANAGE_ACCOUNTS, PERMISSIONS, READ_AUDIT, Caller, Grant
 from app.platform.database import now
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
@@ -22,6 +23,7 @@ from app.settings import get_settings
 MIN_PASSWORD = 10
 FAILURES_ALLOWED = 5
 FAILURE_WINDOW = timedelta(minutes=15)
+TOKEN_DAYS, MOST_TOKEN_DAYS = 90, 730
 _SEEN_RESOLUTION = timedelta(minutes=1)
 _TOKEN_PREFIX = "blp_"
 
@@ -57,18 +59,27 @@ def check_password(password: str) -> None:
 
 
 def set_password(db: Session, user: User, password: str) -> None:
-    """Change a password and end every browser session of the user."""
+    """Change a password; every browser session and API token of the user ends, for somebody else may have made them."""
     check_password(password)
     user.password_hash = _hasher.hash(password)
+    for token in repository.tokens_of(db, user.id):
+        token.revoked_at = token.revoked_at or now()
     for sign_in in repository.open_sign_ins(db, user.id):
         sign_in.ended_at = now()
 
 
 def change_own_password(db: Session, user_id: int, present: str, new: str) -> None:
-    """Change a password by its owner, who proves to know the present one. Raises Forbidden when it is wrong, Invalid for a bad new one."""
+    """Change a password by its owner, who proves to know the present one; tries are counted together with sign-ins, and committed.
+
+    Raises:
+        TooMany: too many wrong passwords lately. Forbidden: the present one is wrong. Invalid: a bad new one.
+    """
+    check_password(new)
     user = db.get_one(User, user_id)
+    attempt = _count_attempt(db, user.email)
     if not _hasher.verify(present, user.password_hash):
         raise Forbidden("The present password is wrong.", "Nothing was changed; try again.")
+    repository.forget_failures(db, attempt)
     set_password(db, user, new)
 
 
@@ -80,8 +91,8 @@ def administers(caller: Caller, study_id: int, site_id: int | None = None) -> bo
 
 
 def manages(caller: Caller, user: User) -> bool:
-    """Whether the caller administers everything that the user has access to."""
-    return all(administers(caller, m.study_id, m.site_id) for m in user.memberships)
+    """Whether the caller administers everything that the user has access to, and there is something."""
+    return bool(user.memberships) and all(administers(caller, m.study_id, m.site_id) for m in user.memberships)
 
 
 def reads_whole_audit(db: Session, caller: Caller) -> bool:
@@ -162,7 +173,7 @@ def caller_of_token(db: Session, token: str) -> Caller | None:
     if row.last_used_at is None or now() - row.last_used_at > _SEEN_RESOLUTION:
         row.last_used_at = now()
         db.commit()
-    return caller_of(row.user)
+    return replace(caller_of(row.user), token_scope=Scope(row.scope))
 
 
 def caller_of(user: User) -> Caller:
@@ -170,8 +181,17 @@ def caller_of(user: User) -> Caller:
     return Caller(user.email, user.id, tuple(Grant(m.study_id, m.site_id, Role(m.role)) for m in user.memberships))
 
 
-def create_token(db: Session, email: str, name: str) -> str:
-    """Make an API token and return it; it is shown this once."""
+def create_token(db: Session, email: str, name: str, scope: Scope = Scope.FULL, days: int = TOKEN_DAYS) -> str:
+    """Make an API token and return it; it is shown this once.
+
+    Args:
+        name: what will use it. scope: what it may do of what the user may. days: after which it ends, 1 to MOST_TOKEN_DAYS.
+
+    Raises:
+        NotFound: no such user. Invalid: a bad name or number of days. Conflict: the user has a token of this name.
+    """
+    if not 1 <= days <= MOST_TOKEN_DAYS:
+        raise Invalid(f"A token cannot last {days} days.", f"Give 1 to {MOST_TOKEN_DAYS}.")
     user = repository.user_by_email(db, email)
     if user is None:
         raise NotFound(f"There is no user {email}.", "Make one with `betaloop user add`.")
@@ -181,7 +201,7 @@ def create_token(db: Session, email: str, name: str) -> str:
     if repository.token_by_name(db, user.id, name):
         raise Conflict(f"{email} already has a token named '{name}'.", "Choose another name.")
     token = _TOKEN_PREFIX + secrets.token_urlsafe(32)
-    db.add(ApiToken(user_id=user.id, name=name, token_sha256=_hash(token)))
+    db.add(ApiToken(user_id=user.id, name=name, scope=scope, token_sha256=_hash(token), expires_at=now() + timedelta(days=days)))
     db.flush()
     return token
 

@@ -123,6 +123,7 @@ def _sessions_changed(flag: Flag) -> str:
         "newer": "newer: visit " + ", ".join(flag.fact("visits")),
         "unconfirmed": "no longer confirmed",
         "qoc": "with corrected QoCs",
+        "conditions": "whose conditions were corrected",
         "left_out": "newly left out",
         "included": "newly included",
         "decoded": "decoded anew",
@@ -195,7 +196,22 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         f"in {_percent(f.value)} of steps the policy's average amplitude over the last minute is one that no session held: what it does "
         "there is a model's guess"
     ),
+    "few_near_sessions": lambda f: (
+        f"{_refusal(f)}{count(int(_value(f)), 'session', 'sessions')} came near what it would do; {f.limit:.0f} on two visits are needed"
+    ),
+    "few_near_visits": lambda f: (
+        f"{_refusal(f)}all sessions that came near what it would do are of {count(int(_value(f)), 'visit', 'visits')}, "
+        f"and {f.limit:.0f} are needed"
+    ),
     "few_effective_sessions": lambda f: f"{_refusal(f)}the weights rest on {_value(f):.1f} effective sessions of {f.fact('sessions'):.0f}",
+    "acts_within_hold": lambda f: (
+        f"{_refusal(f)}the policy acts within amplitudes that were drawn once and held, in "
+        f"{count(round(_value(f)), 'session', 'sessions')}: importance weights cannot tell what it would have done"
+    ),
+    "hold_density_unknown": lambda f: (
+        f"{_refusal(f)}the held amplitudes of {count(round(_value(f)), 'session', 'sessions')} were drawn by no stated design, "
+        "so that they have no weight"
+    ),
     "few_sessions_behind_correction": lambda f: (
         f"the correction of the value function rests on {_value(f):.1f} effective sessions of {f.fact('sessions'):.0f}"
     ),

@@ -48,6 +48,7 @@ class SnapshotSession(Base):
     amplitude_trace_id: Mapped[int | None] = mapped_column(ForeignKey("trace.id"))
     decode_version: Mapped[int | None]
     qoc_id: Mapped[int | None] = mapped_column(ForeignKey("qoc.id"))
+    conditions_id: Mapped[int | None] = mapped_column(ForeignKey("session_conditions.id"))
     cdbs_amplitude_ma: Mapped[float | None]
     steps: Mapped[int | None]
     left_out_reason: Mapped[str | None] = mapped_column(Text)

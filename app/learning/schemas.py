@@ -96,6 +96,7 @@ class SnapshotSessionOut(Model):
     amplitude_trace_id: int | None
     decode_version: int | None
     qoc_id: int | None
+    conditions_id: int | None = Field(description="Revision of the session's conditions; null in snapshots of before there were any.")
     cdbs_amplitude_ma: float | None
     steps: int | None
     left_out_reason: str | None

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from app.learning.gate.service import ALPHA, Gate, QocTest
 from app.learning.models import GateChoice
+from app.study.sessions.programming import Difference
 
 
 def gate_grounds(gate: Gate) -> str:
@@ -30,4 +33,13 @@ def gate_test_note(test: QocTest) -> str:
     return (
         f"not enough sessions with {test.name.lower()}: {test.n_learned} of learned policies and {test.n_random} of the random controller "
         "(3 against 4, 2 against 5 or 1 against 20 are the fewest that can show a difference)"
+    )
+
+
+def other_programming(differs: Sequence[Difference]) -> str:
+    """Why a session under another programming than the participant's newest stays out of a buffer."""
+    parts = [f"{d.of} and not {d.other} on {f'the {d.hemisphere} ' if d.hemisphere else ''}program {d.program}" for d in differs]
+    return (
+        f"it ran under another programming than the participant's newest session: {'; '.join(parts)}. The same fraction is another dose "
+        "there; a clinician may pool both in the settings"
     )

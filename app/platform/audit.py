@@ -44,6 +44,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "device": (),
     "visit": (),
     "session": (),
+    "session_conditions": (),
     "recording": ("details",),
     "session_segment": (),
     "trace": ("values_f32", "valid_bits"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,8 +15,10 @@ from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 
 from app.platform.embedded import place
-from app.platform.embedded_postgres import EmbeddedPostgres
+from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import Settings, get_settings
+
+log = logging.getLogger(__name__)
 
 NAMING = {
     "ix": "ix_%(column_0_N_label)s",
@@ -58,6 +61,36 @@ def database_url(settings: Settings | None = None) -> str:
             server.start()
             _embedded[key] = server
         return _embedded[key].url("betaloop")
+
+
+HEAL_POLL_S = 1.0
+"""Longest time for which a service does not see that its embedded server died."""
+
+
+def supervise_database(stop: threading.Event | None = None) -> None:
+    """Have a thread of this process start the embedded server again whenever it dies; a PostgreSQL of one's own is left to its keeper.
+
+    Args:
+        stop: ends the thread; without one it ends with the process.
+    """
+    database_url()
+    with _lock:
+        server = _embedded.get(str(get_settings().data_dir.resolve()))
+    if server is not None and not get_settings().database_url:
+        threading.Thread(target=_supervise, args=(server, stop or threading.Event()), name="database-supervisor", daemon=True).start()
+
+
+def _supervise(server: EmbeddedPostgres, stop: threading.Event) -> None:
+    told = False
+    while not stop.wait(HEAL_POLL_S):
+        try:
+            if server.heal():
+                log.warning("the embedded database had died and was started again")
+            told = False
+        except (RuntimeError, OSError) as error:  # a full disk, mostly: tried again until there is room
+            if not told:
+                log.error("the embedded database has died and does not start: %s", error)
+            told = True
 
 
 def database_place(settings: Settings | None = None) -> str:

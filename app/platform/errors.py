@@ -77,3 +77,17 @@ class TooMany(BetaloopError):
 
     status = 429
     title = "Too many attempts"
+
+
+class DatabaseAway(BetaloopError):
+    """The database does not answer for the moment."""
+
+    status = 503
+    title = "The database is not available"
+
+
+class StorageFull(BetaloopError):
+    """No room is left on the disk of the service or of its database."""
+
+    status = 507
+    title = "The disk is full"

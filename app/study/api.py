@@ -11,6 +11,8 @@ from app.study import repository, service
 from app.study.deps import CurrentParticipant, CurrentSession, CurrentVisit
 from app.study.outcomes import values as outcome_values
 from app.study.schemas import (
+    ConditionsChange,
+    ConditionsOut,
     DerivedChoice,
     OutcomeOut,
     ParticipantIn,
@@ -27,6 +29,7 @@ from app.study.schemas import (
     VisitOut,
 )
 from app.study.serializers import outcome_out, participant_out, session_out, trace_out, visit_out
+from app.study.sessions import conditions
 from app.study.sessions.data import session_data
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
@@ -121,6 +124,20 @@ def change_session(session: CurrentSession, change: SessionChange, db: Db, calle
 def read_trace(session: CurrentSession, db: Db) -> TraceOut:
     """Beta and amplitude on the 2 s grid; rows with t_s <= 0 are the window before the session."""
     return trace_out(session_data(db, session))
+
+
+@router.get("/sessions/{session_id}/conditions")
+def read_conditions(session: CurrentSession) -> ConditionsOut | None:
+    """What the session ran under; null of a proposal, whose conditions are taken down when it is confirmed."""
+    return ConditionsOut.model_validate(session.conditions) if session.conditions else None
+
+
+@router.put("/sessions/{session_id}/conditions", responses=problems(409))
+def change_conditions(session: CurrentSession, change: ConditionsChange, db: Db, caller: CurrentCaller) -> ConditionsOut:
+    """Correct what the session ran under; buffers made from now on take it from here, those made before keep theirs."""
+    row = conditions.change(db, session, change, caller)
+    db.commit()
+    return ConditionsOut.model_validate(row)
 
 
 @router.get("/sessions/{session_id}/qoc")

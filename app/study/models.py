@@ -11,6 +11,7 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.accounts.models import Site
 from app.platform.database import Base
+from app.study.sessions.models import SessionConditions
 
 
 class Controller(StrEnum):
@@ -106,6 +107,7 @@ class SettingsVersion(Base):
     min_valid_fraction: Mapped[float]
     most_imputed: Mapped[int] = mapped_column(SmallInteger, server_default="0")
     beta_measure: Mapped[str] = mapped_column(String(10), server_default="rms")
+    pool_programmings: Mapped[bool] = mapped_column(server_default="false")
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
@@ -231,11 +233,17 @@ class StudySession(Base):
         back_populates="session", order_by="SessionSegment.start_s", cascade="all, delete-orphan", passive_deletes=True
     )
     qocs: Mapped[list[QocRevision]] = relationship(back_populates="session", order_by="QocRevision.revision")
+    conditions_revisions: Mapped[list[SessionConditions]] = relationship(order_by="SessionConditions.revision")
 
     @property
     def qoc(self) -> QocRevision | None:
         """The newest revision of the session's QoCs."""
         return self.qocs[-1] if self.qocs else None
+
+    @property
+    def conditions(self) -> SessionConditions | None:
+        """What the session ran under, newest revision; None of a proposal, whose conditions are taken down when it is confirmed."""
+        return self.conditions_revisions[-1] if self.conditions_revisions else None
 
 
 class Recording(Base):

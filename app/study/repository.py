@@ -184,7 +184,7 @@ def last_editor(db: Session, entity: str, row_id: int) -> str:
 def lock_session(db: Session, session: StudySession) -> None:
     """Lock a session and read its QoCs again, so that two corrections at once become two revisions and neither is lost."""
     db.execute(select(StudySession.id).where(StudySession.id == session.id).with_for_update())
-    db.expire(session, ["qocs"])
+    db.expire(session, ["qocs", "conditions_revisions"])
 
 
 def tremor_series(db: Session, participant_id: int, start: datetime, stop: datetime) -> Sequence[TremorSeries]:
@@ -248,6 +248,20 @@ def has_policy(db: Session, participant_id: int, policy_id: int) -> bool:
     return db.scalar(select(policies.c.id).where(policies.c.id == policy_id, policies.c.participant_id == participant_id)) is not None
 
 
+def released_limits(db: Session, policy_id: int, moment: datetime | None) -> tuple[float, float] | None:
+    """Amplitude limits, mA, of the newest bundle of a policy that was released before a moment; None where there is none.
+
+    Bundles belong to a later phase; of their table only the limits are needed here.
+    """
+    names = ("policy_id", "min_ma", "max_ma", "created_at")
+    releases = table("bundle_release", *(column(name) for name in names))
+    query = select(releases.c.min_ma, releases.c.max_ma).where(releases.c.policy_id == policy_id)
+    if moment is not None:
+        query = query.where(releases.c.created_at <= moment)
+    row = db.execute(query.order_by(releases.c.created_at.desc()).limit(1)).first()
+    return None if row is None else (float(row.min_ma), float(row.max_ma))
+
+
 def settings_version(db: Session, settings_version_id: int) -> SettingsVersion:
     """A settings version by its row number."""
     return db.get_one(SettingsVersion, settings_version_id)
@@ -267,6 +281,7 @@ def _sessions() -> Select[StudySession]:
             joinedload(StudySession.visit).joinedload(Visit.participant).joinedload(Participant.site),
             joinedload(StudySession.visit).selectinload(Visit.cdbs_amplitudes),
             selectinload(StudySession.qocs),
+            selectinload(StudySession.conditions_revisions),
             selectinload(StudySession.segments).joinedload(SessionSegment.recording),
         )
     )

@@ -103,6 +103,11 @@ class SettingsFields(Model):
     beta_measure: BetaMeasure = Field(
         "rms", description="Beta from time-domain LFP: 'rms' amplitude (in its unit) or 'power' (unit squared)."
     )
+    pool_programmings: Bool = Field(
+        False,
+        description="Sessions under other contacts, pulse widths or rates than the participant's newest enter buffers too; a clinician's "
+        "word, for the same fraction is another dose there.",
+    )
 
 
 class SettingsIn(SettingsFields):
@@ -263,6 +268,80 @@ class SessionChange(Model):
     control_channel: Text | None = Field(None, max_length=80)
     excluded_reason: Text | None = Field(None, max_length=1000, description="Keeps it out of buffers and analyses; null takes that back.")
     reason: Text | None = Field(None, max_length=1000)
+
+
+class HoldModel(Model):
+    """One amplitude that a design held."""
+
+    start: Int = Field(ge=0, le=1_000_000, description="First step.")
+    steps: Int = Field(ge=1, le=1_000_000)
+    amplitude: Number = Field(ge=0, le=1, description="Fraction of the cDBS amplitude.")
+    log_density: Number | None = Field(description="Of the amplitude given the level and the bound in force; null where nothing was drawn.")
+
+
+class DesignParameters(Model):
+    """What a design drew for one session."""
+
+    level: Number | None = Field(None, ge=0, le=1, description="Of the session, fraction of the cDBS amplitude; null where it has none.")
+    holds: list[HoldModel] = Field(default_factory=list, max_length=10_000, description="In order, without gaps.")
+
+
+class ProgramModel(Model):
+    """One stimulation program as it was set; null or empty where it is not known."""
+
+    hemisphere: Hemisphere | None = None
+    group: Text | None = Field(None, max_length=10)
+    program: Int = Field(0, ge=0, le=3)
+    contacts: Text = Field("", max_length=200, description="With their signs, e.g. '+C-2'.")
+    pulse_width_us: Number | None = Field(None, gt=0, le=1000)
+    rate_hz: Number | None = Field(None, gt=0, le=1000)
+
+
+class ConditionsFields(Model):
+    """What a session ran under."""
+
+    lower_bound: Number = Field(description="B in force, fraction: random amplitudes were drawn from [B, 1].")
+    window: Int = Field(description="W, beta amplitudes in a state.")
+    period_s: Number = Field(description="Seconds per step.")
+    xi_beta: Number | None = Field(description="Beta threshold, in the unit of the settings of the time.")
+    min_ma: Number | None = Field(description="Lowest amplitude that limits allowed, mA.")
+    max_ma: Number | None = Field(description="Highest amplitude that limits allowed, mA.")
+    seed: Int | None = Field(description="Of the design.")
+    design: Literal["paper", "stratified", "ladder"] | None = Field(description="Of a random session; null where nobody stated one.")
+    design_parameters: DesignParameters
+    lead_amplitude_ma: Number | None = Field(description="Amplitude in force just before the session, mA.")
+    cdbs_amplitude_ma: Number | None = Field(description="cDBS amplitude when the session was confirmed, mA; for the record.")
+    programming: list[ProgramModel] = Field(description="Programs that stimulated, on every side that was recorded.")
+
+
+class ConditionsOut(ConditionsFields):
+    """Newest revision of a session's conditions."""
+
+    revision: int
+    origin: Literal["stated", "settings", "assumed"] = Field(
+        description="Who tells B, W, period and threshold: a person or plan, the settings in force when the session ran, or neither."
+    )
+    entered_by: str
+    reason: str | None
+    created_at: datetime
+
+
+class ConditionsChange(Model):
+    """What is stated of a session's conditions; what is left out stays."""
+
+    lower_bound: Number | None = Field(None, ge=0, lt=1)
+    window: Int | None = Field(None, ge=1, le=500)
+    period_s: Number | None = Field(None, gt=0, le=600)
+    xi_beta: Number | None = None
+    min_ma: Number | None = Field(None, ge=0, le=25.5)
+    max_ma: Number | None = Field(None, ge=0, le=25.5)
+    seed: Int | None = None
+    design: Literal["paper", "stratified", "ladder"] | None = None
+    design_parameters: DesignParameters | None = None
+    lead_amplitude_ma: Number | None = Field(None, ge=0, le=25.5)
+    cdbs_amplitude_ma: Number | None = Field(None, gt=0, le=25.5)
+    programming: list[ProgramModel] | None = Field(None, max_length=16)
+    reason: Text = Field(min_length=1, max_length=1000, description="Why; kept with the revision and in the audit trail.")
 
 
 class TraceOut(Model):

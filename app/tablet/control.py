@@ -21,18 +21,15 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from app.platform.errors import Invalid
 from app.settings import get_settings
 from app.tablet.battery import Implant, read_implant
-from app.tablet.sources import Row, Source, Wish, open_source
+from app.tablet.sources import Source, Wish, open_source
 from ml.deploy.appraisal import battery_gain
 from ml.deploy.bundle import OpenBundle, open_bundle
 from ml.deploy.manifest import BundleError, BundleManifest
+from ml.deploy.runtime import decision_log
 from ml.deploy.runtime.envelope import Decision, Reason, Signal, reason_names
 from ml.deploy.wording import battery_words, warning_sentences
 from ml.energy import relative_energy, saving_percent
 
-COLUMNS = (
-    "t_s", "beta", "unit", "valid", "window", "fraction", "requested_ma", "amplitude_ma", "action", "reasons", "latency_us", "signal_us",
-    "late_ms", "missed", "detail",
-)  # fmt: skip
 _KEY = "bundle-signing"
 
 
@@ -151,7 +148,7 @@ class DecisionLog:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._rows = path, -1  # the first row is the header
+        self._path, self._rows = path, -2  # the first lines are the kind and the header
         try:
             if path.is_file() and path.stat().st_size:
                 raise Invalid(f"The log {path} is there already.", "Name a new file: no decision is written over.")
@@ -215,8 +212,9 @@ def drive(
     """
     controller = opened.controller()
     writer = csv.writer(sink) if sink else None
-    if writer:
-        writer.writerow(COLUMNS)
+    if sink and writer:
+        sink.write(f"{decision_log.kind_line(run.period_s)}\r\n")
+        writer.writerow(decision_log.COLUMNS)
     window: deque[float] = deque(maxlen=opened.manifest.window)
     rows = source.rows
     row = next(rows, None)
@@ -244,7 +242,8 @@ def drive(
         if row.sample is not None and not decision.reasons & Reason.LATE_SAMPLE:
             window.append(row.sample.beta)
         if writer:
-            writer.writerow(_log_row(row, decision, list(window), latency_us, late_s, missed))
+            told = decision_log.cells(row.now_s, row.sample, decision, list(window), latency_us, row.signal_us, late_s, missed)
+            writer.writerow(told)
         try:
             row = rows.send(decision.amplitude_ma)
         except StopIteration:
@@ -307,28 +306,6 @@ def _public_key(key: str | None) -> Ed25519PublicKey:
         return Ed25519PublicKey.from_public_bytes(bytes.fromhex(text))
     except ValueError as error:
         raise Invalid("The key is not 64 hexadecimal digits.", "GET /api/v1/bundle-key gives it.") from error
-
-
-def _log_row(row: Row, decision: Decision, window: list[float], latency_us: float, late_s: float, missed: bool) -> list[Any]:
-    sample = row.sample
-    shown = window[len(window) - decision.valid :] if decision.valid else []
-    return [
-        f"{decision.t_s:.3f}",
-        "" if sample is None else f"{sample.beta:.6g}",
-        "" if sample is None else sample.signal.unit,
-        decision.valid,
-        " ".join(f"{beta:.6g}" for beta in shown),
-        "" if decision.fraction is None else f"{decision.fraction:.7g}",
-        "" if decision.requested_ma is None else f"{decision.requested_ma:.6g}",
-        f"{decision.amplitude_ma:.6g}",
-        "cdbs" if decision.fallback else "policy",
-        " ".join(reason_names(decision.reasons)),
-        f"{latency_us:.1f}",
-        f"{row.signal_us:.1f}",
-        f"{1000.0 * late_s:.3f}",
-        int(missed),
-        decision.detail,
-    ]
 
 
 def _spread(values: Any) -> dict[str, float] | None:

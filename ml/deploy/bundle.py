@@ -46,6 +46,8 @@ WEIGHTS, HEADER, SELF_TEST = "weights.f32", "betaloop_controller.h", "selftest.c
 HEADER_INT8, SELF_TEST_INT8 = "betaloop_controller_int8.h", "selftest_int8.c"
 _RUNTIME = Path(__file__).parent / "runtime"
 RUNNER = tuple(f"controller/{path.name}" for path in sorted(_RUNTIME.glob("*.py")))
+_LATER = {"controller/decision_log.py"}
+"""Files of the runner that bundles of version 0.1.0 do not have; these stay in use."""
 _REQUIRED = {SHEET, MODEL, VECTORS}
 _OF_NETWORKS = {WEIGHTS, HEADER, SELF_TEST, *RUNNER}
 _OF_SMALL_NETWORKS = {HEADER_INT8, SELF_TEST_INT8}
@@ -202,7 +204,7 @@ def _check_names(manifest: BundleManifest, present: set[str]) -> None:
     """The files named, and those inside, are one of the three sets that a bundle can be."""
     named = set(manifest.files)
     wanted = _REQUIRED | (_OF_NETWORKS if manifest.layers else set()) | (_OF_SMALL_NETWORKS if manifest.int8_bound is not None else set())
-    if named != wanted:
+    if named not in (wanted, wanted - _LATER):
         raise BundleError(f"the manifest must name {', '.join(sorted(wanted))}; it names {', '.join(sorted(named)) or 'nothing'}")
     for name in sorted(present ^ named):
         raise BundleError(f"the bundle lacks {name}" if name in named else f"the bundle holds {name}, which the manifest does not name")

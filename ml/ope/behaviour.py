@@ -92,10 +92,10 @@ def clone(states: Floats, actions: Floats, seed: int = 0) -> tuple[Policy, float
 
 
 def clones(buffer: ReplayBuffer, seed: int = 0) -> dict[Key, tuple[Policy, float]]:
-    """A stand-in for every controller of a buffer: uniform for random sessions, else a clone, with its residual spread."""
+    """A stand-in for every controller of a buffer: uniform for sessions drawn at every step, else a clone, with its residual spread."""
     result: dict[Key, tuple[Policy, float]] = {}
     for key, indices in controllers(buffer).items():
-        bounds = [buffer.sessions[i].random_lower_bound for i in indices]
+        bounds = [buffer.sessions[i].uniform_bound for i in indices]
         known = [b for b in bounds if b is not None]
         if known:
             lower = float(np.mean(known))

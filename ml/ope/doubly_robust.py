@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ml.ope.estimate import Estimate, checked_horizon
 from ml.ope.fqe.estimator import FittedFqe, Fqe, FqeConfig, QMember, head_schedule, value_estimate, within_reach
-from ml.ope.fqe.steps import TargetActions, fresh_memory
-from ml.ope.importance import behaviour_densities, horizon_of_ten, kernel_log_density
+from ml.ope.fqe.steps import TargetActions
+from ml.ope.importance import behaviour_densities, horizon_of_ten, kernel_log_density, session_log_ratios
 from ml.ope.linear.end_outcomes import summarise
 from ml.ope.registry import Size
 from ml.ope.scale import outcome_table
@@ -126,6 +126,12 @@ class FittedDoublyRobust:
         rows = table.session[early], table.step[early]
         log_ratio[rows] = (kernel_log_density(table.actions, target.at, self.bandwidth) - self.density)[early]
         mask[rows] = True
+        for i, session in enumerate(self.fqe.buffer.sessions):
+            own = early & (table.session == i)
+            if session.holds and own.any():
+                k = table.step[own]
+                ratios = session_log_ratios(session, k, target.at[own], self.density[own], self.bandwidth)
+                log_ratio[i, k], mask[i, k] = ratios, np.isfinite(ratios).all()  # what cannot be weighed corrects nothing
         return log_ratio, mask
 
     def _value(self, view: _View, pick: Indices, log_ratio: Floats, mask: Mask, horizon: int) -> tuple[Floats, float]:
@@ -154,7 +160,7 @@ class _View:
     def __init__(self, member: QMember, fqe: FittedFqe, target: TargetActions) -> None:
         table = fqe.table
         self.member, self.table, self.span = member, table, target.span
-        self.start = member.features(table.first_states, target.first, fresh_memory(target.first))
+        self.start = member.features(table.first_states, target.first, table.first_memory(target.first))
         self.then = member.features(table.next_states, target.then, target.memory)
         self.products = member.grams.product(self.then)
         self._order = np.argsort(table.step, kind="stable")

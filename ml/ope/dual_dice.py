@@ -21,7 +21,8 @@ from torch import Tensor
 
 from ml.ope.estimate import Estimate, checked_horizon
 from ml.ope.fqe.estimator import value_estimate, within_reach
-from ml.ope.fqe.steps import TargetActions, UsableSteps, ValueFeatures, fresh_memory, usable_steps
+from ml.ope.fqe.steps import TargetActions, UsableSteps, ValueFeatures, usable_steps
+from ml.ope.lead import dose_before
 from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
 from ml.ope.registry import Size
 from ml.ope.support.coverage import AmplitudeSupport
@@ -153,7 +154,7 @@ class DualDice:
         Raises:
             ValueError: no usable step, or no session with a complete s_0.
         """
-        table, c = usable_steps(buffer), self.config
+        table, c = usable_steps(buffer, before=dose_before(buffer)), self.config
         draws = resamples(table.sessions, c.refits, c.seed)
         inputs = ValueFeatures(table, 0, c.seed)
         report(1.0, "inputs of the density ratios")
@@ -182,7 +183,7 @@ class FittedDualDice:
         targets = [TargetActions.of(table, policy) for policy in policies.values()]
         now = self.inputs(table.states, table.actions, table.memory)
         then = np.stack([self.inputs(table.next_states, t.then, t.memory) for t in targets])
-        first = np.stack([self.inputs(table.first_states, t.first, fresh_memory(t.first)) for t in targets])
+        first = np.stack([self.inputs(table.first_states, t.first, table.first_memory(t.first)) for t in targets])
         zeta = ratios(now, then, first, self._shares(), self.buffer.settings.gamma, self.config, report)
         support = AmplitudeSupport(self.buffer)
         return {name: self._estimate(policy, z, horizon, support) for (name, policy), z in zip(policies.items(), zeta, strict=True)}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal, cast
 
@@ -19,6 +20,8 @@ from scipy.stats import norm
 from ml.ope.behaviour import Key, clones, controller_key, rule_of_thumb_bandwidth
 from ml.ope.estimate import LEVEL, Estimate, checked_horizon
 from ml.ope.flags import Flag
+from ml.ope.holds import Abstention, abstention, held_log_ratios
+from ml.ope.holds import flags as hold_flags
 from ml.ope.registry import Size
 from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size, few_effective
 from ml.policies.policy import Policy
@@ -102,8 +105,9 @@ def kernel_log_density(amplitude: Floats, centre: Floats, bandwidth: float) -> F
 def behaviour_log_density(session: SessionTrajectory, bandwidth: float, cloned: tuple[Policy, float] | None = None) -> Floats:
     """Log density of the logged amplitudes of a session, [T]; NaN where unusable.
 
-    Random sessions: uniform on [B, 1]. Others: a kernel around `cloned`, what the controller does at the window and the spread around
-    it, at least as wide as the one that smooths the target, so that a target that acts alike has the ratio 1 and none grows without end.
+    Random sessions drawn at every step: uniform on [B, 1]; held draws: 0 here, their holds have the densities (`ml.ope.holds`). Others: a
+    kernel around `cloned`, what the controller does at the window and the spread around it, at least as wide as the one that smooths the
+    target, so that a target that acts alike has the ratio 1 and none grows without end.
 
     Raises:
         ValueError: neither a known density nor a clone.
@@ -113,8 +117,11 @@ def behaviour_log_density(session: SessionTrajectory, bandwidth: float, cloned: 
     result = np.full(session.steps, np.nan)
     if not usable.any():
         return result
-    if session.random_lower_bound is not None:
-        result[usable] = -np.log(1 - session.random_lower_bound)
+    if session.uniform_bound is not None:
+        result[usable] = -np.log(1 - session.uniform_bound)
+        return result
+    if session.holds:
+        result[usable] = 0.0
         return result
     if cloned is None:
         raise ValueError(f"session {session.session_id} has no known density, and none was estimated")
@@ -128,6 +135,22 @@ def behaviour_densities(buffer: ReplayBuffer, bandwidth: float | None, seed: int
     width = rule_of_thumb_bandwidth(buffer) if bandwidth is None else bandwidth
     cloned: dict[Key, tuple[Policy, float]] = clones(buffer, seed)
     return [behaviour_log_density(s, width, cloned.get(controller_key(s))) for s in buffer.sessions], width
+
+
+def session_log_ratios(session: SessionTrajectory, steps: NDArray[np.int64], target: Floats, density: Floats, bandwidth: float) -> Floats:
+    """Log ratios of a session's usable steps, [k]; -inf at the first one where the session cannot be weighed for this policy.
+
+    Args:
+        session: whose amplitudes. steps: usable steps, rising, [k]. target: what the policy does there, [k].
+        density: log density of the logged amplitudes, [k]. bandwidth: of the kernel around the target.
+    """
+    if not session.holds:
+        return kernel_log_density(np.clip(session.amplitude[steps], 0, 1), target, bandwidth) - density
+    if abstention(session, steps, target, bandwidth) is None:
+        return held_log_ratios(session, steps, target, partial(kernel_log_density, bandwidth=bandwidth))
+    nothing = np.zeros(len(steps))
+    nothing[:1] = -np.inf
+    return nothing
 
 
 @dataclass(frozen=True)
@@ -160,7 +183,7 @@ class ImportanceSampling:
         Raises:
             ValueError: no session is left to weigh.
         """
-        kept = [s for s in buffer.sessions if s.usable().any() and not (self.only_random and s.random_lower_bound is None)]
+        kept = [s for s in buffer.sessions if s.usable().any() and not (self.only_random and not _known_density(s))]
         if not kept:
             raise ValueError("importance sampling has no session to weigh: none has a usable step with a behaviour density")
         every, bandwidth = behaviour_densities(buffer, self.bandwidth, self.seed)
@@ -190,18 +213,26 @@ class FittedImportance:
         return estimates
 
     def log_ratios(self, policy: Policy, horizon: int) -> tuple[Floats, Mask, Floats]:
-        """Log ratios, the mask of usable steps, and rewards, [N, H] each."""
+        """Log ratios, the mask of usable steps, and rewards, [N, H] each; -inf at the first step of a session that cannot be weighed."""
         n = len(self.sessions)
         log_ratio, rewards, mask = np.zeros((n, horizon)), np.zeros((n, horizon)), np.zeros((n, horizon), dtype=bool)
         for i, (s, density) in enumerate(zip(self.sessions, self.densities, strict=True)):
             k = np.flatnonzero(s.usable())
             k = k[k < horizon]
             if k.size:
-                target = policy.act(s.states()[k])
-                log_ratio[i, k] = kernel_log_density(np.clip(s.amplitude[k], 0, 1), target, self.bandwidth) - density[k]
+                log_ratio[i, k] = session_log_ratios(s, k, policy.act(s.states()[k]), density[k], self.bandwidth)
                 rewards[i, k] = s.rewards(self.buffer.settings)[k]
                 mask[i, k] = True
         return log_ratio, mask, rewards
+
+    def _abstentions(self, policy: Policy, horizon: int) -> tuple[Flag, ...]:
+        """Flags of the sessions of held draws that this policy cannot be weighed in."""
+        reasons: list[Abstention | None] = []
+        for s in self.sessions:
+            k = np.flatnonzero(s.usable()[:horizon])
+            reasons.append(abstention(s, k, policy.act(s.states()[k]), self.bandwidth) if s.holds and k.size else None)
+        weighed = any(reason is None and _known_density(s) for reason, s in zip(reasons, self.sessions, strict=True))
+        return hold_flags(reasons, others=weighed)
 
     def _estimate(self, policy: Policy, horizon: int, support: AmplitudeSupport) -> Estimate:
         config, gamma = self.settings, self.buffer.settings.gamma
@@ -234,6 +265,7 @@ class FittedImportance:
         flags = list(logged.flags())
         if effective < FEW_EFFECTIVE:
             flags.append(few_effective("few_effective_sessions", effective, len(end), refuses=True))
+        flags += self._abstentions(policy, horizon)
         if not known.any():
             flags.append(Flag.of("no_end_reward"))
         return Estimate(
@@ -246,7 +278,7 @@ class FittedImportance:
             step_return=step,
             end_reward=end_value if known.any() else None,
             predicted={},
-            supported=logged.supported and effective >= FEW_EFFECTIVE,
+            supported=logged.supported and effective >= FEW_EFFECTIVE and not any(f.refuses for f in flags),
             flags=tuple(flags),
             n=len(end),
             details={
@@ -257,12 +289,17 @@ class FittedImportance:
                 "effective_sample_size": effective,
                 "largest_weight_share": largest,
                 "horizon_of_ten": horizon_of_ten(log_ratio, mask),
-                "sessions_of_known_density": sum(s.random_lower_bound is not None for s in self.sessions),
+                "sessions_of_known_density": sum(_known_density(s) for s in self.sessions),
                 "sessions_left_out": len(self.buffer.sessions) - len(self.sessions),
                 "coverage": logged.to_json(),
                 "draws": [float(d) for d in draws[:200]],
             },
         )
+
+
+def _known_density(session: SessionTrajectory) -> bool:
+    """Whether the session's amplitudes were drawn from a density that is known."""
+    return session.uniform_bound is not None or any(h.log_density is not None for h in session.holds)
 
 
 def _signed_exp(log_weights: Floats, values: Floats) -> Floats:

@@ -47,6 +47,20 @@ class Sums:
         """Of a design [n, q] and targets [n]."""
         return cls(design.T @ design, design.T @ y, float(y @ y), len(y))
 
+    @classmethod
+    def pooled(cls, parts: Sequence[Sums]) -> Sums:
+        """Of the rows of all parts together, at least one part."""
+        return cls(
+            np.sum([p.gram for p in parts], axis=0),
+            np.sum([p.moment for p in parts], axis=0),
+            sum(p.square for p in parts),
+            sum(p.rows for p in parts),
+        )
+
+    def without(self, part: Sums) -> Sums:
+        """Of the rows that are not in a part of them."""
+        return Sums(self.gram - part.gram, self.moment - part.moment, self.square - part.square, self.rows - part.rows)
+
 
 @dataclass(frozen=True)
 class MixedModel:
@@ -99,9 +113,32 @@ class MixedModel:
         variance = float(squares[0]) / problem.degrees
         return RestrictedFit(tuple(self.estimated), best, means[0], variance * factors[0] @ factors[0].T, variance)
 
+    def likeliest(self, sums: Sums) -> tuple[Floats, Floats]:
+        """The likeliest lambdas [G] and the coefficients [q] there: `fit` without what the data leave open.
+
+        Raises:
+            ValueError: no row.
+        """
+        if sums.rows < 1:
+            raise ValueError("a mixed model needs at least one row")
+        problem = _Problem(self, sums)
+        best = problem.search(len(self.estimated))
+        return best, problem.solve(best[None])[1][0]
+
     def conditional(self, sums: Sums, ratios: Floats) -> Floats:
         """Coefficients [q] at given lambdas, one per estimated group."""
         return _Problem(self, sums).solve(ratios[None])[1][0]
+
+    def conditional_draws(self, sums: Sums, ratios: Floats, number: int, rng: np.random.Generator) -> Floats:
+        """Draws [number, q] at given lambdas; columns that no row has are drawn from their prior."""
+        problem = _Problem(self, sums)
+        _, means, factors, squares = problem.solve(ratios[None])
+        sigma = np.sqrt(squares[0] / problem.degrees)
+        drawn = means[0] + sigma * rng.standard_normal((number, self.columns)) @ factors[0].T
+        for ratio, columns in zip(ratios, self.estimated.values(), strict=True):
+            unseen = np.setdiff1d(np.asarray(columns, dtype=np.int64), problem.live)
+            drawn[:, unseen] = sigma * np.sqrt(ratio) * rng.standard_normal((number, unseen.size))
+        return np.asarray(drawn, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -189,26 +226,50 @@ class _Problem:
         for column, ratio in self.known.items():
             self.fixed[column] = 1 / ratio
 
+    def log_posterior(self, ratios: Floats) -> Floats:
+        """Log posterior of the lambdas [K, G], [K], up to a constant: `solve` without what the search does not need.
+
+        The last diagonal element of the Cholesky factor of [[A, m], [m^T, y^T y]] is the root of y^T y - m^T A^-1 m.
+        """
+        q = len(self.live)
+        joint = np.zeros((len(ratios), q + 1, q + 1))
+        joint[:, :q, :q] = self.gram + self._penalties(ratios)[:, :, None] * np.eye(q)
+        joint[:, q, :q] = joint[:, :q, q] = self.moment
+        # a little more than y^T y keeps the matrix positive definite where the fit is perfect
+        floor = self._floor
+        joint[:, q, q] = self.square + floor
+        diagonal = np.diagonal(np.linalg.cholesky(joint), axis1=1, axis2=2)
+        return self._logs(ratios, diagonal[:, :q], np.maximum(diagonal[:, q] ** 2 - floor, floor))
+
     def solve(self, ratios: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Log posterior of the lambdas [K] (up to a constant), coefficients [K, q], factors [K, q, q], squares [K] at lambdas [K, G]."""
-        penalties = np.tile(self.fixed, (len(ratios), 1))
-        for g, columns in enumerate(self.groups):
-            penalties[:, columns] = 1 / ratios[:, g : g + 1]
-        matrices = self.gram + penalties[:, :, None] * np.eye(len(self.live))
+        matrices = self.gram + self._penalties(ratios)[:, :, None] * np.eye(len(self.live))
         lower = np.linalg.cholesky(matrices)
         inverse = np.linalg.inv(lower)
         half = inverse @ self.moment
-        floor = 1e-12 * max(self.square, 1e-12)
-        squares = np.maximum(self.square - np.sum(half**2, axis=1), floor)
-        counts = np.array([len(columns) for columns in self.groups], dtype=np.float64)
-        log_det = 2 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(1) + np.log(ratios) @ counts
-        # In log lambda the half-Cauchy of sqrt(lambda) has the density sqrt(lambda) / (1 + lambda).
-        prior = (0.5 * np.log(ratios) - np.log1p(ratios)).sum(1) if self.prior else 0.0
-        logs = prior - 0.5 * (log_det + self.degrees * np.log(squares))
+        squares = np.maximum(self.square - np.sum(half**2, axis=1), self._floor)
+        logs = self._logs(ratios, np.diagonal(lower, axis1=1, axis2=2), squares)
         means, factors = np.zeros((len(ratios), self.q)), np.zeros((len(ratios), self.q, self.q))
         means[:, self.live] = np.einsum("kji,kj->ki", inverse, half)
         factors[:, self.live[:, None], self.live] = np.swapaxes(inverse, 1, 2)
         return logs, means, factors, squares
+
+    @property
+    def _floor(self) -> float:
+        return 1e-12 * max(self.square, 1e-12)
+
+    def _penalties(self, ratios: Floats) -> Floats:
+        penalties = np.tile(self.fixed, (len(ratios), 1))
+        for g, columns in enumerate(self.groups):
+            penalties[:, columns] = 1 / ratios[:, g : g + 1]
+        return penalties
+
+    def _logs(self, ratios: Floats, diagonal: Floats, squares: Floats) -> Floats:
+        counts = np.array([len(columns) for columns in self.groups], dtype=np.float64)
+        log_det = 2 * np.log(diagonal).sum(1) + np.log(ratios) @ counts
+        # In log lambda the half-Cauchy of sqrt(lambda) has the density sqrt(lambda) / (1 + lambda).
+        prior = (0.5 * np.log(ratios) - np.log1p(ratios)).sum(1) if self.prior else 0.0
+        return np.asarray(prior - 0.5 * (log_det + self.degrees * np.log(squares)), dtype=np.float64)
 
     def search(self, groups: int) -> Floats:
         """Likeliest lambdas [G], one coordinate at a time, first over decades, then around what was found."""
@@ -226,16 +287,16 @@ class _Problem:
 
     def steps(self, best: Floats) -> list[float]:
         """Ratio between neighbouring lambdas of the grid, per group."""
-        top = self.solve(best[None])[0][0]
+        top = self.log_posterior(best[None])[0]
         found = []
         for g in range(len(best)):
             trial = np.tile(best, (2 * len(STEPS), 1))
             trial[:, g] = np.clip(best[g] * np.concatenate([STEPS, 1 / np.array(STEPS)]), SMALLEST, LARGEST)
-            fall = (top - self.solve(trial)[0]).reshape(2, -1).mean(0)
+            fall = (top - self.log_posterior(trial)).reshape(2, -1).mean(0)
             found.append(next((s for s, f in zip(STEPS, fall, strict=True) if f >= 0.5), STEPS[-1]))
         return found
 
     def _along(self, best: Floats, g: int, values: Floats) -> float:
         trial = np.tile(best, (len(values), 1))
         trial[:, g] = values
-        return float(values[int(np.argmax(self.solve(trial)[0]))])
+        return float(values[int(np.argmax(self.log_posterior(trial)))])

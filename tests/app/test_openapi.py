@@ -63,7 +63,19 @@ INTENDED: dict[str, str] = {
             "components > schemas > PipelineJob > properties > methods",
             "paths > /api/v1/participants/{code}/ranking > get > parameters > query method",
         ),
-        "Evaluation: a further method by name, `impulse`",
+        "Evaluation: further methods by name, `impulse` and `posterior`",
+    ),
+    **dict.fromkeys(
+        (
+            "components > schemas > ConditionsChange",
+            "components > schemas > ConditionsOut",
+            "components > schemas > DesignParameters",
+            "components > schemas > HoldModel",
+            "components > schemas > ProgramModel",
+            "components > schemas > SnapshotSessionOut",
+            "paths > /api/v1/sessions/{session_id}/conditions",
+        ),
+        "API: `GET` and `PUT /sessions/{id}/conditions` read and correct what a session ran under; a snapshot's session names the revision",
     ),
     **dict.fromkeys(
         (

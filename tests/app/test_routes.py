@@ -28,6 +28,7 @@ READABLE = (
     "/api/v1/visits/{visit_id}/sessions",
     "/api/v1/sessions/{session_id}",
     "/api/v1/sessions/{session_id}/trace",
+    "/api/v1/sessions/{session_id}/conditions",
     "/api/v1/sessions/{session_id}/qoc",
     "/api/v1/sessions/{session_id}/outcomes",
     "/api/v1/uploads/{upload_id}",
@@ -61,6 +62,7 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("patch", "/api/v1/visits/{visit_id}"): {"clinician", "engineer", "admin"},
     ("patch", "/api/v1/sessions/{session_id}"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/sessions/{session_id}/outcomes"): {"clinician", "engineer", "admin"},
+    ("put", "/api/v1/sessions/{session_id}/conditions"): {"clinician", "engineer", "admin"},
     ("put", "/api/v1/sessions/{session_id}/qoc"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/uploads"): {"clinician", "engineer", "admin"},
     ("patch", "/api/v1/proposals/{session_id}"): {"clinician", "engineer", "admin"},
@@ -137,6 +139,7 @@ class World:
             ("patch", "/visits/{visit_id}"): {"json": {"note": "tired", "reason": "forgotten"}},
             ("patch", "/sessions/{session_id}"): {"json": {"excluded_reason": "cable", "reason": "said so"}},
             ("post", "/sessions/{session_id}/outcomes"): {"session_id": derived, "json": {"name": "grasp_hz", "value": 2.5}},
+            ("put", "/sessions/{session_id}/conditions"): {"json": {"lower_bound": 0.2, "reason": "protocol sheet"}},
             ("put", "/sessions/{session_id}/qoc"): {"json": {"rating": 5, "reason": "misread"}},
             ("post", "/uploads"): {
                 "data": {"participant": "P3", "visit": "1", "controller": "cdbs"},

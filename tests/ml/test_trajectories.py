@@ -9,7 +9,7 @@ import pytest
 
 from ml.mdp import MdpSettings
 from ml.qoc import Qoc
-from ml.trajectories import ReplayBuffer, SessionTrajectory, content_hash, from_parquet, to_parquet
+from ml.trajectories import Hold, ReplayBuffer, SessionTrajectory, content_hash, from_parquet, to_parquet
 
 SETTINGS = MdpSettings(xi_beta=0.5, window=3)
 
@@ -173,6 +173,25 @@ def test_the_stored_form_keeps_everything_and_its_hash() -> None:
             b.qoc,
             b.random_lower_bound,
         )
+
+
+def test_held_draws_survive_storing_and_a_buffer_without_them_keeps_its_bytes() -> None:
+    holds = (Hold(0, 3, -0.25), Hold(3, 1, None))
+    held = ReplayBuffer(SETTINGS, (session(1, holds=holds),), "uV", "table")
+    again = from_parquet(to_parquet(held))
+    assert again.sessions[0].holds == holds
+    assert again.sessions[0].uniform_bound is None
+    assert again.sessions[0].random_lower_bound == 0.3
+    plain = ReplayBuffer(SETTINGS, (session(1),), "uV", "table")
+    assert from_parquet(to_parquet(plain)).sessions[0].uniform_bound == 0.3
+    assert b'"schema_version": 1' in to_parquet(plain)
+    assert b'"schema_version": 3' in to_parquet(held)
+
+
+@pytest.mark.parametrize("holds", [(Hold(1, 2, None),), (Hold(0, 2, None), Hold(3, 1, None)), (Hold(0, 5, None),), (Hold(0, 0, None),)])
+def test_holds_leave_no_step_out_and_end_with_the_session(holds: tuple[Hold, ...]) -> None:
+    with pytest.raises(ValueError, match="leave out steps or go beyond"):
+        session(1, holds=holds)
 
 
 def test_another_file_is_no_snapshot() -> None:

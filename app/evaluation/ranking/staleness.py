@@ -67,6 +67,7 @@ def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot) ->
         shut_out = bool(session.excluded_reason) or (learned and not barrier.is_open)
         free = session.id in readmitted or (learned and opened)
         found["qoc"] += (session.qoc.id if session.qoc else None) != pinned.qoc_id
+        found["conditions"] += pinned.conditions_id is not None and (session.conditions and session.conditions.id) != pinned.conditions_id
         found["left_out"] += shut_out and pinned.left_out_reason is None
         found["included"] += free and not shut_out and pinned.left_out_reason is not None
         present = _sources(session, participant.current_settings, heads)

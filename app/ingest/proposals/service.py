@@ -24,6 +24,7 @@ from app.study import repository as study
 from app.study import service as study_service
 from app.study.models import Controller, Participant, Recording, StudySession
 from app.study.service import POLICY_CONTROLLERS
+from app.study.sessions import conditions
 from app.study.sessions.contradictions import contradictions, control_recording, local_day
 from app.study.sessions.stimulation import delivered
 from app.study.sessions.usable_steps import sentence, usable_steps
@@ -70,6 +71,7 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
             f"Session {session.id}: visit {guess.visit.number}, {stated.controller}, {length}, {seen} (recording {placement.control.id})."
         )
         flagged = [*placement.notes, *sessions.fix_milliamperes(db, session), *sentences(contradictions(db, session))]
+        conditions.record(db, session, upload.created_by)
         return NewSession(session, group, [said, usable, *outcomes_intake.derive(db, session)], flagged)
     evidence = {"visit": guess.why, "controller": BY_UPLOAD}
     controller = stated.controller
@@ -232,7 +234,9 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
     sessions.refuse_overlap(db, session)
     session.status = "confirmed"
     db.flush()
-    return [*sessions.fix_milliamperes(db, session), *sentences(contradictions(db, session)), *outcomes_intake.derive(db, session)]
+    kept_as_fractions = sessions.fix_milliamperes(db, session)
+    conditions.record(db, session, caller.label)
+    return [*kept_as_fractions, *sentences(contradictions(db, session)), *outcomes_intake.derive(db, session)]
 
 
 def split(db: Session, session: StudySession, version: int, parts: Sequence[PartIn], caller: Caller) -> list[StudySession]:

@@ -52,7 +52,7 @@ BEGUN = "begun"
 """Member of a file's report: how often reading it was begun, while it is being read."""
 ASIDE = "aside_sha256"
 """Member of a file's report: hash of its bytes without identity, where these are what the quarantine holds, and not the original."""
-TABLES = ("csv", "parquet")
+TABLES = ("csv", "parquet", "control_log")
 MEDIA_TYPE = "application/octet-stream"
 
 

@@ -27,15 +27,16 @@ from app.platform.errors import Invalid
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.models import Participant, SettingsVersion, StudySession
+from app.study.models import Hemisphere, Participant, SettingsVersion, StudySession
 from app.study.sessions.data import session_data
+from app.study.sessions.programming import Program, differences, stored
 from app.study.threshold import mdp_settings, suggest_xi_beta
 from app.study.traces import StepTable
 from ml.mdp import MdpSettings
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
 
 PARQUET = "application/vnd.apache.parquet"
-PINS_VERSION = 1
+PINS_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class Member:
             table.amplitude_trace.id if table and table.amplitude_trace else None,
             self.decode_version,
             self.session.qoc.id if self.session.qoc else None,
+            self.session.conditions.id if self.session.conditions else None,
             table.cdbs_ma if table else None,
             self.left_out,
             _digest(s) if s else None,
@@ -69,6 +71,11 @@ class Member:
     def decode_version(self) -> int | None:
         """Decode version of the session's beta trace."""
         return self.table.beta_trace.decode_version if self.table and self.table.beta_trace else None
+
+    @property
+    def programs(self) -> list[Program]:
+        """Stimulation programs that the session ran under; empty where they are not known."""
+        return stored(self.session.conditions.programming) if self.session.conditions else []
 
     @property
     def steps(self) -> int | None:
@@ -118,7 +125,8 @@ def collect(db: Session, participant: Participant) -> Collection:
     read = [_read(db, session, version) for session in sessions]
     unit, source = _signal(version, read)
     barrier = gate(db, participant, sessions)
-    members = tuple(_pass_gate(_admit(m, unit, source), barrier) for m in read)
+    admitted = _of_one_programming([_admit(m, unit, source) for m in read], version)
+    members = tuple(_pass_gate(m, barrier) for m in admitted)
     if not any(m.trajectory for m in members):
         reasons = Counter(m.left_out for m in members)
         listed = "; ".join(f"{n} x {reason}" for reason, n in reasons.most_common(4))
@@ -181,7 +189,7 @@ def _read(db: Session, session: StudySession, version: SettingsVersion) -> Membe
         table = session_data(db, session).table
     except Invalid as error:
         return Member(session, None, None, str(error))
-    trajectory = trajectory_of(session, table, blinding.arm(session, SYSTEM), version, version.lower_bound)
+    trajectory = trajectory_of(session, table, blinding.arm(session, SYSTEM), version)
     if isinstance(trajectory, str):
         return Member(session, table, None, trajectory)
     if not trajectory.usable().any():
@@ -234,6 +242,21 @@ def _admit(m: Member, unit: str, source: str) -> Member:
     return Member(m.session, m.table, None, reason)
 
 
+def _of_one_programming(members: list[Member], version: SettingsVersion) -> list[Member]:
+    """Leave out sessions under other contacts, pulse widths or rates than the newest of their side: a fraction is another dose there."""
+    if version.pool_programmings:
+        return members
+    newest: dict[Hemisphere | None, list[Program]] = {}
+    for m in members:
+        if m.programs:
+            newest[m.session.hemisphere] = m.programs  # members come by visit and order
+    found = []
+    for m in members:
+        differs = differences(m.programs, newest.get(m.session.hemisphere, ()), m.session.hemisphere) if m.trajectory else []
+        found.append(Member(m.session, m.table, None, wording.other_programming(differs)) if differs else m)
+    return found
+
+
 def _pass_gate(m: Member, barrier: Gate) -> Member:
     """Leave out sessions of learned policies while the gate is shut."""
     if m.trajectory is None or barrier.is_open or blinding.arm(m.session, SYSTEM).controller not in LEARNED:
@@ -250,6 +273,7 @@ def _row(snapshot_id: int, m: Member) -> SnapshotSession:
         amplitude_trace_id=table.amplitude_trace.id if table and table.amplitude_trace else None,
         decode_version=m.decode_version,
         qoc_id=m.session.qoc.id if m.session.qoc else None,
+        conditions_id=m.session.conditions.id if m.session.conditions else None,
         cdbs_amplitude_ma=table.cdbs_ma if table else None,
         steps=m.steps,
         left_out_reason=m.left_out,
@@ -261,5 +285,5 @@ def _digest(s: SessionTrajectory) -> str:
     digest = hashlib.sha256()
     for values in (s.lead_beta, s.beta, s.amplitude):
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes() + b"|")
-    digest.update(repr(s.random_lower_bound).encode())
+    digest.update(repr((s.random_lower_bound, s.lead_amplitude)).encode())
     return digest.hexdigest()

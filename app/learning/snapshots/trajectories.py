@@ -11,21 +11,24 @@ from app.study.traces import StepTable
 from ml.trajectories import SessionTrajectory
 
 
-def trajectory_of(
-    session: StudySession, table: StepTable, arm: Arm, version: SettingsVersion, random_bound: float | None = None
-) -> SessionTrajectory | str:
+def trajectory_of(session: StudySession, table: StepTable, arm: Arm, version: SettingsVersion) -> SessionTrajectory | str:
     """The session's steps after its start, with the window of beta before it; or why there are none.
 
     Args:
         session: its QoCs are taken in their newest revision. table: its steps, [window + T].
         arm: what drove it, as far as the asker may know.
         version: W, and how many steps of a state may be imputed (one is always measured).
-        random_bound: B in force, kept for a session of the random controller.
+
+    B of a random session and the amplitude before it are those of its conditions, whatever the settings say today.
     """
     reason = own_reason(session, table)
     if reason is not None:
         return reason
-    window = version.window
+    window, conditions = version.window, session.conditions
+    lead_ma = conditions.lead_amplitude_ma if conditions else None
+    # B alone is the density of a new uniform draw every step: the paper's design, which a random session without a stated one is taken for
+    drawn_each_step = conditions is not None and conditions.design in (None, "paper")
+    random_bound = conditions.lower_bound if conditions is not None and drawn_each_step else None
     return SessionTrajectory(
         session_id=session.id,
         visit=session.visit.number,
@@ -36,6 +39,7 @@ def trajectory_of(
         amplitude=table.fraction[window:],
         qoc=qoc_of(session),
         random_lower_bound=random_bound if arm.controller is Controller.RANDOM else None,
+        lead_amplitude=lead_ma / table.cdbs_ma if lead_ma is not None and table.cdbs_ma else None,
         most_imputed=min(version.most_imputed, window - 1),
     )
 

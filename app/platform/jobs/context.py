@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -19,18 +20,8 @@ StepOutcome = dict[str, Any]
 """`{"ok": True, "result": {...}}`, `{"ok": False, "message": "..."}` or, never started, `{"ok": False, "skipped": True}`."""
 
 
-class Durable(Protocol):
-    """Runs a body once and gives its recorded result after a crash."""
-
-    def durable(self, name: str, body: Callable[[], StepOutcome]) -> StepOutcome:
-        """One step."""
-
-    def durable_all(self, steps: Sequence[tuple[str, Callable[[], StepOutcome]]]) -> list[StepOutcome]:
-        """Steps side by side; results in the order given."""
-
-
 class Steps(Protocol):
-    """Carries out the steps of one job and keeps their records."""
+    """Carries out the steps of one job and keeps their records; a step that has ended gives its recorded outcome."""
 
     def declare(self, key: str, title: str, weight: float) -> None:
         """Make the step's row unless it is there."""
@@ -56,16 +47,13 @@ class JobContext:
         created_by: who submitted it.
     """
 
-    def __init__(
-        self, id: str, kind: str, participant_id: int | None, params: dict[str, Any], created_by: str, steps: Steps, engine: Durable
-    ) -> None:
+    def __init__(self, id: str, kind: str, participant_id: int | None, params: dict[str, Any], created_by: str, steps: Steps) -> None:
         self.id = id
         self.kind = kind
         self.participant_id = participant_id
         self.params = params
         self.created_by = created_by
         self._steps = steps
-        self._engine = engine
         self._used: set[str] = set()
 
     def step(self, key: str, title: str | None = None, *, weight: float = 1.0) -> None:
@@ -105,16 +93,18 @@ class JobContext:
             self._use(key)
         failed: list[str] = []
 
-        def body(key: str, name: str, params: dict[str, Any]) -> Callable[[], StepOutcome]:
-            def run() -> StepOutcome:
-                outcome = self._steps.compute(key, name, params, lambda: bool(failed))
-                if not outcome["ok"]:
-                    failed.append(key)
-                return outcome
+        def run(call: tuple[str, str, dict[str, Any]]) -> StepOutcome:
+            outcome = self._steps.compute(*call, lambda: bool(failed))
+            if not outcome["ok"]:
+                failed.append(call[0])
+            return outcome
 
-            return run
-
-        outcomes = self._engine.durable_all([(f"compute:{key}", body(key, name, params)) for key, name, params in calls])
+        if not calls:
+            return []
+        with ThreadPoolExecutor(max_workers=len(calls), thread_name_prefix="fan-out") as pool:
+            # a step that raises (cancel, stop) does not keep the others from ending: the pool waits for all
+            futures = [pool.submit(run, call) for call in calls]
+        outcomes = [future.result() for future in futures]
         for (key, _, _), outcome in zip(calls, outcomes, strict=True):
             if not outcome["ok"] and not outcome.get("skipped"):
                 raise StepFailed(key, outcome["message"])
@@ -129,7 +119,7 @@ class JobContext:
             StepFailed: `fn` raised; nothing that it wrote remains.
         """
         self._use(key)
-        outcome = self._engine.durable(f"transact:{key}", lambda: self._steps.transact(key, fn))
+        outcome = self._steps.transact(key, fn)
         if not outcome["ok"]:
             raise StepFailed(key, outcome["message"])
         result: dict[str, Any] = outcome["result"]

@@ -1,30 +1,27 @@
 """The durable-workflow engine: the only module that knows DBOS (3.4 or later, below 4).
 
 Every job is one workflow `betaloop.job(job_id)` on one queue, in the schema `dbos` of our own PostgreSQL. DBOS keeps the queue, says which
-executor owns a workflow and replays it after a crash; what people see (status, steps, results) stands in our own tables. Three things
-the library leaves to us: noticing dead executors (`recover`), moving waiting jobs to a new protocol (`adopt_older_protocols`), and
-deleting what finished long ago (`delete_finished`).
+executor owns a workflow and starts it again after a crash. It records no step: status, steps and results stand once, in our own tables
+(`ledger`). Three things the library leaves to us: noticing dead executors (`recover`), moving waiting jobs to a new protocol
+(`adopt_older_protocols`), and deleting what finished long ago (`delete_finished`).
 """
 
 from __future__ import annotations
 
-import contextvars
 import json
 import logging
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from dbos import DBOS, DBOSClient, DBOSConfig, EnqueueOptions
-from dbos._dbos import StepReservation
 from dbos._serialization import Serializer
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
-PROTOCOL = "3"
-"""Version of the job protocol: raise it when orchestrations change the order of their steps or the meaning of recorded results."""
+PROTOCOL = "4"
+"""Version of the job protocol: raise it when orchestrations change the keys of their steps or the meaning of recorded results."""
 
 MAX_RECOVERIES = 3
 """A job whose worker dies this many times after the first is given up: it is likely what kills them."""
@@ -34,8 +31,6 @@ SCHEMA = "dbos"
 QUEUE = "jobs"
 WORKFLOW = "betaloop.job"
 QUEUE_POLL_S = 0.5
-
-Body = Callable[[], dict[str, Any]]
 
 
 class JsonSerializer(Serializer):
@@ -158,32 +153,6 @@ def shutdown() -> None:
     _runner = None
 
 
-class Durability:
-    """Steps of the workflow that runs in this thread."""
-
-    def durable(self, name: str, body: Body) -> dict[str, Any]:
-        """Run `body` as a step: after a crash its recorded result is returned instead."""
-        return DBOS.run_step({"name": name}, body)
-
-    def durable_all(self, steps: Sequence[tuple[str, Body]]) -> list[dict[str, Any]]:
-        """Run bodies side by side, each a step; results in the order given.
-
-        A body that raises (cancel, stop) does not keep the others from ending; then the first such exception is raised.
-        """
-        # positions in the workflow are drawn here, in order, so that a replay finds the same ones whatever the threads do
-        reserved = [(name, body, DBOS.reserve_step()) for name, body in steps]
-        if not reserved:
-            return []
-        with ThreadPoolExecutor(max_workers=len(reserved), thread_name_prefix="fan-out") as pool:
-            # every thread gets a copy of this one's context: it says which workflow the step belongs to
-            futures = [pool.submit(contextvars.copy_context().run, _reserved_step(step, name, body)) for name, body, step in reserved]
-        return [future.result() for future in futures]
-
-
-def _reserved_step(step: StepReservation, name: str, body: Body) -> Body:
-    return lambda: step.run({"name": name}, body)
-
-
 def recover(executor_ids: Sequence[str]) -> list[str]:
     """Put the unfinished jobs of dead executors back on the queue; returns the ids of those that this call found.
 
@@ -214,8 +183,7 @@ def ended(db: Session, job_ids: Sequence[str]) -> dict[str, str]:
 def adopt_older_protocols(db: Session) -> int:
     """Move unfinished jobs of other protocol versions to ours, at start-up; returns how many.
 
-    DBOS would leave them waiting for ever for a worker of their version. It also replays by position, which a new protocol may have
-    changed: its record of their steps is dropped, and finished steps are found by their keys in `job_step` instead.
+    DBOS would leave them waiting for ever for a worker of their version. Their finished steps are found by their keys in `job_step`.
     """
     rows = db.execute(
         text(
@@ -225,10 +193,7 @@ def adopt_older_protocols(db: Session) -> int:
         ),
         {"version": PROTOCOL, "name": WORKFLOW},
     )
-    moved = [row.workflow_uuid for row in rows]
-    if moved:
-        db.execute(text("delete from dbos.operation_outputs where workflow_uuid = any(:ids)"), {"ids": moved})
-    return len(moved)
+    return len(rows.all())
 
 
 def forgive_attempt(db: Session, executor_id: str) -> None:

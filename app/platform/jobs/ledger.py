@@ -22,6 +22,7 @@ from sqlalchemy.orm import Session
 from app.platform.database import now, set_actor, transaction
 from app.platform.jobs import repository
 from app.platform.jobs.children.supervisor import ChildMessages
+from app.platform.jobs.context import StepOutcome
 from app.platform.jobs.errors import JobCancelled
 from app.platform.jobs.models import Job, JobStatus, JobStep
 
@@ -71,14 +72,23 @@ class Ledger:
 
         self._persist(write)
 
-    def begin(self, key: str) -> dict[str, Any] | None:
-        """Start a step, unless it has its result: that is returned."""
+    def outcome(self, key: str) -> StepOutcome | None:
+        """The outcome of a step that has ended, else None. This record alone says what a job has done before a crash."""
 
-        def write() -> dict[str, Any] | None:
+        def read() -> StepOutcome | None:
+            with self._locked() as (db, job):
+                return _outcome(repository.step(db, job.id, key))
+
+        return self._persist(read)
+
+    def begin(self, key: str) -> StepOutcome | None:
+        """Start a step, unless it has ended: then its outcome is returned."""
+
+        def write() -> StepOutcome | None:
             with self._locked() as (db, job):
                 step = repository.step(db, job.id, key)
-                if step.status == JobStatus.SUCCEEDED:
-                    return step.result
+                if (known := _outcome(step)) is not None:
+                    return known
                 step.status, step.message, step.progress = JobStatus.RUNNING, "", 0.0
                 step.attempts += 1
                 step.worker, step.started_at, step.finished_at = self.worker, now(), None
@@ -171,6 +181,14 @@ class Ledger:
         job.message = f"{step.title}: {step.message}" if step.message else step.title
         data = {"progress": step.progress, "job_progress": job.progress, "message": step.message}
         repository.add_event(db, job.id, "progress", data, step.key)
+
+
+def _outcome(step: JobStep) -> StepOutcome | None:
+    if step.status == JobStatus.SUCCEEDED:
+        return {"ok": True, "result": step.result}
+    if step.status == JobStatus.FAILED:
+        return {"ok": False, "message": step.message}
+    return None
 
 
 def persist(action: Callable[[], Value], check: Callable[[], None]) -> Value:

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.database import new_session
 from app.platform.errors import BetaloopError
-from app.platform.jobs import engine, registry, repository
+from app.platform.jobs import registry, repository
 from app.platform.jobs.children.slots import Slots
 from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall
 from app.platform.jobs.context import JobContext, StepOutcome
@@ -59,12 +59,14 @@ class JobSteps:
     def compute(self, key: str, name: str, params: dict[str, Any], skip: Callable[[], bool]) -> StepOutcome:
         """Run a compute function in a child process, unless `skip()` holds when its turn comes."""
         checked = _as_json(params, f"the params of step {key!r}")
+        if (known := self.ledger.outcome(key)) is not None:  # before waiting for a slot: after a crash, most steps have ended
+            return known
         call = ComputeCall(name, registry.compute_reference(name), checked, self.workdir(key), get_settings().job_memory_mb)
         with self.slots.hold(self.ledger.job_id, self.requests.check):
             if skip():
                 return {"ok": False, "skipped": True}
             if (known := self.ledger.begin(key)) is not None:
-                return {"ok": True, "result": known}
+                return known
             outcome = self.children.run(call, lambda messages: self.ledger.record(key, messages), self.requests.check)
         if outcome["ok"]:
             return {"ok": True, "result": self.ledger.commit_step(key, lambda _: outcome["result"])}
@@ -74,7 +76,7 @@ class JobSteps:
     def transact(self, key: str, fn: Callable[[Session], dict[str, Any]]) -> StepOutcome:
         """Run a function in a database transaction together with its record."""
         if (known := self.ledger.begin(key)) is not None:
-            return {"ok": True, "result": known}
+            return known
         try:
             return {"ok": True, "result": self.ledger.commit_step(key, lambda db: _as_json(fn(db), f"the result of step {key!r}"))}
         except Exception as error:
@@ -151,7 +153,7 @@ class JobRunner:
         if not ledger.open():
             return
         steps = JobSteps(ledger, requests, self._children, self._slots)
-        context = JobContext(job_id, job.kind, job.participant_id, job.params, job.created_by, steps, engine.Durability())
+        context = JobContext(job_id, job.kind, job.participant_id, job.params, job.created_by, steps)
         try:
             if job.cancel_requested_at is not None:
                 raise JobCancelled

@@ -1,4 +1,7 @@
-"""No request body may be larger than the installation's upload limit, stated or not."""
+"""No request body may be larger than its kind allows, stated or not: files up to the installation's upload limit, all else 1 MiB.
+
+JSON and plain forms are read into memory and parsed before anybody asks who calls, hence their small limit.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.settings import get_settings
 
+PLAIN_LIMIT = 1 << 20
+"""Bytes of a JSON document or a plain form."""
 _FORM_ALLOWANCE = 1 << 20  # the form fields and boundaries around a file of the largest size
 
 
@@ -23,10 +28,13 @@ class BodyLimit:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        limit = get_settings().upload_limit_mb * 1024 * 1024 + _FORM_ALLOWANCE
-        stated = dict(scope["headers"]).get(b"content-length", b"0")
+        headers = dict(scope["headers"])
+        has_files = headers.get(b"content-type", b"").lower().startswith(b"multipart/form-data")
+        limit = get_settings().upload_limit_mb * 1024 * 1024 + _FORM_ALLOWANCE if has_files else PLAIN_LIMIT
+        said = _said(has_files)
+        stated = headers.get(b"content-length", b"0")
         if stated.isdigit() and int(stated) > limit:
-            await _refuse(send, scope["path"])
+            await _refuse(send, scope["path"], *said)
             return
         seen = 0
 
@@ -35,23 +43,25 @@ class BodyLimit:
             message = await receive()
             seen += len(message.get("body", b""))
             if seen > limit:
-                # the reader of the form lets this one through to the error handlers
-                raise HTTPException(413, f"The request is larger than {get_settings().upload_limit_mb} MiB.")
+                # those who read the body let this one through to the error handlers
+                raise HTTPException(413, said[0])
             return message
 
         await self.app(scope, counted, send)
 
 
-async def _refuse(send: Send, path: str) -> None:
-    megabytes = get_settings().upload_limit_mb
-    problem = {
-        "type": "about:blank",
-        "title": "The file is too large",
-        "status": 413,
-        "detail": f"The request is larger than {megabytes} MiB.",
-        "hint": "Split the upload, or have BETALOOP_UPLOAD_LIMIT_MB raised.",
-        "instance": path,
-    }
+def _said(has_files: bool) -> tuple[str, str]:
+    """What is wrong and what to do about it."""
+    if has_files:
+        return (
+            f"The request is larger than {get_settings().upload_limit_mb} MiB.",
+            "Split the upload, or have BETALOOP_UPLOAD_LIMIT_MB raised.",
+        )
+    return "The request is larger than 1 MiB and has no file in it.", "Send recordings and policies as files (multipart/form-data)."
+
+
+async def _refuse(send: Send, path: str, detail: str, hint: str) -> None:
+    problem = {"type": "about:blank", "title": "The request is too large", "status": 413, "detail": detail, "hint": hint, "instance": path}
     headers = [(b"content-type", b"application/problem+json"), (b"connection", b"close")]
     await send({"type": "http.response.start", "status": 413, "headers": headers})
     await send({"type": "http.response.body", "body": json.dumps(problem).encode()})

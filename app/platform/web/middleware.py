@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import secrets
 import time
@@ -13,10 +14,12 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse
 from prometheus_client import Counter, Histogram
+from sqlalchemy.exc import DBAPIError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 from starlette.middleware.base import RequestResponseEndpoint
 
-from app.platform.errors import BetaloopError, Forbidden, Unauthorized
+from app.platform.errors import BetaloopError, DatabaseAway, Forbidden, StorageFull, Unauthorized
 from app.platform.web.body_limit import BodyLimit
 from app.platform.web.templates import render
 
@@ -33,11 +36,14 @@ _seconds = Histogram("betaloop_request_seconds", "Time to answer by route.", ["r
 
 def install(app: FastAPI) -> None:
     """Add middleware and error handlers to the service."""
+    app.add_middleware(BodyLimit)  # inside the other: its refusals have the headers of every answer
     app.middleware("http")(_around)
-    app.add_middleware(BodyLimit)
     app.add_exception_handler(BetaloopError, _known_error)
     app.add_exception_handler(RequestValidationError, _bad_input)
     app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(DBAPIError, _database_error)
+    app.add_exception_handler(PoolTimeout, _database_error)
+    app.add_exception_handler(OSError, _system_error)
     app.add_exception_handler(Exception, _unknown_error)
 
 
@@ -124,6 +130,46 @@ async def _http_error(request: Request, error: Exception) -> Response:
     response = _answer(request, _PlainError(error.status_code, str(error.detail)))
     response.headers.update(error.headers or {})
     return response
+
+
+RETRY_S = 5
+_FULL = {errno.ENOSPC, errno.EDQUOT}
+_DISK_FULL = "53100"
+
+
+async def _database_error(request: Request, error: Exception) -> Response:
+    """503 where the database is away, restarting or out of connections, 507 where its disk is full; anything else is an error of ours."""
+    state = getattr(getattr(error, "orig", None), "sqlstate", None)
+    if state == _DISK_FULL:
+        return _full(request, error)
+    invalidated = isinstance(error, DBAPIError) and error.connection_invalidated
+    unreached = isinstance(error, PoolTimeout) or (isinstance(error, OperationalError) and state is None)
+    if not (invalidated or unreached or (state or "")[:2] == "08" or (state or "")[:3] in {"57P", "533"}):
+        return await _unknown_error(request, error)
+    log.warning("the database is away", path=request.url.path, error=type(error).__name__)
+    away = DatabaseAway(
+        "The database does not answer for the moment.",
+        "It comes back by itself. Wait a few seconds, look at what is stored, then try again.",
+    )
+    response = _answer(request, away)
+    response.headers["Retry-After"] = str(RETRY_S)
+    return response
+
+
+async def _system_error(request: Request, error: Exception) -> Response:
+    if isinstance(error, OSError) and error.errno in _FULL:
+        return _full(request, error)
+    return await _unknown_error(request, error)
+
+
+def _full(request: Request, error: Exception) -> Response:
+    log.error("the disk is full", path=request.url.path, error=type(error).__name__)
+    return _answer(
+        request,
+        StorageFull(
+            "There is no room left on the disk.", "Ask your administrator to make room; what was stored before is safe. Then try again."
+        ),
+    )
 
 
 async def _unknown_error(request: Request, error: Exception) -> Response:

@@ -22,7 +22,8 @@ from app.study.blinding import CONTROLLER_NAMES, arm
 from app.study.deps import CurrentSession
 from app.study.form_changes import Shown, own_changes
 from app.study.models import QocRevision, Recording, StudySession
-from app.study.schemas import DerivedChoice, QocIn, SessionChange
+from app.study.schemas import ConditionsChange, DerivedChoice, QocIn, SessionChange
+from app.study.sessions import conditions
 from app.study.sessions import view as session_view
 from app.study.sessions.charts import operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
@@ -36,6 +37,10 @@ router = APIRouter()
 _QOC_LABELS = {"grasp_hz": "Grasp frequency", "rating": "Rating", "tremor_percent": "Tremor", "reason": "Reason"}
 _CORRECTION_LABELS = {
     "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "control": "Control trace", "correction_reason": "Reason",
+}  # fmt: skip
+_CONDITIONS_LABELS = {
+    "lower_bound": "Lower bound B", "xi_beta": "Beta threshold", "min_ma": "Lowest amplitude", "max_ma": "Highest amplitude",
+    "lead_amplitude_ma": "Amplitude before", "conditions_reason": "Reason",
 }  # fmt: skip
 
 
@@ -158,6 +163,24 @@ def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
     return RedirectResponse(f"/sessions/{session.id}?done=corrected", 303)
 
 
+@router.post("/sessions/{session_id}/conditions")
+def correct_conditions(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Correct what a session ran under."""
+    seen = str(values["revision"]) if "revision" in values else None
+    changes = own_changes(values, seen, _conditions_revisions(session), _CONDITIONS_LABELS)
+    reason = str(values.get("conditions_reason", "")).strip()[:1000]
+    try:
+        service.require(caller, can.WRITE_STUDY, session.visit.participant)
+        changes.refuse_conflicts()
+        labels = _CONDITIONS_LABELS | {"reason": "Reason"}
+        conditions.change(db, session, parse(ConditionsChange, changes.fields | {"reason": reason}, labels), caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, db, session, caller, error, typed=changes.fields | {"conditions_reason": reason})
+    db.commit()
+    return RedirectResponse(f"/sessions/{session.id}?done=conditions", 303)
+
+
 @router.post("/sessions/{session_id}/derived")
 def take_derived(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Put the value that the uploaded files give in the place of a typed one."""
@@ -191,6 +214,16 @@ def _shown_qoc(revision: QocRevision | None) -> dict[str, str]:
     """QoCs as the form shows them."""
     values = {n: getattr(revision, n, None) for n in ("grasp_hz", "rating", "tremor_percent")}
     return {name: "" if value is None else f"{value:.4g}" for name, value in values.items()}
+
+
+def _conditions_revisions(session: StudySession) -> list[Shown]:
+    """Every revision of a session's conditions as the form showed it; before the first one, it was empty."""
+    names = [n for n in _CONDITIONS_LABELS if n != "conditions_reason"]
+    found = [Shown(0, dict.fromkeys(names, ""), "")]
+    for row in session.conditions_revisions:
+        values = {n: getattr(row, n) for n in names}
+        found.append(Shown(row.revision, {n: "" if v is None else f"{v:.6g}" for n, v in values.items()}, row.entered_by))
+    return found
 
 
 def _policy_id(db: Session, session: StudySession, name: str) -> int:
@@ -243,6 +276,9 @@ def _page(
         qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
         correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},
         seen=seen,
+        ran_under=dict(_conditions_revisions(session)[-1].fields)
+        | {"conditions_reason": ""}
+        | {k: v for k, v in (typed or {}).items() if k in _CONDITIONS_LABELS},
         may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
         problem=error.problem(request.url.path) if error else None,
     )

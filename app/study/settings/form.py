@@ -76,6 +76,11 @@ GROUPS = (
                 "beta_measure", "Measure of beta", "What is computed from time-domain LFP. Recordings decoded before keep theirs.",
                 options=(("rms", "RMS amplitude, in the LFP's unit"), ("power", "power, in the LFP's unit squared")),
             ),
+            SettingField(
+                "pool_programmings", "Sessions of another programming",
+                "Contacts, pulse width and rate of the newest session count as the participant's. A fraction is another dose under others.",
+                options=(("no", "stay out of buffers"), ("yes", "enter buffers too")),
+            ),
         ),
     ),
     SettingGroup(

@@ -1,19 +1,24 @@
-"""`python -m controller [FOLDER] [--run]`: check an unpacked bundle against its test vectors, and run it on standard input.
+"""`python -m controller [FOLDER] [--run [--log=FILE]]`: check an unpacked bundle against its test vectors, and run it on standard input.
 
 Hashes are checked here; the signature of the manifest is not (that needs a cryptography library): `betaloop control` does.
 """
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 import math
 import sys
+import time
+from collections import deque
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from . import decision_log
 from .controller import BoundedController
 from .envelope import BetaSample, EnvelopeLimits, Signal, reason_names
 from .network import MlpNetwork, Output
@@ -43,7 +48,12 @@ def main(arguments: list[str]) -> int:
         return 1
     sys.stderr.write(f"test vectors agree: worst difference {worst:.3g} of a fraction, {worst_ma:.3g} mA\n")
     if "--run" in arguments:
-        run(manifest, network)
+        log = next((Path(a.removeprefix("--log=")) for a in arguments if a.startswith("--log=")), None)
+        try:
+            run(manifest, network, log)
+        except OSError as error:
+            sys.stderr.write(f"the log {log} cannot be written: {error.strerror}\n")
+            return 1
     return 0
 
 
@@ -66,18 +76,34 @@ def check(manifest: dict[str, Any], network: MlpNetwork, vectors: dict[str, Any]
     return worst, worst_ma
 
 
-def run(manifest: dict[str, Any], network: MlpNetwork) -> None:
-    """One beta amplitude per line in (anything else counts as no number), one amplitude in mA and its reasons per line out."""
+def run(manifest: dict[str, Any], network: MlpNetwork, log: Path | None = None) -> None:
+    """One beta amplitude per line in (anything else counts as no number), one amplitude in mA and its reasons per line out.
+
+    With a log, every decision is a row of it too, handed to the operating system at once. Raises OSError where it is there already or
+    cannot be written.
+    """
     controller, signal = _controller(manifest, network), Signal(manifest["beta_unit"], manifest["beta_source"])
-    for k, line in enumerate(sys.stdin):
-        try:
-            beta = math.nan if "_" in line else float(line)  # float() alone takes "1_5" for 15
-        except ValueError:
-            beta = math.nan
-        now_s = k * manifest["period_s"]
-        decision = controller.decide(now_s, BetaSample(now_s, beta, signal))
-        sys.stdout.write(f"{decision.amplitude_ma:.6g} {' '.join(reason_names(decision.reasons))}\n")
-        sys.stdout.flush()
+    window: deque[float] = deque(maxlen=manifest["window"])
+    with nullcontext() if log is None else log.open("x", newline="", encoding="utf-8") as sink:
+        writer = csv.writer(sink) if sink else None
+        if sink and writer:
+            sink.write(f"{decision_log.kind_line(manifest['period_s'])}\r\n")
+            writer.writerow(decision_log.COLUMNS)
+        for k, line in enumerate(sys.stdin):
+            try:
+                beta = math.nan if "_" in line else float(line)  # float() alone takes "1_5" for 15
+            except ValueError:
+                beta = math.nan
+            now_s = k * manifest["period_s"]
+            sample, began = BetaSample(now_s, beta, signal), time.perf_counter_ns()
+            decision = controller.decide(now_s, sample)
+            latency_us = (time.perf_counter_ns() - began) / 1000.0
+            window.append(beta)
+            sys.stdout.write(f"{decision.amplitude_ma:.6g} {' '.join(reason_names(decision.reasons))}\n")
+            sys.stdout.flush()
+            if sink and writer:
+                writer.writerow(decision_log.cells(now_s, sample, decision, list(window), latency_us))
+                sink.flush()
 
 
 def _controller(manifest: dict[str, Any], network: MlpNetwork) -> BoundedController:

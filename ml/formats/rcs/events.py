@@ -10,12 +10,14 @@ from ml.formats.rcs.amplitude import AmplitudeSteps, delivered, stimulating
 from ml.formats.rcs.labels import parse, render
 from ml.formats.rcs.packets.streams import Adaptive
 from ml.formats.rcs.packets.time import PacketTimes
-from ml.formats.rcs.settings import GROUPS, Settings, get, number
+from ml.formats.rcs.settings import GROUPS, Settings, get, integer, number
 from ml.formats.rcs.traces import Grid
 from ml.formats.recording import EventLog
 
 AMPLITUDE_TOLERANCE_MA = 0.05
 MAX_NOTES = 10_000
+CASE = 16
+"""Index of the case among the electrodes of a program; 0 to 15 are contacts. Source: format notes, A.5."""
 
 
 def stimulation_events(settings: Settings, grid: Grid) -> list[EventLog]:
@@ -25,7 +27,9 @@ def stimulation_events(settings: Settings, grid: Grid) -> list[EventLog]:
         programs = []
         for p in stimulating(state):
             program = state.programs[p]
-            programs.append({"program": p, "amplitude_ma": program.amplitude_ma, "pulse_width_us": program.pulse_width_us})
+            contacts = _contacts(settings, state.group, p)
+            set_to = {"amplitude_ma": program.amplitude_ma, "pulse_width_us": program.pulse_width_us, "contacts": contacts}
+            programs.append({"program": p, **set_to})
         total = delivered(state)
         known = all(np.isfinite(total))
         data: dict[str, Any] = {
@@ -42,6 +46,18 @@ def stimulation_events(settings: Settings, grid: Grid) -> list[EventLog]:
         )
         out.append(EventLog(_t_s(t_ms, grid), "stimulation", label, data))
     return out
+
+
+def _contacts(settings: Settings, group: int | None, program: int) -> str:
+    """Stimulating contacts with their signs, such as `-2 +C` (C: the case); empty where the settings do not tell."""
+    electrodes = get(settings.merged, f"TherapyConfigGroup{group}", "programs", program, "electrodes", "electrodes")
+    signs = {0: "-", 1: "+"}
+    used = [
+        f"{signs[kind]}{'C' if i == CASE else i}"
+        for i, e in enumerate(electrodes if isinstance(electrodes, list) else ())
+        if get(e, "isOff") is False and (kind := integer(get(e, "electrodeType"))) in signs
+    ]
+    return " ".join(sorted(used, key=lambda name: name[0] == "+"))
 
 
 def adaptive_events(data: Adaptive, times: PacketTimes, grid: Grid) -> list[EventLog]:

@@ -8,6 +8,7 @@ from typing import Literal
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, UndecodableFile
+from ml.formats.tables.control_log import decode_log, is_log
 from ml.formats.tables.delimited import read_headers
 from ml.formats.tables.grasps import decode_grasps, looks_like_grasps
 from ml.formats.tables.redact import redact_table
@@ -16,11 +17,12 @@ from ml.formats.tables.strivepd import decode_strivepd, looks_like_tremor
 
 __all__ = ["TableKind", "decode_table", "kind_of_text", "redact_table"]
 
-TableKind = Literal["csv", "parquet", "tremor", "grasp"]
+TableKind = Literal["csv", "parquet", "control_log", "tremor", "grasp"]
 
 _DECODERS: dict[TableKind, Callable[[Path, DecodeOptions, str | None], DecodedFile]] = {
     "csv": decode_csv,
     "parquet": decode_parquet,
+    "control_log": decode_log,
     "tremor": decode_strivepd,
     "grasp": decode_grasps,
 }
@@ -32,7 +34,9 @@ def decode_table(path: Path, kind: TableKind, options: DecodeOptions, name: str 
 
 
 def kind_of_text(path: Path) -> TableKind:
-    """Which table a text is, by its headers."""
+    """Which table a text is, by its first line or its headers."""
+    if is_log(path):
+        return "control_log"
     try:
         headers = read_headers(path)
     except UndecodableFile:

@@ -41,6 +41,9 @@ LONGEST_TABLE_S = 7 * 86_400.0
 """No session's table reaches further from the session's start, before it or after it."""
 _UNIX_SPAN_S = (datetime(1990, 1, 1, tzinfo=UTC).timestamp(), datetime(2200, 1, 1, tzinfo=UTC).timestamp())
 _UNIX_UNITS = (("seconds", 1.0), ("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
+LOG_KIND_LINE = "# betaloop controller log, version 1, period 2 s"
+LOG_COLUMNS = frozenset({"requested_ma", "action", "reasons", "latency_us", "signal_us", "late_ms", "missed"})
+"""Columns that nothing but a controller's log has."""
 NEEDED = "t_s, beta and amplitude_fraction (or amplitude_ma), or t_s and lfp with its unit"
 
 
@@ -98,6 +101,7 @@ def match_columns(headers: Sequence[str]) -> tuple[dict[str, int], dict[str, str
     Raises:
         UndecodableFile: a needed column is missing, named twice or in an unknown unit.
     """
+    _refuse_log(headers)
     found: dict[str, int] = {}
     units: dict[str, str | None] = {}
     unused: list[str] = []
@@ -114,6 +118,18 @@ def match_columns(headers: Sequence[str]) -> tuple[dict[str, int], dict[str, str
         found[role], units[role] = index, _header_unit(role, unit, header, notes)
     _check_complete(found, headers)
     return found, units, unused, notes
+
+
+def _refuse_log(headers: Sequence[str]) -> None:
+    """Raise for a controller's log without its kind line: read as a table of steps, every amplitude would stand one step too early."""
+    if len(LOG_COLUMNS & {column_name(h)[0] for h in headers}) >= 2:
+        raise UndecodableFile(
+            "this looks like the log of a controller without its first line, which says so: each of its rows has the beta of the step that "
+            "ended and the amplitude of the next one, not of the same step",
+            "line 1",
+            f"Upload the log as the controller wrote it. Where `betaloop control` of version 0.1.0 wrote it, put '{LOG_KIND_LINE}' (with "
+            "its period) as a line before the header. A table of steps has no such columns: leave them out.",
+        )
 
 
 def _check_complete(found: dict[str, int], headers: Sequence[str]) -> None:

@@ -14,11 +14,12 @@ from ml.formats.options import DecodeOptions
 from ml.formats.recording import TREMOR_CLASSES, GraspLog, TremorLog
 from ml.formats.redaction_record import Redaction
 from ml.formats.tables.columns import Columns, read_csv, read_parquet
+from ml.formats.tables.control_log import redact_log
 from ml.formats.tables.grasps import decode_grasps
 from ml.formats.tables.steps import decode_columns
 from ml.formats.tables.strivepd import decode_strivepd
 
-TableKind = Literal["csv", "parquet", "tremor", "grasp"]
+TableKind = Literal["csv", "parquet", "control_log", "tremor", "grasp"]
 
 
 def redact_table(source: Path, target: Path, kind: TableKind, options: DecodeOptions) -> Redaction:
@@ -38,6 +39,8 @@ def redact_table(source: Path, target: Path, kind: TableKind, options: DecodeOpt
     """
     if kind in ("tremor", "grasp"):
         return _redact_outcomes(source, target, kind, options)
+    if kind == "control_log":
+        return redact_log(source, target, options)
     columns = read_csv(source, options) if kind == "csv" else read_parquet(source, options)
     decode_columns(columns, options, "table")
     if kind == "csv":

@@ -16,6 +16,7 @@ from scipy.optimize import nnls
 from ml.ope.estimate import LEVEL, Estimate
 from ml.ope.flags import distinct
 from ml.ope.registry import AGGREGATE
+from ml.ope.registry import methods as methods_of_all
 from ml.statistics.bootstrap import percentile_interval
 
 Floats = NDArray[np.float64]
@@ -66,13 +67,14 @@ def combine(estimates: Mapping[str, Mapping[str, Estimate]], bias: Mapping[str, 
     """Combined estimate of every policy.
 
     Args:
-        estimates: method -> policy -> estimate. A method takes part when it is supported for at least one policy.
+        estimates: method -> policy -> estimate. A method takes part when it is supported for at least one policy; combinations do not.
         bias: root mean squared error of each method on left-out controllers, unit of the return.
 
     Raises:
         ValueError: no method takes part, or no policy has been estimated by all that do.
     """
-    methods = [m for m, table in estimates.items() if m != AGGREGATE and any(e.supported for e in table.values())]
+    apart = {m.key for m in methods_of_all() if m.family == "combination"}
+    methods = [m for m, table in estimates.items() if m not in apart and any(e.supported for e in table.values())]
     if not methods:
         raise ValueError("nothing to combine: no method supports any policy")
     policies = common_policies(estimates, methods)

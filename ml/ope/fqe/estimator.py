@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from ml.mdp import MdpSettings
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS
-from ml.ope.fqe.steps import TargetActions, UsableSteps, ValueFeatures, fresh_memory, usable_steps
+from ml.ope.fqe.steps import TargetActions, UsableSteps, ValueFeatures, usable_steps
+from ml.ope.lead import dose_before
 from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
 from ml.ope.observed import day_noise
 from ml.ope.registry import Size
@@ -194,6 +195,7 @@ def replace_steps(table: UsableSteps, keep: NDArray[np.bool_]) -> UsableSteps:
         table.first_states,
         table.first_session,
         table.sessions,
+        table.before,
     )
 
 
@@ -230,7 +232,7 @@ class Fqe:
         Raises:
             ValueError: no usable step, or no session with a complete s_0.
         """
-        table, c = usable_steps(buffer), self.config
+        table, c = usable_steps(buffer, before=dose_before(buffer)), self.config
         folds = session_folds(buffer.sessions, c.folds, c.seed)
         members = []
         for m in range(c.members):
@@ -267,7 +269,7 @@ class FittedFqe:
         table, c, settings = self.table, self.config, self.buffer.settings
         target = TargetActions.of(table, policy)
         everything = np.arange(table.sessions)
-        starts = [m.features(table.first_states, target.first, fresh_memory(target.first)) for m in self.members]
+        starts = [m.features(table.first_states, target.first, table.first_memory(target.first)) for m in self.members]
         products = [m.next_products(target) for m in self.members]
         mains, penalties = [], []
         for member, start, product in zip(self.members, starts, products, strict=True):

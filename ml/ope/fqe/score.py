@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.estimate import checked_horizon
 from ml.ope.fqe.estimator import QMember, fit_member, summaries_of, within_reach
-from ml.ope.fqe.steps import TargetActions, fresh_memory, usable_steps
+from ml.ope.fqe.steps import TargetActions, usable_steps
+from ml.ope.lead import dose_before
 from ml.ope.linear.end_outcomes import fit_end_model
 from ml.ope.scale import learn_scale, session_folds
 from ml.policies.policy import Policy
@@ -55,14 +56,14 @@ def fqe_value(
     settings, sessions = buffer_train.settings, tuple(held_out_sessions)
     horizon = checked_horizon(buffer_train, horizon_steps)
     scale = learn_scale(buffer_train)
-    table = usable_steps(buffer_train, scale)
+    table = usable_steps(buffer_train, scale, dose_before(buffer_train))
     member = fit_member(table, session_folds(buffer_train.sessions, 3, seed), settings.gamma, units, seed)
     target = TargetActions.of(table, policy)
     weights, _ = member.weights(member.next_products(target), np.arange(table.sessions), horizon, settings.gamma)
     own = [s.lead_beta for s in sessions if np.isfinite(s.lead_beta).all()]
     first = np.stack(own) if own else table.first_states
     actions = np.clip(policy.act(first.copy()), 0.0, 1.0)
-    sums = member.features(first, actions, fresh_memory(actions)).mean(0) @ weights[-1]
+    sums = member.features(first, actions, table.first_memory(actions)).mean(0) @ weights[-1]
     sums = within_reach(sums, settings, horizon, (scale.beta_low, scale.beta_high), target.span)
     end_model = fit_end_model(buffer_train)
     end = float(end_model.predict(summaries_of(sums, horizon))[0]) if end_model.seen[0] else 0.0
@@ -79,7 +80,8 @@ def _residual(
     usable = tuple(s for s in sessions if s.usable().any() and np.isfinite(s.lead_beta).all())
     if not usable:
         return 0.0
-    held = usable_steps(ReplayBuffer(buffer.settings, usable, buffer.beta_unit, buffer.beta_source), member.features.scale)
+    part = replace(buffer, sessions=usable)
+    held = usable_steps(part, member.features.scale, member.grams.table.before)
     target = TargetActions.of(held, policy)
     now = member.features(held.states, held.actions, held.memory) @ weights[-1][:, 0]
     then = member.features(held.next_states, target.then, target.memory) @ weights[-2][:, 0]

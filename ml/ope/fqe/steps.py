@@ -33,7 +33,7 @@ def remember(memory: Floats, a: Floats) -> Floats:
 
 
 def fresh_memory(a: Floats) -> Floats:
-    """Memories [N, 3] at a session's first step: as if its amplitude [N] had been on before."""
+    """Memories [N, 3] as if the amplitudes [N] had been on for long."""
     return np.tile(a[:, None], (1, len(DECAYS)))
 
 
@@ -47,10 +47,14 @@ def held_amplitude(session: SessionTrajectory) -> Floats:
     return np.asarray(a[np.where(last < 0, int(np.argmax(known)), last)], dtype=np.float64)
 
 
-def memories(a: Floats) -> Floats:
-    """Memories [T, 3] of a session's amplitudes [T], each row with its own step in it."""
+def memories(a: Floats, before: float | None = None) -> Floats:
+    """Memories [T, 3] of a session's amplitudes [T], each row with its own step in it.
+
+    Args:
+        before: amplitude that had been on for long before the session; its own first one where that is None.
+    """
     result = np.empty((a.size, len(DECAYS)))
-    result[0] = a[0]
+    result[0] = remember(fresh_memory(a[:1] if before is None else np.array([before])), a[:1])[0]
     for k in range(1, a.size):
         result[k] = remember(result[k - 1 : k], a[k : k + 1])[0]
     return result
@@ -69,6 +73,7 @@ class UsableSteps:
         follows: row of the next step of the same session where that is usable too, else -1, [N].
         first_states: s_0 of the sessions without gaps in it, [m, W]. first_session: their indices, [m].
         sessions: n.
+        before: amplitude that had been on before every session; None: each session's first (`ml.ope.lead`).
     """
 
     scale: Scale
@@ -83,14 +88,23 @@ class UsableSteps:
     first_states: Floats
     first_session: Indices
     sessions: int
+    before: float | None = None
+
+    def first_memory(self, a: Floats) -> Floats:
+        """Memories [m, 3] at the first step of sessions under the amplitudes [m], which the dose before them precedes."""
+        return fresh_memory(a) if self.before is None else remember(np.full((a.size, len(DECAYS)), self.before), a)
 
 
-def usable_steps(buffer: ReplayBuffer, scale: Scale | None = None) -> UsableSteps:
-    """The table of a buffer. Raises ValueError when no step is usable or no session starts without gaps."""
+def usable_steps(buffer: ReplayBuffer, scale: Scale | None = None, before: float | None = None) -> UsableSteps:
+    """The table of a buffer whose sessions began after the dose `before`.
+
+    Raises:
+        ValueError: no step is usable, or no session starts without gaps.
+    """
     settings = buffer.settings
     scale = learn_scale(buffer) if scale is None else scale
     steps = buffer.transitions()
-    memory = np.concatenate([memories(held_amplitude(s))[s.usable()] for s in buffer.sessions])
+    memory = np.concatenate([memories(held_amplitude(s), before)[s.usable()] for s in buffer.sessions])
     beta = steps.next_states[:, -1]
     rates = np.stack([steps.rewards, steps.actions, steps.actions**2, beta, (beta >= settings.xi_beta).astype(np.float64)], axis=1)
     next_row = np.arange(1, len(beta) + 1)
@@ -111,6 +125,7 @@ def usable_steps(buffer: ReplayBuffer, scale: Scale | None = None) -> UsableStep
         first_states=np.stack([lead for _, lead in starts]),
         first_session=np.array([i for i, _ in starts], dtype=np.int64),
         sessions=len(buffer.sessions),
+        before=before,
     )
 
 

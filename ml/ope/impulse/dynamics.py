@@ -13,14 +13,14 @@ sessions are random effects.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.fqe.steps import held_amplitude
-from ml.ope.linear.dynamics import autoregression, filtered, log_noise_weights, noise_features
+from ml.ope.linear.dynamics import autoregression, level_model, level_sums, log_noise_weights, noise_features
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedFit, MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -93,9 +93,10 @@ class LaggedMeans:
         return np.moveaxis((self._sums[at[:-1]] - self._sums[at[1:]]) / np.diff(EDGES).reshape(-1, *([1] * value.ndim)), 0, -1)
 
 
-def lagged_means(signal: Floats) -> Floats:
-    """`LaggedMeans` of a whole signal [T], [T, STRETCHES]."""
-    sums = np.concatenate([np.zeros(1), np.cumsum(np.concatenate([np.full(MEMORY, signal[0]), signal]))])
+def lagged_means(signal: Floats, before: float | None = None) -> Floats:
+    """`LaggedMeans` of a whole signal [T] after the value `before` it (its first one where that is None), [T, STRETCHES]."""
+    first = signal[0] if before is None else before
+    sums = np.concatenate([np.zeros(1), np.cumsum(np.concatenate([np.full(MEMORY, first), signal]))])
     now = MEMORY + 1 + np.arange(signal.size)
     at = now[:, None] - np.array(EDGES)
     return np.asarray((sums[at[:, :-1]] - sums[at[:, 1:]]) / np.diff(EDGES), dtype=np.float64)
@@ -113,10 +114,11 @@ class ResponseTable:
     usable: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, session: SessionTrajectory, scale: Scale) -> ResponseTable:
-        """Tables of a session; before its first step the first amplitude counts as held."""
+    def of(cls, session: SessionTrajectory, scale: Scale, before: float | None = None) -> ResponseTable:
+        """Tables of a session after the dose `before` (`ml.ope.lead`); its own first amplitude where that is None."""
         a, window = held_amplitude(session), session.lead_beta.size
-        means = {shape: lagged_means(dose(shape, np.concatenate([np.full(window, a[0]), a]))) for shape in SHAPES}
+        first = a[0] if before is None else before
+        means = {shape: lagged_means(dose(shape, np.concatenate([np.full(window, first), a]))) for shape in SHAPES}
         return cls(scale.beta(session.padded_beta), a, means, session.usable())
 
 
@@ -142,6 +144,8 @@ class ImpulseDynamics:
         noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
         evidence: share of every (shape, alpha).
         shares: lambda / (1 + lambda) of the visits' and the sessions' levels.
+        before: dose before every session; None: each session's first amplitude.
+        ratios: likeliest lambdas of every (shape, alpha).
     """
 
     phi: Floats
@@ -151,6 +155,8 @@ class ImpulseDynamics:
     noise_weights: Floats
     evidence: dict[tuple[str, float], float]
     shares: dict[str, float]
+    before: float | None = None
+    ratios: dict[tuple[str, float], Floats] = field(default_factory=dict)
 
     @property
     def sustained(self) -> Floats:
@@ -180,17 +186,25 @@ class ImpulseDynamics:
         return np.asarray((self.levels + np.array(answer)[:, None]).mean(0), dtype=np.float64)
 
     def response(self, first: Floats, steps: int) -> Response:
-        """The answer to amplitudes that come step by step, first [P, D, n] before them."""
-        return Response(self, first, steps)
+        """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
+        return Response(self, first if self.before is None else np.full_like(first, self.before), steps)
 
 
 class Response:
     """The answer of beta to amplitudes [P, D, n] as they come."""
 
-    def __init__(self, dynamics: ImpulseDynamics, first: Floats, steps: int) -> None:
+    def __init__(self, dynamics: ImpulseDynamics, before: Floats, steps: int) -> None:
         self._dynamics = dynamics
         self._groups = [(SHAPES[s], np.flatnonzero(dynamics.shapes == s)) for s in np.unique(dynamics.shapes)]
-        self._means = [LaggedMeans(dose(shape, first[:, members]), steps) for shape, members in self._groups]
+        self._means = [LaggedMeans(dose(shape, before[:, members]), steps) for shape, members in self._groups]
+        self._before = before
+
+    def lasting(self) -> Floats:
+        """Answer [P, D, n] before the first amplitudes."""
+        answer = np.empty_like(self._before)
+        for shape, members in self._groups:
+            answer[:, members] = dose(shape, self._before[:, members]) * self._dynamics.sustained[members, None]
+        return answer
 
     def step(self, a: Floats) -> Floats:
         """Answer [P, D, n] once the amplitudes a [P, D, n] are in force."""
@@ -200,8 +214,13 @@ class Response:
         return answer
 
 
-def fit_impulse(buffer: ReplayBuffer, tables: Sequence[ResponseTable], draws: int, seed: int) -> ImpulseDynamics:
+def fit_impulse(
+    buffer: ReplayBuffer, tables: Sequence[ResponseTable], draws: int, seed: int, before: float | None = None
+) -> ImpulseDynamics:
     """`draws` sets of coefficients from the posterior over shapes, time scales and coefficients.
+
+    Args:
+        before: the dose before every session that the tables were made with.
 
     Raises:
         ValueError: fewer than two sessions with usable steps.
@@ -225,7 +244,7 @@ def fit_impulse(buffer: ReplayBuffer, tables: Sequence[ResponseTable], draws: in
         [_residual(t, best, own, i) for i, t in enumerate(tables)], [t.beta for t in tables], [t.amplitude for t in tables],
         [t.usable for t in tables], phi,
     )  # fmt: skip
-    return _drawn(combinations, own, phi, noise, draws, seed)
+    return replace(_drawn(combinations, own, phi, noise, draws, seed), before=before)
 
 
 def _beside(best: Combination | None) -> tuple[float, ...]:
@@ -238,7 +257,7 @@ def _weighed(
 ) -> list[Combination]:
     found: list[tuple[str, float, MixedFit]] = []
     for shape in shapes:
-        sums = _sums(tables, own, phi, shape)
+        sums = Sums.pooled(response_sums(tables, own, phi, shape))
         found += [(shape, alpha, _fit(sums, own, alpha)) for alpha in alphas]
     logs = np.array([fit.log_evidence for _, _, fit in found])
     weights = np.exp(logs - logs.max())
@@ -246,41 +265,28 @@ def _weighed(
     return [Combination(s, a, float(w), f) for (s, a, f), w in zip(found, weights, strict=True)]
 
 
-def _sums(tables: Sequence[ResponseTable], own: Floats, phi: Floats, shape: str) -> Sums:
-    """Sums over rows filtered by phi; columns: 1, means over stretches, visits, sessions."""
-    n, visits = len(tables), own.shape[1]
-    rest, q = 1 - float(phi.sum()), 1 + STRETCHES + visits + n
-    gram, moment, square, rows = np.zeros((q, q)), np.zeros(q), 0.0, 0
-    for i, table in enumerate(tables):
-        y = filtered(table.beta[:, None], phi)[table.usable, 0]
-        level = np.concatenate([own[i], np.arange(n) == i]) * rest
-        x = np.concatenate(
-            [np.full((y.size, 1), rest), filtered(table.means[shape], phi)[table.usable], np.tile(level, (y.size, 1))], axis=1
-        )
-        gram, moment, square, rows = gram + x.T @ x, moment + x.T @ y, square + float(y @ y), rows + y.size
-    return Sums(gram, moment, square, rows)
+def response_sums(tables: Sequence[ResponseTable], own: Floats, phi: Floats, shape: str) -> list[Sums]:
+    """Sums of every session over rows filtered by phi; columns: 1, means over stretches of lags, visits, sessions."""
+    return [level_sums(t.beta, t.means[shape], t.usable, own, i, phi) for i, t in enumerate(tables)]
 
 
-def _transform(own: Floats, alpha: float) -> Floats:
-    """Columns of the sums from (1, u, visits, sessions): [q, q + 1]."""
+def moved(sums: Sums, own: Floats, alpha: float) -> Sums:
+    """Sums for the columns (1, u, visits, sessions), of which `prior_root` makes the impulse response."""
     root, levels = prior_root(alpha), own.shape[1] + len(own)
-    result = np.zeros((1 + STRETCHES + levels, 1 + root.shape[1] + levels))
-    result[0, 0] = 1.0
-    result[1 : 1 + STRETCHES, 1 : 1 + root.shape[1]] = root
-    result[1 + STRETCHES :, 1 + root.shape[1] :] = np.eye(levels)
-    return result
+    change = np.zeros((1 + STRETCHES + levels, 1 + root.shape[1] + levels))
+    change[0, 0] = 1.0
+    change[1 : 1 + STRETCHES, 1 : 1 + root.shape[1]] = root
+    change[1 + STRETCHES :, 1 + root.shape[1] :] = np.eye(levels)
+    return Sums(change.T @ sums.gram @ change, change.T @ sums.moment, sums.square, sums.rows)
+
+
+def response_model(own: Floats) -> MixedModel:
+    """The mixed model of the columns (1, u, visits, sessions)."""
+    return level_model((("response", tuple(range(1, 2 + STRETCHES))),), STRETCHES + 1, own, {})
 
 
 def _fit(sums: Sums, own: Floats, alpha: float) -> MixedFit:
-    change = _transform(own, alpha)
-    moved = Sums(change.T @ sums.gram @ change, change.T @ sums.moment, sums.square, sums.rows)
-    first, visits = 1 + STRETCHES + 1, own.shape[1]
-    groups = {
-        "response": tuple(range(1, first)),
-        "visit": tuple(range(first, first + visits)),
-        "session": tuple(range(first + visits, change.shape[1])),
-    }
-    return MixedModel(change.shape[1], groups, {}).fit(moved)
+    return response_model(own).fit(moved(sums, own, alpha))
 
 
 def _split(coefficients: Floats, own: Floats, alpha: float) -> tuple[Floats, Floats]:
@@ -314,4 +320,5 @@ def _drawn(combinations: Sequence[Combination], own: Floats, phi: Floats, noise:
             shapes += [SHAPES.index(combination.shape)] * int(count)
     shares_of = {name: sum(c.weight * c.fit.share(name) for c in combinations) for name in ("visit", "session")}
     evidence = {(c.shape, c.alpha): c.weight for c in combinations}
-    return ImpulseDynamics(phi, np.concatenate(gains), np.array(shapes), np.concatenate(levels), noise, evidence, shares_of)
+    ratios = {(c.shape, c.alpha): c.fit.likeliest for c in combinations}
+    return ImpulseDynamics(phi, np.concatenate(gains), np.array(shapes), np.concatenate(levels), noise, evidence, shares_of, ratios=ratios)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ml.ope.impulse.dynamics import ResponseTable, fit_impulse
+from ml.ope.lead import dose_before
 from ml.ope.linear.end_outcomes import fit_end_model
 from ml.ope.linear.estimator import FittedLinear, LinearConfig
 from ml.ope.registry import Size
@@ -28,9 +29,10 @@ class ImpulseModel:
             ValueError: fewer than two sessions with usable steps.
         """
         c, scale = self.config, learn_scale(buffer)
-        tables = [ResponseTable.of(s, scale) for s in buffer.sessions]
+        before = dose_before(buffer)
+        tables = [ResponseTable.of(s, scale, before) for s in buffer.sessions]
         draws = max(20, min(c.draws, c.most_rows // len(tables)))
-        drawn = fit_impulse(buffer, tables, draws, c.seed)
+        drawn = fit_impulse(buffer, tables, draws, c.seed, before)
         report(0.7, "fitting the response of beta")
         severity = drawn.levels.mean(0)
         end, ends = fit_end_model(buffer, severity=severity), fit_end_model(buffer, draws=draws, seed=c.seed, severity=severity)

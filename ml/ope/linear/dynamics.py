@@ -10,15 +10,15 @@ by phi (Cochrane and Orcutt 1949; generalised least squares), then phi on what i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.fqe.steps import fresh_memory, held_amplitude, memories, remember
 from ml.ope.scale import Scale
-from ml.statistics.mixed import MixedFit, MixedModel, Sums
+from ml.statistics.mixed import MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
@@ -63,11 +63,12 @@ class SessionTable:
     usable: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, session: SessionTrajectory, scale: Scale) -> SessionTable:
-        """Tables of a session; before its first step the first amplitude counts as held."""
+    def of(cls, session: SessionTrajectory, scale: Scale, before: float | None = None) -> SessionTable:
+        """Tables of a session after the dose `before` (`ml.ope.lead`); its own first amplitude where that is None."""
         a = held_amplitude(session)
-        own = answers(a, memories(a))
-        lead = answers(a[:1], fresh_memory(a[:1]))
+        own = answers(a, memories(a, before))
+        first = a[:1] if before is None else np.array([before])
+        lead = answers(first, fresh_memory(first))
         window = session.lead_beta.size
         return cls(scale.beta(session.padded_beta), np.concatenate([np.repeat(lead, window, axis=0), own]), a, session.usable())
 
@@ -81,6 +82,8 @@ class Dynamics:
         beta: answers to the amplitude, [D, 7]. levels: mu + visit + session, [D, n].
         noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
         shares: lambda / (1 + lambda) of the visits' and the sessions' levels; how far they stand out of one step's noise.
+        before: dose before every session; None: each session's first amplitude. log_evidence: of the fit, up to a constant of the rows.
+        ratios: likeliest lambdas of the fit, by group.
     """
 
     phi: Floats
@@ -88,6 +91,9 @@ class Dynamics:
     levels: Floats
     noise_weights: Floats
     shares: dict[str, float]
+    before: float | None = None
+    log_evidence: float = 0.0
+    ratios: Floats = field(default_factory=lambda: np.ones(4))
 
     def innovations(self, tables: Sequence[SessionTable]) -> list[Floats]:
         """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
@@ -101,8 +107,8 @@ class Dynamics:
         return found
 
     def response(self, first: Floats, steps: int) -> LinearResponse:
-        """The answer to amplitudes that come step by step, as if the first [P, D, n] had been on before."""
-        return LinearResponse(self.beta, first)
+        """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
+        return LinearResponse(self.beta, first if self.before is None else np.full_like(first, self.before))
 
     def usual_lead(self) -> Floats:
         """Standardised beta of each session under the mean of the random amplitudes, [n]: where the window before it is not known."""
@@ -115,22 +121,31 @@ class Dynamics:
 
 
 class LinearResponse:
-    """The answer of beta to amplitudes [P, D, n] as they come, with coefficients [D, 7]."""
+    """The answer of beta to amplitudes [P, D, n] as they come after those `before` them, with coefficients [D, 7]."""
 
-    def __init__(self, beta: Floats, first: Floats) -> None:
-        self._beta, self._shape, self._memory = beta, first.shape, fresh_memory(first.ravel())
-        self._started = False
+    def __init__(self, beta: Floats, before: Floats) -> None:
+        self._beta, self._shape, self._memory = beta, before.shape, fresh_memory(before.ravel())
+
+    def lasting(self) -> Floats:
+        """Answer [P, D, n] before the first amplitudes."""
+        return self._answer(self._memory[:, 0])
 
     def step(self, a: Floats) -> Floats:
-        """Answer [P, D, n] once the amplitudes a [P, D, n] are in force; the first call's are those it was made with."""
-        if self._started:
-            self._memory = remember(self._memory, a.ravel())
-        self._started = True
-        return np.einsum("pdnj,dj->pdn", answers(a.ravel(), self._memory).reshape(*self._shape, -1), self._beta)
+        """Answer [P, D, n] once the amplitudes a [P, D, n] are in force."""
+        self._memory = remember(self._memory, a.ravel())
+        return self._answer(a.ravel())
+
+    def _answer(self, a: Floats) -> Floats:
+        return np.einsum("pdnj,dj->pdn", answers(a, self._memory).reshape(*self._shape, -1), self._beta)
 
 
-def fit_dynamics(buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: int, seed: int) -> tuple[Dynamics, Dynamics]:
+def fit_dynamics(
+    buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: int, seed: int, before: float | None = None
+) -> tuple[Dynamics, Dynamics]:
     """The model at its posterior mean (D = 1), and `draws` of its coefficients from their posterior (phi and noise as in the first).
+
+    Args:
+        before: the dose before every session that the tables were made with.
 
     Raises:
         ValueError: fewer than two sessions with usable steps.
@@ -142,17 +157,17 @@ def fit_dynamics(buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: in
     own = (visits[:, None] == np.unique(visits)).astype(np.float64)
     phi = np.zeros(window)
     for _ in range(TURNS):
-        fit = _mixed(tables, own, phi)
-        beta, levels = _split(fit.coefficients[None], own)
+        _, coefficients = linear_model(own).likeliest(Sums.pooled(linear_sums(tables, own, phi)))
+        beta, levels = _split(coefficients[None], own)
         phi = autoregression(_residuals(tables, beta[0], levels[0]), [t.usable for t in tables], window)
-    fit = _mixed(tables, own, phi)
+    fit = linear_model(own).fit(Sums.pooled(linear_sums(tables, own, phi)))
     beta, levels = _split(fit.coefficients[None], own)
     shares = {name: fit.share(name) for name in ("visit", "session")}
     usable, amplitudes = [t.usable for t in tables], [t.amplitude for t in tables]
     noise = log_noise_weights(_residuals(tables, beta[0], levels[0]), [t.beta for t in tables], amplitudes, usable, phi)
-    mean = Dynamics(phi, beta, levels, noise, shares)
+    mean = Dynamics(phi, beta, levels, noise, shares, before, fit.log_evidence, fit.likeliest)
     drawn = _split(fit.draws(draws, np.random.default_rng([seed, 0xD7A])), own)
-    return mean, Dynamics(phi, *drawn, mean.noise_weights, shares)
+    return mean, replace(mean, beta=drawn[0], levels=drawn[1])
 
 
 def largest_root(phi: Floats) -> float:
@@ -161,24 +176,40 @@ def largest_root(phi: Floats) -> float:
     return float(np.abs(roots).max()) if roots.size else 0.0
 
 
-def _mixed(tables: Sequence[SessionTable], own: Floats, phi: Floats) -> MixedFit:
-    """Mixed model of rows filtered by phi; columns: 1, answers, visits, sessions."""
-    n, visits = len(tables), own.shape[1]
-    rest, q = 1 - float(phi.sum()), 1 + ANSWERS + visits + n
-    gram, moment, square, rows = np.zeros((q, q)), np.zeros(q), 0.0, 0
-    for i, table in enumerate(tables):
-        y = filtered(table.beta[:, None], phi)[table.usable, 0]
-        level = np.concatenate([own[i], np.arange(n) == i]) * rest
-        x = np.concatenate([np.full((y.size, 1), rest), filtered(table.answers, phi)[table.usable], np.tile(level, (y.size, 1))], axis=1)
-        gram, moment, square, rows = gram + x.T @ x, moment + x.T @ y, square + float(y @ y), rows + y.size
-    first = 1 + ANSWERS
-    groups = {
-        "timing": (2, 3, 4),
-        "shape": (5, 6, 7),
-        "visit": tuple(range(first, first + visits)),
-        "session": tuple(range(first + visits, q)),
-    }
-    return MixedModel(q, groups, {1: DOSE_RATIO}).fit(Sums(gram, moment, square, rows))
+def level_model(columns: Sequence[tuple[str, Sequence[int]]], width: int, own: Floats, known: Mapping[int, float]) -> MixedModel:
+    """Mixed model of the columns (1, `width` answers, visits, sessions) with groups of answers by name and the levels' own."""
+    first, visits = 1 + width, own.shape[1]
+    q = first + visits + len(own)
+    groups = dict(columns) | {"visit": tuple(range(first, first + visits)), "session": tuple(range(first + visits, q))}
+    return MixedModel(q, groups, known)
+
+
+def level_sums(beta: Floats, answers: Floats, usable: NDArray[np.bool_], own: Floats, i: int, phi: Floats) -> Sums:
+    """Sums over the usable rows of session i, filtered by phi: beta [W + T] on (1, answers [W + T, k], visits, sessions)."""
+    n, visits = own.shape
+    width, rest = answers.shape[1], 1 - float(phi.sum())
+    q = 1 + width + visits + n
+    y, x = filtered(beta[:, None], phi)[usable, 0], filtered(answers, phi)[usable]
+    inner, gram, moment = np.arange(1, 1 + width), np.zeros((q, q)), np.zeros(q)
+    # the levels' columns are constant over a session: of them only sums are needed
+    at = np.concatenate([[0], 1 + width + np.flatnonzero(own[i]), [1 + width + visits + i]])
+    total = x.sum(0) * rest
+    gram[np.ix_(inner, inner)] = x.T @ x
+    gram[np.ix_(at, inner)] = total
+    gram[np.ix_(inner, at)] = total[:, None]
+    gram[np.ix_(at, at)] = rest**2 * y.size
+    moment[inner], moment[at] = x.T @ y, rest * y.sum()
+    return Sums(gram, moment, float(y @ y), y.size)
+
+
+def linear_model(own: Floats) -> MixedModel:
+    """The mixed model of the linear answers."""
+    return level_model((("timing", (2, 3, 4)), ("shape", (5, 6, 7))), ANSWERS, own, {1: DOSE_RATIO})
+
+
+def linear_sums(tables: Sequence[SessionTable], own: Floats, phi: Floats) -> list[Sums]:
+    """Sums of every session for `linear_model`."""
+    return [level_sums(t.beta, t.answers, t.usable, own, i, phi) for i, t in enumerate(tables)]
 
 
 def _split(coefficients: Floats, own: Floats) -> tuple[Floats, Floats]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ml.mdp import step_reward
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS
+from ml.ope.lead import dose_before
 from ml.ope.linear.dynamics import SessionTable, fit_dynamics, largest_root, noise_features
 from ml.ope.linear.end_outcomes import EndModel, fit_end_model, summarise
 from ml.ope.linear.held_out import replay_skill
@@ -39,6 +40,9 @@ BEYOND = 0.25
 
 class Response(Protocol):
     """The answer of beta to amplitudes [P, D, n] as they come."""
+
+    def lasting(self) -> Floats:
+        """Answer [P, D, n] before the first of them."""
 
     def step(self, a: Floats) -> Floats:
         """Answer [P, D, n] once the amplitudes a are in force."""
@@ -65,7 +69,7 @@ class Replayable(Protocol):
         """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
 
     def response(self, first: Floats, steps: int) -> Response:
-        """The answer to amplitudes that come step by step, as if the first [P, D, n] had been on before."""
+        """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
 
     def usual_lead(self) -> Floats:
         """Standardised beta of each session, [n], where the window before it is not known."""
@@ -101,11 +105,12 @@ class LinearModel:
             ValueError: fewer than two sessions with usable steps.
         """
         c, scale = self.config, learn_scale(buffer)
-        tables = [SessionTable.of(s, scale) for s in buffer.sessions]
+        before = dose_before(buffer)
+        tables = [SessionTable.of(s, scale, before) for s in buffer.sessions]
         draws = max(20, min(c.draws, c.most_rows // len(tables)))
-        main, drawn = fit_dynamics(buffer, tables, draws, c.seed)
+        main, drawn = fit_dynamics(buffer, tables, draws, c.seed, before)
         report(0.4, "fitting the linear model")
-        skill = replay_skill(buffer, scale, session_folds(buffer.sessions, c.folds, c.seed))
+        skill = replay_skill(buffer, scale, session_folds(buffer.sessions, c.folds, c.seed), before)
         report(0.8, "replaying left-out sessions")
         severity = main.levels[0]
         end, ends = fit_end_model(buffer, severity=severity), fit_end_model(buffer, draws=draws, seed=c.seed, severity=severity)
@@ -119,6 +124,7 @@ class Replayed:
 
     Attributes:
         step_return, energy, amplitude, beta: discounted step return, mean a^2, mean a and mean beta, [P, D, n].
+        above: share of steps at or above the threshold, [P, D, n].
         outcomes: r_end and QoCs, [P, D, n, 4]. actions: [P, D, n, H].
     """
 
@@ -127,6 +133,7 @@ class Replayed:
     energy: Floats
     amplitude: Floats
     beta: Floats
+    above: Floats
     actions: Floats
 
 
@@ -176,10 +183,10 @@ class FittedLinear:
         for t in range(horizon):
             raw = self.scale.raw_beta(window)
             a = np.stack([policy.act(raw[k].reshape(-1, w)).reshape(d, n) for k, policy in enumerate(policies)])
-            response = response or dynamics.response(a, horizon)
+            if response is None:
+                response = dynamics.response(a, horizon)
+                eta[:] = window - (response.lasting() + level)[..., None]
             rest = response.step(a) + level
-            if t == 0:
-                eta[:] = window - rest[..., None]
             predicted = rest + eta @ dynamics.phi[::-1]
             newest = predicted + np.exp(noise_features(a, predicted) @ dynamics.noise_weights) * noise[:, :, t]
             newest = np.clip(newest, low, high)
@@ -214,7 +221,8 @@ class FittedLinear:
         change = model.predict(summarise(betas, actions, settings.xi_beta))
         known, seen = outcome_table(self.buffer), model.predict(logged[None])
         own = np.where(np.isfinite(known), known - seen, 0.0)
-        return Replayed(returns, model.shifted(change, own), (actions**2).mean(-1), actions.mean(-1), betas.mean(-1), actions)
+        above = (betas >= settings.xi_beta).mean(-1)
+        return Replayed(returns, model.shifted(change, own), (actions**2).mean(-1), actions.mean(-1), betas.mean(-1), above, actions)
 
     def _returns(self, replayed: Replayed) -> Floats:
         return replayed.step_return + (replayed.outcomes[..., 0] if self.end.seen[0] else 0.0)

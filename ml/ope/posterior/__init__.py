@@ -1,1 +1,1 @@
-"""From estimates to tests: the posterior over candidate policies, what to say of each, and which to test at the next visit."""
+"""The posterior over policies: structures averaged by what they predict, a Gaussian process over candidates, updated by tested sessions."""

@@ -1,8 +1,9 @@
 """A virtual population: a distribution over patients at beta level (steps of 2 s), in three parts, with data, policies and true returns."""
 
 from ml.population.virtual.candidates import RelayPolicy, SmoothPolicy, draw_candidates
-from ml.population.virtual.patient import MECHANISMS, SHAPES, TREMORS, Patient, draw_patient
+from ml.population.virtual.patient import MECHANISMS, RATINGS, SHAPES, TREMORS, Patient, draw_patient
 from ml.population.virtual.sessions import Days, Sessions, new_days, simulate, visit_days
+from ml.population.virtual.traits import TRAITS, with_trait
 from ml.population.virtual.world import (
     PARTS,
     WORLDS_PER_PART,
@@ -20,7 +21,9 @@ from ml.population.virtual.world import (
 __all__ = [
     "MECHANISMS",
     "PARTS",
+    "RATINGS",
     "SHAPES",
+    "TRAITS",
     "TREMORS",
     "WORLDS_PER_PART",
     "DataDesign",
@@ -40,6 +43,7 @@ __all__ = [
     "simple_policies",
     "simulate",
     "visit_days",
+    "with_trait",
     "within_margins",
     "world",
 ]

@@ -166,7 +166,7 @@ def advance(
             if z[U_EPISODE] < chance:
                 s[EPISODE] = 1.0 - s[EPISODE]
             s[TREMOR] = EPISODE_SEVERITY * s[EPISODE]
-        out_beta[i, k] = beta
+        out_beta[i, k] = beta * (1 + p.leak * a)
         out_brady[i, k] = p.burden_share * burden + (1 - p.burden_share) * (1 - relief) + 0.5 * need
         out_tremor[i, k] = s[TREMOR]
         out_overload[i, k] = max(a**2 * (1 + 0.3 * m) - p.tolerance - p.act_tolerance * s[ACT], 0.0)

@@ -13,6 +13,8 @@ from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
 Floats = NDArray[np.float64]
 
 HIDDEN = 8
+MOST = 12
+"""Candidates of a world at most."""
 
 
 class RelayPolicy:
@@ -78,7 +80,7 @@ class SmoothPolicy:
 
 
 def draw_candidates(rng: np.random.Generator, xi: float, spread: float, window: int = 10) -> dict[str, Policy]:
-    """Ten candidates, by name.
+    """Eight to twelve candidates, by name: some far apart, several close to cDBS and to each other, as a training sweep leaves them.
 
     Args:
         rng: what they are drawn with. xi: beta threshold. spread: standard deviation of beta, both in the unit of beta.
@@ -95,19 +97,29 @@ def draw_candidates(rng: np.random.Generator, xi: float, spread: float, window: 
     def smooth(bias: float, gain: float, follows: bool) -> SmoothPolicy:
         return SmoothPolicy.draw(rng, xi, spread, bias=bias, gain=gain, follows=follows, window=window)
 
+    def relay() -> RelayPolicy:
+        return RelayPolicy(xi - 0.3 * spread, xi + 0.3 * spread, uniform(0.2, 0.6), uniform(0.75, 1.0))
+
+    def near_cdbs() -> SmoothPolicy:
+        return smooth(uniform(1.2, 3.0), uniform(0.5, 2.0), bool(rng.random() < 0.7))
+
     found: dict[str, Policy] = {
         "constant low": ConstantPolicy(uniform(0.4, 0.55)),
         "constant middle": ConstantPolicy(uniform(0.55, 0.75)),
         "constant high": ConstantPolicy(uniform(0.75, 0.95)),
         "proportional slow": proportional(window),
         "proportional fast": proportional(int(rng.integers(1, 4))),
-        "relay": RelayPolicy(xi - 0.3 * spread, xi + 0.3 * spread, uniform(0.2, 0.6), uniform(0.75, 1.0)),
+        "near cDBS 1": near_cdbs(),
+        "near cDBS 2": near_cdbs(),
         "smooth following": smooth(uniform(-0.5, 1.5), uniform(1.0, 3.0), True),
-        "smooth any": smooth(uniform(-1.5, 2.0), uniform(0.5, 3.0), False),
     }
-    if rng.random() < 0.5:
-        found["saturated"] = smooth(3.5, 0.4, True)
-    else:  # hardly moves from the mean of the random controller
-        found["clone"] = smooth(0.6, 0.4, True)
-    found["nearly off"] = smooth(-3.0, 0.5, True)
-    return found
+    # drawn whether they are taken or not, so that one of them does not change the others
+    optional: dict[str, tuple[float, Policy]] = {
+        "relay": (0.6, relay()),
+        "near cDBS 3": (0.7, near_cdbs()),
+        "smooth any": (0.5, smooth(uniform(-1.5, 2.0), uniform(0.5, 3.0), False)),
+        "clone": (0.4, smooth(0.6, 0.4, True)),  # hardly moves from the mean of the random controller
+        "nearly off": (0.3, smooth(-3.0, 0.5, True)),
+    }
+    taken = {name: policy for name, (share, policy) in optional.items() if rng.random() < share}
+    return found | dict(list(taken.items())[: MOST - len(found)])

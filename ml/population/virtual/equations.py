@@ -14,6 +14,7 @@ D's half-effect amplitude is half exp(day + act_half act): active, more stimulat
     oscillator   r <- |r + (mu r - r^3) / 4 + noise|, mu = osc_base - osc_drop E;  beta = unit (0.3 + r) exp(rest of x)
 
 Noise is an autoregression whose size is noise exp(noise_slope (a - 0.65)). Ringing is a damped second-order answer to changes of a.
+Sensed beta is beta (1 + leak a): an artefact, which symptoms do not feel.
 
 Symptoms have their own dose response S (fast and slow) and a need n = day + act_need act - med_need m:
 
@@ -116,6 +117,7 @@ def step(
     size = p.noise * np.exp(p.noise_slope * (a - 0.65))
     state[:, NOISE] = p.ar * state[:, NOISE] + size * z[:, Z_NOISE]
     beta = _beta(p, state, x, effect, depth, d, z, before_delay=_delayed(p, amplitude, k - 1), reached=reached)
+    out[0][:, k] = beta * (1 + p.leak * a)
     _symptoms(p, xi, constants, state, a, m, beta, z, k, out)
 
 
@@ -193,7 +195,6 @@ def _symptoms(
         state[:, TREMOR] = EPISODE_SEVERITY * state[:, EPISODE]
     else:
         assert p.tremor == NO_TREMOR
-    out[0][:, k] = beta
     out[1][:, k] = p.burden_share * burden + (1 - p.burden_share) * (1 - effect) + 0.5 * need
     out[2][:, k] = state[:, TREMOR]
     out[3][:, k] = np.maximum(a**2 * (1 + 0.3 * m) - p.tolerance - p.act_tolerance * state[:, ACT], 0.0)

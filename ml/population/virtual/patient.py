@@ -17,10 +17,13 @@ MECHANISMS: Final = ("graded", "bursts", "volatility", "hysteresis", "delayed", 
 
 SHAPES: Final = ("line", "hill", "threshold", "u")
 TREMORS: Final = ("none", "graded", "episodic")
+RATINGS: Final = ("mean", "late", "peak_end")
+"""What a rating goes by: the whole session, its last two minutes, or its worst and its last minute."""
 
 BURSTS, VOLATILITY, HYSTERESIS, DELAYED, REGIMES, TOLERANCE, OSCILLATOR = range(1, 8)
 LINE, HILL, THRESHOLD, U_SHAPE = range(4)
 NO_TREMOR, GRADED_TREMOR, EPISODIC_TREMOR = range(3)
+MEAN_RATING, LATE_RATING, PEAK_END_RATING = range(3)
 
 
 class Patient(NamedTuple):
@@ -47,7 +50,9 @@ class Patient(NamedTuple):
         burden_share: share of bradykinesia that follows beta. act_need, act_tolerance: how activity moves need and tolerance, the part of
         the treatment that following beta can better.
         tremor, tremor_max, tremor_theta, tremor_up, tremor_down, tremor_noise, onset: tremor form `TREMORS`, size, rates, onset per step.
-        grasp_low, grasp_high: Hz at most and least bradykinesia. side, tolerance: over-stimulation.
+        leak: share by which stimulation at full amplitude raises the beta that is sensed, not the beta that there is (artefact).
+        grasp_low, grasp_high, grasp_noise: Hz at most and least bradykinesia, error of a test. side, tolerance: over-stimulation.
+        rating_form: `RATINGS`. rating_top, rating_scale, rating_noise: rating without symptoms, how far symptoms lower it, its error.
     """
 
     kind: int
@@ -117,10 +122,16 @@ class Patient(NamedTuple):
     tremor_down: float
     tremor_noise: float
     onset: float
+    leak: float
     grasp_low: float
     grasp_high: float
+    grasp_noise: float
     side: float
     tolerance: float
+    rating_form: int
+    rating_top: float
+    rating_scale: float
+    rating_noise: float
 
     @property
     def mechanism(self) -> str:
@@ -138,12 +149,16 @@ def rate(tau_s: float) -> float:
     return 1.0 - math.exp(-PERIOD_S / tau_s)
 
 
-def draw_patient(kind: int, rng: np.random.Generator, *, silent_beta: bool = False) -> Patient:
-    """A patient of one mechanism.
+def drawn_rate(rng: np.random.Generator, low_s: float, high_s: float) -> float:
+    """Rate of a lag whose time constant is log-uniform between two numbers of seconds."""
+    return rate(math.exp(float(rng.uniform(math.log(low_s), math.log(high_s)))))
+
+
+def draw_patient(kind: int, rng: np.random.Generator) -> Patient:
+    """An ordinary patient of one mechanism; `traits.with_trait` makes it a difficult one.
 
     Args:
         kind: index into `MECHANISMS`. rng: what the constants are drawn with.
-        silent_beta: beta hardly answers to stimulation while symptoms do.
 
     Raises:
         ValueError: there is no such mechanism.
@@ -155,7 +170,7 @@ def draw_patient(kind: int, rng: np.random.Generator, *, silent_beta: bool = Fal
         return float(rng.uniform(low, high))
 
     def tau(low_s: float, high_s: float) -> float:
-        return rate(math.exp(uniform(math.log(low_s), math.log(high_s))))
+        return drawn_rate(rng, low_s, high_s)
 
     def pick(*weights: float) -> int:
         return int(rng.choice(len(weights), p=np.array(weights) / sum(weights)))
@@ -174,7 +189,7 @@ def draw_patient(kind: int, rng: np.random.Generator, *, silent_beta: bool = Fal
         shape=shape,
         half=uniform(0.55, 0.8) if shape == U_SHAPE else uniform(0.3, 0.7),
         steep=uniform(1.5, 5.0),
-        depth=uniform(0.01, 0.04) if silent_beta else uniform(0.35, 0.8),
+        depth=uniform(0.35, 0.8),
         immediate=float(shares[0]),
         fast=float(shares[1]),
         fast_up=tau(2.0, 15.0),
@@ -225,7 +240,7 @@ def draw_patient(kind: int, rng: np.random.Generator, *, silent_beta: bool = Fal
         sym_fast_down=tau(6.0, 40.0),
         sym_slow_up=tau(60.0, 240.0),
         sym_slow_down=tau(120.0, 600.0),
-        burden_share=0.0 if silent_beta else uniform(0.1, 0.7),
+        burden_share=uniform(0.1, 0.7),
         act_need=0.5 * follow * uniform(0.4, 1.0),
         act_tolerance=0.5 * follow * uniform(0.4, 1.0),
         tremor=tremor,
@@ -235,8 +250,14 @@ def draw_patient(kind: int, rng: np.random.Generator, *, silent_beta: bool = Fal
         tremor_down=tau(4.0, 12.0),
         tremor_noise=uniform(0.02, 0.1),
         onset=PERIOD_S / uniform(90.0, 300.0),
+        leak=0.0,
         grasp_low=uniform(1.1, 1.7),
         grasp_high=uniform(2.2, 3.0),
+        grasp_noise=uniform(0.08, 0.2),
         side=uniform(0.3, 2.0) if rng.random() < 0.6 else 0.0,
         tolerance=uniform(0.5, 1.0),
+        rating_form=pick(0.5, 0.25, 0.25),
+        rating_top=uniform(7.5, 9.8),
+        rating_scale=uniform(0.5, 1.1),
+        rating_noise=uniform(0.3, 0.8),
     )

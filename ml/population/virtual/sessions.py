@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 from ml.policies.policy import Policy
 from ml.population.virtual import _kernel, equations
 from ml.population.virtual.equations import CONSTANTS, GAIN, HALF, HOUR, LEVEL, NEED, NOISES, NORMALS, STATES
-from ml.population.virtual.patient import HYSTERESIS, OSCILLATOR, TOLERANCE, Patient
+from ml.population.virtual.patient import (
+    HYSTERESIS,
+    LATE_RATING,
+    OSCILLATOR,
+    PEAK_END_RATING,
+    TOLERANCE,
+    Patient,
+)  # fmt: skip
 
 Floats = NDArray[np.float64]
 
@@ -24,8 +31,7 @@ WARM_STEPS: Final = 30
 """Steps under cDBS before step 0; the last of them are the session's lead."""
 
 HOURS_OF_A_VISIT: Final = 2.0
-GRASP_NOISE_HZ, RATING_NOISE = 0.12, 0.5
-STEPS_PER_MINUTE, GRASP_STEPS = 30, 5
+STEPS_PER_MINUTE, GRASP_STEPS, LATE_STEPS = 30, 5, 60
 OWN_NORMALS: Final = 5
 """Normals of a session: its level, its first drift and activity, and the errors of grasp and rating."""
 MILD = 1.0
@@ -139,13 +145,24 @@ def session_constants(patient: Patient, days: Days, own: Floats) -> Floats:
 def quality(patient: Patient, noise: Floats, amplitude: Floats, brady: Floats, tremor: Floats, overload: Floats) -> tuple[Floats, ...]:
     """Grasp frequency (Hz), rating (1-10) and tremor (%) of sessions from their symptoms, [n, T] each; `noise` [n, 2] standard normals."""
     late = brady[:, -GRASP_STEPS:].mean(axis=1)
-    grasp = patient.grasp_high - (patient.grasp_high - patient.grasp_low) * late + GRASP_NOISE_HZ * noise[:, 0]
-    score = 9.5 - 3.0 * brady.mean(axis=1) - 4.0 * np.minimum(tremor / 2.5, 1.0).mean(axis=1)
-    score -= 3.0 * patient.side * overload.mean(axis=1) + np.abs(np.diff(amplitude, axis=1)).mean(axis=1) + RATING_NOISE * noise[:, 1]
+    grasp = patient.grasp_high - (patient.grasp_high - patient.grasp_low) * late + patient.grasp_noise * noise[:, 0]
     minutes = np.arange(0, tremor.shape[1], STEPS_PER_MINUTE)
     lengths = np.diff(np.append(minutes, tremor.shape[1]))
+    complaint = 3.0 * brady + 4.0 * np.minimum(tremor / 2.5, 1.0) + 3.0 * patient.side * overload
+    felt = _remembered(patient.rating_form, complaint, np.add.reduceat(complaint, minutes, axis=1) / lengths)
+    felt += np.abs(np.diff(amplitude, axis=1)).mean(axis=1)
+    score = patient.rating_top - patient.rating_scale * felt + patient.rating_noise * noise[:, 1]
     counted = np.add.reduceat(tremor, minutes, axis=1) / lengths >= MILD
     return np.clip(grasp, 0.1, 4.5), np.clip(np.round(score), 1, 10), 100 * (counted @ lengths) / tremor.shape[1]
+
+
+def _remembered(form: int, complaint: Floats, minutes: Floats) -> Floats:
+    """The complaint that a rating goes by, [n], out of that of every step, [n, T], and of every minute, [n, M]; see `patient.RATINGS`."""
+    if form == LATE_RATING:
+        return np.asarray(complaint[:, -LATE_STEPS:].mean(axis=1))
+    if form == PEAK_END_RATING:
+        return np.asarray((minutes.max(axis=1) + minutes[:, -1]) / 2)
+    return np.asarray(complaint.mean(axis=1))
 
 
 def _stream(key: int, stream: int, number: int) -> np.random.Generator:

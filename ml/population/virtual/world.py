@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import cycle
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -21,8 +22,9 @@ from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.population.virtual.candidates import draw_candidates
 from ml.population.virtual.patient import MECHANISMS, Patient, draw_patient
 from ml.population.virtual.sessions import Days, Sessions, new_days, simulate, visit_days
+from ml.population.virtual.traits import TRAITS, with_trait
 from ml.qoc import Qoc
-from ml.trajectories import ReplayBuffer, SessionTrajectory
+from ml.trajectories import Hold, ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
 Part = Literal["A", "B", "C"]
@@ -31,9 +33,13 @@ DataDesign = Literal["paper", "stratified", "ladder"]
 PARTS: Final[dict[str, int]] = {"A": 11, "B": 23, "C": 37}
 WORLDS_PER_PART: Final = 60
 PER_OTHER_MECHANISM: Final = 4
+"""Worlds of a part with each mechanism but the graded one: one ordinary, the others with traits in rotation."""
+SILENT: Final = "silent"
 SILENT_BETA: Final = 7
 """Graded worlds of a part whose beta hardly answers while symptoms do."""
-WITHOUT_END: Final = 0.1
+PER_TRAIT: Final = 3
+"""Graded worlds of a part with each of the other traits; the rest are ordinary."""
+WITHOUT_END: Final = 0.25
 """Share of worlds without an end-of-session reward: C2 to C4 are 0."""
 
 STEPS, NO_DBS_STEPS, PAUSE_H = 300, 150, 10 / 60
@@ -90,13 +96,15 @@ class World:
     """One virtual patient with MDP settings.
 
     Attributes:
-        part, index: which one. patient: its constants. settings: of its MDP; xi_beta is midway between beta under cDBS and under 0.3.
+        part, index: which one. patient: its constants. trait: what makes it difficult, `traits.TRAITS`; None for an ordinary
+            one. settings: of its MDP; xi_beta is midway between beta under cDBS and under 0.3.
         spread: standard deviation of beta, its unit. key: of its random streams.
     """
 
     part: str
     index: int
     patient: Patient
+    trait: str | None
     settings: MdpSettings
     spread: float
     key: int
@@ -128,7 +136,7 @@ class World:
             own = Days(days.effects[i : i + 1], days.hours[i : i + 1])
             run = self.run(row.amplitudes[None, :], own, _DATA + 4096 * seed + i, row.amplitudes.size)
             qoc = Qoc(float(run.grasp_hz[0]), int(run.rating[0]), float(run.tremor_percent[0]))
-            bound = self.settings.lower_bound if row.controller == "random" and design == "paper" else None
+            bound = self.settings.lower_bound if row.controller == "random" else None
             sessions.append(
                 SessionTrajectory(
                     session_id=i + 1,
@@ -139,6 +147,7 @@ class World:
                     amplitude=run.amplitude[0],
                     qoc=qoc,
                     random_lower_bound=bound,
+                    holds=row.holds,
                 )
             )
         return ReplayBuffer(self.settings, tuple(sessions), "uV", "table")
@@ -166,12 +175,13 @@ class World:
 
 @dataclass(frozen=True)
 class DataSession:
-    """One session of the data: visit, controller (`cdbs`, `random`, `no_dbs`), hour of the visit, amplitude of every step."""
+    """One session of the data: visit, controller (`cdbs`, `random`, `no_dbs`), hour of the visit, amplitude of every step, held draws."""
 
     visit: int
     controller: str
     hour: float
     amplitudes: Floats
+    holds: tuple[Hold, ...] = ()
 
 
 def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int) -> list[DataSession]:
@@ -190,10 +200,11 @@ def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int
     )
     rows: list[DataSession] = []
     for visit in range(1, visits + 1):
-        random = [("random", s.amplitudes) for s in designed if s.visit == visit]
-        cdbs, off = ("cdbs", np.ones(STEPS)), ("no_dbs", np.zeros(NO_DBS_STEPS))
+        random = [("random", s.amplitudes, s.holds) for s in designed if s.visit == visit]
+        nothing: tuple[Hold, ...] = ()
+        cdbs, off = ("cdbs", np.ones(STEPS), nothing), ("no_dbs", np.zeros(NO_DBS_STEPS), nothing)
         slots = [cdbs, *random[:2], cdbs, *random[2:], off]
-        rows += [DataSession(visit, name, k * (STEPS * 2 / 3600 + PAUSE_H), a) for k, (name, a) in enumerate(slots)]
+        rows += [DataSession(visit, name, k * (STEPS * 2 / 3600 + PAUSE_H), a, holds) for k, (name, a, holds) in enumerate(slots)]
     return rows
 
 
@@ -206,23 +217,29 @@ def world(part: Part, index: int) -> World:
     """
     if part not in PARTS or not 0 <= index < WORLDS_PER_PART:
         raise ValueError(f"there is no world {index} in part {part!r}: parts are A, B and C, indices 0 to {WORLDS_PER_PART - 1}")
-    kind, silent = mechanisms_of(part)[index]
+    kind, trait = make_up(part)[index]
     rng = np.random.default_rng([PARTS[part], index, 0x776F])
-    patient = draw_patient(kind, rng, silent_beta=silent)
+    patient = with_trait(draw_patient(kind, rng), trait, rng)
     lower_bound = float(rng.choice((0.3, 0.3, 0.3, 0.4)))
     weight = 0.0 if rng.random() < WITHOUT_END else 10.0
     key = PARTS[part] * 1000 + index
     days = new_days(key, _CALIBRATION, 100)
     full, low = (simulate(patient, 1.0, ConstantPolicy(a), days=days, key=key, first=_CALIBRATION).beta for a in (1.0, 0.3))
     settings = MdpSettings(xi_beta=float(full.mean() + low.mean()) / 2, c2=weight, c3=weight, c4=weight, lower_bound=lower_bound)
-    return World(part, index, patient, settings, float(np.concatenate([full, low]).std()), key)
+    return World(part, index, patient, trait, settings, float(np.concatenate([full, low]).std()), key)
 
 
-def mechanisms_of(part: str) -> list[tuple[int, bool]]:
-    """Mechanism and whether beta is silent, for every world of a part: the same numbers of each in every part, in an order of its own."""
-    others = [(kind, False) for kind in range(1, len(MECHANISMS))] * PER_OTHER_MECHANISM
-    graded = [(0, k < SILENT_BETA) for k in range(WORLDS_PER_PART - len(others))]
-    both = others + graded
+def make_up(part: str) -> list[tuple[int, str | None]]:
+    """Mechanism and trait of every world of a part: the same numbers of each in every part, in an order of its own."""
+    traits = [t for t in TRAITS if t != SILENT]
+    rotation = cycle(traits)
+    others: list[tuple[int, str | None]] = []
+    for kind in range(1, len(MECHANISMS)):
+        others += [(kind, None), *((kind, next(rotation)) for _ in range(PER_OTHER_MECHANISM - 1))]
+    repeated = [SILENT] * SILENT_BETA + [t for t in traits for _ in range(PER_TRAIT)]
+    difficult: list[tuple[int, str | None]] = [(0, t) for t in repeated]
+    ordinary: list[tuple[int, str | None]] = [(0, None)] * (WORLDS_PER_PART - len(others) - len(difficult))
+    both = others + difficult + ordinary
     return [both[i] for i in np.random.default_rng([PARTS[part], 0x6D65]).permutation(len(both))]
 
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from app.cli import app as command_line
 from app.platform.embedded import place
-from app.platform.embedded_postgres import EmbeddedPostgres
+from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
 from tests.system_users import require_root
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from app.platform.embedded_postgres import EmbeddedPostgres
+from app.platform.embedded.server import EmbeddedPostgres
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_what_was_committed_survives_kill_9_of_the_postmaster(server: EmbeddedPo
 def test_the_server_outlives_one_of_two_users_and_not_the_last(tmp_path: Path) -> None:
     folder = tmp_path / "postgres"
     code = (
-        "import sys, pathlib; from app.platform.embedded_postgres import EmbeddedPostgres as E;"
+        "import sys, pathlib; from app.platform.embedded.server import EmbeddedPostgres as E;"
         f"s = E(pathlib.Path({str(folder)!r})); s.start(); print(s.pid(), flush=True); sys.stdin.readline()"
     )
     users = [

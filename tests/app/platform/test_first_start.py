@@ -12,8 +12,8 @@ import psycopg
 import pytest
 
 from app.platform.embedded import place
+from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.embedded.system_user import system_user
-from app.platform.embedded_postgres import EmbeddedPostgres
 from app.settings import Settings
 from tests.system_users import exists, require_root, unknown_user
 
@@ -59,7 +59,7 @@ def at_once(code: str, arguments: list[str], **env: str) -> list[str]:
 def test_eight_first_starts_at_once_in_two_data_folders(tmp_path: Path, unknown: str) -> None:
     folders = [tmp_path / name / "postgres" for name in ("one", "two")]
     code = (
-        "import pathlib; from app.platform.embedded_postgres import EmbeddedPostgres\n"
+        "import pathlib; from app.platform.embedded.server import EmbeddedPostgres\n"
         f"server = EmbeddedPostgres(pathlib.Path(arg), durable=False, server_user={unknown!r})\n"
         "server.start(); print(server.pid(), flush=True)"
     )

@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from app.platform.embedded_postgres import EmbeddedPostgres
+from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -36,4 +36,5 @@ def made(folder: Path, **changes: object) -> Path:
 
 def rows_of(log: Path) -> list[dict[str, str]]:
     with log.open(encoding="utf-8") as stream:
+        assert next(stream).strip() == "# betaloop controller log, version 1, period 2 s"
         return list(csv.DictReader(stream))

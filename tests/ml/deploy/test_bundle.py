@@ -69,6 +69,17 @@ def test_a_bundle_holds_the_network_in_every_form_its_vectors_the_sheet_and_ever
     np.testing.assert_allclose(vectors["expected"], network.act(np.array(vectors["windows"])), atol=1e-5)
 
 
+def test_a_bundle_of_before_the_runner_kept_a_log_stays_in_use(bundle):
+    files = unpack(bundle)
+    stated = json.loads(files["manifest.json"])
+    for folder in (files, stated["files"]):
+        del folder["controller/decision_log.py"]
+    assert open_bundle(pack(files | {"manifest.json": json.dumps(stated).encode()})).manifest.layers
+    del files["weights.f32"], stated["files"]["weights.f32"]
+    with pytest.raises(BundleError, match="the manifest must name"):
+        open_bundle(pack(files | {"manifest.json": json.dumps(stated).encode()}))
+
+
 def test_the_test_vectors_reach_saturation_and_every_way_in_which_beta_goes_wrong(bundle):
     vectors = json.loads(unpack(bundle)["test_vectors.json"])
     assert min(vectors["expected"]) < 1e-3 or max(vectors["expected"]) > 1 - 1e-3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,8 @@ from ml.mdp import MdpSettings, end_reward
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.population.virtual import (
     MECHANISMS,
+    RATINGS,
+    TRAITS,
     WORLDS_PER_PART,
     Mean,
     RelayPolicy,
@@ -19,12 +22,13 @@ from ml.population.virtual import (
     new_days,
     simulate,
     visit_days,
+    with_trait,
     world,
 )
 from ml.population.virtual.equations import dose
 from ml.population.virtual.patient import HILL, LINE, THRESHOLD, U_SHAPE
 from ml.population.virtual.sessions import quality
-from ml.population.virtual.world import end_rewards, mechanisms_of, visit_plan
+from ml.population.virtual.world import end_rewards, make_up, visit_plan
 from ml.qoc import Qoc, tremor_percent
 
 FIELDS = ("lead", "beta", "amplitude", "brady", "tremor", "overload", "grasp_hz", "rating", "tremor_percent")
@@ -34,7 +38,9 @@ FOLLOWING = ProportionalPolicy(0.6, 1.8, 0.2, 3)
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("kind", range(len(MECHANISMS)))
 def test_the_kernel_gives_the_numbers_of_the_equations(kind, seed):
-    patient = draw_patient(kind, np.random.default_rng([kind, seed]))
+    rng = np.random.default_rng([kind, seed])
+    trait = [None, *TRAITS][(kind + 2 * seed) % 9]
+    patient = with_trait(draw_patient(kind, rng), trait, rng)
     days = new_days(3, 0, 6)
     fast, read = (simulate(patient, 1.2, FOLLOWING, days=days, key=3, steps=120, readable=r) for r in (False, True))
     for field in FIELDS:
@@ -148,6 +154,56 @@ def test_qocs_follow_the_formulas_of_the_paper():
         Qoc(float(grasp[i]), int(rating[i]), float(share[i]))
 
 
+@pytest.mark.parametrize(("form", "expected"), [("mean", 9.0 - 3 * 0.4), ("late", 9.0 - 3 * 0.75), ("peak_end", 9.0 - 3 * (1.0 + 0.5) / 2)])
+def test_a_rating_goes_by_the_session_by_its_end_or_by_its_worst_and_last_minute(form, expected):
+    patient = quiet(rating_form=RATINGS.index(form), rating_top=9.0, rating_scale=1.0, rating_noise=0.0, side=0.0)
+    brady = np.repeat([[0.0, 0.0, 0.5, 1.0, 0.5]], 30, axis=1)
+    _, rating, _ = quality(patient, np.zeros((1, 2)), np.ones((1, 150)), brady, np.zeros((1, 150)), np.zeros((1, 150)))
+    assert rating == np.round(expected)
+
+
+def test_an_artefact_raises_the_sensed_beta_and_no_symptom():
+    patient = quiet(immediate=1.0, burden_share=0.5)
+    leaking = patient._replace(leak=0.3)
+    asked = np.repeat([[0.2, 1.0]], 30, axis=1)
+    true, sensed = (simulate(p, 1.0, asked, days=new_days(1, 0, 1), key=1, steps=60) for p in (patient, leaking))
+    np.testing.assert_allclose(sensed.beta, true.beta * (1 + 0.3 * asked))
+    np.testing.assert_array_equal(sensed.brady, true.brady)
+
+
+def test_every_trait_is_what_it_says():
+    def drawn(trait, n=40):
+        for seed in range(n):
+            rng = np.random.default_rng([seed, 5])
+            yield with_trait(draw_patient(0, rng), trait, rng)
+
+    a = np.array([0.75, 1.0])
+    low, full = np.transpose([dose(p.shape, a, np.full(2, p.half), p.steep) for p in drawn("saturating")])
+    assert np.median(low / full) > 0.9  # three quarters of the amplitude do nearly all
+    assert all(p.drift_sd > 0.4 * p.depth * 0.7 and p.immediate >= 0.8 for p in drawn("drifting"))
+    assert all(dose(p.shape, np.array([p.half, 1.0]), np.full(2, p.half), 1.0).argmax() == 0 for p in drawn("overstimulated"))
+    assert min(p.day_half for p in drawn("unsteady")) > max(p.day_half for p in drawn(None))
+    assert not any(p.beta_answers for p in drawn("silent"))
+    assert all(p.depth < 0.35 and p.grasp_high - p.grasp_low <= 0.6 for p in drawn("faint"))
+    assert all(max(p.slow_up, p.slow_down) > 3 * min(p.slow_up, p.slow_down) for p in drawn("asymmetric"))
+    assert all(p.leak > 0 and p.immediate == 0 for p in drawn("artefact"))
+    with pytest.raises(ValueError, match="no trait 'lazy'"):
+        with_trait(draw_patient(0, np.random.default_rng(0)), "lazy", np.random.default_rng(0))
+
+
+def test_candidates_are_eight_to_twelve_and_several_are_near_cdbs():
+    counts = set()
+    for index in range(12):
+        w = world("A", index)
+        candidates = w.candidates()
+        counts.add(len(candidates))
+        assert {"constant low", "proportional slow", "near cDBS 1", "near cDBS 2"} <= set(candidates)
+        near = w.truth(candidates["near cDBS 1"], 20)
+        assert near.amplitude.value > 0.5
+    assert counts <= set(range(8, 13))
+    assert len(counts) > 1
+
+
 def test_end_rewards_of_many_sessions_are_those_of_each():
     settings = MdpSettings(xi_beta=1.0, c2=3.0, c3=2.0, c4=5.0)
     grasp, rating, tremor = np.array([1.5, 2.5]), np.array([3.0, 9.0]), np.array([0.0, 62.5])
@@ -163,12 +219,16 @@ def test_a_relay_has_two_amplitudes_and_remembers_within_its_window():
 
 def test_parts_hold_the_same_mechanisms_and_a_third_of_them_no_estimator_contains():
     for part in ("A", "B", "C"):
-        kinds = [kind for kind, _ in mechanisms_of(part)]
+        kinds = [kind for kind, _ in make_up(part)]
+        traits = Counter(trait for _, trait in make_up(part))
         assert len(kinds) == WORLDS_PER_PART >= 60
         assert sum(kind != 0 for kind in kinds) >= WORLDS_PER_PART / 3
         assert set(kinds) == set(range(len(MECHANISMS)))
-        assert sum(silent for _, silent in mechanisms_of(part)) == 7
-    assert mechanisms_of("A") != mechanisms_of("B")
+        assert traits.pop("silent") == 7
+        assert traits.pop(None) == 11
+        assert traits == dict.fromkeys(set(TRAITS) - {"silent"}, 6)
+        assert Counter(make_up(part)) == Counter(make_up("A"))
+    assert make_up("A") != make_up("B")
 
 
 def test_a_world_depends_on_its_part_and_index_alone():
@@ -188,7 +248,8 @@ def test_data_are_three_visits_of_logged_sessions(design):
     assert {s.visit for s in buffer.sessions} == {1, 2, 3}
     random = [s for s in buffer.sessions if s.controller == "random"]
     assert all(s.amplitude.min() >= w.settings.lower_bound for s in random)
-    assert {s.random_lower_bound for s in random} == ({w.settings.lower_bound} if design == "paper" else {None})
+    assert {s.random_lower_bound for s in random} == {w.settings.lower_bound}
+    assert {s.uniform_bound for s in random} == ({w.settings.lower_bound} if design == "paper" else {None})
     assert all(s.usable().all() and s.end_reward(w.settings) is not None for s in buffer.sessions)
 
 
@@ -222,7 +283,7 @@ def test_days_move_what_a_policy_returns():
 
 
 def test_silent_beta_does_not_answer_while_symptoms_do():
-    index = next(i for i, (_, silent) in enumerate(mechanisms_of("A")) if silent)
+    index = next(i for i, (_, trait) in enumerate(make_up("A")) if trait == "silent")
     w = world("A", index)
     full, off = (w.truth(ConstantPolicy(a), 200) for a in (1.0, 0.0))
     assert not w.patient.beta_answers

@@ -188,3 +188,62 @@ def test_a_table_that_came_before_its_unit_was_stated_is_in_the_unit_stated_for_
     snapshot, buffer = taken(db)
     assert [s.session_id for s in buffer.sessions] == [kept]
     assert "unstated from power" in reasons(snapshot)[other]
+
+
+def state(client: TestClient, session: int, **conditions: object) -> None:
+    answer = client.put(f"/api/v1/sessions/{session}/conditions", json={**conditions, "reason": "as it was"})
+    assert answer.status_code == 200, answer.text
+
+
+def test_a_random_session_keeps_its_own_bound_whatever_the_settings_say_today(upload: Upload, client: TestClient, db: Session) -> None:
+    first = upload("random")
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"lower_bound": 0.5}})
+    second = upload("random")
+    before, buffer = taken(db)
+    assert {s.session_id: s.random_lower_bound for s in buffer.sessions} == {first: 0.3, second: 0.5}
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"lower_bound": 0.1}})
+    assert {s.session_id: s.random_lower_bound for s in taken(db)[1].sessions} == {first: 0.3, second: 0.5}
+    state(client, first, lower_bound=0.2)
+    after, corrected = taken(db)
+    assert {s.session_id: s.random_lower_bound for s in corrected.sessions} == {first: 0.2, second: 0.5}
+    pinned = {m.session_id: m.conditions_id for m in before.members}
+    again = {m.session_id: m.conditions_id for m in after.members}
+    assert pinned[first] != again[first]
+    assert pinned[second] == again[second] is not None
+
+
+def test_a_session_of_a_held_design_has_no_density_per_step(upload: Upload, client: TestClient, db: Session) -> None:
+    held, drawn = upload("random"), upload("random")
+    state(client, held, design="stratified", seed=4)
+    state(client, drawn, design="paper")
+    assert {s.session_id: s.random_lower_bound for s in taken(db)[1].sessions} == {held: None, drawn: 0.3}
+
+
+def test_the_amplitude_before_a_session_stands_in_the_buffer(upload: Upload, client: TestClient, db: Session) -> None:
+    known, unknown = upload("cdbs", level=0.6), upload("cdbs", level=0.6, lead=0)
+    _, buffer = taken(db)
+    leads = {s.session_id: s.lead_amplitude for s in buffer.sessions}
+    assert leads[known] == pytest.approx(0.6)
+    assert leads[unknown] is None
+    state(client, unknown, lead_amplitude_ma=1.5)
+    _, stated = taken(db)
+    (table,) = {s.session_id: s for s in stated.sessions if s.session_id == unknown}.values()
+    cdbs_ma = client.get(f"/api/v1/sessions/{unknown}/trace").json()["cdbs_amplitude_ma"]
+    assert table.lead_amplitude == pytest.approx(1.5 / cdbs_ma)
+
+
+def test_sessions_under_another_programming_stay_out_until_a_clinician_pools_them(upload: Upload, client: TestClient, db: Session) -> None:
+    first, second, third = (upload("random") for _ in range(3))
+    now = {"program": 0, "contacts": "-2 +C", "pulse_width_us": 60.0, "rate_hz": 130.0}
+    state(client, first, programming=[now | {"pulse_width_us": 90.0, "contacts": "-1 +C"}])
+    assert reasons(taken(db)[0]) == {}, "sessions whose programming is not known are no other programming"
+    state(client, second, programming=[now | {"rate_hz": 130.2}])
+    state(client, third, programming=[now])
+    snapshot, buffer = taken(db)
+    assert [s.session_id for s in buffer.sessions] == [second, third]
+    assert "-1 +C and not -2 +C on program 0" in reasons(snapshot)[first]
+    assert "90 us and not 60 us on program 0" in reasons(snapshot)[first]
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"pool_programmings": True}, "reason": "low difference in dose"})
+    pooled, buffer = taken(db)
+    assert [s.session_id for s in buffer.sessions] == [first, second, third]
+    assert reasons(pooled) == {}

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from rich.console import Console
 from sqlalchemy import text
 
-from app.platform.database import transaction
+from app.platform.database import new_session, transaction
 from app.platform.errors import NotFound
 from app.platform.jobs import JobContext, StepFailed, StepReport, registry, repository, write_atomically
 from app.platform.jobs.children.child import params_hash
@@ -103,23 +103,27 @@ def test_a_file_is_replaced_whole(tmp_path: Path):
 
 
 class _Memory:
-    """Steps and engine that only remember, to test the context's own rules."""
+    """Steps that only remember, to test the context's own rules. Step `waits` has no slot until another failed."""
 
     def __init__(self, outcomes=None):
-        self.declared, self.outcomes = [], outcomes or {}
+        self.declared, self.outcomes, self.started = [], outcomes or {}, []
 
     def declare(self, key, title, weight):
         self.declared.append(key)
 
     def compute(self, key, name, params, skip):
-        return {"ok": False, "skipped": True} if skip() else self.outcomes[key]
-
-    def durable_all(self, steps):
-        return [body() for _, body in steps]
+        for _ in range(200 if key == "waits" else 0):
+            if skip():
+                break
+            threading.Event().wait(0.01)
+        if skip():
+            return {"ok": False, "skipped": True}
+        self.started.append(key)
+        return self.outcomes[key]
 
 
 def _context(memory):
-    return JobContext("id", "kind", None, {}, "test", memory, memory)
+    return JobContext("id", "kind", None, {}, "test", memory)
 
 
 @pytest.mark.parametrize("key", ["", "Train", "a b", "../etc", "a//b", "a/.b", "/a", "x" * 101])
@@ -134,10 +138,25 @@ def test_a_key_cannot_be_run_twice():
 
 
 def test_after_a_failure_those_still_waiting_do_not_start():
-    memory = _Memory({"a": {"ok": True, "result": {}}, "b": {"ok": False, "message": "broken"}, "c": {"ok": True, "result": {}}})
+    memory = _Memory({"a": {"ok": True, "result": {}}, "b": {"ok": False, "message": "broken"}, "waits": {"ok": True, "result": {}}})
     with pytest.raises(StepFailed, match="Step b failed: broken") as caught:
-        _context(memory).compute_all([("a", "f", {}), ("b", "f", {}), ("c", "f", {})])
+        _context(memory).compute_all([("a", "f", {}), ("b", "f", {}), ("waits", "f", {})])
     assert caught.value.key == "b"
+    assert "waits" not in memory.started
+
+
+def test_a_step_that_failed_before_a_crash_is_not_tried_again(jobs):
+    """The worker may die between the step's failure and the job's: whoever goes on must find the failure, not repeat the step."""
+    job_id = jobs.submit()
+    ledger = Ledger(job_id, "test", "worker", lambda: None)
+    ledger.open()
+    ledger.declare("train", "Train", 1.0)
+    assert ledger.outcome("train") is None
+    assert ledger.begin("train") is None
+    ledger.fail_step("train", "out of memory", "")
+    assert ledger.outcome("train") == ledger.begin("train") == {"ok": False, "message": "out of memory"}
+    with new_session() as db:
+        assert repository.step(db, job_id, "train").attempts == 1
 
 
 @pytest.fixture
@@ -243,7 +262,7 @@ def test_a_step_is_stored_once_however_often_it_is_committed(jobs):
         return {"n": len(calls)}
 
     assert [ledger.commit_step("a", store) for _ in range(3)] == [{"n": 1}] * 3
-    assert ledger.begin("a") == {"n": 1}
+    assert ledger.begin("a") == {"ok": True, "result": {"n": 1}}
 
 
 def test_nothing_more_is_recorded_for_a_job_that_was_cancelled(jobs):

@@ -69,9 +69,13 @@ def test_all_sessions_policies_and_draws_together_are_each_replayed_alone(small_
                 window, memory, eta, beta, chosen = list(table.beta[:10]), None, None, [], []
                 for t in range(30):
                     a = policy.act(fitted.scale.raw_beta(np.array([window])))
-                    memory = np.tile(a, 3) if memory is None else np.array([0.8, 0.95, 0.985]) * memory + np.array([0.2, 0.05, 0.015]) * a
+                    if memory is None:
+                        before = a if model.before is None else np.array([model.before])
+                        memory = np.tile(before, 3)
+                        lasting = float(answers(before, memory[None])[0] @ model.beta[d] + model.levels[d, i])
+                        eta = [v - lasting for v in window]
+                    memory = np.array([0.8, 0.95, 0.985]) * memory + np.array([0.2, 0.05, 0.015]) * a
                     rest = float(answers(a, memory[None])[0] @ model.beta[d] + model.levels[d, i])
-                    eta = [v - rest for v in window] if eta is None else eta
                     predicted = rest + sum(model.phi[k] * eta[-1 - k] for k in range(10))
                     newest = predicted + np.exp(noise_features(a, np.array([predicted]))[0] @ model.noise_weights) * noise[t]
                     eta, window = [*eta, newest - rest], [*window[1:], newest]

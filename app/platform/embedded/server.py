@@ -31,7 +31,8 @@ from app.platform.embedded.access import DATABASE, OWNER, Access, Passwords
 from app.platform.embedded.system_user import system_user
 from app.settings import stored_secret
 
-_START_TIMEOUT_S = 60
+_START_TIMEOUT_S = 60.0
+_HEAL_TIMEOUT_S = 5.0
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -118,6 +119,26 @@ class EmbeddedPostgres:
         finally:
             os.close(guard)
 
+    def heal(self) -> bool:
+        """Start the server again where its postmaster has died while we use it; True where this call did.
+
+        Safe in many processes and threads at once: one of them starts it. A server that recovers, or is only busy, is left alone.
+
+        Raises:
+            RuntimeError: it does not come up, for instance because the disk is full.
+        """
+        if self._lock_fd is None or self._postmaster_lives():
+            return False
+        guard = _exclusive(self._asked.with_name(f"{self._asked.name}.start"))
+        try:
+            if self._lock_fd is None or not self.data.exists() or self._postmaster_lives():
+                return False
+            self._clear_stale_pid()
+            self._launch(_HEAL_TIMEOUT_S)
+        finally:
+            os.close(guard)
+        return True
+
     def remove(self) -> None:
         """Stop the server and delete its data (tests)."""
         self.leave()
@@ -185,23 +206,22 @@ class EmbeddedPostgres:
 
     def _clear_stale_pid(self) -> None:
         """After kill -9 the pid file may name a dead, zombie or unrelated process, and PostgreSQL would refuse to start."""
-        pid_file = self.data / "postmaster.pid"
-        if not pid_file.exists():
-            return
-        try:
-            process = psutil.Process(int(pid_file.read_text().splitlines()[0]))
-            alive = process.status() != psutil.STATUS_ZOMBIE and process.name().startswith("postgres")
-        except (psutil.NoSuchProcess, ValueError, IndexError):
-            alive = False
-        if not alive:
-            pid_file.unlink()
+        if not self._postmaster_lives():
+            (self.data / "postmaster.pid").unlink(missing_ok=True)
 
-    def _launch(self) -> None:
+    def _postmaster_lives(self) -> bool:
+        try:
+            process = psutil.Process(self.pid())
+            return bool(process.status() != psutil.STATUS_ZOMBIE and process.name().startswith("postgres"))
+        except (FileNotFoundError, psutil.NoSuchProcess, ValueError, IndexError):
+            return False
+
+    def _launch(self, timeout_s: float = _START_TIMEOUT_S) -> None:
         options = f"-h '' -k {self._sockets} -c unix_socket_permissions=0700 -c max_connections=200"
         if not self._durable:
             options += " -c fsync=off -c full_page_writes=off -c synchronous_commit=off"
         log = self.data / "server.log"
-        deadline = time.monotonic() + _START_TIMEOUT_S
+        deadline = time.monotonic() + timeout_s
         while True:
             # orphaned children of a killed postmaster hold shared memory for a moment: try again until they are gone
             started = self._run("pg_ctl", "-D", str(self.data), "-l", str(log), "-o", options, "-w", "-t", "30", "start", check=False)

@@ -1,0 +1,135 @@
+"""What a session ran under: taken down when it is confirmed, corrected by a person afterwards, never read from today's settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import SYSTEM, Caller
+from app.platform.database import set_reason
+from app.platform.errors import Conflict, Invalid
+from app.study import blinding, repository, service
+from app.study.models import Recording, SettingsVersion, StudySession
+from app.study.schemas import ConditionsChange, ConditionsFields
+from app.study.sessions import programming
+from app.study.sessions.models import SessionConditions
+from app.study.traces import AMPLITUDE_STREAM, StepTable, step_table
+
+OF_SETTINGS = ("lower_bound", "window", "period_s", "xi_beta")
+"""What a settings version tells of the sessions that ran under it."""
+NEEDED = ("lower_bound", "window", "period_s")
+"""What every session ran under: a correction may replace it and not take it back."""
+
+
+def record(db: Session, session: StudySession, by: str, stated: ConditionsChange | None = None) -> SessionConditions:
+    """Take down what a session ran under as it is confirmed; one that has conditions keeps them.
+
+    B, W, period and threshold are those of the settings that were in force when it began, by the clock; the present ones, marked as
+    assumed, where its start is not known or lies before the participant's first settings.
+
+    Args:
+        by: whose name stands with it. stated: what a person or a plan says of it, which counts before anything else.
+    """
+    if session.conditions is not None:
+        return session.conditions
+    settings, in_force = settings_of(session)
+    values: dict[str, Any] = {name: getattr(settings, name) for name in OF_SETTINGS}
+    values |= dict(zip(("min_ma", "max_ma"), _limits(db, session) or (None, None), strict=True))
+    values |= {"seed": None, "design": None, "design_parameters": {}}
+    values["programming"] = [p.as_json() for p in programming.of_session(session)]
+    try:
+        table = step_table(db, session, session.visit.participant.current_settings)
+        values |= {"lead_amplitude_ma": lead_amplitude_ma(table), "cdbs_amplitude_ma": table.cdbs_ma}
+    except Invalid:
+        # its steps cannot be read, for which its page and every buffer give the reason
+        values |= {"lead_amplitude_ma": None, "cdbs_amplitude_ma": None}
+    given = _given(stated) if stated is not None else {}
+    told = bool(given.keys() & set(OF_SETTINGS))
+    origin = "stated" if told else "settings" if in_force else "assumed"
+    return _add(db, session, values | given, origin, by, stated.reason if stated else None)
+
+
+def change(db: Session, session: StudySession, wanted: ConditionsChange, caller: Caller) -> SessionConditions:
+    """Correct what a session ran under: a new revision; what is left out stays. Same values, no revision.
+
+    Raises:
+        Conflict: a proposal, which has none yet. Invalid: B, W or period taken back, or a lower limit above the upper one.
+    """
+    service.require(caller, can.WRITE_STUDY, session.visit.participant)
+    if session.status != "confirmed":
+        raise Conflict(f"Session {session.id} is a proposal that nobody has confirmed yet.", "Confirm it first; then state its conditions.")
+    repository.lock_session(db, session)
+    known = record(db, session, caller.label)
+    present = {name: getattr(known, name) for name in ConditionsFields.model_fields}
+    given = _given(wanted)
+    missing = [name for name in NEEDED if name in given and given[name] is None]
+    if missing:
+        raise Invalid(f"A session always ran under some {' and '.join(missing)}.", "Give the value, or leave the member out.")
+    merged = present | given
+    if merged == present:
+        return known
+    low, high = merged["min_ma"], merged["max_ma"]
+    if low is not None and high is not None and low > high:
+        raise Invalid(f"The lower limit of {low:g} mA lies above the upper one of {high:g} mA.", "Give min_ma below max_ma.")
+    set_reason(db, wanted.reason)
+    origin = "stated" if given.keys() & set(OF_SETTINGS) else known.origin
+    return _add(db, session, merged, origin, caller.label, wanted.reason)
+
+
+def settings_of(session: StudySession) -> tuple[SettingsVersion, bool]:
+    """The settings that a session ran under, and whether they were in force by the clock; else the present ones."""
+    versions = session.visit.participant.settings
+    began = session.started_at
+    before = [v for v in versions if began is not None and v.created_at <= began]
+    return (before[-1], True) if before else (versions[-1], False)
+
+
+def lead_amplitude_ma(table: StepTable) -> float | None:
+    """The amplitude in force just before a session, mA: that of the newest row before its start; None where none is known."""
+    before = table.amplitude_ma[table.t_s <= 0]
+    known = before[np.isfinite(before)]
+    return float(known[-1]) if known.size else None
+
+
+def _given(wanted: ConditionsChange) -> dict[str, Any]:
+    """What a change states, whole: null empties a list or an object."""
+    whole = wanted.model_dump(include=wanted.model_fields_set - {"reason"})
+    empty: dict[str, Any] = {"design_parameters": {}, "programming": []}
+    return {name: empty.get(name) if value is None else value for name, value in whole.items()}
+
+
+def _add(db: Session, session: StudySession, values: dict[str, Any], origin: str, by: str, reason: str | None) -> SessionConditions:
+    revision = len(session.conditions_revisions) + 1
+    row = SessionConditions(session_id=session.id, revision=revision, origin=origin, entered_by=by, reason=reason, **values)
+    session.conditions_revisions.append(row)
+    db.flush()
+    return row
+
+
+def _limits(db: Session, session: StudySession) -> tuple[float, float] | None:
+    """Amplitude limits in force, mA: the clinician's in the device for the controlled program, else those of the bundle that ran."""
+    control = next((s.recording for s in session.segments if s.is_control), None)
+    found = _device_limits(db, control) if control is not None else None
+    if found is not None:
+        return found
+    arm = blinding.stated_arm(session, SYSTEM)
+    return None if arm is None or arm.policy_id is None else repository.released_limits(db, arm.policy_id, session.started_at)
+
+
+def _device_limits(db: Session, recording: Recording) -> tuple[float, float] | None:
+    """Limits of the recording's own program, where its device says which of them that was."""
+    rows: dict[str, tuple[float, float]] = {}
+    for programs in (recording.details.get("limits") or {}).values():
+        for name, limit in programs.items() if isinstance(programs, Mapping) else ():
+            if isinstance(limit, Mapping) and {"lower_ma", "upper_ma"} <= limit.keys() and limit["lower_ma"] <= limit["upper_ma"]:
+                if name in rows and rows[name] != (limit["lower_ma"], limit["upper_ma"]):
+                    return None  # several groups have such a program, and which one was active is not told
+                rows[name] = (float(limit["lower_ma"]), float(limit["upper_ma"]))
+    if len(rows) == 1:
+        return next(iter(rows.values()))
+    driving = next((t for t in repository.traces_of_recording(db, recording.id) if t.stream == AMPLITUDE_STREAM), None)
+    return rows.get(driving.channel) if driving is not None else None

@@ -1,0 +1,50 @@
+"""Tables of sessions beside the session itself: what it ran under."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, String, Text, UniqueConstraint, func
+from sqlalchemy.orm import Mapped, mapped_column
+
+from app.platform.database import Base
+
+
+class SessionConditions(Base):
+    """What a session ran under, as far as it is known; a correction is a new revision, and results pin the one they used.
+
+    `origin`: `stated` by a person or a plan; `settings` in force by the clock when the session ran; `assumed` where neither tells.
+    `design_parameters` has `level` and `holds` (objects of `start`, `steps`, `amplitude`, `log_density`) as `ml.designs` has them.
+    `programming` has an object per program: `hemisphere`, `group`, `program`, `contacts`, `pulse_width_us`, `rate_hz`.
+    """
+
+    __tablename__ = "session_conditions"
+    __table_args__ = (
+        UniqueConstraint("session_id", "revision"),
+        CheckConstraint("origin in ('stated', 'settings', 'assumed')", name="origin"),
+        CheckConstraint("lower_bound >= 0 and lower_bound < 1", name="lower_bound"),
+        CheckConstraint('"window" >= 1 and period_s > 0', name="window"),
+        CheckConstraint("min_ma >= 0 and max_ma >= min_ma", name="limits"),
+        CheckConstraint("lead_amplitude_ma >= 0 and cdbs_amplitude_ma > 0", name="amplitudes"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    session_id: Mapped[int] = mapped_column(ForeignKey("session.id", ondelete="CASCADE"), index=True)
+    revision: Mapped[int]
+    origin: Mapped[str] = mapped_column(String(10))
+    lower_bound: Mapped[float]
+    window: Mapped[int]
+    period_s: Mapped[float]
+    xi_beta: Mapped[float | None]
+    min_ma: Mapped[float | None]
+    max_ma: Mapped[float | None]
+    seed: Mapped[int | None] = mapped_column(BigInteger)
+    design: Mapped[str | None] = mapped_column(String(40))
+    design_parameters: Mapped[dict[str, Any]] = mapped_column(server_default="{}")
+    lead_amplitude_ma: Mapped[float | None]
+    cdbs_amplitude_ma: Mapped[float | None]
+    programming: Mapped[list[Any]] = mapped_column(server_default="[]")
+    entered_by: Mapped[str] = mapped_column(String(254))
+    reason: Mapped[str | None] = mapped_column(Text)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())

@@ -1,0 +1,34 @@
+"""What the structures get wrong beside what they say they do: constants fitted on part A of the virtual population, never on B or C.
+
+Variance of the error of a component = what the draws say + base^2 + reach^2 leverage, leverage from `ml.ope.posterior.support`. Fitted by
+`python benchmarks/posterior_constants.py` to maximum likelihood over worlds, policies and both designs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+VERSION = 1
+"""Raised with every refit; an estimate keeps it."""
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """Standard deviation of what structures get wrong. base: near the data. reach: more, where no session is near."""
+
+    base: float
+    reach: float
+
+    def sd(self, leverage: float) -> float:
+        """At a leverage in [0, 1]."""
+        return float((self.base**2 + self.reach**2 * leverage) ** 0.5)
+
+
+MODEL_ERRORS = {
+    "steps": ModelError(0.03, 0.10),
+    "r_end": ModelError(2.0, 6.0),
+    "grasp_hz": ModelError(0.05, 0.20),
+    "rating": ModelError(0.2, 0.6),
+    "tremor_percent": ModelError(3.0, 12.0),
+}
+"""By component. `steps`: per unit of the reward between r_b and r_a and of the discounted length; the others in their own unit."""

@@ -1,0 +1,107 @@
+"""Joint draws of what policies return, spend and do to symptoms, out of replays in all structures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.ope.estimate import OUTCOMES
+from ml.ope.flags import Flag
+from ml.ope.linear.end_outcomes import EndModel
+from ml.ope.observed import mean_over_days
+from ml.ope.posterior.constants import MODEL_ERRORS
+from ml.ope.posterior.gaussian import correlated
+from ml.trajectories import ReplayBuffer
+
+Floats = NDArray[np.float64]
+
+KEPT = 400
+"""Draws that are kept, aligned over policies and quantities."""
+
+
+@dataclass(frozen=True)
+class Replays:
+    """Sessions under policies in all structures: P policies, D draws, n sessions.
+
+    Attributes:
+        step_return, energy, amplitude, beta: [P, D, n]. outcomes: [P, D, n, 4]. weights: of the draws, [D], summing to 1.
+        summaries: mean dose, late dose, burden of beta of each policy, [P, 3]. behaviour: see `FittedPosterior`, by policy.
+    """
+
+    step_return: Floats
+    energy: Floats
+    amplitude: Floats
+    beta: Floats
+    outcomes: Floats
+    weights: Floats
+    summaries: Floats
+    behaviour: tuple[dict[str, float], ...]
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Draws [P, KEPT] by quantity: `steps`, `r_end`, `return`, `energy` and the QoCs that sessions have.
+
+    Attributes:
+        between_visits: standard deviation of a policy's true difference to cDBS between visits, by quantity.
+        unknown: a flag where days cannot be told apart.
+    """
+
+    values: dict[str, Floats]
+    between_visits: dict[str, float]
+    unknown: Flag | None
+
+
+def joint_draws(buffer: ReplayBuffer, replays: Replays, ends: EndModel, alike: Floats, leverage: Floats, horizon: int, seed: int) -> Draws:
+    """Draws of coefficients and structures, of the days that were not seen, and of what the structures get wrong.
+
+    Args:
+        replays: P policies, cDBS last. ends: model of r_end. alike: correlation of what structures get wrong, [P, P]. leverage: [P].
+        horizon: steps. seed: of the draws.
+    """
+    settings = buffer.settings
+    visits = np.array([s.visit for s in buffer.sessions])
+    parts = {"steps": replays.step_return, "energy": replays.energy}
+    parts |= {name: replays.outcomes[..., j] for j, name in enumerate(OUTCOMES) if j and ends.seen[j]}
+    constants = ends.constants if ends.seen[0] else None
+    if ends.seen[0] and constants is None:
+        parts["r_end"] = replays.outcomes[..., 0]
+    total = replays.step_return + (replays.outcomes[..., 0] if ends.seen[0] else 0.0)
+    days = mean_over_days(np.einsum("pdn,d->pn", total, replays.weights), visits, KEPT, seed)
+    rng = np.random.default_rng([seed, 0x9057])
+    picked = systematic(replays.weights, KEPT, rng)
+    reach = float(np.sum(settings.gamma ** np.arange(horizon))) * abs(settings.r_a - settings.r_b)
+    drawn, between = {}, {}
+    for name, values in parts.items():
+        base, over_draws = values @ days.weights, np.einsum("pdn,d->pn", values, replays.weights)
+        own = mean_over_days(over_draws, visits, KEPT, seed)
+        rows = base[:, picked] + own.common + own.own
+        # what was picked has a mean of its own: the draws keep that of all
+        rows += (base @ replays.weights - rows.mean(1))[:, None]
+        if name in MODEL_ERRORS:
+            unit = reach if name == "steps" else 1.0
+            rows += correlated(alike, np.array([unit * MODEL_ERRORS[name].sd(v) for v in leverage]), KEPT, rng)
+        drawn[name] = rows
+        between[name] = _between_visits(over_draws - over_draws[-1], visits)
+    if constants is not None:
+        qoc = [drawn.get(name, np.zeros_like(drawn["steps"])) for name in OUTCOMES[1:]]
+        drawn["r_end"] = np.einsum("k,kpd->pd", constants, np.stack(qoc))
+    drawn.setdefault("r_end", np.zeros_like(drawn["steps"]))
+    drawn["return"] = drawn["steps"] + drawn["r_end"]
+    between["return"] = _between_visits(np.einsum("pdn,d->pn", total - total[-1], replays.weights), visits)
+    return Draws(drawn, between, days.unknown)
+
+
+def systematic(weights: Floats, number: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Indices [number] in random order, each about weight times number often (systematic resampling)."""
+    at = (np.arange(number) + rng.random()) / number
+    picked = np.minimum(np.searchsorted(np.cumsum(weights / weights.sum()), at), weights.size - 1)
+    return rng.permutation(picked)
+
+
+def _between_visits(gaps: Floats, visits: NDArray[np.int64]) -> float:
+    """Root mean squared standard deviation between visits of differences [P, n], over policies; 0 with one visit."""
+    means = np.stack([gaps[:, visits == v].mean(1) for v in np.unique(visits)])
+    return float(np.sqrt(np.mean(means.var(0, ddof=1)))) if len(means) > 1 else 0.0

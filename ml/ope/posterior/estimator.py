@@ -1,0 +1,240 @@
+"""The estimator `posterior`: what every policy would return, and how sure that is, from all structures and all tested sessions.
+
+Structures (`structures`) replay the logged sessions under every policy with draws of their coefficients and are averaged by how well they
+predict left-out sessions (`held_out`). What they get wrong is added as far as sessions lie from the policy (`support`, `constants`), alike
+for policies that act alike (`gaussian`). Sessions that tested a policy then move the draws of all that resemble it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.ope.estimate import LEVEL, Estimate, checked_horizon
+from ml.ope.flags import FEW_END_REWARDS, Flag, distinct
+from ml.ope.lead import dose_before
+from ml.ope.linear.end_outcomes import EndModel, fit_end_model
+from ml.ope.linear.estimator import FittedLinear, LinearConfig, Replayed
+from ml.ope.posterior.constants import VERSION
+from ml.ope.posterior.draws import Draws, Replays, joint_draws
+from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference, similarity, updated
+from ml.ope.posterior.held_out import HeldOut, held_out
+from ml.ope.posterior.skill import Skill, ordering_skill
+from ml.ope.posterior.structures import STRUCTURES, Fit
+from ml.ope.posterior.support import LATE_STEPS, SessionSupport, Support
+from ml.ope.registry import Size
+from ml.ope.scale import Scale, learn_scale
+from ml.ope.support.coverage import AmplitudeSupport
+from ml.policies.policy import ConstantPolicy, Policy
+from ml.progress import Report, silent
+from ml.trajectories import ReplayBuffer
+
+Floats = NDArray[np.float64]
+
+CDBS = "cDBS, for comparison"
+"""Name of the constant policy at 1 that is always evaluated too: tests are differences to it."""
+
+LEAST_DRAWS = 6
+"""Draws of a structure that has a say at all."""
+LEAST_WEIGHT = 0.02
+"""Structures below this weight have none."""
+
+NEARLY_OFF = 0.2
+LIMITS = {"energy": (0.0, 1.0), "grasp_hz": (0.0, np.inf), "rating": (1.0, 10.0), "tremor_percent": (0.0, 100.0)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosteriorConfig:
+    """Settings of the posterior.
+
+    Attributes:
+        draws: sets of coefficients, over all structures together, with which every session is replayed.
+        most_rows: replayed sessions per policy at most; a longer record takes fewer draws, though never fewer than 24.
+        seed: of all draws.
+    """
+
+    draws: int = 48
+    most_rows: int = 1500
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The estimator.
+
+    Attributes:
+        tests: tested sessions as differences to the same visit's cDBS; their policies must be among those that are evaluated.
+    """
+
+    config: PosteriorConfig = field(default_factory=PosteriorConfig)
+    method: str = "posterior"
+    tests: tuple[TestedDifference, ...] = ()
+
+    def with_tests(self, tests: Sequence[TestedDifference]) -> Posterior:
+        """The same estimator knowing tested sessions as well; `evaluate` raises ValueError where a tested policy is not evaluated."""
+        return replace(self, tests=tuple(tests))
+
+    def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedPosterior:
+        """Fit and weigh the structures; takes seconds, so nothing is kept in `checkpoint_dir`.
+
+        Raises:
+            ValueError: fewer than two sessions with usable steps.
+        """
+        c, scale, before = self.config, learn_scale(buffer), dose_before(buffer)
+        draws = max(24, min(c.draws, c.most_rows // len(buffer.sessions)))
+        fits = []
+        for k, fitter in enumerate(STRUCTURES.values()):
+            fits.append(fitter(buffer, scale, draws, c.seed, before))
+            report(0.4 * (k + 1) / len(STRUCTURES), "fitting the structures")
+        predictions = held_out(buffer, scale, fits, c.seed)
+        report(0.9, "predicting left-out sessions")
+        shares = shared_out(predictions.weights, draws)
+        severity = sum(predictions.weights[f.key] * f.drawn.levels.mean(0) for f in fits)
+        total = sum(shares.values())
+        ends = fit_end_model(buffer, draws=total, seed=c.seed, severity=np.asarray(severity))
+        report(1.0, "fitting the outcomes")
+        return FittedPosterior(self.method, c, buffer, scale, tuple(fits), shares, predictions, ends, self.tests)
+
+
+def shared_out(weights: Mapping[str, float], draws: int) -> dict[str, int]:
+    """How many draws each structure has; none below `LEAST_WEIGHT`, and at least `LEAST_DRAWS` above it."""
+    return {key: max(LEAST_DRAWS, round(w * draws)) for key, w in weights.items() if w >= LEAST_WEIGHT}
+
+
+@dataclass(frozen=True)
+class FittedPosterior:
+    """Fitted structures with their weights, and the tests."""
+
+    method: str
+    config: PosteriorConfig
+    buffer: ReplayBuffer
+    scale: Scale
+    fits: tuple[Fit, ...]
+    shares: dict[str, int]
+    predictions: HeldOut
+    ends: EndModel
+    tests: tuple[TestedDifference, ...]
+
+    def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
+        """Posterior of every policy.
+
+        Raises:
+            ValueError: a horizon below one step, or a tested policy that is not among them.
+        """
+        horizon = checked_horizon(self.buffer, horizon_steps)
+        if not policies:
+            return {}
+        everyone = {**policies, CDBS: ConstantPolicy(1.0)}
+        names, chosen = list(everyone), list(everyone.values())
+        replays = self._replays(chosen, horizon, report)
+        support = SessionSupport(self.buffer)
+        supports = [support.of(s) for s in replays.summaries]
+        draws = self._draws(replays, everyone, supports, horizon)
+        skill = ordering_skill(self.buffer, self.predictions, self.ends)
+        look = AmplitudeSupport(self.buffer)
+        return {
+            name: self._estimate(i, replays, draws, supports[i], skill, list(look.of_policy(chosen[i]).flags()), horizon)
+            for i, name in enumerate(names[:-1])
+        }
+
+    def _replays(self, policies: list[Policy], horizon: int, report: Report) -> Replays:
+        """Every structure's replays side by side; the draws of r_end are dealt out over the structures."""
+        found: list[Replayed] = []
+        weights: list[Floats] = []
+        first = 0
+        live = [f for f in self.fits if f.key in self.shares]
+        total = sum(self.predictions.weights[f.key] for f in live)
+        for k, fit in enumerate(live):
+            number = self.shares[fit.key]
+            drawn = fit.thinned(number)
+            ends = self.ends.with_weights(self.ends.weights[first : first + number])
+            replayer = FittedLinear(
+                fit.key, LinearConfig(seed=self.config.seed), self.buffer, self.scale, fit.tables, drawn, drawn, ends, ends, None
+            )
+            found.append(replayer.replay(policies, drawn, ends, horizon))
+            weights.append(np.full(number, self.predictions.weights[fit.key] / total / number))
+            first += number
+            report((k + 1) / len(live), "replaying sessions")
+        return Replays(
+            step_return=np.concatenate([r.step_return for r in found], axis=1),
+            energy=np.concatenate([r.energy for r in found], axis=1),
+            amplitude=np.concatenate([r.amplitude for r in found], axis=1),
+            beta=np.concatenate([r.beta for r in found], axis=1),
+            outcomes=np.concatenate([r.outcomes for r in found], axis=1),
+            weights=np.concatenate(weights),
+            summaries=self._summaries(found, np.concatenate(weights)),
+            behaviour=tuple(_behaviour(np.concatenate([r.actions[i].reshape(-1, horizon) for r in found])) for i in range(len(policies))),
+        )
+
+    def _summaries(self, found: Sequence[Replayed], weights: Floats) -> Floats:
+        """`support.SUMMARIES` of every policy, [P, 3], over sessions and draws."""
+        each = []
+        for r in found:
+            late = r.actions[..., -LATE_STEPS:].mean(-1)
+            each.append(np.stack([r.amplitude.mean(-1), late.mean(-1), r.above.mean(-1)], axis=-1))  # [P, D, 3]
+        return np.asarray(np.einsum("pds,d->ps", np.concatenate(each, axis=1), weights), dtype=np.float64)
+
+    def _draws(self, replays: Replays, policies: Mapping[str, Policy], supports: Sequence[Support], horizon: int) -> Draws:
+        alike = similarity(list(policies.values()), self.buffer.transitions().states)
+        leverage = np.array([s.leverage for s in supports])
+        found = joint_draws(self.buffer, replays, self.ends, alike, leverage, horizon, self.config.seed)
+        if not self.tests:
+            return found
+        names, rng = list(policies), np.random.default_rng([self.config.seed, 0x7E57])
+        return replace(found, values=updated(found.values, names, len(names) - 1, self.tests, found.between_visits, rng))
+
+    def _estimate(
+        self, i: int, replays: Replays, draws: Draws, support: Support, skill: Skill, amplitudes: list[Flag], horizon: int
+    ) -> Estimate:
+        values = {name: rows[i] for name, rows in draws.values.items()}
+        own, with_end = values["return"], self.ends.seen[0]
+        low, high = (float(q) for q in np.quantile(own, [(1 - LEVEL) / 2, (1 + LEVEL) / 2]))
+        shown = {name: np.clip(values[name], *LIMITS[name]) for name in QUANTITIES if name in values and name != "return"}
+        flags = [*support.flags, *(f for f in amplitudes if not f.refuses)]
+        flags += [] if with_end else [FEW_END_REWARDS]
+        flags += [draws.unknown] if draws.unknown else []
+        moved = {"mean_amplitude": replays.amplitude, "mean_beta": replays.beta}
+        return Estimate(
+            method=self.method,
+            value=float(own.mean()),
+            low=low,
+            high=high,
+            level=LEVEL,
+            standard_error=float(own.std(ddof=1)),
+            step_return=float(values["steps"].mean()),
+            end_reward=float(values["r_end"].mean()) if with_end else None,
+            predicted={name: float(v.mean()) for name, v in shown.items()}
+            | {name: float(v[i].mean(-1) @ replays.weights) for name, v in moved.items()},
+            supported=support.supported,
+            flags=distinct(flags),
+            n=len(self.buffer.sessions),
+            details={
+                "horizon_steps": horizon,
+                "draws": [round(float(v), 4) for v in own],
+                "outcome_draws": {name: [round(float(v), 4) for v in drawn] for name, drawn in shown.items()},
+                "support": support.to_json(),
+                "behaviour": replays.behaviour[i],
+                "skill": skill.to_json(),
+                "weights": {key: round(w, 4) for key, w in self.predictions.weights.items()},
+                "tests": len(self.tests),
+                "constants_version": VERSION,
+            },
+        )
+
+
+def _behaviour(actions: Floats) -> dict[str, float]:
+    """What a policy does in its replayed sessions: amplitudes of any shape, as fractions of cDBS."""
+    return {
+        "below_cdbs_20_percent": float(np.mean(actions < NEARLY_OFF)),
+        "closeness_to_cdbs": float(np.mean(np.abs(actions - 1.0))),
+        "mean_amplitude": float(actions.mean()),
+    }
+
+
+def build(key: str, seed: int, size: Size) -> Posterior:
+    """The factory of the registry: 32 draws for a first look, 48 for a study."""
+    return Posterior(PosteriorConfig(seed=seed, draws=48 if size == "full" else 32), key)

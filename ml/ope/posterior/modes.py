@@ -1,0 +1,235 @@
+"""Beta's answer to the amplitude as low-passes of several speeds behind polynomials of the dose, shrunk as far as the data ask for.
+
+    y_t = mu + visit + session + sum over j, m of g_jm L_m[p_j(a)]_t + sum over k of h_k U_k[a]_t + eta_t
+    eta_t = sum over l <= W of phi_l eta_{t-l} + e_t
+
+y is standardised (log) beta, p_j one of `polynomials` of the dose, L_m a first-order low-pass with one of `TIMES` (the first of them passes
+everything), U_k a low-pass that rises and falls at different speeds. Sums of exponentials are a dense family of impulse responses (Laguerre
+and Kautz bases: Wahlberg 1991), so that an answer at once, one over minutes, one that wears off and one that rings are all in it; the dose
+may have another shape at every speed. Coefficients of one group share a variance (`ml.statistics.mixed`): the straight dose at fast and at
+slow speeds, the bend of the dose, the difference between rising and falling. What the data leave open about them stays in the draws.
+
+Before its first step a session has been under the dose that was in force before it (`ml.ope.lead`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from ml.ope.fqe.steps import held_amplitude
+from ml.ope.linear.dynamics import autoregression, level_model, level_sums, log_noise_weights, noise_features
+from ml.ope.scale import Scale
+from ml.statistics.mixed import MixedFit, MixedModel, Sums
+from ml.trajectories import ReplayBuffer, SessionTrajectory
+
+Floats = NDArray[np.float64]
+
+TIMES = (0.0, 3.0, 8.0, 20.0, 60.0, 180.0)
+"""Time constants of the low-passes, steps; 0 passes everything at once."""
+KEEP = np.array([np.exp(-1 / t) if t > 0 else 0.0 for t in TIMES])
+SLOW = 3
+"""From this time on an answer counts as slow."""
+
+POLYNOMIALS = 3
+ONE_SIDED = ((12.0, 80.0), (40.0, 240.0))
+"""Time constants of rise and fall of the low-passes that have two, steps."""
+RISE, FALL = (1 - np.exp(-1 / np.array(t)) for t in zip(*ONE_SIDED, strict=True))
+
+COLUMNS = POLYNOMIALS * len(TIMES) + len(ONE_SIDED)
+TURNS = 2
+
+
+def polynomials(a: Floats) -> Floats:
+    """Dose functions [..., 3]: the dose, its bend and its turn; the last two are 0 at no stimulation and at cDBS."""
+    return np.stack([a, 4 * a * (1 - a), 10 * a * (1 - a) * (1 - 2 * a)], axis=-1)
+
+
+class Filters:
+    """Low-passed doses of rows side by side, at first as if `first` [...] had been on for long."""
+
+    def __init__(self, first: Floats) -> None:
+        self._passed = np.repeat(polynomials(first)[..., None, :], len(TIMES), axis=-2)  # [..., M, J]
+        self._sided = np.repeat(first[..., None], len(ONE_SIDED), axis=-1)
+
+    def step(self, a: Floats) -> Floats:
+        """Columns [..., COLUMNS] once the amplitudes a [...] are in force."""
+        self._passed = KEEP[:, None] * self._passed + (1 - KEEP[:, None]) * polynomials(a)[..., None, :]
+        gap = a[..., None] - self._sided
+        self._sided = self._sided + np.where(gap > 0, RISE, FALL) * gap
+        return self.columns
+
+    @property
+    def columns(self) -> Floats:
+        """The columns now, [..., COLUMNS]."""
+        return np.concatenate([self._passed.reshape(*self._sided.shape[:-1], -1), self._sided], axis=-1)
+
+
+def columns_of(a: Floats, first: float) -> Floats:
+    """`Filters` of a whole session, [T, COLUMNS], for amplitudes [T] after `first` had been on for long."""
+    p, start = polynomials(a), polynomials(np.array(first))
+    passed = np.empty((a.size, len(TIMES), POLYNOMIALS))
+    for m, keep in enumerate(KEEP):
+        passed[:, m], _ = lfilter([1 - keep], [1, -keep], p, axis=0, zi=keep * start[None])
+    sided = np.empty((a.size, len(ONE_SIDED)))
+    now = np.full(len(ONE_SIDED), first)
+    for t, value in enumerate(a):
+        gap = value - now
+        now = now + np.where(gap > 0, RISE, FALL) * gap
+        sided[t] = now
+    return np.concatenate([passed.reshape(a.size, -1), sided], axis=1)
+
+
+@dataclass(frozen=True)
+class ModeTable:
+    """One session, standardised: beta [W + T] with the window before it first, amplitude [T], `columns_of` it with the window's rows before
+    it [W + T, COLUMNS], usable steps [T].
+    """
+
+    beta: Floats
+    amplitude: Floats
+    columns: Floats
+    usable: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, session: SessionTrajectory, scale: Scale, before: float | None) -> ModeTable:
+        """Tables of a session after the dose `before`; its own first amplitude where that is None."""
+        a, window = held_amplitude(session), session.lead_beta.size
+        first = float(a[0]) if before is None else before
+        columns = columns_of(np.concatenate([np.full(window, first), a]), first)
+        return cls(scale.beta(session.padded_beta), a, columns, session.usable())
+
+
+@dataclass(frozen=True)
+class ModeDynamics:
+    """A fitted model, or draws from its posterior; n sessions, D sets of coefficients.
+
+    Attributes:
+        phi: autoregression of eta on lags 1 ... W, [W]. gains: of the columns, [D, COLUMNS]. levels: mu + visit + session, [D, n].
+        noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
+        shares: lambda / (1 + lambda) of the visits' and the sessions' levels.
+        before: dose before every session; None: each session's first amplitude.
+    """
+
+    phi: Floats
+    gains: Floats
+    levels: Floats
+    noise_weights: Floats
+    shares: dict[str, float]
+    before: float | None
+
+    def innovations(self, tables: Sequence[ModeTable]) -> list[Floats]:
+        """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
+        found, w = [], self.phi.size
+        for i, table in enumerate(tables):
+            eta = table.beta - self.gains @ table.columns.T - self.levels[:, i : i + 1]
+            windows = np.lib.stride_tricks.sliding_window_view(eta, w, axis=1)[:, :-1]
+            innovation = eta[:, w:] - windows @ self.phi[::-1]
+            predicted = table.beta[w:] - innovation
+            scale = np.exp(noise_features(np.broadcast_to(table.amplitude, predicted.shape), predicted) @ self.noise_weights)
+            found.append(np.where(table.usable, innovation / scale, np.nan))
+        return found
+
+    def usual_lead(self) -> Floats:
+        """Standardised beta of each session, [n], where the window before it is not known."""
+        dose = columns_of(np.array([1.0 if self.before is None else self.before]), 1.0 if self.before is None else self.before)[0]
+        return np.asarray((self.levels + (self.gains @ dose)[:, None]).mean(0), dtype=np.float64)
+
+    def response(self, first: Floats, steps: int) -> ModeResponse:
+        """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
+        return ModeResponse(self.gains, first if self.before is None else np.full_like(first, self.before))
+
+
+class ModeResponse:
+    """The answer of beta to amplitudes [P, D, n] as they come, with gains [D, COLUMNS]."""
+
+    def __init__(self, gains: Floats, first: Floats) -> None:
+        self._gains, self._filters = gains, Filters(first)
+
+    def lasting(self) -> Floats:
+        """Answer [P, D, n] before the first amplitudes."""
+        return np.einsum("pdnk,dk->pdn", self._filters.columns, self._gains)
+
+    def step(self, a: Floats) -> Floats:
+        """Answer [P, D, n] once the amplitudes a are in force."""
+        return np.einsum("pdnk,dk->pdn", self._filters.step(a), self._gains)
+
+
+@dataclass(frozen=True)
+class FittedModes:
+    """The posterior of a fit, and what draws from it need besides."""
+
+    fit: MixedFit
+    own: Floats
+    phi: Floats
+    noise_weights: Floats
+    before: float | None
+
+    def drawn(self, draws: int, rng: np.random.Generator) -> ModeDynamics:
+        """Draws of the coefficients."""
+        return self._of(self.fit.draws(draws, rng))
+
+    @property
+    def mean(self) -> ModeDynamics:
+        """The model at its posterior mean (D = 1)."""
+        return self._of(self.fit.coefficients[None])
+
+    def _of(self, coefficients: Floats) -> ModeDynamics:
+        gains, levels = _split(coefficients, self.own)
+        shares = {name: self.fit.share(name) for name in ("visit", "session")}
+        return ModeDynamics(self.phi, gains, levels, self.noise_weights, shares, self.before)
+
+
+def fit_modes(buffer: ReplayBuffer, tables: Sequence[ModeTable], before: float | None) -> FittedModes:
+    """The posterior of the model.
+
+    Raises:
+        ValueError: fewer than two sessions with usable steps.
+    """
+    with_steps = sum(bool(t.usable.any()) for t in tables)
+    if with_steps < 2:
+        raise ValueError(f"a model of beta's answer needs at least two sessions with usable steps; the buffer has {with_steps}")
+    window, visits = buffer.settings.window, np.array([s.visit for s in buffer.sessions])
+    own = (visits[:, None] == np.unique(visits)).astype(np.float64)
+    usable = [t.usable for t in tables]
+    phi = np.zeros(window)
+    for _ in range(TURNS):
+        _, coefficients = mode_model(own).likeliest(Sums.pooled(mode_sums(tables, own, phi)))
+        phi = autoregression(_residuals(tables, coefficients, own), usable, window)
+    fit = mode_model(own).fit(Sums.pooled(mode_sums(tables, own, phi)))
+    betas, amplitudes = [t.beta for t in tables], [t.amplitude for t in tables]
+    noise = log_noise_weights(_residuals(tables, fit.coefficients, own), betas, amplitudes, usable, phi)
+    return FittedModes(fit, own, phi, noise, before)
+
+
+def mode_model(own: Floats) -> MixedModel:
+    """The mixed model of the columns (1, modes, visits, sessions)."""
+    j, first = POLYNOMIALS, 1 + COLUMNS
+    groups = (
+        ("fast", tuple(1 + m * j for m in range(SLOW))),
+        ("slow", tuple(1 + m * j for m in range(SLOW, len(TIMES)))),
+        ("shape", tuple(1 + m * j + k for m in range(len(TIMES)) for k in range(1, j))),
+        ("sided", tuple(range(1 + j * len(TIMES), first))),
+    )
+    return level_model(groups, COLUMNS, own, {})
+
+
+def mode_sums(tables: Sequence[ModeTable], own: Floats, phi: Floats) -> list[Sums]:
+    """Sums of every session for `mode_model`."""
+    return [level_sums(t.beta, t.columns, t.usable, own, i, phi) for i, t in enumerate(tables)]
+
+
+def _split(coefficients: Floats, own: Floats) -> tuple[Floats, Floats]:
+    """Gains [D, COLUMNS] and levels [D, n] from coefficients [D, q]."""
+    first = 1 + COLUMNS
+    visits = coefficients[:, first : first + own.shape[1]]
+    return coefficients[:, 1:first], coefficients[:, :1] + visits @ own.T + coefficients[:, first + own.shape[1] :]
+
+
+def _residuals(tables: Sequence[ModeTable], coefficients: Floats, own: Floats) -> list[Floats]:
+    gains, levels = _split(coefficients[None], own)
+    return [table.beta - table.columns @ gains[0] - levels[0, i] for i, table in enumerate(tables)]

@@ -1,0 +1,77 @@
+"""Whether the data can order policies at all, which is asked before any order is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.ope.behaviour import controllers
+from ml.ope.linear.end_outcomes import EndModel
+from ml.ope.posterior.held_out import HeldOut
+from ml.trajectories import ReplayBuffer
+
+Floats = NDArray[np.float64]
+
+FEWEST = 6
+"""Left-out sessions below which nothing is concluded from them."""
+OPPOSITE = 2.0
+"""An observed contrast of so many standard errors whose predicted sign is the other one is not reproduced."""
+NO_BETTER, CONTRASTS, TOO_FEW = "no_better_than_equal", "contrasts_not_reproduced", "too_few_left_out_sessions"
+
+
+@dataclass(frozen=True)
+class Skill:
+    """Skill of ordering.
+
+    Attributes:
+        told: False where the data give no reason to believe an order of policies. reasons: codes of what speaks against it.
+        held_out_correlation: of predicted with observed reward of left-out sessions; None where there are too few or they do not differ.
+    """
+
+    told: bool
+    reasons: tuple[str, ...]
+    held_out_correlation: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """All fields, JSON-able."""
+        return {"told": self.told, "reasons": list(self.reasons), "held_out_correlation": self.held_out_correlation}
+
+
+def ordering_skill(buffer: ReplayBuffer, predictions: HeldOut, ends: EndModel) -> Skill:
+    """Predictions of left-out sessions against calling them all equal, and against contrasts between controllers.
+
+    The reward of the amplitude's price is known and orders nothing by itself. Beta may answer to nothing while outcomes do: where r_end of
+    left-out sessions is predicted better than by its mean, that alone is skill.
+    """
+    keys = list(predictions.weights)
+    predicted = np.sum([predictions.weights[k] * predictions.predicted[k] for k in keys], axis=0)
+    seen = predictions.observed
+    known = np.isfinite(predicted) & np.isfinite(seen)
+    if known.sum() < FEWEST:
+        return Skill(False, (TOO_FEW,), None)
+    said, was = predicted[known], seen[known]
+    correlation = float(np.corrcoef(said, was)[0, 1]) if min(said.std(), was.std()) > 1e-9 else None
+    steps_told = float(np.mean((said - was) ** 2)) < float(np.var(was))
+    outcomes_told = ends.seen[0] and bool(np.nan_to_num(ends.skill[0]) > 0)
+    reasons = [] if steps_told or outcomes_told else [NO_BETTER]
+    if _contradicted(buffer, predicted, seen):
+        reasons.append(CONTRASTS)
+    return Skill(not reasons, tuple(reasons), correlation)
+
+
+def _contradicted(buffer: ReplayBuffer, predicted: Floats, seen: Floats) -> bool:
+    """Whether a clear contrast between two controllers is predicted with the other sign."""
+    arms = []
+    for indices in controllers(buffer).values():
+        own = np.array([i for i in indices if np.isfinite(predicted[i]) and np.isfinite(seen[i])])
+        if own.size >= 2:
+            arms.append((seen[own].mean(), seen[own].var(ddof=1) / own.size, predicted[own].mean()))
+    for k, (mean, variance, said) in enumerate(arms):
+        for other, other_variance, other_said in arms[:k]:
+            gap, error = mean - other, float(np.sqrt(variance + other_variance))
+            if abs(gap) > OPPOSITE * error and (said - other_said) * gap < 0 and abs(said - other_said) > error:
+                return True
+    return False

@@ -1,0 +1,135 @@
+"""The structures that the posterior averages: models of beta in which logged sessions can be replayed under a policy, with draws.
+
+Each is linear in its coefficients given a few hyperparameters, so that a session can be left out by taking its sums away (`LinearForm`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.ope.impulse.dynamics import ImpulseDynamics, ResponseTable, fit_impulse, moved, prior_root, response_model, response_sums
+from ml.ope.linear.dynamics import ANSWERS, Dynamics, SessionTable, fit_dynamics, linear_model, linear_sums
+from ml.ope.linear.estimator import Replayable
+from ml.ope.posterior.modes import ModeDynamics, ModeTable, fit_modes, mode_model, mode_sums
+from ml.ope.scale import Scale
+from ml.statistics.mixed import MixedModel, Sums
+from ml.trajectories import ReplayBuffer
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LinearForm:
+    """A structure at stated hyperparameters as a regression of beta on (1, answers, visits, sessions).
+
+    Attributes:
+        weight: share of the evidence among the forms of one structure. model: groups of columns. ratios: lambdas of the groups.
+        sums: of every session, [n]. answers: columns of every session, [W + T, k] each; levels have no column here.
+        phi: autoregression, [W]. noise_weights: of the log of an innovation's scale, [3].
+    """
+
+    weight: float
+    model: MixedModel
+    ratios: Floats
+    sums: tuple[Sums, ...]
+    answers: tuple[Floats, ...]
+    phi: Floats
+    noise_weights: Floats
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One structure fitted to a buffer: its sessions' tables, D draws of its coefficients, and its forms."""
+
+    key: str
+    tables: tuple[Any, ...]
+    drawn: Replayable
+    forms: tuple[LinearForm, ...]
+
+    def thinned(self, draws: int) -> Replayable:
+        """The first draws alone, at most those that there are."""
+        return take(self.drawn, np.arange(min(draws, len(self.drawn.levels))))
+
+
+Fitter = Callable[[ReplayBuffer, Scale, int, int, float | None], Fit]
+"""Fits a structure: buffer, standardisation, draws, seed, the dose before every session (`ml.ope.lead`)."""
+
+LEAST_FORM = 0.05
+"""Forms below this share of a structure's evidence are left out where sessions are left out."""
+
+
+def take(dynamics: Replayable, keep: NDArray[np.int64]) -> Replayable:
+    """Some of the draws of a model.
+
+    Raises:
+        TypeError: a model of a kind that is not known here.
+    """
+    if isinstance(dynamics, Dynamics):
+        return replace(dynamics, beta=dynamics.beta[keep], levels=dynamics.levels[keep])
+    if isinstance(dynamics, ModeDynamics):
+        return replace(dynamics, gains=dynamics.gains[keep], levels=dynamics.levels[keep])
+    if isinstance(dynamics, ImpulseDynamics):
+        return replace(dynamics, gains=dynamics.gains[keep], shapes=dynamics.shapes[keep], levels=dynamics.levels[keep])
+    raise TypeError(f"draws of {type(dynamics).__name__} cannot be taken apart")
+
+
+def fit_linear(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, before: float | None) -> Fit:
+    """The linear model: levels, an answer to the dose over about 20 steps with differences in timing, an autoregression."""
+    tables = [SessionTable.of(s, scale, before) for s in buffer.sessions]
+    mean, drawn = fit_dynamics(buffer, tables, draws, seed, before)
+    own = visits_of(buffer)
+    sums = tuple(linear_sums(tables, own, mean.phi))
+    form = LinearForm(1.0, linear_model(own), mean.ratios, sums, tuple(t.answers for t in tables), mean.phi, mean.noise_weights)
+    return Fit("linear", tuple(tables), drawn, (form,))
+
+
+def no_answer(fit: Fit, buffer: ReplayBuffer) -> Fit:
+    """A fitted linear model without any answer to the amplitude, which calls all doses equal: what skill is held against."""
+    tables = [replace(t, answers=np.zeros_like(t.answers)) for t in fit.tables]
+    mean, drawn = fit_dynamics(buffer, tables, 1, 0, None)
+    own = visits_of(buffer)
+    zeros = tuple(np.zeros((t.beta.size, ANSWERS)) for t in tables)
+    form = LinearForm(1.0, linear_model(own), mean.ratios, tuple(linear_sums(tables, own, mean.phi)), zeros, mean.phi, mean.noise_weights)
+    return Fit("equal", tuple(tables), drawn, (form,))
+
+
+def fit_response(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, before: float | None) -> Fit:
+    """The impulse response with a stable-spline prior behind one of four dose shapes."""
+    tables = [ResponseTable.of(s, scale, before) for s in buffer.sessions]
+    drawn = fit_impulse(buffer, tables, draws, seed, before)
+    own, forms = visits_of(buffer), []
+    by_shape = {shape: response_sums(tables, own, drawn.phi, shape) for (shape, _), w in drawn.evidence.items() if w >= LEAST_FORM}
+    for (shape, alpha), weight in drawn.evidence.items():
+        if weight < LEAST_FORM:
+            continue
+        sums = tuple(moved(s, own, alpha) for s in by_shape[shape])
+        answers = tuple(t.means[shape] @ prior_root(alpha) for t in tables)
+        forms.append(LinearForm(weight, response_model(own), drawn.ratios[shape, alpha], sums, answers, drawn.phi, drawn.noise_weights))
+    # its draws come combination by combination: shuffled, the first few stand for all
+    order = np.random.default_rng([seed, 0x0BDE]).permutation(len(drawn.levels))
+    return Fit("impulse", tuple(tables), take(drawn, order), tuple(forms))
+
+
+def fit_low_passes(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, before: float | None) -> Fit:
+    """Low-passes of several speeds behind polynomials of the dose."""
+    tables = [ModeTable.of(s, scale, before) for s in buffer.sessions]
+    found = fit_modes(buffer, tables, before)
+    sums = tuple(mode_sums(tables, found.own, found.phi))
+    columns = tuple(t.columns for t in tables)
+    form = LinearForm(1.0, mode_model(found.own), found.fit.likeliest, sums, columns, found.phi, found.noise_weights)
+    return Fit("modes", tuple(tables), found.drawn(draws, np.random.default_rng([seed, 0x30DE])), (form,))
+
+
+def visits_of(buffer: ReplayBuffer) -> Floats:
+    """Which visit each session belongs to, [n, V]."""
+    visits = np.array([s.visit for s in buffer.sessions])
+    return np.asarray(visits[:, None] == np.unique(visits), dtype=np.float64)
+
+
+STRUCTURES: dict[str, Fitter] = {"linear": fit_linear, "impulse": fit_response, "modes": fit_low_passes}
+"""Every structure by its key."""

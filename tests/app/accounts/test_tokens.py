@@ -1,0 +1,120 @@
+"""API tokens: what they may do, when they end, and what only a person who has signed in may change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import timedelta
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+
+from app.accounts import service
+from app.accounts.models import Role, Scope, User
+from app.accounts.permissions import PERMISSIONS, SCOPES, Caller, Grant
+from app.platform.database import now
+from app.platform.errors import Forbidden, Invalid, TooMany
+from tests.conftest import PASSWORD
+
+ADA = "ada@clinic.example"
+
+
+@pytest.fixture
+def ada(db: Session) -> str:
+    service.add_user(db, ADA, Role.ADMIN, PASSWORD)
+    db.commit()
+    return ADA
+
+
+@pytest.fixture
+def client_with(service_app: FastAPI) -> Callable[[str], TestClient]:
+    """A client that calls with a token."""
+    return lambda token: TestClient(service_app, headers={"Authorization": f"Bearer {token}"})
+
+
+@pytest.mark.parametrize("scope", list(Scope))
+def test_a_scope_narrows_what_its_user_may_and_widens_nothing(scope: Scope) -> None:
+    every = set().union(*PERMISSIONS.values())
+    for role, allowed in PERMISSIONS.items():
+        caller = Caller("x", 1, (Grant(1, None, role),), token_scope=scope)
+        within = SCOPES[scope]
+        assert {p for p in every if caller.may(p)} == (allowed if within is None else allowed & within)
+
+
+def test_a_narrow_token_is_refused_in_words(db: Session, ada: str, client_with: Callable[[str], TestClient]) -> None:
+    token = service.create_token(db, ada, "reader", Scope.READ)
+    db.commit()
+    client = client_with(token)
+    assert client.get("/api/v1/participants").status_code == 200
+    answer = client.post("/api/v1/participants", json={"code": "P9"})
+    assert answer.status_code in (403, 422)
+    upload = client.post("/api/v1/uploads", files={"file": ("a.csv", b"x")}, data={"participant": "P1"})
+    assert upload.status_code == 403
+    assert upload.json()["detail"] == "A token for 'read' may not do this ('upload')."
+
+
+def test_a_token_ends_on_its_day(db: Session, ada: str) -> None:
+    token = service.create_token(db, ada, "tablet", days=1)
+    assert service.caller_of_token(db, token) is not None
+    db.execute(text("update api_token set expires_at = :at"), {"at": now() - timedelta(seconds=1)})
+    assert service.caller_of_token(db, token) is None
+
+
+@pytest.mark.parametrize("days", [0, -1, service.MOST_TOKEN_DAYS + 1])
+def test_a_token_has_an_end_within_reason(db: Session, ada: str, days: int) -> None:
+    with pytest.raises(Invalid, match="cannot last"):
+        service.create_token(db, ada, "tablet", days=days)
+
+
+def test_a_new_password_ends_tokens_and_browser_sessions(db: Session, ada: str) -> None:
+    token, cookie = service.create_token(db, ada, "tablet"), service.sign_in(db, ada, PASSWORD)
+    db.commit()
+    caller = service.caller_of_cookie(db, cookie)
+    assert caller is not None
+    assert caller.user_id is not None
+    service.change_own_password(db, caller.user_id, PASSWORD, "another good password")
+    db.commit()
+    assert service.caller_of_token(db, token) is None
+    assert service.caller_of_cookie(db, cookie) is None
+
+
+def test_the_present_password_cannot_be_guessed_without_limit(db: Session, ada: str) -> None:
+    user = db.query(User).filter_by(email=ada).one()
+    for _ in range(service.FAILURES_ALLOWED):
+        with pytest.raises(Forbidden, match="present password is wrong"):
+            service.change_own_password(db, user.id, "a wrong guess", "another good password")
+    with pytest.raises(TooMany):
+        service.change_own_password(db, user.id, PASSWORD, "another good password")
+
+
+@pytest.mark.parametrize(
+    ("path", "form"),
+    [
+        ("/account/tokens", {"name": "minted"}),
+        ("/account/password", {"present": PASSWORD, "password": "another good password", "again": "another good password"}),
+        ("/account/tokens/1/revoke", {}),
+        ("/accounts", {"email": "eve@clinic.example", "role": "admin", "password": "another good password"}),
+        ("/accounts/1/password", {"password": "another good password"}),
+        ("/accounts/1/active", {"active": "no"}),
+    ],
+)
+def test_a_token_changes_no_password_token_or_account(
+    db: Session, ada: str, client_with: Callable[[str], TestClient], path: str, form: dict[str, str]
+) -> None:
+    token = service.create_token(db, ada, "tablet")
+    db.commit()
+    answer = client_with(token).post(path, data=form)
+    assert answer.status_code == 403
+    assert "may not change passwords, tokens or accounts" in answer.text
+    assert db.execute(text("select count(*) from api_token")).scalar_one() == 1
+
+
+def test_nobody_administers_a_user_without_any_access(db: Session, ada: str) -> None:
+    """Such a user belongs to no study of the caller: whoever administers one site could take the account over."""
+    service.add_user(db, "former@clinic.example", Role.VIEWER, PASSWORD).memberships.clear()
+    db.flush()
+    former = db.query(User).filter_by(email="former@clinic.example").one()
+    study = service.study_of(db, None)
+    assert not service.manages(Caller("x", 1, (Grant(study.id, None, Role.ADMIN),)), former)

@@ -1,0 +1,176 @@
+"""A controller's log gives back what the device had: each beta beside the amplitude that was in force while it was measured."""
+
+from __future__ import annotations
+
+import csv
+import io
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from app.tablet.control import Run, drive, verified
+from app.tablet.sources import Row, Source
+from ml.deploy.runtime.decision_log import COLUMNS, kind_line
+from ml.deploy.runtime.envelope import BetaSample, Signal
+from ml.formats import DecodeOptions, UndecodableFile, decode, redact, sniff
+from ml.formats.recording import DecodedFile
+from ml.formats.tables.columns import LOG_COLUMNS, LOG_KIND_LINE
+from tests.app.tablet.control_bundles import MANIFEST, PUBLIC, made
+
+STEPS, LEAD = 40, 10
+SIGNAL = Signal("uV", "time_domain")
+
+
+class Device:
+    """A stimulator with a brain: beta answers to the amplitude in force, and both are on record as they were."""
+
+    def __init__(self) -> None:
+        self._rng = np.random.default_rng(8)
+        self.beta: dict[float, float] = {}
+        self.amplitude_ma: dict[float, float] = {}
+
+    def measured(self, t_end_s: float, amplitude_ma: float) -> float:
+        """Beta of the period that ends at `t_end_s` under an amplitude; float32, as every runtime takes it."""
+        value = float(np.float32(2.2 - 0.4 * amplitude_ma + 0.3 * self._rng.standard_normal()))
+        self.beta[t_end_s], self.amplitude_ma[t_end_s] = max(value, 0.05), amplitude_ma
+        return self.beta[t_end_s]
+
+
+def in_closed_loop(device: Device):  # type: ignore[no-untyped-def]
+    amplitude = MANIFEST.cdbs_ma
+    for i in range(-LEAD + 1, STEPS + 1):
+        t_s = 2.0 * i
+        amplitude = yield Row(t_s, BetaSample(t_s, device.measured(t_s, amplitude), SIGNAL))
+
+
+def same_as_the_device(decoded: DecodedFile, device: Device) -> None:
+    (recording,) = decoded.recordings
+    beta, amplitude = (next(t for t in recording.traces if t.stream == stream) for stream in ("beta", "amplitude"))
+    times = [round(t, 6) for t in beta.t_end_s]
+    assert times == list(device.beta)
+    np.testing.assert_allclose(beta.values, list(device.beta.values()), rtol=1e-6)
+    np.testing.assert_allclose(amplitude.values[1:], list(device.amplitude_ma.values())[1:], rtol=1e-5)  # six digits
+    assert np.isnan(amplitude.values[0]), "nothing is known of the time before the first decision"
+    assert (beta.unit, beta.source, amplitude.unit, amplitude.source) == ("uV", "time_domain", "mA", "device_log")
+    assert recording.kind == "controller_log"
+
+
+@pytest.fixture
+def logged(tmp_path: Path) -> tuple[Device, Path]:
+    device, log, sink = Device(), tmp_path / "log.csv", io.StringIO()
+    drive(verified(made(tmp_path), PUBLIC), Source(in_closed_loop(device), "a device"), Run(2.0, 3.0), False, sink)
+    log.write_text(sink.getvalue())
+    return device, log
+
+
+def test_the_log_of_the_tablet_gives_back_what_the_device_had(logged: tuple[Device, Path], tmp_path: Path) -> None:
+    device, log = logged
+    assert len(set(device.amplitude_ma.values())) > 5, "the amplitude moves, so that a shift by one step would show"
+    assert sniff(log) == "control_log"
+    decoded = decode(log)
+    same_as_the_device(decoded, device)
+    clean = tmp_path / "clean.csv"
+    redact(log, clean, "control_log", b"k" * 32)
+    same_as_the_device(decode(clean), device)
+    assert decode(clean).recordings[0].fingerprint == decoded.recordings[0].fingerprint
+    assert "policy" not in clean.read_text()
+
+
+def test_the_log_of_a_bundles_own_runner_gives_back_what_the_device_had(tmp_path: Path) -> None:
+    with zipfile.ZipFile(made(tmp_path)) as archive:
+        archive.extractall(tmp_path / "bundle")
+    call = [sys.executable, "-m", "controller", "--run", "--log=log.csv"]
+    device, amplitude = Device(), MANIFEST.cdbs_ma
+    with subprocess.Popen(call, cwd=tmp_path / "bundle", stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as runner:
+        assert runner.stdin is not None
+        assert runner.stdout is not None
+        for k in range(STEPS):
+            runner.stdin.write(f"{device.measured(2.0 * k, amplitude):.9g}\n")
+            runner.stdin.flush()
+            amplitude = float(runner.stdout.readline().split()[0])
+        runner.stdin.close()
+        assert runner.wait(20) == 0
+    same_as_the_device(decode(tmp_path / "bundle" / "log.csv"), device)
+    again = subprocess.run(call, cwd=tmp_path / "bundle", input="1\n", capture_output=True, text=True, check=False)
+    assert (again.returncode, "log.csv cannot be written" in again.stderr) == (1, True)
+
+
+def test_an_uploaded_log_is_the_session_that_the_device_had(logged: tuple[Device, Path], client: TestClient, enrolled: str) -> None:
+    device, log = logged
+    client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"cdbs_amplitude_ma": 3.0}})
+    data = {"participant": enrolled, "visit": "1", "controller": "other"}
+    answer = client.post("/api/v1/uploads", data=data, files={"file": ("log.csv", log.read_bytes())})
+    assert answer.status_code == 201, answer.text
+    assert "each put to the period that followed it" in answer.json()["report"][0]["understood"][0]
+    trace = client.get(f"/api/v1/sessions/{answer.json()['sessions'][0]['id']}/trace").json()
+    steps = {t: a for t, a in zip(trace["t_s"], trace["amplitude_ma"], strict=True) if t > 0}
+    assert steps == pytest.approx({t: a for t, a in device.amplitude_ma.items() if t > 0})
+    # a table of the same rows, as they stand, would be a step off
+    with log.open() as stream:
+        next(stream)
+        shifted = {float(r["due_s"]): float(r["amplitude_ma"]) for r in csv.DictReader(stream)}
+    assert max(abs(shifted[t] - steps[t]) for t in steps) > 0.3
+
+
+def test_a_log_without_its_first_line_is_refused_in_words(logged: tuple[Device, Path], client: TestClient, enrolled: str) -> None:
+    bare = logged[1].read_bytes().split(b"\n", 1)[1]
+    data = {"participant": enrolled, "visit": "1", "controller": "other"}
+    answer = client.post("/api/v1/uploads", data=data, files={"file": ("log.csv", bare)})
+    assert answer.status_code == 422, answer.text
+    assert "the log of a controller without its first line" in answer.text
+    assert "put '# betaloop controller log, version 1" in answer.text
+
+
+def test_a_log_of_0_1_0_is_read_once_its_kind_is_said(logged: tuple[Device, Path], tmp_path: Path) -> None:
+    old = tmp_path / "old.csv"
+    with logged[1].open() as stream, old.open("w") as out:
+        kind = next(stream)
+        out.write(kind)
+        rows = csv.DictReader(stream)
+        writer = csv.DictWriter(out, [c for c in COLUMNS if c not in ("due_s", "source")], extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    (recording,) = decode(old).recordings
+    amplitude = next(t for t in recording.traces if t.stream == "amplitude")
+    np.testing.assert_allclose(amplitude.values[1:], list(logged[0].amplitude_ma.values())[1:], rtol=1e-5)  # six digits
+
+
+def test_a_late_decision_counts_from_when_it_was_made(tmp_path: Path) -> None:
+    log = tmp_path / "late.csv"
+    rows = ["0,0,1,uV,,3", "2.5,2,1,uV,,1", "4,4,1,uV,,2", "10,10,1,uV,,2", "12,12,1,uV,invalid_beta,2"]
+    log.write_text(f"{kind_line(2.0)}\nt_s,due_s,beta,unit,reasons,amplitude_ma\n" + "\n".join(rows) + "\n")
+    (recording,) = decode(log).recordings
+    beta, amplitude = (next(t for t in recording.traces if t.stream == stream) for stream in ("beta", "amplitude"))
+    np.testing.assert_allclose(amplitude.values, [np.nan, 3.0, 1.5, np.nan, np.nan, np.nan, 2.0])
+    np.testing.assert_array_equal(beta.valid, [True, True, True, False, False, True, False])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda text: text.replace("version 1", "version 2", 1), "log of version 2"),
+        (lambda text: text.replace("period 2 s", "period 5 s", 1), "decided every 5 s"),
+        (lambda text: text.replace(", period 2 s", "", 1), "first line of this controller's log is not whole"),
+        (lambda text: text.replace("amplitude_ma", "amplitude", 1), "without the column amplitude_ma"),
+        (lambda text: text.replace(",uV,", ",mV,", 1), "beta of several units"),
+        (lambda text: text.replace("2.000,2.000,", "2.000,soon,", 1), "'soon' is no number"),
+        (lambda text: "\n".join(text.splitlines()[:2]), "the log has no decision"),
+    ],
+)
+def test_what_is_wrong_with_a_log_is_said(logged: tuple[Device, Path], change: Callable[[str], str], words: str) -> None:
+    text = logged[1].read_text()
+    assert change(text) != text
+    logged[1].write_text(change(text))
+    with pytest.raises(UndecodableFile, match=words):
+        decode(logged[1], options=DecodeOptions())
+
+
+def test_the_words_of_decoder_and_writer_agree() -> None:
+    assert kind_line(2.0) == LOG_KIND_LINE
+    assert set(COLUMNS) >= LOG_COLUMNS

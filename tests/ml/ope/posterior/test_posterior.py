@@ -1,0 +1,122 @@
+"""The posterior as an estimator: its contract, its answers on sessions whose truth is known, tests, and skill."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ml.ope.compare.aggregate import combine
+from ml.ope.compare.metrics import spearman
+from ml.ope.estimate import Estimate
+from ml.ope.posterior.draws import KEPT, systematic
+from ml.ope.posterior.estimator import Posterior, PosteriorConfig, shared_out
+from ml.ope.posterior.gaussian import TestedDifference
+from ml.ope.posterior.structures import STRUCTURES
+from ml.ope.registry import POSTERIOR, build
+from ml.policies.policy import ConstantPolicy, ProportionalPolicy
+from ml.qoc import Qoc
+from tests.ml.ope.posterior.known_system import STEPS, KnownSystem
+
+POLICIES = {f"constant {a}": ConstantPolicy(a) for a in (0.4, 0.55, 0.7, 0.85, 1.0)} | {"off": ConstantPolicy(0.0)}
+SMALL = Posterior(PosteriorConfig(draws=24))
+
+
+@pytest.fixture(scope="module")
+def found(known_buffer):
+    return SMALL.fit(known_buffer).evaluate(POLICIES)
+
+
+def test_an_estimate_holds_what_verdicts_and_pages_are_made_from(found) -> None:
+    for estimate in found.values():
+        d = estimate.details
+        assert estimate.method == POSTERIOR
+        assert estimate.low < estimate.value < estimate.high
+        assert estimate.value == pytest.approx(estimate.step_return + estimate.end_reward)
+        assert len(d["draws"]) == KEPT
+        assert set(d["outcome_draws"]) == {"energy", "grasp_hz", "rating", "tremor_percent"}
+        assert {len(v) for v in d["outcome_draws"].values()} == {KEPT}
+        assert set(d["support"]) == {"near_sessions", "near_visits", "leverage", "dose", "lowest_supported"}
+        assert set(d["behaviour"]) == {"below_cdbs_20_percent", "closeness_to_cdbs", "mean_amplitude"}
+        assert set(d["weights"]) == set(STRUCTURES)
+        assert sum(d["weights"].values()) == pytest.approx(1, abs=1e-3)
+        assert d["skill"]["told"] is True
+        assert Estimate.from_json(estimate.to_json()) == estimate
+    assert found["off"].details["behaviour"]["below_cdbs_20_percent"] == 1
+    assert found["constant 0.7"].details["behaviour"]["closeness_to_cdbs"] == pytest.approx(0.3)
+    assert found["constant 0.7"].predicted["energy"] == pytest.approx(0.49, abs=0.01)
+    assert found["constant 0.7"].supported
+    ratings = np.array(found["off"].details["outcome_draws"]["rating"])
+    assert ratings.min() >= 1
+
+
+def test_the_same_seed_gives_the_same_numbers(known_buffer, found) -> None:
+    assert SMALL.fit(known_buffer).evaluate(POLICIES) == found
+
+
+def test_known_doses_are_ordered_and_covered(found) -> None:
+    """Truth by simulation of the system on new sessions."""
+    system, rng = KnownSystem(), np.random.default_rng(5)
+    settings = system.buffer().settings
+    discount = settings.gamma ** np.arange(STEPS)
+    truth = {}
+    for name in list(POLICIES)[:5]:
+        runs = [system.session(i, 1, "other", np.full(STEPS, POLICIES[name].amplitude), rng) for i in range(60)]
+        truth[name] = np.mean([(s.rewards(settings) * discount).sum() for s in runs])
+    said = [found[n].step_return for n in truth]
+    assert spearman(list(truth.values()), said) > 0.8
+    assert np.abs(np.array(said) - list(truth.values())).max() < 8
+
+
+def test_tested_sessions_move_what_was_tested_and_its_neighbours(known_buffer, found) -> None:
+    cdbs = found["constant 1.0"].value
+    gap = found["constant 0.7"].value - cdbs
+    tests = [TestedDifference("constant 0.7", v, 4, {"return": gap - 15.0}, {"return": 1.0}) for v in (4, 5, 6)]
+    after = SMALL.with_tests(tests).fit(known_buffer).evaluate(POLICIES)
+    moved = {n: (after[n].value - after["constant 1.0"].value) - (found[n].value - cdbs) for n in POLICIES}
+    assert moved["constant 0.7"] < -7
+    assert moved["constant 0.55"] < moved["off"] + 1
+    assert abs(moved["constant 0.55"]) < abs(moved["constant 0.7"])
+    assert after["constant 0.7"].standard_error < found["constant 0.7"].standard_error
+    assert after["constant 0.7"].value == pytest.approx(after["constant 0.7"].step_return + after["constant 0.7"].end_reward)
+    with pytest.raises(ValueError, match="not evaluated"):
+        SMALL.with_tests([replace(tests[0], policy_name="gone")]).fit(known_buffer).evaluate(POLICIES)
+
+
+def test_without_outcomes_the_return_is_that_of_the_steps_and_says_so() -> None:
+    buffer = KnownSystem().buffer()
+    bare = replace(buffer, sessions=tuple(replace(s, qoc=Qoc()) for s in buffer.sessions))
+    found = SMALL.fit(bare).evaluate({"half": ConstantPolicy(0.5)})["half"]
+    assert found.end_reward is None
+    assert found.value == pytest.approx(found.step_return)
+    assert "few_end_rewards" in {f.code for f in found.flags}
+    assert set(found.details["outcome_draws"]) == {"energy"}
+
+
+def test_data_that_cannot_order_policies_say_so() -> None:
+    """Beta that answers to nothing, and outcomes that nobody took."""
+    buffer = KnownSystem(depth=0.0).buffer(weight=0.0)
+    noise = replace(buffer.settings, xi_beta=1.0)
+    bare = replace(buffer, settings=noise, sessions=tuple(replace(s, qoc=Qoc()) for s in buffer.sessions))
+    skill = SMALL.fit(bare).evaluate({"half": ConstantPolicy(0.5)})["half"].details["skill"]
+    assert skill["told"] is False
+    assert "no_better_than_equal" in skill["reasons"]
+
+
+def test_a_policy_that_follows_beta_can_be_evaluated_at_every_size(known_buffer) -> None:
+    policy = ProportionalPolicy(0.4, 0.8, 0.3, 3)
+    for size in ("demo", "full"):
+        assert build(POSTERIOR, 1, size).fit(known_buffer).evaluate({"p": policy}, 40)["p"].n == len(known_buffer.sessions)
+
+
+def test_the_posterior_takes_no_part_in_the_combination_of_the_methods(found) -> None:
+    other = {n: replace(e, method="linear", value=e.value + 1) for n, e in found.items()}
+    made = combine({"linear": other, POSTERIOR: found})
+    assert made["constant 0.7"].value == pytest.approx(other["constant 0.7"].value)
+
+
+def test_draws_are_dealt_out_by_weight() -> None:
+    assert shared_out({"a": 0.9, "b": 0.09, "c": 0.01}, 40) == {"a": 36, "b": 6}
+    counts = np.bincount(systematic(np.array([0.5, 0.3, 0.2]), 100, np.random.default_rng(0)))
+    assert counts.tolist() == [50, 30, 20]
