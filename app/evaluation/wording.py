@@ -252,9 +252,6 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         f"{_percent(f.value)} likely at least as good as cDBS within the margins (a test asks for {_percent(f.limit)})"
     ),
     "saves_energy": lambda f: f"{_percent(f.value)} likely to use less energy (a test asks for {_percent(f.limit)})",
-    "few_near_sessions": lambda f: (
-        f"{_refusal(f)}{count(int(f.value or 0), 'session', 'sessions')} came near what it would do, {f.limit:.0f} are needed"
-    ),
     "sessions_needed": lambda f: count(int(_value(f)), "session", "sessions"),
     "near_amplitude": lambda f: f"held near {f.value:.1f} mA" if f.unit == "mA" else f"held near {_percent(f.value)} of the cDBS amplitude",
     # of the choice of a method
