@@ -191,7 +191,7 @@ class RankingOut(Model):
     policies: list[RankedPolicy]
     references: list[RankedPolicy]
     coverage_failed: str | None = Field(description="Why what the data cover could not be checked.")
-    choice: None = Field(None, description="Always null: the posterior ranks, and no method is chosen.")
+    choice: None = Field(description="Always null: the posterior ranks, and no method is chosen.")
     hidden: int = Field(0, description="Candidates that the filter leaves out.")
 
 

@@ -78,6 +78,11 @@ class Answer:
         """What is not to be run without a clinician's word, whatever its verdict."""
         return [r for r in (*self.rows, *self.like_off) if r.decided.needs_override and not r.one.policy.retired_reason]
 
+    def everyone(self) -> dict[int, Row]:
+        """Every candidate's row by the id of its policy, what to test first; twins have the row of what they do the same as."""
+        rows = (*self.rows, *self.like_cdbs, *self.like_off)
+        return {a.policy.id: r for r in rows for a in (r.one, *r.twins)}
+
     @property
     def cheapest(self) -> Row | None:
         """The row that the fewest further sessions would tell."""

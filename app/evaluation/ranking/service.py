@@ -96,6 +96,7 @@ def ranking_of(db: Session, found: Assessment, shown: RankingFilter | None = Non
         policies=[p for p in candidates if _passes(p, shown)],
         references=references,
         coverage_failed=coverage_failed(evaluation),
+        choice=None,
         hidden=sum(not _passes(p, shown) for p in candidates),
     )
 
