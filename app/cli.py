@@ -61,7 +61,9 @@ def serve(
     """Serve the web pages and the REST interface. Jobs need a worker beside it (`betaloop worker`)."""
     import uvicorn
 
+    from app.ingest.uploads.interrupted import keep_resuming
     from app.main import create_app
+    from app.platform.jobs.children import limited
     from app.platform.migrate import migrate as bring_up_to_date
 
     logs.configure()
@@ -70,19 +72,13 @@ def serve(
     supervise_database()
     structlog.get_logger().info("database", lies_in=database_place())
     service = create_app()
+    limited.prepare()  # before the first upload, which would wait for it
     # beside the service, for reading what a crash left behind may take minutes
-    threading.Thread(target=_resume_uploads, daemon=True).start()
+    threading.Thread(target=keep_resuming, args=("the service", threading.Event()), daemon=True).start()
     uvicorn.run(
         service, host=host or settings.host, port=port or settings.port, log_level=settings.log_level.lower(), access_log=False,
         timeout_graceful_shutdown=3, timeout_keep_alive=75,
     )  # fmt: skip
-
-
-def _resume_uploads() -> None:
-    from app.ingest.uploads.interrupted import resume
-
-    for taken in resume("start of the service"):
-        structlog.get_logger().info("interrupted upload", upload=taken.upload_id, done=taken.done, message=taken.message)
 
 
 @app.command(epilog="Example: betaloop worker --slots 2")

@@ -30,6 +30,9 @@ class Settings(BaseSettings):
     cookie_secure: bool = Field(False, description="Send the session cookie over HTTPS only; switch on behind TLS.")
     worker_slots: int = Field(2, ge=1, description="Compute steps that one worker runs side by side.")
     job_memory_mb: int = Field(8192, ge=512, description="Memory limit of one compute step, MiB.")
+    decode_slots: int = Field(2, ge=1, description="Uploaded files that one process has read side by side.")
+    decode_memory_mb: int = Field(2048, ge=512, description="Memory limit of reading one uploaded file, MiB.")
+    decode_seconds: int = Field(180, ge=5, description="Processor time that reading one uploaded file may take, s.")
     log_level: str = Field("INFO", description="DEBUG, INFO, WARNING or ERROR.")
     log_json: bool = Field(False, description="Log lines as JSON.")
 

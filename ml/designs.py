@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
@@ -245,6 +246,17 @@ class Recognised:
     kind: Literal["every_step", "held", "constant", "unknown"]
     holds: tuple[tuple[int, int, float], ...]
     repeats: float | None
+
+
+def unstated_holds(recognised: Recognised, steps: int) -> tuple[Hold, ...]:
+    """The stretches of held draws as decisions of unknown density that leave out none of `steps`: unknown steps go on with the hold before.
+
+    One amplitude all along is one hold. Empty where the draws are not held.
+    """
+    if recognised.kind not in ("held", "constant"):
+        return ()
+    starts = [0, *(start for start, _, _ in recognised.holds[1:]), steps]
+    return tuple(Hold(start, stop - start, None) for start, stop in pairwise(starts))
 
 
 HELD_SHARE: Final = 0.5

@@ -83,10 +83,23 @@ function send(files, fields, shown) {
       if (event.lengthComputable) shown.bar.value = event.loaded / event.total;
       shown.words.textContent = event.loaded < event.total ? `sending, ${Math.round((100 * event.loaded) / event.total)} %` : "decoding …";
     });
+    request.upload.addEventListener("load", () => follow(shown, request));
     request.addEventListener("load", () => { report(shown, request.status, request.response ?? {}); done(); });
     request.addEventListener("error", () => { report(shown, 0, { detail: "The connection broke off.", hint: "Send the files again; what has arrived is not counted twice." }); done(); });
     request.send(body);
   });
+}
+
+// while the service reads a file, which may take minutes, the page asks how far it is
+function follow(shown, request) {
+  const watching = setInterval(async () => {
+    if (request.readyState === XMLHttpRequest.DONE) { clearInterval(watching); return; }
+    const answer = await fetch(`${home}/upload/progress`).catch(() => null);
+    const newest = answer?.ok ? (await answer.json()).at(-1) : null;
+    if (!newest || request.readyState === XMLHttpRequest.DONE) return;
+    shown.bar.value = newest.share;
+    shown.words.textContent = newest.text;
+  }, 1000);
 }
 
 function badge(text, tone) { return element("span", { className: `badge ${tone}`, textContent: text }); }

@@ -221,6 +221,10 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "few_end_rewards": lambda f: "fewer than three sessions have an end-of-session reward: the estimate is the step return alone",
     "no_end_reward": lambda f: "no session has an end-of-session reward: the estimate is the step return alone",
     "days_unknown": lambda f: "how returns differ from day to day cannot be told from these sessions: the intervals leave it out",
+    "stopped_sessions": lambda f: (
+        f"{count(int(_value(f)), 'session', 'sessions')} stopped for the participant's sake: counted as failures with the worst outcomes. "
+        f"Counted as measured, the end-of-session reward would be {f.fact('measured'):.1f} instead of {f.fact('counted'):.1f}"
+    ),
     "no_better_than_mean": lambda f: (
         f"left-out sessions are predicted no better than by the mean of the others (error {_value(f):.2f} of that one's)"
     ),

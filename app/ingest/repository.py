@@ -87,6 +87,12 @@ def unfinished_uploads(db: Session) -> Sequence[int]:
     return db.scalars(select(Upload.id).where(Upload.status == "received").order_by(Upload.id)).all()
 
 
+def received_uploads(db: Session, participant_id: int) -> Sequence[int]:
+    """Numbers of a participant's uploads that were begun and not finished, oldest first."""
+    mine = (Upload.participant_id == participant_id) & (Upload.status == "received")
+    return db.scalars(select(Upload.id).where(mine).order_by(Upload.id)).all()
+
+
 def recordings_of_file(db: Session, upload_file_id: int) -> Sequence[Recording]:
     """Recordings that a file gave, in the order in which they were stored."""
     return db.scalars(select(Recording).where(Recording.upload_file_id == upload_file_id).order_by(Recording.id)).all()

@@ -19,6 +19,35 @@ def reason(evidence: Evidence) -> str:
     return _stated(evidence) if evidence.reason is Reason.STATED else _SENTENCES[evidence.reason](evidence.facts)
 
 
+WAITS = "cut short: read again by itself"
+AFTER_READER_ENDED = (
+    "It is kept encrypted. Send it again in smaller parts, or have BETALOOP_DECODE_MEMORY_MB or BETALOOP_DECODE_SECONDS raised and read it "
+    "again on the page of the quarantine."
+)
+
+
+def reader_ended(cause: str, memory_mb: int, cpu_s: int | None) -> str:
+    """Why a file could not be read, where that was ended by a limit."""
+    reasons = {
+        "memory": f"reading it takes more memory than the {memory_mb} MiB that one file may have",
+        "time": f"reading it takes longer than the {cpu_s} s of processor time that one file may have",
+    }
+    return reasons.get(cause, "the process that read it was ended")
+
+
+def progress(file: int, files: int, share: float, doing: str) -> str:
+    """How far the reading of an upload is."""
+    of = f"file {file} of {files}: " if files > 1 else ""
+    return f"{of}{doing}, {100 * share:.0f} %" if doing else f"{of}receiving"
+
+
+def cut_short(upload_id: int, kept: int, of: int) -> tuple[str, str]:
+    """What was kept of an upload that a fault of ours ended, and what becomes of it."""
+    what = f"Upload {upload_id} was cut short: the bytes of {kept} of its {of} file{'s' if of != 1 else ''} are kept."
+    rest = "" if kept >= of else " Send the others again; what came before is recognised."
+    return what, f"What is kept is read by itself within some minutes: its report will be on /uploads/{upload_id}.{rest}"
+
+
 def unreadable(members: list[str]) -> list[str]:
     """Of files that could not be read, and are stored encrypted for that reason."""
     return [f"kept encrypted, because it could not be read: {member}" for member in members]

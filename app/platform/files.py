@@ -24,7 +24,7 @@ from app.settings import get_settings, private_folder
 
 CHUNK = 1 << 20
 _LOCK = ".lock"
-_OPEN_FILES = Path("/proc/self/fd")
+_OPEN_FILES = Path("/proc")
 
 
 class StoredFile(Base):
@@ -123,7 +123,7 @@ def remove_abandoned() -> int:
         if lock is None:
             continue
         try:
-            removed += sum(1 for f in entry.iterdir() if f.name != _LOCK)
+            removed += sum(1 for f in entry.rglob("*") if f.is_file() and f.name != _LOCK)
             shutil.rmtree(entry)
         finally:
             os.close(lock)
@@ -131,18 +131,29 @@ def remove_abandoned() -> int:
 
 
 @contextmanager
+def draft_folder() -> Iterator[Path]:
+    """A fresh folder beside the drafts of this process, for work on one of them; it goes with all that is in it, as drafts do."""
+    folder = private_folder(_draft_folder() / secrets.token_hex(16))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
+
+
+@contextmanager
 def nameless_file() -> Iterator[tuple[BinaryIO, Path]]:
-    """A file without a name for raw bytes, and a path by which this process, and no other user, can open it again.
+    """A file without a name for raw bytes, and a path by which this process and its children, and no other user, can open it again.
 
     It is gone when the context ends and when the process is killed, at whatever moment: nobody has to clear up.
     """
     draft = draft_path()
     with draft.open("w+b", buffering=0) as file:
-        named = not (_OPEN_FILES / str(file.fileno())).exists()
+        nameless = _OPEN_FILES / str(os.getpid()) / "fd" / str(file.fileno())
+        named = not nameless.exists()
         if not named:
             draft.unlink()
         try:
-            yield file, draft if named else _OPEN_FILES / str(file.fileno())
+            yield file, draft if named else nameless
         finally:
             draft.unlink(missing_ok=True)
 

@@ -8,6 +8,7 @@ from datetime import datetime
 from typing import Any
 
 from sqlalchemy import ColumnElement, Select, column, false, func, or_, select, table, true
+from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.models import Site
@@ -260,6 +261,18 @@ def released_limits(db: Session, policy_id: int, moment: datetime | None) -> tup
         query = query.where(releases.c.created_at <= moment)
     row = db.execute(query.order_by(releases.c.created_at.desc()).limit(1)).first()
     return None if row is None else (float(row.min_ma), float(row.max_ma))
+
+
+def planned_designs(db: Session, visit_id: int) -> list[dict[str, Any]]:
+    """Designs of the random sessions in a visit's approved plan, by position; those that are drawn by the device have none.
+
+    Plans belong to a later phase; of their tables only the designs are needed here.
+    """
+    plans = table("plan", *(column(name) for name in ("id", "visit_id", "status")))
+    items = table("plan_item", *(column(name) for name in ("plan_id", "position")), column("design", JSONB))
+    query = select(items.c.design).join_from(items, plans, items.c.plan_id == plans.c.id)
+    query = query.where(plans.c.visit_id == visit_id, plans.c.status == "approved", items.c.design.is_not(None))
+    return [row for row in db.scalars(query.order_by(items.c.position)) if row["holds"]]
 
 
 def settings_version(db: Session, settings_version_id: int) -> SettingsVersion:

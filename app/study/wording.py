@@ -7,6 +7,7 @@ from typing import Any
 
 from app.study.models import Controller
 from app.study.sessions.contradictions import Contradiction, Kind
+from app.study.sessions.designs import Drawn
 
 _SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be without DBS"}
 
@@ -14,6 +15,20 @@ _SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be with
 def sentences(contradictions: Iterable[Contradiction]) -> list[str]:
     """What a person should look at, a sentence each."""
     return [_SENTENCES[c.kind](c.facts) for c in contradictions]
+
+
+def drawn_words(drawn: Drawn) -> str:
+    """How a random session's amplitudes were drawn."""
+    holds = f", {len(drawn.holds)} held amplitudes" if drawn.holds else ""
+    held = f"the amplitudes are held ({len(drawn.holds)} of them) and not drawn every step"
+    told = {
+        "paper": "the paper's: a new draw every step",
+        "stratified": "stratified" + ("" if drawn.level is None else f", level {drawn.level:.2f} of cDBS") + holds,
+        "ladder": f"titration ladder{holds}",
+        "held": f"not stated; {held}: their density is not known",
+        "unstated": "not stated; taken for the paper's, a new draw every step, which the amplitudes do not contradict",
+    }[drawn.kind]
+    return told + (f", seed {drawn.seed}" if drawn.seed is not None else "")
 
 
 def _day(f: Mapping[str, Any]) -> str:

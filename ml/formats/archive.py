@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import stat
 import zipfile
 import zlib
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from types import TracebackType
@@ -14,23 +19,87 @@ from ml.formats.options import ArchiveLimits
 from ml.formats.recording import UndecodableFile
 
 NESTED = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".bz2", ".xz")
+SUFFIXES = frozenset({".json", ".csv", ".parquet", ".txt", ".tsv", ".xml", ".pdf", ".png", ".jpg", ".mat", ".edf", ".exe", *NESTED})
+"""Endings that a report may show; any other might be a part of a name."""
 READ_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError)
 """What zipfile raises for damaged members, wrong sizes, a password, and (a kind of RuntimeError) a compression that it does not know."""
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """A file that is not read, by the name that may be shown to its sender, and why."""
+    """A file that is not read, by its place in the archive's list, from 1, and its ending, for its name may be a person's; and why."""
 
-    name: str
+    number: int
+    suffix: str
     reason: str
 
     def __str__(self) -> str:
-        return f"{self.name}: {self.reason}"
+        return f"{numbered(self.number, self.suffix)}: {self.reason}"
+
+
+def numbered(number: int, suffix: str) -> str:
+    """A member of an archive as a report may call it."""
+    return f"member {number}{f' ({suffix})' if suffix else ''}"
+
+
+def cleaned_suffix(name: str) -> str:
+    """The ending of a file's name where it is a known one, in lower case; else nothing, for it may be a part of a name."""
+    suffix = PurePosixPath(name.replace("\\", "/")).suffix.lower()
+    return suffix if suffix in SUFFIXES else ""
+
+
+def told(left_out: Sequence[LeftOut], most: int = 5) -> list[str]:
+    """Sentences about what was left out: members of one ending and one reason are one sentence with their count."""
+    groups: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for one in left_out:
+        groups[one.suffix, one.reason].append(one.number)
+    said = []
+    for (suffix, reason), numbers in groups.items():
+        if len(numbers) == 1:
+            said.append(f"{numbered(numbers[0], suffix)}: {reason}")
+            continue
+        listed = ", ".join(map(str, numbers[:most])) + (", …" if len(numbers) > most else "")
+        said.append(f"{len(numbers)} members ({f'{suffix}, ' if suffix else ''}number {listed}): {reason}")
+    return said
+
+
+_watcher: ContextVar[Callable[[float], None] | None] = ContextVar("watcher", default=None)
+
+
+@contextmanager
+def reading_of_members(watch: Callable[[float], None]) -> Iterator[None]:
+    """Tell `watch`, while archives are read inside the context, which share of their unpacked bytes was read, 0 to 1."""
+    token = _watcher.set(watch)
+    try:
+        yield
+    finally:
+        _watcher.reset(token)
+
+
+class _Watched(io.BufferedIOBase):
+    """A member's bytes, counted as they are read."""
+
+    def __init__(self, stream: IO[bytes], count: Callable[[int], None]) -> None:
+        self._stream, self._count = stream, count
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Bytes as of the stream."""
+        found = self._stream.read(-1 if size is None else size)
+        self._count(len(found))
+        return found
+
+    def readable(self) -> bool:
+        """It is."""
+        return True
+
+    def close(self) -> None:
+        """Close the stream too."""
+        self._stream.close()
+        super().close()
 
 
 class Files(Protocol):
-    """Named files of one upload: members of an archive or files of a folder. Names use forward slashes and are safe to show."""
+    """Named files of one upload: members of an archive or files of a folder. Names use forward slashes; no report shows them."""
 
     left_out: list[LeftOut]
 
@@ -50,10 +119,10 @@ class FolderFiles:
     _paths: dict[str, Path] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for path in sorted(self.root.rglob("*")):
+        for number, path in enumerate(sorted(self.root.rglob("*")), start=1):
             name = path.relative_to(self.root).as_posix()
             if path.is_symlink():
-                self.left_out.append(LeftOut(name, "a link, not followed"))
+                self.left_out.append(LeftOut(number, cleaned_suffix(name), "a link, not followed"))
             elif path.is_file():
                 self._paths[name] = path
 
@@ -77,6 +146,8 @@ class ZipFiles:
         self.left_out: list[LeftOut] = []
         self._limits = limits
         self._members: dict[str, zipfile.ZipInfo] = {}
+        self._number: dict[str, int] = {}
+        self._bytes = self._read = 0
         try:
             self._zip = zipfile.ZipFile(path)
         except READ_ERRORS as error:
@@ -107,31 +178,32 @@ class ZipFiles:
             raise UndecodableFile(
                 f"the archive claims to unpack to {total / packed:.0f} times its size", "archive", "Zip the original session folder again."
             )
-        for info in infos:
-            self._take(info)
+        for number, info in enumerate(infos, start=1):
+            self._take(number, info)
+        self._bytes = sum(info.file_size for info in self._members.values())
 
-    def _take(self, info: zipfile.ZipInfo) -> None:
+    def _take(self, number: int, info: zipfile.ZipInfo) -> None:
         name = info.filename.replace("\\", "/")
         mode = info.external_attr >> 16
-        parts = PurePosixPath(name).parts
+        parts, suffix = PurePosixPath(name).parts, cleaned_suffix(name)
         if info.is_dir() or name.endswith("/"):
             return
         if name.startswith("/") or ".." in parts or (parts and parts[0].endswith(":")) or any(ord(c) < 32 for c in name):
-            self.left_out.append(LeftOut(_safe(name), "its path leads outside the archive"))
+            self.left_out.append(LeftOut(number, suffix, "its path leads outside the archive"))
         elif stat.S_IFMT(mode) not in (0, stat.S_IFREG):
-            self.left_out.append(LeftOut(_safe(name), "a link or special file, not a file"))
+            self.left_out.append(LeftOut(number, suffix, "a link or special file, not a file"))
         elif info.file_size > self._limits.member_bytes:
             self.left_out.append(
-                LeftOut(_safe(name), f"{info.file_size / 1e6:.0f} MB, larger than {self._limits.member_bytes / 1e6:.0f} MB")
+                LeftOut(number, suffix, f"{info.file_size / 1e6:.0f} MB, larger than {self._limits.member_bytes / 1e6:.0f} MB")
             )
         elif name.lower().endswith(NESTED):
-            self.left_out.append(LeftOut(_safe(name), "an archive inside the archive; unpack it and upload it by itself"))
+            self.left_out.append(LeftOut(number, suffix, "an archive inside the archive; unpack it and upload it by itself"))
         elif "__MACOSX" in parts or (parts and parts[-1].startswith("._")):
             return
         elif name in self._members:
-            self.left_out.append(LeftOut(_safe(name), "the name stands twice in the archive; the first is used"))
+            self.left_out.append(LeftOut(number, suffix, "the name stands twice in the archive; the first is used"))
         else:
-            self._members[name] = info
+            self._members[name], self._number[name] = info, number
 
     def names(self) -> list[str]:
         """Names in sorted order."""
@@ -140,17 +212,19 @@ class ZipFiles:
     def open(self, name: str) -> IO[bytes]:
         """The member's bytes as a stream. Raises UndecodableFile for a member that cannot be unpacked."""
         try:
-            return self._zip.open(self._members[name])
+            stream = self._zip.open(self._members[name])
         except READ_ERRORS as error:
-            raise UndecodableFile("the archive is damaged here", _safe(name), "Zip the session folder again.") from error
+            where = numbered(self._number[name], cleaned_suffix(name))
+            raise UndecodableFile("the archive is damaged here", where, "Zip the session folder again.") from error
+        watch = _watcher.get()
+        return stream if watch is None else _Watched(stream, lambda size: self._tell(watch, size))  # type: ignore[return-value]
+
+    def _tell(self, watch: Callable[[float], None], size: int) -> None:
+        self._read += size
+        watch(min(1.0, self._read / max(1, self._bytes)))
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._zip.close()
-
-
-def _safe(name: str) -> str:
-    """A member name as it may stand in a message."""
-    return "".join(c if c.isprintable() else "?" for c in name[-120:])

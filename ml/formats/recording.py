@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ml.qoc import TREMOR_CLASSES as TREMOR_CLASSES
 
-DECODE_VERSION = 4
+DECODE_VERSION = 5
 """Raised whenever a decoder would give other numbers for the same bytes; traces are stored per version."""
 
 TraceSource = Literal["time_domain", "device_power", "percept_lfp", "device_log", "table"]
@@ -40,8 +40,12 @@ class UndecodableFile(Exception):
         self.stored_what = what if stored_what is None else stored_what
         self.stored_where = where if stored_where is None else stored_where
 
-    def __reduce__(self) -> tuple[type[UndecodableFile], tuple[str, str, str, str, str]]:
-        return type(self), (self.what, self.where, self.hint, self.stored_what, self.stored_where)
+    def __reduce__(self) -> tuple[type[UndecodableFile], tuple[str, ...]]:
+        return UndecodableFile, self.args_of()
+
+    def args_of(self) -> tuple[str, str, str, str, str]:
+        """What makes the same error again, in another process too."""
+        return self.what, self.where, self.hint, self.stored_what, self.stored_where
 
     @property
     def for_sender(self) -> Problem:

@@ -23,7 +23,7 @@ from ml.ope.estimate import Estimate, checked_horizon
 from ml.ope.fqe.estimator import value_estimate, within_reach
 from ml.ope.fqe.steps import TargetActions, UsableSteps, ValueFeatures, usable_steps
 from ml.ope.lead import dose_before
-from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
+from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.registry import Size
 from ml.ope.support.coverage import AmplitudeSupport
 from ml.policies.policy import Policy
@@ -158,7 +158,7 @@ class DualDice:
         draws = resamples(table.sessions, c.refits, c.seed)
         inputs = ValueFeatures(table, 0, c.seed)
         report(1.0, "inputs of the density ratios")
-        return FittedDualDice(self.method, c, buffer, table, inputs, draws, fit_end_model(buffer), fit_end_model(buffer, draws))
+        return FittedDualDice(self.method, c, buffer, table, inputs, draws, fit_end_model(buffer, draws=c.refits, seed=c.seed))
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,6 @@ class FittedDualDice:
     inputs: ValueFeatures
     draws: Indices
     end: EndModel
-    end_refits: EndModel
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
         """Train the ratios of all policies together, then average the logged rewards under them."""
@@ -207,12 +206,11 @@ class FittedDualDice:
         for m in range(members):
             np.add.at(weighted[m], table.session, zeta[m][:, None] * columns)
         length = float(np.sum(settings.gamma ** np.arange(horizon)))
-        lengths = np.array([length, horizon, horizon, horizon, horizon, min(LATE_STEPS, horizon)])
+        lengths = np.append(length, np.full(table.rates.shape[1] - 1, horizon))
 
         def sums(totals: Floats) -> Floats:
             rates = totals[..., :-1] / np.maximum(totals[..., -1:], 1e-300)
-            spread = np.concatenate([rates, rates[..., 1:2]], axis=-1) * lengths
-            return within_reach(spread, settings, horizon, (table.scale.beta_low, table.scale.beta_high))
+            return within_reach(rates * lengths, settings, horizon, (table.scale.beta_low, table.scale.beta_high))
 
         main = sums(weighted.sum(1)).mean(0)
         refits = np.stack([sums(weighted[d % members][pick].sum(0)) for d, pick in enumerate(self.draws)])

@@ -18,6 +18,8 @@ RANGE_TOLERANCE = 1e-4
 """An output this far outside [0, 1] is rounding and is clipped; farther outside it is a fault and raises."""
 MAX_FILE_BYTES = 64 * 2**20
 _DTYPES = {onnx.TensorProto.FLOAT: np.float32, onnx.TensorProto.DOUBLE: np.float64}
+_DOMAINS = {"", "ai.onnx", "ai.onnx.ml", "com.microsoft"}
+"""Of operators that onnxruntime has; functions that the file itself defines come with a domain of their own."""
 _RANDOM_OPERATORS = {"RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike", "Multinomial", "Bernoulli"}
 
 
@@ -127,7 +129,11 @@ def _parse(content: bytes) -> Any:
     for tensor in _tensors(model):
         if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
             raise PolicyFileError(f"the weights '{tensor.name}' lie outside the file; save the model as one file, without external data")
+    known = _DOMAINS | {function.domain for function in model.functions}
     for node in _all_nodes(model):
+        if node.domain not in known:
+            what = f"the operator '{node.op_type}' of '{node.domain}' is not one of ONNX's own"
+            raise PolicyFileError(f"{what}; export the policy with standard operators alone")
         if node.op_type in _RANDOM_OPERATORS:
             raise PolicyFileError(f"the operator {node.op_type} draws random numbers: a policy must be deterministic")
     try:

@@ -104,6 +104,16 @@ INTENDED: dict[str, str] = {
         ),
         "API: margins against cDBS and the levels of verdicts are read and set at `/participants/{code}/margins`.",
     ),
+    **dict.fromkeys(
+        (
+            "components > schemas > BoundOut",
+            "components > schemas > PlannedDesignOut",
+            "components > schemas > PlannedHoldOut",
+            "components > schemas > PlannedSessionOut > properties > design",
+            "components > schemas > PlannedSessionOut > required",
+        ),
+        "API: settings have `design`, `design_ladder` and `early_visits`, and a planned session has `design`.",
+    ),
     "components > schemas > ProposalOut": "API: a proposal has `usable_steps`.",
     "components > schemas > UsableStepsOut": "API: a proposal has `usable_steps`.",
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",

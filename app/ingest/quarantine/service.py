@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from cryptography.fernet import InvalidToken
@@ -18,32 +18,31 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.ingest import encryption, repository
 from app.ingest.models import UploadFile
-from app.ingest.uploads import service
-from app.ingest.uploads.receiving import ASIDE, MEDIA_TYPE, BetaStated, Receiver, StoredContent
+from app.ingest.uploads import reading, service
+from app.ingest.uploads.receiving import MEDIA_TYPE, BetaStated, Receiver, StoredContent, twice
+from app.ingest.uploads.reports import ASIDE
 from app.ingest.uploads.service import UploadOutcome
 from app.platform import files
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
-from app.settings import get_settings
 from app.study import service as study_service
 from app.study.models import Participant
-from ml import formats
 from ml.formats.recording import UndecodableFile
 from ml.formats.redaction_record import REDACTOR_VERSION
 
 
-def review(db: Session, file_id: int, caller: Caller) -> bytes:
-    """The original bytes, for a person to look at; the audit trail says who did. They may identify the participant.
+def review(db: Session, file_id: int, caller: Caller) -> Iterator[bytes]:
+    """The original bytes, piece by piece, for a person to look at; the audit trail says who did. They may identify the participant.
 
     Raises:
         Conflict: the file is not, or no longer, in quarantine.
     """
     file, _ = _held(db, file_id, caller)
-    with _original(file) as path:
-        content = path.read_bytes()
-    file.reviewed_by, file.reviewed_at = caller.label, now()
-    db.commit()
-    return content
+    with ExitStack() as held:
+        path = held.enter_context(_original(file))  # all of it is checked before the first byte leaves
+        file.reviewed_by, file.reviewed_at = caller.label, now()
+        db.commit()
+        return _pieces(path, held.pop_all())
 
 
 def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> UploadOutcome:
@@ -62,14 +61,15 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
     clean = files.draft_path()
     with _original(file) as original:
         try:
-            kind = formats.sniff(original)
-            redaction = formats.redact(original, clean, kind, get_settings().secret("pseudonyms"), options)
+            found = twice(lambda: reading.clean(original, clean, options))
+            if found.problem is not None:
+                raise found.problem
         except BaseException as error:
             clean.unlink(missing_ok=True)
             if not isinstance(error, UndecodableFile):
                 raise
             raise Invalid(f"It still cannot be read: {error.stored_what} ({error.stored_where}).", error.hint) from error
-    sealed = file.quarantine_sha256
+    kind, redaction, sealed = found.kind, found.redaction, file.quarantine_sha256
     stored = files.store(db, clean, MEDIA_TYPE).sha256
     file.kind, file.stored_sha256, file.redactor_version = kind, stored, REDACTOR_VERSION
     _decide(db, file, reason, caller)
@@ -124,6 +124,12 @@ def _decide(db: Session, file: UploadFile, reason: str, caller: Caller) -> None:
     set_reason(db, reason)
     file.decided_by, file.decided_at, file.decision_reason = caller.label, now(), reason
     db.flush()
+
+
+def _pieces(path: Path, held: ExitStack) -> Iterator[bytes]:
+    with held, path.open("rb") as source:
+        while piece := source.read(files.CHUNK):
+            yield piece
 
 
 @contextmanager

@@ -1,9 +1,10 @@
-"""Which uploads are being received at this moment, by locks that die with the process that holds them."""
+"""Which uploads are being received at this moment, by locks that die with the process that holds them; and how far this process is."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 from sqlalchemy import NullPool, create_engine, text
 from sqlalchemy.orm import Session
@@ -13,6 +14,41 @@ from app.platform.database import database_url
 
 LOCKS = 0x75706C64
 """First key of the advisory locks of uploads; the second is the upload's number."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far an upload is that this process is receiving.
+
+    Attributes:
+        file, files: the file that is read, from 1, and how many there are; 0 before the first.
+        share: of that file, 0 to 1. doing: what is done to it.
+    """
+
+    file: int = 0
+    files: int = 0
+    share: float = 0.0
+    doing: str = ""
+
+
+_progress: dict[int, Progress] = {}
+"""By upload. In memory, for it is of use while the upload's own request runs, and is not worth a row in the audit trail each time."""
+
+
+def tell(upload_id: int, share: float | None = None, doing: str | None = None) -> None:
+    """Say how far the reading of the present file of an upload is."""
+    known = _progress.get(upload_id, Progress())
+    _progress[upload_id] = replace(known, share=known.share if share is None else share, doing=doing or known.doing)
+
+
+def tell_file(upload_id: int, file: int, of: int) -> None:
+    """Say which file of an upload comes now."""
+    _progress[upload_id] = Progress(file, of)
+
+
+def told(upload_id: int) -> Progress | None:
+    """How far an upload is; None where this process is not receiving it."""
+    return _progress.get(upload_id)
 
 
 @contextmanager
@@ -25,6 +61,7 @@ def in_progress(upload_id: int) -> Iterator[None]:
         try:
             yield
         finally:
+            _progress.pop(upload_id, None)
             # The server frees it too once it notices that the connection is gone, which on a busy machine is a moment later.
             connection.execute(text("select pg_advisory_unlock(:space, :upload)"), {"space": LOCKS, "upload": upload_id})
             connection.commit()

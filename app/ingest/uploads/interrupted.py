@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from threading import Event
 
 import structlog
 from sqlalchemy.orm import Session
@@ -16,9 +17,12 @@ from app.ingest.uploads.receiving import BetaStated, Receiver
 from app.ingest.uploads.service import UploadOutcome
 from app.platform.database import transaction
 from app.platform.errors import Invalid
+from app.platform.jobs.children.child import places
 from app.study.models import Participant
 
 log = structlog.get_logger()
+
+RESUME_EVERY_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -46,9 +50,22 @@ def resume(actor: str) -> Iterator[ResumedUpload]:
                 resumed = ResumedUpload(upload_id, _resume(db, upload_id), True)
         except Exception as fault:
             # one upload that cannot be read must not keep the others from being resumed; it stays as it is
-            log.exception("interrupted upload could not be resumed", upload=upload_id, fault=repr(fault))
-            resumed = ResumedUpload(upload_id, f"it could not be resumed: {fault}", False)
+            log.error("interrupted upload could not be resumed", upload=upload_id, places=places(fault))
+            resumed = ResumedUpload(upload_id, f"it could not be resumed: {type(fault).__name__}, see the log", False)
         yield resumed
+
+
+def keep_resuming(actor: str, stop: Event, every_s: float = RESUME_EVERY_S) -> None:
+    """Resume interrupted uploads now, and again until `stop` is set: a fault of ours cuts uploads short without a restart too."""
+    while True:
+        try:
+            for taken in resume(actor):
+                log.info("interrupted upload", upload=taken.upload_id, done=taken.done, message=taken.message)
+        except Exception as fault:
+            # the database may be away; uploads wait until it is back
+            log.error("interrupted uploads could not be looked for", places=places(fault))
+        if stop.wait(every_s):
+            return
 
 
 def _resume(db: Session, upload_id: int) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, get_args
+from typing import Annotated, Any, get_args
 
 from fastapi import APIRouter, File, Form, Request, UploadFile
 from fastapi.responses import HTMLResponse
@@ -11,10 +11,12 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
-from app.ingest import repository
+from app.ingest import repository, wording
+from app.ingest.models import Upload
 from app.ingest.schemas import UploadForm
 from app.ingest.uploads import service
 from app.ingest.uploads.early_refusal import UploadRoute
+from app.ingest.uploads.in_progress import told
 from app.ingest.uploads.service import BetaStated, Incoming, UploadOutcome
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
@@ -92,6 +94,16 @@ def upload(
     return _page(request, db, participant, typed, outcome)
 
 
+@router.get("/participants/{code}/upload/progress")
+def upload_progress(participant: CurrentParticipant, db: Db) -> list[dict[str, Any]]:
+    """How far the uploads of a participant are that this process is reading, oldest first: for the page, while it waits for an answer."""
+    return [
+        {"upload": number, "share": found.share, "text": wording.progress(found.file, found.files, found.share, found.doing)}
+        for number in repository.received_uploads(db, participant.id)
+        if (found := told(number)) is not None
+    ]
+
+
 @router.get("/uploads/{upload_id}")
 def report(request: Request, upload_id: RowId, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """What became of the files of one upload."""
@@ -99,6 +111,16 @@ def report(request: Request, upload_id: RowId, db: Db, caller: CurrentCaller) ->
     outcome = UploadOutcome(row, participant, service.stored_outcomes(db, row))
     waiting = {s.id for s in study.proposals_of_participant(db, participant.id)} & set(outcome.session_ids)
     return HTMLResponse(render(request, "ingest/report.html", participant=participant, outcome=outcome, waiting=len(waiting)))
+
+
+def _state(upload: Upload) -> tuple[str, str]:
+    """What became of an upload, in a few words, and their tone."""
+    if upload.status == "decoded":
+        return "decoded", "good"
+    if upload.status == "failed":
+        return "not usable", "bad"
+    found = told(upload.id)
+    return (wording.progress(found.file, found.files, found.share, found.doing), "info") if found else (wording.WAITS, "warn")
 
 
 def _page(
@@ -124,7 +146,7 @@ def _page(
         sessions=study.sessions_of_participant(db, participant.id, with_proposals=True),
         proposed=len(study.proposals_of_participant(db, participant.id)),
         held=sum(f.quarantine_sha256 is not None for f in repository.quarantined_files(db, participant.id)),
-        uploads=repository.uploads_of_participant(db, participant.id),
+        uploads=[(u, _state(u)) for u in repository.uploads_of_participant(db, participant.id)],
         limit_mb=get_settings().upload_limit_mb,
         problem=error.problem(request.url.path) if error else None,
     )

@@ -5,31 +5,29 @@ Which sessions come out is decided when all files of the upload are in; see `app
 
 from __future__ import annotations
 
-import zipfile
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from copy import deepcopy
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 import structlog
 from sqlalchemy.orm import Session
 
-from app.ingest import encryption, repository, wording
+from app.ingest import encryption, repository
 from app.ingest.models import Upload, UploadFile
 from app.ingest.uploads import outcomes as outcomes_intake
-from app.ingest.uploads import recordings
+from app.ingest.uploads import reading, recordings
+from app.ingest.uploads.in_progress import tell
 from app.ingest.uploads.incoming import Incoming
+from app.ingest.uploads.reading import ReaderEnded, ReaderFault
+from app.ingest.uploads.reports import ASIDE, BEGUN, add_redaction, aside, known_recordings, store_reports, stored_reports
 from app.platform import files
 from app.platform.errors import TooLarge
+from app.platform.jobs.children import child
 from app.settings import get_settings
 from app.study.models import Participant, Recording, SettingsVersion
-from ml import formats
-from ml.formats import FileKind
-from ml.formats.archive import ZipFiles
-from ml.formats.options import ArchiveLimits, DecodeOptions
-from ml.formats.rcs import find_sessions
+from ml.formats.archive import cleaned_suffix
+from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, GraspLog, Problem, TraceLog, TraceSource, UndecodableFile
 from ml.formats.redaction_record import REDACTOR_VERSION, Redaction
 from ml.formats.tables.numbers import unit_name
@@ -42,16 +40,13 @@ CUT_SHORT = UndecodableFile(
 )
 LETHAL = 2
 """So many times a process may end while it reads a file, or makes sessions of an upload; then that is not tried again by itself."""
+_Read = TypeVar("_Read")
 ENDED_THE_SERVICE = UndecodableFile(
-    f"the service ended {LETHAL} times while it read this file: it may ask for more memory than there is",
+    f"reading this file was cut short {LETHAL} times: the service, or what it rests on, stopped while it was read",
     "file",
     "Look at it on the page of the quarantine. Send it again with what is wrong mended, or read it again when the service was mended.",
 )
-RESUMED = "The service was stopped while it read this file and has read it from the kept bytes since; what was removed is not listed again."
-BEGUN = "begun"
-"""Member of a file's report: how often reading it was begun, while it is being read."""
-ASIDE = "aside_sha256"
-"""Member of a file's report: hash of its bytes without identity, where these are what the quarantine holds, and not the original."""
+RESUMED = "Reading this file was cut short; it was read from the kept bytes since, and what was removed from it is not listed again."
 TABLES = ("csv", "parquet", "control_log")
 MEDIA_TYPE = "application/octet-stream"
 
@@ -117,6 +112,8 @@ class Receiver:
     upload: Upload
     options: DecodeOptions
     beta: BetaStated
+    kept: list[int] = field(default_factory=list)
+    """Files of which the bytes are safe."""
 
     def receive(self, one: Incoming) -> FileOutcome:
         """Keep a file and decode it. Raises TooLarge."""
@@ -143,6 +140,7 @@ class Receiver:
         )
         self.db.add(row)
         self.db.commit()  # the bytes are safe from here on, whatever the decoder does with them
+        self.kept.append(row.id)
         return self.decode(name, row, content)
 
     def _known(self, name: str, sha256: str) -> FileOutcome | None:
@@ -163,26 +161,32 @@ class Receiver:
             return FileOutcome(row.name, row, stored_reports(row), recordings=self._recordings(row))
         sealed = row.stored_sha256 is None or row.stored_sha256 == row.quarantine_sha256
         if not sealed and row.report.get(BEGUN, 0) >= LETHAL:
-            return self._put_aside(row)
+            return self._put_aside(row, self._content(row), ENDED_THE_SERVICE)
         # committed before the file is read, so that it is known whom to blame when that ends the process
         row.report = {BEGUN: row.report.get(BEGUN, 0) + 1}
         self.db.commit()
-        outcome = self.decode(
-            row.name, row, StoredContent(row.kind, row.stored_sha256, row.quarantine_sha256, Redaction(), CUT_SHORT if sealed else None)
-        )
+        outcome = self.decode(row.name, row, replace(self._content(row), problem=CUT_SHORT if sealed else None))
         if not outcome.same_bytes:
             outcome.reports[0].understood.append(RESUMED)
             store_reports(row, outcome.reports, known_recordings(row))
         return outcome
 
-    def _put_aside(self, row: UploadFile) -> FileOutcome:
-        """Into quarantine with a file that ends the process which reads it; a person decides on it there."""
-        assert row.stored_sha256 is not None
-        log.error("file put aside: reading it ended the service", upload_file=row.id, times=row.report[BEGUN])
-        stored = row.stored_sha256
-        if row.quarantine_sha256 is None:
-            row.quarantine_sha256, row.report = self._seal(files.path_of(stored)), {ASIDE: stored}
-        return self._failed(row.name, row, StoredContent(row.kind, stored, row.quarantine_sha256, Redaction(), None), ENDED_THE_SERVICE)
+    @staticmethod
+    def _content(row: UploadFile) -> StoredContent:
+        return StoredContent(row.kind, row.stored_sha256, row.quarantine_sha256, Redaction(), None)
+
+    def _put_aside(self, row: UploadFile, content: StoredContent, problem: UndecodableFile) -> FileOutcome:
+        """Into quarantine with a file that ends the processes which read it; a person decides on it there."""
+        assert content.stored_sha256 is not None
+        log.error("file put aside: reading it ended the reader", upload_file=row.id, why=problem.stored_what)
+        sealed = row.quarantine_sha256 is not None
+        if not sealed:
+            row.quarantine_sha256 = self._seal(files.path_of(content.stored_sha256))
+        row.report = aside(row) if sealed else {ASIDE: content.stored_sha256}
+        return self._failed(row.name, row, replace(content, quarantine_sha256=row.quarantine_sha256), problem)
+
+    def _told(self, share: float | None, doing: str | None) -> None:
+        tell(self.upload.id, share, doing)
 
     def _store(self, raw: Path) -> StoredContent:
         """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted.
@@ -191,25 +195,29 @@ class Receiver:
         """
         clean = files.draft_path()
         try:
-            kind = formats.sniff(raw)
-            redaction = formats.redact(raw, clean, kind, get_settings().secret("pseudonyms"), self.options)
-        except UndecodableFile as error:
-            return self._quarantined(raw, clean, error)
-        except Exception as fault:
+            found = twice(lambda: reading.clean(raw, clean, self.options, str(self.upload.id), self._told))
+        except ReaderEnded as ended:
+            log.error("file put aside: cleaning it ended the reader", upload=self.upload.id, cause=ended.cause)
+            return self._quarantined(raw, clean, ended)
+        except ReaderFault as fault:
             # a fault of ours must not take the other files of the upload with it, and what it left behind may still name a person
-            log.exception("file could not be cleaned", upload=self.upload.id, fault=repr(fault))
+            log.error("file could not be cleaned", upload=self.upload.id, places=fault.places)
             hint = f"It is kept encrypted; tell your administrator: upload {self.upload.id}."
             return self._quarantined(
                 raw, clean, UndecodableFile("the service failed while it took identity out of this file", "file", hint)
             )
-        sealed = self._seal(raw) if redaction.unreadable else None
-        return StoredContent(kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, redaction, None)
+        except BaseException:
+            clean.unlink(missing_ok=True)
+            raise
+        if found.problem is not None:
+            return self._quarantined(raw, clean, found.problem, found.redaction)
+        sealed = self._seal(raw) if found.redaction.unreadable else None
+        return StoredContent(found.kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, found.redaction, None)
 
-    def _quarantined(self, raw: Path, clean: Path, problem: UndecodableFile) -> StoredContent:
+    def _quarantined(self, raw: Path, clean: Path, problem: UndecodableFile, redaction: Redaction | None = None) -> StoredContent:
         clean.unlink(missing_ok=True)
-        left_out = _left_out(raw, self.options.archive)
         sealed = self._seal(raw)
-        return StoredContent("unreadable", sealed, sealed, Redaction(ignored=left_out), problem)
+        return StoredContent("unreadable", sealed, sealed, redaction or Redaction(), problem)
 
     def _seal(self, raw: Path) -> str:
         return files.store(self.db, encryption.encrypt(raw), MEDIA_TYPE).sha256
@@ -219,37 +227,68 @@ class Receiver:
         if content.problem is not None or content.stored_sha256 is None:
             return self._failed(name, row, content, content.problem or CUT_SHORT)
         try:
+            if (known := self._known_meanwhile(name, row)) is not None:
+                return known
+            decoded = self._decoded(row, content)
             repository.lock_participant(self.db, self.participant.id)
             # asked again under the lock: somebody may have sent the same bytes meanwhile
-            if known := self._known(name, row.original_sha256):
-                self.db.delete(row)
-                self.db.commit()
+            if (known := self._known_meanwhile(name, row)) is not None:
                 return known
-            decoded = formats.decode(files.path_of(content.stored_sha256), cast(FileKind, content.kind), self.options, name=row.name)
             if content.kind in TABLES:
                 decoded = self._name_beta(decoded)
             stored = recordings.store(self.db, self.participant, row, decoded.recordings)
             tremor = outcomes_intake.take_tremor(self.db, row, decoded.tremor)
+        except ReaderEnded as ended:
+            return self._put_aside(row, content, ended)
         except UndecodableFile as error:
             self.db.rollback()
             return self._failed(name, row, content, error)
         except Exception as fault:
             # a fault of ours must not take the other files of the upload with it; the bytes are safe for a better decoder
             self.db.rollback()
-            log.exception("decoder failed", upload_file=row.id, kind=content.kind, fault=repr(fault))
+            places = fault.places if isinstance(fault, ReaderFault) else child.places(fault)
+            log.error("decoder failed", upload_file=row.id, kind=content.kind, places=places)
             ours = UndecodableFile("the decoder failed on this file", "file", f"Tell your administrator: upload file {row.id}.")
             return self._failed(name, row, content, ours)
         reports = list(decoded.reports)
-        _add_redaction(reports[0], content.redaction, tremor)
+        add_redaction(reports[0], content.redaction, tremor)
         row.status = "decoded"
         store_reports(row, reports, [r.id for r in stored.known], content.redaction.unreadable)
         self.db.commit()
         all_known = bool(stored.known) and not stored.fresh
         return FileOutcome(name, row, reports, all_known, recordings=[*stored.known, *stored.fresh], grasps=decoded.grasps)
 
+    def _known_meanwhile(self, name: str, row: UploadFile) -> FileOutcome | None:
+        """The outcome for a file whose bytes another upload has brought since; the row goes then."""
+        if (known := self._known(name, row.original_sha256)) is not None:
+            self.db.delete(row)
+            self.db.commit()
+        return known
+
+    def _decoded(self, row: UploadFile, content: StoredContent) -> DecodedFile:
+        """What a child makes of a stored file. One that ends it is read once more, which is known before, should that end us too.
+
+        Raises:
+            ReaderEnded: at the second time.
+        """
+        assert content.stored_sha256 is not None
+        path = files.path_of(content.stored_sha256)
+
+        def read() -> DecodedFile:
+            return reading.decode(path, content.kind, self.options, row.name, str(self.upload.id), self._told)
+
+        def again() -> bool:
+            begun = row.report.get(BEGUN, 1)
+            if begun < LETHAL:
+                row.report = {**aside(row), BEGUN: begun + 1}
+                self.db.commit()
+            return bool(begun < LETHAL)
+
+        return twice(read, again)
+
     def _failed(self, name: str, row: UploadFile, content: StoredContent, problem: UndecodableFile) -> FileOutcome:
         report = FileReport(name=row.name, problem=problem.stored)
-        _add_redaction(report, content.redaction, ())
+        add_redaction(report, content.redaction, ())
         before = repository.failed_file(self.db, self.participant.id, row) if row.decided_at is None else None
         if before is not None:
             return self._failed_before(name, row, before, report, problem)
@@ -278,6 +317,21 @@ class Receiver:
         return name_beta(decoded, self.beta, self.participant.current_settings)
 
 
+def twice(read: Callable[[], _Read], again: Callable[[], bool] = lambda: True) -> _Read:
+    """What a child reads. One that ends it may have met a machine in need: it is read once more, where `again()` holds.
+
+    Raises:
+        ReaderEnded: it ended that child too.
+    """
+    try:
+        return read()
+    except ReaderEnded as ended:
+        log.warning("reading a file ended the reader", cause=ended.cause)
+        if not again():
+            raise
+        return read()
+
+
 def name_beta(decoded: DecodedFile, beta: BetaStated, settings: SettingsVersion) -> DecodedFile:
     """A table's own beta under its source; the report gets a sentence that says who stated unit and source.
 
@@ -304,45 +358,6 @@ def _stated_by_a_person(trace: TraceLog) -> bool:
     return trace.stream == "beta" and trace.source == "table"
 
 
-def store_reports(
-    row: UploadFile, reports: Sequence[FileReport], known: Sequence[int] = (), unreadable: Sequence[str] | None = None
-) -> None:
-    """Store a file's reports, which of its recordings came before in other files, and which members could not be read (None: as stored)."""
-    found = unreadable_members(row) if unreadable is None else list(unreadable)
-    aside = {ASIDE: row.report[ASIDE]} if ASIDE in (row.report or {}) else {}
-    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known), "unreadable": found, **aside}
-
-
-def stored_reports(row: UploadFile) -> list[FileReport]:
-    """The reports of a file as they were stored."""
-    # a copy: sentences appended to the stored lists themselves would not be seen as a change, and not be written
-    stored = deepcopy(row.report.get("reports", []))
-    return [FileReport(**{**r, "problem": _stored_problem(r["problem"])}) for r in stored]
-
-
-def _stored_problem(stored: Mapping[str, str] | None) -> Problem | None:
-    """The problem of a stored report; version 0.1.0 called its hint `mend`."""
-    if stored is None:
-        return None
-    return Problem(stored["what"], stored["where"], stored["hint"] if "hint" in stored else stored["mend"])
-
-
-def unreadable_members(row: UploadFile) -> list[str]:
-    """Members of a stored file that could not be read, and why; in reports of version 0.1.0 they stand among the flags, behind a prefix."""
-    report = row.report or {}
-    found: list[str] | None = report.get("unreadable")
-    if found is not None:
-        return found
-    prefix = "kept encrypted, because it could not be read: "
-    return [s.removeprefix(prefix) for r in stored_reports(row) for s in r.flagged if s.startswith(prefix)]
-
-
-def known_recordings(row: UploadFile) -> list[int]:
-    """Recordings of a file that another file had brought before."""
-    found: list[int] = row.report.get("known_recordings", [])
-    return found
-
-
 def _stated_by(by_upload: str | None, by_settings: str | None) -> str:
     """Who stated a unit or a source."""
     if by_upload:
@@ -350,29 +365,6 @@ def _stated_by(by_upload: str | None, by_settings: str | None) -> str:
     return "as the participant's settings say" if by_settings else "because nobody stated one"
 
 
-def _add_redaction(report: FileReport, redaction: Redaction, notes: Sequence[str]) -> None:
-    """Add to a report what cleaning the file found, and what was made of it."""
-    for ours, found in ((report.removed, redaction.removed), (report.repaired, redaction.repaired), (report.ignored, redaction.ignored)):
-        ours.extend(sentence for sentence in found if sentence not in ours)
-    report.flagged.extend(wording.unreadable(redaction.unreadable))
-    report.understood.extend(notes)
-
-
-def _left_out(path: Path, limits: ArchiveLimits) -> list[str]:
-    """Why members of an archive of no use were left out, counted, without their names, which may identify a person."""
-    if not zipfile.is_zipfile(path):
-        return []
-    listing = FileReport("archive")
-    try:
-        with ZipFiles(path, limits) as members:
-            find_sessions(members, listing)
-            reasons = Counter(member.reason for member in members.left_out)
-    except UndecodableFile:
-        return []  # the problem itself says what is wrong with the archive
-    return [*listing.ignored, *(f"{n} file{'s' if n > 1 else ''}: {reason}" for reason, n in sorted(reasons.items()))]
-
-
 def _harmless_name(name: str, kind: str) -> str:
-    """Names of files carry names of people; what stays is the kind and the ending."""
-    suffix = Path(name).suffix.lower()
-    return f"{kind}{suffix if len(suffix) <= 9 and suffix[1:].isalnum() else ''}"
+    """Names of files carry names of people; what stays is the kind, and the ending where it is a known one."""
+    return kind + cleaned_suffix(name)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import cast
 
 import numpy as np
 import structlog
@@ -18,17 +17,17 @@ from app.ingest import repository
 from app.ingest.models import Upload, UploadFile
 from app.ingest.sessions import in_milliamperes
 from app.ingest.uploads import outcomes as outcomes_intake
-from app.ingest.uploads import recordings
+from app.ingest.uploads import reading, recordings
+from app.ingest.uploads.reading import ReaderFault
 from app.ingest.uploads.receiving import TABLES, BetaStated, name_beta
 from app.ingest.uploads.service import decode_options
 from app.platform import files
 from app.platform.database import transaction
 from app.platform.errors import NotFound
+from app.platform.jobs.children.child import places
 from app.study import repository as study
 from app.study.models import Participant, Recording, StudySession, Trace
 from app.study.traces import AMPLITUDE_STREAM, unpack
-from ml import formats
-from ml.formats import FileKind
 from ml.formats.recording import DECODE_VERSION, DecodedFile, RecordingLog, UndecodableFile
 
 log = structlog.get_logger()
@@ -86,8 +85,9 @@ def redecode(participant_id: int | None, upload_file_id: int | None, dry_run: bo
                 change.state, change.said = "failed", [str(error)]
             except Exception as fault:
                 # a fault of ours in one file must not keep the others at the old version
-                log.exception("redecoding failed", upload_file=file_id, fault=repr(fault))
-                change.state, change.said = "failed", [f"fault in the decoder: {fault!r}"]
+                where = fault.places if isinstance(fault, ReaderFault) else places(fault)
+                log.error("redecoding failed", upload_file=file_id, places=where)
+                change.state, change.said = "failed", [f"fault in the decoder: {where.split()[-1]}, see the log"]
         yield change
 
 
@@ -122,7 +122,7 @@ def _decoded(db: Session, file: UploadFile, participant: Participant) -> Decoded
         raise files.MissingFile(f"The stored file {file.stored_sha256} is missing or damaged.")
     said = db.get_one(Upload, file.upload_id).stated
     beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
-    decoded = formats.decode(path, cast(FileKind, file.kind), decode_options(participant, beta), name=file.name)
+    decoded = reading.decode(path, file.kind, decode_options(participant, beta), file.name)
     return name_beta(decoded, beta, participant.current_settings) if file.kind in TABLES else decoded
 
 

@@ -12,38 +12,38 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.ingest import repository, sessions
+from app.ingest import repository, sessions, wording
 from app.ingest.models import Upload, UploadFile
 from app.ingest.proposals import service as proposals
 from app.ingest.repository import GRASP_KIND
 from app.ingest.sessions import StatedSession
 from app.ingest.uploads import outcomes as outcomes_intake
-from app.ingest.uploads.in_progress import in_progress
+from app.ingest.uploads import reading
+from app.ingest.uploads.in_progress import in_progress, tell_file
 from app.ingest.uploads.incoming import Incoming, arrange
-from app.ingest.uploads.receiving import (
-    LETHAL,
-    BetaStated,
-    FileOutcome,
-    Receiver,
-    known_recordings,
-    store_reports,
-    stored_reports,
-    unreadable_members,
-)
+from app.ingest.uploads.receiving import LETHAL, BetaStated, FileOutcome, Receiver
+from app.ingest.uploads.reports import known_recordings, store_reports, stored_reports, unreadable_members
 from app.platform import files
 from app.platform.errors import BetaloopError, Conflict, Invalid, TooLarge
+from app.platform.jobs.children.child import places
 from app.platform.web.schemas import sensible_time
 from app.study import repository as study
 from app.study import service as study_service
 from app.study.models import Controller, Hemisphere, Participant, StudySession
-from ml import formats
-from ml.formats import FileKind
 from ml.formats.options import BetaMeasure, DecodeOptions
 from ml.formats.recording import FileReport, Problem, UndecodableFile
 
 __all__ = ["BetaStated", "FileOutcome", "Incoming", "UploadOutcome", "receive", "state_session", "stored_reports", "unreadable_members"]
 
 log = structlog.get_logger()
+
+
+class CutShort(BetaloopError):
+    """A fault of ours ended an upload of which something was kept; `interrupted` takes it up again."""
+
+    status = 500
+    title = "Something went wrong on our side"
+
 
 SESSIONS_BEGUN = "sessions_begun"
 """Member of what an upload states: how often its sessions were begun to be made."""
@@ -145,7 +145,7 @@ def receive(
     `beta` says what the columns of a table are; the participant's unit and source are taken, and said, where it is silent.
 
     Raises:
-        TooLarge: every file exceeds the installation's limit. Invalid: no file.
+        TooLarge: every file exceeds the installation's limit. Invalid: no file. CutShort: a fault of ours, after something was kept.
     """
     study_service.require(caller, can.UPLOAD, participant)
     if not incoming:
@@ -159,18 +159,32 @@ def receive(
         arranged = arrange(incoming)
         receiver = Receiver(db, participant, upload, decode_options(participant, beta), beta)
         outcome = UploadOutcome(upload, participant, [], arranged.asides)
-        refused: list[TooLarge] = []
-        for one in arranged.incoming:
-            try:
-                outcome.files.append(receiver.receive(one))
-            except TooLarge as error:
-                refused.append(error)
-                problem = Problem(error.detail, "file", f"It was not kept. {error.hint}")
-                outcome.asides.append(FileReport(one.name, problem=problem))
-        if refused and not outcome.files:
-            raise refused[0]
-        finish(db, outcome, stated)
+        try:
+            _take(receiver, outcome, arranged.incoming)
+            finish(db, outcome, stated)
+        except BetaloopError:
+            raise
+        except Exception as fault:
+            if not receiver.kept:
+                raise
+            log.error("upload cut short", upload=upload.id, kept=len(receiver.kept), places=places(fault))
+            raise CutShort(*wording.cut_short(upload.id, len(receiver.kept), len(arranged.incoming))) from fault
     return outcome
+
+
+def _take(receiver: Receiver, outcome: UploadOutcome, incoming: Sequence[Incoming]) -> None:
+    """Keep and decode each file; those that are too large are told. Raises TooLarge where all are."""
+    refused: list[TooLarge] = []
+    for number, one in enumerate(incoming, start=1):
+        tell_file(outcome.upload.id, number, len(incoming))
+        try:
+            outcome.files.append(receiver.receive(one))
+        except TooLarge as error:
+            refused.append(error)
+            problem = Problem(error.detail, "file", f"It was not kept. {error.hint}")
+            outcome.asides.append(FileReport(one.name, problem=problem))
+    if refused and not outcome.files:
+        raise refused[0]
 
 
 def finish(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
@@ -229,7 +243,7 @@ def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) ->
             created = proposals.make_sessions(db, outcome.participant, outcome.upload, list(fresh.values()), stated)
     except Exception as fault:
         # the recordings are stored and safe; a fault of ours must not turn a whole upload away
-        log.exception("sessions could not be made", upload=outcome.upload.id, fault=repr(fault))
+        log.error("sessions could not be made", upload=outcome.upload.id, places=places(fault))
         trouble = f"No session could be made of it. It is stored; tell your administrator: upload {outcome.upload.id}."
     reported: set[int] = set()
     for file in with_recordings:
@@ -310,7 +324,7 @@ def attach_grasps(db: Session, file: UploadFile, session: StudySession) -> list[
     if file.session_id is not None and file.session_id != session.id:
         raise Conflict(f"File {file.id} belongs to session {file.session_id} already.", "Correct the QoCs of the session by hand instead.")
     try:
-        decoded = formats.decode(files.path_of(file.stored_sha256), cast(FileKind, file.kind), DecodeOptions(), name=file.name)
+        decoded = reading.decode(files.path_of(file.stored_sha256), file.kind, DecodeOptions(), file.name)
     except UndecodableFile as error:
         raise Invalid(f"File {file.id} cannot be read any more: {error.what} ({error.where}).", error.hint) from error
     return outcomes_intake.take_grasps(db, file, decoded.grasps, session)

@@ -16,6 +16,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import repository
 from app.learning.models import BufferSnapshot, Policy
+from app.learning.policies import foreign
 from app.learning.policies.baselines import ONNX
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.training.results import POLICY
@@ -59,7 +60,7 @@ def require_window(policy: Policy, window: int) -> None:
 
 
 def add_external(db: Session, participant: Participant, name: str, content: bytes, file_name: str, caller: Caller) -> Policy:
-    """Store a policy made elsewhere. It is run on beta windows of many scales, and on the participant's own where there are some.
+    """Store a policy made elsewhere. It is tried, in a child, on beta windows of many scales, and on the participant's own if any.
 
     The file's name, which may name a person, stands in the answer to a bad file alone and is not kept.
 
@@ -71,7 +72,7 @@ def add_external(db: Session, participant: Participant, name: str, content: byte
     newest = repository.newest_snapshot(db, participant.id)
     probe = probe_windows(newest, settings) if newest and _window_of(db, newest) == settings.window else None
     try:
-        OnnxPolicy(content, settings.window, probe)
+        foreign.judge(content, settings.window, probe)
     except PolicyFileError as error:
         raise Invalid(
             f"'{file_name}' is no policy that betaloop can run: {error}.",

@@ -285,5 +285,5 @@ def _digest(s: SessionTrajectory) -> str:
     digest = hashlib.sha256()
     for values in (s.lead_beta, s.beta, s.amplitude):
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes() + b"|")
-    digest.update(repr((s.random_lower_bound, s.lead_amplitude)).encode())
+    digest.update(repr((s.random_lower_bound, s.lead_amplitude, *s.holds)).encode())
     return digest.hexdigest()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import repository as learning
 from app.learning.models import BufferSnapshot, Policy
+from app.learning.policies import foreign
 from app.learning.policies.service import onnx_of, probe_windows
 from app.planning import wording
 from app.planning.bundles import repository
@@ -33,6 +35,10 @@ from ml.deploy.manifest import Approval, BundleError, BundleManifest
 from ml.policies.onnx_policy import PolicyFileError
 
 KEY = "bundle-signing"
+MAKE = "app.planning.bundles.compute:make"
+"""What a child runs."""
+FOREIGN = "external"
+"""The kind of policies that were made elsewhere."""
 _ZIP = "application/zip"
 
 
@@ -83,10 +89,9 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
     study.require(caller, can.TAKE_BUNDLES, participant)
     manifest, windows = _manifest(db, participant, policy, limits, hemisphere, caller)
     try:
-        content = build_bundle(onnx_of(policy), manifest, windows)
+        signed = _signed(policy, manifest, windows)
     except (BundleError, PolicyFileError) as error:
         raise _unmade(policy, error) from error
-    signed = sign(content, signing_key())
     set_reason(db, wording.release_reason(manifest))
     release = BundleRelease(
         participant_id=participant.id,
@@ -111,9 +116,42 @@ def preview(
     """What the bundle would say of itself, all but its files; nothing is stored. Raises as `bundle` does, but whoever reads may look."""
     manifest, windows = _manifest(db, participant, policy, limits, hemisphere, caller)
     try:
-        return describe(onnx_of(policy), manifest, windows)
+        return _described(policy, manifest, windows)
     except (BundleError, PolicyFileError) as error:
         raise _unmade(policy, error) from error
+
+
+def _signed(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64]) -> bytes:
+    """The signed bundle. A policy made elsewhere is run in a child, one of ours here. Raises BundleError, PolicyFileError."""
+    content = onnx_of(policy)
+    if policy.kind != FOREIGN:
+        return sign(build_bundle(content, manifest, windows), signing_key())
+    with files.draft_folder() as folder:
+        _in_child(policy, manifest, windows, folder / "bundle.zip")
+        return (folder / "bundle.zip").read_bytes()
+
+
+def _described(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64]) -> BundleManifest:
+    """The manifest alone, as `_signed`."""
+    content = onnx_of(policy)
+    if policy.kind != FOREIGN:
+        return describe(content, manifest, windows)
+    return BundleManifest.from_bytes(_in_child(policy, manifest, windows, None)["manifest"].encode())
+
+
+def _in_child(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64], target: Path | None) -> dict[str, Any]:
+    params = {
+        "file": str(files.path_of(policy.onnx_sha256).resolve()),
+        "manifest": manifest.to_bytes().decode(),
+        "windows": windows.tolist(),
+        "target": None if target is None else str(target),
+        "secrets": str(get_settings().data_dir.resolve() / "secrets"),
+        "key": KEY,
+    }
+    found = foreign.run(MAKE, params)
+    if "refused" in found:
+        raise BundleError(found["refused"])
+    return found
 
 
 def may_take(participant: Participant, caller: Caller) -> bool:

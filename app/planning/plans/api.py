@@ -9,7 +9,7 @@ from fastapi import APIRouter, Response
 from app.accounts.deps import CurrentCaller
 from app.evaluation.shown import estimate_out
 from app.planning.plans import service, sheet
-from app.planning.plans.schemas import Approval, PlanEstimateOut, PlanEvaluationOut, PlanIn, PlannedSessionOut, PlanOut
+from app.planning.plans.schemas import Approval, PlanEstimateOut, PlanEvaluationOut, PlanIn, PlannedDesignOut, PlannedSessionOut, PlanOut
 from app.planning.plans.service import PlanLine, PlanView
 from app.platform.database import Db, now
 from app.platform.web.schemas import problems
@@ -102,4 +102,5 @@ def _session_out(line: PlanLine) -> PlannedSessionOut:
         verdict=line.item.verdict,
         min_fraction=line.item.min_fraction,
         override_reason=line.item.override_reason,
+        design=PlannedDesignOut.model_validate(line.design.as_json()) if line.design else None,
     )

@@ -6,6 +6,7 @@ from datetime import datetime
 from typing import Any
 
 from sqlalchemy import CheckConstraint, ForeignKey, Index, String, Text, UniqueConstraint, func
+from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
@@ -62,3 +63,5 @@ class PlanItem(Base):
     """Lowest amplitude of the session's envelope, fraction of the cDBS amplitude; None where the plan states none."""
     override_reason: Mapped[str | None] = mapped_column(Text)
     """Why a clinician plans an unsafe policy all the same."""
+    design: Mapped[dict[str, Any] | None] = mapped_column(JSONB(none_as_null=True))
+    """What a random session shall try, `app.planning.plans.designs.Planned.as_json`; null for other controllers and in plans of before."""

@@ -24,6 +24,7 @@ from app.evaluation.schemas import DECISION_NAMES
 from app.evaluation.wording import method_name, sentence
 from app.learning import repository as learning
 from app.learning.models import Policy
+from app.planning import wording
 from app.planning.plans import repository, service
 from app.planning.plans.schedule import most_policies, total_minutes
 from app.planning.plans.schemas import Id, LimitIn, PlanIn, PlanOptions
@@ -169,6 +170,10 @@ def _page(
         typed=values or {},
         may_override=may(caller, can.APPROVE_PLAN, participant),
         in_words=sentence,
+        design_words=wording.design_words,
+        bound_words=wording.bound_words,
+        schedule_words=wording.schedule_words,
+        leave_at_once=wording.LEAVE_AT_ONCE,
         plan_method=method_name(view.evaluation.default_method) if view and view.evaluation else "",
         choices=choices,
         form_values=form,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import date
 
 from sqlalchemy.orm import Session
@@ -22,6 +22,7 @@ from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning import wording as plan_wording
 from app.planning.plans import repository
+from app.planning.plans.designs import Planned, bounds_of, planned_sessions
 from app.planning.plans.models import Plan, PlanItem
 from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
 from app.planning.plans.schedule import Candidate, Rules, schedule
@@ -44,6 +45,7 @@ class PlanLine:
         start_minute: from the first session's start.
         estimate: of the pinned evaluation's method, as it was; None for what was not ranked.
         predicted_energy: mean squared amplitude fraction; 1 for cDBS and 0 for no-DBS by definition, else as the estimate predicts.
+        design: what a random session shall try, in a draft with the bounds of today; None for other sessions.
     """
 
     item: PlanItem
@@ -51,6 +53,8 @@ class PlanLine:
     policy: Policy | None
     estimate: Estimate | None
     predicted_energy: float | None
+
+    design: Planned | None
 
 
 @dataclass(frozen=True)
@@ -111,6 +115,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
         note=draft.note,
         created_by=caller.label,
     )
+    to_try = iter(_random_sessions(db, visit, rules))
     plan.items = [
         PlanItem(
             position=i,
@@ -120,6 +125,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
             washout_minutes=s.washout_minutes,
             note="",
             **asdict(Safeguard() if s.policy_id is None else guarded[s.policy_id]),
+            design=next(to_try).as_json() if s.controller is Controller.RANDOM else None,
         )
         for i, s in enumerate(day, start=1)
     ]
@@ -138,6 +144,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, plan_id: int | None 
     Raises:
         NotFound: no plan. Conflict: approved already, replaced meanwhile, with a policy that was retired since it was drafted, or what
             `safeguards.refuse_approval` refuses.
+        Invalid: random sessions of held draws, and no cDBS amplitude by which their lower bound is one in milliamperes.
     """
     study.require(caller, can.APPROVE_PLAN, visit.participant)
     repository.lock_visit(db, visit.id)
@@ -155,6 +162,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, plan_id: int | None 
             )
     stated = [(v.policy, Safeguard(v.item.verdict, v.item.min_fraction, v.item.override_reason)) for v in view.lines if v.policy]
     refuse_approval(assessment_of(db, visit.participant, view.evaluation) if view.evaluation else None, stated)
+    _sign_designs(visit, plan)
     plan.status, plan.approved_at, plan.approved_by = "approved", now(), caller.label
     db.flush()
     return view
@@ -263,10 +271,38 @@ def _view(db: Session, plan: Plan, visit: Visit, caller: Caller) -> PlanView:
     for item in plan.items:
         estimate = estimates.get(item.policy_id) if item.policy_id else None
         policy = policies.get(item.policy_id) if item.policy_id else None
-        lines.append(PlanLine(item, start, policy, estimate, _energy(item, estimate)))
+        lines.append(PlanLine(item, start, policy, estimate, _energy(item, estimate), _design(visit, item)))
         start += item.minutes + item.washout_minutes
     stale = _stale_reasons(db, visit.participant, evaluation)
     return PlanView(plan, visit, lines, evaluation, stale, _warnings(db, visit, plan, lines, found, stale))
+
+
+def _random_sessions(db: Session, visit: Visit, rules: Rules) -> list[Planned]:
+    """What the visit's random sessions shall try, by the participant's settings of today."""
+    participant = visit.participant
+    earlier = repository.earlier_designed_visits(db, visit)
+    return planned_sessions(participant.current_settings, participant.code, earlier, rules.random_sessions, rules.session_minutes)
+
+
+def _design(visit: Visit, item: PlanItem) -> Planned | None:
+    if item.design is None:
+        return None
+    design = Planned.from_json(item.design)
+    if design.bounds or not design.holds:
+        return design
+    try:
+        return replace(design, bounds=bounds_of(visit, visit.participant.current_settings, design.lower_bound))
+    except Invalid:
+        return design  # a warning of the plan says what is missing, and approving it is refused
+
+
+def _sign_designs(visit: Visit, plan: Plan) -> None:
+    """Fix the bounds of held draws in milliamperes."""
+    for item in plan.items:
+        if item.design is not None and item.design["holds"]:
+            design = Planned.from_json(item.design)
+            bounds = bounds_of(visit, visit.participant.current_settings, design.lower_bound)
+            item.design = replace(design, bounds=bounds).as_json()
 
 
 def _energy(item: PlanItem, estimate: Estimate | None) -> float | None:
@@ -308,6 +344,8 @@ def _warnings(
             warnings.append(f"Policy '{line.policy.name}': {flags}.")
         if line.policy.retired_reason:
             warnings.append(f"Policy '{line.policy.name}' was retired: {line.policy.retired_reason}.")
+    if plan.status == "draft" and any(line.design and line.design.holds and not line.design.bounds for line in lines):
+        warnings.append("The cDBS amplitude is not known: the plan cannot be approved before its lower bound is one in milliamperes.")
     held = repository.session_count(db, visit.id)
     if held:
         warnings.append(f"The visit already has {held} {'session' if held == 1 else 'sessions'}.")

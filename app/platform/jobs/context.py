@@ -17,7 +17,8 @@ _KEY = re.compile(r"[a-z0-9][a-z0-9_.\-]*(/[a-z0-9][a-z0-9_.\-]*)*")
 _KEY_LENGTH = 100
 
 StepOutcome = dict[str, Any]
-"""`{"ok": True, "result": {...}}`, `{"ok": False, "message": "..."}` or, never started, `{"ok": False, "skipped": True}`."""
+"""`{"ok": True, "result": {...}}`, `{"ok": False, "message": "..."}` or, never started, `{"ok": False, "skipped": True}`. What a child
+failed of stands under `cause` too, a `Cause` of `children.child`."""
 
 
 class Steps(Protocol):

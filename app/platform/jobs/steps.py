@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session
 from app.platform.database import new_session
 from app.platform.errors import BetaloopError
 from app.platform.jobs import registry, repository
+from app.platform.jobs.children.child import ChildLimits
 from app.platform.jobs.children.slots import Slots
 from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall
 from app.platform.jobs.context import JobContext, StepOutcome
@@ -61,7 +62,7 @@ class JobSteps:
         checked = _as_json(params, f"the params of step {key!r}")
         if (known := self.ledger.outcome(key)) is not None:  # before waiting for a slot: after a crash, most steps have ended
             return known
-        call = ComputeCall(name, registry.compute_reference(name), checked, self.workdir(key), get_settings().job_memory_mb)
+        call = ComputeCall(name, registry.compute_reference(name), checked, self.workdir(key), ChildLimits(get_settings().job_memory_mb))
         with self.slots.hold(self.ledger.job_id, self.requests.check):
             if skip():
                 return {"ok": False, "skipped": True}

@@ -13,9 +13,9 @@ from app.accounts.permissions import SYSTEM, Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import blinding, repository, service
-from app.study.models import Recording, SettingsVersion, StudySession
+from app.study.models import Controller, Recording, SettingsVersion, StudySession
 from app.study.schemas import ConditionsChange, ConditionsFields
-from app.study.sessions import programming
+from app.study.sessions import designs, programming
 from app.study.sessions.models import SessionConditions
 from app.study.traces import AMPLITUDE_STREAM, StepTable, step_table
 
@@ -41,14 +41,20 @@ def record(db: Session, session: StudySession, by: str, stated: ConditionsChange
     values |= dict(zip(("min_ma", "max_ma"), _limits(db, session) or (None, None), strict=True))
     values |= {"seed": None, "design": None, "design_parameters": {}}
     values["programming"] = [p.as_json() for p in programming.of_session(session)]
+    of_plan = False
     try:
         table = step_table(db, session, session.visit.participant.current_settings)
         values |= {"lead_amplitude_ma": lead_amplitude_ma(table), "cdbs_amplitude_ma": table.cdbs_ma}
     except Invalid:
         # its steps cannot be read, for which its page and every buffer give the reason
         values |= {"lead_amplitude_ma": None, "cdbs_amplitude_ma": None}
+    else:
+        arm = blinding.stated_arm(session, SYSTEM)
+        if arm is not None and arm.controller is Controller.RANDOM:
+            found = designs.planned(db, session, table, session.visit.participant.current_settings.period_s)
+            values, of_plan = values | (found or {}), found is not None
     given = _given(stated) if stated is not None else {}
-    told = bool(given.keys() & set(OF_SETTINGS))
+    told = of_plan or bool(given.keys() & set(OF_SETTINGS))
     origin = "stated" if told else "settings" if in_force else "assumed"
     return _add(db, session, values | given, origin, by, stated.reason if stated else None)
 

@@ -112,8 +112,21 @@ GROUPS = (
         ),
     ),
     SettingGroup(
-        "Random controller",
-        (SettingField("lower_bound", "Lower bound B", "Lowest fraction that the random controller draws. It never bounds a policy."),),
+        "Random sessions of early visits",
+        (
+            SettingField("lower_bound", "Lower bound B", "No random session goes below this fraction of cDBS. It never bounds a policy."),
+            SettingField(
+                "design", "Design", "A level that lasts shows what a lasting dose does; draws of every step hardly leave the middle.",
+                options=(("stratified", "stratified levels, draws held 10 to 60 s"), ("paper", "the paper's: a new draw every step")),
+            ),
+            SettingField(
+                "design_ladder", "Titration ladder", "1, 0.8, 0.6, … of cDBS, 2 minutes each; in the stratified design alone.",
+                options=(("no", "none"), ("yes", "first random session of each visit")),
+            ),
+            SettingField(
+                "early_visits", "Early visits", "Over so many visits the stratified levels are spread.", "visits", attrs=_WHOLE
+            ),
+        ),
     ),
 )  # fmt: skip
 

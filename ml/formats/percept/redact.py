@@ -14,7 +14,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from ml.formats.archive import ZipFiles
+from ml.formats.archive import ZipFiles, told
 from ml.formats.options import ArchiveLimits
 from ml.formats.percept.details import EVENT_WORDS
 from ml.formats.percept.enums import is_known
@@ -78,7 +78,7 @@ def redact_percept(source: Path, target: Path, key: bytes, limits: ArchiveLimits
             texts = {f"report-{n}.json": t for n, m in enumerate(members, start=1) if (t := _member(files, m, n, scrub, done)) is not None}
             others = len(files.names()) - len(members)
             done.ignored += [
-                *map(str, files.left_out),
+                *told(files.left_out),
                 *([f"{others} file{'s' if others > 1 else ''} that are no session report"] if others else []),
             ]
         if not texts:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.archive import READ_ERRORS, ZipFiles
+from ml.formats.archive import READ_ERRORS, ZipFiles, told
 from ml.formats.beta import channel_spectrum, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
 from ml.formats.percept import details
@@ -102,7 +102,7 @@ def decode_percept(path: Path, options: DecodeOptions, name: str | None = None) 
             recordings.extend(found)
         others = len(files.names()) - len(members)
         if reports:
-            reports[0].ignored.extend(map(str, files.left_out))
+            reports[0].ignored.extend(told(files.left_out))
         if reports and others:
             reports[0].ignored.append(f"{others} file{'s' if others > 1 else ''} that are no session report")
     if not any(r.problem is None for r in reports):

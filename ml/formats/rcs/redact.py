@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
-from ml.formats.archive import ZipFiles
+from ml.formats.archive import ZipFiles, told
 from ml.formats.options import ArchiveLimits
 from ml.formats.rcs.folder import SessionFiles, find_sessions
 from ml.formats.rcs.keys import KEYS
@@ -74,7 +74,7 @@ def redact_rcs_zip(source: Path, target: Path, key: bytes, limits: ArchiveLimits
         if not sessions:
             raise UndecodableFile("no RC+S session in here", "archive", "Zip the session's Device folder with its JSON files.")
         # in the archive that is written every recording has a folder of its own
-        done = Redaction(repaired=listing.flagged, ignored=[*listing.ignored, *map(str, files.left_out)])
+        done = Redaction(repaired=listing.flagged, ignored=[*listing.ignored, *told(files.left_out)])
         scrub = _Scrubber(key)
         taken: set[str] = set()
         members = sorted(_plan(sessions, files, scrub, taken))

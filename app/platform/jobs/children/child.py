@@ -1,7 +1,8 @@
-"""The child process of one compute step: `python -m app.platform.jobs.children.child NAME WORKDIR`.
+"""The child process of one compute step: `python -m app.platform.jobs.children.child NAME WORKDIR`, or a fork of `fork_server`.
 
-It reads `params.json` from its folder, runs the function, and leaves `result.json` there by atomic rename. Progress goes as JSON lines to
-the file descriptor that BETALOOP_REPORT_FD names; what the function prints goes to `log.txt`. It dies with the worker that started it.
+It reads `params.json` from its folder, runs the function within its limits, and leaves `result.json` there by atomic rename. Progress goes
+as JSON lines to the file descriptor that BETALOOP_REPORT_FD names; what the function prints goes to `log.txt`. It dies with the process
+that started it.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import ctypes
 import fcntl
 import hashlib
 import json
+import math
 import os
 import resource
 import signal
@@ -17,18 +19,42 @@ import sys
 import threading
 import time
 import traceback
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from app.platform.errors import BetaloopError
 from app.platform.jobs.children.report import StepReport, pipe_sender, write_atomically
 from app.platform.jobs.errors import JobError
 from app.platform.jobs.registry import load_compute
 
+REPORT_FD = "BETALOOP_REPORT_FD"
+"""Names the descriptor of the pipe of reports."""
+PARENT = "BETALOOP_WORKER_PID"
+"""Names the process that must live as long as the child."""
 _PR_SET_PDEATHSIG = 1
 _LOCK_WAIT_S = 30.0
-_NICENESS = 5
 _OOM_SCORE = "500"
+
+Cause = Literal["memory", "time", "killed", "error"]
+"""Why a call gave no result: it met its limit of memory or time, its process was killed or broke down, or its function raised."""
+
+
+@dataclass(frozen=True)
+class ChildLimits:
+    """What one child may take of the machine.
+
+    Attributes:
+        memory_mb: data of the process, what it has imported included, MiB.
+        cpu_s: seconds of processor time, which a busy machine does not use up; None for no limit.
+        niceness: how far it steps back behind other processes.
+        quotes: whether its log may quote what its function works on. Files of strangers may name a person: then it may not.
+    """
+
+    memory_mb: int
+    cpu_s: int | None = None
+    niceness: int = 5
+    quotes: bool = True
 
 
 def params_hash(name: str, params: dict[str, Any]) -> str:
@@ -57,39 +83,50 @@ def too_much_memory(limit_mb: int) -> str:
 
 def main(arguments: list[str]) -> int:
     """Run one call; 0 when it gave a result, 1 when it failed (the reason stands in result.json), 2 for wrong arguments."""
-    _die_with_parent()
+    die_with_parent()
     if len(arguments) != 2:
         sys.stderr.write("usage: python -m app.platform.jobs.children.child NAME WORKDIR\n")
         return 2
     name, workdir = arguments[0], Path(arguments[1])
-    _be_modest()
     os.umask(0o077)  # checkpoints and results are of participants
     call = json.loads((workdir / "params.json").read_bytes())
+    limits = ChildLimits(**call["limits"])
+    _be_modest(limits)
     outcome: dict[str, Any] = {"params_sha256": call["params_sha256"]}
     lock = None
     try:
         lock = _lock(workdir)
-        outcome |= {"ok": True, "result": _run(name, call, workdir)}
+        outcome |= {"ok": True, "result": _run(name, call, limits, workdir)}
     except Exception as error:
         # memory to write the message with, when it was the memory that ran out
         resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         # stderr is the step's log, which shows the traceback to those who can read one
-        traceback.print_exc()
-        outcome |= {"ok": False, "message": _worded(error, call["memory_mb"])}
+        if limits.quotes:
+            traceback.print_exc()
+        else:
+            sys.stderr.write(places(error))
+        outcome |= {"ok": False, "cause": "memory" if _lacked_memory(error) else "error", "message": _worded(error, limits)}
     write_atomically(workdir / "result.json", json.dumps(outcome, allow_nan=False).encode())
     if lock is not None:
         os.close(lock)
     return 0 if outcome["ok"] else 1
 
 
-def _run(name: str, call: dict[str, Any], workdir: Path) -> dict[str, Any]:
+def places(error: BaseException) -> str:
+    """The kind of an error and the lines of code that it passed, without the values that it may quote."""
+    return "".join([*traceback.format_tb(error.__traceback__), type(error).__name__, "\n"])
+
+
+def _run(name: str, call: dict[str, Any], limits: ChildLimits, workdir: Path) -> dict[str, Any]:
     function = load_compute(call["function"])
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(1)
     # after the imports: a limit below what they need would only say so in a worse way
-    limit = call["memory_mb"] << 20
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, resource.RLIM_INFINITY))
-    report = StepReport(pipe_sender(int(os.environ["BETALOOP_REPORT_FD"])))
+    resource.setrlimit(resource.RLIMIT_DATA, (limits.memory_mb << 20, resource.RLIM_INFINITY))
+    if limits.cpu_s is not None:
+        used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(used) + limits.cpu_s, resource.RLIM_INFINITY))
+    report = StepReport(pipe_sender(int(os.environ[REPORT_FD])))
     result = function(call["params"], workdir, report)
     if not isinstance(result, dict):
         raise TypeError(f"compute function {name!r} must return a dict, not {type(result).__name__}")
@@ -101,19 +138,25 @@ def _run(name: str, call: dict[str, Any], workdir: Path) -> dict[str, Any]:
     return result
 
 
-def _worded(error: Exception, memory_mb: int) -> str:
+def _lacked_memory(error: Exception) -> bool:
+    return isinstance(error, MemoryError) or "can't allocate memory" in str(error)
+
+
+def _worded(error: Exception, limits: ChildLimits) -> str:
     """One line for the user."""
+    if _lacked_memory(error):
+        return too_much_memory(limits.memory_mb)
     text = str(error).strip()
-    if isinstance(error, MemoryError) or "can't allocate memory" in text:
-        return too_much_memory(memory_mb)
     if isinstance(error, BetaloopError):
         return text
+    if not limits.quotes:
+        return type(error).__name__
     return f"{type(error).__name__}: {text.splitlines()[-1]}" if text else type(error).__name__
 
 
-def _die_with_parent() -> None:
-    """Let the kernel kill us when the worker's spawning thread ends, kill -9 included."""
-    parent = int(os.environ.get("BETALOOP_WORKER_PID", "0"))
+def die_with_parent() -> None:
+    """Let the kernel kill us when the thread that started us ends, kill -9 included."""
+    parent = int(os.environ.get(PARENT, "0"))
     if sys.platform == "linux":
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
@@ -132,9 +175,10 @@ def _watch_parent(parent: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _be_modest() -> None:
-    """Leave the processor to the web service, and offer ourselves first when the machine runs out of memory."""
-    os.nice(_NICENESS)
+def _be_modest(limits: ChildLimits) -> None:
+    """Step back behind the web service, offer ourselves first when the machine runs out of memory, and leave no image of it on the disk."""
+    os.nice(limits.niceness)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     score = Path("/proc/self/oom_score_adj")
     if score.exists():
         score.write_text(_OOM_SCORE)

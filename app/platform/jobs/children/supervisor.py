@@ -1,4 +1,4 @@
-"""The worker's side of child processes: starts them, reads their reports, watches their memory, kills them."""
+"""The starter's side of child processes: starts them, reads their reports, watches their memory, kills them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import psutil
 
-from app.platform.jobs.children.child import params_hash, stored_result, too_much_memory
+from app.platform.jobs.children.child import PARENT, REPORT_FD, Cause, ChildLimits, params_hash, stored_result, too_much_memory
 from app.platform.jobs.children.report import write_atomically
 from app.platform.jobs.context import StepOutcome
 from app.settings import private_folder
@@ -42,7 +42,7 @@ class ComputeCall:
     reference: str
     params: dict[str, Any]
     workdir: Path
-    memory_mb: int
+    limits: ChildLimits
 
     @property
     def sha256(self) -> str:
@@ -73,14 +73,42 @@ class ChildMessages:
         return any(part is not None for part in (self.progress, self.message, self.points, self.logs))
 
 
-_Child = subprocess.Popen[bytes]
-_Order = tuple[Callable[[], _Child], Future[_Child]]
+class Child(Protocol):
+    """A running child, as `subprocess.Popen` is one."""
+
+    @property
+    def pid(self) -> int:
+        """Its number, which is its process group's too."""
+
+    @property
+    def returncode(self) -> int | None:
+        """As of `poll`, when it was asked last."""
+
+    def poll(self) -> int | None:
+        """Its exit code, negative for a signal; None while it runs."""
+
+    def wait(self) -> int:
+        """Its exit code, when it has ended."""
+
+    def kill(self) -> None:
+        """End it."""
+
+
+Starter = Callable[[list[str], int, int], Child]
+"""Starts a child with these arguments, this log and this pipe of reports, in a session of its own."""
+_Popen = subprocess.Popen[bytes]
+_Order = tuple[Callable[[], _Popen], Future[_Popen]]
 
 
 class ChildProcesses:
-    """Starts every child from one thread, because the kernel's parent-death signal fires when the starting *thread* ends."""
+    """Starts every process from one thread, because the kernel's parent-death signal fires when the starting *thread* ends.
 
-    def __init__(self) -> None:
+    Args:
+        start: starts a child in another way than as a fresh interpreter.
+    """
+
+    def __init__(self, start: Starter | None = None) -> None:
+        self._start_child = start or self._fresh
         self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="child-starter", daemon=True)
         self._thread.start()
@@ -108,40 +136,51 @@ class ChildProcesses:
         log_start = log.stat().st_size if log.exists() else 0
         process, pipe = self._start(call, log)
         try:
-            killed_for = _listen(process, pipe, call.memory_mb, record, check)
+            outgrown = _listen(process, pipe, call.limits.memory_mb, record, check)
         finally:
             os.close(pipe)
             _kill(process)
-        outcome = _outcome(call, process.returncode, killed_for)
+        outcome = _outcome(call, process.wait(), outgrown)
         if not outcome["ok"]:
             outcome["log"] = log.read_bytes()[log_start:][-LOG_TAIL:].decode(errors="replace")
         return outcome
 
-    def _start(self, call: ComputeCall, log: Path) -> tuple[_Child, int]:
+    def open_process(self, arguments: list[str], **named: Any) -> subprocess.Popen[bytes]:
+        """Start a Python process that lives no longer than this one, with its libraries on one thread; see `subprocess.Popen`."""
+        env = (
+            os.environ
+            | _ONE_THREAD
+            | {PARENT: str(os.getpid()), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+            | named.pop("env", {})
+        )
+
+        def start() -> _Popen:
+            return subprocess.Popen([sys.executable, *arguments], env=env, start_new_session=True, **named)
+
+        started: Future[_Popen] = Future()
+        self._orders.put((start, started))
+        return started.result()
+
+    def _start(self, call: ComputeCall, log: Path) -> tuple[Child, int]:
         reader, writer = os.pipe()
-        env = os.environ | _ONE_THREAD
-        env |= {
-            "BETALOOP_REPORT_FD": str(writer),
-            "BETALOOP_WORKER_PID": str(os.getpid()),
-            "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
-        }
-        command = [sys.executable, "-m", "app.platform.jobs.children.child", call.name, str(call.workdir.resolve())]
         with log.open("ab") as out:
-
-            def start() -> _Child:
-                return subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=env, pass_fds=(writer,), start_new_session=True
-                )
-
-            started: Future[_Child] = Future()
-            self._orders.put((start, started))
             try:
-                return started.result(), reader
+                return self._start_child([call.name, str(call.workdir.resolve())], out.fileno(), writer), reader
             except BaseException:
                 os.close(reader)
                 raise
             finally:
                 os.close(writer)
+
+    def _fresh(self, arguments: list[str], log: int, report: int) -> Child:
+        return self.open_process(
+            ["-m", "app.platform.jobs.children.child", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env={REPORT_FD: str(report)},
+            pass_fds=(report,),
+        )
 
     def _work(self) -> None:
         while order := self._orders.get():
@@ -158,15 +197,15 @@ def _prepare(call: ComputeCall) -> None:
     if call.workdir.exists() and (not params.exists() or json.loads(params.read_bytes())["params_sha256"] != call.sha256):
         shutil.rmtree(call.workdir)
     private_folder(call.workdir)
-    content = {"function": call.reference, "params": call.params, "params_sha256": call.sha256, "memory_mb": call.memory_mb}
+    content = {"function": call.reference, "params": call.params, "params_sha256": call.sha256, "limits": asdict(call.limits)}
     write_atomically(params, json.dumps(content, allow_nan=False).encode())
     result = call.workdir / "result.json"
     if result.exists() and stored_result(call.workdir, call.sha256) is None:
         result.unlink()  # of a failed attempt
 
 
-def _listen(process: _Child, pipe: int, memory_mb: int, record: Callable[[ChildMessages], None], check: Callable[[], None]) -> str | None:
-    """Read what a child reports until it ends; returns why it had to be killed, or None when it ended by itself."""
+def _listen(process: Child, pipe: int, memory_mb: int, record: Callable[[ChildMessages], None], check: Callable[[], None]) -> bool:
+    """Read what a child reports until it ends; whether it has to be killed because it outgrew its limit of memory."""
     messages, rest, open_ = ChildMessages(), b"", True
     reported = measured = time.monotonic()
     while open_ or process.poll() is None:
@@ -186,12 +225,12 @@ def _listen(process: _Child, pipe: int, memory_mb: int, record: Callable[[ChildM
         if present - measured >= MEMORY_CHECK_S:
             measured = present
             if _resident_mb(process.pid) > memory_mb:
-                return too_much_memory(memory_mb)
+                return True
         if process.poll() is not None and not select.select([pipe], [], [], 0)[0]:
             break  # a grandchild may hold the pipe open
     if messages:
         record(messages)
-    return None
+    return False
 
 
 def _resident_mb(pid: int) -> float:
@@ -201,7 +240,7 @@ def _resident_mb(pid: int) -> float:
         return 0.0
 
 
-def _kill(process: _Child) -> None:
+def _kill(process: Child) -> None:
     if process.poll() is None:
         try:
             os.killpg(process.pid, signal.SIGKILL)  # its own session: its children go too
@@ -210,17 +249,23 @@ def _kill(process: _Child) -> None:
     process.wait()
 
 
-def _outcome(call: ComputeCall, returncode: int, killed_for: str | None) -> StepOutcome:
-    if killed_for:
-        return {"ok": False, "message": killed_for}
+def _outcome(call: ComputeCall, returncode: int, outgrown: bool) -> StepOutcome:
+    if outgrown:
+        return _failed("memory", too_much_memory(call.limits.memory_mb))
     try:
         stored: dict[str, Any] = json.loads((call.workdir / "result.json").read_bytes())
     except FileNotFoundError:
-        if returncode < 0:
-            name = signal.Signals(-returncode).name
-            why = "most likely because the machine ran out of memory" if name == "SIGKILL" else "see the step's log"
-            return {"ok": False, "message": f"The step's process was killed from outside ({name}), {why}."}
-        return {"ok": False, "message": f"The step's process ended with exit code {returncode} and without a result; see the step's log."}
+        if returncode >= 0:
+            return _failed("killed", f"The step's process ended with exit code {returncode} and without a result; see the step's log.")
+        name = signal.Signals(-returncode).name
+        if name == "SIGXCPU":
+            return _failed("time", f"The step's process took more than its limit of {call.limits.cpu_s} s of processor time.")
+        why = "most likely because the machine ran out of memory" if name == "SIGKILL" else "see the step's log"
+        return _failed("killed", f"The step's process was killed from outside ({name}), {why}.")
     if stored["ok"]:
         return {"ok": True, "result": stored["result"]}
-    return {"ok": False, "message": stored["message"]}
+    return _failed(stored["cause"], stored["message"])
+
+
+def _failed(cause: Cause, message: str) -> StepOutcome:
+    return {"ok": False, "cause": cause, "message": message}

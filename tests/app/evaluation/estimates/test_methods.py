@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 from app.evaluation.estimates.compute import evaluate_method
 from app.evaluation.schemas import EvaluateParams
 from app.platform.jobs import StepReport
+from app.platform.jobs.children.child import ChildLimits
 from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall
 from ml.ope import registry
 from ml.ope.estimate import Estimate
@@ -77,7 +78,7 @@ def test_a_method_of_its_own_file_runs_in_a_child_process(db: Session, tmp_path:
     db.commit()
     children = ChildProcesses()
     try:
-        step = ComputeCall("evaluate_mean_session", f"{__name__}:evaluate_here", db_call, tmp_path / "step", 2048)
+        step = ComputeCall("evaluate_mean_session", f"{__name__}:evaluate_here", db_call, tmp_path / "step", ChildLimits(2048))
         outcome = children.run(step, lambda messages: None, lambda: None)
     finally:
         children.close()

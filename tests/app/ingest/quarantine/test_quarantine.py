@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import zipfile
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,11 +13,12 @@ from sqlalchemy.orm import Session
 
 from app.ingest.models import UploadFile
 from app.ingest.quarantine.serializers import problem_of
-from app.ingest.uploads.receiving import stored_reports
+from app.ingest.uploads import reading
+from app.ingest.uploads.reading import Cleaned
+from app.ingest.uploads.reports import stored_reports
 from app.platform import files
 from app.platform.audit import AuditEvent
 from app.platform.files import StoredFile
-from ml import formats
 from ml.formats.recording import UndecodableFile
 from tests.app.ingest.conftest import device_zip, steady
 
@@ -93,15 +93,12 @@ def test_a_file_that_still_cannot_be_read_stays_and_the_answer_says_why(held: di
 def test_a_better_decoder_reads_what_was_held(
     send: Any, client: TestClient, db: Session, monkeypatch: pytest.MonkeyPatch, proposals: Any
 ) -> None:
-    content, real = device_zip(), formats.sniff
-
-    def too_old(path: Path) -> Any:
-        raise UndecodableFile("no format this service reads", "first bytes", "Wait for an update.")
-
-    monkeypatch.setattr(formats, "sniff", too_old)
+    content, real = device_zip(), reading.clean
+    too_old = UndecodableFile("no format this service reads", "first bytes", "Wait for an update.")
+    monkeypatch.setattr(reading, "clean", lambda *_: Cleaned("unreadable", problem=too_old))
     file = send(("s.zip", content)).json()
     assert file["report"][0]["problem"]["what"] == "no format this service reads"
-    monkeypatch.setattr(formats, "sniff", real)
+    monkeypatch.setattr(reading, "clean", real)
     held = client.get("/api/v1/participants/P1/quarantine").json()[0]
     answer = decide(client, held, "release", how="read", reason="decoder of version 3")
     assert answer.status_code == 200, answer.text
@@ -117,10 +114,10 @@ def test_a_better_decoder_reads_what_was_held(
 
 
 def test_bytes_that_were_read_meanwhile_are_not_read_twice(send: Any, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    content, real = device_zip(), formats.sniff
-    monkeypatch.setattr(formats, "sniff", lambda path: (_ for _ in ()).throw(UndecodableFile("too new", "file", "Wait.")))
+    content, real = device_zip(), reading.clean
+    monkeypatch.setattr(reading, "clean", lambda *_: Cleaned("unreadable", problem=UndecodableFile("too new", "file", "Wait.")))
     send(("s.zip", content))
-    monkeypatch.setattr(formats, "sniff", real)
+    monkeypatch.setattr(reading, "clean", real)
     assert send(("s.zip", content)).status_code == 201
     held = next(f for f in client.get("/api/v1/participants/P1/quarantine").json() if f["held"])
     answer = decide(client, held, "release", how="read", reason="now")

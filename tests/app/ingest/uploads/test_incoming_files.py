@@ -23,13 +23,13 @@ UPLOAD = """
 import io, sys, time
 from app.accounts.permissions import SYSTEM
 from app.ingest.uploads import service
-from ml import formats
+from app.ingest.uploads import reading
 from app.ingest.sessions import StatedSession
 from app.platform.database import new_session
 from app.platform.tables import load_tables
 from app.study.repository import participant_by_code
 
-def stay(*_):
+def stay(*_, **__):
     print("here", flush=True)
     time.sleep(600)
 
@@ -41,7 +41,7 @@ class Slow(io.BytesIO):
 
 load_tables()
 if sys.argv[1] == "cleaning":
-    formats.redact = stay
+    reading.clean = stay
 raw = b"t_s,beta,amplitude_fraction,note\\n" + b"".join(b"%d,1,1,NAME-OF-THE-PATIENT\\n" % (2 * k) for k in range(1, 250_000))
 with new_session() as db:
     service.receive(db, participant_by_code(db, "P1", SYSTEM), StatedSession(), [service.Incoming("t.csv", Slow(raw))], SYSTEM)

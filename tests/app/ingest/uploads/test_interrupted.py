@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import threading
+import time
 from typing import Any
 
 import pytest
@@ -15,16 +17,17 @@ from app.accounts.permissions import SYSTEM
 from app.cli import app as command_line
 from app.ingest.models import Upload, UploadFile
 from app.ingest.sessions import StatedSession
-from app.ingest.uploads import service
+from app.ingest.uploads import reading, service
 from app.ingest.uploads.in_progress import in_progress, interrupted
-from app.ingest.uploads.interrupted import resume
+from app.ingest.uploads.interrupted import keep_resuming, resume
 from app.ingest.uploads.receiving import Receiver
 from app.ingest.uploads.service import Incoming
 from app.platform.database import new_session
+from app.settings import get_settings
 from app.study import repository as study
 from app.study.models import Controller
-from ml import formats
-from tests.app.ingest.conftest import steady
+from tests.app.ingest.conftest import Send, steady
+from tests.app.ingest.uploads import readers
 
 
 class Stopped(BaseException):
@@ -52,7 +55,7 @@ def cut_short(db: Session, monkeypatch: pytest.MonkeyPatch, where: Any, name: st
 
 @pytest.mark.parametrize(
     ("where", "name", "nth", "files"),
-    [(formats, "decode", 1, 1), (Receiver, "decode", 2, 2), (service, "make_sessions", 1, 2)],
+    [(reading, "decode", 1, 1), (Receiver, "decode", 2, 2), (service, "make_sessions", 1, 2)],
     ids=["while the first file is decoded", "before the second file is decoded", "before the sessions are made"],
 )
 def test_an_upload_that_was_cut_short_is_taken_up(
@@ -69,7 +72,7 @@ def test_an_upload_that_was_cut_short_is_taken_up(
     assert proposal["session"]["controller"] == "cdbs"
     assert body["files"][0]["session_ids"] == [proposal["session"]["id"]]
     if name == "decode":
-        assert "The service was stopped while it read this file" in repr(body["report"])
+        assert "Reading this file was cut short" in repr(body["report"])
     if files == 2:
         assert client.get(f"/api/v1/uploads/{number}").json()["files"][1]["session_ids"] == [proposal["session"]["id"]]
     assert list(resume("test")) == []
@@ -86,7 +89,7 @@ def test_what_the_sender_had_stated_holds_when_it_is_taken_up(
 
 
 def test_an_upload_that_is_still_coming_is_left_alone(enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    number = cut_short(db, monkeypatch, formats, "decode")
+    number = cut_short(db, monkeypatch, reading, "decode")
     with in_progress(number):
         assert interrupted(db) == []
         assert list(resume("test")) == []
@@ -95,7 +98,7 @@ def test_an_upload_that_is_still_coming_is_left_alone(enrolled: str, db: Session
 
 
 def test_the_command_takes_up_what_was_cut_short(enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    number = cut_short(db, monkeypatch, formats, "decode")
+    number = cut_short(db, monkeypatch, reading, "decode")
     result = CliRunner().invoke(command_line, ["ingest", "resume"])
     assert (result.exit_code, result.output) == (0, f"Upload {number}: files: 1, sessions: 1\n")
     assert CliRunner().invoke(command_line, ["ingest", "resume"]).output == "No upload was cut short.\n"
@@ -114,3 +117,75 @@ def test_bytes_that_nobody_can_read_are_told_when_they_are_taken_up(
     assert (file.status, file.quarantine_sha256 is not None) == ("failed", True)
     (row,) = client.get("/api/v1/participants/P1/quarantine").json()
     assert "the service was stopped while it took this file" in row["problem"]
+
+
+def until(found: Any, seconds: float = 60.0) -> Any:
+    """What a question answers once it answers anything."""
+    deadline = time.monotonic() + seconds
+    while not (answer := found()):
+        assert time.monotonic() < deadline, "nothing happened"
+        time.sleep(0.05)
+    return answer
+
+
+def test_a_fault_after_the_bytes_are_safe_tells_so_and_is_mended_without_a_restart(
+    send: Send, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    files = (("t.csv", steady(1)), ("grasp.csv", b"t_s,hand\n1,L\n1.5,L\n2,L\n"))
+    with monkeypatch.context() as patch:
+        patch.setattr(service, "finish", full)
+        answer = send(*files, visit=1, controller="cdbs")
+    assert answer.status_code == 500
+    body = answer.json()
+    assert body["detail"] == "Upload 1 was cut short: the bytes of 2 of its 2 files are kept."
+    assert body["hint"] == "What is kept is read by itself within some minutes: its report will be on /uploads/1."
+    assert client.get("/api/v1/uploads/1").json()["status"] == "received"
+    stop = threading.Event()
+    keeper = threading.Thread(target=keep_resuming, args=("test", stop, 0.1))
+    keeper.start()
+    try:
+        upload = until(lambda: (u := client.get("/api/v1/uploads/1").json())["status"] == "decoded" and u)
+    finally:
+        stop.set()
+        keeper.join(30)
+    assert [f["status"] for f in upload["files"]] == ["decoded", "decoded"]
+    assert upload["sessions"][0]["controller"] == "cdbs"
+
+
+def test_a_fault_between_two_files_says_how_many_are_kept(send: Send, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = Receiver.receive
+
+    def second_fails(self: Receiver, one: Incoming) -> Any:
+        if one.name == "b.csv":
+            raise OSError(28, "No space left on device")
+        return real(self, one)
+
+    monkeypatch.setattr(Receiver, "receive", second_fails)
+    answer = send(("a.csv", steady(1)), ("b.csv", steady(1, beta=2.0)), visit=1, controller="cdbs")
+    assert (answer.status_code, "the bytes of 1 of its 2 files are kept" in answer.json()["detail"]) == (500, True)
+    assert "Send the others again" in answer.json()["hint"]
+
+
+def test_the_reading_of_a_file_is_told_while_it_lasts(
+    service_app: Any, make_token: Any, enrolled: str, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reading, "DECODE", f"{readers.__name__}:hold")
+    stated = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+
+    def send_one() -> None:
+        client.post("/api/v1/uploads", data=stated, files=[("file", ("a.csv", steady(1)))])
+
+    sender = threading.Thread(target=send_one)
+    sender.start()
+    try:
+        (row,) = until(lambda: [p for p in client.get("/participants/P1/upload/progress").json() if p["share"]])
+        assert (row["share"], row["text"]) == (0.25, "decoding, 25 %")
+        assert "decoding, 25 %" in client.get("/participants/P1/upload", headers={"Accept": "text/html"}).text
+    finally:
+        for folder in get_settings().files_dir.iterdir():
+            (folder / "go").touch()
+        sender.join(60)
+    assert client.get("/participants/P1/upload/progress").json() == []

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
@@ -14,19 +18,25 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.ingest.models import Upload, UploadFile
+from app.ingest.uploads import reading
 from app.ingest.uploads.interrupted import resume
 from app.platform.errors import Invalid
+from app.platform.jobs.children import limited
+from app.settings import get_settings
 from app.study import repository as study
 from app.study.models import Recording, SettingsVersion, StudySession
 from app.study.traces import MOST_STEPS, step_table
-from tests.app.ingest.conftest import Send, steady, table
+from ml import formats
+from ml.formats import archive
+from tests.app.ingest.conftest import Send, device_zip, steady, table
+from tests.app.ingest.uploads import readers
 
 ROOT = Path(__file__).resolve().parents[4]
 LETHAL = """
 import io, os, signal, sys
 from app.accounts.permissions import SYSTEM
 from app.ingest.uploads import service
-from ml import formats
+from app.ingest.uploads import reading
 from app.ingest.uploads.interrupted import resume
 from app.ingest.sessions import StatedSession
 from app.platform.database import new_session
@@ -34,7 +44,11 @@ from app.platform.tables import load_tables
 from app.study.repository import participant_by_code
 
 load_tables()
-setattr({"decode": formats, "make_sessions": service}[sys.argv[2]], sys.argv[2], lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL))
+if sys.argv[2] == "slowly":
+    reading.DECODE = "tests.app.ingest.uploads.readers:sleep"
+else:
+    where = {"decode": reading, "make_sessions": service}[sys.argv[2]]
+    setattr(where, sys.argv[2], lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL))
 if sys.argv[1] == "send":
     with new_session() as db:
         one = service.Incoming("t.csv", io.BytesIO(sys.argv[3].encode()))
@@ -57,7 +71,7 @@ def test_a_file_that_ends_the_service_twice_is_put_aside_and_can_be_read(client:
     (file,) = db.scalars(select(UploadFile))
     assert (file.status, file.quarantine_sha256 is not None) == ("failed", True)
     (row,) = client.get("/api/v1/participants/P1/quarantine").json()
-    assert "the service ended 2 times while it read this file" in row["problem"]
+    assert "reading this file was cut short 2 times" in row["problem"]
     assert list(resume("test")) == [], "it is not resumed again"
     assert client.post(f"/api/v1/uploaded-files/{file.id}/review").status_code == 200
     released = client.post(f"/api/v1/uploaded-files/{file.id}/release", json={"how": "read", "reason": "the service was repaired"})
@@ -81,6 +95,91 @@ def test_sessions_that_end_the_service_twice_are_not_made_a_third_time(client: T
     assert "The service ended 2 times while it made sessions" in repr(client.get(f"/api/v1/uploads/{upload.id}").json()["report"])
     assert client.get("/api/v1/participants/P1/proposals").json() == []
     assert list(resume("test")) == []
+
+
+@pytest.mark.parametrize(
+    ("reader", "said"),
+    [
+        ("kill", "the process that read it was ended"),
+        ("outgrow", "reading it takes more memory than the 2048 MiB that one file may have"),
+        ("spin", "reading it takes longer than the 1 s of processor time that one file may have"),
+    ],
+)
+@pytest.mark.parametrize("step", ["CLEAN", "DECODE"])
+def test_a_file_that_ends_its_reader_twice_is_put_aside_with_the_reason_and_the_service_lives(
+    send: Send, client: TestClient, db: Session, monkeypatch: pytest.MonkeyPatch, step: str, reader: str, said: str
+) -> None:
+    monkeypatch.setattr(get_settings(), "decode_seconds", 1)
+    good, real = ("good.csv", steady(1, beta=2.0)), getattr(reading, step)
+    with monkeypatch.context() as patch:
+        patch.setattr(reading, step, f"{readers.__name__}:{reader}")
+        lethal = send(("t.csv", steady(1)), visit=1, controller="cdbs")
+    assert lethal.status_code == 422, lethal.text
+    problem = lethal.json()["report"][0]["problem"]
+    assert (problem["what"], "BETALOOP_DECODE_MEMORY_MB" in problem["hint"]) == (said, True)
+    assert send(good, visit=1, controller="cdbs").status_code == 201, "the service takes the next file"
+    assert list(resume("test")) == [], "it is not tried again at the next start"
+    (row,) = client.get("/api/v1/participants/P1/quarantine").json()
+    assert (row["status"], row["held"]) == ("failed", True)
+    assert said in row["problem"]
+    released = client.post(f"/api/v1/uploaded-files/{row['id']}/release", json={"how": "read", "reason": "more memory"})
+    assert (released.status_code, getattr(reading, step)) == (200, real), released.text
+    assert (released.json()["status"], released.json()["held"]) == ("decoded", False)
+
+
+def test_a_file_whose_reader_was_ended_once_is_read_again_at_once(send: Send, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading, "DECODE", f"{readers.__name__}:kill_once")
+    answer = send(("t.csv", steady(1)), visit=1, controller="cdbs")
+    assert answer.status_code == 201, answer.text
+    assert answer.json()["files"][0]["status"] == "decoded"
+    assert client.get("/api/v1/participants/P1/quarantine").json() == []
+
+
+def test_when_the_process_that_forks_readers_is_killed_the_next_file_starts_another(send: Send) -> None:
+    assert send(("a.csv", steady(1)), visit=1, controller="cdbs").status_code == 201
+    first = limited.server_pid()
+    assert first is not None
+    os.kill(first, signal.SIGKILL)
+    assert send(("b.csv", steady(1, beta=2.0)), visit=1, controller="cdbs").status_code == 201
+    assert limited.server_pid() != first
+
+
+def test_readers_die_with_the_service(enrolled: str) -> None:
+    script = LETHAL.replace("load_tables()", "load_tables()\nreading.DECODE = 'tests.app.ingest.uploads.readers:sleep'", 1)
+    script = script.replace("setattr({", "({").replace(
+        "[sys.argv[2]], sys.argv[2], lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL))", ")"
+    )
+    with subprocess.Popen([sys.executable, "-c", script, "send", "decode", steady(1).decode()], cwd=ROOT) as service:
+        try:
+            mine = _descendants(service.pid, 2)
+        finally:
+            service.kill()
+    gone, alive = psutil.wait_procs(mine, timeout=10)
+    assert (len(gone), alive) == (2, [])
+
+
+def _descendants(pid: int, count: int) -> list[psutil.Process]:
+    """The process that forks readers, and a reader, once both are there."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        found = psutil.Process(pid).children(recursive=True)
+        if len(found) >= count:
+            return found
+        time.sleep(0.1)
+    raise AssertionError("no reader was started")
+
+
+def test_the_web_process_never_reads_a_file_itself(send: Send, monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*_: Any, **__: Any) -> Any:
+        raise AssertionError("read in the web process")
+
+    for name in ("sniff", "redact", "decode"):
+        monkeypatch.setattr(formats, name, never)
+    monkeypatch.setattr(archive, "ZipFiles", never)
+    noise, grasps = b"PK\x03\x04 no archive", b"t_s,hand\n1,L\n1.5,L\n2,L\n"
+    answer = send(("s.zip", device_zip()), ("t.csv", steady(1)), ("g.csv", grasps), ("n.zip", noise), visit=1, controller="cdbs")
+    assert answer.status_code == 201, answer.text
+    assert [f["status"] for f in answer.json()["files"]] == ["decoded", "decoded", "decoded", "failed"]
 
 
 @pytest.mark.parametrize(

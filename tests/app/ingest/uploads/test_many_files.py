@@ -13,10 +13,12 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from app.ingest.uploads import reading
 from app.ingest.uploads.incoming import Incoming, arrange
 from app.platform import files
 from app.settings import get_settings
 from tests.app.ingest.conftest import device_zip, loose, steady, table
+from tests.app.ingest.uploads import readers
 
 
 def by_name(answer: Any) -> dict[str, Any]:
@@ -231,37 +233,22 @@ def test_a_request_that_claims_ten_gigabytes_is_refused_before_it_is_read(client
     assert answer.headers["content-type"] == "application/problem+json"
 
 
-def test_a_fault_of_our_own_decoder_keeps_the_bytes_and_the_other_files(send: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ml import formats
-
-    real = formats.decode
-
-    def faulty(path: Path, kind: Any = None, *args: Any, **named: Any) -> Any:
-        if kind == "rcs":
-            raise ZeroDivisionError("a fault of ours")
-        return real(path, kind, *args, **named)
-
-    monkeypatch.setattr(formats, "decode", faulty)
+def test_a_fault_of_our_own_decoder_keeps_the_bytes_and_the_other_files(
+    send: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    real = reading.DECODE
+    monkeypatch.setattr(reading, "DECODE", f"{readers.__name__}:fault_of_rcs")
     answer = send(("s.zip", device_zip()), GOOD, visit=1, controller="cdbs")
     told = by_name(answer)
     assert (told["s.zip"]["status"], told["good.csv"]["status"]) == ("failed", "decoded")
     assert files.path_of(told["s.zip"]["stored_sha256"]).exists()
-    monkeypatch.setattr(formats, "decode", real)
+    assert "fault_of_rcs" in capfd.readouterr().err, "the log names the place in the code"
+    monkeypatch.setattr(reading, "DECODE", real)
     assert by_name(send(("s.zip", device_zip()), visit=1))["s.zip"]["status"] == "decoded"
 
 
 def test_a_fault_while_identity_is_taken_out_keeps_the_file_encrypted(send: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ml import formats
-
-    real = formats.redact
-
-    def faulty(source: Path, target: Path, kind: Any, *args: Any) -> Any:
-        if kind == "rcs":
-            target.write_bytes(b"SYN000001H, half cleaned")
-            raise ZeroDivisionError("a fault of ours")
-        return real(source, target, kind, *args)
-
-    monkeypatch.setattr(formats, "redact", faulty)
+    monkeypatch.setattr(reading, "CLEAN", f"{readers.__name__}:fault_of_cleaning")
     told = by_name(send(("s.zip", device_zip()), GOOD, visit=1, controller="cdbs"))
     assert (told["s.zip"]["status"], told["s.zip"]["quarantined"], told["good.csv"]["status"]) == ("failed", True, "decoded")
     assert not any(b"SYN000001H" in p.read_bytes() for p in get_settings().files_dir.rglob("*") if p.is_file())

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
 from app.cli import app
-from app.ingest.uploads import recordings
+from app.ingest.uploads import reading, recordings
 from app.ingest.uploads import redecode as module
 from app.ingest.uploads.redecode import redecode
 from app.platform import files
@@ -24,17 +24,15 @@ from ml.formats.recording import DECODE_VERSION, DecodedFile
 from tests.app.ingest.conftest import device_zip, steady
 from tests.app.ingest.uploads.test_outcomes_intake import GRASPS, qoc, tremor
 
-REAL = formats.decode
-
 
 def better_decoder(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
     """From now on the decoder has the next version, and `change` is applied to every trace."""
 
-    def decode(path: Path, *args: Any, **named: Any) -> DecodedFile:
-        found = REAL(path, *args, **named)
+    def decode(path: Path, kind: Any, options: Any, name: str, *_: Any) -> DecodedFile:
+        found = formats.decode(path, kind, options, name)
         return replace(found, recordings=tuple(replace(r, traces=tuple(t for t in map(change, r.traces) if t)) for r in found.recordings))
 
-    monkeypatch.setattr(formats, "decode", decode)
+    monkeypatch.setattr(reading, "decode", decode)
     for holder in (module, recordings):
         monkeypatch.setattr(holder, "DECODE_VERSION", DECODE_VERSION + 1)
 
@@ -104,7 +102,8 @@ def test_minutes_that_the_decoder_reads_otherwise_are_told_and_count(
 ) -> None:
     session = send(("s.zip", device_zip()), ("m.csv", tremor()), visit=1, controller="random").json()["sessions"][0]["id"]
     assert qoc(client, session)["tremor_percent"] == pytest.approx(25)
-    monkeypatch.setattr(formats, "decode", lambda *args, **named: more_tremor(REAL(*args, **named)))
+    real = reading.decode
+    monkeypatch.setattr(reading, "decode", lambda *args, **named: more_tremor(real(*args, **named)))
     changes = {c.kind: c for c in all_of()}
     assert changes["tremor"].state == "read again"
     assert any("tremor 50 %" in s for s in changes["tremor"].said)

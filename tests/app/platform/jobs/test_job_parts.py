@@ -16,7 +16,7 @@ from sqlalchemy import text
 from app.platform.database import new_session, transaction
 from app.platform.errors import NotFound
 from app.platform.jobs import JobContext, StepFailed, StepReport, registry, repository, write_atomically
-from app.platform.jobs.children.child import params_hash
+from app.platform.jobs.children.child import ChildLimits, params_hash
 from app.platform.jobs.children.slots import Slots
 from app.platform.jobs.children.supervisor import ChildMessages, ChildProcesses, ComputeCall
 from app.platform.jobs.errors import JobCancelled
@@ -192,7 +192,9 @@ def test_a_result_is_reused_for_equal_params_and_the_folder_emptied_for_others(k
     children, workdir = ChildProcesses(), tmp_path / "step"
 
     def run(**params):
-        call = ComputeCall("count", "sample_job_kinds:count", {"part": 0, "numbers": 2, "pause_s": 0.0, **params}, workdir, 1024)
+        call = ComputeCall(
+            "count", "sample_job_kinds:count", {"part": 0, "numbers": 2, "pause_s": 0.0, **params}, workdir, ChildLimits(1024)
+        )
         return children.run(call, lambda messages: None, lambda: None)["result"]
 
     first = run()

@@ -1,0 +1,111 @@
+"""What is done to the bytes of an uploaded file: identity out, and decoding. Runs in a limited child, never in the web process.
+
+The children know no settings and no database: what they need stands in their params. `reading` beside this is their caller's side.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from app.platform.jobs import StepReport
+from app.settings import stored_secret
+from ml import formats
+from ml.formats import transfer
+from ml.formats.archive import ZipFiles, reading_of_members
+from ml.formats.options import ArchiveLimits, DecodeOptions
+from ml.formats.rcs import find_sessions
+from ml.formats.recording import FileReport, UndecodableFile
+
+EXAMPLE = """[{"RecordInfo":{"DeviceId":"E","HostUnixTime":1700000000000,"SessionId":"1700000000000"},"TimeDomainData":[%s]}]"""
+PACKET = (
+    '{"Header":{"dataSize":100,"dataType":1,"dataTypeSequence":%d,"globalSequence":%d,"info":0,"systemTick":%d,"timestamp":{"seconds":%d},'
+    '"user1":1,"user2":1},"PacketGenTime":%d,"PacketRxUnixTime":%d,"ChannelSamples":[{"Key":0,"Value":[%s]}],"DebugInfo":0,'
+    '"EvokedMarker":[],"IncludedChannels":1,"SampleRate":1,"Units":"millivolts"}'
+)
+
+
+def clean(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Take identity out of a file.
+
+    Args:
+        params: `source`, `target` (paths), `secrets` (the folder of keys), `options`.
+        workdir: not used.
+        report: takes the share that was read.
+
+    Returns:
+        `kind` and `redaction`; or the `problem` that keeps it from being cleaned, and what was `left_out` of its archive, if it is one.
+    """
+    source, options = Path(params["source"]), _options(params["options"])
+    try:
+        kind = formats.sniff(source)
+        key = stored_secret(Path(params["secrets"]), "pseudonyms")
+        with reading_of_members(_told(report, "taking identity out")):
+            redaction = formats.redact(source, Path(params["target"]), kind, key, options)
+    except UndecodableFile as error:
+        return {"problem": error.args_of(), "left_out": _left_out(source, options.archive)}
+    return {"kind": kind, "redaction": asdict(redaction)}
+
+
+def decode(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Decode a file without identity.
+
+    Args:
+        params: `source` (path), `kind`, `name`, `options`, and `target`, the folder into which `transfer` writes what came of it.
+        workdir: not used.
+        report: takes the share that was read.
+
+    Returns:
+        Nothing, or the `problem` that keeps it from being decoded.
+    """
+    try:
+        with reading_of_members(_told(report, "decoding")):
+            decoded = formats.decode(Path(params["source"]), params["kind"], _options(params["options"]), name=params["name"])
+        transfer.write(decoded, Path(params["target"]))
+    except UndecodableFile as error:
+        return {"problem": error.args_of()}
+    return {}
+
+
+def prepare() -> None:
+    """Decode an example, so that the process whose forks decode files has loaded all that they need."""
+    packets = ",".join(
+        PACKET % (i, i, 1000 * i, 700_000_000 + i // 10, 1_700_000_000_000 + 100 * i, 1_700_000_000_000 + 100 * i, ",".join(["0.5"] * 50))
+        for i in range(80)
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "example.zip", Path(folder) / "clean.zip"
+        with zipfile.ZipFile(source, "w") as archive:
+            archive.writestr("RawDataTD.json", EXAMPLE % packets)
+        formats.redact(source, target, "rcs", bytes(32))
+        transfer.write(formats.decode(target, "rcs"), Path(folder))
+        table = Path(folder) / "example.csv"
+        table.write_text("t_s,beta,amplitude_fraction\n" + "".join(f"{2 * k},1,1\n" for k in range(5)))
+        formats.redact(table, Path(folder) / "clean.csv", formats.sniff(table), bytes(32))
+
+
+def _options(stated: dict[str, Any]) -> DecodeOptions:
+    return DecodeOptions(**{**stated, "archive": ArchiveLimits(**stated["archive"])})
+
+
+def _told(report: StepReport, doing: str) -> Callable[[float], None]:
+    return lambda share: report.progress(share, doing)
+
+
+def _left_out(path: Path, limits: ArchiveLimits) -> list[str]:
+    """Why members of an archive of no use were left out, counted, without their names, which may identify a person."""
+    if not zipfile.is_zipfile(path):
+        return []
+    listing = FileReport("archive")
+    try:
+        with ZipFiles(path, limits) as members:
+            find_sessions(members, listing)
+            reasons = Counter(member.reason for member in members.left_out)
+    except UndecodableFile:
+        return []  # the problem itself says what is wrong with the archive
+    return [*listing.ignored, *(f"{n} file{'s' if n > 1 else ''}: {reason}" for reason, n in sorted(reasons.items()))]

@@ -1,0 +1,101 @@
+"""Uploaded files are read in children with limits of memory and time (`compute`), one child per file; this is their caller's side."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from app.ingest import wording
+from app.platform import files
+from app.platform.jobs.children.child import Cause, ChildLimits
+from app.platform.jobs.children.limited import ChildEnded, run_limited
+from app.settings import get_settings
+from ml.formats import transfer
+from ml.formats.options import DecodeOptions
+from ml.formats.recording import DecodedFile, UndecodableFile
+from ml.formats.redaction_record import Redaction
+
+CLEAN, DECODE = "app.ingest.uploads.compute:clean", "app.ingest.uploads.compute:decode"
+"""What the children run."""
+
+Told = Callable[[float | None, str | None], None]
+"""Takes progress: a share, 0 to 1, and a few words; None where it did not change."""
+
+
+class ReaderEnded(UndecodableFile):
+    """A file met a limit of the child that read it, or ended it; `cause` says which."""
+
+    def __init__(self, cause: Cause, limits: ChildLimits) -> None:
+        super().__init__(wording.reader_ended(cause, limits.memory_mb, limits.cpu_s), "file", wording.AFTER_READER_ENDED)
+        self.cause = cause
+
+
+class ReaderFault(Exception):
+    """A fault of ours in a decoder; `places` are the lines of code that it passed, without values, which may be of a person."""
+
+    def __init__(self, places: str) -> None:
+        super().__init__("a decoder failed")
+        self.places = places
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """What came of cleaning a file: its kind and what was done to it, or why it cannot be cleaned, and what of it was left out."""
+
+    kind: str
+    redaction: Redaction = field(default_factory=Redaction)
+    problem: UndecodableFile | None = None
+
+
+def clean(source: Path, target: Path, options: DecodeOptions, who: str = "", told: Told = lambda *_: None) -> Cleaned:
+    """Write a file without identity to `target`.
+
+    Args:
+        source: the raw bytes.
+        target: where the bytes without identity go; of no use where the file cannot be cleaned.
+        options: choices of the decoder, which checks tables as the sender wrote them.
+        who: whose files take turns where many are to be read.
+        told: takes progress.
+
+    Raises:
+        ReaderEnded: the child met a limit or was ended. ReaderFault: our decoder failed.
+    """
+    params = {
+        "source": os.path.abspath(source),
+        "target": os.path.abspath(target),
+        "secrets": str(get_settings().data_dir.resolve() / "secrets"),
+        "options": asdict(options),
+    }
+    get_settings().secret("pseudonyms")  # made here, where it is missing: children only read it
+    found = _run(CLEAN, params, who, told)
+    if "problem" in found:
+        return Cleaned("unreadable", Redaction(ignored=found["left_out"]), UndecodableFile(*found["problem"]))
+    return Cleaned(found["kind"], Redaction(**found["redaction"]))
+
+
+def decode(source: Path, kind: str, options: DecodeOptions, name: str, who: str = "", told: Told = lambda *_: None) -> DecodedFile:
+    """Decode a file without identity; arguments as of `clean`, `name` as it is to stand in reports.
+
+    Raises:
+        UndecodableFile: nothing in it can be used. ReaderEnded, a kind of it, and ReaderFault as `clean`.
+    """
+    with files.draft_folder() as folder:
+        params = {"source": os.path.abspath(source), "kind": kind, "name": name, "options": asdict(options), "target": str(folder)}
+        found = _run(DECODE, params, who, told)
+        if "problem" in found:
+            raise UndecodableFile(*found["problem"])
+        return transfer.read(folder)
+
+
+def _run(reference: str, params: Mapping[str, Any], who: str, told: Told) -> dict[str, Any]:
+    settings = get_settings()
+    limits = ChildLimits(settings.decode_memory_mb, settings.decode_seconds, niceness=0, quotes=False)
+    try:
+        return run_limited(reference, dict(params), limits, told, who)
+    except ChildEnded as ended:
+        if ended.cause == "error":
+            raise ReaderFault(ended.log) from None
+        raise ReaderEnded(ended.cause, limits) from None

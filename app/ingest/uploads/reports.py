@@ -1,0 +1,77 @@
+"""What is stored of the reports of uploaded files, and read again."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import asdict
+
+from app.ingest import wording
+from app.ingest.models import UploadFile
+from ml.formats.recording import FileReport, Problem
+from ml.formats.redaction_record import Redaction
+
+BEGUN = "begun"
+"""Member of a file's report: how often reading it was begun, while it is being read."""
+ASIDE = "aside_sha256"
+"""Member of a file's report: hash of its bytes without identity, where these are what the quarantine holds, and not the original."""
+
+
+def store_reports(
+    row: UploadFile, reports: Sequence[FileReport], known: Sequence[int] = (), unreadable: Sequence[str] | None = None
+) -> None:
+    """Store a file's reports, which of its recordings came before in other files, and which members could not be read (None: as stored)."""
+    found = unreadable_members(row) if unreadable is None else list(unreadable)
+    for report in reports:
+        count_equal_lines(report)
+    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known), "unreadable": found, **aside(row)}
+
+
+def aside(row: UploadFile) -> dict[str, str]:
+    """The member `ASIDE` of a file's report, where it has one."""
+    return {ASIDE: row.report[ASIDE]} if ASIDE in (row.report or {}) else {}
+
+
+def count_equal_lines(report: FileReport) -> None:
+    """Make one line, with a count, of equal lines in each of a report's lists."""
+    for lines in (report.understood, report.repaired, report.ignored, report.flagged, report.removed):
+        lines[:] = [line if n == 1 else f"{line} ({n}×)" for line, n in Counter(lines).items()]
+
+
+def stored_reports(row: UploadFile) -> list[FileReport]:
+    """The reports of a file as they were stored."""
+    # a copy: sentences appended to the stored lists themselves would not be seen as a change, and not be written
+    stored = deepcopy(row.report.get("reports", []))
+    return [FileReport(**{**r, "problem": _stored_problem(r["problem"])}) for r in stored]
+
+
+def _stored_problem(stored: Mapping[str, str] | None) -> Problem | None:
+    """The problem of a stored report; version 0.1.0 called its hint `mend`."""
+    if stored is None:
+        return None
+    return Problem(stored["what"], stored["where"], stored["hint"] if "hint" in stored else stored["mend"])
+
+
+def unreadable_members(row: UploadFile) -> list[str]:
+    """Members of a stored file that could not be read, and why; in reports of version 0.1.0 they stand among the flags, behind a prefix."""
+    report = row.report or {}
+    found: list[str] | None = report.get("unreadable")
+    if found is not None:
+        return found
+    prefix = "kept encrypted, because it could not be read: "
+    return [s.removeprefix(prefix) for r in stored_reports(row) for s in r.flagged if s.startswith(prefix)]
+
+
+def known_recordings(row: UploadFile) -> list[int]:
+    """Recordings of a file that another file had brought before."""
+    found: list[int] = row.report.get("known_recordings", [])
+    return found
+
+
+def add_redaction(report: FileReport, redaction: Redaction, notes: Sequence[str]) -> None:
+    """Add to a report what cleaning the file found, and what was made of it."""
+    for ours, found in ((report.removed, redaction.removed), (report.repaired, redaction.repaired), (report.ignored, redaction.ignored)):
+        ours.extend(sentence for sentence in found if sentence not in ours)
+    report.flagged.extend(wording.unreadable(redaction.unreadable))
+    report.understood.extend(notes)

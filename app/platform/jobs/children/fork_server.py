@@ -1,0 +1,124 @@
+"""A process that has imported what its children need, and forks one child per order.
+
+It is started as `python -m app.platform.jobs.children.fork_server NAME...`.
+A fresh interpreter needs seconds until the decoders are imported; a fork of this process needs some milliseconds, and has a memory of its
+own all the same. It runs one thread, so that a fork finds no lock held, and holds no data: orders go to the children unread.
+
+Each order is one byte on the socket at standard input, with three descriptors: a socket of its own, the log and the pipe of reports. The
+order itself, JSON, comes on the order's socket, which answers `{"pid": ...}` at once and `{"status": ...}`, as of `waitpid`, at the end.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import traceback
+from importlib import import_module
+
+from app.platform.jobs.children import child
+
+DESCRIPTORS = 3
+"""Of each order: its socket, the log, the pipe of reports."""
+LONGEST_ORDER = 1 << 16
+
+
+def main(names: list[str]) -> int:
+    """Import modules (`module`), call what is to be made ready (`module:function`), and serve until the starter has gone."""
+    child.die_with_parent()
+    for name in names:
+        module, _, function = name.partition(":")
+        loaded = import_module(module)
+        if function:
+            getattr(loaded, function)()
+    gc.collect()
+    gc.freeze()  # the collector would touch, and so copy, every page that the children share
+    with socket.socket(fileno=os.dup(0)) as orders:
+        _Server(orders).serve()
+    return 0
+
+
+class _Server:
+    """Forks children and tells how they ended."""
+
+    def __init__(self, orders: socket.socket) -> None:
+        self._orders = orders
+        self._running: dict[int, socket.socket] = {}
+        self._awake, wake = os.pipe()
+        os.set_blocking(self._awake, False)
+        os.set_blocking(wake, False)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        self._wake = wake
+        signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+
+    def serve(self) -> None:
+        """Until the other end of the socket is closed."""
+        while True:
+            ready, _, _ = select.select([self._orders.fileno(), self._awake], [], [])
+            if self._awake in ready:
+                os.read(self._awake, 1 << 12)
+                self._reap()
+            if self._orders.fileno() in ready:
+                byte, descriptors, _, _ = socket.recv_fds(self._orders, 1, DESCRIPTORS)
+                if not byte:
+                    return
+                self._fork(*descriptors)
+
+    def _fork(self, order_fd: int, log: int, report: int) -> None:
+        order = socket.socket(fileno=order_fd)
+        call = json.loads(order.recv(LONGEST_ORDER))
+        pid = os.fork()
+        if pid == 0:
+            self._become_child(call, order, log, report)
+        os.close(log)
+        os.close(report)
+        self._running[pid] = order
+        _tell(order, {"pid": pid})
+
+    def _reap(self) -> None:
+        while self._running:
+            pid, status = os.waitpid(-1, os.WNOHANG)
+            if pid == 0:
+                return
+            with self._running.pop(pid) as order:
+                _tell(order, {"status": status})
+
+    def _become_child(self, call: dict[str, str], order: socket.socket, log: int, report: int) -> None:
+        """Run the order in this process, which is the fork, and end it."""
+        status = 1
+        try:
+            server = os.getppid()
+            signal.set_wakeup_fd(-1)
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            os.setsid()
+            nothing = os.open(os.devnull, os.O_RDONLY)
+            for source, target in ((nothing, 0), (log, 1), (log, 2)):
+                os.dup2(source, target)
+            for fd in (nothing, log, self._awake, self._wake):
+                os.close(fd)
+            for held in (self._orders, order, *self._running.values()):
+                held.close()
+            os.environ |= {child.REPORT_FD: str(report), child.PARENT: str(server)}
+            status = child.main([call["name"], call["workdir"]])
+        except BaseException as error:
+            # in the log of the child: its places, not its values, which may be of a person
+            sys.stderr.write(child.places(error))
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(status)
+
+
+def _tell(order: socket.socket, words: dict[str, int]) -> None:
+    try:
+        order.sendall(json.dumps(words).encode() + b"\n")
+    except OSError:
+        traceback.print_exc()  # whoever ordered has gone
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

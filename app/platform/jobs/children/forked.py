@@ -1,0 +1,121 @@
+"""Children that are forked by a process which has imported what they need, and so start in milliseconds; see `fork_server`."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import threading
+from collections.abc import Sequence
+
+from app.platform.jobs.children.supervisor import Child, ChildProcesses
+
+MODULE = "app.platform.jobs.children.fork_server"
+
+
+class ForkedProcesses(ChildProcesses):
+    """Child processes forked by one server process, which is started with the first of them, and again where it was killed.
+
+    Args:
+        prepared: what the server imports (`module`) and calls (`module:function`) before it forks.
+    """
+
+    def __init__(self, prepared: Sequence[str]) -> None:
+        super().__init__(self._fork)
+        self._prepared = list(prepared)
+        self._one_at_a_time = threading.Lock()
+        self._server: subprocess.Popen[bytes] | None = None
+        self._to_server: socket.socket | None = None
+
+    def prepare(self) -> None:
+        """Start the server, so that the first call need not wait for it."""
+        with self._one_at_a_time:
+            self._connected()
+
+    @property
+    def server_pid(self) -> int | None:
+        """Number of the server process, once there is one."""
+        return None if self._server is None else self._server.pid
+
+    def _fork(self, arguments: list[str], log: int, report: int) -> Child:
+        name, workdir = arguments
+        with self._one_at_a_time:
+            try:
+                return self._order(name, workdir, log, report)
+            except OSError:
+                # the server was killed, as by a machine that ran out of memory: its children died with it
+                self._forget()
+                return self._order(name, workdir, log, report)
+
+    def _order(self, name: str, workdir: str, log: int, report: int) -> ForkedChild:
+        orders = self._connected()
+        mine, theirs = socket.socketpair()
+        with theirs:
+            mine.sendall(json.dumps({"name": name, "workdir": workdir}).encode())
+            socket.send_fds(orders, [b"c"], [theirs.fileno(), log, report])
+        return ForkedChild(mine)
+
+    def _connected(self) -> socket.socket:
+        if self._to_server is None:
+            mine, theirs = socket.socketpair()
+            with theirs:
+                self._server = self.open_process(["-m", MODULE, *self._prepared], stdin=theirs.fileno(), stdout=subprocess.DEVNULL)
+            self._to_server = mine
+        return self._to_server
+
+    def _forget(self) -> None:
+        if self._to_server is not None:
+            self._to_server.close()
+        if self._server is not None:
+            self._server.kill()
+            self._server.wait()
+        self._to_server = self._server = None
+
+
+class ForkedChild:
+    """A child of the server, as `subprocess.Popen` shows one of our own. Raises OSError where the server is gone."""
+
+    def __init__(self, order: socket.socket) -> None:
+        self._order = order
+        self._lines = order.makefile("rb")
+        self._returncode: int | None = None
+        line = self._lines.readline()
+        if not line:
+            self._close()
+            raise BrokenPipeError("the process that forks children has gone")
+        self.pid: int = json.loads(line)["pid"]
+
+    @property
+    def returncode(self) -> int | None:
+        """As of `poll`, when it was asked last."""
+        return self._returncode
+
+    def poll(self) -> int | None:
+        """Its exit code, negative for a signal; None while it runs."""
+        if self._returncode is None and _readable(self._order):
+            self.wait()
+        return self._returncode
+
+    def wait(self) -> int:
+        """Its exit code, when it has ended."""
+        if self._returncode is None:
+            line = self._lines.readline()
+            # without a last word the server has been killed, and the child with it
+            self._returncode = os.waitstatus_to_exitcode(json.loads(line)["status"]) if line else -signal.SIGKILL
+            self._close()
+        return self._returncode
+
+    def kill(self) -> None:
+        """End it."""
+        os.kill(self.pid, signal.SIGKILL)
+
+    def _close(self) -> None:
+        self._lines.close()
+        self._order.close()
+
+
+def _readable(waiting: socket.socket) -> bool:
+    return bool(select.select([waiting], [], [], 0)[0])

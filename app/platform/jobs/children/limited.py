@@ -1,0 +1,103 @@
+"""Functions that work on files of strangers, each call in a forked child with limits of its own: what they do to it harms nobody else."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from app.platform.files import draft_folder
+from app.platform.jobs.children.child import Cause, ChildLimits
+from app.platform.jobs.children.forked import ForkedProcesses
+from app.platform.jobs.children.slots import Slots
+from app.platform.jobs.children.supervisor import ChildMessages, ComputeCall
+from app.settings import get_settings
+
+PREPARED = ("app.ingest.uploads.compute:prepare",)
+"""What children are to have ready, as names: the platform lies below the phases and may not import them."""
+WALL_PER_CPU = 5
+"""A child may take so many times its limit of processor time by the clock, on a machine that has other work too."""
+
+
+class ChildEnded(Exception):
+    """A call in a child gave no result.
+
+    Attributes:
+        cause: why. limits: those it ran under. log: the end of the child's log, which quotes nothing of the file.
+    """
+
+    def __init__(self, cause: Cause, limits: ChildLimits, log: str) -> None:
+        super().__init__(f"the child ended: {cause}")
+        self.cause, self.limits, self.log = cause, limits, log
+
+
+class _OutOfTime(Exception):
+    """The clock's limit of a call is over."""
+
+
+_guard = threading.Lock()
+_shared: list[tuple[int, ForkedProcesses, Slots]] = []
+"""The children of this process: its number, their starter, and how many may work at once."""
+
+
+def run_limited(
+    reference: str,
+    params: dict[str, Any],
+    limits: ChildLimits,
+    record: Callable[[float | None, str | None], None] = lambda *_: None,
+    who: str = "",
+) -> dict[str, Any]:
+    """Call a compute function (`module:function`) in a child and give its result.
+
+    Args:
+        reference: the function; it takes all it needs from its params, for its process knows no settings of ours.
+        params: JSON. Files are named by paths that the child can open.
+        limits: what it may take.
+        record: takes the progress that it reports, a share and a few words, either of them None where it did not change.
+        who: calls of one name wait for each other's turn where there are more calls than may work at once.
+
+    Raises:
+        ChildEnded: it met a limit, broke down or raised.
+    """
+    children, slots = _children()
+    wall_s = None if limits.cpu_s is None else float(WALL_PER_CPU * limits.cpu_s)
+    with slots.hold(who, lambda: None), draft_folder() as folder:
+        begun = time.monotonic()
+
+        def check() -> None:
+            if wall_s is not None and time.monotonic() - begun > wall_s:
+                raise _OutOfTime
+
+        def told(messages: ChildMessages) -> None:
+            record(messages.progress, messages.message)
+
+        call = ComputeCall("limited", reference, params, folder / "call", limits)
+        try:
+            outcome = children.run(call, told, check)
+        except _OutOfTime:
+            raise ChildEnded("time", limits, "") from None
+    if outcome["ok"]:
+        result: dict[str, Any] = outcome["result"]
+        return result
+    raise ChildEnded(outcome["cause"], limits, outcome["log"])
+
+
+def prepare() -> None:
+    """Start the process that forks children, so that the first call need not wait; one that cannot start is told by that call."""
+    with suppress(OSError):
+        _children()[0].prepare()
+
+
+def server_pid() -> int | None:
+    """Number of the process that forks children, once there is one."""
+    return _children()[0].server_pid
+
+
+def _children() -> tuple[ForkedProcesses, Slots]:
+    with _guard:
+        if not _shared or _shared[0][0] != os.getpid():
+            _shared[:] = [(os.getpid(), ForkedProcesses(PREPARED), Slots(get_settings().decode_slots))]
+        return _shared[0][1:]
