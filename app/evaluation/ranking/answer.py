@@ -139,6 +139,8 @@ def _row(found: Assessment, one: Assessed, twins: Sequence[Assessed]) -> Row:
 def _same(student: Assessed, teacher: Assessed) -> bool:
     if student.decided is None or teacher.decided is None or student.decided.decision != teacher.decided.decision:
         return False
+    if student.decided.needs_override != teacher.decided.needs_override:
+        return False
     if (student.policy.retired_reason is None) != (teacher.policy.retired_reason is None):
         return False
     ours, theirs = _behaviour(student.posterior), _behaviour(teacher.posterior)

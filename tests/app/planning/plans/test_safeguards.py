@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import json
+import zipfile
 from collections.abc import Callable
 from typing import Any
 
@@ -132,3 +135,24 @@ def test_the_form_asks_for_the_reason_and_the_limit_and_keeps_what_was_typed(
     plan = client.get(f"/api/v1{path}").json()
     stated = {s["policy_id"]: (s["min_fraction"], s["override_reason"]) for s in plan["sessions"] if s["policy_id"]}
     assert stated == {a: (None, "watched"), b: (0.6, None)}
+
+
+def test_a_bundle_of_a_policy_tested_with_care_does_not_go_below_the_approved_limit(
+    client: TestClient, policies: list[int], judge: Judge, visit: int
+) -> None:
+    bundle = f"/api/v1/policies/{policies[0]}/bundle"
+    judge({policies[0]: judged(50.0, **CAREFUL)})
+    assert draft(client, visit, policies[0]).status_code == 201
+    assert lowest_ma(client.get(bundle).content) == 0.0, "a draft limits nothing"
+    assert approve(client, visit).status_code == 200
+    assert lowest_ma(client.get(bundle).content) == 1.5
+    below = client.get(bundle, params={"min_ma": 1.2})
+    assert (below.status_code, "below the 1.5 mA" in below.json()["detail"]) == (422, True)
+    assert lowest_ma(client.get(bundle, params={"min_ma": 2.0}).content) == 2.0
+
+
+def lowest_ma(content: bytes) -> float:
+    """The lower limit that a bundle states, mA."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        (name,) = [n for n in archive.namelist() if n.endswith("manifest.json")]
+        return float(json.loads(archive.read(name))["min_ma"])
