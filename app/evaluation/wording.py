@@ -203,6 +203,10 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         f"{_refusal(f)}all sessions that came near what it would do are of {count(int(_value(f)), 'visit', 'visits')}, "
         f"and {f.limit:.0f} are needed"
     ),
+    "not_converged": lambda f: (
+        f"{_refusal(f)}not converged: its ratios break the equation that defines them by {_value(f):.2f} standard deviations "
+        f"(limit {f.limit:.2f})"
+    ),
     "few_effective_sessions": lambda f: f"{_refusal(f)}the weights rest on {_value(f):.1f} effective sessions of {f.fact('sessions'):.0f}",
     "acts_within_hold": lambda f: (
         f"{_refusal(f)}the policy acts within amplitudes that were drawn once and held, in "

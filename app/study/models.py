@@ -272,6 +272,8 @@ class Recording(Base):
     started_at: Mapped[datetime | None]
     duration_s: Mapped[float]
     details: Mapped[dict[str, Any]]
+    superseded_by_id: Mapped[int | None] = mapped_column(ForeignKey("recording.id"), index=True)
+    """The fuller copy of the same minutes that sessions use instead."""
     device: Mapped[Device] = relationship()
     traces: Mapped[list[Trace]] = relationship(back_populates="recording", order_by="Trace.stream")
 

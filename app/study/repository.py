@@ -27,6 +27,7 @@ from app.study.models import (
     TremorSeries,
     Visit,
 )
+from app.study.sessions.models import CountedTime
 
 CONFIRMED = StudySession.status == "confirmed"
 """Condition on `StudySession`: only what a person has confirmed counts in buffers, analyses, rankings and exports."""
@@ -161,6 +162,60 @@ def trace_heads(db: Session, recording_ids: Collection[int]) -> dict[int, list[T
 def recording_by_fingerprint(db: Session, participant_id: int, fingerprint: str) -> Recording | None:
     """A participant's recording of a fingerprint."""
     return db.scalar(select(Recording).where(Recording.participant_id == participant_id, Recording.fingerprint == fingerprint))
+
+
+SLACK_S = 2.0
+"""Two stretches of one device are the same minutes where they share more than this: clocks of consecutive recordings are not exact."""
+
+
+@dataclass(frozen=True)
+class SameMinutes:
+    """A session that holds minutes of a device which another one holds too.
+
+    Attributes:
+        recording_id: its own recording of them. seconds: how long both are. counts: whether it is confirmed and not excluded.
+    """
+
+    session_id: int
+    recording_id: int
+    seconds: float
+    counts: bool
+
+
+def same_minutes(db: Session, recording: Recording, begin: datetime, end: datetime, besides: int | None) -> list[SameMinutes]:
+    """Sessions controlled by a recording's device and side within [begin, end], in another recording, by number.
+
+    Args:
+        recording: one of no known side is of both. besides: a session that is not asked for.
+    """
+    own_side = true() if recording.hemisphere is None else or_(Recording.hemisphere.is_(None), Recording.hemisphere == recording.hemisphere)
+    first = Recording.started_at + func.make_interval(0, 0, 0, 0, 0, 0, SessionSegment.start_s)
+    last = Recording.started_at + func.make_interval(0, 0, 0, 0, 0, 0, SessionSegment.stop_s)
+    shared = func.extract("epoch", func.least(last, end) - func.greatest(first, begin))
+    counts = CONFIRMED & StudySession.excluded_reason.is_(None)
+    query = (
+        select(StudySession.id, Recording.id, shared, counts)
+        .join(SessionSegment, SessionSegment.session_id == StudySession.id)
+        .join(Recording, Recording.id == SessionSegment.recording_id)
+        .where(Recording.device_id == recording.device_id, Recording.id != recording.id, own_side, SessionSegment.is_control)
+        .where(shared > SLACK_S, StudySession.id != (besides or 0))
+        .order_by(StudySession.id)
+    )
+    return [SameMinutes(i, r, float(seconds), bool(counting)) for i, r, seconds, counting in db.execute(query)]
+
+
+def repeated_sessions(db: Session, participant_id: int) -> set[int]:
+    """Sessions that count by a device's clock and have no place of their own in `counted_time`: another one had their minutes before."""
+    query = (
+        select(StudySession.id)
+        .join(StudySession.visit)
+        .join(SessionSegment, SessionSegment.session_id == StudySession.id)
+        .join(Recording, Recording.id == SessionSegment.recording_id)
+        .outerjoin(CountedTime, (CountedTime.session_id == StudySession.id) & (CountedTime.recording_id == Recording.id))
+        .where(Visit.participant_id == participant_id, CONFIRMED, StudySession.excluded_reason.is_(None), SessionSegment.is_control)
+        .where(Recording.started_at.is_not(None), CountedTime.session_id.is_(None))
+    )
+    return set(db.scalars(query))
 
 
 def session_ids_of_recording(db: Session, recording_id: int) -> Sequence[int]:

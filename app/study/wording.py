@@ -70,6 +70,14 @@ def _silent_control(f: Mapping[str, Any]) -> str:
     )
 
 
+def _repeated(f: Mapping[str, Any]) -> str:
+    other = f"session {f['session']} (recording {f['recording']}{', which counts' if f['counts'] else ''})"
+    return (
+        f"The same {f['seconds']:.0f} s of this device stand in {other}, and what recording {f['own']} holds of them is not the same: "
+        "the same minutes count once. Look at both, and drop or exclude one."
+    )
+
+
 _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.DAY: _day,
     Kind.START: _start,
@@ -78,6 +86,7 @@ _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.ABOVE_CDBS: _above_cdbs,
     Kind.AMPLITUDE: _amplitude,
     Kind.SILENT_CONTROL: _silent_control,
+    Kind.REPEATED: _repeated,
     Kind.NO_POLICY: lambda f: (
         "No policy is named for this session: it cannot be compared with its estimate. Name one on the session's page."
     ),

@@ -41,6 +41,7 @@ INTENDED: dict[str, str] = {
         ),
         "API: sweeps call their scores of controllers without learning `baselines` (was `yardsticks`).",
     ),
+    "paths > /readyz": "`GET /readyz` says whether requests can be served (the database answers and has this version's schema).",
     **dict.fromkeys(
         ("components > schemas > Problem", "components > schemas > ProblemOut"),
         "API: the member `mend` of problem documents and of file reports is called `hint`.",

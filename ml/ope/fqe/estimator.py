@@ -30,7 +30,7 @@ from ml.ope.scale import session_folds
 from ml.ope.support.coverage import AmplitudeSupport
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
-from ml.statistics.bootstrap import percentile_interval, resamples
+from ml.statistics.bootstrap import percentile_interval, resampled, resamples
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
@@ -284,11 +284,20 @@ class FittedFqe:
         return value_estimate(self, main, refits, policy, horizon, support, extra)
 
 
+class Seeded(Protocol):
+    """Settings with the seed of the resamples."""
+
+    @property
+    def seed(self) -> int: ...
+
+
 class ValueSource(Protocol):
     """What `value_estimate` needs of a fitted method."""
 
     @property
     def method(self) -> str: ...
+    @property
+    def config(self) -> Seeded: ...
     @property
     def table(self) -> UsableSteps: ...
     @property
@@ -345,6 +354,7 @@ def value_estimate(
             **details,
             "coverage": logged.to_json(),
             "draws": [round(float(d + value), 4) for d in draws],
+            "resampled": resampled(fitted.table.sessions, fitted.config.seed),
         },
     )
 

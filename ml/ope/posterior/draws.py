@@ -11,7 +11,7 @@ from ml.ope.estimate import OUTCOMES
 from ml.ope.flags import Flag
 from ml.ope.observed import mean_over_days
 from ml.ope.outcomes.model import EndModel
-from ml.ope.posterior.constants import MODEL_ERRORS
+from ml.ope.posterior.constants import COMMON_SHARE, MODEL_ERRORS
 from ml.ope.posterior.gaussian import correlated
 from ml.trajectories import ReplayBuffer
 
@@ -75,7 +75,7 @@ def joint_draws(buffer: ReplayBuffer, replays: Replays, ends: EndModel, alike: F
     for name, values in parts.items():
         base, over_draws = values @ days.weights, np.einsum("pdn,d->pn", values, replays.weights)
         own = mean_over_days(over_draws, visits, KEPT, seed)
-        rows = base[:, picked] + own.common + own.own
+        rows = base[:, picked] + COMMON_SHARE * own.common + own.own
         # what was picked has a mean of its own: the draws keep that of all
         rows += (base @ replays.weights - rows.mean(1))[:, None]
         if name in MODEL_ERRORS:
