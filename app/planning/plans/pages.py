@@ -170,6 +170,7 @@ def _page(
         typed=values or {},
         may_override=may(caller, can.APPROVE_PLAN, participant),
         in_words=sentence,
+        design_name=wording.design_name,
         design_words=wording.design_words,
         bound_words=wording.bound_words,
         schedule_words=wording.schedule_words,
