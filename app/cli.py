@@ -41,6 +41,7 @@ app.add_typer(upkeep_app)
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Code = Annotated[str, typer.Argument(help="Code of the participant, e.g. P1.")]
 ACTOR = "command line"
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 def main() -> None:
@@ -73,6 +74,8 @@ def serve(
     settings = get_settings()
     supervise_database()
     structlog.get_logger().info("database", lies_in=database_place())
+    if (host or settings.host) not in LOOPBACK and not settings.cookie_secure:
+        structlog.get_logger().warning("other machines reach this service without TLS: use a TLS proxy and set BETALOOP_COOKIE_SECURE")
     service = create_app()
     limited.prepare()  # before the first upload, which would wait for it
     # beside the service, for reading what a crash left behind may take minutes
