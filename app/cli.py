@@ -256,12 +256,12 @@ def rank(code: Code, as_json: AsJson = False) -> None:
     console = Console()
     title = f"{code}: estimated return over {body['horizon_steps']} steps (method {body['default_method']})"
     table = Table(title=title, caption="STALE: " + body["stale_reason"] if body["stale"] else None)
-    for heading in ("rank", "policy", "return", "interval", "supported"):
+    for heading in ("rank", "policy", "verdict", "return", "interval", "supported"):
         table.add_column(heading)
     for row in body["policies"]:
         best = row["estimates"].get(body["default_method"])
         shown = ("—", "—", "—") if best is None else _estimate_cells(best)
-        table.add_row(str(row["rank"] or "—"), row["name"], *shown)
+        table.add_row(str(row["rank"] or "—"), row["name"], (row["decision"] or "—").replace("_", " "), *shown)
     console.print(table)
     for sentence in body["notes"]:
         console.print(sentence, markup=False, highlight=False)
