@@ -95,7 +95,7 @@ class Posterior:
         shares = shared_out(predictions.weights, draws)
         severity = sum(predictions.weights[f.key] * f.drawn.levels.mean(0) for f in fits)
         total = sum(shares.values())
-        ends = fit_end_model(buffer, draws=total, seed=c.seed, severity=np.asarray(severity))
+        ends = fit_end_model(buffer, draws=total, seed=c.seed, severity=np.asarray(severity), wider=1.0)
         report(1.0, "fitting the outcomes")
         return FittedPosterior(self.method, c, buffer, scale, tuple(fits), shares, predictions, ends, self.tests)
 
