@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 
 import numpy as np
+from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
@@ -244,6 +245,22 @@ def refuse_overlap(db: Session, session: StudySession) -> None:
                     f"({other.start_s:.0f} to {other.stop_s:.0f} s of the recording).",
                     "Choose another part of the recording, or correct that session first.",
                 )
+
+
+def count(db: Session, session: StudySession) -> None:
+    """Let a session count. Raises Conflict where another one with the same minutes of its device was let count at the same time."""
+    session.status = "confirmed"
+    try:
+        db.flush()
+    except IntegrityError as error:
+        if "counted_time_once" not in str(error.orig):
+            raise
+        number = session.id
+        db.rollback()
+        raise Conflict(
+            f"Somebody else confirmed a session with the same minutes of this device as session {number} at the same time.",
+            "Load the page again: it names the other session.",
+        ) from error
 
 
 def counted_minutes(db: Session, placement: Placement) -> bool:

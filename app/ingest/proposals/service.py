@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from datetime import timedelta
 from itertools import pairwise
 
-from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
@@ -252,17 +251,7 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
         why = "; ".join(f"{name}: {known.get(name, 'nobody stated it')}" for name in missing)
         raise Invalid(f"Session {session.id} cannot be confirmed yet: its {' and '.join(missing)} is open ({why}).", "State it.")
     sessions.refuse_overlap(db, session)
-    session.status = "confirmed"
-    try:
-        db.flush()
-    except IntegrityError as error:
-        if "counted_time_once" not in str(error.orig):
-            raise
-        db.rollback()
-        raise Conflict(
-            f"Somebody else confirmed a session with the same minutes of this device as session {session.id} at the same time.",
-            "Load the page again: it names the other session.",
-        ) from error
+    sessions.count(db, session)
     kept_as_fractions = sessions.fix_milliamperes(db, session)
     conditions.record(db, session, caller.label)
     return [*kept_as_fractions, *sentences(contradictions(db, session)), *outcomes_intake.derive(db, session)]
