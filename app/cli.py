@@ -24,6 +24,7 @@ from app.platform import logs
 from app.platform.database import database_place, supervise_database, transaction
 from app.platform.errors import BetaloopError
 from app.platform.tables import load_tables
+from app.platform.upkeep.commands import app as upkeep_app
 from app.settings import get_settings
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="betaloop: the study system for closed-loop deep brain stimulation.")
@@ -35,6 +36,7 @@ app.add_typer(token_app, name="token")
 study_app = typer.Typer(no_args_is_help=True, help="Whole studies.")
 app.add_typer(study_app, name="study")
 app.add_typer(ingest_app, name="ingest")
+app.add_typer(upkeep_app)
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Code = Annotated[str, typer.Argument(help="Code of the participant, e.g. P1.")]
@@ -107,28 +109,10 @@ def demo(
     run_demo(host or settings.host, port or settings.port)
 
 
-@app.command(epilog="Example: betaloop migrate")
-def migrate() -> None:
-    """Bring the database to the newest schema."""
-    from app.platform.migrate import migrate as bring_up_to_date
-
-    bring_up_to_date()
-    print("The database is up to date.")  # noqa: T201
-
-
-@app.command(epilog="Example: betaloop where")
-def where(as_json: AsJson = False) -> None:
-    """Tell where the database, the stored files and the keys of this installation lie; nothing is started."""
-    data_dir = get_settings().data_dir.resolve()
-    result = {"data_folder": str(data_dir), "database": database_place()}
-    result |= {"files": str(data_dir / "files"), "keys": str(data_dir / "secrets")}
-    _print(result, as_json, "\n".join(f"{name.replace('_', ' ')}: {value}" for name, value in result.items()))
-
-
 @user_app.command("add", epilog="Example: betaloop user add ada@clinic.example --role clinician")
 def user_add(
     email: Annotated[str, typer.Argument(help="E-mail address to sign in with.")],
-    role: Annotated[Role, typer.Option(help="viewer, clinician, engineer or admin.")],
+    role: Annotated[Role, typer.Option(help="blinded_assessor, viewer, clinician, engineer or admin.")],
     study: Annotated[str | None, typer.Option(help="Code of the study, where there are several.")] = None,
     password_file: Annotated[
         Path | None, typer.Option(help="File with the password; asked for when left out ('-': standard input).")
@@ -312,8 +296,8 @@ def export_(
     to: Annotated[Path | None, typer.Option(help="Zip to write; CODE.zip when left out.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write everything of a participant as a zip of tables (CSV) and settings (JSON)."""
-    from app.overview.export import export_participant
+    """Write everything of a participant as a zipped Frictionless data package, with a script that recomputes its primary tables."""
+    from app.overview.package.export import export_participant
     from app.study import repository as study
 
     target = to or Path(f"{code}.zip")

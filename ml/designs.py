@@ -91,6 +91,12 @@ class Decision:
     log_density: float | None
 
 
+def amplitudes(decisions: Sequence[Decision], steps: int) -> Floats:
+    """Amplitude fraction of the first steps of decisions in order, [steps]: cDBS after the last one."""
+    held = np.repeat([d.amplitude for d in decisions], [d.steps for d in decisions])
+    return np.concatenate([held, np.ones(max(0, steps - held.size))])[:steps]
+
+
 @dataclass(frozen=True)
 class DesignedSession:
     """One session of a design.
@@ -111,6 +117,10 @@ class DesignedSession:
     def amplitudes(self) -> Floats:
         """Amplitude fraction of every step, [T]."""
         return np.repeat([d.amplitude for d in self.decisions], [d.steps for d in self.decisions])
+
+    def first_steps(self, steps: int) -> Floats:
+        """Amplitude fraction of so many steps, [steps]: cDBS after the last decision."""
+        return amplitudes(self.decisions, steps)
 
     @property
     def holds(self) -> tuple[Hold, ...]:

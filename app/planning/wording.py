@@ -18,6 +18,11 @@ def release_reason(manifest: BundleManifest) -> str:
     )
 
 
+def design_name(planned: Planned) -> str:
+    """A design in two words, for a table."""
+    return {"paper": "paper's draws", "ladder": "titration ladder"}.get(planned.design) or f"level {planned.level:.2f}"
+
+
 def design_words(planned: Planned) -> str:
     """What a random session tries, in one clause."""
     if planned.design == "paper":
@@ -37,13 +42,17 @@ def bound_words(planned: Planned, bounds: tuple[Bound, ...]) -> str:
     words = f"never below {lowest} ({planned.lower_bound:g} of cDBS)"
     if planned.low_seconds:
         low = ", ".join(_side(b, f"{b.low_ma:g} mA") for b in bounds)
-        words += f"; below {low} ({LOW_AMPLITUDE:g}) for {planned.low_seconds / 60:.1f} of at most {LOW_SECONDS / 60:g} min, at the end"
+        words += f"; below {low} ({LOW_AMPLITUDE:g}) for {planned.low_seconds / 60:.1f} of at most {LOW_SECONDS / 60:g} min"
+        words += "" if planned.design == "ladder" else ", at the end"
     return words
 
 
 def schedule_words(planned: Planned, bounds: tuple[Bound, ...]) -> str:
     """Every held amplitude with the minute it begins at: milliamperes by side, fractions of cDBS where those are not known."""
-    return "  ".join(f"{_clock(h.start * planned.period_s)} {_given(h.amplitude, bounds)}" for h in planned.holds)
+    held = [f"{_clock(h.start * planned.period_s)} {_given(h.amplitude, bounds)}" for h in planned.holds]
+    last = planned.holds[-1]
+    after = [f"{_clock((last.start + last.steps) * planned.period_s)} cDBS"]  # a ladder may end before the session does
+    return "  ".join(held + after)
 
 
 def _given(fraction: float, bounds: tuple[Bound, ...]) -> str:

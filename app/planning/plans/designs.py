@@ -7,10 +7,13 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from app.platform.errors import Invalid
 from app.study.cdbs_amplitude import plausible
 from app.study.models import SettingsVersion, Visit
-from ml.designs import LOW_AMPLITUDE, Decision, DesignedSession, DesignSettings, lay_out
+from ml.designs import LOW_AMPLITUDE, Decision, DesignedSession, DesignSettings, amplitudes, lay_out
 
 RESOLUTION_MA: Final = 0.1
 """What a stimulator rounds amplitudes to."""
@@ -60,6 +63,10 @@ class Planned:
         """The inverse of `as_json`."""
         nested = {"holds": tuple(Decision(**h) for h in stored["holds"]), "bounds": tuple(Bound(**b) for b in stored["bounds"])}
         return cls(**stored | nested)
+
+    def first_steps(self, steps: int) -> NDArray[np.float64]:
+        """Amplitude fraction of so many steps, [steps]: cDBS after the last hold."""
+        return amplitudes(self.holds, steps)
 
     @property
     def low_seconds(self) -> float:

@@ -151,6 +151,7 @@ def _page(
         view=view,
         ranking=ranking,
         in_words=sentence,
+        design_name=wording.design_name,
         design_words=wording.design_words,
         bound_words=wording.bound_words,
         schedule_words=wording.schedule_words,

@@ -80,7 +80,7 @@ def of_session(db: Session, session: StudySession, table: StepTable, caller: Cal
         holds = tuple(Hold(h["start"], h["steps"], h["log_density"]) for h in parameters["holds"])
         return Drawn(plan["design"], parameters["level"], plan["seed"], holds)
     found = drawn(session.conditions, table)
-    return None if arm is None and found.kind == "unstated" else found
+    return None if arm is None and len(found.holds) < 2 else found
 
 
 def planned(db: Session, session: StudySession, table: StepTable, period_s: float) -> dict[str, Any] | None:

@@ -48,8 +48,8 @@ def test_new_participants_have_the_stratified_design_and_settings_of_before_the_
     assert settle(client, design="sobol").status_code == 422
     assert settle(client, early_visits=0).status_code == 422
     page = client.get("/participants/P1/settings").text
-    assert "stratified levels, draws held 10 to 60 s" in page
-    assert "the paper&#39;s: a new draw every step" in page
+    assert "stratified, held draws" in page
+    assert "The paper&#39;s: a new draw every step." in page
 
 
 def test_levels_are_stratified_over_the_sessions_and_the_visits(client: TestClient, enrolled: str) -> None:
