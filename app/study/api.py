@@ -20,6 +20,7 @@ from app.study.schemas import (
     ParticipantOut,
     QocIn,
     QocOut,
+    RecordedTraceOut,
     SessionChange,
     SessionOut,
     SettingsChange,
@@ -34,7 +35,6 @@ from app.study.schemas import (
 from app.study.serializers import outcome_out, participant_out, recorded_trace_out, session_out, trace_out, visit_out
 from app.study.sessions import conditions
 from app.study.sessions.data import session_data
-from app.study.sessions.schemas import RecordedTraceOut
 from app.study.traces import recorded_traces
 from app.study.visits import service as visits
 

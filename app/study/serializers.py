@@ -14,13 +14,13 @@ from app.study.schemas import (
     OutcomeOut,
     ParticipantOut,
     QocOut,
+    RecordedTraceOut,
     SessionOut,
     SettingsOut,
     TraceOut,
     VisitOut,
 )
 from app.study.sessions.data import SessionData
-from app.study.sessions.schemas import RecordedTraceOut
 from app.study.traces import RecordedTrace
 
 
