@@ -24,6 +24,7 @@ from app.platform import logs
 from app.platform.database import database_place, supervise_database, transaction
 from app.platform.errors import BetaloopError
 from app.platform.tables import load_tables
+from app.platform.upkeep.commands import app as upkeep_app
 from app.settings import get_settings
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="betaloop: the study system for closed-loop deep brain stimulation.")
@@ -35,6 +36,7 @@ app.add_typer(token_app, name="token")
 study_app = typer.Typer(no_args_is_help=True, help="Whole studies.")
 app.add_typer(study_app, name="study")
 app.add_typer(ingest_app, name="ingest")
+app.add_typer(upkeep_app)
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Code = Annotated[str, typer.Argument(help="Code of the participant, e.g. P1.")]
@@ -105,24 +107,6 @@ def demo(
 
     settings = get_settings()
     run_demo(host or settings.host, port or settings.port)
-
-
-@app.command(epilog="Example: betaloop migrate")
-def migrate() -> None:
-    """Bring the database to the newest schema."""
-    from app.platform.migrate import migrate as bring_up_to_date
-
-    bring_up_to_date()
-    print("The database is up to date.")  # noqa: T201
-
-
-@app.command(epilog="Example: betaloop where")
-def where(as_json: AsJson = False) -> None:
-    """Tell where the database, the stored files and the keys of this installation lie; nothing is started."""
-    data_dir = get_settings().data_dir.resolve()
-    result = {"data_folder": str(data_dir), "database": database_place()}
-    result |= {"files": str(data_dir / "files"), "keys": str(data_dir / "secrets")}
-    _print(result, as_json, "\n".join(f"{name.replace('_', ' ')}: {value}" for name, value in result.items()))
 
 
 @user_app.command("add", epilog="Example: betaloop user add ada@clinic.example --role clinician")

@@ -18,10 +18,13 @@ from starlette.concurrency import run_in_threadpool
 from app import __version__
 from app.platform import logs
 from app.platform.database import Db, check_connection
+from app.platform.errors import DatabaseAway
 from app.platform.files import remove_abandoned
 from app.platform.tables import load_tables
+from app.platform.upkeep.doctor import newest_revision, revision
 from app.platform.web import middleware as web
 from app.platform.web.compressed import CompressedFiles
+from app.platform.web.schemas import problems
 from app.platform.web.templates import STATIC
 
 log = structlog.get_logger()
@@ -114,6 +117,13 @@ def _service_routes() -> APIRouter:
         """Whether the service and its database answer; no token needed."""
         check_connection(db)
         return {"status": "ok", "version": __version__}
+
+    @router.get("/readyz", tags=["service"], responses=problems(503))
+    def readyz(db: Db) -> dict[str, str]:
+        """Whether requests can be served: the database answers and has the schema of this version; no token needed."""
+        if (has := revision(db)) != (needs := newest_revision()):
+            raise DatabaseAway(f"The database has schema {has or 'none'}; this version needs {needs}.", "Run `betaloop migrate`.")
+        return {"status": "ready", "schema": has}
 
     @router.get("/metrics", include_in_schema=False)
     def metrics() -> Response:

@@ -6,8 +6,8 @@
     python benchmarks/ope.py --participants --out FOLDER      the four detailed participants, paper's design
 
 Nothing is fitted or chosen by true returns; they are computed to measure with. Finished cells are lines of FOLDER/cells-*.jsonl, and a run
-that is started again skips them. CPU seconds of one thread. `page` is what the ranking page shows; `days alone` is a perfect method that
-knows the days of the data and no others; `tested` tests the candidates themselves in as many sessions as the data hold.
+that is started again skips them. CPU seconds of one thread. `page` is the order of the ranking page of 0.1.0; `days alone` is a perfect
+method that knows the days of the data and no others; `tested` tests the candidates themselves in as many sessions as the data hold.
 """
 
 from __future__ import annotations
@@ -32,11 +32,12 @@ from support.page_order import NEEDED, page_order
 
 from app.evaluation.decision import gain_over
 from ml.ope.estimate import Estimate, Estimator
-from ml.ope.registry import estimators
+from ml.ope.registry import POSTERIOR, estimators
 from ml.population.virtual import WORLDS_PER_PART
 
 PAGE = "page"
-CHEAP = ("linear", "fqe", "wdr", "dlmm", "wis", "cwpdis")
+HEADLINE = POSTERIOR
+CHEAP = (POSTERIOR, "linear", "fqe", "wdr", "dlmm", "wis", "cwpdis")
 PARTICIPANTS = ("P1", "P2", "P3", "P4")
 DLSM_EVERY = 6
 """The DLSM runs on every sixth world: it costs more than all others together."""
@@ -63,10 +64,11 @@ def measure(task: Task) -> list[dict[str, Any]]:
     if truth is None:
         cells.append({"key": f"{task.name}/truth", **case.truth})
     for design in task.designs:
-        wanted = (*task.methods, PAGE)
-        if all(f"{task.name}/{design}/{m}" in task.known for m in wanted):
-            continue
-        cells += design_cells(case, design, task.methods)
+        wanted = tuple(m for m in task.methods if f"{task.name}/{design}/{m}" not in task.known)
+        if wanted:
+            # the page chooses between what its methods say, so they are all made again where it is wanted
+            again = tuple(m for m in task.methods if PAGE in wanted and m in NEEDED and m not in wanted)
+            cells += design_cells(case, design, (*wanted, *again))
     return cells
 
 
@@ -84,6 +86,8 @@ def design_cells(case: Case, design: str, methods: tuple[str, ...]) -> list[dict
     cells = []
     for method, estimator in chosen.items():
         cells.append(_method_cell(case, design, method, estimator, buffer, policies, tables))
+    if PAGE not in methods:
+        return cells
     start = time.process_time()
     page = page_order(buffer, {m: t for m, t in tables.items() if m in NEEDED}, list(case.candidates), STEPS)
     seconds = time.process_time() - start
@@ -119,14 +123,14 @@ def _kept(case: Case, table: Mapping[str, Estimate]) -> dict[str, Any]:
 
 def tasks(chosen: argparse.Namespace, cells: Cells) -> list[Task]:
     """What is to be run, in order."""
-    methods = tuple(m for m in CHEAP if m not in chosen.without.split(","))
+    methods = tuple(m for m in (*CHEAP, PAGE) if m not in chosen.without.split(","))
     if chosen.participants:
         return [Task(code, chosen.truth, methods, ("paper",), _of(cells, code)) for code in PARTICIPANTS[: 1 if chosen.quick else None]]
     result = []
-    for index in range(chosen.first, min(chosen.first + chosen.worlds, WORLDS_PER_PART)):
+    for index in range(chosen.first, WORLDS_PER_PART, chosen.every)[: chosen.worlds]:
         with_dlsm = chosen.dlsm and index % DLSM_EVERY == 0
         name = f"{chosen.part}{index:02d}"
-        result.append(Task(name, chosen.truth, (*methods, "dlsm") if with_dlsm else methods, DESIGNS, _of(cells, name)))
+        result.append(Task(name, chosen.truth, ("dlsm", *methods) if with_dlsm else methods, DESIGNS, _of(cells, name)))
     return result
 
 
@@ -142,9 +146,10 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="three worlds or one participant, few simulated sessions, no DLSM")
     parser.add_argument("--worlds", type=int, default=WORLDS_PER_PART)
     parser.add_argument("--first", type=int, default=0, help="index of the first world")
-    parser.add_argument("--without", default="", help="methods to leave out, with commas")
+    parser.add_argument("--without", default="", help="methods to leave out, with commas; `page` leaves out the baseline")
     parser.add_argument("--no-dlsm", dest="dlsm", action="store_false", help=f"else the DLSM runs on every {DLSM_EVERY}th world")
-    parser.add_argument("--headline", default=PAGE, help="the method that the figures of the last line are of")
+    parser.add_argument("--every", type=int, default=1, help="take every so manyth world")
+    parser.add_argument("--headline", default=HEADLINE, help="the method that the figures of the last line are of")
     parser.add_argument("--truth", type=int, help=f"simulated sessions behind each true return; {TRUTH}, {QUICK_TRUTH} with --quick")
     parser.add_argument("--minutes", type=float, default=1e9, help="start no further world after so many minutes")
     parser.add_argument("--processes", type=int, default=1)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
@@ -90,6 +91,12 @@ class Decision:
     log_density: float | None
 
 
+def amplitudes(decisions: Sequence[Decision], steps: int) -> Floats:
+    """Amplitude fraction of the first steps of decisions in order, [steps]: cDBS after the last one."""
+    held = np.repeat([d.amplitude for d in decisions], [d.steps for d in decisions])
+    return np.concatenate([held, np.ones(max(0, steps - held.size))])[:steps]
+
+
 @dataclass(frozen=True)
 class DesignedSession:
     """One session of a design.
@@ -110,6 +117,10 @@ class DesignedSession:
     def amplitudes(self) -> Floats:
         """Amplitude fraction of every step, [T]."""
         return np.repeat([d.amplitude for d in self.decisions], [d.steps for d in self.decisions])
+
+    def first_steps(self, steps: int) -> Floats:
+        """Amplitude fraction of so many steps, [steps]: cDBS after the last decision."""
+        return amplitudes(self.decisions, steps)
 
     @property
     def holds(self) -> tuple[Hold, ...]:
@@ -245,6 +256,17 @@ class Recognised:
     kind: Literal["every_step", "held", "constant", "unknown"]
     holds: tuple[tuple[int, int, float], ...]
     repeats: float | None
+
+
+def unstated_holds(recognised: Recognised, steps: int) -> tuple[Hold, ...]:
+    """The stretches of held draws as decisions of unknown density that leave out none of `steps`: unknown steps go on with the hold before.
+
+    One amplitude all along is one hold. Empty where the draws are not held.
+    """
+    if recognised.kind not in ("held", "constant"):
+        return ()
+    starts = [0, *(start for start, _, _ in recognised.holds[1:]), steps]
+    return tuple(Hold(start, stop - start, None) for start, stop in pairwise(starts))
 
 
 HELD_SHARE: Final = 0.5

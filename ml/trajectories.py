@@ -30,6 +30,9 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
+FAILED = Qoc(grasp_hz=0.0, rating=1, tremor_percent=100.0)
+"""The worst QoCs there are: those of a session that was stopped for the participant's sake."""
+
 PRIOR_PAIRS = 10
 """Pairs of unrelated rows that count beside the measured ones where autocorrelations are estimated: short sessions say little of them."""
 
@@ -86,6 +89,7 @@ class SessionTrajectory:
         holds: decisions of a random session whose draws are held, in order and without gaps up to where it ended. Empty where every step is
             a decision of its own: a random session's density is then 1 / (1 - B) on [B, 1] at every step.
         lead_amplitude: amplitude fraction in force just before step 0, where it is known; else None.
+        stopped: ended for the participant's sake (they asked for it, an adverse event), which is a failure of what ran: see `counted_qoc`.
         most_imputed: how many imputed beta amplitudes a window may hold; 0 as in sessions of 0.1.0.
 
     Raises:
@@ -103,6 +107,7 @@ class SessionTrajectory:
     policy_id: int | None = None
     random_lower_bound: float | None = None
     lead_amplitude: float | None = None
+    stopped: bool = False
     most_imputed: int = 0
     holds: tuple[Hold, ...] = ()
 
@@ -179,9 +184,15 @@ class SessionTrajectory:
         """r_k, shape [T]; NaN where beta or amplitude is unknown."""
         return step_reward(settings, self.beta, self.amplitude)
 
+    @property
+    def counted_qoc(self) -> Qoc:
+        """The QoCs that count: `FAILED` of a session that was stopped, whatever was measured, except under cDBS, whose failures must not
+        help what is held against it; else as measured."""
+        return FAILED if self.stopped and self.controller != "cdbs" else self.qoc
+
     def end_reward(self, settings: MdpSettings) -> float | None:
-        """r_end, or None where a QoC it needs is missing."""
-        return end_reward(settings, self.qoc)
+        """r_end of the QoCs that count, or None where one it needs is missing."""
+        return end_reward(settings, self.counted_qoc)
 
 
 @dataclass(frozen=True)
@@ -267,10 +278,14 @@ _IMPUTED_SCHEMA_VERSION = 2
 """Of buffers whose windows may hold imputed values, which a reader of version 1 would not find. Values are stored as measured."""
 _HELD_SCHEMA_VERSION = 3
 """Of buffers with held draws, whose steps a reader of version 2 would take for decisions of their own."""
+_STOPPED_SCHEMA_VERSION = 4
+"""Of buffers with sessions that were stopped for the participant's sake, which a reader of version 3 would take as measured."""
 
 
 def _schema_version(buffer: ReplayBuffer) -> int:
     """The lowest version that tells all of a buffer, so that buffers of before keep their bytes and their names."""
+    if any(s.stopped for s in buffer.sessions):
+        return _STOPPED_SCHEMA_VERSION
     if any(s.holds for s in buffer.sessions):
         return _HELD_SCHEMA_VERSION
     return _IMPUTED_SCHEMA_VERSION if any(s.most_imputed for s in buffer.sessions) else _SCHEMA_VERSION
@@ -309,9 +324,10 @@ def from_parquet(content: bytes) -> ReplayBuffer:
     if raw is None:
         raise ValueError("this Parquet file is not a betaloop buffer snapshot: its metadata lack the key 'betaloop'")
     meta = json.loads(raw)
-    if not _SCHEMA_VERSION <= meta["schema_version"] <= _HELD_SCHEMA_VERSION:
+    if not _SCHEMA_VERSION <= meta["schema_version"] <= _STOPPED_SCHEMA_VERSION:
         raise ValueError(
-            f"buffer snapshot of schema version {meta['schema_version']}; this betaloop reads {_SCHEMA_VERSION} to {_HELD_SCHEMA_VERSION}"
+            f"buffer snapshot of schema version {meta['schema_version']}; "
+            f"this betaloop reads {_SCHEMA_VERSION} to {_STOPPED_SCHEMA_VERSION}"
         )
     ids = table["session_id"].to_numpy()
     step = table["step"].to_numpy()
@@ -333,6 +349,7 @@ def from_parquet(content: bytes) -> ReplayBuffer:
                 qoc=Qoc(**m["qoc"]),
                 random_lower_bound=m["random_lower_bound"],
                 lead_amplitude=m.get("lead_amplitude"),
+                stopped=m.get("stopped", False),
                 most_imputed=m.get("most_imputed", 0),
                 holds=tuple(Hold(*h) for h in m.get("holds", ())),
             )
@@ -350,6 +367,7 @@ def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
     later: dict[str, Any] = {"most_imputed": s.most_imputed} if s.most_imputed else {}
     later |= {"lead_amplitude": s.lead_amplitude} if s.lead_amplitude is not None else {}
     later |= {"holds": [[h.start, h.steps, h.log_density] for h in s.holds]} if s.holds else {}
+    later |= {"stopped": True} if s.stopped else {}
     return later | {
         "session_id": s.session_id,
         "visit": s.visit,

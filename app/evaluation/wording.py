@@ -166,6 +166,10 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         f"{_refusal(f)}all sessions that came near what it would do are of {count(int(_value(f)), 'visit', 'visits')}, "
         f"and {f.limit:.0f} are needed"
     ),
+    "not_converged": lambda f: (
+        f"{_refusal(f)}not converged: its ratios break the equation that defines them by {_value(f):.2f} standard deviations "
+        f"(limit {f.limit:.2f})"
+    ),
     "few_effective_sessions": lambda f: f"{_refusal(f)}the weights rest on {_value(f):.1f} effective sessions of {f.fact('sessions'):.0f}",
     "acts_within_hold": lambda f: (
         f"{_refusal(f)}the policy acts within amplitudes that were drawn once and held, in "
@@ -184,6 +188,10 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "few_end_rewards": lambda f: "fewer than three sessions have an end-of-session reward: the estimate is the step return alone",
     "no_end_reward": lambda f: "no session has an end-of-session reward: the estimate is the step return alone",
     "days_unknown": lambda f: "how returns differ from day to day cannot be told from these sessions: the intervals leave it out",
+    "stopped_sessions": lambda f: (
+        f"{count(int(_value(f)), 'session', 'sessions')} stopped for the participant's sake: counted as failures with the worst outcomes. "
+        f"Counted as measured, the end-of-session reward would be {f.fact('measured'):.1f} instead of {f.fact('counted'):.1f}"
+    ),
     "no_better_than_mean": lambda f: (
         f"left-out sessions are predicted no better than by the mean of the others (error {_value(f):.2f} of that one's)"
     ),

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import datetime, timedelta
 
-from sqlalchemy import select
+from sqlalchemy import func, select, true
 from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.permissions import Caller
 from app.ingest.models import SessionProposal, Upload, UploadFile
 from app.platform.errors import NotFound
 from app.study.models import Device, Participant, Recording, SessionSegment, StudySession, Visit
-from app.study.repository import in_scope
+from app.study.repository import SLACK_S, in_scope
 
 GRASP_KIND = "grasp"
 """Kind of a file with hand-grasp tests, which names no clock."""
@@ -101,6 +101,31 @@ def recordings_of_file(db: Session, upload_file_id: int) -> Sequence[Recording]:
 def recordings_by_id(db: Session, ids: Sequence[int]) -> Sequence[Recording]:
     """Recordings by number."""
     return db.scalars(select(Recording).where(Recording.id.in_(ids)).order_by(Recording.id)).all() if ids else []
+
+
+def recordings_of_minutes(db: Session, like: Recording) -> Sequence[Recording]:
+    """Recordings of the device and side of another one that share minutes with it and were not superseded, oldest first.
+
+    Args:
+        like: it need not be stored; one of no known side is of both.
+    """
+    assert like.started_at is not None
+    either = true() if like.hemisphere is None else Recording.hemisphere.is_(None) | (Recording.hemisphere == like.hemisphere)
+    last = Recording.started_at + func.make_interval(0, 0, 0, 0, 0, 0, Recording.duration_s)
+    end = like.started_at + timedelta(seconds=like.duration_s)
+    shared = func.extract("epoch", func.least(last, end) - func.greatest(Recording.started_at, like.started_at))
+    own = (Recording.device_id == like.device_id) & Recording.superseded_by_id.is_(None)
+    return db.scalars(select(Recording).where(own, either, shared > SLACK_S).order_by(Recording.id)).all()
+
+
+def fullest(db: Session, recordings: Sequence[Recording]) -> list[Recording]:
+    """Recordings, or the fuller copies that took their place, each once."""
+    found: dict[int, Recording] = {}
+    for recording in recordings:
+        while recording.superseded_by_id is not None:
+            recording = db.get_one(Recording, recording.superseded_by_id)
+        found[recording.id] = recording
+    return list(found.values())
 
 
 def confirmed_sessions_of_recording(db: Session, recording_id: int, besides: int) -> Sequence[int]:

@@ -15,6 +15,7 @@ from app.platform.errors import Conflict, Invalid
 from app.study import blinding, cdbs_amplitude
 from app.study import repository as study
 from app.study.models import Controller, Hemisphere, Participant, Recording, SessionSegment, StudySession, Trace, Visit
+from app.study.sessions import repeated
 from app.study.sessions.usable_steps import CONTROL_STREAMS
 from app.study.traces import AMPLITUDE_STREAM, pack, unpack
 
@@ -232,7 +233,8 @@ def in_milliamperes(trace: Trace, cdbs_ma: float) -> None:
 
 
 def refuse_overlap(db: Session, session: StudySession) -> None:
-    """Raises Conflict where a confirmed session already counts on the same stretch of a recording."""
+    """Raises Conflict where a confirmed session already counts on the same stretch of a recording, or of its device in another one."""
+    repeated.refuse(db, session)
     for segment in session.segments:
         for other in repository.segments_of_recording(db, segment.recording_id, besides=session.id):
             shared = min(segment.stop_s, other.stop_s) - max(segment.start_s, other.start_s)
@@ -242,6 +244,15 @@ def refuse_overlap(db: Session, session: StudySession) -> None:
                     f"({other.start_s:.0f} to {other.stop_s:.0f} s of the recording).",
                     "Choose another part of the recording, or correct that session first.",
                 )
+
+
+def counted_minutes(db: Session, placement: Placement) -> bool:
+    """Whether a session that counts has the minutes of a placement already, of the same device in another recording."""
+    began = placement.control.started_at
+    if began is None:
+        return False
+    begin, end = (began + timedelta(seconds=s) for s in (placement.start_s, placement.stop_s))
+    return any(one.counts for one in study.same_minutes(db, placement.control, begin, end, besides=None))
 
 
 def disagreements(db: Session, session_ids: Sequence[int], stated: StatedSession) -> list[str]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from app.ingest.proposals.evidence import Evidence, Reason, Source, stored_courses
+from app.study.models import Recording
 from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern
 
 
@@ -107,3 +108,22 @@ _SENTENCES: dict[Reason, Callable[[Mapping[str, Any]], str]] = {
     Reason.CUT_OUT: lambda f: f"cut out of proposed session {f['session']}",
     Reason.SENTENCE: lambda f: str(f["text"]),
 }
+
+
+def no_more_than(stored: Recording) -> str:
+    """Of a copy that holds no more than a stored recording."""
+    return f"The same minutes of this device came before, as recording {stored.id}, which holds all of this: nothing was stored again."
+
+
+def fuller_than(old: Recording, sessions: Sequence[int]) -> str:
+    """Of a copy that holds more than a stored recording."""
+    used = f"; session{'s' if len(sessions) > 1 else ''} {', '.join(map(str, sessions))} uses it from now on" if sessions else ""
+    return f"A fuller copy of the minutes of recording {old.id} ({old.duration_s:.0f} s): it takes that one's place{used}."
+
+
+def beside(new: Recording, other: Recording) -> str:
+    """Of a recording of the same minutes as a stored one, neither of which holds all of the other."""
+    return (
+        f"Recording {other.id} holds minutes of the same device that this one (recording {new.id}) holds too, and the two differ, or each "
+        "holds what the other lacks: both are kept, and their minutes count once. If it is one session, upload its whole folder."
+    )

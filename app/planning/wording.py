@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from app.planning.plans.designs import Bound, Planned, delivered_ma
 from ml.deploy.manifest import BundleManifest
+from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
+
+LEAVE_AT_ONCE = "A stop, an adverse event or a lost link: back to cDBS at once; the rest of the session is not made up for."
 
 
 def release_reason(manifest: BundleManifest) -> str:
@@ -12,3 +16,52 @@ def release_reason(manifest: BundleManifest) -> str:
         f"controller bundle of {manifest.participant}, policy {manifest.policy_id}{side}: {manifest.min_ma:g} to {manifest.max_ma:g} mA, "
         f"cDBS {manifest.cdbs_ma:g} mA, ramp {manifest.ramp_ma_per_s:g} mA/s"
     )
+
+
+def design_name(planned: Planned) -> str:
+    """A design in two words, for a table."""
+    return {"paper": "paper's draws", "ladder": "titration ladder"}.get(planned.design) or f"level {planned.level:.2f}"
+
+
+def design_words(planned: Planned) -> str:
+    """What a random session tries, in one clause."""
+    if planned.design == "paper":
+        return f"the paper's design: a new draw every {planned.period_s:g} s, uniform from {planned.lower_bound:g} to 1 of cDBS"
+    if planned.design == "ladder":
+        steps = ", ".join(f"{h.amplitude:g}" for h in planned.holds)
+        return f"titration ladder: {steps} of cDBS, {planned.holds[0].steps * planned.period_s / 60:g} min each"
+    low, high = HOLD_SECONDS
+    return f"stratified design: level {planned.level:.2f} of cDBS, {len(planned.holds)} draws held {low:g} to {high:g} s"
+
+
+def bound_words(planned: Planned, bounds: tuple[Bound, ...]) -> str:
+    """What a random session never does, in milliamperes where the cDBS amplitude is known."""
+    if not bounds:
+        return f"never below {planned.lower_bound:g} of cDBS; its cDBS amplitude is not known, so that no bound in mA can be given"
+    lowest = ", ".join(_side(b, f"{b.lowest_ma:g} mA") for b in bounds)
+    words = f"never below {lowest} ({planned.lower_bound:g} of cDBS)"
+    if planned.low_seconds:
+        low = ", ".join(_side(b, f"{b.low_ma:g} mA") for b in bounds)
+        words += f"; below {low} ({LOW_AMPLITUDE:g}) for {planned.low_seconds / 60:.1f} of at most {LOW_SECONDS / 60:g} min"
+        words += "" if planned.design == "ladder" else ", at the end"
+    return words
+
+
+def schedule_words(planned: Planned, bounds: tuple[Bound, ...]) -> str:
+    """Every held amplitude with the minute it begins at: milliamperes by side, fractions of cDBS where those are not known."""
+    held = [f"{_clock(h.start * planned.period_s)} {_given(h.amplitude, bounds)}" for h in planned.holds]
+    last = planned.holds[-1]
+    after = [f"{_clock((last.start + last.steps) * planned.period_s)} cDBS"]  # a ladder may end before the session does
+    return "  ".join(held + after)
+
+
+def _given(fraction: float, bounds: tuple[Bound, ...]) -> str:
+    return "/".join(f"{delivered_ma(fraction, b):.1f}" for b in bounds) or f"{fraction:.2f}"
+
+
+def _clock(seconds: float) -> str:
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+
+
+def _side(bound: Bound, words: str) -> str:
+    return f"{words} {bound.side}" if bound.side else words

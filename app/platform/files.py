@@ -167,19 +167,28 @@ def store(db: Session, content: bytes | Path, media_type: str) -> StoredFile:
     try:
         if isinstance(content, bytes):
             draft.write_bytes(content)
-        sha256, size = hash_file(draft)
-        target = path_of(sha256)
-        if not target.exists():
-            draft.chmod(0o600)
-            _sync(draft)
-            private_folder(target.parent)
-            draft.rename(target)
-            _sync(target.parent)
+        size = draft.stat().st_size
+        sha256 = keep(draft)
     finally:
         # also where the disk is full: what cannot be stored must not keep it full
         draft.unlink(missing_ok=True)
     db.execute(insert(StoredFile).values(sha256=sha256, size=size, media_type=media_type).on_conflict_do_nothing())
     return db.get_one(StoredFile, sha256)
+
+
+def keep(draft: Path) -> str:
+    """Move a draft to where its bytes live, on disk when this returns, and give their hash; bytes that are there already stay."""
+    sha256, _ = hash_file(draft)
+    target = path_of(sha256)
+    if target.exists():
+        draft.unlink()
+    else:
+        draft.chmod(0o600)
+        _sync(draft)
+        private_folder(target.parent)
+        draft.rename(target)
+        _sync(target.parent)
+    return sha256
 
 
 def read(sha256: str) -> bytes:

@@ -227,6 +227,8 @@ class _Loader:
             answer = self.client.post("/uploads", data=fields, files={"file": (name, content)})
             stored = self._checked(answer)["sessions"][0]["id"]
             self._checked(self.client.put(f"/sessions/{stored}/qoc", json=session.qoc()))
+            if (conditions := session.conditions()) is not None:
+                self._checked(self.client.put(f"/sessions/{stored}/conditions", json=conditions))
             bars.advance(bar)
 
     def _post(self, path: str, body: dict[str, Any], may_exist: bool = False) -> dict[str, Any]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import datetime as dt
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
+from ml.designs import DesignedSession, DesignSettings, lay_out
 from ml.population import PARTICIPANTS, SimulatedSession, rcs_session_zip, run_session, session_table_csv
 
 VISITS = 3
@@ -47,17 +48,19 @@ class DemoSession:
     ordinal: int
     controller: str
     begins: dt.datetime
+    design: DesignedSession | None = None
 
     @cached_property
     def simulated(self) -> SimulatedSession:
         """The session's numbers: the same at every start."""
+        steps = MINUTES[self.controller] * _STEPS_PER_MINUTE
         return run_session(
             self.code,
-            self.controller,  # type: ignore[arg-type]
+            self.controller if self.design is None else self.design.first_steps(steps),  # type: ignore[arg-type]
             visit=self.visit,
             hour=(self.begins.hour - 9) + self.begins.minute / 60,
             seed=1000 * self.visit + self.ordinal,
-            steps=MINUTES[self.controller] * _STEPS_PER_MINUTE,
+            steps=steps,
             lead_steps=_LEAD_STEPS,
             resolution_ma=0.1,
         )
@@ -70,6 +73,14 @@ class DemoSession:
     def file(self) -> tuple[str, bytes]:
         """Name and bytes of the session's file."""
         return session_file(f"{self.code}-visit{self.visit}-session{self.ordinal}", self.simulated, self.begins)
+
+    def conditions(self) -> dict[str, Any] | None:
+        """What the design drew for a random session, for the REST interface; None for other sessions."""
+        if self.design is None:
+            return None
+        holds = [asdict(d) for d in self.design.decisions]
+        stated = {"design": self.design.design, "seed": self.design.seed, "reason": "laid out before the visit"}
+        return stated | {"design_parameters": {"level": self.design.level, "holds": holds}}
 
     def qoc(self) -> dict[str, Any]:
         """End-of-session QoCs for the REST interface."""
@@ -103,15 +114,31 @@ def participant_body(code: str) -> dict[str, Any]:
     }
 
 
+def designs(code: str) -> tuple[DesignedSession, ...]:
+    """What the participant's random sessions try: the stratified design of a new participant, over the demo's visits."""
+    wanted = DesignSettings(
+        visits=VISITS, sessions=DAY.count("random"), steps=MINUTES["random"] * _STEPS_PER_MINUTE, seed=list(PARTICIPANTS).index(code)
+    )
+    return lay_out(wanted)
+
+
 def demo_visits(code: str, today: dt.date) -> list[DemoVisit]:
     """The participant's visits, a month apart; the next lies two weeks after `today`."""
     visits = []
+    designed = iter(designs(code))
     first = dt.datetime.combine(today + NEXT_VISIT_IN - VISITS * BETWEEN_VISITS, MORNING)
     for number in range(1, VISITS + 2):
         day = first + BETWEEN_VISITS * (number - 1)
         sessions = (
             tuple(
-                DemoSession(code, number, i + 1, controller, day + BETWEEN_SESSIONS * i + dt.timedelta(minutes=5))
+                DemoSession(
+                    code,
+                    number,
+                    i + 1,
+                    controller,
+                    day + BETWEEN_SESSIONS * i + dt.timedelta(minutes=5),
+                    next(designed) if controller == "random" else None,
+                )
                 for i, controller in enumerate(DAY)
             )
             if number <= VISITS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from sqlalchemy.orm import Session
@@ -18,6 +18,7 @@ from app.learning.models import Policy
 from app.pipeline.service import start_job
 from app.planning.plans import repository as plans
 from app.planning.plans import service as planning
+from app.planning.plans.designs import planned_sessions
 from app.planning.plans.schedule import total_minutes
 from app.planning.plans.schemas import PlanIn
 from app.platform.database import new_session, set_actor
@@ -120,7 +121,7 @@ class ParticipantLoop:
                 self._approve(db, visit)
                 placed = self._planned(db, visit, day)
             else:
-                placed = self._collecting(day)
+                placed = self._collecting(person, number, day)
             for one in placed:
                 self.progress.say(self.code, f"visit {number}: {_name(one)}")
                 sessions.hold(db, person, visit, one, self.design.seed, self.caller)
@@ -204,10 +205,16 @@ class ParticipantLoop:
             for line in lines
         ]
 
-    def _collecting(self, day: dt.date) -> list[PlacedSession]:
-        """The sessions of a visit that only collects."""
-        rows = enumerate(collecting_day(self.design.preset), start=1)
-        return [_placed(i, Controller(row.controller), None, day, row.hour, row.steps) for i, row in rows]
+    def _collecting(self, person: Participant, number: int, day: dt.date) -> list[PlacedSession]:
+        """The sessions of a visit that only collects; what its random ones try is by the design in the participant's settings."""
+        size = self.design.preset
+        to_try = iter(planned_sessions(person.current_settings, self.code, number - 1, size.random_sessions, float(size.session_minutes)))
+        placed = []
+        for i, row in enumerate(collecting_day(size), start=1):
+            design = next(to_try) if row.controller == Controller.RANDOM else None
+            held = design if design is not None and design.holds else None
+            placed.append(replace(_placed(i, Controller(row.controller), None, day, row.hour, row.steps), design=held))
+        return placed
 
 
 def _placed(position: int, controller: Controller, policy: Policy | None, day: dt.date, hour: float, steps: int) -> PlacedSession:

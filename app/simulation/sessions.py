@@ -12,13 +12,15 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.ingest.uploads import service as ingest
 from app.learning.models import Policy
+from app.planning.plans.designs import Planned
 from app.platform import files
 from app.platform.errors import BetaloopError
 from app.simulation.demo_study import device_session, session_file
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Controller, Participant, StudySession, Visit
-from app.study.schemas import QocIn
+from app.study.schemas import ConditionsChange, DesignParameters, QocIn
+from app.study.sessions import conditions
 from app.study.sessions.data import qoc_of, session_data
 from app.study.threshold import mdp_settings
 from ml.mdp import end_reward, step_reward
@@ -33,7 +35,7 @@ RESOLUTION_MA = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedSession:
-    """A session of a visit day: `position` counts from 1, `hour` from the day's first session."""
+    """A session of a visit day: `position` counts from 1, `hour` from the day's first session; `design`: of a random one of held draws."""
 
     position: int
     controller: Controller
@@ -41,6 +43,7 @@ class PlacedSession:
     begins: dt.datetime
     hour: float
     steps: int
+    design: Planned | None = None
 
 
 def simulate(participant: Participant, visit: Visit, placed: PlacedSession, seed: int) -> SimulatedSession:
@@ -49,6 +52,8 @@ def simulate(participant: Participant, visit: Visit, placed: PlacedSession, seed
     controller: CohortController
     if placed.policy is not None:
         controller = OnnxPolicy(files.read(placed.policy.onnx_sha256), settings.window)
+    elif placed.design is not None:
+        controller = placed.design.first_steps(placed.steps)
     else:
         controller = placed.controller.value  # type: ignore[assignment]
     return run_session(
@@ -93,9 +98,20 @@ def hold(db: Session, participant: Participant, visit: Visit, placed: PlacedSess
         held = _session_at(db, visit, placed.position)
         if held is None:
             raise BetaloopError(f"The simulated file {name} made no session at place {placed.position} of visit {visit.number}.")
+    if placed.design is not None:
+        conditions.change(db, held, _stated(placed.design), caller)
     qoc = simulated.qoc
     study.record_qoc(db, held, QocIn(grasp_hz=qoc.grasp_hz, rating=simulated.rating, tremor_percent=qoc.tremor_percent), caller)
     db.commit()
+
+
+def _stated(design: Planned) -> ConditionsChange:
+    return ConditionsChange(
+        design=design.design,
+        seed=design.seed,
+        design_parameters=DesignParameters.model_validate({"level": design.level, "holds": design.as_json()["holds"]}),
+        reason="laid out by the simulated study",
+    )
 
 
 def actual_return(db: Session, session: StudySession) -> float | None:

@@ -82,6 +82,8 @@ class SettingsVersion(Base):
         CheckConstraint("min_valid_fraction > 0 and min_valid_fraction <= 1", name="min_valid"),
         CheckConstraint("most_imputed >= 0", name="most_imputed"),
         CheckConstraint("beta_measure in ('rms', 'power')", name="beta_measure"),
+        CheckConstraint("design in ('stratified', 'paper')", name="design"),
+        CheckConstraint("early_visits >= 1", name="early_visits"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
@@ -107,6 +109,9 @@ class SettingsVersion(Base):
     min_valid_fraction: Mapped[float]
     most_imputed: Mapped[int] = mapped_column(SmallInteger, server_default="0")
     beta_measure: Mapped[str] = mapped_column(String(10), server_default="rms")
+    design: Mapped[str] = mapped_column(String(20), server_default="paper")
+    design_ladder: Mapped[bool] = mapped_column(server_default="false")
+    early_visits: Mapped[int] = mapped_column(SmallInteger, server_default="3")
     pool_programmings: Mapped[bool] = mapped_column(server_default="false")
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
@@ -267,6 +272,8 @@ class Recording(Base):
     started_at: Mapped[datetime | None]
     duration_s: Mapped[float]
     details: Mapped[dict[str, Any]]
+    superseded_by_id: Mapped[int | None] = mapped_column(ForeignKey("recording.id"), index=True)
+    """The fuller copy of the same minutes that sessions use instead."""
     device: Mapped[Device] = relationship()
     traces: Mapped[list[Trace]] = relationship(back_populates="recording", order_by="Trace.stream")
 

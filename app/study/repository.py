@@ -8,6 +8,7 @@ from datetime import datetime
 from typing import Any
 
 from sqlalchemy import ColumnElement, Select, column, false, func, or_, select, table, true
+from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.models import Site
@@ -26,6 +27,7 @@ from app.study.models import (
     TremorSeries,
     Visit,
 )
+from app.study.sessions.models import CountedTime
 
 CONFIRMED = StudySession.status == "confirmed"
 """Condition on `StudySession`: only what a person has confirmed counts in buffers, analyses, rankings and exports."""
@@ -162,6 +164,60 @@ def recording_by_fingerprint(db: Session, participant_id: int, fingerprint: str)
     return db.scalar(select(Recording).where(Recording.participant_id == participant_id, Recording.fingerprint == fingerprint))
 
 
+SLACK_S = 2.0
+"""Two stretches of one device are the same minutes where they share more than this: clocks of consecutive recordings are not exact."""
+
+
+@dataclass(frozen=True)
+class SameMinutes:
+    """A session that holds minutes of a device which another one holds too.
+
+    Attributes:
+        recording_id: its own recording of them. seconds: how long both are. counts: whether it is confirmed and not excluded.
+    """
+
+    session_id: int
+    recording_id: int
+    seconds: float
+    counts: bool
+
+
+def same_minutes(db: Session, recording: Recording, begin: datetime, end: datetime, besides: int | None) -> list[SameMinutes]:
+    """Sessions controlled by a recording's device and side within [begin, end], in another recording, by number.
+
+    Args:
+        recording: one of no known side is of both. besides: a session that is not asked for.
+    """
+    own_side = true() if recording.hemisphere is None else or_(Recording.hemisphere.is_(None), Recording.hemisphere == recording.hemisphere)
+    first = Recording.started_at + func.make_interval(0, 0, 0, 0, 0, 0, SessionSegment.start_s)
+    last = Recording.started_at + func.make_interval(0, 0, 0, 0, 0, 0, SessionSegment.stop_s)
+    shared = func.extract("epoch", func.least(last, end) - func.greatest(first, begin))
+    counts = CONFIRMED & StudySession.excluded_reason.is_(None)
+    query = (
+        select(StudySession.id, Recording.id, shared, counts)
+        .join(SessionSegment, SessionSegment.session_id == StudySession.id)
+        .join(Recording, Recording.id == SessionSegment.recording_id)
+        .where(Recording.device_id == recording.device_id, Recording.id != recording.id, own_side, SessionSegment.is_control)
+        .where(shared > SLACK_S, StudySession.id != (besides or 0))
+        .order_by(StudySession.id)
+    )
+    return [SameMinutes(i, r, float(seconds), bool(counting)) for i, r, seconds, counting in db.execute(query)]
+
+
+def repeated_sessions(db: Session, participant_id: int) -> set[int]:
+    """Sessions that count by a device's clock and have no place of their own in `counted_time`: another one had their minutes before."""
+    query = (
+        select(StudySession.id)
+        .join(StudySession.visit)
+        .join(SessionSegment, SessionSegment.session_id == StudySession.id)
+        .join(Recording, Recording.id == SessionSegment.recording_id)
+        .outerjoin(CountedTime, (CountedTime.session_id == StudySession.id) & (CountedTime.recording_id == Recording.id))
+        .where(Visit.participant_id == participant_id, CONFIRMED, StudySession.excluded_reason.is_(None), SessionSegment.is_control)
+        .where(Recording.started_at.is_not(None), CountedTime.session_id.is_(None))
+    )
+    return set(db.scalars(query))
+
+
 def session_ids_of_recording(db: Session, recording_id: int) -> Sequence[int]:
     """Sessions that a recording belongs to."""
     return db.scalars(select(SessionSegment.session_id).where(SessionSegment.recording_id == recording_id).distinct()).all()
@@ -260,6 +316,18 @@ def released_limits(db: Session, policy_id: int, moment: datetime | None) -> tup
         query = query.where(releases.c.created_at <= moment)
     row = db.execute(query.order_by(releases.c.created_at.desc()).limit(1)).first()
     return None if row is None else (float(row.min_ma), float(row.max_ma))
+
+
+def planned_designs(db: Session, visit_id: int) -> list[dict[str, Any]]:
+    """Designs of the random sessions in a visit's approved plan, by position; those that are drawn by the device have none.
+
+    Plans belong to a later phase; of their tables only the designs are needed here.
+    """
+    plans = table("plan", *(column(name) for name in ("id", "visit_id", "status")))
+    items = table("plan_item", *(column(name) for name in ("plan_id", "position")), column("design", JSONB))
+    query = select(items.c.design).join_from(items, plans, items.c.plan_id == plans.c.id)
+    query = query.where(plans.c.visit_id == visit_id, plans.c.status == "approved", items.c.design.is_not(None))
+    return [row for row in db.scalars(query.order_by(items.c.position)) if row["holds"]]
 
 
 def settings_version(db: Session, settings_version_id: int) -> SettingsVersion:

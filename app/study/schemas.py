@@ -62,6 +62,7 @@ SETTING_BOUNDS = {
     "beta_high_hz": Bound(1, 500, "Hz"),
     "min_valid_fraction": Bound(0.01, 1),
     "most_imputed": Bound(0, 10, "steps"),
+    "early_visits": Bound(1, 20, "visits"),
 }
 """Clinical bounds of what may be set from now on; versions of before may lie outside of them, and are shown as they are."""
 
@@ -103,6 +104,13 @@ class SettingsFields(Model):
     beta_measure: BetaMeasure = Field(
         "rms", description="Beta from time-domain LFP: 'rms' amplitude (in its unit) or 'power' (unit squared)."
     )
+    design: Literal["stratified", "paper"] = Field(
+        "stratified",
+        description="How random sessions try amplitudes: 'stratified' levels with draws held 10-60 s, or 'paper', a new uniform draw every "
+        "step. Settings of before there was a choice have 'paper'.",
+    )
+    design_ladder: Bool = Field(False, description="Stratified design: the first random session of a visit is a titration ladder.")
+    early_visits: Int = Field(3, description="Stratified design: visits over which the levels of random sessions are spread.")
     pool_programmings: Bool = Field(
         False,
         description="Sessions under other contacts, pulse widths or rates than the participant's newest enter buffers too; a clinician's "
@@ -283,7 +291,18 @@ class DesignParameters(Model):
     """What a design drew for one session."""
 
     level: Number | None = Field(None, ge=0, le=1, description="Of the session, fraction of the cDBS amplitude; null where it has none.")
-    holds: list[HoldModel] = Field(default_factory=list, max_length=10_000, description="In order, without gaps.")
+    holds: list[HoldModel] = Field(default_factory=list, max_length=10_000, description="In order, without gaps, the first from step 0.")
+
+    @field_validator("holds")
+    @classmethod
+    def _without_gaps(cls, value: list[HoldModel]) -> list[HoldModel]:
+        at = 0
+        for number, hold in enumerate(value, start=1):
+            if hold.start != at:
+                words = {"number": number, "start": hold.start, "at": at}
+                raise PydanticCustomError("gap", "hold {number} starts at step {start}; the one before ends at step {at}", words)
+            at += hold.steps
+        return value
 
 
 class ProgramModel(Model):

@@ -18,6 +18,7 @@ from app.study.margins.schemas import MarginsFields
 from app.study.models import CdbsAmplitude, Controller, MarginsVersion, Participant, QocRevision, SettingsVersion, StudySession, Visit
 from app.study.outcomes import service as outcomes
 from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, ParticipantIn, QocIn, SessionChange, SettingsIn, VisitChange, VisitIn
+from app.study.sessions import repeated
 from app.study.threshold import MDP_FIELDS
 from app.study.traces import NO_CONTROL
 from ml.mdp import MdpSettings
@@ -141,6 +142,8 @@ def change_session(db: Session, session: StudySession, change: SessionChange, ca
         _check_policy(db, session, controller, policy_id)
         blinding.assign(session, controller, policy_id)
     _check_control(db, session, given)
+    if "excluded_reason" in given and not (given["excluded_reason"] or "").strip() and session.excluded_reason is not None:
+        repeated.refuse(db, session)
     for name, value in given.items():
         if name == "excluded_reason":
             value = (value or "").strip() or None

@@ -7,6 +7,7 @@ from typing import Any
 
 from app.study.models import Controller
 from app.study.sessions.contradictions import Contradiction, Kind
+from app.study.sessions.designs import Drawn
 
 _SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be without DBS"}
 
@@ -14,6 +15,20 @@ _SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be with
 def sentences(contradictions: Iterable[Contradiction]) -> list[str]:
     """What a person should look at, a sentence each."""
     return [_SENTENCES[c.kind](c.facts) for c in contradictions]
+
+
+def drawn_words(drawn: Drawn) -> str:
+    """How a random session's amplitudes were drawn."""
+    holds = f", {len(drawn.holds)} held amplitudes" if drawn.holds else ""
+    held = f"the amplitudes are held ({len(drawn.holds)} of them) and not drawn every step"
+    told = {
+        "paper": "the paper's: a new draw every step",
+        "stratified": "stratified" + ("" if drawn.level is None else f", level {drawn.level:.2f} of cDBS") + holds,
+        "ladder": f"titration ladder{holds}",
+        "held": f"not stated; {held}: their density is not known",
+        "unstated": "not stated; taken for the paper's, a new draw every step, which the amplitudes do not contradict",
+    }[drawn.kind]
+    return told + (f", seed {drawn.seed}" if drawn.seed is not None else "")
 
 
 def _day(f: Mapping[str, Any]) -> str:
@@ -55,6 +70,14 @@ def _silent_control(f: Mapping[str, Any]) -> str:
     )
 
 
+def _repeated(f: Mapping[str, Any]) -> str:
+    other = f"session {f['session']} (recording {f['recording']}{', which counts' if f['counts'] else ''})"
+    return (
+        f"The same {f['seconds']:.0f} s of this device stand in {other}, and what recording {f['own']} holds of them is not the same: "
+        "the same minutes count once. Look at both, and drop or exclude one."
+    )
+
+
 _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.DAY: _day,
     Kind.START: _start,
@@ -63,6 +86,7 @@ _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.ABOVE_CDBS: _above_cdbs,
     Kind.AMPLITUDE: _amplitude,
     Kind.SILENT_CONTROL: _silent_control,
+    Kind.REPEATED: _repeated,
     Kind.NO_POLICY: lambda f: (
         "No policy is named for this session: it cannot be compared with its estimate. Name one on the session's page."
     ),

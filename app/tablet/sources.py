@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,7 @@ from ml.deploy.streaming import StreamingBeta, split_by_period
 from ml.formats import DecodeOptions, RecordingLog, TraceLog, UndecodableFile, decode, sniff
 from ml.formats.archive import FolderFiles, ZipFiles
 from ml.formats.rcs.beta import time_domain_stretches
-from ml.formats.rcs.folder import SessionFiles, find_sessions
-from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
-from ml.formats.rcs.packets.scan import batch_of
-from ml.formats.rcs.packets.streams import read_time_domain
-from ml.formats.rcs.packets.time import reconstruct
-from ml.formats.rcs.settings import follow
+from ml.formats.rcs.folder import find_sessions, read_streams
 from ml.formats.recording import FileReport
 from ml.formats.tables.delimited import read_delimited
 from ml.formats.tables.numbers import column_name, unit_name
@@ -38,7 +33,6 @@ from ml.signals import Stretch, band_rows
 LFP_UNITS = {"uV": 1.0, "mV": 1000.0, "V": 1e6}
 _COHORT = re.compile(r"cohort:([A-Za-z0-9]+)(?::(\d{1,9}))?")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-_PACKETS_AT_ONCE = 4096
 
 
 class Row(NamedTuple):
@@ -255,32 +249,15 @@ def _rcs_stretches(path: Path, options: DecodeOptions, recording: RecordingLog) 
     out: dict[str, list[Stretch]] = {}
     with files if isinstance(files, ZipFiles) else nullcontext():
         for session in find_sessions(files, FileReport(path.name)):
-            data = read_time_domain(_batches(_elements(session, files, "RawDataTD")))
-            if data.headers.size == 0:
+            streams = read_streams(session, files)
+            times, settings = streams.placed()
+            if streams.time_domain is None or "time_domain" not in times.streams:
                 continue
-            settings = follow(list(_elements(session, files, "DeviceSettings")), list(_elements(session, files, "StimLog")))
-            for name, pieces in time_domain_stretches(data, reconstruct(data.headers), settings).items():
+            for name, pieces in time_domain_stretches(streams.time_domain, times.streams["time_domain"], settings).items():
                 placed = [((first_ms - start_ms) / 1000.0, rate, x * 1000.0) for first_ms, rate, x in pieces]
                 if any(-1.0 <= t <= recording.duration_s + 1.0 for t, _, _ in placed):
                     out.setdefault(name, []).extend(placed)
     return out
-
-
-def _elements(session: SessionFiles, files: Any, stem: str) -> Iterator[Any]:
-    if stem in session.members:
-        with files.open(session.members[stem]) as stream:
-            yield from (element for element, _ in read_elements(stream, JsonNotes()))
-
-
-def _batches(elements: Iterator[Any]) -> Iterator[Any]:
-    packets: list[Any] = []
-    for element in elements:
-        packets.append(element)
-        if len(packets) == _PACKETS_AT_ONCE:
-            yield batch_of(packets)
-            packets = []
-    if packets:
-        yield batch_of(packets)
 
 
 def _lfp_columns(path: Path) -> list[Stretch]:

@@ -61,7 +61,7 @@ def summarise(names: Iterable[str], cells: Table, methods: list[str]) -> Summary
         v = [truth["policies"][n]["total"][0] for n in candidates]
         cdbs = truth["policies"]["cDBS"]["total"][0]
         for design in DESIGNS:
-            if cells.get(f"{name}/{design}/page") is None:
+            if not any(cells.get(f"{name}/{design}/{method}") for method in methods):
                 continue
             for method in methods:
                 cell = cells.get(f"{name}/{design}/{method}")
@@ -92,7 +92,7 @@ def report(names: Iterable[str], cells: Table, headline: str, figure: Path, out:
     """Print tables, draw the figure, and return what they were made from."""
     names = list(names)
     truths = [cells.get(f"{n}/truth") for n in names]
-    methods = ["page", "linear", "fqe", "wdr", "dlmm", "wis", "cwpdis", "dlsm"]
+    methods = ["posterior", "page", "linear", "fqe", "wdr", "dlmm", "wis", "cwpdis", "dlsm"]
     summary = summarise(names, cells, methods)
     flat = [n for n, t in zip(names, truths, strict=True) if t["flat"]]
     responders, silent = (sum(t[what] for t in truths) for what in ("responder", "silent"))

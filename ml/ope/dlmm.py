@@ -4,7 +4,7 @@ Source: Gao et al. 2023, appendix C.2 (after Gao et al., ICCPS 2022): a variatio
     prior p(z) = N(0, I),  encoder q(z_t | s_t),  decoder p(s_{t+1}, r_t | z_t, a_t),
 trained by the evidence lower bound of log p(s_{t+1}, r_t) and rolled out by encoding every predicted state anew. It carries nothing from
 one step to the next but the window of beta itself, and cannot predict end-of-session outcomes: those come from the same regression on a
-session's summaries that the linear model uses, so that the comparison is fair. Only the newest beta of s_{t+1} is decoded; the others
+session's minutes that the linear model uses, so that the comparison is fair. Only the newest beta of s_{t+1} is decoded; the others
 are known from s_t. Everything enters standardised; the reward is the decoder's.
 """
 
@@ -26,7 +26,8 @@ from ml.ope.dlsm.batches import Batch, make_batch
 from ml.ope.dlsm.heads import GaussianHead, gaussian_kl, gaussian_log_prob
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS
-from ml.ope.linear.end_outcomes import EndModel, fit_end_model, summarise
+from ml.ope.outcomes.minutes import by_minute
+from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale, session_folds
 from ml.ope.support.coverage import AmplitudeSupport, flags_of
@@ -235,7 +236,7 @@ class FittedDlmm:
             step_return += settings.gamma**t * (reward.numpy().astype(np.float64) * scale.reward_std + scale.reward_mean)
         discount = settings.gamma ** np.arange(horizon)[:, None]
         known = (discount * step_reward(settings, beta, actions)).sum(0)
-        outcomes = self.end.predict(summarise(beta.T, actions.T, settings.xi_beta))
+        outcomes = self.end.predict(by_minute(beta.T, actions.T, settings))
         shape = (p, m)
         return _Simulated(
             step_return.reshape(shape),

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.estimate import Estimate, checked_horizon
-from ml.ope.fqe.estimator import FittedFqe, Fqe, FqeConfig, QMember, head_schedule, value_estimate, within_reach
+from ml.ope.fqe.estimator import FittedFqe, Fqe, FqeConfig, QMember, discounts, value_estimate, within_reach
 from ml.ope.fqe.steps import TargetActions
 from ml.ope.importance import behaviour_densities, horizon_of_ten, kernel_log_density, session_log_ratios
-from ml.ope.linear.end_outcomes import summarise
+from ml.ope.outcomes.minutes import of_buffer
 from ml.ope.registry import Size
 from ml.ope.scale import outcome_table
 from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_sample_size, few_effective
@@ -71,8 +71,7 @@ class DoublyRobust:
         densities, bandwidth = behaviour_densities(buffer, self.bandwidth, self.value.seed)
         density = np.concatenate([d[s.usable()] for d, s in zip(densities, buffer.sessions, strict=True)])
         ends = outcome_table(buffer)[:, 0]
-        summaries = np.stack([summarise(s.beta, s.amplitude, buffer.settings.xi_beta) for s in buffer.sessions])
-        end_errors = ends - fitted.end.predict(summaries)[:, 0]
+        end_errors = ends - fitted.end.predict(of_buffer(buffer), fitted.end.sessions)[:, 0]
         return FittedDoublyRobust(fitted, density, end_errors, bandwidth)
 
 
@@ -135,11 +134,11 @@ class FittedDoublyRobust:
         return log_ratio, mask
 
     def _value(self, view: _View, pick: Indices, log_ratio: Floats, mask: Mask, horizon: int) -> tuple[Floats, float]:
-        """Corrected sums of `HEADS` [6] of the picked sessions, and the correction of r_end."""
+        """Corrected sums of the heads [R] of the picked sessions, and the correction of r_end."""
         fqe, table = self.fqe, self.fqe.table
         gamma = fqe.buffer.settings.gamma
         weights, _ = view.member.weights(view.products, pick, horizon, gamma)
-        discount, _ = head_schedule(horizon, gamma)
+        discount = discounts(gamma)
         errors = view.errors(weights, horizon, gamma)
         share = step_weights(log_ratio[pick], mask[pick])
         own = np.isin(table.first_session, pick)
@@ -167,15 +166,14 @@ class _View:
         self._ends = np.searchsorted(table.step[self._order], np.arange(int(table.step.max()) + 2))
 
     def errors(self, weights: Floats, horizon: int, gamma: float) -> Floats:
-        """Temporal errors of `HEADS` with H - t steps to go, [n, H, 6]; 0 where a session has no usable step."""
+        """Temporal errors of the heads with H - t steps to go, [n, H, R]; 0 where a session has no usable step."""
         table = self.table
-        discount, counts = head_schedule(horizon, gamma)
+        discount = discounts(gamma)
         result = np.zeros((table.sessions, horizon, len(discount)))
-        rates = np.concatenate([table.rates, table.rates[:, 1:2]], axis=1)
         for t in range(min(horizon, int(table.step.max()) + 1)):
             rows = self._order[self._ends[t] : self._ends[t + 1]]
             left = horizon - t
-            paid = rates[rows] * counts[left - 1] + discount * (self.then[rows] @ weights[left - 1])
+            paid = table.rates[rows] + discount * (self.then[rows] @ weights[left - 1])
             result[table.session[rows], t] = paid - self.member.grams.phi[rows] @ weights[left]
         return result
 

@@ -10,7 +10,7 @@ of the session; and r_end follows from averages under the *discounted* distribut
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ml.ope.estimate import Estimate, checked_horizon
+from ml.ope.flags import Flag
 from ml.ope.fqe.estimator import value_estimate, within_reach
 from ml.ope.fqe.steps import TargetActions, UsableSteps, ValueFeatures, usable_steps
 from ml.ope.lead import dose_before
-from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
+from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.registry import Size
 from ml.ope.support.coverage import AmplitudeSupport
 from ml.policies.policy import Policy
@@ -36,6 +37,9 @@ Indices = NDArray[np.int64]
 
 AVERAGE = 0.995
 """Decay of the running average of zeta's weights, which is what is read: the saddle is circled, not reached."""
+
+LARGEST_GAP = 0.25
+"""A larger `flow_gap`: the training has not converged, and the estimate speaks for no policy."""
 
 ONE = 0.5413248546129181
 """softplus of this is 1: where zeta starts."""
@@ -141,6 +145,21 @@ def ratios(now: Floats, then: Floats, first: Floats, shares: Floats, gamma: floa
     return result
 
 
+def flow_gap(zeta: Floats, now: Floats, then: Floats, first: Floats, gamma: float) -> float:
+    """By how much the ratios of one policy break the equation that defines them; 0 at the saddle.
+
+    E_D[zeta f(s, a)] = (1 - gamma) E[f(s_0, pi)] + gamma E_D[zeta f(s', pi(s'))] for every f: here for every input, in its standard
+    deviations over the logged steps; and for 1, which asks that ratios average to 1. The largest of all, over members. Ratios that are
+    nearly 0 everywhere break the second alone, and are what training that stopped short leaves where gamma is near 1.
+
+    Args:
+        zeta: [M, N]. now, then: inputs at (s, a) and (s', pi(s')), [N, F]. first: at (s_0, pi(s_0)), [m, F].
+    """
+    spread = np.where(now.std(0) > 1e-9, now.std(0), 1.0)
+    flows = zeta @ ((now - gamma * then) / spread) / len(now) - (1 - gamma) * (first / spread).mean(0)
+    return float(max(np.abs(flows).max(), np.abs(zeta.mean(1) - 1).max()))
+
+
 @dataclass(frozen=True)
 class DualDice:
     """The estimator."""
@@ -158,7 +177,7 @@ class DualDice:
         draws = resamples(table.sessions, c.refits, c.seed)
         inputs = ValueFeatures(table, 0, c.seed)
         report(1.0, "inputs of the density ratios")
-        return FittedDualDice(self.method, c, buffer, table, inputs, draws, fit_end_model(buffer), fit_end_model(buffer, draws))
+        return FittedDualDice(self.method, c, buffer, table, inputs, draws, fit_end_model(buffer, draws=c.refits, seed=c.seed))
 
 
 @dataclass(frozen=True)
@@ -172,7 +191,6 @@ class FittedDualDice:
     inputs: ValueFeatures
     draws: Indices
     end: EndModel
-    end_refits: EndModel
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
         """Train the ratios of all policies together, then average the logged rewards under them."""
@@ -184,9 +202,12 @@ class FittedDualDice:
         now = self.inputs(table.states, table.actions, table.memory)
         then = np.stack([self.inputs(table.next_states, t.then, t.memory) for t in targets])
         first = np.stack([self.inputs(table.first_states, t.first, table.first_memory(t.first)) for t in targets])
-        zeta = ratios(now, then, first, self._shares(), self.buffer.settings.gamma, self.config, report)
+        gamma = self.buffer.settings.gamma
+        zeta = ratios(now, then, first, self._shares(), gamma, self.config, report)
         support = AmplitudeSupport(self.buffer)
-        return {name: self._estimate(policy, z, horizon, support) for (name, policy), z in zip(policies.items(), zeta, strict=True)}
+        gaps = [flow_gap(z, now, t, f, gamma) for z, t, f in zip(zeta, then, first, strict=True)]
+        rows = zip(policies.items(), zeta, gaps, strict=True)
+        return {name: self._estimate(policy, z, gap, horizon, support) for (name, policy), z, gap in rows}
 
     def _shares(self) -> Floats:
         """Probability of each step per member: all sessions for the first, a resample of the sessions for each of the others."""
@@ -199,7 +220,7 @@ class FittedDualDice:
         rows[empty] = 1.0
         return np.asarray(rows / rows.sum(1, keepdims=True), dtype=np.float64)
 
-    def _estimate(self, policy: Policy, zeta: Floats, horizon: int, support: AmplitudeSupport) -> Estimate:
+    def _estimate(self, policy: Policy, zeta: Floats, gap: float, horizon: int, support: AmplitudeSupport) -> Estimate:
         table, settings = self.table, self.buffer.settings
         n, members = table.sessions, len(zeta)
         weighted = np.zeros((members, n, table.rates.shape[1] + 1))
@@ -207,18 +228,18 @@ class FittedDualDice:
         for m in range(members):
             np.add.at(weighted[m], table.session, zeta[m][:, None] * columns)
         length = float(np.sum(settings.gamma ** np.arange(horizon)))
-        lengths = np.array([length, horizon, horizon, horizon, horizon, min(LATE_STEPS, horizon)])
+        lengths = np.append(length, np.full(table.rates.shape[1] - 1, horizon))
 
         def sums(totals: Floats) -> Floats:
             rates = totals[..., :-1] / np.maximum(totals[..., -1:], 1e-300)
-            spread = np.concatenate([rates, rates[..., 1:2]], axis=-1) * lengths
-            return within_reach(spread, settings, horizon, (table.scale.beta_low, table.scale.beta_high))
+            return within_reach(rates * lengths, settings, horizon, (table.scale.beta_low, table.scale.beta_high))
 
         main = sums(weighted.sum(1)).mean(0)
         refits = np.stack([sums(weighted[d % members][pick].sum(0)) for d, pick in enumerate(self.draws)])
         share = zeta.mean(0) / zeta.mean(0).sum()
         details = {
             "mean_ratio": float(zeta.mean()),
+            "flow_gap": gap,
             "effective_steps": float(1 / np.sum(share**2)),
             "member_values": [float(v) for v in sums(weighted.sum(1))[:, 0]],
             "approximations": [
@@ -226,7 +247,11 @@ class FittedDualDice:
                 "r_end from averages under the discounted distribution",
             ],
         }
-        return value_estimate(self, main, refits, policy, horizon, support, details)
+        found = value_estimate(self, main, refits, policy, horizon, support, details)
+        if gap <= LARGEST_GAP:
+            return found
+        flag = Flag("not_converged", gap, LARGEST_GAP, "standard deviations", refuses=True)
+        return replace(found, supported=False, flags=(*found.flags, flag))
 
 
 def build(key: str, seed: int, size: Size) -> DualDice:

@@ -88,6 +88,15 @@ DAYS_UNKNOWN = Flag("days_unknown")
 """How returns differ from day to day cannot be told from these sessions: the intervals leave it out."""
 
 
+def stopped_sessions(stopped: int, counted: float, measured: float) -> Flag:
+    """How much of an estimate hangs on sessions that were stopped for the participant's sake.
+
+    Args:
+        stopped: sessions. counted, measured: r_end where they count as failures, and where they count as measured.
+    """
+    return Flag.of("stopped_sessions", float(stopped), None, "sessions", counted=counted, measured=measured)
+
+
 def distinct(flags: Iterable[Flag]) -> tuple[Flag, ...]:
     """The flags in their order, each once; two that nobody could tell apart when shown are one."""
     seen: dict[tuple[object, ...], Flag] = {}

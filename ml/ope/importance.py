@@ -27,7 +27,7 @@ from ml.ope.support.coverage import FEW_EFFECTIVE, AmplitudeSupport, effective_s
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.returns import step_returns
-from ml.statistics.bootstrap import bca_interval, percentile_interval, resamples
+from ml.statistics.bootstrap import bca_interval, percentile_interval, resampled, resamples
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
@@ -293,6 +293,7 @@ class FittedImportance:
                 "sessions_left_out": len(self.buffer.sessions) - len(self.sessions),
                 "coverage": logged.to_json(),
                 "draws": [float(d) for d in draws[:200]],
+                "resampled": resampled(len(end), config.seed),
             },
         )
 

@@ -26,7 +26,8 @@ class Scale:
         log: True when beta enters as its logarithm: all valid amplitudes are positive and their logarithm is less skewed.
         beta_mean, beta_std: of (log) beta. beta_low, beta_high: range of the raw beta, participant's unit.
         reward_mean, reward_std: of the usable rewards.
-        outcome_mean, outcome_std: of `OUTCOMES`, four each; 0 and 1 where the outcome is not seen.
+        outcome_mean, outcome_std: of `OUTCOMES`, four each; 0 and 1 where the outcome is not seen. The deviation is 0 where
+            all sessions have the same value, which is then the prediction.
         outcome_seen: which of `OUTCOMES` at least `FEWEST_OUTCOMES` sessions have.
     """
 
@@ -65,13 +66,13 @@ class Scale:
 
 
 def outcome_table(buffer: ReplayBuffer) -> Floats:
-    """`OUTCOMES` of every session, shape [n, 4]; NaN where not measured. r_end is NaN for all where C2 = C3 = C4 = 0 makes it 0 for all."""
+    """`OUTCOMES` of every session, shape [n, 4]; NaN where not measured. Where C2 = C3 = C4 = 0 r_end is 0 for all, measured or not."""
     settings = buffer.settings
     weighted = settings.c2 + settings.c3 + settings.c4 > 0
     rows = []
     for s in buffer.sessions:
-        end = s.end_reward(settings) if weighted else 0.0
-        rows.append([np.nan if v is None else float(v) for v in (end, s.qoc.grasp_hz, s.qoc.rating, s.qoc.tremor_percent)])
+        qoc, end = s.counted_qoc, s.end_reward(settings) if weighted else 0.0
+        rows.append([np.nan if v is None else float(v) for v in (end, qoc.grasp_hz, qoc.rating, qoc.tremor_percent)])
     return np.array(rows, dtype=np.float64)
 
 
@@ -95,7 +96,7 @@ def learn_scale(buffer: ReplayBuffer) -> Scale:
         reward_mean=float(rewards.mean()),
         reward_std=_positive(float(rewards.std())),
         outcome_mean=tuple(float(v) for v in mean),
-        outcome_std=tuple(_positive(float(v)) for v in std),
+        outcome_std=tuple(float(v) if v > 1e-12 else 0.0 for v in std),
         outcome_seen=tuple(seen),
     )
 

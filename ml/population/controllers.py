@@ -16,16 +16,25 @@ from ml.population.physiology.brain import STREAM_CONTROLLER
 
 Floats = NDArray[np.float64]
 FixedController = Literal["random", "cdbs", "no_dbs"]
-Controller = Policy | FixedController
+Controller = Policy | FixedController | Floats
+"""A policy, a fixed controller, or amplitudes that a design laid out, [T], the same in all sessions of a call."""
 _FIXED: Final[dict[str, float]] = {"cdbs": 1.0, "no_dbs": 0.0}
+
+
+def is_random(controller: Controller) -> bool:
+    """Whether it explores: by draws of its own, or as a design laid out."""
+    return isinstance(controller, np.ndarray) or (isinstance(controller, str) and controller == "random")
 
 
 def chooser(controller: Controller, counters: NDArray[np.uint64], lower_bound: float) -> Callable[[Floats], Floats]:
     """What to ask for at each step, from the beta windows [N, W]."""
-    if controller == "random":
+    if isinstance(controller, str) and controller == "random":
         if not 0 <= lower_bound < 1:
             raise ValueError(f"the random controller needs a lower bound in [0, 1), not {lower_bound}")
         return lambda states: np.array([lower_bound + (1 - lower_bound) * brain.uniform(row, STREAM_CONTROLLER) for row in counters])
+    if isinstance(controller, np.ndarray):
+        laid_out = iter(controller)
+        return lambda states: np.full(len(states), next(laid_out))
     if isinstance(controller, str):
         if controller not in _FIXED:
             raise ValueError(f"there is no controller {controller!r}; use 'random', 'cdbs', 'no_dbs' or a policy")

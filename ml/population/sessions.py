@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ml.population.controllers import Controller, chooser, delivery
+from ml.population.controllers import Controller, chooser, delivery, is_random
 from ml.population.days import DayEffect, day_effect
 from ml.population.outcomes import GRASP_TEST_STEPS, Outcomes, measure
 from ml.population.participants import PARTICIPANTS, ParticipantModel
@@ -242,7 +242,7 @@ def run_sessions(
 
     Args:
         participant: a model or its code.
-        controller: a policy, `random` (uniform on [lower_bound, 1] anew at each step), `cdbs` or `no_dbs`.
+        controller: a policy, `random` (uniform on [lower_bound, 1] anew at each step), `cdbs`, `no_dbs`, or a design's amplitudes, [T].
         visits, hours, seeds, study_seed: of each session, [N] or one for all; `hours` since the first session of the day (0-6).
         steps: T. lead_steps: L, beta amplitudes before step 0, which is also the window W that a policy sees.
         lead_amplitude: amplitude fraction before the session; 1 because cDBS runs between sessions.
@@ -251,9 +251,14 @@ def run_sessions(
         keep_lfp: keep the LFP (2 kB per step and session).
 
     Raises:
-        ValueError: an unknown participant or controller, no step, or a policy that leaves [0, 1] or answers in another shape.
+        ValueError: an unknown participant or controller, no step, a policy that leaves [0, 1] or answers in another shape, or a design of
+            another length or below `lower_bound`.
     """
     model = _model(participant)
+    if isinstance(controller, np.ndarray) and (
+        controller.shape != (steps,) or not bool(np.all((controller >= lower_bound) & (controller <= 1)))
+    ):
+        raise ValueError(f"a design needs {steps} amplitudes from {lower_bound:g} to 1, not {controller.shape} from {controller.min():g}")
     if steps < 1 or lead_steps < 1:
         raise ValueError(f"a session needs at least one step and one beta amplitude before it, not steps={steps}, lead_steps={lead_steps}")
     seed = np.atleast_1d(np.asarray(seeds)).astype(np.uint64)
@@ -273,7 +278,7 @@ def run_sessions(
         threads=threads,
     )
     choose = chooser(controller, simulation.counters, lower_bound)
-    deliver = delivery(model, resolution_ma, lower_bound if controller == "random" else 0.0)
+    deliver = delivery(model, resolution_ma, lower_bound if is_random(controller) else 0.0)
     beta, amplitude = np.empty((n, total)), np.full((n, total), lead_amplitude)
     hidden = {key: np.empty((n, steps)) for key in ("medication", "activity", "brady", "tremor", "overload")}
     lfp = np.empty((n, total * SAMPLES_PER_PERIOD), dtype=np.float32) if keep_lfp else None
@@ -299,7 +304,7 @@ def run_sessions(
     )
     return SessionBatch(
         participant=model,
-        controller=controller if isinstance(controller, str) else name,
+        controller=controller if isinstance(controller, str) else "random" if is_random(controller) else name,
         visits=np.array(visit),
         hours=np.array(hour),
         seeds=seed,
@@ -307,7 +312,7 @@ def run_sessions(
         beta=np.ascontiguousarray(beta[:, lead_steps:]),
         amplitude=amplitude,
         lead_amplitude=lead_amplitude,
-        lower_bound=lower_bound if controller == "random" else None,
+        lower_bound=lower_bound if is_random(controller) else None,
         lfp=lfp,
         outcomes=outcomes,
         hidden=hidden,

@@ -46,6 +46,11 @@ def resamples(n: int, draws: int, seed: int) -> Indices:
     return np.random.default_rng(seed).integers(0, n, size=(draws, n))
 
 
+def resampled(n: int, seed: int) -> str:
+    """Name of `resamples` of n sessions with a seed: equal names mean equal resamples, as far as both go."""
+    return f"{n} sessions, seed {seed}"
+
+
 def session_bootstrap(
     statistic: Callable[[Indices], float],
     n: int,

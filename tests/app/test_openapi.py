@@ -41,6 +41,7 @@ INTENDED: dict[str, str] = {
         ),
         "API: sweeps call their scores of controllers without learning `baselines` (was `yardsticks`).",
     ),
+    "paths > /readyz": "`GET /readyz` says whether requests can be served (the database answers and has this version's schema).",
     **dict.fromkeys(
         ("components > schemas > Problem", "components > schemas > ProblemOut"),
         "API: the member `mend` of problem documents and of file reports is called `hint`.",
@@ -85,6 +86,16 @@ INTENDED: dict[str, str] = {
             "paths > /api/v1/participants/{code}/margins",
         ),
         "API: margins against cDBS and the levels of verdicts are read and set at `/participants/{code}/margins`.",
+    ),
+    **dict.fromkeys(
+        (
+            "components > schemas > BoundOut",
+            "components > schemas > PlannedDesignOut",
+            "components > schemas > PlannedHoldOut",
+            "components > schemas > PlannedSessionOut > properties > design",
+            "components > schemas > PlannedSessionOut > required",
+        ),
+        "API: settings have `design`, `design_ladder` and `early_visits`, and a planned session has `design`.",
     ),
     "components > schemas > ProposalOut": "API: a proposal has `usable_steps`.",
     "components > schemas > UsableStepsOut": "API: a proposal has `usable_steps`.",

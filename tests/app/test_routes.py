@@ -52,6 +52,7 @@ READABLE = (
     "/api/v1/participants/{code}/analyses",
     "/api/v1/participants/{code}/calibration",
     "/healthz",
+    "/readyz",
 )
 ROLES: dict[tuple[str, str], set[str]] = {
     # method and path: roles that may
@@ -94,7 +95,7 @@ PASSWORD = "a password of the test"
 def routes(app: Any) -> list[tuple[str, str]]:
     """(method, path) of every route of the REST interface, as the service has them, but its own description."""
     found = [(m.lower(), c.path) for c in iter_route_contexts(app.routes) if c.path for m in sorted(getattr(c, "methods", None) or ())]
-    return [(m, p) for m, p in found if m in METHODS and p.startswith(("/api/", "/healthz")) and p != app.openapi_url]
+    return [(m, p) for m, p in found if m in METHODS and p.startswith(("/api/", "/healthz", "/readyz")) and p != app.openapi_url]
 
 
 def token_of(role: str, study: str | None = None) -> str:
@@ -240,7 +241,7 @@ def test_the_contract_has_every_route_others_rely_on(service_app: Any) -> None:
         "/policies/{policy_id}/bundle", "/participants/{code}/jobs", "/jobs/{job_id}", "/jobs/{job_id}/events",
         "/participants/{code}/ranking", "/participants/{code}/analyses", "/visits/{visit_id}/plan",
     }  # fmt: skip
-    assert {f"/api/v1{p}" for p in promised} | {"/healthz"} <= paths
+    assert {f"/api/v1{p}" for p in promised} | {"/healthz", "/readyz"} <= paths
 
 
 def test_the_table_of_roles_has_every_route_and_no_other(service_app: Any) -> None:
@@ -251,7 +252,7 @@ def test_the_table_of_roles_has_every_route_and_no_other(service_app: Any) -> No
 
 def test_without_a_token_no_route_answers(world: World) -> None:
     bare = world.calling(None)
-    answers = {(m, p): world.call(bare, m, p) for m, p in routes(world.app) if p != "/healthz"}
+    answers = {(m, p): world.call(bare, m, p) for m, p in routes(world.app) if p not in {"/healthz", "/readyz"}}
     assert {route: status for route, status in answers.items() if status != 401} == {}
 
 
@@ -276,7 +277,7 @@ def test_a_caller_of_another_study_sees_nothing(world: World) -> None:
         db.add(Site(study_id=study.id, code="other", name="Other site"))
     stranger = world.calling(token_of("admin", "other"))
     assert stranger.get("/api/v1/participants").json()["total"] == 0
-    own = {"/api/v1/participants", "/healthz", "/api/v1/bundle-key"}  # the key that every bundle is verified with is public
+    own = {"/api/v1/participants", "/healthz", "/readyz", "/api/v1/bundle-key"}  # the key that every bundle is verified with is public
     answers = {(m, p): world.call(stranger, m, p) for m, p in routes(world.app) if p not in own}
     assert {route: status for route, status in answers.items() if status != 404} == {}
 

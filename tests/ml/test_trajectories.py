@@ -204,3 +204,15 @@ def test_another_file_is_no_snapshot() -> None:
     pq.write_table(pa.table({"x": [1]}), sink)
     with pytest.raises(ValueError, match="not a betaloop buffer snapshot"):
         from_parquet(sink.getvalue())
+
+
+def test_a_stopped_session_counts_with_the_worst_outcomes_except_under_cdbs_and_stays_stopped_when_stored() -> None:
+    weighted = replace(SETTINGS, c2=10.0, c3=10.0, c4=10.0)
+    tested, clinical = (session(k, controller=name, stopped=True, qoc=Qoc()) for k, name in ((1, "rl"), (2, "cdbs")))
+    assert tested.end_reward(weighted) == 10.0 * 0 + 10.0 * 1 - 10.0 * 1
+    assert clinical.end_reward(weighted) is None
+    assert replace(clinical, qoc=Qoc(2.0, 7, 10.0)).end_reward(weighted) == 89.0
+    stored = to_parquet(ReplayBuffer(SETTINGS, (tested, session(3)), "uV", "table"))
+    assert [s.stopped for s in from_parquet(stored).sessions] == [True, False]
+    plain = to_parquet(ReplayBuffer(SETTINGS, (session(3),), "uV", "table"))
+    assert b'"stopped"' not in plain

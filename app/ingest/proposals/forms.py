@@ -37,6 +37,7 @@ class ProposalForm:
         clocked: whether times are dates and times of day; else minutes and seconds of the recording.
         why: by field, why it is proposed so.
         notes: contradictions that a person should look at.
+        drawn: how the amplitudes of a random session were drawn; empty for other sessions.
         usable: usable steps by channel, the control channel first.
         problem: why the form was refused.
     """
@@ -49,6 +50,7 @@ class ProposalForm:
     clocked: bool
     why: Mapping[str, str]
     notes: list[str]
+    drawn: str
     usable: list[UsableSteps]
     reason: str = ""
     problem: dict[str, Any] | None = None

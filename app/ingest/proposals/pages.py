@@ -28,11 +28,12 @@ from app.study import service as study_service
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant, StudySession
+from app.study.sessions import designs
 from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions
 from app.study.sessions.data import session_data
 from app.study.sessions.usable_steps import usable_steps
-from app.study.wording import sentences
+from app.study.wording import drawn_words, sentences
 
 router = APIRouter()
 
@@ -198,10 +199,19 @@ def _form(
         is_clocked(session),
         wording.reasons(proposal.evidence),
         sentences(contradictions(db, session, proposal.visit_open)),
+        _drawn(db, session, caller),
         usable_steps(db, session),
         sent.get(f"reason-{session.id}", "") if error else "",
         error.problem(request.url.path) if error else None,
     )
+
+
+def _drawn(db: Session, session: StudySession, caller: Caller) -> str:
+    try:
+        found = designs.of_session(db, session, session_data(db, session).table, caller)
+    except Invalid:
+        return ""  # the proposal's notes say why its steps cannot be read
+    return drawn_words(found) if found else ""
 
 
 def _chart(db: Session, session: StudySession) -> Any:

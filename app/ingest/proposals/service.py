@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from itertools import pairwise
 
+from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
@@ -61,6 +62,9 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     if (joined := _join_earlier(db, participant, group, stated)) is not None:
         return joined
     placement = sessions.place(db, participant, group, stated, alone)
+    if stated.counts and sessions.counted_minutes(db, placement):
+        # what differs from a session that counts is for a person to look at
+        stated = replace(stated, confirm=False)
     day = local_day(placement.control, placement.started_at) if placement.started_at else None
     guess = guess_visit(study.visits(db, participant.id, 1000, 0)[0], day, stated.visit)
     session = add_session(db, guess.visit, placement, stated.controller, stated.policy_id, stated.hemisphere, stated.counts)
@@ -155,10 +159,8 @@ def _joined(db: Session, session: StudySession, stated: StatedSession) -> tuple[
         side = f" ({control_recording(session).hemisphere} side)" if control_recording(session).hemisphere else ""
         said = f"Recorded at the same time as session {session.id}, which counts already: added to it beside its controlled recording"
         return f"{said}{side}.", [*differs, *sentences(contradictions(db, session))]
+    renew(db, session)
     proposal = repository.proposals(db, [session.id])[session.id]
-    proposal.version += 1
-    _renew_guess(db, session, proposal)
-    db.flush()
     said = f"Recorded at the same time as proposed session {session.id}, which counts nowhere until it is confirmed"
     return f"{said}: it belongs to that session.", [*differs, *sentences(contradictions(db, session, proposal.visit_open))]
 
@@ -177,6 +179,14 @@ def _renew_guess(db: Session, session: StudySession, proposal: SessionProposal, 
     if not keep and controller != (arm.controller if arm else None):
         kept = arm.policy_id if arm and controller in POLICY_CONTROLLERS else None
         blinding.assign(session, controller, kept)
+
+
+def renew(db: Session, session: StudySession) -> None:
+    """After the recordings of a proposal became other ones: its guess is made anew, and forms that are open do not overwrite it."""
+    proposal = repository.proposals(db, [session.id])[session.id]
+    proposal.version += 1
+    _renew_guess(db, session, proposal)
+    db.flush()
 
 
 def change(db: Session, session: StudySession, wanted: ProposalChange, caller: Caller) -> SessionProposal:
@@ -233,7 +243,16 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
         raise Invalid(f"Session {session.id} cannot be confirmed yet: its {' and '.join(missing)} is open ({why}).", "State it.")
     sessions.refuse_overlap(db, session)
     session.status = "confirmed"
-    db.flush()
+    try:
+        db.flush()
+    except IntegrityError as error:
+        if "counted_time_once" not in str(error.orig):
+            raise
+        db.rollback()
+        raise Conflict(
+            f"Somebody else confirmed a session with the same minutes of this device as session {session.id} at the same time.",
+            "Load the page again: it names the other session.",
+        ) from error
     kept_as_fractions = sessions.fix_milliamperes(db, session)
     conditions.record(db, session, caller.label)
     return [*kept_as_fractions, *sentences(contradictions(db, session)), *outcomes_intake.derive(db, session)]

@@ -153,7 +153,8 @@ class Receiver:
         return FileOutcome(name, row, [report], duplicate=True, same_bytes=True, recordings=self._recordings(row))
 
     def _recordings(self, row: UploadFile) -> list[Recording]:
-        return [*repository.recordings_of_file(self.db, row.id), *repository.recordings_by_id(self.db, known_recordings(row))]
+        mine = [*repository.recordings_of_file(self.db, row.id), *repository.recordings_by_id(self.db, known_recordings(row))]
+        return repository.fullest(self.db, mine)
 
     def resume(self, row: UploadFile) -> FileOutcome:
         """Go on with a file of an upload that was interrupted: decode it where that is still to do, else as it was left."""
@@ -252,6 +253,8 @@ class Receiver:
             return self._failed(name, row, content, ours)
         reports = list(decoded.reports)
         add_redaction(reports[0], content.redaction, tremor)
+        reports[0].understood.extend(stored.understood)
+        reports[0].flagged.extend(stored.flagged)
         row.status = "decoded"
         store_reports(row, reports, [r.id for r in stored.known], content.redaction.unreadable)
         self.db.commit()

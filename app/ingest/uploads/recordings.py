@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from app.ingest import repository
+from app.ingest import copies, repository, wording
 from app.ingest.models import UploadFile
 from app.platform.web.schemas import sensible_time
 from app.settings import get_settings
@@ -23,27 +23,45 @@ from ml.formats.redaction_record import pseudonym
 
 @dataclass
 class Stored:
-    """The recordings of a file: those that are new, and those that had come before in another file."""
+    """The recordings of a file: those that are new, and those that had come before in another file; sentences on copies of either."""
 
     fresh: list[Recording] = field(default_factory=list)
     known: list[Recording] = field(default_factory=list)
+    understood: list[str] = field(default_factory=list)
+    flagged: list[str] = field(default_factory=list)
 
 
 def store(db: Session, participant: Participant, file: UploadFile, decoded: Sequence[RecordingLog]) -> Stored:
-    """Store what a file gave. A recording that is known by its content, from whatever file, is not stored again."""
+    """Store what a file gave. A recording that is known by its content, or whose minutes are stored more fully, is not stored again."""
     stored = Stored()
     for one in decoded:
         known = study.recording_by_fingerprint(db, participant.id, one.fingerprint)
         if known is not None:
-            stored.known.append(known)
-        else:
-            stored.fresh.append(add(db, participant, file, one))
+            stored.known += repository.fullest(db, [known])
+            continue
+        with db.no_autoflush:
+            row = _row(db, participant, file, one)
+            verdict = copies.judge(db, row, one.traces)
+        if verdict.copy_of is not None:
+            stored.known.append(verdict.copy_of)
+            stored.understood.append(wording.no_more_than(verdict.copy_of))
+            continue
+        fresh = _add(db, row, one)
+        stored.fresh.append(fresh)
+        for old in verdict.fuller_than:
+            stored.flagged.append(wording.fuller_than(old, copies.supersede(db, old, fresh, file.upload.created_by)))
+        stored.flagged += [wording.beside(fresh, other) for other in verdict.beside]
     return stored
 
 
 def add(db: Session, participant: Participant, file: UploadFile, decoded: RecordingLog) -> Recording:
     """A new recording with its traces."""
-    recording = Recording(
+    return _add(db, _row(db, participant, file, decoded), decoded)
+
+
+def _row(db: Session, participant: Participant, file: UploadFile, decoded: RecordingLog) -> Recording:
+    """A recording that is not in the database yet."""
+    return Recording(
         participant_id=participant.id,
         device_id=_device(db, participant, decoded).id,
         upload_file_id=file.id,
@@ -54,6 +72,9 @@ def add(db: Session, participant: Participant, file: UploadFile, decoded: Record
         duration_s=decoded.duration_s,
         details=details(decoded),
     )
+
+
+def _add(db: Session, recording: Recording, decoded: RecordingLog) -> Recording:
     db.add(recording)
     db.flush()
     db.add_all(trace_row(recording.id, t) for t in decoded.traces)

@@ -30,6 +30,7 @@ from app.study import service as study
 from app.study.models import Hemisphere, Participant, SettingsVersion, StudySession
 from app.study.sessions.data import session_data
 from app.study.sessions.programming import Program, differences, stored
+from app.study.sessions.repeated import counts_elsewhere
 from app.study.threshold import mdp_settings, suggest_xi_beta
 from app.study.traces import StepTable
 from ml.mdp import MdpSettings
@@ -37,6 +38,7 @@ from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
 
 PARQUET = "application/vnd.apache.parquet"
 PINS_VERSION = 2
+REPEATED = "its minutes of this device stand in another session that counts: exclude one of the two"
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,8 @@ def collect(db: Session, participant: Participant) -> Collection:
     suggestion = suggest_xi_beta(db, participant, SYSTEM) if version.xi_beta is None else None
     settings = mdp_settings(version, suggestion)
     sessions = [s for s in study_repository.sessions_of_participant(db, participant.id) if s.status == "confirmed"]
-    read = [_read(db, session, version) for session in sessions]
+    twice = {s.id for s in sessions if s.id in study_repository.repeated_sessions(db, participant.id) and counts_elsewhere(db, s)}
+    read = [_read(db, session, version) if session.id not in twice else Member(session, None, None, REPEATED) for session in sessions]
     unit, source = _signal(version, read)
     barrier = gate(db, participant, sessions)
     admitted = _of_one_programming([_admit(m, unit, source) for m in read], version)
@@ -285,5 +288,5 @@ def _digest(s: SessionTrajectory) -> str:
     digest = hashlib.sha256()
     for values in (s.lead_beta, s.beta, s.amplitude):
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes() + b"|")
-    digest.update(repr((s.random_lower_bound, s.lead_amplitude)).encode())
+    digest.update(repr((s.random_lower_bound, s.lead_amplitude, *s.holds)).encode())
     return digest.hexdigest()

@@ -7,6 +7,7 @@ import numpy as np
 from app.study.blinding import Arm
 from app.study.models import Controller, SettingsVersion, StudySession
 from app.study.sessions.data import qoc_of
+from app.study.sessions.designs import drawn
 from app.study.traces import StepTable
 from ml.trajectories import SessionTrajectory
 
@@ -26,9 +27,7 @@ def trajectory_of(session: StudySession, table: StepTable, arm: Arm, version: Se
         return reason
     window, conditions = version.window, session.conditions
     lead_ma = conditions.lead_amplitude_ma if conditions else None
-    # B alone is the density of a new uniform draw every step: the paper's design, which a random session without a stated one is taken for
-    drawn_each_step = conditions is not None and conditions.design in (None, "paper")
-    random_bound = conditions.lower_bound if conditions is not None and drawn_each_step else None
+    by_design = drawn(conditions, table) if arm.controller is Controller.RANDOM and conditions is not None else None
     return SessionTrajectory(
         session_id=session.id,
         visit=session.visit.number,
@@ -38,7 +37,8 @@ def trajectory_of(session: StudySession, table: StepTable, arm: Arm, version: Se
         beta=table.beta[window:],
         amplitude=table.fraction[window:],
         qoc=qoc_of(session),
-        random_lower_bound=random_bound if arm.controller is Controller.RANDOM else None,
+        random_lower_bound=conditions.lower_bound if by_design and conditions and by_design.density_told else None,
+        holds=by_design.holds if by_design else (),
         lead_amplitude=lead_ma / table.cdbs_ma if lead_ma is not None and table.cdbs_ma else None,
         most_imputed=min(version.most_imputed, window - 1),
     )

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Response
 from app.accounts.deps import CurrentCaller
 from app.evaluation.shown import estimate_out
 from app.planning.plans import service, sheet
-from app.planning.plans.schemas import Approval, PlanEstimateOut, PlanEvaluationOut, PlanIn, PlannedSessionOut, PlanOut
+from app.planning.plans.schemas import Approval, PlanEstimateOut, PlanEvaluationOut, PlanIn, PlannedDesignOut, PlannedSessionOut, PlanOut
 from app.planning.plans.service import PlanLine, PlanView
 from app.platform.database import Db, now
 from app.platform.web.schemas import problems
@@ -99,4 +99,5 @@ def _session_out(line: PlanLine) -> PlannedSessionOut:
         washout_minutes=line.item.washout_minutes,
         estimate=estimate_out(line.estimate, PlanEstimateOut) if line.estimate else None,
         predicted_energy=line.predicted_energy,
+        design=PlannedDesignOut.model_validate(line.design.as_json()) if line.design else None,
     )

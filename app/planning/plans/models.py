@@ -6,6 +6,7 @@ from datetime import datetime
 from typing import Any
 
 from sqlalchemy import CheckConstraint, ForeignKey, Index, String, Text, UniqueConstraint, func
+from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
@@ -54,3 +55,5 @@ class PlanItem(Base):
     minutes: Mapped[float]
     washout_minutes: Mapped[float]
     note: Mapped[str] = mapped_column(Text, server_default="")
+    design: Mapped[dict[str, Any] | None] = mapped_column(JSONB(none_as_null=True))
+    """What a random session shall try, `app.planning.plans.designs.Planned.as_json`; null for other controllers and in plans of before."""

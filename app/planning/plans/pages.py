@@ -18,6 +18,7 @@ from app.evaluation.ranking.service import current_ranking
 from app.evaluation.schemas import RankingOut
 from app.evaluation.wording import method_name, sentence
 from app.learning import repository as learning
+from app.planning import wording
 from app.planning.plans import repository, service
 from app.planning.plans.schedule import most_policies, total_minutes
 from app.planning.plans.schemas import Id, PlanIn, PlanOptions
@@ -150,6 +151,11 @@ def _page(
         view=view,
         ranking=ranking,
         in_words=sentence,
+        design_name=wording.design_name,
+        design_words=wording.design_words,
+        bound_words=wording.bound_words,
+        schedule_words=wording.schedule_words,
+        leave_at_once=wording.LEAVE_AT_ONCE,
         method=method_name(ranking.default_method) if ranking else "",
         plan_method=method_name(view.evaluation.default_method) if view and view.evaluation else "",
         choices=choices,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import date
 
-from sqlalchemy import exists, func, or_, select
+from sqlalchemy import distinct, exists, func, or_, select
 from sqlalchemy.orm import Session, selectinload
 
 from app.evaluation.models import Evaluation
-from app.planning.plans.models import Plan
+from app.planning.plans.models import Plan, PlanItem
 from app.study.models import StudySession, Visit
 from app.study.repository import CONFIRMED, count
 
@@ -31,6 +31,18 @@ def plans(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Se
 def lock_visit(db: Session, visit_id: int) -> None:
     """Let one transaction at a time change the plan of a visit."""
     db.execute(select(Visit.id).where(Visit.id == visit_id).with_for_update())
+
+
+def earlier_designed_visits(db: Session, visit: Visit) -> int:
+    """Visits of the participant before this one whose live plan has random sessions of held draws."""
+    query = (
+        select(func.count(distinct(Plan.visit_id)))
+        .join(PlanItem, PlanItem.plan_id == Plan.id)
+        .join(Visit, Visit.id == Plan.visit_id)
+        .where(Visit.participant_id == visit.participant_id, Visit.number < visit.number, Plan.status != "superseded")
+        .where(PlanItem.design["design"].astext.in_(("stratified", "ladder")))
+    )
+    return db.scalar(query) or 0
 
 
 def session_count(db: Session, visit_id: int) -> int:

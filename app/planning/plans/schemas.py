@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -51,6 +51,38 @@ class PlanEstimateOut(EstimateSummary):
     method: str
 
 
+class PlannedHoldOut(Model):
+    """One amplitude that is held."""
+
+    start: int = Field(description="First step.")
+    steps: int
+    amplitude: float = Field(description="Fraction of the cDBS amplitude.")
+    log_density: float | None = Field(description="Given the session's level and the bound in force; null where nothing is drawn.")
+
+
+class BoundOut(Model):
+    """Amplitudes of one side, mA."""
+
+    side: str | None
+    cdbs_ma: float
+    lowest_ma: float = Field(description="No step is below it.")
+    low_ma: float = Field(description="Below it the session stays for five minutes at most, at its end.")
+
+
+class PlannedDesignOut(Model):
+    """What a random session shall try."""
+
+    design: Literal["paper", "stratified", "ladder"]
+    level: float | None = Field(description="Of the session, fraction of the cDBS amplitude; null where it has none.")
+    seed: int | None
+    lower_bound: float
+    period_s: float
+    holds: list[PlannedHoldOut] = Field(description="In order; empty in the paper's design, where the device draws anew every step.")
+    bounds: list[BoundOut] = Field(
+        description="As they stood when the plan was approved, in a draft as of today; empty where the cDBS amplitude is not known."
+    )
+
+
 class PlannedSessionOut(Model):
     """One session of a plan."""
 
@@ -63,6 +95,7 @@ class PlannedSessionOut(Model):
     washout_minutes: float
     estimate: PlanEstimateOut | None
     predicted_energy: float | None = Field(description="Mean squared amplitude fraction; cDBS = 1.")
+    design: PlannedDesignOut | None = Field(description="Of a random session: what it shall try; null in plans of before.")
 
 
 class PlanEvaluationOut(Model):

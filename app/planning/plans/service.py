@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import date
 
 from sqlalchemy.orm import Session
@@ -19,6 +19,7 @@ from app.evaluation.ranking.service import current_ranking, evaluation_notes
 from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning.plans import repository
+from app.planning.plans.designs import Planned, bounds_of, planned_sessions
 from app.planning.plans.models import Plan, PlanItem
 from app.planning.plans.schedule import Candidate, Rules, schedule
 from app.planning.plans.schemas import PlanIn, PlanOptions
@@ -40,6 +41,7 @@ class PlanLine:
         start_minute: from the first session's start.
         estimate: of the pinned evaluation's method, as it was; None for what was not ranked.
         predicted_energy: mean squared amplitude fraction; 1 for cDBS and 0 for no-DBS by definition, else as the estimate predicts.
+        design: what a random session shall try, in a draft with the bounds of today; None for other sessions.
     """
 
     item: PlanItem
@@ -47,6 +49,8 @@ class PlanLine:
     policy: Policy | None
     estimate: Estimate | None
     predicted_energy: float | None
+
+    design: Planned | None
 
 
 @dataclass(frozen=True)
@@ -103,8 +107,17 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
         note=draft.note,
         created_by=caller.label,
     )
+    to_try = iter(_random_sessions(db, visit, rules))
     plan.items = [
-        PlanItem(position=i, controller=s.controller, policy_id=s.policy_id, minutes=s.minutes, washout_minutes=s.washout_minutes, note="")
+        PlanItem(
+            position=i,
+            controller=s.controller,
+            policy_id=s.policy_id,
+            minutes=s.minutes,
+            washout_minutes=s.washout_minutes,
+            note="",
+            design=next(to_try).as_json() if s.controller is Controller.RANDOM else None,
+        )
         for i, s in enumerate(day, start=1)
     ]
     db.add(plan)
@@ -121,6 +134,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, plan_id: int | None 
 
     Raises:
         NotFound: no plan. Conflict: approved already, replaced meanwhile, or with a policy that was retired since it was drafted.
+        Invalid: random sessions of held draws, and no cDBS amplitude by which their lower bound is one in milliamperes.
     """
     study.require(caller, can.APPROVE_PLAN, visit.participant)
     repository.lock_visit(db, visit.id)
@@ -136,6 +150,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, plan_id: int | None 
                 f"Policy '{line.policy.name}' was retired after this plan was drafted: {line.policy.retired_reason}.",
                 "Draft the visit anew.",
             )
+    _sign_designs(visit, plan)
     plan.status, plan.approved_at, plan.approved_by = "approved", now(), caller.label
     db.flush()
     return view
@@ -243,10 +258,38 @@ def _view(db: Session, plan: Plan, visit: Visit, caller: Caller) -> PlanView:
     for item in plan.items:
         estimate = estimates.get(item.policy_id) if item.policy_id else None
         policy = policies.get(item.policy_id) if item.policy_id else None
-        lines.append(PlanLine(item, start, policy, estimate, _energy(item, estimate)))
+        lines.append(PlanLine(item, start, policy, estimate, _energy(item, estimate), _design(visit, item)))
         start += item.minutes + item.washout_minutes
     stale = _stale_reasons(db, visit.participant, evaluation, caller)
     return PlanView(plan, visit, lines, evaluation, stale, _warnings(db, visit, plan, lines, evaluation, stale))
+
+
+def _random_sessions(db: Session, visit: Visit, rules: Rules) -> list[Planned]:
+    """What the visit's random sessions shall try, by the participant's settings of today."""
+    participant = visit.participant
+    earlier = repository.earlier_designed_visits(db, visit)
+    return planned_sessions(participant.current_settings, participant.code, earlier, rules.random_sessions, rules.session_minutes)
+
+
+def _design(visit: Visit, item: PlanItem) -> Planned | None:
+    if item.design is None:
+        return None
+    design = Planned.from_json(item.design)
+    if design.bounds or not design.holds:
+        return design
+    try:
+        return replace(design, bounds=bounds_of(visit, visit.participant.current_settings, design.lower_bound))
+    except Invalid:
+        return design  # a warning of the plan says what is missing, and approving it is refused
+
+
+def _sign_designs(visit: Visit, plan: Plan) -> None:
+    """Fix the bounds of held draws in milliamperes."""
+    for item in plan.items:
+        if item.design is not None and item.design["holds"]:
+            design = Planned.from_json(item.design)
+            bounds = bounds_of(visit, visit.participant.current_settings, design.lower_bound)
+            item.design = replace(design, bounds=bounds).as_json()
 
 
 def _energy(item: PlanItem, estimate: Estimate | None) -> float | None:
@@ -286,6 +329,8 @@ def _warnings(
             warnings.append(f"Policy '{line.policy.name}': {flags}.")
         if line.policy.retired_reason:
             warnings.append(f"Policy '{line.policy.name}' was retired: {line.policy.retired_reason}.")
+    if plan.status == "draft" and any(line.design and line.design.holds and not line.design.bounds for line in lines):
+        warnings.append("The cDBS amplitude is not known: the plan cannot be approved before its lower bound is one in milliamperes.")
     held = repository.session_count(db, visit.id)
     if held:
         warnings.append(f"The visit already has {held} {'session' if held == 1 else 'sessions'}.")

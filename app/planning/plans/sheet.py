@@ -12,6 +12,7 @@ from fpdf.enums import XPos, YPos
 
 from app.evaluation.wording import method_name
 from app.learning.models import Policy
+from app.planning import wording
 from app.planning.plans.latin1_text import latin
 from app.planning.plans.service import PlanLine, PlanView
 from app.study.blinding import CONTROLLER_NAMES
@@ -110,6 +111,7 @@ def render(view: PlanView, printed_by: str, printed_at: datetime) -> bytes:
     if view.plan.note:
         _paragraph(pdf, "Note", view.plan.note)
     _table(pdf, view)
+    _designs(pdf, view)
     _reading(pdf, view)
     _closing(pdf, view)
     return bytes(pdf.output())
@@ -176,6 +178,28 @@ def _table(pdf: _Sheet, view: PlanView) -> None:
             for _ in _COLUMNS[_FIRST_BLANK:]:
                 row.cell("", style=FontFace(fill_color=(255, 255, 255)))
     pdf.ln(2)
+
+
+def _designs(pdf: _Sheet, view: PlanView) -> None:
+    """What each random session tries and never does: it is signed with the plan."""
+    for line in view.lines:
+        if line.design is None:
+            continue
+        text = f"Session {line.item.position}: {wording.design_words(line.design)}"
+        pdf.set_text_color(*_INK)
+        if not line.design.holds:
+            pdf.set_font("Helvetica", "", 8)
+            pdf.multi_cell(_WIDTH, 3.8, latin(f"{text}."), align="L", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
+            continue
+        pdf.set_font("Helvetica", "B", 8)
+        text = f"{text}, seed {line.design.seed}; {wording.bound_words(line.design, line.design.bounds)}."
+        pdf.multi_cell(_WIDTH, 3.8, latin(text), align="L", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
+        pdf.set_font("Helvetica", "", 8)
+        unit = "mA" if line.design.bounds else "fraction of cDBS"
+        words = f"min:s and {unit}:  {wording.schedule_words(line.design, line.design.bounds)}"
+        pdf.multi_cell(_WIDTH, 3.8, latin(words), align="L", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
+        pdf.ln(1)
+    pdf.ln(1)
 
 
 def _cells(line: PlanLine) -> list[str]:

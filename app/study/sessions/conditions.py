@@ -13,9 +13,9 @@ from app.accounts.permissions import SYSTEM, Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import blinding, repository, service
-from app.study.models import Recording, SettingsVersion, StudySession
+from app.study.models import Controller, Recording, SettingsVersion, StudySession
 from app.study.schemas import ConditionsChange, ConditionsFields
-from app.study.sessions import programming
+from app.study.sessions import designs, programming
 from app.study.sessions.models import SessionConditions
 from app.study.traces import AMPLITUDE_STREAM, StepTable, step_table
 
@@ -38,17 +38,15 @@ def record(db: Session, session: StudySession, by: str, stated: ConditionsChange
         return session.conditions
     settings, in_force = settings_of(session)
     values: dict[str, Any] = {name: getattr(settings, name) for name in OF_SETTINGS}
-    values |= dict(zip(("min_ma", "max_ma"), _limits(db, session) or (None, None), strict=True))
-    values |= {"seed": None, "design": None, "design_parameters": {}}
-    values["programming"] = [p.as_json() for p in programming.of_session(session)]
-    try:
-        table = step_table(db, session, session.visit.participant.current_settings)
-        values |= {"lead_amplitude_ma": lead_amplitude_ma(table), "cdbs_amplitude_ma": table.cdbs_ma}
-    except Invalid:
-        # its steps cannot be read, for which its page and every buffer give the reason
-        values |= {"lead_amplitude_ma": None, "cdbs_amplitude_ma": None}
+    table = _steps(db, session)
+    values |= {"seed": None, "design": None, "design_parameters": {}} | _of_recordings(db, session, table)
+    of_plan = False
+    arm = blinding.stated_arm(session, SYSTEM)
+    if table is not None and arm is not None and arm.controller is Controller.RANDOM:
+        found = designs.planned(db, session, table, session.visit.participant.current_settings.period_s)
+        values, of_plan = values | (found or {}), found is not None
     given = _given(stated) if stated is not None else {}
-    told = bool(given.keys() & set(OF_SETTINGS))
+    told = of_plan or bool(given.keys() & set(OF_SETTINGS))
     origin = "stated" if told else "settings" if in_force else "assumed"
     return _add(db, session, values | given, origin, by, stated.reason if stated else None)
 
@@ -78,6 +76,32 @@ def change(db: Session, session: StudySession, wanted: ConditionsChange, caller:
     set_reason(db, wanted.reason)
     origin = "stated" if given.keys() & set(OF_SETTINGS) else known.origin
     return _add(db, session, merged, origin, caller.label, wanted.reason)
+
+
+def renew(db: Session, session: StudySession, by: str, reason: str) -> None:
+    """After the recordings of a session became other ones: what they tell of its conditions is taken from them; all else stays."""
+    known = record(db, session, by)
+    present = {name: getattr(known, name) for name in ConditionsFields.model_fields}
+    told = {name: value for name, value in _of_recordings(db, session, _steps(db, session)).items() if value not in (None, [])}
+    if present | told != present:
+        _add(db, session, present | told, known.origin, by, reason)
+
+
+def _steps(db: Session, session: StudySession) -> StepTable | None:
+    """The session's steps; None where they cannot be read, for which its page and every buffer give the reason."""
+    try:
+        return step_table(db, session, session.visit.participant.current_settings)
+    except Invalid:
+        return None
+
+
+def _of_recordings(db: Session, session: StudySession, table: StepTable | None) -> dict[str, Any]:
+    """What recordings, visit and bundles tell of a session's conditions."""
+    values: dict[str, Any] = dict(zip(("min_ma", "max_ma"), _limits(db, session) or (None, None), strict=True))
+    values["programming"] = [p.as_json() for p in programming.of_session(session)]
+    values["lead_amplitude_ma"] = lead_amplitude_ma(table) if table is not None else None
+    values["cdbs_amplitude_ma"] = table.cdbs_ma if table is not None else None
+    return values
 
 
 def settings_of(session: StudySession) -> tuple[SettingsVersion, bool]:

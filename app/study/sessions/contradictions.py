@@ -15,6 +15,7 @@ from app.accounts.permissions import SYSTEM
 from app.platform.errors import Invalid
 from app.study import blinding
 from app.study.models import Controller, Recording, StudySession
+from app.study.sessions import repeated
 from app.study.sessions.stimulation import Delivered, contradicts, delivered
 from app.study.traces import step_table
 
@@ -37,6 +38,8 @@ class Kind(StrEnum):
     SILENT_CONTROL = "silent_control"
     """`side`: name of the controlled side; `others`: names of those that had stimulation."""
     NO_POLICY = "no_policy"
+    REPEATED = "repeated"
+    """`session`, `recording`: of the other one; `seconds`: that both hold; `counts`: whether the other one counts; `own`: recording."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ def contradictions(db: Session, session: StudySession, visit_open: bool = False,
         visit_open: nobody has said the visit yet, so that its date contradicts nothing.
         steps_shown: the reader sees elsewhere why steps cannot be read, and which lie above the cDBS amplitude.
     """
-    found = [*_of_day(session, visit_open), *_of_start(session), *_of_side(session)]
+    found = [*_of_minutes(db, session), *_of_day(session, visit_open), *_of_start(session), *_of_side(session)]
     try:
         table = step_table(db, session, session.visit.participant.current_settings)
         sides = delivered(db, session)
@@ -88,6 +91,12 @@ def local_day(recording: Recording, moment: datetime) -> date:
 def control_recording(session: StudySession) -> Recording:
     """The recording that the controller of a session saw."""
     return next(s for s in session.segments if s.is_control).recording
+
+
+def _of_minutes(db: Session, session: StudySession) -> Iterator[Contradiction]:
+    for one in repeated.others(db, session):
+        facts = {"session": one.session_id, "recording": one.recording_id, "seconds": one.seconds, "counts": one.counts}
+        yield Contradiction(Kind.REPEATED, facts | {"own": control_recording(session).id})
 
 
 def _of_day(session: StudySession, visit_open: bool) -> Iterator[Contradiction]:

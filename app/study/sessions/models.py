@@ -6,9 +6,31 @@ from datetime import datetime
 from typing import Any
 
 from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, String, Text, UniqueConstraint, func
+from sqlalchemy.dialects.postgresql import INT4RANGE, TSTZRANGE, ExcludeConstraint, Range
 from sqlalchemy.orm import Mapped, mapped_column
 
 from app.platform.database import Base
+
+
+class CountedTime(Base):
+    """Which minutes of which device and side a confirmed session counts on; kept by triggers, so that none can count twice.
+
+    `device_side` is the range [4 device, 4 device + 4) where no side is known, else one number of it, so that a recording of no side
+    meets those of both; ranges need no extension of PostgreSQL. `span` leaves a second out at both ends: clocks are not exact.
+    """
+
+    __tablename__ = "counted_time"
+    __table_args__ = (
+        ExcludeConstraint(
+            ("device_side", "&&"), ("span", "&&"), name="counted_time_once", using="gist", deferrable=True, initially="IMMEDIATE"
+        ),
+    )
+
+    session_id: Mapped[int] = mapped_column(ForeignKey("session.id", ondelete="CASCADE"), primary_key=True)
+    recording_id: Mapped[int] = mapped_column(ForeignKey("recording.id"), primary_key=True)
+    start_s: Mapped[float] = mapped_column(primary_key=True)
+    device_side: Mapped[Range[int]] = mapped_column(INT4RANGE)
+    span: Mapped[Range[datetime]] = mapped_column(TSTZRANGE)
 
 
 class SessionConditions(Base):

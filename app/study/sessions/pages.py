@@ -23,13 +23,13 @@ from app.study.deps import CurrentSession
 from app.study.form_changes import Shown, own_changes
 from app.study.models import QocRevision, Recording, StudySession
 from app.study.schemas import ConditionsChange, DerivedChoice, QocIn, SessionChange
-from app.study.sessions import conditions
+from app.study.sessions import conditions, designs
 from app.study.sessions import view as session_view
 from app.study.sessions.charts import operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.data import SessionData, session_data
 from app.study.traces import NO_CONTROL, session_offset_s
-from app.study.wording import sentences
+from app.study.wording import drawn_words, sentences
 from ml.energy import relative_energy
 
 router = APIRouter()
@@ -276,6 +276,7 @@ def _page(
         qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
         correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},
         seen=seen,
+        drawn=_drawn(db, session, data, caller),
         ran_under=dict(_conditions_revisions(session)[-1].fields)
         | {"conditions_reason": ""}
         | {k: v for k, v in (typed or {}).items() if k in _CONDITIONS_LABELS},
@@ -283,6 +284,12 @@ def _page(
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)
+
+
+def _drawn(db: Session, session: StudySession, data: SessionData | None, caller: Caller) -> str:
+    """How a random session's amplitudes were drawn, in words; empty for other sessions and where its steps cannot be read."""
+    found = designs.of_session(db, session, data.table, caller) if data else None
+    return drawn_words(found) if found else ""
 
 
 def _control_events(session: StudySession, recordings: list[Recording]) -> tuple[list[dict[str, Any]], float]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from app.platform.web.charts import Cell, Chart, axis, figure
 from app.study.models import Recording, Trace
+from app.study.sessions.recording_facts import clock_fit
 from app.study.traces import unpack
 
 _DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
@@ -98,6 +99,51 @@ def spectrum_charts(recording: Recording, low_hz: float, high_hz: float) -> list
             )
         )
     return charts
+
+
+def clock_chart(recording: Recording) -> Chart | None:
+    """What is left of PacketGenTime over the implant's ticks, and where a clock was set; None where nothing is known of it."""
+    fit = clock_fit(recording)
+    if fit is None or not fit.residual_ms:
+        return None
+    minutes = np.array(fit.residual_t_s) / 60
+    line = {
+        "type": "scatter", "mode": "markers", "name": "PacketGenTime", "x": minutes, "y": np.array(fit.residual_ms),
+        "marker": {"size": 3.5, "color": "token:cdbs"}, "hovertemplate": "%{x:.2f} min<br>%{y:.0f} ms<extra></extra>",
+    }  # fmt: skip
+    steps = [("PC", t, by) for t, by in fit.pc_steps] + [("implant", t, by) for t, by in fit.implant_steps]
+    shapes = [
+        {
+            "type": "line", "xref": "x", "x0": t / 60, "x1": t / 60, "yref": "paper", "y0": 0, "y1": 1,
+            "line": {"width": 1.5, "dash": "dot", "color": "token:warn"},
+        }
+        for _, t, _ in steps
+    ]  # fmt: skip
+    labels = [
+        {
+            "text": f"{whose} clock set by {by:+.1f} s", "xref": "x", "x": t / 60, "yref": "paper", "y": 1, "yanchor": "bottom",
+            "showarrow": False, "font": {"size": 12, "color": "token:muted"},
+        }
+        for whose, t, by in steps
+    ]  # fmt: skip
+    said = ["ms · extremes per piece of the recording; times are those of the implant's ticks"]
+    if fit.sd_ms is not None and fit.beyond_50_ms is not None:
+        said.append(f"SD {fit.sd_ms:.0f} ms, {100 * fit.beyond_50_ms:.1f} % of packets beyond 50 ms")
+    said.append("too short to tell the drift" if fit.drift_ppm is None else f"drift {fit.drift_ppm:+.0f} ppm")
+    layout = {
+        "xaxis": axis("Time in recording", "min"), "yaxis": axis("Residual", "ms"), "shapes": shapes, "annotations": labels,
+        "showlegend": False, "margin": {"l": 62, "r": 20, "t": 30 if steps else 12, "b": 44},
+    }  # fmt: skip
+    rows: list[list[Cell]] = [[t, ms] for t, ms in zip(fit.residual_t_s, fit.residual_ms, strict=True)]
+    return Chart(
+        f"clock-{recording.id}",
+        "Clock of the computer against the implant's",
+        " · ".join(said),
+        figure([line], **layout),
+        ("Time in recording (s)", "Residual (ms)"),
+        rows,
+        height=200,
+    )
 
 
 def _windows(rows: Sequence[Sequence[Cell]]) -> str:

@@ -23,7 +23,12 @@ _STORED_SENTENCES = {
     "PacketGenTime steps back": Rejected.STEPS_BACK,
 }
 """Version 0.1.0 counted rejected packets under sentences; these stand in stored recordings and are never changed."""
-_KNOWN = {"packets", "samples", "missing", "missing_samples", "loss", "chunks", "rejected", "unusable", "clock", "loss_visible", "rate_hz"}
+_KNOWN = {
+    *("packets", "samples", "missing", "missing_samples", "missing_s", "loss", "chunks", "rejected", "unusable", "clock", "loss_visible"),
+    *("rate_hz", "paused_s", "reordered", "late", "moved"),
+}
+_APART = {"valid_fraction", "clock"}
+"""Parts of the quality that stand elsewhere on the page."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,9 @@ class StreamQuality:
 
     Attributes:
         name: of the stream. what: whether `count` and `missing` are packets or samples.
-        loss: share missing, 0 to 1. gaps: interruptions. back_steps, duplicates: left out for these reasons.
+        missing_s: signal that is missing, s. loss: its share of the signal, 0 to 1 (up to decode version 4: of packets).
+        gaps: interruptions.
+        late, out_of_order, duplicates: packets that arrived late, after a later one, or twice.
         clock: what placed it in time. remarks: everything else, in words.
     """
 
@@ -40,9 +47,11 @@ class StreamQuality:
     what: str
     count: int | None
     missing: int | None
+    missing_s: float | None
     loss: float | None
     gaps: int | None
-    back_steps: int
+    late: int | None
+    out_of_order: int | None
     duplicates: int
     clock: str
     remarks: list[str]
@@ -52,7 +61,7 @@ def quality_rows(recording: Recording) -> list[StreamQuality]:
     """Data quality of each stream, in the order of the decoder."""
     rows = []
     for name, stored in recording.details.get("quality", {}).items():
-        if not isinstance(stored, Mapping) or name == "valid_fraction" or not _is_stream(stored):
+        if not isinstance(stored, Mapping) or name in _APART or not _is_stream(stored):
             continue
         if _KNOWN & stored.keys():
             rows.append(_row(name, stored, recording.clock))
@@ -67,7 +76,7 @@ def quality_remarks(recording: Recording) -> list[tuple[str, str]]:
     return [
         (_words(name), _plain(value))
         for name, value in quality.items()
-        if value not in (None, {}) and name != "valid_fraction" and not (isinstance(value, Mapping) and _is_stream(value))
+        if value not in (None, {}) and name not in _APART and not (isinstance(value, Mapping) and _is_stream(value))
     ]
 
 
@@ -111,6 +120,46 @@ def leads(recording: Recording) -> str:
     return ", ".join(str(x) for x in recording.details.get("settings", {}).get("leads") or [] if x)
 
 
+@dataclass(frozen=True)
+class ClockFit:
+    """How the PC's clock lay against the implant's ticks, over one recording.
+
+    Attributes:
+        drift_ppm: how fast the implant's clock runs against the PC's; None where the recording is too short to tell.
+        pc_steps, implant_steps: where a clock was set: time in the recording, and by how much, s.
+        residual_t_s, residual_ms: PacketGenTime minus the fitted clock, the extremes of pieces of the recording.
+        sd_ms: of all residuals. beyond_50_ms: share of packets whose residual is larger than 50 ms.
+    """
+
+    drift_ppm: float | None
+    pc_steps: list[tuple[float, float]]
+    implant_steps: list[tuple[float, float]]
+    residual_t_s: list[float]
+    residual_ms: list[float]
+    sd_ms: float | None
+    beyond_50_ms: float | None
+
+
+def clock_fit(recording: Recording) -> ClockFit | None:
+    """The fit of the clocks; None for recordings without one (tables, Percept, decode versions up to 4)."""
+    stored = recording.details.get("quality", {}).get("clock")
+    if not isinstance(stored, Mapping):
+        return None
+
+    def steps(name: str) -> list[tuple[float, float]]:
+        return [(float(t), float(by)) for t, by in stored.get(name) or []]
+
+    return ClockFit(
+        drift_ppm=stored.get("drift_ppm"),
+        pc_steps=steps("pc_steps"),
+        implant_steps=steps("implant_steps"),
+        residual_t_s=[float(t) for t in stored.get("residual_t_s") or []],
+        residual_ms=[float(ms) for ms in stored.get("residual_ms") or []],
+        sd_ms=stored.get("residual_sd_ms"),
+        beyond_50_ms=stored.get("residual_beyond_50_ms"),
+    )
+
+
 def valid_shares(recording: Recording) -> dict[str, float]:
     """Share of valid windows per trace over the whole recording, 0 to 1."""
     stored = recording.details.get("quality", {}).get("valid_fraction", {})
@@ -146,8 +195,12 @@ def _limit_rows(stored: Any) -> list[tuple[str, str]]:
 def _row(name: str, stored: Mapping[str, Any], clock: str) -> StreamQuality:
     samples = "packets" not in stored and "samples" in stored
     rejected = {_rejected(why): int(count) for why, count in (stored.get("rejected") or {}).items()}
-    back, twice = rejected.pop(Rejected.STEPS_BACK, 0), rejected.pop(Rejected.DUPLICATE, 0)
+    twice = rejected.pop(Rejected.DUPLICATE, 0)
     remarks = [f"{count} left out: {REJECTED_WORDS[why]}" for why, count in rejected.items()]
+    if stored.get("paused_s"):
+        remarks.append(f"sensing switched off for {stored['paused_s']:.1f} s in between")
+    if stored.get("moved"):
+        remarks.append(f"{stored['moved']} under the clock of the next one put back before it")
     if stored.get("unusable"):
         remarks.append(f"{stored['unusable']} left out: fields missing or of the wrong kind")
     if stored.get("loss_visible") is False:
@@ -161,9 +214,11 @@ def _row(name: str, stored: Mapping[str, Any], clock: str) -> StreamQuality:
         "samples" if samples else "packets",
         stored.get("samples" if samples else "packets"),
         None if unseen else stored.get("missing_samples" if samples else "missing"),
+        None if unseen else stored.get("missing_s"),
         None if unseen else stored.get("loss"),
         max(0, int(stored["chunks"]) - 1) if stored.get("chunks") is not None else None,
-        back,
+        stored.get("late"),
+        stored.get("reordered"),
         twice,
         str(stored.get("clock", clock)),
         remarks,

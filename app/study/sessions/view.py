@@ -18,7 +18,7 @@ from app.study.outcomes.service import Disagreement
 from app.study.outcomes.values import Derived, GraspOutcome, TremorOutcome
 from app.study.sessions.charts import control_chart
 from app.study.sessions.data import SessionData
-from app.study.sessions.recording_charts import Stretch, spectrum_charts, trace_charts, trace_name
+from app.study.sessions.recording_charts import Stretch, clock_chart, spectrum_charts, trace_charts, trace_name
 from app.study.sessions.recording_facts import (
     CLOCKS,
     SensingConfiguration,
@@ -61,6 +61,7 @@ class RecordingBlock:
     Attributes:
         is_control: whether the controller saw it. part: which part of it belongs to the session.
         clock: what its times rest on. quality: a row per stream. limits: where, and from to in mA.
+        clock_chart: the PC's clock against the device's ticks.
         valid: share of valid windows per trace, 0 to 1. amplitude_from: the device's log that the delivered amplitude was read from.
         sensing: configurations within the recording. states: time (s) and number of each adaptive state. leads: where they are.
     """
@@ -72,6 +73,7 @@ class RecordingBlock:
     charts: list[Chart]
     spectra: list[Chart]
     quality: list[StreamQuality]
+    clock_chart: Chart | None
     remarks: list[tuple[str, str]]
     limits: list[tuple[str, str]]
     valid: dict[str, float]
@@ -138,6 +140,7 @@ def recording_blocks(
                 charts=trace_charts(recording, rest, stretch),
                 spectra=spectrum_charts(recording, settings.beta_low_hz, settings.beta_high_hz),
                 quality=quality_rows(recording),
+                clock_chart=clock_chart(recording),
                 remarks=quality_remarks(recording),
                 limits=amplitude_limits(recording),
                 valid=valid_shares(recording),

@@ -112,8 +112,21 @@ GROUPS = (
         ),
     ),
     SettingGroup(
-        "Random controller",
-        (SettingField("lower_bound", "Lower bound B", "Lowest fraction that the random controller draws. It never bounds a policy."),),
+        "Random sessions of early visits",
+        (
+            SettingField("lower_bound", "Lower bound B", "No random session goes below this fraction of cDBS. It never bounds a policy."),
+            SettingField(
+                "design", "Design", "Stratified: a level for each session, draws held 10 to 60 s. The paper's: a new draw every step.",
+                options=(("stratified", "stratified, held draws"), ("paper", "the paper's")),
+            ),
+            SettingField(
+                "design_ladder", "Titration ladder", "1, 0.8, 0.6, … of cDBS, 2 minutes each; in the stratified design alone.",
+                options=(("no", "none"), ("yes", "first of each visit")),
+            ),
+            SettingField(
+                "early_visits", "Early visits", "Over so many visits the stratified levels are spread.", "visits", attrs=_WHOLE
+            ),
+        ),
     ),
 )  # fmt: skip
 

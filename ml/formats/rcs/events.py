@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ml.formats.rcs.amplitude import AmplitudeSteps, delivered, stimulating
 from ml.formats.rcs.labels import parse, render
@@ -71,14 +73,20 @@ def adaptive_events(data: Adaptive, times: PacketTimes, grid: Grid) -> list[Even
     ]
 
 
-def note_events(records: list[Any], steps: AmplitudeSteps, grid: Grid) -> list[EventLog]:
-    """Operator's notes by the grammar of labels. `conflict` is true where the noted amplitude is not the device's at that time."""
+def note_events(
+    records: list[Any], steps: AmplitudeSteps, grid: Grid, of_pc_ms: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+) -> list[EventLog]:
+    """Operator's notes by the grammar of labels. `conflict` is true where the noted amplitude is not the device's at that time.
+
+    `of_pc_ms` brings the notes' PC times onto the recording's timeline.
+    """
     out = []
     for record in records[:MAX_NOTES]:
         event = get(record, "Event")
         t_ms = number(get(event, "UnixOnsetTime")) or number(get(record, "RecordInfo", "HostUnixTime"))
         if t_ms is None or not 0 < t_ms < 2.5e14:
             continue
+        t_ms = float(of_pc_ms(np.array([t_ms]))[0])
         found = parse(get(event, "EventType"), get(event, "EventSubType"), get(event, "EventName"))
         if "amplitude_ma" in found:
             device = _amplitude_at(steps, t_ms)

@@ -146,11 +146,20 @@ def _apart(listed: Sequence[tuple[str, str, Opening]], report: FileReport) -> li
 
 def decode_session(session: SessionFiles, files: Files, options: DecodeOptions) -> RecordingLog:
     """Decode one device folder; never raises for a defect of one file."""
+    streams = read_streams(session, files)
+    for stem in NEEDED:
+        if stem not in session.members:
+            session.report(stem).flagged.append("not in the upload; the recording was decoded without it")
+    return build_recording(streams, session.report, options)
+
+
+def read_streams(session: SessionFiles, files: Files) -> Streams:
+    """Everything in one device folder, not yet placed in time; what is defect stands in the reports."""
     infos: list[dict[str, Any]] = []
     records = {stem: _records(session, files, stem, infos) for stem in ("DeviceSettings", "StimLog", "EventLog")}
     settings = follow(records["DeviceSettings"], records["StimLog"])
     interval_at = _interval_at(settings)
-    streams = Streams(
+    return Streams(
         time_domain=_stream(session, files, "RawDataTD", infos, read_time_domain),
         power=_stream(session, files, "RawDataPower", infos, lambda packets: read_power(packets, interval_at)),
         adaptive=_stream(session, files, "AdaptiveLog", infos, lambda records: read_adaptive(records, interval_at)),
@@ -162,10 +171,6 @@ def decode_session(session: SessionFiles, files: Files, options: DecodeOptions) 
         infos=infos,
         counts={name: sum(1 for _ in _elements(session, files, stem, infos)) for stem, name in COUNTED.items() if stem in session.members},
     )
-    for stem in NEEDED:
-        if stem not in session.members:
-            session.report(stem).flagged.append("not in the upload; the recording was decoded without it")
-    return build_recording(streams, session.report, options)
 
 
 def _interval_at(settings: Settings) -> Interval:

@@ -16,9 +16,10 @@ from ml.formats.rcs.amplitude import AmplitudeSteps, amplitude_steps
 from ml.formats.rcs.beta import beta_traces, time_domain_spectra, time_domain_stretches
 from ml.formats.rcs.events import adaptive_events, note_events, stimulation_events
 from ml.formats.rcs.leads import described, hemisphere
+from ml.formats.rcs.packets.headers import PacketHeaders
 from ml.formats.rcs.packets.streams import Accel, Adaptive, Fft, Power, TimeDomain, TimeSync
-from ml.formats.rcs.packets.time import PacketHeaders, PacketTimes, reconstruct
-from ml.formats.rcs.quality import STEMS, describe_quality
+from ml.formats.rcs.packets.time import PacketTimes, RecordingTimes, reconstruct_all
+from ml.formats.rcs.quality import STEMS, describe_clock, describe_quality
 from ml.formats.rcs.settings import GROUPS, Settings, get, integer, number
 from ml.formats.rcs.traces import Grid, accel_traces, amplitude_traces, fft_results, power_traces
 from ml.formats.recording import FileReport, Hemisphere, RecordingLog, SpectrumLog, TraceLog, fingerprint
@@ -53,6 +54,11 @@ class Streams:
         named: dict[str, Stream | None] = {name: getattr(self, name) for name in STEMS}
         return {name: data for name, data in named.items() if data is not None}
 
+    def placed(self) -> tuple[RecordingTimes, Settings]:
+        """All packets on one timeline, and the settings' PC times brought onto it."""
+        times = reconstruct_all(self.headers(), {name: data.same for name, data in self.data().items()}, PRIMARY)
+        return times, self.settings.at_times(times.clock.of_pc_ms)
+
     def headers(self) -> dict[str, PacketHeaders]:
         """Headers of the streams that hold packets."""
         return {name: data.headers for name, data in self.data().items() if data.headers.size}
@@ -60,24 +66,27 @@ class Streams:
 
 def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) -> RecordingLog:
     """Put a recording together; what is left out is said in the report of the file it comes from."""
-    times = {name: reconstruct(headers) for name, headers in streams.headers().items()}
+    timeline, settings = streams.placed()
+    times = timeline.streams
     spans = _spans(streams.headers(), times, report, options)
     times = {name: t for name, t in times.items() if name in spans}
     main = {name: span for name, span in spans.items() if name in PRIMARY} or {n: s for n, s in spans.items() if n != "time_sync"}
-    start_ms = min((span[0] for span in main.values()), default=_first_record_ms(streams))
+    start_ms = min((span[0] for span in main.values()), default=_first_record_ms(streams.settings))
     end_ms = max((span[1] for span in main.values()), default=start_ms)
     duration_s = (end_ms - start_ms) / 1000.0
     grid = Grid(start_ms, duration_s, max(0, math.ceil(duration_s / options.period_s - 1e-6)), options)
-    steps = amplitude_steps(streams.settings, streams.adaptive if "adaptive" in times else None, times.get("adaptive"))
-    traces, spectra = _traces(streams, times, steps, grid, report) if main else ([], [])
+    steps = amplitude_steps(settings, streams.adaptive if "adaptive" in times else None, times.get("adaptive"))
+    traces, spectra = _traces(streams, settings, times, steps, grid, report) if main else ([], [])
     if not main:
         report("RawDataTD").flagged.append("a recording without data: no stream holds a packet that can be placed in time")
-    quality = describe_quality(streams.data(), times, streams.counts, report)
+    quality = describe_quality(streams.data(), times, settings, streams.counts, report)
+    if timeline.streams:
+        quality["clock"] = describe_clock(timeline, start_ms, report)
     quality["valid_fraction"] = {f"{t.stream} {t.channel}": round(float(t.valid.mean()), 4) for t in traces if t.valid.size}
     quality["spike_packets"] = {t.channel: t.details["spike_packets"] for t in traces if t.details.get("spike_packets")}
     device_clock = bool(main) and all(times[name].device_clock for name in main)
     started = None if start_ms <= 0 else datetime.fromtimestamp(start_ms / 1000.0, UTC)
-    events = [*stimulation_events(streams.settings, grid), *note_events(streams.notes, steps, grid)]
+    events = [*stimulation_events(settings, grid), *note_events(streams.notes, steps, grid, timeline.clock.of_pc_ms)]
     if streams.adaptive is not None and "adaptive" in times:
         events += adaptive_events(streams.adaptive, times["adaptive"], grid)
     return RecordingLog(
@@ -90,7 +99,7 @@ def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) 
         traces=tuple(traces),
         events=tuple(sorted(events, key=lambda event: event.t_s)),
         limits=_limits(streams.settings),
-        settings=_summary(streams, grid),
+        settings=_summary(settings, grid),
         quality=quality,
         fingerprint=_fingerprint(streams),
         spectra=tuple(spectra),
@@ -143,24 +152,24 @@ def _plausible(span: tuple[float, float], limit_ms: float, report: FileReport) -
     return False
 
 
-def _first_record_ms(streams: Streams) -> float:
-    known = [*streams.settings.sensing.times_ms[:1], *streams.settings.therapy.times_ms[:1]]
+def _first_record_ms(settings: Settings) -> float:
+    known = [*settings.sensing.times_ms[:1], *settings.therapy.times_ms[:1]]
     return min(known, default=0.0)
 
 
 def _traces(
-    streams: Streams, times: dict[str, PacketTimes], steps: AmplitudeSteps, grid: Grid, report: ReportOf
+    streams: Streams, settings: Settings, times: dict[str, PacketTimes], steps: AmplitudeSteps, grid: Grid, report: ReportOf
 ) -> tuple[list[TraceLog], list[SpectrumLog]]:
     traces: list[TraceLog] = []
     spectra: list[SpectrumLog] = []
     if streams.time_domain is not None and "time_domain" in times:
-        channels = time_domain_stretches(streams.time_domain, times["time_domain"], streams.settings)
+        channels = time_domain_stretches(streams.time_domain, times["time_domain"], settings)
         traces += beta_traces(channels, grid, report("RawDataTD").flagged)
         spectra += time_domain_spectra(channels)
     if streams.power is not None and "power" in times:
-        traces += power_traces(streams.power, times["power"], streams.settings, grid, report("RawDataPower").flagged)
+        traces += power_traces(streams.power, times["power"], settings, grid, report("RawDataPower").flagged)
     if streams.fft is not None and "fft" in times:
-        fft_traces, fft_spectra = fft_results(streams.fft, times["fft"], streams.settings, grid)
+        fft_traces, fft_spectra = fft_results(streams.fft, times["fft"], settings, grid)
         traces, spectra = traces + fft_traces, spectra + fft_spectra
     if streams.accel is not None and "accel" in times:
         traces += accel_traces(streams.accel, times["accel"], grid)
@@ -186,9 +195,8 @@ def _limits(settings: Settings) -> dict[str, Any]:
     return limits
 
 
-def _summary(streams: Streams, grid: Grid) -> dict[str, Any]:
+def _summary(settings: Settings, grid: Grid) -> dict[str, Any]:
     """What sensing and detection were set to, in plain values."""
-    settings = streams.settings
     sensing = [
         {
             "from_s": round((t - grid.start_ms) / 1000.0, 3),

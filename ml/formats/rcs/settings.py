@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 RATE_HZ = {0: 250.0, 1: 500.0, 2: 1000.0}
 FFT_SIZE = {0: 64, 1: 256, 3: 1024}
@@ -205,6 +208,17 @@ class Settings:
     merged: dict[str, Any]
     stim_log: bool
     record_times_ms: list[float] = field(default_factory=list)
+
+    def at_times(self, of_pc_ms: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Settings:
+        """The same settings with their PC times brought onto a recording's timeline."""
+
+        def moved(times_ms: list[float]) -> list[float]:
+            times: list[float] = of_pc_ms(np.array(times_ms, dtype=np.float64)).tolist()
+            return times
+
+        sensing = Timeline(moved(self.sensing.times_ms), self.sensing.states)
+        therapy = Timeline(moved(self.therapy.times_ms), self.therapy.states)
+        return Settings(sensing, therapy, self.merged, self.stim_log, moved(self.record_times_ms))
 
 
 def follow(settings: Iterable[Any], stim: Iterable[Any]) -> Settings:

@@ -25,8 +25,9 @@ Floats = NDArray[np.float64]
 def error_matrix(estimates: Mapping[str, Mapping[str, Estimate]], methods: list[str], bias: Mapping[str, float] | None = None) -> Floats:
     """Estimated mean product of the errors of two methods, averaged over policies, [M, M].
 
-    Draws of two methods count together as far as both were made on the same resamples (the first ones, at equal seeds); a method that keeps
-    none has the square of its standard error, and no covariance.
+    Draws of two methods count together where both were made on the same resamples of the sessions, which they name (`resampled`): the first
+    ones are then the same sessions. Draws from a posterior or of an ensemble stand side by side with no others, and their chance products
+    are no covariance; such methods, and those that keep no draws, have the square of their standard error alone.
     """
     policies = common_policies(estimates, methods)
     total = np.zeros((len(methods), len(methods)))
@@ -36,13 +37,19 @@ def error_matrix(estimates: Mapping[str, Mapping[str, Estimate]], methods: list[
             total[i, i] += estimates[methods[i]][name].standard_error ** 2
             for j, other in enumerate(kept[:i]):
                 size = min(one.size, other.size)
-                if size >= 20:
+                if size >= 20 and _same_resamples(estimates[methods[i]][name], estimates[methods[j]][name]):
                     together = float(np.mean((one[:size] - one[:size].mean()) * (other[:size] - other[:size].mean())))
                     total[i, j] += together
                     total[j, i] += together
     total /= max(len(policies), 1)
     squares = np.array([(bias or {}).get(m, 0.0) ** 2 for m in methods])
     return np.asarray(total + np.diag(squares), dtype=np.float64)
+
+
+def _same_resamples(one: Estimate, other: Estimate) -> bool:
+    """Whether the draws of two estimates were made on the same resamples of the same sessions."""
+    mine = one.details.get("resampled")
+    return mine is not None and mine == other.details.get("resampled")
 
 
 def convex_weights(errors: Floats) -> Floats:

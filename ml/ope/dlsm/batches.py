@@ -82,8 +82,10 @@ def make_batch(buffer: ReplayBuffer, scale: Scale, dtype: torch.dtype = torch.fl
         usable[:t, i] = ok
         rewards[:t, i] = np.where(ok, (s.rewards(settings) - scale.reward_mean) / scale.reward_std, 0.0)
         first_known[i] = float(np.isfinite(s.lead_beta).all())
-    outcomes = (outcome_table(buffer) - np.array(scale.outcome_mean)) / np.array(scale.outcome_std)
-    mask = np.isfinite(outcomes) & np.array(scale.outcome_seen)
+    spread = np.array(scale.outcome_std)
+    outcomes = (outcome_table(buffer) - np.array(scale.outcome_mean)) / np.where(spread > 0, spread, 1.0)
+    # An outcome that is the same for all, as r_end where nothing counts in it, has nothing to be learnt or scored by.
+    mask = np.isfinite(outcomes) & np.array(scale.outcome_seen) & (spread > 0)
 
     def tensor(values: NDArray[Any]) -> Tensor:
         return torch.as_tensor(values, dtype=dtype)

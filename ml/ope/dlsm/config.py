@@ -40,8 +40,8 @@ class DlsmConfig:
         rollouts: trajectories per policy and member. block: trajectories advanced together.
         reward_source: step return from the learnt reward `head`, from the `known` reward on sampled beta, or whichever predicts
             `held_out` sessions better.
-        end_source: r_end and QoCs from the `latent` state (paper), from the regression on session `summaries` that other methods use
-            (`end_outcomes`), or whichever predicts r_end of `held_out` sessions better.
+        end_source: r_end and QoCs from the `latent` state (paper), from the `summaries` of its minutes as in the other methods
+            (`ml.ope.outcomes`), or whichever predicts r_end of `held_out` sessions better.
         decode_all_window: draw all W betas of s_t anew instead of shifting the window (paper; needs `window`).
         select: choose the objective on the buffer's own sessions first, among `candidates()`; each costs a training per left-out group.
         seed: first seed.

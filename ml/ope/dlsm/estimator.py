@@ -26,8 +26,9 @@ from ml.ope.dlsm.selection import Selection, SelectionRun, usable_folds
 from ml.ope.dlsm.training import Member, MemberTraining
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS, Flag
-from ml.ope.linear.end_outcomes import EndModel, fit_end_model
 from ml.ope.observed import day_noise
+from ml.ope.outcomes.minutes import Minutes
+from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale
 from ml.ope.support.coverage import AmplitudeSupport, Coverage, flags_of
@@ -214,13 +215,13 @@ class FittedDlsm:
 
     def _outcomes(self, run: Rollouts) -> Floats:
         """r_end and QoCs of the simulated sessions, [P, M, 4]."""
-        return run.outcomes if self.end_source == "latent" else self.end.predict(run.summaries)
+        return run.outcomes if self.end_source == "latent" else self.end.predict(run.minutes)
 
     def _uncertainty(self, values: Floats, runs: list[Rollouts], horizon: int) -> tuple[Floats, Floats]:
         """Draws around the values, [DRAWS, P], and standard errors, [P].
 
         Spread of the ensemble (correlated over policies), error of the level from held-out sessions and from few days (common to all
-        policies), slopes of the regression of r_end where it is used (correlated), Monte-Carlo error (of each policy).
+        policies), coefficients of the outcome model where it is used (correlated), Monte-Carlo error (of each policy).
         """
         rng = np.random.default_rng(self.config.seed + 2000)
         members, p = values.shape
@@ -235,12 +236,14 @@ class FittedDlsm:
         return draws, np.sqrt(variance)
 
     def _end_draws(self, runs: list[Rollouts]) -> Floats:
-        """Errors of r_end's differences between policies by the regression on summaries, [DRAWS, P]; its level is in `level_error`."""
+        """Errors of r_end's differences between policies by the outcome model, [DRAWS, P]; its level is in `level_error`."""
         if self.end_source == "latent" or not self.scale.outcome_seen[0]:
             return np.zeros((DRAWS, runs[0].outcomes.shape[0]))
         drawn = fit_end_model(self.buffer, draws=DRAWS, seed=self.config.seed)
-        means = np.mean([r.summaries.mean(1) for r in runs], axis=0)  # [P, 5]
-        ends = drawn.with_weights(drawn.weights[:, None]).predict(means[None])[:, :, 0]
+        # Of the mean minutes of each policy: what its sessions have in common moves its mean.
+        means = np.mean([r.minutes.features.mean(1) for r in runs], axis=0)
+        minutes = Minutes(means[None], runs[0].minutes.share[None, :, 0], runs[0].minutes.late[None, :, 0])
+        ends = drawn.each(minutes)[:, :, 0]
         ends = ends - ends.mean(1, keepdims=True)
         return np.asarray(ends - ends.mean(0), dtype=np.float64)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings, step_reward
 from ml.ope.dlsm.networks import DlsmNetworks
-from ml.ope.linear.end_outcomes import LATE_STEPS, SUMMARIES
+from ml.ope.outcomes.minutes import AMPLITUDE, BETA, ENERGY, FEATURES, Minutes, each_feature, minute_bounds, with_shares
 from ml.ope.scale import Scale
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
@@ -28,14 +28,14 @@ class Rollouts:
         return_known: discounted step return by the known reward on sampled beta (never on its mean: a policy whose mean beta lies just
             under the threshold would look perfect).
         outcomes: r_end, grasp, rating, tremor in their units, [P, M, 4].
-        summaries: `end_outcomes.SUMMARIES` of every simulated session, [P, M, 5].
+        minutes: what outcomes follow in every simulated session.
         actions: one in `keep_every` of all actions, [P, K], for the coverage of the policy's own states.
     """
 
     return_head: Floats
     return_known: Floats
     outcomes: Floats
-    summaries: Floats
+    minutes: Minutes
     actions: Floats
 
     @property
@@ -46,17 +46,17 @@ class Rollouts:
     @property
     def amplitude(self) -> Floats:
         """Mean a."""
-        return self.summaries[:, :, 0]
+        return self.minutes.means[..., AMPLITUDE]
 
     @property
     def energy(self) -> Floats:
         """Mean a^2."""
-        return self.summaries[:, :, 1]
+        return self.minutes.means[..., ENERGY]
 
     @property
     def beta(self) -> Floats:
         """Mean sampled beta, participant's unit."""
-        return self.summaries[:, :, 2]
+        return self.minutes.means[..., BETA]
 
 
 def roll_out(
@@ -95,10 +95,10 @@ def roll_out(
             parts.append(_roll_block(networks, policies, rows, scale, settings, horizon, rng, prior))
         report((first + count) / per_policy, "rolling out policies")
     joined = {
-        name: np.concatenate([getattr(p, name) for p in parts], axis=1)
-        for name in ("return_head", "return_known", "outcomes", "summaries", "actions")
+        name: np.concatenate([getattr(p, name) for p in parts], axis=1) for name in ("return_head", "return_known", "outcomes", "actions")
     }
-    return Rollouts(**joined)
+    minutes = (np.concatenate([getattr(p.minutes, name) for p in parts], axis=1) for name in ("features", "share", "late"))
+    return Rollouts(**joined, minutes=Minutes(*minutes))
 
 
 def _roll_block(
@@ -131,7 +131,9 @@ def _roll_block(
     c = torch.zeros_like(h)
     pooled = torch.zeros_like(z)
     sums = {name: np.zeros(p * m) for name in ("return_head", "return_known")}
-    summed, late = np.zeros((p * m, len(SUMMARIES))), min(LATE_STEPS, horizon)
+    bounds = minute_bounds(horizon, settings.period_s)
+    minute_of = np.repeat(np.arange(len(bounds)), [j - i for i, j in bounds])
+    summed = np.zeros((len(bounds), FEATURES, p * m))
     kept, keep_every = [], max(1, horizon // 50)
     for t in range(horizon):
         a = np.concatenate([policy.act(window[i * m : (i + 1) * m]) for i, policy in enumerate(policies)])
@@ -150,19 +152,25 @@ def _roll_block(
         head = networks.reward(seen)[0].squeeze(1).numpy().astype(np.float64)
         sums["return_head"] += discount * (head * scale.reward_std + scale.reward_mean)
         sums["return_known"] += discount * step_reward(settings, window[:, -1], a)
-        in_the_end = a / late if t >= horizon - late else np.zeros_like(a)
-        above = window[:, -1] >= settings.xi_beta
-        summed += np.stack([a / horizon, a**2 / horizon, window[:, -1] / horizon, above / horizon, in_the_end], axis=1)
+        for total, values in zip(summed[minute_of[t]], each_feature(window[:, -1], a, settings.xi_beta), strict=True):
+            total += values
         if t % keep_every == 0:
             kept.append(a)
     end_input = z if config.end_features == "final" else torch.cat([z, pooled / horizon], dim=1)
     outcomes = networks.outcome(end_input)[0].numpy().astype(np.float64) * np.array(scale.outcome_std) + np.array(scale.outcome_mean)
     return Rollouts(
         outcomes=outcomes.reshape(p, m, -1),
-        summaries=summed.reshape(p, m, -1),
+        minutes=_minutes(summed, np.bincount(minute_of), p),
         actions=np.stack(kept, axis=1).reshape(p, -1),
         **{name: values.reshape(p, m) for name, values in sums.items()},
     )
+
+
+def _minutes(summed: Floats, counts: NDArray[np.int64], policies: int) -> Minutes:
+    """Sums [minutes, F, P M] over the steps of each minute as sessions [P, M]."""
+    means = np.moveaxis(summed / counts[:, None, None], 2, 0)
+    means = means.reshape(policies, -1, *means.shape[1:])
+    return with_shares(means, np.broadcast_to(counts.astype(np.float64), means.shape[:3]))
 
 
 def _within(beta: Floats, scale: Scale) -> Floats:

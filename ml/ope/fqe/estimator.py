@@ -2,8 +2,9 @@
 
 Q_tau(s, a) is the return of the next tau steps. It is linear in fixed features (polynomial ones and random tanh units), so that one
 backward step is one product with a small matrix: 300 steps cost milliseconds, refits on resampled sessions are affordable, and no
-stopping rule, target network or learning rate is left to choose. r_end is not discounted (gamma^299 = 0.05 would erase it): the summaries
-of a session that it follows are averages of steps, so their expectations are undiscounted Q functions of the same features.
+stopping rule, target network or learning rate is left to choose. r_end is not discounted (gamma^299 = 0.05 would erase it): what
+it follows in a session are averages over steps, so their expectations are undiscounted Q functions of the same features. There is one
+head for each column of `fqe.steps.RATES`: the discounted sum of rewards, and sums of what outcomes follow.
 """
 
 from __future__ import annotations
@@ -19,23 +20,21 @@ from numpy.typing import NDArray
 from ml.mdp import MdpSettings
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS
-from ml.ope.fqe.steps import TargetActions, UsableSteps, ValueFeatures, usable_steps
+from ml.ope.fqe.steps import RATES, TargetActions, UsableSteps, ValueFeatures, usable_steps
 from ml.ope.lead import dose_before
-from ml.ope.linear.end_outcomes import LATE_STEPS, EndModel, fit_end_model
 from ml.ope.observed import day_noise
+from ml.ope.outcomes.minutes import ABOVE, AMPLITUDE, BETA, ENERGY, Minutes, step_features
+from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.registry import Size
 from ml.ope.scale import session_folds
 from ml.ope.support.coverage import AmplitudeSupport
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
-from ml.statistics.bootstrap import percentile_interval, resamples
+from ml.statistics.bootstrap import percentile_interval, resampled, resamples
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-HEADS = ("reward", "amplitude", "energy", "beta", "above", "late amplitude")
-"""Discounted sum of rewards; sums of a, a^2, beta and of steps at or above the threshold; sum of a over the last `LATE_STEPS`."""
 
 PENALTIES = tuple(float(v) for v in 10.0 ** np.arange(-5.0, 0.0))
 """Ridge penalties per logged step, on standardised features."""
@@ -47,27 +46,25 @@ CHECK_STEPS = 50
 """Length of the returns on left-out sessions that choose the penalty."""
 
 
-def backward_induction(transition: Floats, reward: Floats, discount: Floats, counts: Floats) -> Floats:
+def backward_induction(transition: Floats, reward: Floats, discount: Floats, horizon: int) -> Floats:
     """Weights of Q_0 ... Q_H.
 
     Args:
         transition: regression of the next step's features on this step's, [F, F]. reward: of the K rewards, [F, K].
-        discount: of each head, [K]. counts: 1 where head k is paid with tau steps to go (row tau - 1), else 0, [H, K].
+        discount: of each head, [K]. horizon: H.
 
     Returns:
-        w_tau = counts_tau reward + discount transition w_{tau - 1}, w_0 = 0; shape [H + 1, F, K].
+        w_tau = reward + discount transition w_{tau - 1}, w_0 = 0; shape [H + 1, F, K].
     """
-    weights = np.zeros((len(counts) + 1, *reward.shape))
-    for tau, paid in enumerate(counts, start=1):
-        weights[tau] = reward * paid + (transition @ weights[tau - 1]) * discount
+    weights = np.zeros((horizon + 1, *reward.shape))
+    for tau in range(1, horizon + 1):
+        weights[tau] = reward + (transition @ weights[tau - 1]) * discount
     return weights
 
 
-def head_schedule(horizon: int, gamma: float) -> tuple[Floats, Floats]:
-    """Discounts [6] and payments [H, 6] of `HEADS`."""
-    counts = np.ones((horizon, len(HEADS)))
-    counts[LATE_STEPS:, -1] = 0.0
-    return np.array([gamma] + [1.0] * (len(HEADS) - 1)), counts
+def discounts(gamma: float) -> Floats:
+    """Discount of every head, [R]: sums that outcomes follow are not discounted."""
+    return np.array([gamma] + [1.0] * (RATES - 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +91,7 @@ class Grams:
         self.table, self.phi = table, phi
         self.bounds = np.searchsorted(table.session, np.arange(table.sessions + 1))
         self.square = self.product(phi)
-        rates = np.concatenate([table.rates, table.rates[:, 1:2]], axis=1)
-        self.reward = self.product(rates)
+        self.reward = self.product(table.rates)
 
     def product(self, other: Floats) -> Floats:
         """Phi^T other, per session, [n, F, ...]."""
@@ -125,13 +121,12 @@ class QMember:
         return self.grams.product(self.features(self.grams.table.next_states, target.then, target.memory))
 
     def weights(self, products: Floats, pick: Indices, horizon: int, gamma: float) -> tuple[Floats, float]:
-        """Weights of Q_0 ... Q_H for `HEADS`, [H + 1, F, 6], and the penalty used: raised until nothing grows over the horizon."""
-        discount, counts = head_schedule(horizon, gamma)
+        """Weights of Q_0 ... Q_H for every head, [H + 1, F, R], and the penalty used: raised until nothing grows over the horizon."""
         penalty = self.penalty
         while True:
             transition, reward = self.grams.solve(pick, penalty, products, self.grams.reward)
             if spectral_radius(transition) <= LARGEST_ROOT or penalty >= 1e3:
-                return backward_induction(transition, reward, discount, counts), penalty
+                return backward_induction(transition, reward, discounts(gamma), horizon), penalty
             penalty *= 10.0
 
 
@@ -151,7 +146,7 @@ def fit_member(table: UsableSteps, folds: Sequence[Sequence[int]], gamma: float,
     logged = Grams(replace_steps(table, follows), phi[follows])
     products = logged.product(phi[table.follows[follows]])
     errors = np.full(len(PENALTIES), np.inf)
-    discount, counts = np.array([gamma]), np.ones((CHECK_STEPS, 1))
+    discount = np.array([gamma])
     for j, penalty in enumerate(PENALTIES if rows.size else ()):
         squared = 0.0
         for fold in folds:
@@ -159,7 +154,7 @@ def fit_member(table: UsableSteps, folds: Sequence[Sequence[int]], gamma: float,
             if rest.size == 0 or logged.square[rest, 0, 0].sum() < 1:
                 continue
             transition, reward = logged.solve(rest, penalty, products, logged.reward[:, :, :1])
-            weights = backward_induction(transition, reward, discount, counts)[-1]
+            weights = backward_induction(transition, reward, discount, CHECK_STEPS)[-1]
             held = np.isin(table.session[rows], fold)
             squared += float(np.sum((phi[rows[held]] @ weights[:, 0] - returns[held]) ** 2))
         errors[j] = squared if np.isfinite(squared) else np.inf
@@ -199,24 +194,21 @@ def replace_steps(table: UsableSteps, keep: NDArray[np.bool_]) -> UsableSteps:
     )
 
 
-def summaries_of(sums: Floats, horizon: int) -> Floats:
-    """`end_outcomes.SUMMARIES` [..., 5] from sums over the horizon of `HEADS` [..., 6]."""
-    late = min(LATE_STEPS, horizon)
-    parts = [sums[..., 1] / horizon, sums[..., 2] / horizon, sums[..., 3] / horizon, sums[..., 4] / horizon, sums[..., 5] / late]
-    return np.stack(parts, axis=-1)
+def minutes_of(sums: Floats, horizon: int) -> Minutes:
+    """Sessions as the outcome model sees them, [...], from sums over the horizon [..., R]: one minute that stands for all."""
+    return Minutes.of_means(sums[..., 1:] / horizon)
 
 
 def within_reach(
     sums: Floats, settings: MdpSettings, horizon: int, beta_range: tuple[float, float], span: tuple[float, float] = (0.0, 1.0)
 ) -> Floats:
-    """Sums of `HEADS` [..., 6] cut to what H steps can hold at all of a policy whose amplitudes lie within `span`."""
-    least, most = span
+    """Sums of the heads [..., R] cut to what H steps can hold at all of a policy whose amplitudes lie within `span`."""
     discounted = float(np.sum(settings.gamma ** np.arange(horizon)))
-    late = min(LATE_STEPS, horizon)
-    beta = beta_range[0] * horizon, beta_range[1] * horizon
-    low = [(settings.r_b - settings.c1 * most) * discounted, least * horizon, least**2 * horizon, beta[0], 0.0, least * late]
-    high = [(settings.r_a - settings.c1 * least) * discounted, most * horizon, most**2 * horizon, beta[1], horizon, most * late]
-    return np.asarray(np.clip(sums, low, high), dtype=np.float64)
+    low, high = horizon * step_features(np.array(beta_range), np.array(span), settings.xi_beta)
+    low[ABOVE], high[ABOVE] = 0.0, horizon
+    least = np.append((settings.r_b - settings.c1 * span[1]) * discounted, low)
+    most = np.append((settings.r_a - settings.c1 * span[0]) * discounted, high)
+    return np.asarray(np.clip(sums, least, most), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -239,7 +231,7 @@ class Fqe:
             members.append(fit_member(table, folds, buffer.settings.gamma, c.units, c.seed + 1000 * m))
             report((m + 1) / c.members, "choosing the penalty of the value function")
         draws = resamples(table.sessions, c.refits, c.seed)
-        return FittedFqe(self.method, c, buffer, table, tuple(members), draws, fit_end_model(buffer), fit_end_model(buffer, draws))
+        return FittedFqe(self.method, c, buffer, table, tuple(members), draws, fit_end_model(buffer, draws=c.refits, seed=c.seed))
 
 
 @dataclass(frozen=True)
@@ -253,7 +245,6 @@ class FittedFqe:
     members: tuple[QMember, ...]
     draws: Indices
     end: EndModel
-    end_refits: EndModel
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
         """Estimate of every policy from the sessions' own s_0."""
@@ -276,7 +267,7 @@ class FittedFqe:
             weights, penalty = member.weights(product, everything, horizon, settings.gamma)
             mains.append(start.mean(0) @ weights[-1])
             penalties.append(penalty)
-        refits = np.empty((c.refits, len(HEADS)))
+        refits = np.empty((c.refits, RATES))
         for d, pick in enumerate(self.draws):
             k = d % c.members
             weights, _ = self.members[k].weights(products[k], pick, horizon, settings.gamma)
@@ -293,19 +284,26 @@ class FittedFqe:
         return value_estimate(self, main, refits, policy, horizon, support, extra)
 
 
+class Seeded(Protocol):
+    """Settings with the seed of the resamples."""
+
+    @property
+    def seed(self) -> int: ...
+
+
 class ValueSource(Protocol):
     """What `value_estimate` needs of a fitted method."""
 
     @property
     def method(self) -> str: ...
     @property
+    def config(self) -> Seeded: ...
+    @property
     def table(self) -> UsableSteps: ...
     @property
     def buffer(self) -> ReplayBuffer: ...
     @property
     def end(self) -> EndModel: ...
-    @property
-    def end_refits(self) -> EndModel: ...
 
 
 def value_estimate(
@@ -318,15 +316,15 @@ def value_estimate(
     details: Mapping[str, object],
     end_shift: tuple[float, Floats] | None = None,
 ) -> Estimate:
-    """An estimate from sums of `HEADS` [6] and those of every refit [D, 6]; `end_shift` is added to r_end and to its refits [D]."""
+    """An estimate from sums of the heads [R] and those of every refit [D, R]; `end_shift` is added to r_end and to its refits [D]."""
     with_end = fitted.end.seen[0]
-    summaries = summaries_of(main, horizon)
-    outcomes = fitted.end.predict(summaries)
+    minutes = minutes_of(main, horizon)
+    outcomes, means = fitted.end.predict(minutes), minutes.means
     shift, shifts = (0.0, np.zeros(len(refits))) if end_shift is None else end_shift
     end = float(outcomes[0]) + shift if with_end else 0.0
     draws = refits[:, 0].copy()
     if with_end:
-        draws += fitted.end_refits.predict(summaries_of(refits, horizon))[:, 0] + shifts
+        draws += fitted.end.each(minutes_of(refits[:, None], horizon))[:, 0, 0] + shifts
     value = float(main[0]) + end
     noise, unknown = day_noise(fitted.buffer, horizon, len(draws), 0)
     draws = draws - draws.mean()
@@ -336,7 +334,7 @@ def value_estimate(
     if not with_end:
         flags.append(FEW_END_REWARDS)
     flags += [unknown] if unknown else []
-    predicted = {"energy": float(summaries[1]), "mean_amplitude": float(summaries[0]), "mean_beta": float(summaries[2])}
+    predicted = {"energy": float(means[ENERGY]), "mean_amplitude": float(means[AMPLITUDE]), "mean_beta": float(means[BETA])}
     predicted |= {name: float(outcomes[j]) for j, name in enumerate(OUTCOMES) if j and fitted.end.seen[j]}
     return Estimate(
         method=fitted.method,
@@ -356,6 +354,7 @@ def value_estimate(
             **details,
             "coverage": logged.to_json(),
             "draws": [round(float(d + value), 4) for d in draws],
+            "resampled": resampled(fitted.table.sessions, fitted.config.seed),
         },
     )
 

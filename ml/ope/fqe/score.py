@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.estimate import checked_horizon
-from ml.ope.fqe.estimator import QMember, fit_member, summaries_of, within_reach
+from ml.ope.fqe.estimator import QMember, fit_member, minutes_of, within_reach
 from ml.ope.fqe.steps import TargetActions, usable_steps
 from ml.ope.lead import dose_before
-from ml.ope.linear.end_outcomes import fit_end_model
+from ml.ope.outcomes.model import fit_end_model
 from ml.ope.scale import learn_scale, session_folds
 from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -66,7 +66,7 @@ def fqe_value(
     sums = member.features(first, actions, table.first_memory(actions)).mean(0) @ weights[-1]
     sums = within_reach(sums, settings, horizon, (scale.beta_low, scale.beta_high), target.span)
     end_model = fit_end_model(buffer_train)
-    end = float(end_model.predict(summaries_of(sums, horizon))[0]) if end_model.seen[0] else 0.0
+    end = float(end_model.predict(minutes_of(sums, horizon))[0]) if end_model.seen[0] else 0.0
     return FqeScore(float(sums[0]) + end, float(sums[0]), end, _residual(buffer_train, sessions, policy, member, weights))
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.ope.outcomes.minutes import FEATURES, step_features
 from ml.ope.scale import Scale, learn_scale
 from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -22,8 +23,8 @@ Indices = NDArray[np.int64]
 DECAYS = (0.8, 0.95, 0.985)
 """Memories of past amplitudes: exponential averages with time constants of about 5, 20 and 66 steps."""
 
-RATES = ("reward", "amplitude", "energy", "beta", "above")
-"""Columns of `UsableSteps.rates`: r_k, a_k, a_k^2, beta of the row, and whether that beta is at or above the threshold."""
+RATES = 1 + FEATURES
+"""Columns of `UsableSteps.rates`: r_k, and what outcomes follow (`outcomes.minutes.step_features`) of a_k and the beta of the row."""
 
 
 def remember(memory: Floats, a: Floats) -> Floats:
@@ -68,7 +69,7 @@ class UsableSteps:
         scale: standardisation of beta.
         states, next_states: s_k and s_{k+1}, participant's unit, [N, W].
         actions: a_k, [N]. memory: memories of the amplitudes up to and with a_k, [N, 3].
-        rates: `RATES`, [N, 5].
+        rates: see `RATES`, [N, R].
         session: index of the session, [N]. step: k, [N].
         follows: row of the next step of the same session where that is usable too, else -1, [N].
         first_states: s_0 of the sessions without gaps in it, [m, W]. first_session: their indices, [m].
@@ -106,7 +107,7 @@ def usable_steps(buffer: ReplayBuffer, scale: Scale | None = None, before: float
     steps = buffer.transitions()
     memory = np.concatenate([memories(held_amplitude(s), before)[s.usable()] for s in buffer.sessions])
     beta = steps.next_states[:, -1]
-    rates = np.stack([steps.rewards, steps.actions, steps.actions**2, beta, (beta >= settings.xi_beta).astype(np.float64)], axis=1)
+    rates = np.concatenate([steps.rewards[:, None], step_features(beta, steps.actions, settings.xi_beta)], axis=1)
     next_row = np.arange(1, len(beta) + 1)
     joined = np.append((np.diff(steps.session) == 0) & (np.diff(steps.step) == 1), False)
     starts = [(i, s.lead_beta) for i, s in enumerate(buffer.sessions) if np.isfinite(s.lead_beta).all()]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ml.ope.impulse.dynamics import ResponseTable, fit_impulse
 from ml.ope.lead import dose_before
-from ml.ope.linear.end_outcomes import fit_end_model
 from ml.ope.linear.estimator import FittedLinear, LinearConfig
+from ml.ope.outcomes.model import fit_end_model
 from ml.ope.registry import Size
 from ml.ope.scale import learn_scale
 from ml.progress import Report, silent
@@ -35,9 +35,9 @@ class ImpulseModel:
         drawn = fit_impulse(buffer, tables, draws, c.seed, before)
         report(0.7, "fitting the response of beta")
         severity = drawn.levels.mean(0)
-        end, ends = fit_end_model(buffer, severity=severity), fit_end_model(buffer, draws=draws, seed=c.seed, severity=severity)
+        ends = fit_end_model(buffer, draws=draws, seed=c.seed, severity=severity)
         report(1.0, "fitting the response of beta")
-        return FittedLinear(self.method, c, buffer, scale, tuple(tables), drawn, drawn, end, ends, None)
+        return FittedLinear(self.method, c, buffer, scale, tuple(tables), drawn, drawn, ends.part(0, 0), ends, None)
 
 
 def build(key: str, seed: int, size: Size) -> ImpulseModel:

@@ -3,13 +3,13 @@
 The paper did not compare with it. A regression, no network, and hard to beat: every other method must earn its place against it. What a
 session had of its own (its level, its innovations in their order, what its outcomes had beyond the regression) stays with it, so that only
 what the amplitude changes has to be modelled: a policy that would have done what was done gets back exactly what was observed. The reward
-is that of the replayed beta, never of its mean. The dynamics are in `linear_dynamics`, the outcomes in `end_outcomes`.
+is that of the replayed beta, never of its mean. The dynamics are in `linear_dynamics`, the outcomes in `ml.ope.outcomes`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from ml.mdp import step_reward
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
-from ml.ope.flags import FEW_END_REWARDS
+from ml.ope.flags import FEW_END_REWARDS, stopped_sessions
 from ml.ope.lead import dose_before
 from ml.ope.linear.dynamics import SessionTable, fit_dynamics, largest_root, noise_features
-from ml.ope.linear.end_outcomes import EndModel, fit_end_model, summarise
 from ml.ope.linear.held_out import replay_skill
 from ml.ope.observed import MeanOverDays, mean_over_days
+from ml.ope.outcomes.minutes import Minutes, by_minute, of_buffer
+from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale, outcome_table, session_folds
 from ml.ope.support.coverage import AmplitudeSupport, flags_of
@@ -113,9 +114,9 @@ class LinearModel:
         skill = replay_skill(buffer, scale, session_folds(buffer.sessions, c.folds, c.seed), before)
         report(0.8, "replaying left-out sessions")
         severity = main.levels[0]
-        end, ends = fit_end_model(buffer, severity=severity), fit_end_model(buffer, draws=draws, seed=c.seed, severity=severity)
+        ends = fit_end_model(buffer, draws=draws, seed=c.seed, severity=severity)
         report(1.0, "fitting the linear model")
-        return FittedLinear(self.method, c, buffer, scale, tuple(tables), main, drawn, end, ends, skill)
+        return FittedLinear(self.method, c, buffer, scale, tuple(tables), main, drawn, ends.part(0, 0), ends, skill)
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ class Replayed:
 
 @dataclass(frozen=True)
 class FittedLinear:
-    """A fitted linear model, draws of its coefficients and its buffer."""
+    """A fitted linear model, draws of its coefficients and its buffer; `end` is the mean of the outcome model, `ends` has its draws."""
 
     method: str
     config: LinearConfig
@@ -163,12 +164,13 @@ class FittedLinear:
         spread = self.replay(chosen, self.drawn, self.ends, horizon)
         report(1.0, "replaying sessions in the linear model")
         visits = np.array([s.visit for s in self.buffer.sessions])
+        measured = self._as_measured(chosen, horizon)
         days = mean_over_days(self._returns(main).mean(1), visits, len(self.drawn.levels), self.config.seed)
         support = AmplitudeSupport(self.buffer)
-        return {n: self._estimate(i, p, main, spread, days, support, horizon) for i, (n, p) in enumerate(policies.items())}
+        return {n: self._estimate(i, p, main, spread, days, support, horizon, measured) for i, (n, p) in enumerate(policies.items())}
 
     def replay(self, policies: list[Policy], dynamics: Replayable, end: EndModel, horizon: int) -> Replayed:
-        """Every session under every policy with every set of coefficients."""
+        """Every session under every policy with every set of coefficients, and with as many draws of the outcomes where `end` has any."""
         p, d, n, w = len(policies), len(dynamics.levels), len(self.tables), self.buffer.settings.window
         noise = self._innovations(dynamics, horizon)  # [D, n, H]
         level = dynamics.levels
@@ -195,6 +197,14 @@ class FittedLinear:
             betas[t], actions[t] = self.scale.raw_beta(newest), a
         return self._replayed(np.moveaxis(betas, 0, -1), np.moveaxis(actions, 0, -1), end)
 
+    def _as_measured(self, policies: list[Policy], horizon: int) -> Floats | None:
+        """r_end [P, n] if sessions that were stopped counted as measured; None where none was."""
+        if not any(s.stopped for s in self.buffer.sessions):
+            return None
+        buffer = replace(self.buffer, sessions=tuple(replace(s, stopped=False) for s in self.buffer.sessions))
+        other = replace(self, buffer=buffer, end=fit_end_model(buffer, severity=self.main.levels[0]))
+        return other.replay(policies, self.main, other.end, horizon).outcomes[:, :, :, 0].mean(1)
+
     def _innovations(self, dynamics: Replayable, horizon: int) -> Floats:
         """Standardised innovations of every session over the horizon, [D, n, H].
 
@@ -213,22 +223,30 @@ class FittedLinear:
         return noise
 
     def _replayed(self, betas: Floats, actions: Floats, end: EndModel) -> Replayed:
-        settings, sessions = self.buffer.settings, self.buffer.sessions
+        settings = self.buffer.settings
         discount = settings.gamma ** np.arange(betas.shape[-1])
         returns = (discount * step_reward(settings, betas, actions)).sum(-1)
-        logged = np.stack([summarise(s.beta, s.amplitude, settings.xi_beta) for s in sessions])
-        model = end.with_weights(end.weights.reshape(-1, 1, *end.weights.shape[-2:]))  # [D, 1, 6, 4] against summaries [P, D, n, 5]
-        change = model.predict(summarise(betas, actions, settings.xi_beta))
-        known, seen = outcome_table(self.buffer), model.predict(logged[None])
-        own = np.where(np.isfinite(known), known - seen, 0.0)
+        logged = of_buffer(self.buffer)
+        was = Minutes(logged.features[None], logged.share[None], logged.late[None])
+        of = end.each if end.draws else end.predict
+        predicted, seen = of(by_minute(betas, actions, settings), end.sessions), of(was, end.sessions)
+        outcomes = end.carried(predicted, outcome_table(self.buffer), seen)
         above = (betas >= settings.xi_beta).mean(-1)
-        return Replayed(returns, model.shifted(change, own), (actions**2).mean(-1), actions.mean(-1), betas.mean(-1), above, actions)
+        return Replayed(returns, outcomes, (actions**2).mean(-1), actions.mean(-1), betas.mean(-1), above, actions)
 
     def _returns(self, replayed: Replayed) -> Floats:
         return replayed.step_return + (replayed.outcomes[..., 0] if self.end.seen[0] else 0.0)
 
     def _estimate(
-        self, i: int, policy: Policy, main: Replayed, spread: Replayed, days: MeanOverDays, support: AmplitudeSupport, horizon: int
+        self,
+        i: int,
+        policy: Policy,
+        main: Replayed,
+        spread: Replayed,
+        days: MeanOverDays,
+        support: AmplitudeSupport,
+        horizon: int,
+        measured: Floats | None,
     ) -> Estimate:
         weights = days.weights
         with_end = self.end.seen[0]
@@ -245,6 +263,8 @@ class FittedLinear:
         if not with_end:
             flags.append(FEW_END_REWARDS)
         flags += [days.unknown] if days.unknown else []
+        if measured is not None and end is not None:
+            flags.append(stopped_sessions(sum(s.stopped for s in self.buffer.sessions), end, float(measured[i] @ weights)))
         predicted = {
             "energy": float(main.energy[i].mean(0) @ weights),
             "mean_amplitude": float(main.amplitude[i].mean(0) @ weights),

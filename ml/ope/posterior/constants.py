@@ -32,3 +32,6 @@ MODEL_ERRORS = {
     "tremor_percent": ModelError(3.0, 12.0),
 }
 """By component. `steps`: per unit of the reward between r_b and r_a and of the discounted length; the others in their own unit."""
+
+COMMON_SHARE = 0.6
+"""Share of the error of a mean over few days, common to all policies, that is drawn: its prior of how days differ is wider than they do."""

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from ml.ope.estimate import OUTCOMES
 from ml.ope.flags import Flag
-from ml.ope.linear.end_outcomes import EndModel
 from ml.ope.observed import mean_over_days
-from ml.ope.posterior.constants import MODEL_ERRORS
+from ml.ope.outcomes.model import EndModel
+from ml.ope.posterior.constants import COMMON_SHARE, MODEL_ERRORS
 from ml.ope.posterior.gaussian import correlated
 from ml.trajectories import ReplayBuffer
 
@@ -66,8 +66,6 @@ def joint_draws(buffer: ReplayBuffer, replays: Replays, ends: EndModel, alike: F
     parts = {"steps": replays.step_return, "energy": replays.energy}
     parts |= {name: replays.outcomes[..., j] for j, name in enumerate(OUTCOMES) if j and ends.seen[j]}
     constants = ends.constants if ends.seen[0] else None
-    if ends.seen[0] and constants is None:
-        parts["r_end"] = replays.outcomes[..., 0]
     total = replays.step_return + (replays.outcomes[..., 0] if ends.seen[0] else 0.0)
     days = mean_over_days(np.einsum("pdn,d->pn", total, replays.weights), visits, KEPT, seed)
     rng = np.random.default_rng([seed, 0x9057])
@@ -77,7 +75,7 @@ def joint_draws(buffer: ReplayBuffer, replays: Replays, ends: EndModel, alike: F
     for name, values in parts.items():
         base, over_draws = values @ days.weights, np.einsum("pdn,d->pn", values, replays.weights)
         own = mean_over_days(over_draws, visits, KEPT, seed)
-        rows = base[:, picked] + own.common + own.own
+        rows = base[:, picked] + COMMON_SHARE * own.common + own.own
         # what was picked has a mean of its own: the draws keep that of all
         rows += (base @ replays.weights - rows.mean(1))[:, None]
         if name in MODEL_ERRORS:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ml.ope.estimate import LEVEL, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS, Flag, distinct
 from ml.ope.lead import dose_before
-from ml.ope.linear.end_outcomes import EndModel, fit_end_model
 from ml.ope.linear.estimator import FittedLinear, LinearConfig, Replayed
+from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.posterior.constants import VERSION
 from ml.ope.posterior.draws import Draws, Replays, joint_draws
 from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference, similarity, updated
@@ -151,7 +151,7 @@ class FittedPosterior:
         for k, fit in enumerate(live):
             number = self.shares[fit.key]
             drawn = fit.thinned(number)
-            ends = self.ends.with_weights(self.ends.weights[first : first + number])
+            ends = self.ends.part(first, number)
             replayer = FittedLinear(
                 fit.key, LinearConfig(seed=self.config.seed), self.buffer, self.scale, fit.tables, drawn, drawn, ends, ends, None
             )

@@ -1,13 +1,15 @@
-"""Beta's answer to the amplitude as low-passes of several speeds behind polynomials of the dose, shrunk as far as the data ask for.
+"""Beta's answer to the amplitude as low-passes of several speeds behind dose functions, shrunk as far as the data ask for.
 
-    y_t = mu + visit + session + sum over j, m of g_jm L_m[p_j(a)]_t + sum over k of h_k U_k[a]_t + eta_t
+    y_t = mu + visit + session + sum over j, m of g_jm L_m[p_j(a)]_t + sum over k of h_k U_k[a]_t + sum over k of r_k F_k[a]_t + eta_t
     eta_t = sum over l <= W of phi_l eta_{t-l} + e_t
 
-y is standardised (log) beta, p_j one of `polynomials` of the dose, L_m a first-order low-pass with one of `TIMES` (the first of them passes
-everything), U_k a low-pass that rises and falls at different speeds. Sums of exponentials are a dense family of impulse responses (Laguerre
-and Kautz bases: Wahlberg 1991), so that an answer at once, one over minutes, one that wears off and one that rings are all in it; the dose
-may have another shape at every speed. Coefficients of one group share a variance (`ml.statistics.mixed`): the straight dose at fast and at
-slow speeds, the bend of the dose, the difference between rising and falling. What the data leave open about them stays in the draws.
+y is standardised (log) beta, p_j one of `dose_functions`, L_m a first-order low-pass with one of `TIMES` (the first of them passes
+everything), U_k a low-pass that rises and falls at different speeds, F_k one of falls of the amplitude, after which beta may rebound: a
+controller that switches often may do worse than any dose that it switches between. Sums of exponentials are a dense family of impulse
+responses (Laguerre and Kautz bases: Wahlberg 1991), so that an answer at once, one over minutes, one that wears off and one that rings are
+all in it; the dose may have another shape at every speed. Coefficients of one group share a variance (`ml.statistics.mixed`): the straight
+dose at fast and at slow speeds, the bend of the dose, the difference between rising and falling, and falls. What the data leave open about
+them stays in the draws.
 
 Before its first step a session has been under the dose that was in force before it (`ml.ope.lead`).
 """
@@ -35,44 +37,63 @@ KEEP = np.array([np.exp(-1 / t) if t > 0 else 0.0 for t in TIMES])
 SLOW = 3
 """From this time on an answer counts as slow."""
 
-POLYNOMIALS = 3
+BENDS = (0.25, 0.5, 0.75)
+"""Amplitude fractions at which a dose function rises from nearly none to nearly all."""
+STEEPNESS = 12.0
+SHAPES = 1 + len(BENDS)
 ONE_SIDED = ((12.0, 80.0), (40.0, 240.0))
 """Time constants of rise and fall of the low-passes that have two, steps."""
 RISE, FALL = (1 - np.exp(-1 / np.array(t)) for t in zip(*ONE_SIDED, strict=True))
 
-COLUMNS = POLYNOMIALS * len(TIMES) + len(ONE_SIDED)
+FALL_TIMES = (4.0, 12.0, 40.0)
+"""Time constants of the low-passes of falls, steps."""
+FALL_KEEP = np.exp(-1 / np.array(FALL_TIMES))
+FALL_UNIT = 5.0
+"""Falls enter in fifths of the cDBS amplitude per step: draws of every step fall by 0.1 on average."""
+
+COLUMNS = SHAPES * len(TIMES) + len(ONE_SIDED) + len(FALL_TIMES)
 TURNS = 2
 
 
-def polynomials(a: Floats) -> Floats:
-    """Dose functions [..., 3]: the dose, its bend and its turn; the last two are 0 at no stimulation and at cDBS."""
-    return np.stack([a, 4 * a * (1 - a), 10 * a * (1 - a) * (1 - 2 * a)], axis=-1)
+def dose_functions(a: Floats) -> Floats:
+    """Dose functions [..., SHAPES]: the dose itself, and what steep rises at `BENDS` are beyond it, 0 at no stimulation and at cDBS.
+
+    Together they make lines, answers that saturate early or late, and ones that turn round.
+    """
+    bends = np.array(BENDS)
+    rise, none, full = (1 / (1 + np.exp(-STEEPNESS * (v - bends))) for v in (a[..., None], 0.0, 1.0))
+    return np.concatenate([a[..., None], (rise - none) / (full - none) - a[..., None]], axis=-1)
 
 
 class Filters:
     """Low-passed doses of rows side by side, at first as if `first` [...] had been on for long."""
 
     def __init__(self, first: Floats) -> None:
-        self._passed = np.repeat(polynomials(first)[..., None, :], len(TIMES), axis=-2)  # [..., M, J]
+        self._passed = np.repeat(dose_functions(first)[..., None, :], len(TIMES), axis=-2)  # [..., M, J]
         self._sided = np.repeat(first[..., None], len(ONE_SIDED), axis=-1)
+        self._falls = np.zeros((*first.shape, len(FALL_TIMES)))
+        self._now = first
 
     def step(self, a: Floats) -> Floats:
         """Columns [..., COLUMNS] once the amplitudes a [...] are in force."""
-        self._passed = KEEP[:, None] * self._passed + (1 - KEEP[:, None]) * polynomials(a)[..., None, :]
+        self._passed = KEEP[:, None] * self._passed + (1 - KEEP[:, None]) * dose_functions(a)[..., None, :]
         gap = a[..., None] - self._sided
         self._sided = self._sided + np.where(gap > 0, RISE, FALL) * gap
+        fall = FALL_UNIT * np.maximum(self._now - a, 0.0)
+        self._falls = FALL_KEEP * self._falls + (1 - FALL_KEEP) * fall[..., None]
+        self._now = a
         return self.columns
 
     @property
     def columns(self) -> Floats:
         """The columns now, [..., COLUMNS]."""
-        return np.concatenate([self._passed.reshape(*self._sided.shape[:-1], -1), self._sided], axis=-1)
+        return np.concatenate([self._passed.reshape(*self._now.shape, -1), self._sided, self._falls], axis=-1)
 
 
 def columns_of(a: Floats, first: float) -> Floats:
     """`Filters` of a whole session, [T, COLUMNS], for amplitudes [T] after `first` had been on for long."""
-    p, start = polynomials(a), polynomials(np.array(first))
-    passed = np.empty((a.size, len(TIMES), POLYNOMIALS))
+    p, start = dose_functions(a), dose_functions(np.array(first))
+    passed = np.empty((a.size, len(TIMES), SHAPES))
     for m, keep in enumerate(KEEP):
         passed[:, m], _ = lfilter([1 - keep], [1, -keep], p, axis=0, zi=keep * start[None])
     sided = np.empty((a.size, len(ONE_SIDED)))
@@ -81,7 +102,9 @@ def columns_of(a: Floats, first: float) -> Floats:
         gap = value - now
         now = now + np.where(gap > 0, RISE, FALL) * gap
         sided[t] = now
-    return np.concatenate([passed.reshape(a.size, -1), sided], axis=1)
+    fall = FALL_UNIT * np.maximum(-np.diff(a, prepend=first), 0.0)
+    falls = np.stack([lfilter([1 - keep], [1, -keep], fall) for keep in FALL_KEEP], axis=1)
+    return np.concatenate([passed.reshape(a.size, -1), sided, falls], axis=1)
 
 
 @dataclass(frozen=True)
@@ -208,12 +231,13 @@ def fit_modes(buffer: ReplayBuffer, tables: Sequence[ModeTable], before: float |
 
 def mode_model(own: Floats) -> MixedModel:
     """The mixed model of the columns (1, modes, visits, sessions)."""
-    j, first = POLYNOMIALS, 1 + COLUMNS
+    j, first = SHAPES, 1 + COLUMNS
     groups = (
         ("fast", tuple(1 + m * j for m in range(SLOW))),
         ("slow", tuple(1 + m * j for m in range(SLOW, len(TIMES)))),
         ("shape", tuple(1 + m * j + k for m in range(len(TIMES)) for k in range(1, j))),
-        ("sided", tuple(range(1 + j * len(TIMES), first))),
+        ("sided", tuple(range(1 + j * len(TIMES), first - len(FALL_TIMES)))),
+        ("falls", tuple(range(first - len(FALL_TIMES), first))),
     )
     return level_model(groups, COLUMNS, own, {})
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.behaviour import controllers
-from ml.ope.linear.end_outcomes import EndModel
+from ml.ope.outcomes.model import EndModel
 from ml.ope.posterior.held_out import HeldOut
 from ml.trajectories import ReplayBuffer
 

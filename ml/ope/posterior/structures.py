@@ -59,8 +59,8 @@ class Fit:
 Fitter = Callable[[ReplayBuffer, Scale, int, int, float | None], Fit]
 """Fits a structure: buffer, standardisation, draws, seed, the dose before every session (`ml.ope.lead`)."""
 
-LEAST_FORM = 0.05
-"""Forms below this share of a structure's evidence are left out where sessions are left out."""
+MOST_FORMS = 8
+"""Forms of one structure, those of the most evidence, that predict left-out sessions."""
 
 
 def take(dynamics: Replayable, keep: NDArray[np.int64]) -> Replayable:
@@ -103,10 +103,9 @@ def fit_response(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, befo
     tables = [ResponseTable.of(s, scale, before) for s in buffer.sessions]
     drawn = fit_impulse(buffer, tables, draws, seed, before)
     own, forms = visits_of(buffer), []
-    by_shape = {shape: response_sums(tables, own, drawn.phi, shape) for (shape, _), w in drawn.evidence.items() if w >= LEAST_FORM}
-    for (shape, alpha), weight in drawn.evidence.items():
-        if weight < LEAST_FORM:
-            continue
+    best = sorted(drawn.evidence.items(), key=lambda item: -item[1])[:MOST_FORMS]
+    by_shape = {shape: response_sums(tables, own, drawn.phi, shape) for shape in {shape for (shape, _), _ in best}}
+    for (shape, alpha), weight in best:
         sums = tuple(moved(s, own, alpha) for s in by_shape[shape])
         answers = tuple(t.means[shape] @ prior_root(alpha) for t in tables)
         forms.append(LinearForm(weight, response_model(own), drawn.ratios[shape, alpha], sums, answers, drawn.phi, drawn.noise_weights))
@@ -116,7 +115,7 @@ def fit_response(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, befo
 
 
 def fit_low_passes(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, before: float | None) -> Fit:
-    """Low-passes of several speeds behind polynomials of the dose."""
+    """Low-passes of several speeds behind dose functions."""
     tables = [ModeTable.of(s, scale, before) for s in buffer.sessions]
     found = fit_modes(buffer, tables, before)
     sums = tuple(mode_sums(tables, found.own, found.phi))

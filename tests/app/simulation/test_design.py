@@ -5,11 +5,15 @@ from __future__ import annotations
 import datetime as dt
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from app.planning.plans.schedule import SESSION_MINUTES
 from app.platform.errors import Conflict, Invalid
+from app.simulation.demo_study import demo_visits
 from app.simulation.design import PRESETS, collecting_day, design, remember, visit_day
+from app.study.schemas import ConditionsChange
+from ml.population import PARTICIPANTS
 
 TODAY = dt.date(2026, 6, 1)
 
@@ -57,3 +61,18 @@ def test_a_study_goes_on_under_its_first_date_and_another_one_is_refused_in_its_
     for other in (design(["P1"], 3, 6, "quick"), design(["P1"], 3, 5, "full")):
         with pytest.raises(Conflict, match="seed 5"):
             remember(path, other, TODAY)
+
+
+def test_the_demos_random_sessions_follow_one_stratified_design_that_is_stated_with_them():
+    visits = demo_visits("P2", TODAY)
+    random = [s for v in visits for s in v.sessions if s.controller == "random"]
+    assert len(random) == 9
+    fine = sorted(int((s.design.level - 0.3) / 0.7 * 9) for s in random)
+    assert fine == list(range(9))  # each ninth of [B, 1] once
+    assert all(s.conditions() is None for v in visits for s in v.sessions if s.controller != "random")
+    stated = ConditionsChange.model_validate(random[0].conditions())
+    assert stated.design == "stratified"
+    ran = random[0].simulated.amplitude
+    wanted = np.repeat([h.amplitude for h in stated.design_parameters.holds], [h.steps for h in stated.design_parameters.holds])
+    assert np.abs(ran - wanted).max() <= 0.05 / PARTICIPANTS["P2"].cdbs_amplitude_ma + 1e-9  # rounded to 0.1 mA
+    assert ran.min() >= 0.3

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from sqlalchemy import func, select
 
@@ -30,6 +31,7 @@ from app.simulation.sessions import actual_return
 from app.study import repository as study
 from app.study.blinding import arm
 from app.study.models import Controller, QocRevision, Recording, StudySession
+from app.study.sessions.data import session_data
 
 ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """
@@ -80,6 +82,13 @@ def test_a_simulated_study_that_is_killed_goes_on_with_nothing_lost_and_nothing_
         assert [(s.visit.number, s.ordinal) for s in held] == [(v, i) for v in (1, 2) for i in (1, 2, 3, 4)]
         arms = [arm(s, SYSTEM).controller for s in held]
         assert arms[:4] == [Controller.CDBS, Controller.RANDOM, Controller.CDBS, Controller.NO_DBS]
+        (random,) = [s for s, a in zip(held, arms, strict=True) if a == Controller.RANDOM]
+        assert random.conditions.design == "stratified"
+        planned = random.conditions.design_parameters
+        assert sum(h["steps"] for h in planned["holds"]) == 150
+        fraction = session_data(db, random).table.fraction[-150:]
+        wanted = np.repeat([h["amplitude"] for h in planned["holds"]], [h["steps"] for h in planned["holds"]])
+        assert np.abs(fraction - wanted).max() <= 0.05 / session_data(db, random).table.cdbs_ma + 1e-6  # rounded to the device's 0.1 mA
         learned = [i for i, c in enumerate(arms) if c in (Controller.RL, Controller.DISTILLED)]
         assert {arms[i] for i in learned} == {Controller.RL, Controller.DISTILLED}
         assert all(Controller.CDBS in arms[i:j] for i, j in pairwise(learned))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ml.ope.dual_dice import DiceConfig, DualDice, StackedMlp, ratios, saddle
+from ml.ope.dual_dice import LARGEST_GAP, DiceConfig, DualDice, StackedMlp, flow_gap, ratios, saddle
 from ml.policies.policy import ConstantPolicy
 
 GO = np.array([[[0.75, 0.25], [0.5, 0.5]], [[0.25, 0.75], [0.5, 0.5]]])
@@ -44,7 +44,8 @@ def test_ratios_and_values_of_a_tabular_mdp_are_the_exact_ones_for_two_policies_
     first = np.stack([np.eye(4)[[t[0]]] for t in targets])
     config = DiceConfig(members=1, hidden=(), updates=4000, batch=128, learning_rate=0.01)
     zeta = ratios(now, then, first, np.full((1, len(now)), 1 / len(now)), GAMMA, config)[:, 0]
-    for target, z in zip(targets, zeta, strict=True):
+    for k, (target, z) in enumerate(zip(targets, zeta, strict=True)):
+        assert flow_gap(z[None], now, then[k], first[k], GAMMA) < LARGEST_GAP
         distribution = exact(target)
         expected = (distribution / 0.25)[now.argmax(1)]
         assert np.abs(z - expected).mean() < 0.12
@@ -92,3 +93,14 @@ def test_a_report_that_raises_stops_the_fit(small_buffer):
 
     with pytest.raises(Cancelled):
         DualDice(DiceConfig(updates=500)).fit(small_buffer).evaluate({"half": ConstantPolicy(0.5)}, 40, stop)
+
+
+def test_ratios_that_training_has_not_reached_are_told_and_speak_for_no_policy(small_buffer):
+    """At gamma = 0.99 ratios fall towards 0 long before they find their level: weighted averages look fine, and mean nothing."""
+    found = DualDice(DiceConfig(members=1, updates=20)).fit(small_buffer).evaluate({"half": ConstantPolicy(0.5)}, 30)["half"]
+    assert found.details["flow_gap"] > LARGEST_GAP
+    flag = next(f for f in found.flags if f.code == "not_converged")
+    assert (flag.refuses, flag.limit, found.supported) == (True, LARGEST_GAP, False)
+    exact_now, exact_then = chain(np.array([1, 0]))[:2]
+    exact_zeta = (exact(np.array([1, 0])) / 0.25)[exact_now.argmax(1)]
+    assert flow_gap(exact_zeta[None], exact_now, exact_then, np.eye(4)[[1]], GAMMA) < 1e-9

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from ml.ope.compare.metrics import accuracy
-from ml.ope.fqe.estimator import Fqe, FqeConfig, backward_induction, head_schedule, logged_returns, spectral_radius, summaries_of
+from ml.ope.fqe.estimator import Fqe, FqeConfig, backward_induction, discounts, logged_returns, minutes_of, spectral_radius, within_reach
 from ml.ope.fqe.score import fqe_value
-from ml.ope.fqe.steps import TargetActions, fresh_memory, held_amplitude, memories, usable_steps
+from ml.ope.fqe.steps import RATES, TargetActions, fresh_memory, held_amplitude, memories, usable_steps
+from ml.ope.outcomes.minutes import ABOVE, AMPLITUDE, BETA, ENERGY, step_features
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer
@@ -46,28 +47,40 @@ def every_transition():
 def test_q_of_a_tabular_mdp_is_that_of_dynamic_programming_at_every_horizon(horizon, gamma):
     phi, then, rewards = every_transition()
     transition, reward = (np.linalg.solve(phi.T @ phi, phi.T @ x) for x in (then, rewards))
-    weights = backward_induction(transition, reward, np.array([gamma]), np.ones((horizon, 1)))
+    weights = backward_induction(transition, reward, np.array([gamma]), horizon)
     np.testing.assert_allclose(weights[-1, :, 0].reshape(2, 2), exact_q(horizon, gamma), rtol=1e-9)
 
 
 def test_the_matrix_recursion_is_the_regression_on_targets_of_the_textbook():
     rng = np.random.default_rng(0)
-    phi, then, rewards = rng.normal(size=(80, 6)), 0.3 * rng.normal(size=(80, 6)), rng.normal(size=(80, 6))
+    phi, then, rewards = rng.normal(size=(80, 6)), 0.3 * rng.normal(size=(80, 6)), rng.normal(size=(80, RATES))
     ridge = 0.5 * np.eye(6)
-    discount, counts = head_schedule(9, 0.9)
-    slow = np.zeros((6, 6))
-    for tau in range(9):  # one ridge regression per step to go, its targets made from the one before
-        targets = rewards * counts[tau] + discount * (then @ slow)
+    discount = discounts(0.9)
+    slow = np.zeros((6, RATES))
+    for _ in range(9):  # one ridge regression per step to go, its targets made from the one before
+        targets = rewards + discount * (then @ slow)
         slow = np.linalg.solve(phi.T @ phi + ridge, phi.T @ targets)
     transition, reward = (np.linalg.solve(phi.T @ phi + ridge, phi.T @ x) for x in (then, rewards))
-    np.testing.assert_allclose(backward_induction(transition, reward, discount, counts)[-1], slow, rtol=1e-9)
+    np.testing.assert_allclose(backward_induction(transition, reward, discount, 9)[-1], slow, rtol=1e-9)
 
 
-def test_sums_over_the_horizon_become_means_and_the_last_head_counts_late_steps_alone():
-    discount, counts = head_schedule(200, 0.99)
-    weights = backward_induction(np.ones((1, 1)), np.array([[1.0, 0.4, 0.16, 7.0, 0.25, 0.4]]), discount, counts)
+def test_rewards_are_discounted_and_what_outcomes_follow_is_averaged_over_the_horizon():
+    step = step_features(np.array(7.0), np.array(0.4), 8.0)
+    weights = backward_induction(np.ones((1, 1)), np.append(1.0, step)[None], discounts(0.99), 200)
     np.testing.assert_allclose(weights[-1, 0, 0], (1 - 0.99**200) / 0.01)
-    np.testing.assert_allclose(summaries_of(weights[-1, 0], 200), [0.4, 0.16, 7.0, 0.25, 0.4])
+    minutes = minutes_of(weights[-1, 0], 200)
+    np.testing.assert_allclose(minutes.means, step)
+    np.testing.assert_allclose([minutes.means[k] for k in (AMPLITUDE, ENERGY, BETA, ABOVE)], [0.4, 0.16, 7.0, 0.0])
+
+
+def test_sums_are_cut_to_what_amplitudes_within_the_span_can_add_up_to(simulator):
+    settings = simulator.settings
+    low, high = within_reach(np.array([np.full(RATES, -1e6), np.full(RATES, 1e6)]), settings, 50, (0.2, 1.5), (0.3, 0.8))
+    inside = 50 * step_features(np.array([0.9]), np.array([0.5]), settings.xi_beta)[0]
+    assert (low[1:] <= inside).all()
+    assert (inside <= high[1:]).all()
+    assert high[1 + AMPLITUDE] == pytest.approx(50 * 0.8)
+    assert low[1 + ENERGY] == pytest.approx(50 * 0.09)
 
 
 def test_policies_are_ranked_and_valued_on_two_unrelated_simulators(simulator):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ml.policies.policy import ConstantPolicy
-from ml.population import PARTICIPANTS, plan_day, random_controller_buffer, run_day
+from ml.population import PARTICIPANTS, plan_day, random_controller_buffer, run_day, run_sessions
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -60,3 +60,14 @@ def test_random_amplitudes_are_uniform_above_the_bound():
 def test_the_first_visits_of_a_buffer_do_not_depend_on_later_ones():
     short, long = (random_controller_buffer("P4", visits=v, sessions_per_visit=2, steps=15, seed=3) for v in (1, 2))
     assert all(np.array_equal(a.beta, b.beta) for a, b in zip(short.sessions, long.sessions, strict=False))
+
+
+def test_a_session_can_follow_the_amplitudes_of_a_design():
+    laid_out = np.repeat([1.0, 0.55, 0.7], 10)
+    batch = run_sessions("P2", laid_out, seeds=[1, 2], steps=30, lower_bound=0.3, resolution_ma=0.1)
+    unit = 0.1 / PARTICIPANTS["P2"].cdbs_amplitude_ma
+    np.testing.assert_allclose(batch.amplitude, np.tile(np.rint(laid_out / unit) * unit, (2, 1)))
+    assert (batch.controller, batch.lower_bound) == ("random", 0.3)
+    for wrong in (laid_out[:20], np.full(30, 0.2), np.full(30, 1.1)):
+        with pytest.raises(ValueError, match="a design needs 30 amplitudes"):
+            run_sessions("P2", wrong, seeds=[1], steps=30, lower_bound=0.3)

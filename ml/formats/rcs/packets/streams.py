@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.formats.rcs.packets.headers import ROLLOVER, TICKS_PER_S, PacketHeaders
 from ml.formats.rcs.packets.scan import ARRAYS, Batch, join
-from ml.formats.rcs.packets.time import ROLLOVER, TICKS_PER_S, PacketHeaders
 from ml.formats.rcs.settings import RATE_HZ, get, integer, number
 
 ACCEL_RATE_HZ = {0: 65.104, 1: 32.552, 2: 16.276, 3: 8.138, 4: 4.069}
@@ -41,6 +41,10 @@ class TimeDomain:
     offsets: tuple[NDArray[np.int64], ...]
     unusable: int
 
+    def same(self, i: int, j: int) -> bool:
+        """Whether two packets hold the same samples."""
+        return all(_same(x, at, self.headers.samples, i, j) for x, at in zip(self.samples, self.offsets, strict=True))
+
 
 @dataclass(frozen=True, slots=True)
 class Power:
@@ -53,6 +57,10 @@ class Power:
     unusable: int
     over_range: int
 
+    def same(self, i: int, j: int) -> bool:
+        """Whether two packets hold the same powers."""
+        return bool(np.array_equal(self.bands[i], self.bands[j], equal_nan=True))
+
 
 @dataclass(frozen=True, slots=True)
 class Accel:
@@ -62,6 +70,10 @@ class Accel:
     samples: NDArray[np.float64]
     offsets: NDArray[np.int64]
     unusable: int
+
+    def same(self, i: int, j: int) -> bool:
+        """Whether two packets hold the same samples."""
+        return _same(self.samples, self.offsets, self.headers.samples, i, j)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +87,10 @@ class Fft:
     td_rate_hz: NDArray[np.float64]
     unusable: int
 
+    def same(self, i: int, j: int) -> bool:
+        """Whether two packets hold the same spectrum of the same channel."""
+        return self.channel[i] == self.channel[j] and bool(np.array_equal(self.amplitude_mv[i], self.amplitude_mv[j], equal_nan=True))
+
 
 @dataclass(frozen=True, slots=True)
 class TimeSync:
@@ -83,6 +99,10 @@ class TimeSync:
     headers: PacketHeaders
     latency_ms: NDArray[np.float64]
     unusable: int
+
+    def same(self, i: int, j: int) -> bool:
+        """Whether two packets hold the same latency."""
+        return bool(np.array_equal(self.latency_ms[i], self.latency_ms[j], equal_nan=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +116,11 @@ class Adaptive:
     ld0_inputs: NDArray[np.float64]
     status_bits: NDArray[np.int64]
     unusable: int
+
+    def same(self, i: int, j: int) -> bool:
+        """Whether two updates hold the same amplitudes, state and detector."""
+        columns = (self.amplitude_ma, self.ld0_output, self.ld0_inputs)
+        return self.state[i] == self.state[j] and all(np.array_equal(x[i], x[j], equal_nan=True) for x in columns)
 
 
 class _Table:
@@ -146,6 +171,13 @@ class _Table:
 
 
 _KEPT = ("seconds", "systemTick", "dataTypeSequence", "PacketGenTime", "PacketRxUnixTime", "SampleRate", "FftSize", "Channel")
+
+
+def _same(x: NDArray[np.float64], offsets: NDArray[np.int64], count: NDArray[np.int64], i: int, j: int) -> bool:
+    """Whether packets i and j hold equal samples of x; both may have none."""
+    if offsets[i] < 0 or offsets[j] < 0:
+        return bool(offsets[i] == offsets[j])
+    return bool(np.array_equal(x[offsets[i] : offsets[i] + count[i]], x[offsets[j] : offsets[j] + count[j]], equal_nan=True))
 
 
 def _rate(interval_s: NDArray[np.float64], tick: NDArray[np.float64]) -> NDArray[np.float64]:

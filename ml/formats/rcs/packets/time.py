@@ -1,85 +1,82 @@
-"""When each RC+S packet was measured. Source: the format notes, A.2 and A.9, and where this differs from the public toolbox.
+"""When each RC+S packet was measured: one timeline for all streams of a recording. Source: the format notes, A.2 and A.9.
 
-A packet carries a device clock (1 s `timestamp`, 100 us `systemTick` rolling over every 6.5536 s) and the host's estimate of its
-generation in the PC clock (`PacketGenTime`, about +-50 ms). Packets are cut into chunks without loss; inside a chunk samples are
-equidistant, and the chunk as a whole is placed by the median of its PacketGenTimes.
+The timeline runs with the implant's ticks (`packets/ticks.py`); PacketGenTime says where on the PC's clock it lies, how the two drift, and
+where a clock was set (`packets/clock.py`), and moves no packet against another. Samples are equidistant as far as no signal is missing.
 
-Differences from the toolbox, on purpose:
-- packets whose PacketGenTime is 0 or negative are kept; they only have no say in where their chunk lies;
-- a chunk, or a whole recording, without any PacketGenTime is placed by the device clock;
-- the deviation of the device clock from PacketGenTime is judged against its median, so one bad first packet rejects nothing else;
-- a chunk is placed at the median of (PacketGenTime - elapsed), the first packet included;
-- packets that arrived out of order are put in the order of the device's clock first.
+Differences from the public toolbox, which places every stretch without loss by its own PacketGenTimes, are in `docs/ingest.md`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-TICKS_PER_S = 10_000
-ROLLOVER = 65_536
-ROLLOVER_S = ROLLOVER / TICKS_PER_S
-DAY_S = 86_400
-CLOCK_DEVIATION_MS = 2_000
-BACK_STEP_MS = 500
-UNSEEN_GAP_S = 6.5
-"""Beyond this the 8-bit sequence number says nothing about how many packets are missing, or whether the stream was on."""
+from ml.formats.rcs.packets.clock import SECONDS_STEP_MS, PcClock, fit_clock, levels
+from ml.formats.rcs.packets.headers import PacketHeaders
+from ml.formats.rcs.packets.loss import Gaps, find_gaps
+from ml.formats.rcs.packets.ticks import between_streams, device_ms
+
+LATE_MS = 500.0
+"""A packet is late when it arrives by so much more after it was measured than is usual in its stream."""
+
+SAME_TICK = 0.1
+"""Two packets of signal that lie closer together than this share of their length have one tick between them."""
+
+MOST_MOVED = 8
+ASTRAY_MS = 1_000.0
+JOINS = 0.1
+"""A packet joins the one before where the ticks between them are its length but for this share."""
+
+OFF_LATTICE_MS = 20.0
+"""Equidistant samples that stray further than this from the ticks begin a new stretch."""
+
+Same = Callable[[int, int], bool]
+"""Whether two packets of a stream, by their places in the file, hold the same samples."""
 
 
 class Rejected(StrEnum):
-    """Why a packet was left out."""
+    """Why a packet was left out. The last three are of decode versions up to 4, whose recordings are shown as they were stored."""
 
+    DUPLICATE = "duplicate"
+    UNPLACEABLE = "unplaceable"
     DAY_OFF = "day_off"
     CLOCKS_DISAGREE = "clocks_disagree"
-    DUPLICATE = "duplicate"
     STEPS_BACK = "steps_back"
 
 
 @dataclass(frozen=True, slots=True)
-class PacketHeaders:
-    """Header fields of one stream in file order, all shape [n]."""
-
-    seconds: NDArray[np.int64]
-    tick: NDArray[np.int64]
-    gen_ms: NDArray[np.float64]
-    rx_ms: NDArray[np.float64]
-    sequence: NDArray[np.int64]
-    samples: NDArray[np.int64]
-    rate_hz: NDArray[np.float64]
-
-    @property
-    def size(self) -> int:
-        """Number of packets n."""
-        return int(self.seconds.size)
-
-    def take(self, index: NDArray[np.int64]) -> PacketHeaders:
-        """Some of the packets."""
-        return PacketHeaders(*(getattr(self, name)[index] for name in PacketHeaders.__slots__))
-
-
-@dataclass(frozen=True, slots=True)
 class PacketTimes:
-    """Reconstructed times.
+    """Reconstructed times of one stream.
 
     Attributes:
-        last_ms: time of each packet's last sample, ms in the PC clock (or device-placed), [n]; NaN where rejected.
+        last_ms: time of each packet's last sample on the timeline, ms, [n]; NaN where rejected.
         chunk: number of the gap-free chunk, [n]; -1 where rejected.
         device_clock: True when no packet had a usable PacketGenTime and arrival times placed the recording.
-        missing: packets lost within the stream, by sequence number.
+        missing: packets lost between the first and the last one, pauses included.
+        gaps: where signal is missing.
+        received_ms: how much signal was received.
         rejected: how many packets were rejected, by reason.
         reordered: how many packets stood after a later one in the file.
+        late: how many arrived late.
+        moved: how many carried the tick of the packet after them.
+        residual_ms: PacketGenTime (or the time of arrival where none is known) minus the fitted PC clock, [n]; NaN where unknown.
     """
 
     last_ms: NDArray[np.float64]
     chunk: NDArray[np.int64]
     device_clock: bool
     missing: int
+    gaps: Gaps = field(default_factory=Gaps)
+    received_ms: float = 0.0
     rejected: dict[Rejected, int] = field(default_factory=dict)
     reordered: int = 0
+    late: int = 0
+    moved: int = 0
+    residual_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     @property
     def chunks(self) -> int:
@@ -88,174 +85,199 @@ class PacketTimes:
 
     @property
     def loss(self) -> float:
-        """Share of packets that did not arrive, 0..1."""
-        kept = int(np.sum(self.chunk >= 0))
-        return self.missing / (kept + self.missing) if kept else 0.0
+        """Share of the signal that is missing between the first and the last sample, 0..1."""
+        missing = float(self.gaps.missing_ms.sum())
+        return missing / (self.received_ms + missing) if missing else 0.0
 
 
-def reconstruct(headers: PacketHeaders) -> PacketTimes:
-    """Place every packet of one stream in time."""
+@dataclass(frozen=True, slots=True)
+class RecordingTimes:
+    """All streams of one recording on one timeline.
+
+    Attributes:
+        streams: by name. clock: the PC's clock.
+        implant_steps: where the implant's own clock was set: timeline in ms and by how many ms.
+    """
+
+    streams: dict[str, PacketTimes]
+    clock: PcClock
+    implant_steps: list[tuple[float, float]]
+
+
+def reconstruct(headers: PacketHeaders, same: Same | None = None) -> PacketTimes:
+    """Place every packet of one stream alone in time; without `same`, equal headers count as equal samples."""
+    return reconstruct_all({"": headers}, {} if same is None else {"": same}).streams[""]
+
+
+def reconstruct_all(streams: Mapping[str, PacketHeaders], same: Mapping[str, Same], leading: Sequence[str] = ()) -> RecordingTimes:
+    """Place every packet of every stream on one timeline.
+
+    Args:
+        streams: headers by name of stream.
+        same: how to compare the samples of two packets, by name of stream.
+        leading: streams by whose PacketGenTimes the clock is fitted where they have any, so that the others move nothing; else by all.
+    """
+    elapsed = {name: device_ms(headers) for name, headers in streams.items()}
+    filled = {name: headers for name, headers in streams.items() if headers.size}
+    if not filled:
+        return RecordingTimes({name: _nothing(headers) for name, headers in streams.items()}, fit_clock(np.empty(0), np.empty(0)), [])
+    lead = [name for name in leading if name in filled and np.any(np.isfinite(filled[name].made_ms))] or list(filled)
+    main = max(lead, key=lambda name: filled[name].size)
+    for name, headers in filled.items():
+        if name != main:
+            elapsed[name] = elapsed[name] + between_streams(filled[main], elapsed[main], headers, elapsed[name])
+    device_clock = not any(np.any(np.isfinite(headers.made_ms)) for headers in filled.values())
+    pc = {name: headers.arrived_ms if device_clock else headers.made_ms for name, headers in filled.items()}
+    clock = fit_clock(np.concatenate([elapsed[name] for name in lead]), np.concatenate([pc[name] for name in lead]))
+    every = np.concatenate([elapsed[name] for name in filled])
+    order = np.argsort(every, kind="stable")
+    seconds = np.concatenate([1000.0 * headers.seconds for headers in filled.values()])
+    implant = levels(every[order], (seconds - every)[order], SECONDS_STEP_MS)
+    level = np.empty(every.size)
+    for piece in implant.pieces():
+        level[order[piece]] = np.median((seconds - every)[order[piece]])
+    ends = np.cumsum([headers.size for headers in filled.values()])
+    off = dict(zip(filled, np.split(seconds - every - level, ends[:-1]), strict=True))
+    out = {name: _nothing(headers) for name, headers in streams.items()}
+    for name, headers in filled.items():
+        residual = pc[name] - clock.pc_ms(elapsed[name])
+        out[name] = _place(headers, elapsed[name], clock, residual, off[name], same.get(name), device_clock)
+    steps = [float(np.median(level[order[p]])) for p in implant.pieces()]
+    at = clock.timeline_ms(implant.at_ms).tolist()
+    return RecordingTimes(out, clock, list(zip(at, np.diff(steps).tolist(), strict=True)))
+
+
+def _nothing(headers: PacketHeaders) -> PacketTimes:
+    return PacketTimes(np.full(headers.size, np.nan), np.full(headers.size, -1, dtype=np.int64), False, 0)
+
+
+def _place(
+    headers: PacketHeaders,
+    elapsed: NDArray[np.float64],
+    clock: PcClock,
+    residual: NDArray[np.float64],
+    implant_off: NDArray[np.float64],
+    same: Same | None,
+    device_clock: bool,
+) -> PacketTimes:
+    """Times of one stream from its device times, [n] in file order."""
     rejected: dict[Rejected, int] = {}
-    gen = np.where(headers.gen_ms > 0, headers.gen_ms, np.nan)
-    keep = _acceptable(headers, gen, rejected)
-    last_ms = np.full(headers.size, np.nan)
-    chunk = np.full(headers.size, -1, dtype=np.int64)
-    index = np.flatnonzero(keep)
-    if index.size == 0:
-        return PacketTimes(last_ms, chunk, False, 0, rejected)
-    index, reordered = _in_device_order(headers, index, rejected)
-    kept = headers.take(index)
-    device_ms = _device_ms(kept)
-    number = np.concatenate(([0], np.cumsum(_breaks(kept))))
-    anchor, device_clock = _anchors(kept, gen[index], number, device_ms)
-    last_ms[index] = anchor[number] + _elapsed_ms(kept, number)
-    chunk[index] = number
-    return PacketTimes(last_ms, chunk, device_clock, _missing(kept, device_ms), rejected, reordered)
+    order = np.argsort(elapsed, kind="stable")
+    reordered = int(np.sum(elapsed < np.maximum.accumulate(elapsed)))
+    order = _without(order, _repeats(headers, elapsed, order, same), Rejected.DUPLICATE, rejected)
+    order = _without(order, _astray(headers, elapsed, order, residual, implant_off), Rejected.UNPLACEABLE, rejected)
+    kept = headers.take(order)
+    at, moved = _untangled(elapsed[order], kept)
+    order, at, kept = _sorted(order, at, kept)
+    gaps = find_gaps(at, kept, clock.shift_ms)
+    last_ms, chunk = np.full(headers.size, np.nan), np.full(headers.size, -1, dtype=np.int64)
+    last_ms[order], chunk[order] = _equidistant(clock.timeline_ms(at), kept, gaps)
+    lag = headers.arrived_ms - clock.pc_ms(elapsed)
+    late = int(np.sum(lag > np.nanmedian(lag) + LATE_MS)) if np.any(np.isfinite(lag)) else 0
+    received = float(kept.length_ms.sum())
+    missing = int(gaps.packets.sum())
+    return PacketTimes(last_ms, chunk, device_clock, missing, gaps, received, rejected, reordered, late, moved, residual)
 
 
-def _in_device_order(headers: PacketHeaders, index: NDArray[np.int64], rejected: dict[Rejected, int]) -> tuple[NDArray[np.int64], int]:
-    """The packets in the order of the device's clock without repetitions, and how many of them were late."""
-    device_ms = _device_ms(headers.take(index))
-    reordered = int(np.sum(device_ms < np.maximum.accumulate(device_ms)))
-    if reordered == 0:
-        return index, 0
-    order = index[np.argsort(device_ms, kind="stable")]
-    twin = np.concatenate(([False], _same_packet(headers.take(order))))
-    if twin.any():
-        rejected[Rejected.DUPLICATE] = rejected.get(Rejected.DUPLICATE, 0) + int(twin.sum())
-    return order[~twin], reordered
+def _without(order: NDArray[np.int64], hit: NDArray[np.bool_], reason: Rejected, rejected: dict[Rejected, int]) -> NDArray[np.int64]:
+    if hit.any():
+        rejected[reason] = int(hit.sum())
+    return order[~hit]
 
 
-def _same_packet(headers: PacketHeaders) -> NDArray[np.bool_]:
-    """Where a packet repeats the one before, [n - 1]."""
-    return np.asarray((np.diff(headers.sequence) == 0) & (np.diff(headers.tick) == 0))
+def _sorted(
+    order: NDArray[np.int64], at: NDArray[np.float64], kept: PacketHeaders
+) -> tuple[NDArray[np.int64], NDArray[np.float64], PacketHeaders]:
+    again = np.argsort(at, kind="stable")
+    return order[again], at[again], kept.take(again)
 
 
-def _acceptable(headers: PacketHeaders, gen: NDArray[np.float64], rejected: dict[Rejected, int]) -> NDArray[np.bool_]:
-    """Which packets to use, [n]; counts the others by reason."""
-    keep = np.ones(headers.size, dtype=bool)
-
-    def drop(mask: NDArray[np.bool_], reason: Rejected) -> None:
-        if count := int(np.sum(keep & mask)):
-            rejected[reason] = count
-            keep[mask] = False
-
-    if headers.size == 0:
-        return keep
-    drop(np.abs(headers.seconds - np.median(headers.seconds)) > DAY_S, Rejected.DAY_OFF)
-    deviation = gen - 1000.0 * headers.seconds
-    if np.any(usable := keep & np.isfinite(deviation)):
-        far = np.abs(deviation - np.median(deviation[usable])) > CLOCK_DEVIATION_MS
-        drop(np.isfinite(deviation) & far, Rejected.CLOCKS_DISAGREE)
-    drop(np.concatenate(([False], _same_packet(headers))), Rejected.DUPLICATE)
-    drop(_after_back_step(gen), Rejected.STEPS_BACK)
-    return keep
-
-
-def _after_back_step(gen: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Packets after PacketGenTime fell by more than 500 ms: the next two, and up to the sixth while still earlier than before."""
-    hit = np.zeros(gen.size, dtype=bool)
-    for i in np.flatnonzero(np.diff(gen) < -BACK_STEP_MS).tolist():
-        hit[i + 1 : i + 3] = True
-        for j in range(i + 3, min(i + 7, gen.size)):
-            if not gen[j] < gen[i]:
+def _repeats(headers: PacketHeaders, elapsed: NDArray[np.float64], order: NDArray[np.int64], same: Same | None) -> NDArray[np.bool_]:
+    """Which packets, in device order, hold what an earlier one of the same clock and number holds: headers alone prove nothing."""
+    hit = np.zeros(order.size, dtype=bool)
+    for i in np.flatnonzero(np.diff(elapsed[order]) == 0).tolist():
+        here = int(order[i + 1])
+        j = i
+        while j >= 0 and elapsed[order[j]] == elapsed[here]:
+            there = int(order[j])
+            equal = headers.sequence[there] == headers.sequence[here] and headers.samples[there] == headers.samples[here]
+            if not hit[j] and equal and (same is None or same(there, here)):
+                hit[i + 1] = True
                 break
-            hit[j] = True
+            j -= 1
     return hit
 
 
-def _breaks(kept: PacketHeaders) -> NDArray[np.bool_]:
-    """True where a new chunk starts after packet i, [n - 1]."""
-    seconds = np.diff(kept.seconds)
-    sequence = np.diff(kept.sequence)
-    ticks = np.diff(kept.tick) % ROLLOVER
-    expected = kept.samples[1:] / kept.rate_hz[1:] * TICKS_PER_S
-    return np.asarray(
-        (np.diff(kept.rate_hz) != 0)
-        | ~np.isin(seconds, (0, 1))
-        | ~np.isin(sequence, (1, -255))
-        | (np.abs(expected - ticks) > np.maximum(0.5 * expected, 1000))
-    )
+def _astray(
+    headers: PacketHeaders,
+    elapsed: NDArray[np.float64],
+    order: NDArray[np.int64],
+    residual: NDArray[np.float64],
+    implant_off: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Which packets, in device order, have ticks that both clocks contradict and that join no neighbour: nobody knows where they belong."""
+    doubtful = (np.abs(implant_off[order]) > SECONDS_STEP_MS) & ~(np.abs(residual[order]) <= ASTRAY_MS)
+    if not doubtful.any():
+        return doubtful
+    length = headers.length_ms[order]
+    joins = np.abs(np.diff(elapsed[order]) - length[1:]) <= JOINS * length[1:]
+    return np.asarray(doubtful & ~np.concatenate(([False], joins)) & ~np.concatenate((joins, [False])))
 
 
-def _device_ms(kept: PacketHeaders) -> NDArray[np.float64]:
-    """The device's own clock made continuous, ms after the first packet, [n]: ticks, with the rollovers that `timestamp` shows.
+def _untangled(at: NDArray[np.float64], kept: PacketHeaders) -> tuple[NDArray[np.float64], int]:
+    """Device times, [n] in rising order, where packets that carry the tick of the packet after them are put back, and how many those are.
 
-    A step is the one of its ticks that lies nearest to the step of `timestamp`, which is right to a second: forwards or backwards.
+    Now and then the recording program writes a packet under the header of the next one: two packets then share a tick and a hole of one
+    packet's length lies before them. Signal cannot overlap, so the earlier one of the file belongs before the other.
     """
-    ticks = (np.diff(kept.tick) % ROLLOVER) / TICKS_PER_S
-    turns = np.rint((np.diff(kept.seconds) - ticks) / ROLLOVER_S)
-    return np.concatenate(([0.0], np.cumsum(1000.0 * (ticks + ROLLOVER_S * turns))))
+    length = kept.length_ms
+    signal = kept.samples > 1
+    shared = np.diff(at) <= np.where(signal[1:], SAME_TICK * length[1:], 0.0)
+    moved = 0
+    for i in np.flatnonzero(shared)[::-1].tolist():
+        trial: dict[int, float] = {}
+        j, due = i, float(at[i + 1] - length[i + 1])
+        while j >= 0 and len(trial) < MOST_MOVED and at[j] > due + (0.5 * length[j + 1] if trial else 0.0):
+            trial[j] = due
+            due -= float(length[j])
+            j -= 1
+        if len(trial) < MOST_MOVED:
+            for place, time in trial.items():
+                at[place] = time
+            moved += len(trial)
+    return at, moved
 
 
-DRIFT_SPAN_S = 30.0
-"""Over less time than this the PC's jitter of some 20 ms says nothing about drift."""
+def _equidistant(at_ms: NDArray[np.float64], kept: PacketHeaders, gaps: Gaps) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Time of each packet's last sample and its chunk, both [n] in device order.
 
-
-def device_clock_drift(headers: PacketHeaders) -> float | None:
-    """How fast the device's clock runs against the PC's: relative, 0 when both agree; None when the stream is too short to tell.
-
-    The median of the slopes between packets half the stream apart (the robust line of Theil and Sen on few pairs), PacketGenTime against
-    the device's ticks, of packets in rising order of the device's clock.
+    Packets of one value stand at their ticks. Samples of a chunk are equidistant: it lies at the median of what its packets' ticks say, on
+    the sampling grid of the first chunk.
     """
-    kept = np.flatnonzero(headers.gen_ms > 0)
-    kept = kept[np.abs(headers.seconds[kept] - np.median(headers.seconds[kept])) <= DAY_S] if kept.size else kept
-    if kept.size < 4:
-        return None
-    chosen = headers.take(kept)
-    device_ms, half = _device_ms(chosen), kept.size // 2
-    device, pc = device_ms[half:] - device_ms[:-half], chosen.gen_ms[half:] - chosen.gen_ms[:-half]
-    long = device > 500.0 * DRIFT_SPAN_S
-    if device_ms[-1] < 1000.0 * DRIFT_SPAN_S or not long.any():
-        return None
-    return float(np.median(device[long] / np.where(pc[long] == 0, np.nan, pc[long]))) - 1.0
-
-
-def _elapsed_ms(kept: PacketHeaders, number: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Time of each packet's last sample after that of its chunk's first packet, ms, [n]."""
-    length = 1000.0 * kept.samples / kept.rate_hz
-    total = np.cumsum(length)
+    number = np.zeros(at_ms.size, dtype=np.int64)
+    number[gaps.after + 1] = 1
+    number = np.cumsum(number)
+    if at_ms.size == 0 or kept.samples.max() <= 1:
+        return at_ms, number
+    total = np.cumsum(kept.length_ms)
+    number, level = _leveled(at_ms - total, number)
     first = np.flatnonzero(np.diff(number, prepend=-1))
-    return np.asarray(total - total[first][number])
-
-
-def _anchors(
-    kept: PacketHeaders, gen: NDArray[np.float64], number: NDArray[np.int64], device_ms: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], bool]:
-    """Time of the last sample of each chunk's first packet, snapped to the sampling grid of the first chunk, [chunks]."""
-    elapsed = _elapsed_ms(kept, number)
-    first = np.flatnonzero(np.diff(number, prepend=-1))
-    ends = np.append(first[1:], number.size)
-    device_clock = not np.any(np.isfinite(gen))
-    clock = kept.rx_ms if device_clock else gen
-    offset = np.full(first.size, np.nan)
-    for c, (start, end) in enumerate(zip(first, ends, strict=True)):
-        votes = clock[start:end] - elapsed[start:end]
-        if np.any(known := np.isfinite(votes)):
-            offset[c] = np.median(votes[known])
-    if device_clock:
-        offset = device_ms[first] + (np.nanmedian(clock - device_ms) if np.any(np.isfinite(clock)) else 0.0)
-    else:
-        _place_by_device_clock(offset, device_ms[first])
+    start = (level + total)[first]
     grid = 1000.0 / float(kept.rate_hz.max())
-    return offset[0] + grid * np.floor((offset - offset[0]) / grid + 0.5), device_clock
+    start = start[0] + grid * np.floor((start - start[0]) / grid + 0.5)
+    return start[number] + total - total[first][number], number
 
 
-def _place_by_device_clock(offset: NDArray[np.float64], device_ms: NDArray[np.float64]) -> None:
-    """Fill in chunks without any PacketGenTime from the nearest chunk that has one, in place."""
-    known = np.flatnonzero(np.isfinite(offset))
-    for c in np.flatnonzero(~np.isfinite(offset)):
-        near = known[np.argmin(np.abs(device_ms[known] - device_ms[c]))]
-        offset[c] = offset[near] + device_ms[c] - device_ms[near]
-
-
-def _missing(kept: PacketHeaders, device_ms: NDArray[np.float64]) -> int:
-    """Packets lost in gaps short enough for the sequence number to count them.
-
-    The counter starts anew at times; where it says something else than the clock, the clock counts.
-    """
-    gap_s = np.diff(device_ms) / 1000.0
-    by_clock = np.maximum(0, np.rint(gap_s * kept.rate_hz[1:] / np.maximum(kept.samples[1:], 1)) - 1)
-    by_number = (np.diff(kept.sequence) - 1) % 256
-    agree = np.abs(by_number - by_clock) <= np.maximum(2, 0.5 * by_clock)
-    return int(np.sum(np.where(agree, by_number, by_clock)[gap_s < UNSEEN_GAP_S]))
+def _leveled(ahead_ms: NDArray[np.float64], number: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Chunks cut where ticks and samples part by more than `OFF_LATTICE_MS`, and the median of each chunk, both [n]."""
+    level = np.empty(ahead_ms.size)
+    cuts = np.zeros(ahead_ms.size, dtype=np.int64)
+    todo = np.split(np.arange(ahead_ms.size), np.flatnonzero(np.diff(number)) + 1)
+    while todo:
+        piece = todo.pop()
+        level[piece] = np.median(ahead_ms[piece])
+        if piece.size > 1 and np.abs(ahead_ms[piece] - level[piece]).max() > OFF_LATTICE_MS:
+            half = piece.size // 2
+            cuts[piece[half]] = 1
+            todo += [piece[:half], piece[half:]]
+    return number + np.cumsum(cuts), level

@@ -178,4 +178,4 @@ def test_the_control_channel_is_the_one_with_the_most_valid_steps(send: Any, cli
     (session,) = send(montage, visit=1, controller="other").json()["sessions"]
     trace = client.get(f"/api/v1/sessions/{session['id']}/trace").json()
     assert session["control_channel"] == "key 2 +9-8"
-    assert sum(b is not None for b, t in zip(trace["beta"], trace["t_s"], strict=True) if t > 0) == 36
+    assert sum(b is not None for b, t in zip(trace["beta"], trace["t_s"], strict=True) if t > 0) == 35

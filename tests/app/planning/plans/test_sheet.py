@@ -65,6 +65,7 @@ def test_an_approved_sheet_has_no_watermark_and_names_who_approved(client: TestC
 
 
 def test_a_long_day_goes_over_pages_with_its_head_repeated(client: TestClient, studied: Any) -> None:
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"design": "paper"}})
     body = {"policy_ids": list(studied.policies), "random_sessions": 10, "total_minutes": 600, "note": "word " * 300}
     client.post(f"/api/v1/visits/{studied.visit}/plan", json=body)
     pages = _sheet(client, studied.visit)
@@ -73,6 +74,18 @@ def test_a_long_day_goes_over_pages_with_its_head_repeated(client: TestClient, s
         assert f"Page {number} of 2" in text
         assert "Notes, adverse effects" in text
         assert "DRAFT" in text
+
+
+def test_the_sheet_has_the_amplitudes_of_random_sessions_and_their_bound(client: TestClient, studied: Any) -> None:
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0}})
+    plan = client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]], "random_sessions": 1}).json()
+    design = next(s["design"] for s in plan["sessions"] if s["design"])
+    text = " ".join(" ".join(_sheet(client, studied.visit)).split())
+    assert f"stratified design: level {design['level']:.2f} of cDBS" in text
+    assert "never below 0.9 mA (0.3 of cDBS)" in text
+    second = design["holds"][1]
+    ma = max(round(second["amplitude"] * 3.0, 1), 0.9)
+    assert f"{2 * second['start'] // 60}:{2 * second['start'] % 60:02d} {ma:.1f}" in text
 
 
 def test_names_outside_latin_1_are_spelled(client: TestClient, studied: Any, external: int) -> None:

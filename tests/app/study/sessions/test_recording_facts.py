@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from app.study.models import Recording
-from app.study.sessions.recording_charts import Stretch, spectrum_charts, trace_charts
+from app.study.sessions.recording_charts import Stretch, clock_chart, spectrum_charts, trace_charts
 from app.study.sessions.recording_facts import (
     amplitude_limits,
     quality_remarks,
@@ -40,12 +40,45 @@ def test_packets_left_out_stand_under_their_reason(rejected: dict[str, int]) -> 
     }
     [row] = quality_rows(recording(quality={"time_domain": told, "valid_fraction": {"beta key 0": 0.5}, "errors": 2}))
     assert (row.name, row.count, row.missing, row.loss, row.gaps) == ("time domain", 2156, 385, 0.1515, 302)
-    assert (row.duplicates, row.back_steps, row.clock) == (3, 4, "pc")
+    assert (row.duplicates, row.late, row.out_of_order, row.clock) == (3, None, None, "pc")
     assert row.remarks == [
+        "4 left out: PacketGenTime steps back",
         "1 left out: timestamp more than a day off",
         "2 left out: fields missing or of the wrong kind",
         "flat share: key 0 0.01",
     ]
+
+
+def test_loss_is_told_in_seconds_with_late_and_disordered_packets() -> None:
+    told = {
+        "packets": 90,
+        "missing": 5,
+        "missing_s": 1.25,
+        "paused_s": 3.0,
+        "loss": 0.12,
+        "chunks": 3,
+        "late": 4,
+        "reordered": 2,
+        "moved": 1,
+    }
+    [row] = quality_rows(recording(quality={"accel": told, "clock": {"drift_ppm": 1.0}}))
+    assert (row.missing, row.missing_s, row.loss, row.late, row.out_of_order, row.duplicates) == (5, 1.25, 0.12, 4, 2, 0)
+    assert row.remarks == ["sensing switched off for 3.0 s in between", "1 under the clock of the next one put back before it"]
+
+
+def test_the_fit_of_the_clocks_is_drawn_and_stands_nowhere_else() -> None:
+    told = {
+        "drift_ppm": -60.1, "pc_steps": [[20.3, 10.0]], "implant_steps": [], "residual_t_s": [0.0, 30.0], "residual_ms": [5.0, -40.0],
+        "residual_sd_ms": 31.6, "residual_beyond_50_ms": 0.098,
+    }  # fmt: skip
+    one = recording(quality={"clock": told})
+    assert quality_rows(one) == quality_remarks(one) == []
+    chart = clock_chart(one)
+    assert chart is not None
+    assert list(chart.rows) == [[0.0, 5.0], [30.0, -40.0]]
+    assert "SD 32 ms, 9.8 % of packets beyond 50 ms · drift -60 ppm" in chart.subtitle
+    assert [a["text"] for a in chart.figure["layout"]["annotations"]] == ["PC clock set by +10.0 s"]
+    assert clock_chart(recording(quality={})) is None
 
 
 def test_a_stream_with_one_entry_per_channel_has_a_row_per_channel() -> None:

@@ -108,8 +108,9 @@ def test_wrong_kinds_inside_packets_cost_those_packets(rcs, pack):
     packets[9]["ChannelSamples"][0]["Value"][4] = None
     decoded = decode(pack(session(rcs, RawDataTD=td)))
     about = next(r for r in decoded.reports if r.name == "RawDataTD.json")
-    assert any("3 packets left out" in text for text in about.repaired)
-    assert any("1 samples" in text for text in about.repaired)
+    assert any("3 packets left out" in text for text in about.flagged)
+    assert any("1 samples" in text for text in about.flagged)
+    assert about.repaired == []
     assert one(decoded).quality["time_domain"]["packets"] == 197
 
 

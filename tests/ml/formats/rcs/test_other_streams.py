@@ -104,13 +104,13 @@ def test_clock_exchanges_give_latency_and_drift(rcs, pack):
         packet["PacketGenTime"] += round(0.2 * i)  # the device's second is 1.0002 s of the PC
     quality = one(decode(pack({FOLDER + "TimeSync.json": [{"RecordInfo": {}, "TimeSyncData": sync}]}))).quality
     assert quality["time_sync"]["latency_median_ms"] == 30.0
-    assert quality["time_sync"]["clock_drift_ppm"] == pytest.approx(-200, abs=12)
+    assert quality["clock"]["drift_ppm"] == pytest.approx(-200, abs=12)
 
 
 def test_clock_exchanges_too_few_to_tell_give_no_drift(rcs, pack):
     sync = packets(rcs, lambda i: {}, 1.0, 10)
     quality = one(decode(pack({FOLDER + "TimeSync.json": [{"RecordInfo": {}, "TimeSyncData": sync}]}))).quality
-    assert (quality["time_sync"]["latency_median_ms"], quality["time_sync"]["clock_drift_ppm"]) == (None, None)
+    assert (quality["time_sync"]["latency_median_ms"], quality["clock"]["drift_ppm"]) == (None, None)
 
 
 def test_errors_of_the_device_are_counted_without_their_texts(rcs, pack):

@@ -17,12 +17,11 @@ from ml.policies.policy import ConstantPolicy
 from ml.qoc import Qoc
 
 
-def estimate(value, draws, method="linear", supported=True):
+def estimate(value, draws, method="linear", supported=True, resampled=None):
     draws = np.asarray(draws, dtype=np.float64)
     spread = float(draws.std()) or 1.0
-    return Estimate(
-        method, value, value - spread, value + spread, 0.9, spread, value, None, {}, supported, (), 9, {"draws": [float(d) for d in draws]}
-    )
+    details = {"draws": [float(d) for d in draws], "resampled": resampled}
+    return Estimate(method, value, value - spread, value + spread, 0.9, spread, value, None, {}, supported, (), 9, details)
 
 
 def test_weights_are_those_of_the_quadratic_programme():
@@ -50,9 +49,17 @@ def test_two_independent_methods_are_weighted_by_their_inverse_variances():
 def test_known_bias_moves_weight_to_the_other_method_and_shared_draws_count_as_covariance():
     rng = np.random.default_rng(1)
     shared = rng.normal(size=100)
-    tables = {"a": {"p": estimate(1.0, shared)}, "b": {"p": estimate(3.0, shared + 0.1 * rng.normal(size=100), "b")}}
-    matrix = error_matrix(tables, ["a", "b"])
+    near = shared + 0.1 * rng.normal(size=100)
+
+    def covariance(one, other):
+        tables = {"a": {"p": estimate(1.0, shared, resampled=one)}, "b": {"p": estimate(3.0, near, "b", resampled=other)}}
+        return error_matrix(tables, ["a", "b"])
+
+    matrix = covariance("9 sessions, seed 0", "9 sessions, seed 0")
     assert matrix[0, 1] == pytest.approx(matrix[0, 0], rel=0.2)
+    # draws that were not made on the same sessions have nothing in common but their number
+    assert covariance("9 sessions, seed 0", "8 sessions, seed 0")[0, 1] == covariance(None, None)[0, 1] == 0
+    tables = {"a": {"p": estimate(1.0, shared)}, "b": {"p": estimate(3.0, near, "b")}}
     assert combine(tables, {"a": 0.0, "b": 5.0})["p"].details["weights"]["a"] > 0.95
     assert combine(tables, {"a": 5.0, "b": 0.0})["p"].value > 2.8
 

@@ -146,6 +146,20 @@ def test_without_any_qoc_the_estimate_is_the_step_return_and_says_so(small_buffe
     assert FEW_END_REWARDS in estimate.flags
 
 
+@pytest.mark.parametrize("measured", [True, False])
+def test_where_no_qoc_counts_r_end_is_zero_and_judges_no_model(small_buffer, measured):
+    # r_end is then the same for all: its error as a share of that of a constant, 0, was in the tens of thousands and stood in a flag.
+    settings = replace(small_buffer.settings, c2=0.0, c3=0.0, c4=0.0)
+    sessions = tuple(s if measured else replace(s, qoc=type(s.qoc)()) for s in small_buffer.sessions)
+    fitted = Dlsm(TINY).fit(ReplayBuffer(settings, sessions, "uV", "table"))
+    estimate = fitted.evaluate(POLICIES, 20)["low"]
+    assert estimate.end_reward == 0
+    assert estimate.value == estimate.step_return
+    assert FEW_END_REWARDS not in estimate.flags
+    assert fitted.held_out_skill()["score"] < 20
+    assert ("grasp_hz" in estimate.predicted) == measured
+
+
 def test_gaps_in_beta_and_amplitude_do_not_stop_a_fit(small_buffer):
     beta, amplitude = small_buffer.sessions[1].beta.copy(), small_buffer.sessions[1].amplitude.copy()
     beta[5:9], amplitude[20], amplitude[25] = np.nan, np.nan, 1.4
@@ -258,9 +272,10 @@ def test_outcomes_from_summaries_are_the_regressions_at_the_simulated_sessions(s
             per_policy=config.rollouts,
             seed=config.seed + 1000 + k,
         )
-        np.testing.assert_allclose(run.summaries[0, :, 0], 0.9)
-        np.testing.assert_allclose(run.summaries[0, :, 4], 0.9)
-        ends.append(fitted.end.predict(run.summaries)[:, :, 0].mean(1))
+        np.testing.assert_allclose(run.amplitude[0], 0.9)
+        np.testing.assert_allclose(run.energy[0], 0.81)
+        np.testing.assert_allclose(run.minutes.share.sum(-1), 1.0)
+        ends.append(fitted.end.predict(run.minutes)[:, :, 0].mean(1))
     for i, name in enumerate(POLICIES):
         assert found[name].end_reward == pytest.approx(np.mean(ends, axis=0)[i])
         assert found[name].details["end_source"] == "summaries"

@@ -8,8 +8,9 @@ import pytest
 
 from ml.ope.compare.metrics import accuracy
 from ml.ope.linear.dynamics import answers, noise_features
-from ml.ope.linear.end_outcomes import fit_end_model, summarise
 from ml.ope.linear.estimator import LinearConfig, LinearModel
+from ml.ope.outcomes.minutes import by_minute
+from ml.ope.outcomes.model import fit_end_model
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -110,11 +111,6 @@ def test_the_same_seed_gives_the_same_estimate(small_buffer):
     assert one == two
 
 
-def test_session_summaries_are_the_plain_means_of_the_known_steps():
-    beta, a = np.array([1.0, 2.0, np.nan, 4.0]), np.array([0.5, 0.5, 0.5, 1.0])
-    np.testing.assert_allclose(summarise(beta, a, xi_beta=2.0), [2 / 3, 0.5, 7 / 3, 2 / 3, 2 / 3])
-
-
 def test_outcomes_that_follow_the_mean_amplitude_are_learnt_and_kept_in_their_range(linear_simulator):
     sessions = []
     for k, s in enumerate(linear_simulator.buffer(seed=4, n=24, steps=60).sessions):
@@ -123,10 +119,10 @@ def test_outcomes_that_follow_the_mean_amplitude_are_learnt_and_kept_in_their_ra
         sessions.append(replace(s, amplitude=np.full(s.steps, level), qoc=qoc))
     model = fit_end_model(ReplayBuffer(linear_simulator.settings, tuple(sessions), "uV", "table"))
     beta = np.full((2, 60), 0.9)
-    predicted = model.predict(summarise(beta, np.array([[0.5] * 60, [1.0] * 60]), linear_simulator.xi))
+    predicted = model.predict(by_minute(beta, np.array([[0.5] * 60, [1.0] * 60]), linear_simulator.settings))
     assert predicted[0, 1] == pytest.approx(1.5, abs=0.12)
     assert predicted[1, 1] == pytest.approx(2.0, abs=0.12)
-    assert predicted[:, 2] == pytest.approx(5.0)
+    assert predicted[:, 2] == pytest.approx(5.0, abs=0.3)
     assert (predicted[:, 3] <= 100).all()
     assert model.skill[1] > 0.9
 
@@ -137,6 +133,28 @@ def test_a_buffer_without_outcomes_still_gives_a_step_return(small_buffer):
     estimate = fitted.evaluate({"half": ConstantPolicy(0.5)}, 30)["half"]
     assert estimate.end_reward is None
     assert estimate.value == estimate.step_return
+
+
+def test_where_no_qoc_counts_the_return_is_that_of_the_steps_and_nothing_is_missing(small_buffer):
+    nothing = replace(small_buffer, settings=replace(small_buffer.settings, c2=0.0, c3=0.0, c4=0.0))
+    estimate = LinearModel(LinearConfig(draws=20)).fit(nothing).evaluate({"half": ConstantPolicy(0.5)}, 30)["half"]
+    assert (estimate.end_reward, estimate.value) == (0.0, estimate.step_return)
+    assert "few_end_rewards" not in {f.code for f in estimate.flags}
+    assert {"grasp_hz", "rating", "tremor_percent"} <= estimate.predicted.keys()
+
+
+def test_a_stopped_session_lowers_the_estimate_and_the_flag_says_what_it_would_be_as_measured(linear_simulator):
+    whole = linear_simulator.buffer(seed=3, n=12, steps=60)
+    sessions = tuple(replace(s, stopped=s.controller == "other") for s in whole.sessions)
+    policies = {"low": ConstantPolicy(0.3)}
+    before = LinearModel(LinearConfig(draws=20)).fit(whole).evaluate(policies, 60)["low"]
+    after = LinearModel(LinearConfig(draws=20)).fit(replace(whole, sessions=sessions)).evaluate(policies, 60)["low"]
+    assert after.end_reward < before.end_reward - 5
+    flag = next(f for f in after.flags if f.code == "stopped_sessions")
+    assert flag.value == 1
+    assert flag.fact("counted") == pytest.approx(after.end_reward)
+    assert flag.fact("measured") == pytest.approx(before.end_reward, abs=0.5)  # visits are weighted anew
+    assert "stopped_sessions" not in {f.code for f in before.flags}
 
 
 def test_one_session_is_too_few(small_buffer):

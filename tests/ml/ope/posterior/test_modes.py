@@ -1,45 +1,53 @@
-"""Low-passes of polynomials of the dose against a readable loop, running twins, and sessions whose answer is known."""
+"""Low-passes of dose functions against a readable loop, running twins, and sessions whose answer is known."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from ml.mdp import MdpSettings
 from ml.ope.lead import CDBS, dose_before
 from ml.ope.posterior.modes import (
     COLUMNS,
     FALL,
+    FALL_TIMES,
     ONE_SIDED,
     RISE,
+    SHAPES,
     TIMES,
     Filters,
     ModeTable,
     columns_of,
+    dose_functions,
     fit_modes,
-    polynomials,
 )
 from ml.ope.scale import learn_scale
+from ml.qoc import Qoc
+from ml.trajectories import ReplayBuffer, SessionTrajectory
 from tests.ml.ope.posterior.known_system import KnownSystem
 
 
 def readable(a: np.ndarray, first: float) -> np.ndarray:
     """Columns by their definition, one step after the other."""
     rows = []
-    passed = {(m, j): float(polynomials(np.array(first))[j]) for m in range(len(TIMES)) for j in range(3)}
-    sided = [first] * len(ONE_SIDED)
+    passed = {(m, j): float(dose_functions(np.array(first))[j]) for m in range(len(TIMES)) for j in range(SHAPES)}
+    sided, falls, last = [first] * len(ONE_SIDED), [0.0] * len(FALL_TIMES), first
     for value in a:
         for (m, j), before in passed.items():
             keep = np.exp(-1 / TIMES[m]) if TIMES[m] else 0.0
-            passed[m, j] = keep * before + (1 - keep) * float(polynomials(np.array(value))[j])
+            passed[m, j] = keep * before + (1 - keep) * float(dose_functions(np.array(value))[j])
         for k, before in enumerate(sided):
             sided[k] = before + (RISE if value > before else FALL)[k] * (value - before)
-        rows.append([passed[m, j] for m in range(len(TIMES)) for j in range(3)] + sided)
+        for k, time in enumerate(FALL_TIMES):
+            falls[k] = np.exp(-1 / time) * falls[k] + (1 - np.exp(-1 / time)) * 5 * max(last - value, 0)
+        last = value
+        rows.append([passed[m, j] for m in range(len(TIMES)) for j in range(SHAPES)] + sided + falls)
     return np.array(rows)
 
 
 def test_bends_of_the_dose_are_none_at_both_ends() -> None:
-    ends = polynomials(np.array([0.0, 1.0]))
-    assert np.allclose(ends, [[0, 0, 0], [1, 0, 0]])
+    ends = dose_functions(np.array([0.0, 1.0]))
+    assert np.allclose(ends, [[0, 0, 0, 0], [1, 0, 0, 0]])
 
 
 @pytest.mark.parametrize("first", [0.0, 0.4, 1.0])
@@ -78,3 +86,27 @@ def test_a_wrong_account_of_the_dose_before_costs_the_answer_to_sustained_dose()
     buffer = KnownSystem(steps_constant=120.0, before=1.0).buffer(visits=4)
     right, wrong = (abs(float(np.mean(sustained(buffer, before))) + 0.8) for before in (1.0, None))
     assert right < wrong
+
+
+def test_a_rebound_after_falls_is_not_taken_for_an_answer_to_the_dose() -> None:
+    """Beta answers to no dose, yet rises after every fall: it is high under a random controller because that switches, not by its dose."""
+    rng = np.random.default_rng(4)
+    sessions = []
+    for i in range(12):
+        a = np.ones(300) if i % 3 == 0 else rng.uniform(0.3, 1.0, 300)
+        fall, eta, x = 0.0, 0.0, []
+        for last, value in zip(np.concatenate([[1.0], a[:-1]]), a, strict=True):
+            fall = 0.8 * fall + max(last - value, 0.0)
+            eta = 0.5 * eta + 0.1 * rng.standard_normal()
+            x.append(0.8 * fall + eta)
+        lead = 0.1 * rng.standard_normal(10)
+        sessions.append(SessionTrajectory(i + 1, 1 + i // 4, "cdbs" if i % 3 == 0 else "random", np.exp(lead), np.exp(x), a, Qoc()))
+    buffer = ReplayBuffer(MdpSettings(xi_beta=1.2, lower_bound=0.3), tuple(sessions), "uV", "table")
+    scale = learn_scale(buffer)
+    tables = [ModeTable.of(s, scale, 1.0) for s in buffer.sessions]
+    gains = fit_modes(buffer, tables, 1.0).mean.gains[0]
+    held, full = (columns_of(np.full(400, dose), 1.0)[-1] for dose in (0.65, 1.0))
+    switching = np.concatenate([columns_of(rng.uniform(0.3, 1.0, 300), 1.0)[-50:] for _ in range(4)]).mean(0)
+    rise = (switching - full) @ gains * scale.beta_std
+    assert rise > 0.25  # what the random sessions showed: 0.8 x 0.1167 / 0.2 = 0.47
+    assert abs((held - full) @ gains * scale.beta_std) < 0.5 * rise

@@ -1,0 +1,207 @@
+"""Copies of the same minutes: a recording is what a device and side had in a stretch of time, in whatever set of files it comes.
+
+The fuller copy counts. A copy that holds no more than a stored one is not stored again; a fuller one takes the place of the stored one in
+its sessions. Where both differ, or each holds what the other lacks, both are kept and a person decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import timedelta
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy.orm import Session
+
+from app.ingest import repository
+from app.ingest.proposals import service as proposals
+from app.study import repository as study
+from app.study.models import Recording, SessionSegment, StudySession, Trace
+from app.study.sessions import conditions
+from app.study.traces import unpack
+from ml.formats.beta import ERROR_STREAM
+from ml.formats.recording import TraceLog
+
+NEURAL = ("beta", "band_power")
+"""Streams that tell whether two recordings hold the same signal."""
+FEWEST_ROWS = 5
+"""Rows of a channel that both have, from which on they are held against each other."""
+EXACT_S = 0.001
+EQUAL_SHARE = 0.8
+"""Share of rows on the same grid that are equal where two copies hold the same signal; ends and gaps may be cut elsewhere."""
+LIKE = 0.5
+"""Correlation of rows on shifted grids, of which each covers a part of two others, from which on the signal is the same."""
+LOST = 0.02
+"""Share of its rows (and at least one) that a channel of the fuller copy may have fewer: ends are cut elsewhere."""
+
+Channel = tuple[str, str]
+
+
+class Relation(StrEnum):
+    """What a new recording is to a stored one of the same minutes."""
+
+    NO_MORE = "no_more"
+    FULLER = "fuller"
+    EACH_ITS_OWN = "each_its_own"
+    DIFFERS = "differs"
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A trace for comparison: ends of its rows in s of a common clock, values with NaN where invalid, both [n]."""
+
+    end_s: NDArray[np.float64]
+    values: NDArray[np.float64]
+    dt_s: float
+    unit: str
+
+    @property
+    def valid(self) -> int:
+        """Rows with a value."""
+        return int(np.sum(np.isfinite(self.values)))
+
+
+@dataclass
+class Verdict:
+    """What becomes of a new recording.
+
+    Attributes:
+        copy_of: a stored recording that holds all of it. fuller_than: stored ones that it takes the place of.
+        beside: stored ones of the same minutes that differ, or hold what it lacks.
+    """
+
+    copy_of: Recording | None = None
+    fuller_than: list[Recording] = field(default_factory=list)
+    beside: list[Recording] = field(default_factory=list)
+
+
+def of_logs(traces: Sequence[TraceLog]) -> dict[Channel, Rows]:
+    """Traces as they were decoded, on their own clock."""
+    return {(t.stream, t.channel): Rows(t.t_end_s, _with_gaps(t), t.dt_s, t.unit) for t in traces if t.stream != ERROR_STREAM}
+
+
+def _with_gaps(trace: TraceLog) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = trace.values.astype(np.float64)
+    values[~trace.valid] = np.nan
+    return values
+
+
+def of_stored(traces: Sequence[Trace], ahead_s: float) -> dict[Channel, Rows]:
+    """Stored traces on the clock of a recording that begins `ahead_s` after them."""
+    return {
+        (t.stream, t.channel): Rows(t.first_end_s - ahead_s + t.dt_s * np.arange(t.n, dtype=np.float64), unpack(t), t.dt_s, t.unit)
+        for t in traces
+        if t.stream != ERROR_STREAM
+    }
+
+
+def relation(new: Mapping[Channel, Rows], old: Mapping[Channel, Rows]) -> Relation:
+    """What one recording is to another one of the same minutes, both on one clock."""
+    shared = [key for key in new.keys() & old.keys() if key[0] in NEURAL]
+    alike = [found for key in shared if (found := _alike(new[key], old[key])) is not None]
+    if not all(alike):
+        return Relation.DIFFERS
+    if alike or not any(key[0] in NEURAL for key in (*old, *new)):
+        if _holds(old, new):
+            return Relation.NO_MORE
+        return Relation.FULLER if _holds(new, old) else Relation.EACH_ITS_OWN
+    if not any(key[0] in NEURAL for key in old) and _holds(new, old):
+        return Relation.FULLER
+    return Relation.EACH_ITS_OWN
+
+
+def _alike(a: Rows, b: Rows) -> bool | None:
+    """Whether two traces of a channel hold the same signal; None where they share too few rows to tell."""
+    if a.unit != b.unit or abs(a.dt_s - b.dt_s) > EXACT_S or not a.end_s.size or not b.end_s.size:
+        return None
+    off = (a.end_s[0] - b.end_s[0]) / b.dt_s
+    if abs(off - round(off)) * b.dt_s <= EXACT_S:
+        rows = np.arange(a.end_s.size) + round(off)
+        inside = (rows >= 0) & (rows < b.end_s.size)
+        x, y = a.values[inside], b.values[rows[inside]]
+        both = np.isfinite(x) & np.isfinite(y)
+        if both.sum() < FEWEST_ROWS:
+            return None
+        return float(np.mean(np.isclose(x[both], y[both], rtol=1e-3, atol=0))) >= EQUAL_SHARE
+    place = np.searchsorted(b.end_s, a.end_s)
+    inside = (place > 0) & (place < b.end_s.size)
+    x, right = a.values[inside], place[inside]
+    weight = (a.end_s[inside] - b.end_s[right - 1]) / b.dt_s
+    y = (1 - weight) * b.values[right - 1] + weight * b.values[right]
+    both = np.isfinite(x) & np.isfinite(y)
+    if both.sum() < FEWEST_ROWS or np.ptp(x[both]) == 0 or np.ptp(y[both]) == 0:
+        return None
+    return float(np.corrcoef(x[both], y[both])[0, 1]) >= LIKE
+
+
+def _holds(fuller: Mapping[Channel, Rows], less: Mapping[Channel, Rows]) -> bool:
+    """Whether one recording has every channel of another with as many valid rows."""
+    return all(key in fuller and fuller[key].valid >= rows.valid - max(1.0, LOST * rows.valid) for key, rows in less.items())
+
+
+def judge(db: Session, like: Recording, traces: Sequence[TraceLog]) -> Verdict:
+    """Hold a decoded recording against the stored ones of its device, side and minutes.
+
+    Args:
+        like: its row, which need not be stored yet: device, side, start and length. traces: as decoded.
+    """
+    found = Verdict()
+    if like.started_at is None or not traces or not _of_a_session(like):
+        return found
+    mine = of_logs(traces)
+    for old in repository.recordings_of_minutes(db, like):
+        if not _of_a_session(old):
+            continue
+        assert old.started_at is not None
+        ahead = (like.started_at - old.started_at).total_seconds()
+        is_to = relation(mine, of_stored(study.traces_of_recording(db, old.id), ahead))
+        if is_to is Relation.NO_MORE:
+            return Verdict(copy_of=old)
+        (found.fuller_than if is_to is Relation.FULLER else found.beside).append(old)
+    return found
+
+
+def _of_a_session(recording: Recording) -> bool:
+    """Whether a recording may be part of a session: surveys and a device's history share their minutes with others by nature."""
+    return recording.details.get("run", 0) is not None
+
+
+def supersede(db: Session, old: Recording, new: Recording, by: str) -> list[int]:
+    """Let the sessions of a recording use its fuller copy; which ones. A session of the whole recording is one of the whole copy then."""
+    assert old.started_at is not None
+    assert new.started_at is not None
+    moved = []
+    for session_id in sorted(study.session_ids_of_recording(db, old.id)):
+        session = db.get_one(StudySession, session_id)
+        _move(db, session, old, new)
+        moved.append(session_id)
+        if session.status == "confirmed":
+            conditions.renew(db, session, by, f"a fuller copy of recording {old.id} came: recording {new.id}")
+        else:
+            proposals.renew(db, session)
+    old.superseded_by_id = new.id
+    db.flush()
+    return moved
+
+
+def _move(db: Session, session: StudySession, old: Recording, new: Recording) -> None:
+    assert old.started_at is not None
+    assert new.started_at is not None
+    period = session.visit.participant.current_settings.period_s
+    ahead = (new.started_at - old.started_at).total_seconds()
+    mine = [s for s in session.segments if s.recording_id == old.id]
+    parts = []
+    for segment in mine:
+        whole = segment.start_s <= period and segment.stop_s >= old.duration_s - period
+        start = 0.0 if whole else min(max(0.0, round((segment.start_s - ahead) / period) * period), max(0.0, new.duration_s - 1e-3))
+        stop = new.duration_s if whole else min(max(segment.stop_s - ahead, start + 1e-3), new.duration_s)
+        parts.append((segment.is_control, start, stop))
+        session.segments.remove(segment)
+    db.flush()  # the parts that go are gone before the ones that come claim the same minutes
+    for is_control, start, stop in parts:
+        session.segments.append(SessionSegment(recording=new, start_s=start, stop_s=stop, is_control=is_control))
+        if is_control:
+            session.started_at, session.duration_s = new.started_at + timedelta(seconds=start), stop - start
+    db.flush()

@@ -1,0 +1,142 @@
+"""What the random sessions of a visit shall try: laid out with the plan, bounded in milliamperes, signed with it."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.platform.errors import Invalid
+from app.study.cdbs_amplitude import plausible
+from app.study.models import SettingsVersion, Visit
+from ml.designs import LOW_AMPLITUDE, Decision, DesignedSession, DesignSettings, amplitudes, lay_out
+
+RESOLUTION_MA: Final = 0.1
+"""What a stimulator rounds amplitudes to."""
+MAX_SEED: Final = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Milliamperes of one side.
+
+    Attributes:
+        side: hemisphere; None where the cDBS amplitude is stated without one. cdbs_ma: its cDBS amplitude.
+        lowest_ma: no step is below it: B of cDBS, rounded up to what a stimulator gives.
+        low_ma: below this the session stays for `LOW_SECONDS` at most, and only at its end.
+    """
+
+    side: str | None
+    cdbs_ma: float
+    lowest_ma: float
+    low_ma: float
+
+
+@dataclass(frozen=True)
+class Planned:
+    """What one random session shall try.
+
+    Attributes:
+        design: `paper`, where the device draws anew every step, `stratified` or `ladder`. level: of the session; None where it has none.
+        seed: of the draws; None in the paper's design. lower_bound: B. period_s: of a step. holds: empty in the paper's design.
+        bounds: in milliamperes, as they stood when the plan was approved; empty before.
+    """
+
+    design: str
+    level: float | None
+    seed: int | None
+    lower_bound: float
+    period_s: float
+    holds: tuple[Decision, ...]
+    bounds: tuple[Bound, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """For storage."""
+        return asdict(self) | {"holds": [asdict(h) for h in self.holds], "bounds": [asdict(b) for b in self.bounds]}
+
+    @classmethod
+    def from_json(cls, stored: dict[str, Any]) -> Planned:
+        """The inverse of `as_json`."""
+        nested = {"holds": tuple(Decision(**h) for h in stored["holds"]), "bounds": tuple(Bound(**b) for b in stored["bounds"])}
+        return cls(**stored | nested)
+
+    def first_steps(self, steps: int) -> NDArray[np.float64]:
+        """Amplitude fraction of so many steps, [steps]: cDBS after the last hold."""
+        return amplitudes(self.holds, steps)
+
+    @property
+    def low_seconds(self) -> float:
+        """How long the session is below `LOW_AMPLITUDE`."""
+        return sum(h.steps for h in self.holds if h.amplitude < LOW_AMPLITUDE) * self.period_s
+
+
+def planned_sessions(settings: SettingsVersion, code: str, earlier_visits: int, count: int, minutes: float) -> list[Planned]:
+    """What the random sessions of one visit shall try, by the participant's settings.
+
+    Levels are spread over `early_visits` visits; after these a new round of strata begins. The draws depend on the participant's code and
+    the round alone, so that drafting a plan again gives the same ones.
+
+    Args:
+        settings: design, ladder, B and period. code: the participant's. earlier_visits: with a plan of this design.
+        count: random sessions of the visit. minutes: of each.
+    """
+    if count == 0:
+        return []
+    if settings.design == "paper":
+        return [Planned("paper", None, None, settings.lower_bound, settings.period_s, ())] * count
+    number, place = divmod(earlier_visits, settings.early_visits)
+    wanted = DesignSettings(
+        name="stratified",
+        visits=settings.early_visits,
+        sessions=count,
+        steps=max(1, round(60 * minutes / settings.period_s)),
+        period_s=settings.period_s,
+        lower_bound=settings.lower_bound,
+        ladder=settings.design_ladder,
+        seed=seed_of(code, number),
+    )
+    return [_planned(session, wanted) for session in lay_out(wanted) if session.visit == place + 1]
+
+
+def seed_of(code: str, number: int) -> int:
+    """Seed of a participant's designs in one round of early visits."""
+    digest = hashlib.sha256(f"{code.upper()}/{number}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") % MAX_SEED
+
+
+def bounds_of(visit: Visit, settings: SettingsVersion, lower_bound: float) -> tuple[Bound, ...]:
+    """The bounds of a visit's random sessions in milliamperes, by side.
+
+    Raises:
+        Invalid: nobody has stated the cDBS amplitude, so that no bound in milliamperes can be signed; an amplitude that no device gives.
+    """
+    stated = [
+        (str(a.hemisphere), plausible(a.amplitude_ma, f"Visit {visit.number} states")) for a in visit.cdbs_amplitudes if a.program == 0
+    ]
+    shorthand = plausible(settings.cdbs_amplitude_ma, "The participant's settings state")
+    sides: list[tuple[str | None, float]] = list(stated) or ([(None, shorthand)] if shorthand is not None else [])
+    if not sides:
+        raise Invalid(
+            "The plan has random sessions with a lower bound, and the cDBS amplitude that it is a fraction of is not known.",
+            "State the cDBS amplitude at the visit or in the participant's settings; then approve the plan.",
+        )
+    return tuple(Bound(side, ma, rounded_up(lower_bound * ma), rounded_up(LOW_AMPLITUDE * ma)) for side, ma in sides)
+
+
+def rounded_up(milliamperes: float) -> float:
+    """The least amplitude that a stimulator gives and that is not below this one, mA."""
+    return round(math.ceil(milliamperes / RESOLUTION_MA - 1e-6) * RESOLUTION_MA, 6)
+
+
+def delivered_ma(fraction: float, bound: Bound) -> float:
+    """What a stimulator gives for a fraction of cDBS: rounded to its resolution, within the bound and cDBS, mA."""
+    nearest = round(round(fraction * bound.cdbs_ma / RESOLUTION_MA) * RESOLUTION_MA, 6)
+    return min(max(nearest, bound.lowest_ma), bound.cdbs_ma)
+
+
+def _planned(session: DesignedSession, wanted: DesignSettings) -> Planned:
+    return Planned(session.design, session.level, session.seed, wanted.lower_bound, wanted.period_s, session.decisions)

@@ -1,0 +1,315 @@
+"""Backup and restore of a whole installation: database, stored files and keys, sealed with a key that does not lie beside them.
+
+The database is dumped first, in one snapshot; stored files are never changed or deleted, so every file that the dump names is there when
+the files are copied after it. Passwords of the embedded server stay out: a restored installation has its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import secrets
+import shutil
+import subprocess
+import tarfile
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from sqlalchemy import Engine, inspect, make_url, text
+
+from app import __version__
+from app.platform import files
+from app.platform.database import database_url, get_engine, now
+from app.platform.embedded.server import wheel_binaries
+from app.platform.errors import BetaloopError
+from app.platform.migrate import migrate
+from app.platform.upkeep.sealing import CHUNK, KEY_BYTES, NotOpened, SealedReader, SealedWriter
+from app.settings import get_settings, private_folder
+
+DATABASE, FILES, KEYS, MANIFEST = "database.sealed", "files.sealed", "keys.sealed", "manifest.json"
+FORM = 1
+SERVER_PASSWORDS = ("database", "database-admin")
+_UNKNOWN_TO_OLDER_SERVERS = b"SET transaction_timeout = "
+
+
+class BackupError(BetaloopError):
+    """A backup cannot be made or restored."""
+
+    title = "The backup cannot be made or restored"
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What came back.
+
+    Attributes:
+        tables: rows by table. files: stored files, each with its hash checked. made_at: when the backup was made, ISO 8601.
+    """
+
+    tables: dict[str, int]
+    files: int
+    made_at: str
+
+
+def make_key(path: Path) -> None:
+    """Write a new random key, readable by its owner alone. Raises BackupError where the file exists."""
+    try:
+        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as out:
+            out.write(secrets.token_hex(KEY_BYTES) + "\n")
+    except FileExistsError as error:
+        raise BackupError(
+            f"{path} exists already.", "A key that is overwritten opens no older backup any more. Name another file."
+        ) from error
+
+
+def read_key(path: Path, *apart_from: Path) -> bytes:
+    """The key of a file.
+
+    Raises:
+        BackupError: there is none, it holds no key, or it lies in the data folder or beside the backup.
+    """
+    for folder in apart_from:
+        if path.resolve().is_relative_to(folder.resolve()):
+            raise BackupError(f"The key {path} lies in {folder}, beside what it protects.", "Keep it on another medium.")
+    try:
+        key = bytes.fromhex(path.read_text().strip())
+    except (OSError, ValueError, UnicodeDecodeError):
+        key = b""
+    if len(key) != KEY_BYTES:
+        raise BackupError(f"{path} holds no key of {KEY_BYTES} bytes in hexadecimal.", "Make one with `betaloop backup-key FILE`.")
+    return key
+
+
+def backup(folder: Path, key_file: Path) -> dict[str, Any]:
+    """Make a backup in a new folder and return its manifest; a backup that was cut off has no manifest.
+
+    Raises:
+        BackupError: the folder exists, the key cannot be used, or the database cannot be dumped.
+    """
+    settings = get_settings()
+    key = read_key(key_file, settings.data_dir, folder)
+    if folder.exists():
+        raise BackupError(f"{folder} exists already.", "Name a new folder for each backup.")
+    private_folder(folder)
+    with get_engine().connect() as connection:
+        revision = connection.scalar(text("select version_num from alembic_version"))
+    manifest: dict[str, Any] = {"form": FORM, "betaloop": __version__, "made_at": now().isoformat(), "revision": revision, "parts": {}}
+    with _sealed(folder / DATABASE, key) as out:
+        _dump(out)
+    names = _stored()
+    with _sealed(folder / FILES, key) as out, tarfile.open(fileobj=out, mode="w|") as archive:
+        for sha256 in names:
+            archive.add(files.path_of(sha256), arcname=sha256, recursive=False)
+    with _sealed(folder / KEYS, key) as out, tarfile.open(fileobj=out, mode="w|") as archive:
+        for path in sorted((settings.data_dir / "secrets").glob("*")):
+            if path.is_file() and path.name not in SERVER_PASSWORDS:
+                archive.add(path, arcname=path.name, recursive=False)
+    for name in (DATABASE, FILES, KEYS):
+        sha256, size = files.hash_file(folder / name)
+        manifest["parts"][name] = {"sha256": sha256, "bytes": size}
+    manifest["files"] = len(names)
+    draft = folder / f"{MANIFEST}.new"
+    draft.write_text(json.dumps(manifest, indent=1) + "\n")
+    draft.rename(folder / MANIFEST)
+    return manifest
+
+
+def restore(folder: Path, key_file: Path) -> Restored:
+    """Bring a backup back into an empty installation, bring its database to the newest schema, and check every stored file.
+
+    Raises:
+        BackupError: the backup is incomplete or damaged, the installation is not empty, or rows lack their files.
+    """
+    manifest = verify(folder)
+    settings = get_settings()
+    key = read_key(key_file, settings.data_dir, folder)
+    _require_empty(get_engine())
+    _restore_keys(folder / KEYS, key)
+    count = _restore_files(folder / FILES, key)
+    with (folder / DATABASE).open("rb") as source:
+        _load(SealedReader(source, key))
+    migrate()
+    missing = [sha256 for sha256 in _stored() if not _whole(sha256)]
+    if missing:
+        raise BackupError(f"{len(missing)} of the stored files are missing or damaged, the first {missing[0]}.", "Use another backup.")
+    return Restored(_rows(get_engine()), count, manifest["made_at"])
+
+
+def verify(folder: Path) -> dict[str, Any]:
+    """The manifest of a backup whose parts have their hashes; needs no key.
+
+    Raises:
+        BackupError: it was cut off, parts are damaged, or a later betaloop made it.
+    """
+    try:
+        manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text())
+    except (OSError, ValueError) as error:
+        raise BackupError(f"{folder} holds no complete backup: its {MANIFEST} is missing or damaged.", "Use another backup.") from error
+    if manifest.get("form") != FORM:
+        raise BackupError(
+            f"This backup has form {manifest.get('form')}; this betaloop reads form {FORM}.", "Use the betaloop that made it."
+        )
+    for name, part in manifest["parts"].items():
+        if not (folder / name).is_file() or files.hash_file(folder / name) != (part["sha256"], part["bytes"]):
+            raise BackupError(
+                f"{name} is missing or damaged: it does not have the hash of the manifest.", "Use another copy of the backup."
+            )
+    return manifest
+
+
+@contextmanager
+def _sealed(path: Path, key: bytes) -> Iterator[SealedWriter]:
+    with path.open("wb") as out:
+        writer = SealedWriter(out, key)
+        yield writer
+        writer.close()
+        out.flush()
+        os.fsync(out.fileno())
+
+
+def _program(name: str) -> str:
+    """A PostgreSQL client program: the newest of the wheel's and the machine's own, for an older one cannot read a newer server."""
+    found = [str(wheel_binaries() / name), shutil.which(name)]
+    return max((p for p in found if p), key=_major_version)
+
+
+def _major_version(program: str) -> int:
+    said = subprocess.run([program, "--version"], capture_output=True, text=True, check=True).stdout
+    number = re.search(r"(\d+)(\.|\D|$)", said.split(")")[-1])
+    return int(number.group(1)) if number else 0
+
+
+def _target() -> tuple[str, dict[str, str]]:
+    """Address of the database for libpq, and the environment with its password, which must not stand in a list of processes."""
+    url = make_url(database_url()).set(drivername="postgresql")
+    password = {"PGPASSWORD": url.password} if isinstance(url.password, str) else {}
+    return url.set(password=None).render_as_string(hide_password=False), os.environ | password
+
+
+def _dump(out: SealedWriter) -> None:
+    target, env = _target()
+    command = [_program("pg_dump"), "--format=custom", "--compress=6", "--no-owner", "--no-privileges", f"--dbname={target}"]
+    with tempfile.TemporaryFile() as said, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said, env=env) as process:
+        assert process.stdout is not None
+        shutil.copyfileobj(process.stdout, out, CHUNK)
+        process.wait()
+        _require(process, said, "dumped")
+
+
+def _load(source: SealedReader) -> None:
+    """Archive to SQL to psql, and not straight into the database: the archive sets options that older servers do not know."""
+    target, env = _target()
+    unpack = [_program("pg_restore"), "--no-owner", "--no-privileges", "--file=-"]
+    apply = [_program("psql"), "--no-psqlrc", "--quiet", "--set=ON_ERROR_STOP=1", "--single-transaction", f"--dbname={target}"]
+    with (
+        tempfile.TemporaryFile() as said,
+        subprocess.Popen(unpack, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said) as unpacking,
+        subprocess.Popen(apply, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, env=env) as applying,
+    ):
+        feeding = threading.Thread(target=_feed, args=(source, unpacking), daemon=True)
+        feeding.start()
+        assert unpacking.stdout is not None
+        assert applying.stdin is not None
+        try:
+            options = True  # they stand before the first rows
+            for line in unpacking.stdout:
+                options = options and not line.startswith(b"COPY ")
+                if not (options and line.startswith(_UNKNOWN_TO_OLDER_SERVERS)):
+                    applying.stdin.write(line)
+            applying.stdin.close()
+        except BrokenPipeError:
+            unpacking.kill()  # psql ended early: its exit code and words say why
+        applying.wait()
+        unpacking.wait()
+        feeding.join()
+        _require(applying, said, "restored")
+        _require(unpacking, said, "restored")
+
+
+def _feed(source: SealedReader, process: subprocess.Popen[bytes]) -> None:
+    """Hand the archive on; where it is damaged or the reader has ended, the process sees an early end and says so."""
+    assert process.stdin is not None
+    try:
+        shutil.copyfileobj(source, process.stdin, CHUNK)
+    except (BrokenPipeError, NotOpened):
+        process.kill()
+    finally:
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+
+
+def _require(process: subprocess.Popen[bytes], said: IO[bytes], done: str) -> None:
+    if process.returncode != 0:
+        said.seek(0)
+        lines = said.read().decode(errors="replace").strip().splitlines()
+        raise BackupError(f"The database cannot be {done}: {lines[-1] if lines else f'exit code {process.returncode}'}.")
+
+
+def _require_empty(engine: Engine) -> None:
+    tables = inspect(engine).get_table_names()
+    held = get_settings().files_dir
+    if tables or (held.is_dir() and any(p for p in held.iterdir() if p.name != "incoming")):
+        raise BackupError(
+            "This installation holds data already.", "Restore into a new data folder and, with a PostgreSQL of your own, an empty database."
+        )
+
+
+def _restore_keys(path: Path, key: bytes) -> None:
+    folder = private_folder(get_settings().data_dir / "secrets")
+    with path.open("rb") as source, tarfile.open(fileobj=SealedReader(source, key), mode="r|") as archive:
+        for member in archive:
+            target = folder / Path(member.name).name
+            content = _content(archive, member)
+            if target.exists() and target.read_bytes() != content:
+                raise BackupError(
+                    f"The key {target.name} of this installation differs from the backup's.", "Restore into a new data folder."
+                )
+            with open(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as out:
+                out.write(content)
+
+
+def _restore_files(path: Path, key: bytes) -> int:
+    count = 0
+    with path.open("rb") as source, tarfile.open(fileobj=SealedReader(source, key), mode="r|") as archive:
+        for member in archive:
+            extracted = archive.extractfile(member)
+            if extracted is None:
+                continue
+            draft = files.draft_path()
+            with draft.open("wb") as out:
+                shutil.copyfileobj(extracted, out, CHUNK)
+            if files.keep(draft) != member.name:
+                raise BackupError(f"The stored file {member.name} is damaged in the backup.", "Use another backup.")
+            count += 1
+    return count
+
+
+def _content(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
+    extracted = archive.extractfile(member)
+    return extracted.read() if extracted is not None else b""
+
+
+def _stored() -> list[str]:
+    with get_engine().connect() as connection:
+        return list(connection.scalars(text("select sha256 from stored_file order by sha256")))
+
+
+def _whole(sha256: str) -> bool:
+    path = files.path_of(sha256)
+    if not path.is_file():
+        return False
+    with path.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest() == sha256
+
+
+def _rows(engine: Engine) -> dict[str, int]:
+    with engine.connect() as connection:
+        return {name: connection.scalar(text(f'select count(*) from "{name}"')) or 0 for name in sorted(inspect(engine).get_table_names())}

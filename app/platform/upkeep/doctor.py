@@ -1,0 +1,124 @@
+"""Whether an installation is in order: each check says what it found, and what to do where it is not."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from alembic.config import Config
+from alembic.script import ScriptDirectory
+from sqlalchemy import text
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from app.platform import files
+from app.platform.database import new_session, now
+from app.platform.jobs import repository as jobs
+from app.platform.jobs.service import STALE_S
+from app.settings import get_settings
+
+ROOT = Path(__file__).resolve().parents[3]
+LEAST_FREE_MB = 1024
+MOST_CLOCK_DIFFERENCE_S = 2.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check.
+
+    Attributes:
+        name: of the check. ok: whether all is well. detail: what was found. hint: what to do where it is not well.
+    """
+
+    name: str
+    ok: bool
+    detail: str
+    hint: str = ""
+
+
+def examine(hashes: bool = False) -> list[Finding]:
+    """Every check; `hashes` reads every stored file whole."""
+    found = [_disk(), _closed()]
+    try:
+        with new_session() as db:
+            return [*found, _schema(db), _clock(db), _files(db, hashes), *_jobs(db)]
+    except (SQLAlchemyError, RuntimeError) as error:
+        reason = str(getattr(error, "orig", error)).strip().splitlines()
+        detail = f"it does not answer: {reason[0] if reason else type(error).__name__}"
+        return [*found, Finding("database", False, detail, "Start it, or correct BETALOOP_DATABASE_URL; `betaloop where` says which one.")]
+
+
+def newest_revision() -> str:
+    """The schema that this betaloop needs."""
+    config = Config(str(ROOT / "alembic.ini"))
+    config.set_main_option("script_location", str(ROOT / "migrations"))
+    return ScriptDirectory.from_config(config).get_current_head() or ""
+
+
+def revision(db: Session) -> str:
+    """The schema that the database has."""
+    if db.scalar(text("select to_regclass('alembic_version')")) is None:
+        return ""
+    return db.scalar(text("select version_num from alembic_version")) or ""
+
+
+def _schema(db: Session) -> Finding:
+    has, needs = revision(db), newest_revision()
+    hint = "Run `betaloop migrate`; where the database is newer than the program, install the newer betaloop."
+    return Finding("database", has == needs, f"answers; schema {has or 'none'}, this betaloop needs {needs}", "" if has == needs else hint)
+
+
+def _clock(db: Session) -> Finding:
+    before = now()
+    theirs = db.scalar(text("select clock_timestamp()"))
+    after = now()
+    apart = max((before - theirs).total_seconds(), (theirs - after).total_seconds(), 0.0) if theirs else 0.0
+    ok = apart <= MOST_CLOCK_DIFFERENCE_S
+    return Finding("clock", ok, f"{apart:.1f} s apart from the database's", "" if ok else "Set both machines' clocks by NTP.")
+
+
+def _files(db: Session, hashes: bool) -> Finding:
+    rows = db.execute(text("select sha256, size from stored_file order by sha256")).all()
+    bad = [row.sha256 for row in rows if not _has(row.sha256, row.size, hashes)]
+    checked = "hashes" if hashes else "sizes"
+    if bad:
+        detail = f"{len(bad)} of {len(rows)} stored files are missing or damaged, the first {bad[0]}"
+        return Finding("files", False, detail, "Restore them from a backup (`betaloop restore`).")
+    return Finding("files", True, f"{len(rows)} stored files, {checked} checked")
+
+
+def _has(sha256: str, size: int, hashes: bool) -> bool:
+    path = files.path_of(sha256)
+    if not path.is_file() or path.stat().st_size != size:
+        return False
+    return not hashes or files.hash_file(path)[0] == sha256
+
+
+def _jobs(db: Session) -> Iterator[Finding]:
+    live, workers = jobs.live_ids(db), jobs.live_workers(db, STALE_S)
+    stuck = bool(live) and not workers
+    hint = "Start one with `betaloop worker`; jobs go on where they were." if stuck else ""
+    yield Finding("jobs", not stuck, f"{len(live)} waiting or running, {len(workers)} live workers", hint)
+
+
+def _disk() -> Finding:
+    free = _free_mb(get_settings().data_dir)
+    ok = free >= LEAST_FREE_MB
+    return Finding("disk", ok, f"{free:.0f} MiB free", "" if ok else f"Make room: uploads need at least {LEAST_FREE_MB} MiB.")
+
+
+def _free_mb(folder: Path) -> float:
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free / (1 << 20)
+
+
+def _closed() -> Finding:
+    settings = get_settings()
+    folders = [settings.files_dir, settings.jobs_dir, settings.data_dir / "secrets"]
+    standing_open = [str(f) for f in folders if f.is_dir() and f.stat().st_mode & 0o077]
+    if standing_open:
+        return Finding("folders", False, f"open to other users: {', '.join(standing_open)}", "Run `betaloop migrate`, which closes them.")
+    return Finding("folders", True, "closed to other users of the machine")

@@ -1,0 +1,183 @@
+"""The PC's clock against the implant's ticks: where it lies, how it drifts, where one of the two was set.
+
+PacketGenTime is the PC's estimate of when a packet was made. It wanders by some 30 ms about a straight line over the ticks (format notes,
+A.2), and jumps where the PC's clock is set. Line and jumps are fitted here by medians; what is left of each packet are the residuals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+STEP_MS = 500.0
+"""A clock that is off by more than this from then on was set; less than that is what PacketGenTime wanders."""
+
+SECONDS_STEP_MS = 1_500.0
+"""The same for the implant's `timestamp`, which counts whole seconds."""
+
+LARGEST_DRIFT = 3e-4
+"""Over a long pause clocks may part by so much of it without having been set; in a short recording a larger drift is wander."""
+
+SURE_DRIFT_MS = 600_000.0
+"""Over more time than this any drift is believed."""
+
+DRIFT_SPAN_MS = 30_000.0
+"""Over less time than this the wander of PacketGenTime says nothing about drift."""
+
+BIN_MS = 1_000.0
+BINS_AROUND = 5
+LEAST_PACKETS = 5
+"""A step is judged by medians of up to so many seconds on either side, with at least so many packets on each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """A quantity that is constant between steps.
+
+    Attributes:
+        at_ms: device time of the steps, [k].
+        bounds: places, in device order, where the pieces between steps begin, and the end, [k + 2].
+    """
+
+    at_ms: NDArray[np.float64]
+    bounds: NDArray[np.int64]
+
+    def pieces(self) -> list[slice]:
+        """The packets between steps, as slices of the device order."""
+        return [slice(a, b) for a, b in zip(self.bounds[:-1].tolist(), self.bounds[1:].tolist(), strict=True)]
+
+
+@dataclass(frozen=True, slots=True)
+class PcClock:
+    """What the PC's clock shows at a device time, and when on the recording's timeline a PC time was.
+
+    The timeline runs with the implant's ticks and shows the PC's time where the recording begins; of several pieces between steps of the
+    PC's clock it goes by the one with the most packets.
+
+    Attributes:
+        slope: gain of the PC's clock on the implant's, relative.
+        drift: how fast the implant's clock runs against the PC's, relative; None where the recording is too short to tell.
+        steps_at_ms: device times at which the PC's clock was set, [k]. offsets_ms: PC time minus device time at device time 0, [k + 1].
+        shift_ms: timeline minus device time.
+    """
+
+    slope: float
+    drift: float | None
+    steps_at_ms: NDArray[np.float64]
+    offsets_ms: NDArray[np.float64]
+    shift_ms: float
+
+    def pc_ms(self, device_ms: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the PC's clock shows, [n]."""
+        piece = np.searchsorted(self.steps_at_ms, device_ms, side="right")
+        return np.asarray(device_ms * (1.0 + self.slope) + self.offsets_ms[piece])
+
+    def timeline_ms(self, device_ms: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Place on the timeline, [n]."""
+        return np.asarray(device_ms + self.shift_ms)
+
+    def of_pc_ms(self, pc_ms: NDArray[np.float64]) -> NDArray[np.float64]:
+        """When on the timeline the PC's clock showed this, [n].
+
+        A time that a step forwards left out is that of the step; of a time that a step backwards showed twice the first counts.
+        """
+        ends = self.pc_ms(np.nextafter(self.steps_at_ms, -np.inf))
+        piece = np.searchsorted(np.maximum.accumulate(ends), pc_ms, side="right")
+        device = (pc_ms - self.offsets_ms[piece]) / (1.0 + self.slope)
+        begins = np.concatenate(([-np.inf], self.steps_at_ms))[piece]
+        return self.timeline_ms(np.maximum(device, begins))
+
+    @property
+    def steps_ms(self) -> NDArray[np.float64]:
+        """How far the PC's clock was set at each step, [k]."""
+        return np.diff(self.offsets_ms)
+
+
+def levels(at_ms: NDArray[np.float64], value_ms: NDArray[np.float64], step_ms: float) -> Levels:
+    """Where a quantity, [n] in rising order of `at_ms` [n], steps by more than `step_ms` and stays there."""
+    bins, centre = _binned(at_ms, value_ms)
+    before, after = _around(centre)
+    pause = np.diff(at_ms[bins[:-1]], prepend=at_ms[0]) if at_ms.size else np.empty(0)
+    jump = np.abs(after - before) - step_ms - LARGEST_DRIFT * pause
+    cuts: list[int] = []
+    run: list[int] = []
+    for b in [*np.flatnonzero(jump > 0).tolist(), -1]:
+        if run and b != run[-1] + 1:
+            steepest = max(run, key=lambda i: abs(float(centre[i] - centre[i - 1])))
+            cuts.append(_split(value_ms, bins, steepest, float(before[steepest]), float(after[steepest])))
+            run = []
+        run.append(b)
+    bounds = [0]
+    for cut in cuts:
+        if cut - bounds[-1] >= LEAST_PACKETS and at_ms.size - cut >= LEAST_PACKETS:
+            bounds.append(cut)
+    return Levels(at_ms[bounds[1:]], np.array([*bounds, at_ms.size], dtype=np.int64))
+
+
+def _binned(at_ms: NDArray[np.float64], value_ms: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Begin of every second that holds packets, and the end, [m + 1]; the median of each, [m]."""
+    if at_ms.size == 0:
+        return np.zeros(1, dtype=np.int64), np.empty(0)
+    second = np.floor(at_ms / BIN_MS)
+    begins = np.flatnonzero(np.diff(second, prepend=second[0] - 1))
+    ordered = value_ms[np.lexsort((value_ms, second))]
+    bins = np.append(begins, at_ms.size)
+    return bins, ordered[begins + (np.diff(bins) - 1) // 2]
+
+
+def _around(centre: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Median of the seconds before each and of those from it on, [m] each; the first has none before it and steps nowhere."""
+    padded = np.concatenate((np.full(BINS_AROUND, np.nan), centre, np.full(BINS_AROUND, np.nan)))
+    if centre.size == 0:
+        return centre, centre
+    windows = np.lib.stride_tricks.sliding_window_view(padded, BINS_AROUND)
+    before, after = windows[: centre.size].copy(), windows[BINS_AROUND : BINS_AROUND + centre.size]
+    before[0] = after[0]
+    return np.nanmedian(before, axis=1), np.nanmedian(after, axis=1)
+
+
+def _split(value_ms: NDArray[np.float64], bins: NDArray[np.int64], b: int, before: float, after: float) -> int:
+    """The packet at which the value goes over from one level to the other, near the begin of second b."""
+    low, high = int(bins[max(0, b - 2)]), int(bins[min(bins.size - 1, b + 2)])
+    near = value_ms[low:high]
+    cost = np.concatenate(([0.0], np.cumsum(np.abs(near - before)))) + np.concatenate((np.cumsum(np.abs(near - after)[::-1])[::-1], [0.0]))
+    return low + int(np.argmin(cost))
+
+
+def fit_clock(device_ms: NDArray[np.float64], pc_ms: NDArray[np.float64]) -> PcClock:
+    """The PC's clock from packets whose PC time is known, both [n] in any order; PC and device time are the same where none is."""
+    known = np.flatnonzero(np.isfinite(pc_ms))
+    known = known[np.argsort(device_ms[known], kind="stable")]
+    if known.size == 0:
+        first = float(device_ms.min(initial=np.inf))
+        return PcClock(0.0, None, np.empty(0), np.zeros(1), -first if np.isfinite(first) else 0.0)
+    at, ahead = device_ms[known], pc_ms[known] - device_ms[known]
+    found = levels(at, ahead, STEP_MS)
+    pieces = found.pieces()
+    gain = _gain(at, ahead, pieces)
+    slope = gain or 0.0
+    offsets = np.array([float(np.median(ahead[piece] - slope * at[piece])) for piece in pieces])
+    longest = max(range(len(pieces)), key=lambda i: pieces[i].stop - pieces[i].start)
+    shift = float(offsets[longest] + slope * device_ms.min())
+    return PcClock(slope, None if gain is None else 1.0 / (1.0 + gain) - 1.0, found.at_ms, offsets, shift)
+
+
+def _gain(at_ms: NDArray[np.float64], ahead_ms: NDArray[np.float64], pieces: list[slice]) -> float | None:
+    """Median slope between seconds half a piece apart (the line of Theil and Sen on few pairs); None where no piece is long enough."""
+    slopes: list[NDArray[np.float64]] = []
+    for piece in pieces:
+        at, ahead = at_ms[piece], ahead_ms[piece]
+        if at.size < 2 or at[-1] - at[0] < DRIFT_SPAN_MS:
+            continue
+        bins, centre = _binned(at, ahead)
+        middle, half = at[(bins[:-1] + bins[1:] - 1) // 2], (bins.size - 1) // 2
+        apart, rise = middle[half:] - middle[:-half], centre[half:] - centre[:-half]
+        far = apart > DRIFT_SPAN_MS / 2
+        slopes.append(rise[far] / apart[far])
+    pooled = np.concatenate(slopes) if slopes else np.empty(0)
+    if not pooled.size:
+        return None
+    gain = float(np.median(pooled))
+    return gain if at_ms[-1] - at_ms[0] > SURE_DRIFT_MS else min(max(gain, -LARGEST_DRIFT), LARGEST_DRIFT)

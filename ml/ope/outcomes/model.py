@@ -1,0 +1,201 @@
+"""One hierarchical model of the end-of-session outcomes and r_end, for all methods of off-policy evaluation.
+
+Grasp, rating and tremor follow the minutes of a session (`regressions`); r_end is C2 grasp + C3 rating - C4 tremor of what is predicted, so
+that a session without one QoC still counts for the others. Draws are those of one joint posterior: draw d of two policies shares its
+coefficients, and what the model gets wrong for both cancels in their difference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.mdp import MdpSettings
+from ml.ope.outcomes.minutes import ABOVE, BETA, Minutes, of_buffer
+from ml.ope.outcomes.regressions import ORDER, Outcome, Regression, Sessions, burden_of, fit
+from ml.ope.scale import FEWEST_OUTCOMES, outcome_table
+from ml.trajectories import ReplayBuffer
+
+Floats = NDArray[np.float64]
+
+COLUMN: dict[Outcome, int] = {"grasp": 1, "rating": 2, "tremor": 3}
+"""Place of an outcome in `ml.ope.estimate.OUTCOMES`; r_end is 0."""
+
+RANGES = {1: (0.0, np.inf), 2: (1.0, 10.0), 3: (0.0, 100.0)}
+"""Possible grasp (Hz), rating and tremor (%)."""
+
+
+@dataclass(frozen=True)
+class EndModel:
+    """Outcomes of sessions; columns of every result are r_end, grasp, rating and tremor in their units.
+
+    Attributes:
+        constants: r_end = constants . (grasp, rating, tremor), [3].
+        regressions: of the outcomes that enough sessions have. unseen: mean of the others' few sessions, 0 without one, [4].
+        centre, spread: of beta and of the share above the threshold between sessions, [2].
+        sessions: of the buffer.
+        draws: D.
+        seen: outcomes that are predicted; r_end where every QoC that counts in it is, or where none counts.
+        skill: 1 - leave-one-session-out error / variance, [4]; NaN where unseen.
+        residual: root mean squared leave-one-session-out error, [4]; 0 where unseen.
+        day_share: share of an outcome's unexplained variance that sessions of one visit have in common, [4]; NaN where unseen.
+    """
+
+    constants: Floats
+    regressions: dict[Outcome, Regression]
+    unseen: Floats
+    centre: Floats
+    spread: Floats
+    sessions: Sessions
+    draws: int
+    seen: tuple[bool, ...]
+    skill: Floats
+    residual: Floats
+    day_share: Floats
+
+    def predict(self, minutes: Minutes, own: Sessions | None = None) -> Floats:
+        """Posterior mean [..., 4] of sessions of any leading shape on a new day; with `own` their last axis is those sessions."""
+        burden = burden_of(minutes, self.centre, self.spread)
+        result = self._unseen(minutes.share.shape[:-1])
+        tremor: Floats | None = None
+        for outcome, r in self._ordered():
+            mean = np.zeros(minutes.share.shape[:-1])
+            for weight, member in zip(r.weights, r.members, strict=True):
+                mean += weight * r.mean(member, minutes, burden, tremor, own)
+            tremor = mean if outcome == "tremor" else tremor
+            result[..., COLUMN[outcome]] = 100 * mean if outcome == "tremor" else mean
+        return self.joined(result)
+
+    def each(self, minutes: Minutes, own: Sessions | None = None) -> Floats:
+        """The same by every draw: sessions [..., D, n] (the d-th by draw d) or [..., 1, n] (all by all); [..., D, n, 4].
+
+        Raises:
+            ValueError: the model has no draws, or the sessions are those of another number of them.
+        """
+        *lead, given, n = minutes.share.shape[:-1]
+        if self.draws == 0 or given not in (1, self.draws):
+            raise ValueError(f"sessions of {given} draws for an outcome model of {self.draws}")
+        result = self._unseen((*lead, self.draws, n))
+        for d in range(self.draws):
+            k = d if given > 1 else 0
+            one = Minutes(minutes.features[..., k, :, :, :], minutes.share[..., k, :, :], minutes.late[..., k, :, :])
+            burden = burden_of(one, self.centre, self.spread)
+            tremor: Floats | None = None
+            for outcome, r in self._ordered():
+                mean = r.mean(r.drawn[d], one, burden, tremor, own)
+                tremor = mean if outcome == "tremor" else tremor
+                result[..., d, :, COLUMN[outcome]] = 100 * mean if outcome == "tremor" else mean
+        return self.joined(result)
+
+    def carried(self, predicted: Floats, known: Floats, seen: Floats) -> Floats:
+        """Outcomes [..., n, 4] of sessions under another policy, where what each session had of its own stays with it.
+
+        A share y that was s on average becomes y p / s where p < s and y + (1 - y)(p - s) / (1 - s) where p > s: what is left on
+        average is p, the range is kept, and p = s gives back y. (Of a yes or no this is the same uniform number held against s and p.)
+
+        Args:
+            predicted: under the other policy, [..., n, 4]. known: measured, [n, 4], NaN where not. seen: prediction of the session as it
+                was, [..., n, 4].
+        """
+        result = predicted.copy()
+        for column, (low, high) in RANGES.items():
+            y = known[:, column] - low
+            p, s = (np.maximum(v[..., column] - low, 0.0) for v in (predicted, seen))
+            less = y * np.minimum(p / np.maximum(s, 1e-12), 1.0)
+            room = (high - low - y) / np.maximum(high - low - s, 1e-12) if np.isfinite(high) else 1.0
+            found = np.where(p <= s, less, y + room * (p - s))
+            result[..., column] = np.where(np.isfinite(y), found + low, predicted[..., column])
+        return self.joined(result)
+
+    def part(self, first: int, number: int) -> EndModel:
+        """The same model with some of its draws; with none of them for `number` 0."""
+        chosen = {name: replace(r, drawn=r.drawn[first : first + number]) for name, r in self.regressions.items()}
+        return replace(self, regressions=chosen, draws=number)
+
+    def joined(self, outcomes: Floats) -> Floats:
+        """The outcomes with r_end made of the three QoCs."""
+        outcomes[..., 0] = outcomes[..., 1:] @ self.constants if self.seen[0] else self.unseen[0]
+        return outcomes
+
+    def _ordered(self) -> list[tuple[Outcome, Regression]]:
+        return [(outcome, self.regressions[outcome]) for outcome in ORDER if outcome in self.regressions]
+
+    def _unseen(self, shape: tuple[int, ...]) -> Floats:
+        return np.broadcast_to(self.unseen, (*shape, 4)).copy()
+
+
+def fit_end_model(buffer: ReplayBuffer, draws: int = 0, seed: int = 0, severity: Floats | None = None) -> EndModel:
+    """Fit to all sessions.
+
+    A controller that follows beta gives more in a bad hour, so that more stimulation seems to do worse. What it gives depends on beta
+    alone: with the level of beta that is not the amplitude's doing beside the amplitude, such sessions compare like with like (the
+    back-door criterion of Pearl 1995).
+
+    Args:
+        draws: D draws of the posterior besides its mean. seed: theirs.
+        severity: that level of every session, [n], where the caller's model of beta knows it; it is adjusted for and no policy moves it.
+    """
+    settings, table, minutes = buffer.settings, outcome_table(buffer), of_buffer(buffer)
+    means = minutes.means[:, [BETA, ABOVE]]
+    centre, spread = means.mean(0), means.std(0)
+    spread = np.where(spread > 1e-9, spread, 1.0)
+    _, visit = np.unique([s.visit for s in buffer.sessions], return_inverse=True)
+    sessions = Sessions(visit.astype(np.int64), _standardised(severity))
+    burden, rng = burden_of(minutes, centre, spread), np.random.default_rng([seed, 0xE2D])
+    size = np.array([max(1.0, s.steps * settings.period_s / 60.0) for s in buffer.sessions])
+    constants = _constants(settings)
+    known = np.isfinite(table).sum(0)
+    regressions: dict[Outcome, Regression] = {}
+    for outcome in ORDER:
+        column = COLUMN[outcome]
+        if known[column] < FEWEST_OUTCOMES:
+            continue
+        y = table[:, column] / (100.0 if outcome == "tremor" else 1.0)
+        tremor = _filled(table[:, 3] / 100.0) if outcome == "rating" and "tremor" in regressions else None
+        regressions[outcome] = fit(outcome, y, minutes, burden, tremor, sessions, size, draws, rng)
+    seen = (
+        all(outcome in regressions or constants[column - 1] == 0 for outcome, column in COLUMN.items()),
+        *(outcome in regressions for outcome in ("grasp", "rating", "tremor")),
+    )
+    unseen = np.array([float(np.nanmean(column)) if np.isfinite(column).any() else 0.0 for column in table.T])
+    skill, residual = _left_out(table, regressions, constants, seen)
+    share = np.full(4, np.nan)
+    for outcome, r in regressions.items():
+        share[COLUMN[outcome]] = r.day_share
+    return EndModel(constants, regressions, unseen, centre, spread, sessions, draws, seen, skill, residual, share)
+
+
+def _constants(settings: MdpSettings) -> Floats:
+    """C2, C3, -C4 per percent of tremor."""
+    return np.array([settings.c2, settings.c3, -settings.c4 / (100.0 if settings.tremor_as_fraction else 1.0)])
+
+
+def _standardised(severity: Floats | None) -> Floats | None:
+    if severity is None:
+        return None
+    level = severity - severity.mean()
+    return np.asarray(level / max(float(level.std()), 1e-9), dtype=np.float64)
+
+
+def _filled(values: Floats) -> Floats:
+    return np.where(np.isfinite(values), values, np.nanmean(values))
+
+
+def _left_out(table: Floats, regressions: dict[Outcome, Regression], constants: Floats, seen: tuple[bool, ...]) -> tuple[Floats, Floats]:
+    """Skill and root mean squared error of leave-one-session-out predictions, [4] each."""
+    predicted = np.full(table.shape, np.nan)
+    for outcome, r in regressions.items():
+        predicted[r.sessions, COLUMN[outcome]] = r.left_out * (100.0 if outcome == "tremor" else 1.0)
+    counted = np.flatnonzero(constants) + 1
+    predicted[:, 0] = predicted[:, counted] @ constants[counted - 1]
+    skill, residual = np.full(4, np.nan), np.zeros(4)
+    for j in range(4):
+        both = np.isfinite(table[:, j]) & np.isfinite(predicted[:, j])
+        if not seen[j] or not both.any():
+            continue
+        error = float(np.mean((table[both, j] - predicted[both, j]) ** 2))
+        variance = float(table[both, j].var())
+        residual[j], skill[j] = np.sqrt(error), 1 - error / variance if variance > 0 else 0.0
+    return skill, residual

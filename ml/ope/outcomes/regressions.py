@@ -1,0 +1,201 @@
+"""One regression per outcome: what it follows, what is known beforehand, and its posterior over dose shapes and levels of days.
+
+    grasp    N( one + dose + late dose + burden + severity + visit, s^2 )
+    rating   round( one + dose + over-stimulation + burden + tremor + severity + visit + noise ), cut to 1 to 10
+    tremor   minutes of n, p = mean over minutes of logistic( one + dose + burden + severity + visit ), overdispersed
+
+The dose of a step passes one of `SHAPES` before it is averaged: an effect that saturates is saturated at every moment, not on average.
+Priors are weak and say which way effects are expected to go; units are Hz, points of the rating, and logits of a minute.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.ope.outcomes.laplace import Kind, Problem, Solved, mean_of, solve
+from ml.ope.outcomes.minutes import ABOVE, BETA, DOSE, OVER, SHAPES, Minutes
+
+Floats = NDArray[np.float64]
+Outcome = Literal["tremor", "grasp", "rating"]
+
+ORDER: Final[tuple[Outcome, ...]] = ("tremor", "grasp", "rating")
+"""In which outcomes are predicted: the rating follows the tremor."""
+
+KINDS: Final[dict[Outcome, Kind]] = {"grasp": "gaussian", "rating": "rounded", "tremor": "binomial"}
+
+PRIORS: Final[dict[Outcome, dict[str, tuple[float, float]]]] = {
+    "grasp": {"one": (-0.4, 1.0), "dose": (0.6, 0.8), "late": (0.3, 0.4), "burden": (-0.05, 0.1), "severity": (-0.1, 0.2)},
+    "rating": {
+        "one": (-2.0, 3.0),
+        "dose": (3.0, 3.0),
+        "over": (-0.5, 1.5),
+        "burden": (-0.25, 0.35),
+        "tremor": (-2.0, 2.0),
+        "severity": (-0.3, 0.5),
+    },
+    "tremor": {"one": (-1.0, 6.0), "dose": (-5.0, 5.0), "burden": (0.25, 0.25), "severity": (0.3, 0.5)},
+}
+"""Mean and standard deviation. `one` of grasp and rating is relative to the mean of the sessions. Dose is the change from no stimulation to
+cDBS, burden and severity that of one standard deviation between sessions, tremor that from none to all minutes. Chosen on part A of the
+virtual population, by the error of r_end given true sessions."""
+
+DAYS: Final[dict[Outcome, float]] = {"grasp": 0.15, "rating": 0.5, "tremor": 0.4}
+"""Standard deviation of the levels of visits, in the unit of the predictor; `DAY_TIMES` of it are averaged over."""
+
+DAY_TIMES: Final = (0.3, 1.0, 3.0)
+
+KEPT: Final = 0.01
+"""Members whose weight is less than this share of the largest are left out."""
+
+
+@dataclass(frozen=True)
+class Sessions:
+    """What is known of n sessions besides their steps: index of the visit, [n], and severity (standardised), [n] or None."""
+
+    visit: NDArray[np.int64]
+    severity: Floats | None = None
+
+
+@dataclass(frozen=True)
+class Member:
+    """Coefficients of one dose shape: index into `SHAPES`, of the fixed columns [q], levels of the visits [V], dispersion, day variance."""
+
+    shape: int
+    fixed: Floats
+    levels: Floats
+    dispersion: float
+    day_variance: float
+
+
+@dataclass(frozen=True)
+class Regression:
+    """A fitted outcome.
+
+    Attributes:
+        outcome: which. columns: names of the fixed ones. members, weights: of the posterior mean. drawn: draws of the posterior.
+        left_out: prediction of each fitted session from all others, natural unit (a share for tremor), [n]. sessions: their indices.
+        day_share: posterior mean of the visits' share in what sessions of one shape differ by; on the scale of the predictor.
+    """
+
+    outcome: Outcome
+    columns: tuple[str, ...]
+    members: tuple[Member, ...]
+    weights: Floats
+    drawn: tuple[Member, ...]
+    left_out: Floats
+    sessions: NDArray[np.int64]
+    day_share: float
+
+    def mean(self, member: Member, minutes: Minutes, burden: Floats, tremor: Floats | None, own: Sessions | None) -> Floats:
+        """Expected outcome [...] of sessions, by one member.
+
+        Args:
+            burden: [..., M]. tremor: predicted share of minutes, [...], where the rating follows it.
+            own: the sessions, along the last leading axis, whose visit and severity are to count; without them a new day's.
+        """
+        severity = own.severity if own is not None else None
+        columns, parts = design(self.outcome, member.shape, minutes, burden, tremor, severity)
+        eta = sum((columns[name] * w for name, w in zip(self.columns, member.fixed, strict=True) if name in columns), np.zeros(1))
+        extra = 0.0 if own is not None else member.day_variance
+        if own is not None:
+            eta = eta + member.levels[own.visit][:, None]
+        return mean_of(KINDS[self.outcome], np.broadcast_to(eta, parts.shape), parts, member.dispersion, extra)
+
+
+def design(
+    outcome: Outcome, shape: int, minutes: Minutes, burden: Floats, tremor: Floats | None, severity: Floats | None
+) -> tuple[dict[str, Floats], Floats]:
+    """Fixed columns [..., M'] by name and weights of the parts [..., M']; M' is 1 but for tremor, which is of minutes."""
+    dose = minutes.features[..., DOSE + shape]
+    if outcome == "tremor":
+        columns = {"one": np.ones_like(dose), "dose": dose, "burden": burden}
+        if severity is not None:
+            columns["severity"] = np.broadcast_to(severity[..., None], dose.shape)
+        return columns, minutes.share
+    mean = (minutes.share * dose).sum(-1)
+    whole = {"one": np.ones_like(mean), "dose": mean, "burden": (minutes.share * burden).sum(-1)}
+    if outcome == "grasp":
+        whole["late"] = (minutes.late * dose).sum(-1) - mean
+    else:
+        whole["over"] = (minutes.share * minutes.features[..., OVER]).sum(-1)
+        if tremor is not None:
+            whole["tremor"] = np.broadcast_to(tremor, mean.shape)
+    if severity is not None:
+        whole["severity"] = np.broadcast_to(severity, mean.shape)
+    return {name: values[..., None] for name, values in whole.items()}, np.ones((*mean.shape, 1))
+
+
+def burden_of(minutes: Minutes, centre: Floats, spread: Floats) -> Floats:
+    """Burden of beta by minute, [..., M]: mean of beta and of the share above the threshold, each in standard deviations of sessions."""
+    scaled = (minutes.features[..., [BETA, ABOVE]] - centre) / spread
+    return np.asarray(scaled.mean(-1), dtype=np.float64)
+
+
+def fit(
+    outcome: Outcome,
+    y: Floats,
+    minutes: Minutes,
+    burden: Floats,
+    tremor: Floats | None,
+    sessions: Sessions,
+    size: Floats,
+    draws: int,
+    rng: np.random.Generator,
+) -> Regression:
+    """Posterior of one outcome.
+
+    Args:
+        y: of every session, [n], NaN where not measured; a share for tremor. tremor: measured shares that the rating follows, [n].
+        size: minutes of each session, [n]. draws: of the posterior.
+    """
+    known = np.flatnonzero(np.isfinite(y))
+    days = np.eye(int(sessions.visit.max()) + 1)[sessions.visit]
+    built = [design(outcome, k, minutes, burden, tremor, sessions.severity) for k in range(len(SHAPES))]
+    names = tuple(built[0][0])
+    designs = []
+    for columns, _ in built:
+        fixed = np.stack(list(columns.values()), axis=-1)
+        designs.append(np.concatenate([fixed, np.broadcast_to(days[:, None], (*fixed.shape[:2], days.shape[1]))], axis=-1)[known])
+    grid = list(product(range(len(SHAPES)), DAY_TIMES))
+    mean, deviation = np.array([PRIORS[outcome][name] for name in names]).T
+    if outcome != "tremor":
+        mean[names.index("one")] += y[known].mean()
+    day = np.array([DAYS[outcome] * times for _, times in grid])
+    v = days.shape[1]
+    problem = Problem(
+        KINDS[outcome],
+        np.stack([designs[k] for k, _ in grid]),
+        built[0][1][known],
+        y[known],
+        size[known],
+        np.tile(np.append(mean, np.zeros(v)), (len(grid), 1)),
+        np.concatenate([np.tile(deviation**-2.0, (len(grid), 1)), np.repeat(day[:, None] ** -2.0, v, axis=1)], axis=1),
+    )
+    found = solve(problem)
+    weights = np.exp(found.log_evidence - found.log_evidence.max())
+    weights = np.where(weights < KEPT * weights.max(), 0.0, weights)
+    weights /= weights.sum()
+
+    def member(k: int, theta: Floats, dispersion: float) -> Member:
+        return Member(grid[k][0], theta[: len(names)], theta[len(names) :], dispersion, float(day[k] ** 2))
+
+    kept = np.flatnonzero(weights).tolist()
+    members = tuple(member(k, found.mode[k], float(found.dispersion[k])) for k in kept)
+    drawn = tuple(member(k, theta, float(found.dispersion[k])) for k, theta in _drawn(found, weights, draws, rng))
+    noise = found.dispersion * (np.pi**2 / 3 / np.mean(size) if outcome == "tremor" else 1.0)
+    share = float(weights @ (day**2 / (day**2 + noise)))
+    return Regression(outcome, names, members, weights[kept], drawn, found.left_out(problem, weights), known, share)
+
+
+def _drawn(found: Solved, weights: Floats, draws: int, rng: np.random.Generator) -> list[tuple[int, Floats]]:
+    picks = rng.choice(len(weights), draws, p=weights)
+    noise = rng.standard_normal((draws, found.mode.shape[1]))
+    # The dispersion is not known: draws spread like Student's t.
+    degrees = found.degrees[picks]
+    wider = np.sqrt(degrees / np.maximum(rng.chisquare(degrees), 0.05 * degrees))
+    return [(int(k), found.mode[k] + w * found.factor[k] @ z) for k, w, z in zip(picks, wider, noise, strict=True)]

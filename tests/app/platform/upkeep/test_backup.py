@@ -1,0 +1,206 @@
+"""A backup of the filled study of 0.1.0 comes back in a new data folder and in another PostgreSQL; the doctor says what is missing."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+from fastapi.testclient import TestClient
+
+from app import main
+from app.platform.database import transaction
+from app.platform.embedded.server import EmbeddedPostgres
+from app.platform.embedded.system_user import system_user
+from app.platform.files import path_of
+from app.platform.upkeep import backup as backups
+from app.platform.upkeep.backup import BackupError
+from app.platform.upkeep.doctor import examine, newest_revision
+from app.settings import get_settings
+
+ROOT = Path(__file__).resolve().parents[4]
+TABLE_BYTES = b"t_s,beta,amplitude_fraction\n" + b"".join(b"%d,1,1\n" % (2 * k) for k in range(21))
+
+
+@pytest.fixture
+def place() -> Iterator[Path]:
+    """A folder that the server's user may pass through."""
+    folder = Path("/tmp") / f"betaloop-backup-{os.getpid()}-{os.urandom(4).hex()}"
+    folder.mkdir()
+    folder.chmod(0o711)
+    yield folder
+    for data in folder.glob("*/postgres"):
+        EmbeddedPostgres(data, server_user=get_settings().server_user).remove()
+    shutil.rmtree(folder)
+
+
+@pytest.fixture
+def filled(client: TestClient, enrolled: str) -> dict[str, int]:
+    """A study with a participant, a visit, an uploaded session; rows of its tables."""
+    sent = client.post(
+        "/api/v1/uploads",
+        files={"file": ("session.csv", TABLE_BYTES)},
+        data={"participant": enrolled, "visit": "1", "controller": "random", "started_at": "2026-03-02T10:00:00Z"},
+    )
+    assert sent.status_code == 201, sent.text
+    return rows()
+
+
+def rows() -> dict[str, int]:
+    return backups._rows(backups.get_engine())
+
+
+def betaloop(data: Path, *arguments: str, database_url: str = "") -> subprocess.CompletedProcess[str]:
+    env = {k: v for k, v in os.environ.items() if not k.startswith("BETALOOP_") or k == "BETALOOP_SERVER_USER"}
+    env |= {"BETALOOP_DATA_DIR": str(data), "PYTHONPATH": str(ROOT)}
+    if database_url:
+        env["BETALOOP_DATABASE_URL"] = database_url
+    return subprocess.run([sys.executable, "-m", "app.cli", *arguments], env=env, capture_output=True, text=True, check=False, cwd=data)
+
+
+def made(place: Path) -> tuple[Path, Path]:
+    """A backup of the test's installation, and its key."""
+    key = place / "key"
+    backups.make_key(key)
+    backups.backup(place / "backup", key)
+    return place / "backup", key
+
+
+def test_a_backup_comes_back_in_a_new_data_folder(place: Path, filled: dict[str, int]) -> None:
+    folder, key = made(place)
+    for part in folder.iterdir():
+        assert b"t_s,beta" not in part.read_bytes()
+    new = place / "new"
+    new.mkdir()
+    done = betaloop(new, "restore", str(folder), "--key-file", str(key), "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["rows"] == filled
+    assert filled["session"] == 1
+    assert json.loads(done.stdout)["files"] == filled["stored_file"] > 0
+    doctor = betaloop(new, "doctor", "--hashes", "--json")
+    assert doctor.returncode == 0, doctor.stdout + doctor.stderr
+    again = betaloop(new, "restore", str(folder), "--key-file", str(key))
+    assert again.returncode == 1
+    assert "holds data already" in again.stderr
+
+
+def test_a_backup_comes_back_in_another_postgresql(place: Path, filled: dict[str, int], server: EmbeddedPostgres) -> None:
+    folder, key = made(place)
+    with psycopg.connect(server.admin_conninfo(), autocommit=True) as connection:
+        connection.execute("drop database if exists restored with (force)")
+        connection.execute("create database restored owner betaloop")
+    new = place / "new"
+    new.mkdir()
+    url = server.url("restored").replace("+psycopg", "")
+    try:
+        done = betaloop(new, "restore", str(folder), "--key-file", str(key), "--json", database_url=url)
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["rows"] == filled
+        assert not (new / "postgres").exists()
+    finally:
+        with psycopg.connect(server.admin_conninfo(), autocommit=True) as connection:
+            connection.execute("drop database restored with (force)")
+
+
+@pytest.fixture
+def older_server(place: Path) -> Iterator[str]:
+    """URL of an empty database of the machine's own PostgreSQL, which is older than the embedded one."""
+    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
+    if not programs:
+        pytest.skip("no PostgreSQL of the machine's own here (/usr/lib/postgresql)")
+    user = system_user(get_settings().server_user) if os.geteuid() == 0 else None
+    data = place / "older"
+    data.mkdir(mode=0o700)
+    if user:
+        os.chown(data, user.uid, user.gid)
+
+    def run(name: str, *arguments: str) -> None:
+        who = {"user": user.uid, "group": user.gid, "extra_groups": []} if user else {}
+        with (place / "older.log").open("ab") as log:
+            subprocess.run([str(programs[0] / name), *arguments], stdout=log, stderr=log, cwd="/", check=True, **who)
+
+    run("initdb", "--auth=trust", "--encoding=utf8", "--locale=C.UTF-8", "-U", "betaloop", "-D", str(data / "db"))
+    run("pg_ctl", "-D", str(data / "db"), "-w", "-l", str(data / "log"), "-o", f"-h '' -k {data}", "start")
+    try:
+        with psycopg.connect(f"host={data} user=betaloop dbname=postgres", autocommit=True) as connection:
+            assert connection.info.server_version < 180000
+            connection.execute("create database restored")
+        yield f"postgresql://betaloop@/restored?host={data}"
+    finally:
+        run("pg_ctl", "-D", str(data / "db"), "-m", "immediate", "-w", "stop")
+
+
+def test_a_backup_comes_back_in_an_older_postgresql_of_another_make(place: Path, filled: dict[str, int], older_server: str) -> None:
+    folder, key = made(place)
+    new = place / "new"
+    new.mkdir()
+    done = betaloop(new, "restore", str(folder), "--key-file", str(key), "--json", database_url=older_server)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["rows"] == filled
+
+
+@pytest.mark.parametrize("part", ["database.sealed", "files.sealed", "keys.sealed", "manifest.json"])
+def test_a_damaged_backup_is_refused_before_anything_is_written(place: Path, filled: dict[str, int], part: str) -> None:
+    folder, key = made(place)
+    content = (folder / part).read_bytes()
+    (folder / part).write_bytes(content[:-3])
+    with pytest.raises(BackupError, match="missing or damaged"):
+        backups.restore(folder, key)
+    assert rows() == filled
+
+
+def test_a_key_beside_what_it_protects_is_refused(place: Path, filled: dict[str, int]) -> None:
+    inside = get_settings().data_dir / "backup.key"
+    backups.make_key(inside)
+    try:
+        with pytest.raises(BackupError, match="beside what it protects"):
+            backups.backup(place / "backup", inside)
+    finally:
+        inside.unlink()
+    assert not (place / "backup").exists()
+    assert filled
+
+
+def test_neither_a_key_nor_a_backup_is_overwritten(place: Path, filled: dict[str, int]) -> None:
+    folder, key = made(place)
+    with pytest.raises(BackupError, match="exists already"):
+        backups.make_key(key)
+    with pytest.raises(BackupError, match="exists already"):
+        backups.backup(folder, key)
+    assert filled
+
+
+def test_the_doctor_finds_what_is_missing_damaged_or_standing_open(filled: dict[str, int]) -> None:
+    assert [f.name for f in examine(hashes=True) if not f.ok] == []
+    with transaction("test") as db:
+        first = db.connection().exec_driver_sql("select sha256 from stored_file order by sha256 limit 1").scalar_one()
+    path = path_of(first)
+    content = path.read_bytes()
+    path.write_bytes(bytes([content[0] ^ 1]) + content[1:])
+    assert [f.name for f in examine() if not f.ok] == []  # its size is right: that is all that was asked
+    assert [f.name for f in examine(hashes=True) if not f.ok] == ["files"]
+    path.unlink()
+    missing = next(f for f in examine() if not f.ok)
+    assert first in missing.detail
+    assert "backup" in missing.hint
+    path.write_bytes(content)
+    get_settings().files_dir.chmod(0o755)
+    assert [f.name for f in examine() if not f.ok] == ["folders"]
+    assert filled
+
+
+def test_the_service_is_ready_with_the_right_schema_alone(client: TestClient) -> None:
+    ready = client.get("/readyz")
+    assert ready.json() == {"status": "ready", "schema": newest_revision()}
+    with transaction("test") as db:
+        db.connection().exec_driver_sql("update alembic_version set version_num = '0001'")
+    stale = TestClient(main.create_app()).get("/readyz")
+    assert stale.status_code == 503
+    assert "betaloop migrate" in stale.json()["hint"]
+    assert [f.name for f in examine() if not f.ok] == ["database"]
