@@ -112,7 +112,7 @@ def demo(
 @user_app.command("add", epilog="Example: betaloop user add ada@clinic.example --role clinician")
 def user_add(
     email: Annotated[str, typer.Argument(help="E-mail address to sign in with.")],
-    role: Annotated[Role, typer.Option(help="viewer, clinician, engineer or admin.")],
+    role: Annotated[Role, typer.Option(help="blinded_assessor, viewer, clinician, engineer or admin.")],
     study: Annotated[str | None, typer.Option(help="Code of the study, where there are several.")] = None,
     password_file: Annotated[
         Path | None, typer.Option(help="File with the password; asked for when left out ('-': standard input).")
@@ -296,8 +296,8 @@ def export_(
     to: Annotated[Path | None, typer.Option(help="Zip to write; CODE.zip when left out.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write everything of a participant as a zip of tables (CSV) and settings (JSON)."""
-    from app.overview.export import export_participant
+    """Write everything of a participant as a zipped Frictionless data package, with a script that recomputes its primary tables."""
+    from app.overview.package.export import export_participant
     from app.study import repository as study
 
     target = to or Path(f"{code}.zip")

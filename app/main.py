@@ -43,7 +43,12 @@ API_MODULES = (
     "app.pipeline.api",
     "app.planning.plans.api",
     "app.planning.bundles.api",
+    "app.analysis.primary.api",
     "app.analysis.metrics.api",
+    "app.analysis.pooled.api",
+    "app.analysis.evaluations.api",
+    "app.analysis.energy.api",
+    "app.analysis.biomarker.api",
     "app.analysis.calibration.api",
 )
 PAGE_MODULES = (
@@ -63,10 +68,16 @@ PAGE_MODULES = (
     "app.pipeline.pages",
     "app.planning.plans.pages",
     "app.planning.bundles.pages",
+    "app.analysis.primary.pages",
     "app.analysis.metrics.pages",
+    "app.analysis.pooled.pages",
+    "app.analysis.evaluations.pages",
+    "app.analysis.energy.pages",
+    "app.analysis.biomarker.pages",
     "app.analysis.calibration.pages",
     "app.overview.overview",
     "app.overview.participant",
+    "app.overview.package.pages",
 )
 
 

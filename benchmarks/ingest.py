@@ -4,10 +4,11 @@
 
 `decode_vs_orjson`: RawDataTD.json from disk to float arrays, against `orjson.loads` of the same file with one array per channel (orjson is
 in the `bench` extra). `peak_rss_mb`: highest memory of a fresh process that decodes a session with a time-domain file of so many megabytes
-whole, traces and spectra included. `upload_quiet_s`, `upload_training_s`: wall seconds from sending a device recording (the montage of the
-test recordings, else a synthetic one) until its decoded session can be read over the API, median over fresh participants, on a service of
-its own, quiet and with a training job on its worker. `upload_cpu_s`: CPU seconds of the web process and the children that read its files,
-per upload, which a busy machine does not lengthen.
+whole, traces and spectra included. `lfp_redact_s`, `lfp_decode_s`: CPU of cleaning a table of raw LFP, and of decoding it.
+`upload_quiet_s`, `upload_training_s`: wall seconds from sending a device recording (the montage of the test recordings, else a synthetic
+one) until its decoded session can be read over the API, median over fresh participants, on a service of its own, quiet and with a training
+job on its worker. `upload_cpu_s`: CPU seconds of the web process and the children that read its files, per upload, which a busy machine does
+not lengthen.
 """
 
 from __future__ import annotations
@@ -33,11 +34,12 @@ import httpx2 as httpx
 import numpy as np
 import psutil
 
-from ml.formats import DecodeOptions
+from ml.formats import DecodeOptions, decode
 from ml.formats.rcs import decode_rcs, redact_rcs_zip
 from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
 from ml.formats.rcs.packets.scan import scan
 from ml.formats.rcs.packets.streams import read_time_domain
+from ml.formats.tables.redact import redact_table
 from ml.population import rcs_session_zip, run_session, session_table_csv
 
 START_MS, DEVICE_START_S = 1_700_000_000_000, 700_000_000
@@ -172,6 +174,22 @@ def decode_figures(options: argparse.Namespace, folder: Path) -> tuple[dict[str,
         figures[name.replace(" ", "_") + "_s"] = seconds = cpu_s(work)
         print(f"{name:<28}{seconds:>8.3f}{size_mb / seconds:>8.0f}")
     return figures, ratios
+
+
+def table_figures(options: argparse.Namespace, folder: Path) -> dict[str, float]:
+    """CPU of taking in a table of raw LFP: cleaning it, and decoding what is stored."""
+    path, clean = folder / "lfp.csv", folder / "clean.csv"
+    rows = options.lfp_rows
+    values = np.random.default_rng(0).normal(0, 20, rows).round(4).tolist()
+    with path.open("w") as out:
+        out.write("t_s,lfp [uV],amplitude_ma\n")
+        out.writelines(f"{(i + 1) / 250:.3f},{x!r},{2.5 if i % 2000 < 1000 else 3.0}\n" for i, x in enumerate(values))
+    figures = {
+        "lfp_redact_s": cpu_s(lambda: redact_table(path, clean, "csv", DecodeOptions())),
+        "lfp_decode_s": cpu_s(lambda: decode(clean)),
+    }
+    print(f"raw LFP of {rows} rows: cleaned in {figures['lfp_redact_s']:.2f} s, decoded in {figures['lfp_decode_s']:.2f} s of CPU")
+    return figures
 
 
 def memory_figures(options: argparse.Namespace, folder: Path) -> dict[str, float]:
@@ -317,19 +335,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--megabytes", type=float, default=50.0, help="size of the file that is timed")
     parser.add_argument("--whole-megabytes", type=float, default=WHOLE_MB, help="size of the file whose decoding is weighed")
+    parser.add_argument("--lfp-rows", type=int, default=1_000_000, help="rows of the table of raw LFP")
     parser.add_argument("--repeats", type=int, default=7, help="timings per peer")
     parser.add_argument("--uploads", type=int, default=7, help="uploads timed on a quiet and on a training service")
     parser.add_argument("--only", choices=("decode", "upload"), help="one half alone")
     parser.add_argument("--quick", action="store_true", help="a small file and few repeats, for a first look")
     options = parser.parse_args()
     if options.quick:
-        options.megabytes, options.repeats, options.uploads = 10.0, 3, 3
+        options.megabytes, options.repeats, options.uploads, options.lfp_rows = 10.0, 3, 3, 100_000
     figures: dict[str, float] = {}
     ratios: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as timed, tempfile.TemporaryDirectory() as weighed, tempfile.TemporaryDirectory() as data:
         if options.only != "upload":
             figures, ratios = decode_figures(options, Path(timed))
-            figures |= memory_figures(options, Path(weighed))
+            figures |= table_figures(options, Path(weighed)) | memory_figures(options, Path(weighed))
         if options.only != "decode":
             more, shares = latency_figures(options, Path(data))
             figures, ratios = figures | more, ratios | shares

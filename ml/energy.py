@@ -191,6 +191,36 @@ def _ends(values: Range) -> tuple[float, float]:
     return values.low, values.high
 
 
+@dataclass(frozen=True)
+class Implant:
+    """Assumptions about one implant and its stimulation, each a range, with their source."""
+
+    capacity_mah: Range
+    voltage_v: Range
+    other_drain_uw: Range
+    impedance_ohm: Range
+    supply_v: Range
+    pulse_width_us: Range
+    rate_hz: Range
+    source: str
+
+    def life(self, amplitude_ma: ArrayLike) -> BatteryLife:
+        """From full to empty at these amplitudes, mA [T]: between an output stage without loss (I^2 R) and a fixed supply (I V).
+
+        Raises:
+            ValueError: numbers from which no life follows.
+        """
+        least = mean_power_uw(amplitude_ma, self.pulse_width_us.low, self.rate_hz.low, self.impedance_ohm.low)
+        most = max(
+            supply_power_uw(amplitude_ma, self.pulse_width_us.high, self.rate_hz.high, self.supply_v.high),
+            mean_power_uw(amplitude_ma, self.pulse_width_us.high, self.rate_hz.high, self.impedance_ohm.high),
+        )
+        stated = BatteryAssumptions(
+            capacity_mah=self.capacity_mah, voltage_v=self.voltage_v, other_drain_uw=self.other_drain_uw, source=self.source
+        )
+        return battery_life(Range(least, most), stated)
+
+
 def saving_percent(energy: float, reference: float) -> float:
     """What a controller saves against a reference (cDBS), per cent; negative when it uses more.
 

@@ -8,9 +8,10 @@ from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from app.accounts import service
+from app.accounts.blinded import is_open
 from app.accounts.permissions import Caller
 from app.platform.database import Db, set_actor
-from app.platform.errors import Unauthorized
+from app.platform.errors import Forbidden, Unauthorized
 
 COOKIE = "betaloop_session"
 
@@ -31,6 +32,11 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
     if caller is None:
         raise Unauthorized(
             "This needs a bearer token or a browser session.", "Make one with `betaloop token create EMAIL --name NAME`, or sign in."
+        )
+    if caller.is_blinded and not is_open(request.method, request.url.path):
+        raise Forbidden(
+            "This is closed to blinded assessors: it may show which controller a session had.",
+            "Results by controller stand under Analyses once a visit is locked.",
         )
     set_actor(db, caller.label, caller.user_id, getattr(request.state, "request_id", None))
     request.state.caller = caller

@@ -12,8 +12,9 @@ from app.platform.database import Base
 
 
 class Role(StrEnum):
-    """What a member may do in a study; each includes the reading rights of `viewer`."""
+    """What a member may do in a study; each but the blinded assessor includes the reading rights of `viewer`."""
 
+    BLINDED_ASSESSOR = "blinded_assessor"
     VIEWER = "viewer"
     CLINICIAN = "clinician"
     ENGINEER = "engineer"
@@ -74,7 +75,7 @@ class Membership(Base):
     __tablename__ = "membership"
     __table_args__ = (
         UniqueConstraint("user_id", "study_id", "site_id", postgresql_nulls_not_distinct=True),
-        CheckConstraint("role in ('viewer', 'clinician', 'engineer', 'admin')", name="role"),
+        CheckConstraint("role in ('blinded_assessor', 'viewer', 'clinician', 'engineer', 'admin')", name="role"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)

@@ -8,7 +8,10 @@ from app.accounts.models import Role, Scope
 from app.platform.errors import Forbidden, NotFound
 
 READ = "read"
+READ_ARMS = "arms:read"  # which controller a session had, also before its visit is locked
 WRITE_STUDY = "study:write"  # participants, visits, sessions, QoCs
+WRITE_QOC = "qoc:write"
+LOCK_VISIT = "visit:lock"
 WRITE_SETTINGS = "settings:write"
 UPLOAD = "upload"
 DECIDE_QUARANTINE = "quarantine:decide"  # may see what could not be freed of identity
@@ -20,11 +23,13 @@ TAKE_BUNDLES = "bundles:take"  # a signed controller: each one taken is stored a
 READ_AUDIT = "audit:read"
 MANAGE_ACCOUNTS = "accounts:write"
 
-_VIEWER = frozenset({READ})
-_STAFF = _VIEWER | {WRITE_STUDY, WRITE_SETTINGS, UPLOAD, RUN_JOBS, DRAFT_PLAN, TAKE_BUNDLES, READ_AUDIT}
-_CLINICIAN = _STAFF | {DECIDE_QUARANTINE, APPROVE_PLAN}
+_BLINDED = frozenset({READ, WRITE_QOC})
+_VIEWER = frozenset({READ, READ_ARMS})
+_STAFF = _VIEWER | {WRITE_STUDY, WRITE_QOC, WRITE_SETTINGS, UPLOAD, RUN_JOBS, DRAFT_PLAN, TAKE_BUNDLES, READ_AUDIT}
+_CLINICIAN = _STAFF | {DECIDE_QUARANTINE, APPROVE_PLAN, LOCK_VISIT}
 _ENGINEER = _STAFF | {WRITE_POLICIES}
 PERMISSIONS: dict[Role, frozenset[str]] = {
+    Role.BLINDED_ASSESSOR: _BLINDED,
     Role.VIEWER: _VIEWER,
     Role.CLINICIAN: _CLINICIAN,
     Role.ENGINEER: _ENGINEER,
@@ -90,6 +95,11 @@ class Caller:
         """Raises Forbidden for a token: passwords, tokens and accounts are changed by people who have signed in."""
         if self.token_scope is not None:
             raise Forbidden("A token may not change passwords, tokens or accounts.", "Sign in with a browser.")
+
+    @property
+    def is_blinded(self) -> bool:
+        """Whether the caller is a blinded assessor anywhere: then only what `app.accounts.blinded` lists is open to them."""
+        return any(g.role is Role.BLINDED_ASSESSOR for g in self.grants)
 
     @property
     def role(self) -> Role | None:

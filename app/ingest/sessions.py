@@ -18,6 +18,7 @@ from app.study.models import Controller, Hemisphere, Participant, Recording, Ses
 from app.study.sessions import repeated
 from app.study.sessions.usable_steps import CONTROL_STREAMS
 from app.study.traces import AMPLITUDE_STREAM, pack, unpack
+from app.study.visits.service import require_unlocked
 
 TOGETHER = 0.5
 """Two recordings belong to one session when they share at least this part of the shorter one's time."""
@@ -182,7 +183,9 @@ def add_session(
     hemisphere: Hemisphere | None,
     counts: bool,
 ) -> StudySession:
-    """A new session, confirmed or proposed."""
+    """A new session, confirmed or proposed. Raises Conflict where it would count in a locked visit."""
+    if counts:
+        require_unlocked(visit)
     session = StudySession(
         visit_id=visit.id,
         ordinal=study.next_ordinal(db, visit.id),

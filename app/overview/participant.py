@@ -15,7 +15,7 @@ from app.overview import state
 from app.platform.database import Db
 from app.platform.web.templates import render
 from app.study import repository as study
-from app.study.blinding import arm
+from app.study.blinding import visible_arm
 from app.study.deps import CurrentParticipant
 
 router = APIRouter()
@@ -33,7 +33,7 @@ def participant_page(request: Request, participant: CurrentParticipant, db: Db, 
         settings=participant.current_settings,
         state=state.states(db, [participant], datetime.now(UTC).date())[participant.id],
         phases=state.PHASES,
-        days=[(v, [(s, arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in visits],
+        days=[(v, [(s, visible_arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in visits],
         minutes=sum(s.duration_s for s in sessions) / 60,
         analysis=view(analysis.five_metrics(db, participant, caller)),
         may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),

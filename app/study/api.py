@@ -8,6 +8,7 @@ from app.accounts.deps import CurrentCaller
 from app.platform.database import Db
 from app.platform.web.schemas import Page, PagingQuery, problems
 from app.study import repository, service
+from app.study.blinding import require_known
 from app.study.deps import CurrentParticipant, CurrentSession, CurrentVisit
 from app.study.outcomes import values as outcome_values
 from app.study.schemas import (
@@ -26,11 +27,14 @@ from app.study.schemas import (
     TraceOut,
     VisitChange,
     VisitIn,
+    VisitLockIn,
+    VisitLockOut,
     VisitOut,
 )
 from app.study.serializers import outcome_out, participant_out, session_out, trace_out, visit_out
 from app.study.sessions import conditions
 from app.study.sessions.data import session_data
+from app.study.visits import service as visits
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
@@ -91,12 +95,34 @@ def read_visit(visit: CurrentVisit) -> VisitOut:
     return visit_out(visit, visit.participant.code)
 
 
-@router.patch("/visits/{visit_id}")
+@router.patch("/visits/{visit_id}", responses=problems(409))
 def change_visit(visit: CurrentVisit, change: VisitChange, db: Db, caller: CurrentCaller) -> VisitOut:
     """Correct a visit: its date, its note, its cDBS amplitudes; amplitude fractions of its sessions follow."""
     service.change_visit(db, visit, change, caller)
     db.commit()
     return visit_out(visit, visit.participant.code)
+
+
+@router.get("/visits/{visit_id}/locks")
+def list_locks(visit: CurrentVisit) -> list[VisitLockOut]:
+    """When a visit was locked and unlocked, oldest first; the last one holds."""
+    return [VisitLockOut.model_validate(row) for row in visit.locks]
+
+
+@router.post("/visits/{visit_id}/lock", responses=problems(409))
+def lock_visit(visit: CurrentVisit, why: VisitLockIn, db: Db, caller: CurrentCaller) -> VisitLockOut:
+    """Close the data of a visit for changes; blinded assessors see its controllers from now on."""
+    row = visits.lock(db, visit, why.reason, caller)
+    db.commit()
+    return VisitLockOut.model_validate(row)
+
+
+@router.post("/visits/{visit_id}/unlock", responses=problems(409))
+def unlock_visit(visit: CurrentVisit, why: VisitLockIn, db: Db, caller: CurrentCaller) -> VisitLockOut:
+    """Open the data of a visit for corrections."""
+    row = visits.unlock(db, visit, why.reason, caller)
+    db.commit()
+    return VisitLockOut.model_validate(row)
 
 
 @router.get("/visits/{visit_id}/sessions")
@@ -112,7 +138,7 @@ def read_session(session: CurrentSession, caller: CurrentCaller) -> SessionOut:
     return session_out(session, caller)
 
 
-@router.patch("/sessions/{session_id}")
+@router.patch("/sessions/{session_id}", responses=problems(409))
 def change_session(session: CurrentSession, change: SessionChange, db: Db, caller: CurrentCaller) -> SessionOut:
     """Correct a session: its controller, channel, hemisphere, or whether it counts."""
     service.change_session(db, session, change, caller)
@@ -121,8 +147,9 @@ def change_session(session: CurrentSession, change: SessionChange, db: Db, calle
 
 
 @router.get("/sessions/{session_id}/trace")
-def read_trace(session: CurrentSession, db: Db) -> TraceOut:
+def read_trace(session: CurrentSession, db: Db, caller: CurrentCaller) -> TraceOut:
     """Beta and amplitude on the 2 s grid; rows with t_s <= 0 are the window before the session."""
+    require_known(session.visit, caller)
     return trace_out(session_data(db, session))
 
 
@@ -146,7 +173,7 @@ def read_qoc(session: CurrentSession) -> QocOut | None:
     return QocOut.model_validate(session.qoc) if session.qoc else None
 
 
-@router.put("/sessions/{session_id}/qoc")
+@router.put("/sessions/{session_id}/qoc", responses=problems(409))
 def record_qoc(session: CurrentSession, values: QocIn, db: Db, caller: CurrentCaller) -> QocOut:
     """Enter or correct the QoCs of a session."""
     row = service.record_qoc(db, session, values, caller)
@@ -160,7 +187,7 @@ def read_outcomes(session: CurrentSession, db: Db) -> list[OutcomeOut]:
     return [outcome_out(session, d) for d in outcome_values.derive(db, session)]
 
 
-@router.post("/sessions/{session_id}/outcomes")
+@router.post("/sessions/{session_id}/outcomes", responses=problems(409))
 def take_outcome(session: CurrentSession, choice: DerivedChoice, db: Db, caller: CurrentCaller) -> QocOut:
     """Put the value that the files give in the place of a typed one; `value` is the one that was read before."""
     row = service.take_derived(db, session, choice, caller)

@@ -1,15 +1,20 @@
 """The one gate through which pages, exports and analyses learn which controller a session had.
 
-Blinding hangs on this place: who may not know an arm yet gets a masked one from here, and nowhere else is the column read.
+Blinding hangs on this place: who may not know an arm is refused here or told that it is hidden, and nowhere else is the column read.
 """
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.platform.errors import Conflict
-from app.study.models import Controller, StudySession
+from app.platform.errors import BetaloopError, Conflict, Forbidden
+from app.study import repository
+from app.study.models import Controller, Participant, StudySession, Visit
 
 CONTROLLER_NAMES: dict[Controller, str] = {
     Controller.CDBS: "cDBS",
@@ -35,10 +40,11 @@ class Arm:
 
 
 def arm(session: StudySession, user: Caller) -> Arm:
-    """The arm of a session for this user. Studies are open-label so far, so that whoever may read the session may know its arm.
+    """The arm of a session for this user.
 
     Raises:
         Conflict: the session is a proposal, and nobody has stated its controller yet.
+        Forbidden: the user is blinded, and the visit is not locked yet.
     """
     stated = stated_arm(session, user)
     if stated is None:
@@ -47,9 +53,39 @@ def arm(session: StudySession, user: Caller) -> Arm:
 
 
 def stated_arm(session: StudySession, user: Caller) -> Arm | None:
-    """The arm of a session that may still be a proposal; None where its controller is open."""
-    user.require("read", session.visit.participant.site.study_id, session.visit.participant.site_id)
+    """The arm of a session that may still be a proposal; None where its controller is open. Raises Forbidden as `arm`."""
+    require_known(session.visit, user)
     return None if session._controller is None else Arm(Controller(session._controller), session._policy_id)
+
+
+def visible_arm(session: StudySession, user: Caller) -> Arm | None:
+    """For lists: the arm, or None where it is hidden from this user or open."""
+    return stated_arm(session, user) if may_know(session.visit, user) else None
+
+
+def may_know(visit: Visit, user: Caller) -> bool:
+    """Whether the user may know the arms of a visit: everybody but a blinded assessor, and these once it is locked."""
+    site = visit.participant.site
+    user.require(can.READ, site.study_id, site.id)
+    return user.may(can.READ_ARMS, site.study_id, site.id) or visit.locked
+
+
+def require_known(visit: Visit, user: Caller, instead: BetaloopError | None = None) -> None:
+    """Raises Forbidden (or `instead`) where the user may not know the arms of a visit, nor see what gives them away."""
+    if not may_know(visit, user):
+        raise instead or Forbidden(
+            f"What ran at visit {visit.number} is hidden from you until the visit is locked.",
+            "You are a blinded assessor; a clinician locks the visit when its data are complete.",
+        )
+
+
+def sight(db: Session, participant: Participant, user: Caller) -> Hashable:
+    """What the user may know of a participant's arms: equal sights, equal arms. "all", or the visits that are locked."""
+    site = participant.site
+    user.require(can.READ, site.study_id, site.id)
+    if user.may(can.READ_ARMS, site.study_id, site.id):
+        return "all"
+    return frozenset(repository.locked_visits(db, participant.id))
 
 
 def assign(session: StudySession, controller: Controller | None, policy_id: int | None) -> None:

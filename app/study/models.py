@@ -53,6 +53,7 @@ class Participant(Base):
     site: Mapped[Site] = relationship()
     settings: Mapped[list[SettingsVersion]] = relationship(back_populates="participant", order_by="SettingsVersion.version")
     margins: Mapped[list[MarginsVersion]] = relationship(back_populates="participant", order_by="MarginsVersion.version")
+    margins_locks: Mapped[list[MarginsLock]] = relationship(back_populates="participant", order_by="MarginsLock.id")
     visits: Mapped[list[Visit]] = relationship(back_populates="participant", order_by="Visit.number")
 
     @property
@@ -155,6 +156,25 @@ class MarginsVersion(Base):
     participant: Mapped[Participant] = relationship(back_populates="margins")
 
 
+class MarginsLock(Base):
+    """Margins were fixed before the sessions that they judge: what is recorded later confirms, what was recorded before explores.
+
+    Rows are only added; the newest one holds.
+    """
+
+    __tablename__ = "margins_lock"
+    __table_args__ = (CheckConstraint("reason <> ''", name="reason"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    margins_version_id: Mapped[int] = mapped_column(ForeignKey("margins_version.id"))
+    reason: Mapped[str] = mapped_column(Text)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+    participant: Mapped[Participant] = relationship(back_populates="margins_locks")
+    margins: Mapped[MarginsVersion] = relationship()
+
+
 class CdbsAmplitude(Base):
     """The clinician's cDBS amplitude in force at a visit, per hemisphere and program; fractions are derived from it."""
 
@@ -200,6 +220,27 @@ class Visit(Base):
     participant: Mapped[Participant] = relationship(back_populates="visits")
     sessions: Mapped[list[StudySession]] = relationship(back_populates="visit", order_by="StudySession.ordinal")
     cdbs_amplitudes: Mapped[list[CdbsAmplitude]] = relationship()
+    locks: Mapped[list[VisitLock]] = relationship(back_populates="visit", order_by="VisitLock.id")
+
+    @property
+    def locked(self) -> bool:
+        """Whether the visit's data are closed for changes, and open to blinded assessors."""
+        return bool(self.locks) and self.locks[-1].locked
+
+
+class VisitLock(Base):
+    """A visit was locked or unlocked, by whom, when and why. Rows are only added; the newest one holds."""
+
+    __tablename__ = "visit_lock"
+    __table_args__ = (CheckConstraint("reason <> ''", name="reason"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    visit_id: Mapped[int] = mapped_column(ForeignKey("visit.id"), index=True)
+    locked: Mapped[bool]
+    reason: Mapped[str] = mapped_column(Text)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+    visit: Mapped[Visit] = relationship(back_populates="locks")
 
 
 class StudySession(Base):
@@ -217,6 +258,8 @@ class StudySession(Base):
         CheckConstraint("duration_s >= 0", name="duration"),
         CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"),
         CheckConstraint("excluded_reason is null or excluded_reason <> ''", name="excluded_reason"),
+        CheckConstraint("stopped_reason is null or stopped_reason <> ''", name="stopped_reason"),
+        CheckConstraint("medication_h >= 0 and medication_h <= 72", name="medication"),
         CheckConstraint(TIME_CHECK, name="started_at"),
     )
 
@@ -232,6 +275,10 @@ class StudySession(Base):
     control_stream: Mapped[str] = mapped_column(String(40), server_default="beta")
     control_channel: Mapped[str | None] = mapped_column(String(80))
     excluded_reason: Mapped[str | None] = mapped_column(Text)
+    stopped_reason: Mapped[str | None] = mapped_column(Text)
+    """Why it was stopped for the patient's sake: a failure of its controller, never a missing value. None where it was not."""
+    medication_h: Mapped[float | None]
+    """Hours from the last dose of medication to the session's start; None where nobody stated it."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     visit: Mapped[Visit] = relationship(back_populates="sessions")
     segments: Mapped[list[SessionSegment]] = relationship(
@@ -344,58 +391,3 @@ class QocRevision(Base):
     """Names of the QoCs that stand in this revision as they were derived from uploaded files, not as a person typed them."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     session: Mapped[StudySession] = relationship(back_populates="qocs")
-
-
-class TremorSeries(Base):
-    """Minutes of tremor from one uploaded file of a watch, in UTC.
-
-    Little-endian arrays of `n` minutes in time order: `start_unix_s_f64` and `duration_s_f64` in seconds, `fractions_f32` [n, 6] in the
-    order of `ml.qoc.TREMOR_CLASSES`, `any_tremor_f32`; NaN where the export does not tell.
-    """
-
-    __tablename__ = "tremor_series"
-    __table_args__ = (
-        UniqueConstraint("participant_id", "upload_file_id"),
-        CheckConstraint("n >= 1", name="minutes"),
-        CheckConstraint("last_end_at > first_start_at", name="order"),
-        CheckConstraint(
-            "octet_length(start_unix_s_f64) = 8 * n and octet_length(duration_s_f64) = 8 * n"
-            " and octet_length(fractions_f32) = 24 * n and octet_length(any_tremor_f32) = 4 * n",
-            name="length",
-        ),
-    )
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"))
-    upload_file_id: Mapped[int] = mapped_column(ForeignKey("upload_file.id"), index=True)
-    first_start_at: Mapped[datetime]
-    last_end_at: Mapped[datetime]
-    n: Mapped[int]
-    start_unix_s_f64: Mapped[bytes] = mapped_column(LargeBinary)
-    duration_s_f64: Mapped[bytes] = mapped_column(LargeBinary)
-    fractions_f32: Mapped[bytes] = mapped_column(LargeBinary)
-    any_tremor_f32: Mapped[bytes] = mapped_column(LargeBinary)
-    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
-
-
-class GraspTest(Base):
-    """One hand's grasp test near the end of a session: times of open fists, s (little-endian float64, `n` of them).
-
-    `implausible` lists which of the n - 1 intervals between them are too short or too long to be a grasp.
-    """
-
-    __tablename__ = "grasp_test"
-    __table_args__ = (
-        UniqueConstraint("session_id", "upload_file_id", "hand", postgresql_nulls_not_distinct=True),
-        CheckConstraint("hand in ('left', 'right')", name="hand"),
-        CheckConstraint("n >= 1 and octet_length(open_fist_s_f64) = 8 * n", name="length"),
-    )
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    session_id: Mapped[int] = mapped_column(ForeignKey("session.id", ondelete="CASCADE"))
-    upload_file_id: Mapped[int] = mapped_column(ForeignKey("upload_file.id"), index=True)
-    hand: Mapped[Hemisphere | None] = mapped_column(String(5))
-    n: Mapped[int]
-    open_fist_s_f64: Mapped[bytes] = mapped_column(LargeBinary)
-    implausible: Mapped[list[Any]]
-    created_at: Mapped[datetime] = mapped_column(server_default=func.now())

@@ -16,7 +16,6 @@ from app.accounts.permissions import Caller
 from app.platform.audit import AuditEvent
 from app.platform.errors import NotFound
 from app.study.models import (
-    GraspTest,
     Participant,
     QocRevision,
     Recording,
@@ -24,9 +23,10 @@ from app.study.models import (
     SettingsVersion,
     StudySession,
     Trace,
-    TremorSeries,
     Visit,
+    VisitLock,
 )
+from app.study.outcomes.models import GraspTest, TremorSeries
 from app.study.sessions.models import CountedTime
 
 CONFIRMED = StudySession.status == "confirmed"
@@ -97,6 +97,18 @@ def visit_by_number(db: Session, participant_id: int, number: int) -> Visit | No
     return db.scalar(select(Visit).where(Visit.participant_id == participant_id, Visit.number == number))
 
 
+def locked_visits(db: Session, participant_id: int) -> Sequence[int]:
+    """Visits of a participant that are locked now."""
+    newest = select(func.max(VisitLock.id)).join(VisitLock.visit).where(Visit.participant_id == participant_id).group_by(VisitLock.visit_id)
+    return db.scalars(select(VisitLock.visit_id).where(VisitLock.id.in_(newest), VisitLock.locked)).all()
+
+
+def lock_row(db: Session, visit: Visit) -> None:
+    """Hold a visit for this transaction and read its locks again, so that two people at once are asked in turn."""
+    db.execute(select(Visit.id).where(Visit.id == visit.id).with_for_update())
+    db.expire(visit, ["locks"])
+
+
 def session(db: Session, session_id: int, caller: Caller) -> StudySession:
     """A session with its QoCs, segments and visit. Raises NotFound."""
     row = db.scalar(_sessions().join(Participant.site).where(StudySession.id == session_id, in_scope(caller)))
@@ -135,6 +147,17 @@ def traces_of_recording(db: Session, recording_id: int) -> Sequence[Trace]:
     return db.scalars(
         select(Trace).where(Trace.recording_id == recording_id, Trace.decode_version == newest).order_by(Trace.stream, Trace.channel)
     ).all()
+
+
+def traces_of_recordings(db: Session, recording_ids: Collection[int]) -> dict[int, list[Trace]]:
+    """The same of many recordings at once, by recording; read only, and not the session's own rows."""
+    columns = [c for c in Trace.__table__.columns if c.name != "details"]
+    query = select(*columns).where(Trace.recording_id.in_(recording_ids)).order_by(Trace.stream, Trace.channel)
+    found: dict[int, list[Any]] = {}
+    for row in db.execute(query):
+        found.setdefault(row.recording_id, []).append(row)
+    newest = {i: max(t.decode_version for t in traces) for i, traces in found.items()}
+    return {i: [t for t in traces if t.decode_version == newest[i]] for i, traces in found.items()}
 
 
 @dataclass(frozen=True)

@@ -254,7 +254,9 @@ class SessionOut(Model):
     visit: int
     participant: str
     ordinal: int
-    controller: Controller | None = Field(description="Null only of a proposal whose controller nobody has stated yet.")
+    controller: Controller | None = Field(
+        description="Null of a proposal whose controller nobody has stated yet, and where it is hidden from a blinded assessor."
+    )
     policy_id: int | None
     hemisphere: Hemisphere | None
     status: str
@@ -262,6 +264,8 @@ class SessionOut(Model):
     duration_s: float
     control_channel: str | None
     excluded_reason: str | None
+    stopped_reason: str | None = Field(description="Why it was stopped for the patient's sake; null: it was not.")
+    medication_h: float | None = Field(description="Hours from the last dose to the start.")
     recordings: list[int]
     qoc: QocOut | None
 
@@ -275,7 +279,26 @@ class SessionChange(Model):
     control_stream: Text | None = Field(None, max_length=40)
     control_channel: Text | None = Field(None, max_length=80)
     excluded_reason: Text | None = Field(None, max_length=1000, description="Keeps it out of buffers and analyses; null takes that back.")
+    stopped_reason: Text | None = Field(
+        None, max_length=1000, description="Why it was stopped for the patient's sake: a failure of its controller; null: it was not."
+    )
+    medication_h: Number | None = Field(None, ge=0, le=72, description="Hours from the last dose to the start; null: not known.")
     reason: Text | None = Field(None, max_length=1000)
+
+
+class VisitLockIn(Model):
+    """Why a visit is locked or unlocked."""
+
+    reason: Text = Field(min_length=1, max_length=1000, description="Kept with the lock and in the audit trail.")
+
+
+class VisitLockOut(Model):
+    """One lock or unlock of a visit."""
+
+    locked: bool
+    reason: str
+    created_at: datetime
+    created_by: str
 
 
 class HoldModel(Model):

@@ -47,7 +47,7 @@ def visit_out(v: Visit, code: str) -> VisitOut:
 
 def session_out(s: StudySession, caller: Caller) -> SessionOut:
     """A session for the API; the controller comes through the blinding gate."""
-    arm = blinding.stated_arm(s, caller)
+    arm = blinding.visible_arm(s, caller)
     return SessionOut(
         id=s.id,
         visit_id=s.visit_id,
@@ -62,6 +62,8 @@ def session_out(s: StudySession, caller: Caller) -> SessionOut:
         duration_s=s.duration_s,
         control_channel=s.control_channel,
         excluded_reason=s.excluded_reason,
+        stopped_reason=s.stopped_reason,
+        medication_h=s.medication_h,
         recordings=sorted({g.recording_id for g in s.segments}),
         qoc=QocOut.model_validate(s.qoc) if s.qoc else None,
     )

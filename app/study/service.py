@@ -21,6 +21,7 @@ from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, ParticipantIn, 
 from app.study.sessions import repeated
 from app.study.threshold import MDP_FIELDS
 from app.study.traces import NO_CONTROL
+from app.study.visits.service import require_unlocked
 from ml.mdp import MdpSettings
 
 RESERVED_CODES = {"new"}
@@ -77,6 +78,7 @@ def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Cal
 def change_visit(db: Session, visit: Visit, change: VisitChange, caller: Caller) -> Visit:
     """Correct a visit's date, note or cDBS amplitudes; its sessions' fractions follow, the audit trail keeps what stood before and why."""
     require(caller, can.WRITE_STUDY, visit.participant)
+    require_unlocked(visit)
     set_reason(db, change.reason)
     given = change.model_fields_set
     if "date" in given:
@@ -107,8 +109,9 @@ def _each_once(amplitudes: Sequence[CdbsAmplitudeModel]) -> None:
 
 def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller) -> QocRevision:
     """Enter or correct QoCs: a new revision that keeps what the call leaves out. Same values, no revision."""
-    require(caller, can.WRITE_STUDY, session.visit.participant)
+    require(caller, can.WRITE_QOC, session.visit.participant)
     _refuse_proposal(session)
+    require_unlocked(session.visit)
     repository.lock_session(db, session)
     known = session.qoc
     given = values.model_dump(exclude_unset=True, exclude={"reason"})
@@ -125,6 +128,7 @@ def take_derived(db: Session, session: StudySession, choice: DerivedChoice, call
     """Put a derived QoC in the place of a typed one. Raises Invalid where the files give another value by now."""
     require(caller, can.WRITE_STUDY, session.visit.participant)
     _refuse_proposal(session)
+    require_unlocked(session.visit)
     return outcomes.take_derived(db, session, choice.name, choice.value, caller.label)
 
 
@@ -132,6 +136,7 @@ def change_session(db: Session, session: StudySession, change: SessionChange, ca
     """Correct a session; the audit trail keeps what stood before and why."""
     require(caller, can.WRITE_STUDY, session.visit.participant)
     _refuse_proposal(session)
+    require_unlocked(session.visit)
     given = change.model_dump(exclude_unset=True, exclude={"reason"})
     set_reason(db, change.reason)
     arm = blinding.arm(session, caller)
@@ -145,7 +150,7 @@ def change_session(db: Session, session: StudySession, change: SessionChange, ca
     if "excluded_reason" in given and not (given["excluded_reason"] or "").strip() and session.excluded_reason is not None:
         repeated.refuse(db, session)
     for name, value in given.items():
-        if name == "excluded_reason":
+        if name in ("excluded_reason", "stopped_reason"):
             value = (value or "").strip() or None
         elif name == "control_stream" and value is None:
             continue

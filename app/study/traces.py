@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
 from app.study import cdbs_amplitude, repository
-from app.study.models import SettingsVersion, StudySession, Trace
+from app.study.models import Recording, SettingsVersion, StudySession, Trace
 from ml.formats.beta import ERROR_STREAM
 from ml.mdp import AMPLITUDE_TOLERANCE
 
@@ -64,8 +64,17 @@ def unpack(trace: Trace) -> NDArray[np.float64]:
     return np.where(valid, values, np.nan)
 
 
+TracesOf = Callable[[int], Sequence[Trace]]
+"""The traces of a recording, by its number, in their newest decode version."""
+
+
 def step_table(db: Session, session: StudySession, settings: SettingsVersion) -> StepTable:
-    """Beta and amplitude of a session's control channel, with up to W rows before its start.
+    """Beta and amplitude of a session's control channel, with up to W rows before its start; errors as in `laid_out`."""
+    return laid_out(session, settings, lambda recording_id: repository.traces_of_recording(db, recording_id))
+
+
+def laid_out(session: StudySession, settings: SettingsVersion, traces: TracesOf) -> StepTable:
+    """The step table from traces that somebody else read.
 
     Raises:
         Invalid: a session of more than MOST_STEPS, traces of one recording that do not share a grid, or two segments that claim the same
@@ -77,7 +86,7 @@ def step_table(db: Session, session: StudySession, settings: SettingsVersion) ->
     for segment in session.segments:
         if not segment.is_control:
             continue
-        found, driving = _chosen(session, repository.traces_of_recording(db, segment.recording_id))
+        found, driving = _chosen(session, traces(segment.recording_id))
         origin = session_offset_s(session, segment.recording_id)
         if found is not None:
             _place(beta, t_s, found, origin, period)
@@ -117,8 +126,12 @@ def sources(session: StudySession, settings: SettingsVersion, heads: Mapping[int
     return Sources(beta.id if beta else None, amplitude.id if amplitude else None, cdbs)
 
 
-def shown_table(session: StudySession, settings: SettingsVersion, trace: Trace, amplitude: Trace | None) -> StepTable:
+def shown_table(
+    session: StudySession, settings: SettingsVersion, trace: Trace, amplitude: Trace | None, recording: Recording | None = None
+) -> StepTable:
     """Any trace of a session's recordings on the session's grid, with an amplitude of the same recording; `beta` holds its values.
+
+    `recording` is the trace's own, where the caller has it at hand.
 
     The cDBS amplitude is that of the trace's own side and of the amplitude's program.
 
@@ -126,7 +139,7 @@ def shown_table(session: StudySession, settings: SettingsVersion, trace: Trace, 
         Invalid: a trace that is not on the participant's grid, or a visit that states both sides and a recording that names none.
     """
     program = amplitude_program(amplitude) if amplitude is not None else 0
-    cdbs = cdbs_amplitude.in_force(session.visit, trace.recording.hemisphere or session.hemisphere, settings, program)
+    cdbs = cdbs_amplitude.in_force(session.visit, (recording or trace.recording).hemisphere or session.hemisphere, settings, program)
     t_s = _grid(session, settings)
     beta, amount = np.full(t_s.size, np.nan), np.full(t_s.size, np.nan)
     origin = session_offset_s(session, trace.recording_id)

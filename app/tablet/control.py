@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 
 from app.platform.errors import Invalid
 from app.settings import get_settings
-from app.tablet.battery import Implant, read_implant
+from app.tablet.battery import read_implant
 from app.tablet.sources import Source, Wish, open_source
 from ml.deploy.appraisal import battery_gain
 from ml.deploy.bundle import OpenBundle, open_bundle
@@ -28,7 +28,7 @@ from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.runtime import decision_log
 from ml.deploy.runtime.envelope import Decision, Reason, Signal, reason_names
 from ml.deploy.wording import battery_words, warning_sentences
-from ml.energy import relative_energy, saving_percent
+from ml.energy import Implant, relative_energy, saving_percent
 
 _KEY = "bundle-signing"
 

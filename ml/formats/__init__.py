@@ -30,6 +30,7 @@ from ml.formats.recording import (
 )
 from ml.formats.redaction_record import REDACTOR_VERSION, Redaction
 from ml.formats.tables import TableKind, decode_table, kind_of_text
+from ml.formats.tables.delimited import utf16_without_mark
 
 __all__ = [
     "DECODE_VERSION",
@@ -86,7 +87,7 @@ def sniff(path: Path) -> FileKind:
     if text.startswith((b"[", b"{")):
         what = "a single JSON file, neither a whole RC+S session nor a Percept session report"
         raise UndecodableFile(what, "file", "Zip the whole session folder and upload that.")
-    if head.startswith((b"\xff\xfe", b"\xfe\xff")) or b"\0" not in head[:4096]:
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")) or b"\0" not in head[:4096] or utf16_without_mark(head[:4096]) is not None:
         return kind_of_text(path)
     raise UndecodableFile("no format this service reads", "first bytes", HINT)
 

@@ -38,7 +38,7 @@ class Saving:
     """Stimulation energy saved against the same visit's cDBS.
 
     Attributes:
-        percent: average over visits. low, high: its interval of `level`, per cent.
+        percent: average over visits. low, high: its interval of `level`, per cent; at most 100.
         p_value: one-sided, of no saving.
         by_visit: per cent, [V]. visits: numbers of these visits.
     """
@@ -112,7 +112,8 @@ def energy_saving(energy: Measurements, level: float = 0.95, *, draws: int = 199
         high = whole.estimate - float(bottom) * whole.standard_error
         p = float((1 + np.sum(ratios >= whole.estimate / whole.standard_error)) / (ratios.size + 1))
         method = SavingMethod.BOOTSTRAP
-    return Saving(100 * whole.estimate, 100 * float(low), 100 * float(high), level, p, by_visit, visits, method)
+    high = min(float(high), max(1.0, whole.estimate))  # no controller saves more than all of it
+    return Saving(100 * whole.estimate, 100 * float(low), 100 * high, level, p, by_visit, visits, method)
 
 
 def student_ratios(values: Floats, draws: int, seed: int) -> Floats:

@@ -86,8 +86,9 @@ class MixedModel:
         problem = _Problem(self, sums)
         names = list(self.estimated)
         best = problem.search(len(names))
-        # Five values of each lambda, three wider apart where four groups would make too many combinations.
-        powers = np.arange(-2.0, 3.0) if len(names) < 4 else np.array([-1.7, 0.0, 1.7])
+        # Five values of each lambda, three wider apart where four groups would make too many combinations; from six groups on the two
+        # at one standard deviation, which still have its mean and its variance (Gauss and Hermite's rule of two points).
+        powers = np.arange(-2.0, 3.0) if len(names) < 4 else np.array([-1.7, 0.0, 1.7]) if len(names) < 6 else np.array([-1.0, 1.0])
         axes = [np.clip(v * step**powers, SMALLEST, LARGEST) for v, step in zip(best, problem.steps(best), strict=True)]
         points = sorted(set(product(*[axis.tolist() for axis in axes])))
         ratios = np.array(points, dtype=np.float64).reshape(len(points), len(names))

@@ -18,7 +18,17 @@ from numpy.typing import NDArray
 from ml.statistics.effects import Saving, energy_saving, saving_contrasts
 from ml.statistics.multiplicity import holm
 from ml.statistics.power import MOST_VISITS, Posterior, Target, first_reaching, posterior, success
-from ml.statistics.within_visits.contrasts import Average, Measurements, Reason, Scale, Unavailable, primary
+from ml.statistics.within_visits.contrasts import (
+    Adjustment,
+    Average,
+    Measurements,
+    Reason,
+    Scale,
+    Unavailable,
+    average,
+    primary,
+    visit_contrasts,
+)
 
 Floats = NDArray[np.float64]
 
@@ -221,12 +231,24 @@ def _outcome(outcome: Outcome, rule: FailureRule, level: float) -> OutcomeResult
         found = Unavailable(Reason.TOO_FEW_VISITS, len(counted.arms), LEAST_VISITS)
     else:
         found = primary(counted, level, outcome.scale)
+        if rule is not FailureRule.AS_MEASURED and isinstance(found, Average) and found.adjustment is not Adjustment.NONE:
+            found = _less_favourable(found, average(visit_contrasts(counted, outcome.scale), level), outcome)
     failures = int(np.sum(outcome.stopped & outcome.data.tested))
     missing = int(np.sum(~np.isfinite(counted.value)))
     if isinstance(found, Unavailable):
         return OutcomeResult(outcome.name, outcome.margin, found, None, None, failures, missing)
     p = found.p_above(outcome.loss), found.p_below(outcome.loss)
     return OutcomeResult(outcome.name, outcome.margin, found, *p, failures, missing)
+
+
+def _less_favourable(adjusted: Average, plain: Average | Unavailable, outcome: Outcome) -> Average:
+    """Where a session of the controller failed: the worse of the averages with and without adjustment for the order.
+
+    Sessions that are stopped come late in a visit, so that a drift fitted through their failures would explain them away.
+    """
+    if not (outcome.stopped & outcome.data.tested).any() or isinstance(plain, Unavailable):
+        return adjusted
+    return max(adjusted, plain, key=lambda a: a.p_above(outcome.loss))
 
 
 def _verdict(results: Sequence[OutcomeResult], saving: Saving | Unavailable, alpha: float) -> Verdict:

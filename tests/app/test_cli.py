@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from app.accounts.permissions import SYSTEM
-from app.overview.export import export_participant
+from app.overview.package.export import export_participant
 from app.platform.database import transaction
 from app.study.models import CdbsAmplitude, Hemisphere, StudySession
 from app.study.repository import participant_by_code

@@ -50,6 +50,13 @@ READABLE = (
     "/api/v1/visits/{visit_id}/plan.pdf",
     "/api/v1/bundle-key",
     "/api/v1/participants/{code}/analyses",
+    "/api/v1/participants/{code}/analyses/primary",
+    "/api/v1/participants/{code}/analyses/energy",
+    "/api/v1/participants/{code}/analyses/beta",
+    "/api/v1/participants/{code}/analyses/evaluations",
+    "/api/v1/analyses",
+    "/api/v1/participants/{code}/margins/locks",
+    "/api/v1/visits/{visit_id}/locks",
     "/api/v1/participants/{code}/calibration",
     "/healthz",
     "/readyz",
@@ -61,6 +68,9 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("put", "/api/v1/participants/{code}/margins"): {"clinician", "admin"},
     ("post", "/api/v1/participants/{code}/visits"): {"clinician", "engineer", "admin"},
     ("patch", "/api/v1/visits/{visit_id}"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/visits/{visit_id}/lock"): {"clinician", "admin"},
+    ("post", "/api/v1/visits/{visit_id}/unlock"): {"clinician", "admin"},
+    ("post", "/api/v1/participants/{code}/margins/locks"): {"clinician", "admin"},
     ("patch", "/api/v1/sessions/{session_id}"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/sessions/{session_id}/outcomes"): {"clinician", "engineer", "admin"},
     ("put", "/api/v1/sessions/{session_id}/conditions"): {"clinician", "engineer", "admin"},
@@ -85,6 +95,26 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("post", "/api/v1/participants/{code}/buffer-gate"): {"clinician", "admin"},
     ("get", "/api/v1/policies/{policy_id}/bundle"): {"clinician", "engineer", "admin"},
     **{("get", path): EVERYONE for path in READABLE},
+}
+BLINDED = {
+    # what is open to a blinded assessor while no visit is locked
+    ("get", "/healthz"),
+    ("get", "/readyz"),
+    ("get", "/api/v1/participants"),
+    ("get", "/api/v1/participants/{code}"),
+    ("get", "/api/v1/participants/{code}/visits"),
+    ("get", "/api/v1/visits/{visit_id}"),
+    ("get", "/api/v1/visits/{visit_id}/locks"),
+    ("get", "/api/v1/visits/{visit_id}/sessions"),
+    ("get", "/api/v1/sessions/{session_id}"),
+    ("get", "/api/v1/sessions/{session_id}/qoc"),
+    ("put", "/api/v1/sessions/{session_id}/qoc"),
+    ("get", "/api/v1/sessions/{session_id}/outcomes"),
+    ("get", "/api/v1/participants/{code}/analyses"),
+    ("get", "/api/v1/participants/{code}/analyses/primary"),
+    ("get", "/api/v1/participants/{code}/analyses/energy"),
+    ("get", "/api/v1/participants/{code}/analyses/beta"),
+    ("get", "/api/v1/analyses"),
 }
 Json = dict[str, Any]
 TABLE = b"t_s,beta,amplitude_fraction\n" + b"".join(b"%d,1,1\n" % (2 * k) for k in range(21))
@@ -135,6 +165,9 @@ class World:
             # members of `ids` that differ, and what is sent
             ("post", "/participants"): {"json": {"code": "Q1"}},
             ("put", "/participants/{code}/settings"): {"code": "P3", "json": {"settings": {"gamma": 0.9}}},
+            ("post", "/visits/{visit_id}/lock"): {"json": {"reason": "complete"}},
+            ("post", "/visits/{visit_id}/unlock"): {"json": {"reason": "rating misread"}},
+            ("post", "/participants/{code}/margins/locks"): {"json": {"version": 2, "reason": "protocol"}},
             ("put", "/participants/{code}/margins"): {"json": {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}},
             ("post", "/participants/{code}/visits"): {"json": {"number": 77}},
             ("patch", "/visits/{visit_id}"): {"json": {"note": "tired", "reason": "forgotten"}},
@@ -256,13 +289,14 @@ def test_without_a_token_no_route_answers(world: World) -> None:
     assert {route: status for route, status in answers.items() if status != 401} == {}
 
 
-@pytest.mark.parametrize("role", ["viewer", "clinician", "engineer", "admin"])
+@pytest.mark.parametrize("role", ["viewer", "clinician", "engineer", "admin", "blinded_assessor"])
 def test_every_route_against_every_role(world: World, role: str) -> None:
     """Who may call a route gets what it promises; who may not is refused, with rows that exist in both cases."""
     caller = world.admin if role == "admin" else world.calling(token_of(role))
     found = {}
     for method, path in routes(world.app):
-        right = success(world.app, method, path) if role in ROLES[method, path] else 403
+        may = role in ROLES[method, path] or (role == "blinded_assessor" and (method, path) in BLINDED)
+        right = success(world.app, method, path) if may else 403
         status = world.call(caller, method, path)
         if status != right:
             found[method, path] = f"{status}, not {right}"
@@ -277,7 +311,8 @@ def test_a_caller_of_another_study_sees_nothing(world: World) -> None:
         db.add(Site(study_id=study.id, code="other", name="Other site"))
     stranger = world.calling(token_of("admin", "other"))
     assert stranger.get("/api/v1/participants").json()["total"] == 0
-    own = {"/api/v1/participants", "/healthz", "/readyz", "/api/v1/bundle-key"}  # the key that every bundle is verified with is public
+    # the key that every bundle is verified with is public; of all participants it sees none
+    own = {"/api/v1/participants", "/api/v1/analyses", "/healthz", "/readyz", "/api/v1/bundle-key"}
     answers = {(m, p): world.call(stranger, m, p) for m, p in routes(world.app) if p not in own}
     assert {route: status for route, status in answers.items() if status != 404} == {}
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Query, Response
 
 from app.accounts.deps import CurrentCaller
-from app.analysis.metrics import service
+from app.analysis.metrics import export, service
 from app.analysis.metrics.schemas import FiveMetricsOut
 from app.platform.database import Db
 from app.platform.web.schemas import problems
@@ -14,7 +16,19 @@ from app.study.deps import CurrentParticipant
 router = APIRouter(tags=["analysis"], responses=problems(401, 403, 404, 422))
 
 
-@router.get("/participants/{code}/analyses")
-def read_analyses(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> FiveMetricsOut:
-    """Energy, mean beta, grasp, rating and tremor by controller, each compared with cDBS by a Wilcoxon rank-sum test."""
-    return FiveMetricsOut.model_validate(service.five_metrics(db, participant, caller))
+@router.get(
+    "/participants/{code}/analyses",
+    response_model=FiveMetricsOut,
+    responses={200: {"content": {"text/csv": {"schema": {"type": "string"}}, "image/svg+xml": {"schema": {"type": "string"}}}}},
+)
+def read_analyses(
+    participant: CurrentParticipant,
+    db: Db,
+    caller: CurrentCaller,
+    format: Annotated[Literal["json", "csv", "svg"], Query(description="csv: a row per metric and controller or policy.")] = "json",
+) -> FiveMetricsOut | Response:
+    """Energy, mean beta, grasp, rating and tremor by controller and policy, each compared with cDBS by a Wilcoxon rank-sum test."""
+    found = service.five_metrics(db, participant, caller)
+    if format != "json":
+        return (export.table if format == "csv" else export.svg)([found], participant.code)
+    return FiveMetricsOut.model_validate(found)

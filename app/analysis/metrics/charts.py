@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from app.analysis.evidence.measurements import HIGHER_IS_BETTER
 from app.analysis.metrics.comparisons import ALPHA, Comparison, Group
 from app.analysis.metrics.service import FiveMetrics, MetricResult
 from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, figure, marker
@@ -40,13 +41,13 @@ def metric_chart(metric: MetricResult) -> Chart:
     tests = {c.controller: c for c in metric.comparisons}
     data: list[dict[str, Any]] = []
     for at, g in enumerate(shown):
-        data += [_box(at, g), _points(at, g, metric)]
+        data += [box(at, g), points(at, g, metric)]
     names = [f"{SHORT.get(g.controller, g.label)}<br>n = {g.n}" for g in shown]
     places = {"tickvals": list(range(len(shown))), "ticktext": names, "range": [-0.6, len(shown) - 0.4], "tickangle": 0}
     layout: dict[str, Any] = {
         "xaxis": {**places, "showgrid": False, "zeroline": False},
         "yaxis": axis(metric.unit, rangemode="tozero", zeroline=False),
-        "annotations": [_p_label(at, tests.get(g.controller)) for at, g in enumerate(shown)],
+        "annotations": [_p_label(at, tests.get(g.controller), metric.metric) for at, g in enumerate(shown)],
         "margin": {"l": 52, "r": 8, "t": 30, "b": 44},
         "showlegend": False,
         "dragmode": False,
@@ -67,7 +68,8 @@ def p_text(p: float | None) -> str:
     return "1" if p > 0.9995 else f"{p:.3f}".removeprefix("0")
 
 
-def _box(at: int, g: Group) -> dict[str, Any]:
+def box(at: int, g: Group) -> dict[str, Any]:
+    """Quartiles of a group, whiskers to its extremes."""
     return {
         "type": "box", "x": [at], "q1": [g.q1], "median": [g.median], "q3": [g.q3],
         "lowerfence": [min(g.values)], "upperfence": [max(g.values)], "width": 0.5, "boxpoints": False, "hoverinfo": "skip",
@@ -75,7 +77,8 @@ def _box(at: int, g: Group) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
+def points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
+    """Every session of a group."""
     unit = metric.unit if metric.metric != "rating" else "of 10"
     return {
         "type": "scatter", "mode": "markers", "x": [at + s for s in _spread(g.values)], "y": list(g.values), "cliponaxis": False,
@@ -93,9 +96,23 @@ def _spread(values: Sequence[float]) -> list[float]:
     return places
 
 
-def _p_label(at: int, test: Comparison | None) -> dict[str, Any]:
+def above(test: Comparison | None, metric: str) -> str:
+    """What stands above a box: p, with an asterisk where it is below .05 in the desired direction."""
+    if test is None:
+        return "p"
+    return "too few" if test.p_value is None else p_text(test.p_value) + (" *" if is_better(test, metric) else "")
+
+
+def is_better(test: Comparison, metric: str) -> bool:
+    """Whether a difference is below .05 and in the desired direction: less energy, beta and tremor, faster grasps, a higher rating."""
+    if test.p_value is None or test.difference is None or test.p_value >= ALPHA or test.difference == 0:
+        return False
+    return (test.difference > 0) is HIGHER_IS_BETTER[metric]
+
+
+def _p_label(at: int, test: Comparison | None, metric: str) -> dict[str, Any]:
     strong = test is not None and test.p_value is not None and test.p_value < ALPHA
-    text = "p" if test is None else p_text(test.p_value) if test.p_value is not None else "too few"
+    text = above(test, metric)
     return {
         "x": at, "y": 1.0, "yref": "paper", "yanchor": "bottom", "showarrow": False, "text": f"<b>{text}</b>" if strong else text,
         "font": {"size": 12, "color": TEXT if strong else MUTED},

@@ -38,6 +38,14 @@ class ComparisonOut(Model):
     note: str = Field(description="The check that failed; empty where the test was made.")
 
 
+class PolicyMetricOut(Model):
+    """One metric of one policy: its sessions, and their comparison with cDBS."""
+
+    policy_id: int
+    group: GroupOut
+    comparison: ComparisonOut
+
+
 class MetricOut(Model):
     """One of the five metrics."""
 
@@ -46,6 +54,7 @@ class MetricOut(Model):
     unit: str
     groups: list[GroupOut]
     comparisons: list[ComparisonOut]
+    policies: list[PolicyMetricOut] = Field(description="The same by policy; p-values unadjusted, with no value of p_holm.")
     notes: list[str]
 
 
@@ -68,6 +77,16 @@ class ExcludedOut(Model):
     reason: str
 
 
+class MissingValueOut(Model):
+    """A metric that a session which counts does not have."""
+
+    session_id: int
+    visit: int
+    ordinal: int
+    metric: str
+    reason: str
+
+
 class ContradictionOut(Model):
     """A session whose amplitudes are not those of its controller; it counts until somebody corrects it."""
 
@@ -87,5 +106,6 @@ class FiveMetricsOut(Model):
     controllers: list[ControllerOut]
     metrics: list[MetricOut]
     excluded: list[ExcludedOut]
+    missing: list[MissingValueOut]
     warnings: list[ContradictionOut]
     limits: list[str]

@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.study import repository as study
-from app.study.blinding import CONTROLLER_NAMES, arm
+from app.study.blinding import CONTROLLER_NAMES, visible_arm
 from app.study.models import Controller, Participant
 
 PAPER_ORDER = (Controller.CDBS, Controller.RL, Controller.DISTILLED, Controller.NO_DBS)
@@ -57,8 +57,8 @@ def trial_time(db: Session, participants: Sequence[Participant], caller: Caller)
         held = study.sessions_of_participant(db, participant.id)
         seconds: dict[Controller, list[float]] = {}
         for session in held:
-            if session.excluded_reason is None:
-                seconds.setdefault(arm(session, caller).controller, []).append(session.duration_s)
+            if session.excluded_reason is None and (known := visible_arm(session, caller)) is not None:
+                seconds.setdefault(known.controller, []).append(session.duration_s)
         counted.append(seconds)
         excluded.append(sum(session.excluded_reason is not None for session in held))
     others = [c for c in Controller if c not in PAPER_ORDER and any(c in seconds for seconds in counted)]

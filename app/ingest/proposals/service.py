@@ -29,6 +29,7 @@ from app.study.sessions import conditions
 from app.study.sessions.contradictions import contradictions, control_recording, local_day
 from app.study.sessions.stimulation import delivered
 from app.study.sessions.usable_steps import sentence, usable_steps
+from app.study.visits.service import require_unlocked
 from app.study.wording import sentences
 
 RESTS_ON = frozenset({"visit", "hemisphere", "start_s", "stop_s", "started_at", "controller"})
@@ -241,6 +242,7 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
         known = wording.reasons(proposal.evidence)
         why = "; ".join(f"{name}: {known.get(name, 'nobody stated it')}" for name in missing)
         raise Invalid(f"Session {session.id} cannot be confirmed yet: its {' and '.join(missing)} is open ({why}).", "State it.")
+    require_unlocked(session.visit)
     sessions.refuse_overlap(db, session)
     session.status = "confirmed"
     try:

@@ -30,6 +30,7 @@ from app.platform.web.schemas import sensible_time
 from app.study import repository as study
 from app.study import service as study_service
 from app.study.models import Controller, Hemisphere, Participant, StudySession
+from app.study.visits.service import require_unlocked
 from ml.formats.options import BetaMeasure, DecodeOptions
 from ml.formats.recording import FileReport, Problem, UndecodableFile
 
@@ -90,7 +91,8 @@ def state_session(
     confirm: bool = True,
     session_id: int | None = None,
 ) -> StatedSession:
-    """What the sender says of the sessions. Raises Invalid for a visit, policy or session that does not exist, or that do not fit."""
+    """What the sender says of the sessions. Raises Invalid for a visit, policy or session that does not exist, or that do not fit; Conflict
+    for a locked visit."""
     try:
         started_at = sensible_time(started_at) if started_at else None
     except ValueError as error:
@@ -102,6 +104,8 @@ def state_session(
         raise Invalid(f"Participant {participant.code} has no visit {visit_number} ({listed}).", "Add the visit first.")
     if not known:
         raise Invalid(f"Participant {participant.code} has no visit yet.", "Add the visit first.")
+    if controller is not None and visit is not None and confirm:
+        require_unlocked(visit)
     if controller is not None and visit is None and confirm:
         raise Invalid("A controller is stated, but no visit.", "Name the visit, or send confirm=false and let it be proposed by its date.")
     policy_id = study.policy_id(db, participant.id, policy) if policy else None

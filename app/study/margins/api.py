@@ -9,7 +9,8 @@ from app.platform.database import Db
 from app.platform.web.schemas import problems
 from app.study.deps import CurrentParticipant
 from app.study.margins import service
-from app.study.margins.schemas import MarginsChange, MarginsOut
+from app.study.margins.schemas import MarginsChange, MarginsLockIn, MarginsLockOut, MarginsOut
+from app.study.margins.serializers import lock_out
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
@@ -26,3 +27,17 @@ def change_margins(participant: CurrentParticipant, change: MarginsChange, db: D
     row = service.change_margins(db, participant, change.margins, change.reason, caller)
     db.commit()
     return MarginsOut.model_validate(row)
+
+
+@router.get("/participants/{code}/margins/locks")
+def list_margins_locks(participant: CurrentParticipant) -> list[MarginsLockOut]:
+    """When margins were locked, oldest first; the last one holds. Verdicts confirm with sessions recorded after it alone."""
+    return [lock_out(lock) for lock in participant.margins_locks]
+
+
+@router.post("/participants/{code}/margins/locks", status_code=201, responses=problems(409))
+def lock_margins(participant: CurrentParticipant, wanted: MarginsLockIn, db: Db, caller: CurrentCaller) -> MarginsLockOut:
+    """Lock the present margins before the sessions that they will judge. Those who approve plans alone."""
+    row = service.lock_margins(db, participant, wanted.version, wanted.reason, caller)
+    db.commit()
+    return lock_out(row)

@@ -15,7 +15,7 @@ from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.form_changes import Shown, own_changes, reason_of
 from app.study.margins import service
-from app.study.margins.schemas import MarginsIn
+from app.study.margins.schemas import MarginsIn, MarginsLockIn
 from app.study.models import Participant
 from app.study.service import may
 from app.study.settings.form import SettingField, SettingGroup, history, texts
@@ -72,6 +72,19 @@ def change_margins(request: Request, participant: CurrentParticipant, db: Db, ca
         return _page(request, participant, caller, typed, error, reason_of(values))
     db.commit()
     return RedirectResponse(f"/participants/{participant.code}/margins?done={'changed' if row.version != before else 'same'}", 303)
+
+
+@router.post("/participants/{code}/margins/lock")
+def lock_margins(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Lock the present margins."""
+    try:
+        wanted = parse(MarginsLockIn, {"version": values.get("version", ""), "reason": values.get("lock_reason", "")}, {"reason": "Reason"})
+        service.lock_margins(db, participant, wanted.version, wanted.reason, caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, participant, caller, texts(participant.current_margins, LABELS), error)
+    db.commit()
+    return RedirectResponse(f"/participants/{participant.code}/margins?done=locked", 303)
 
 
 def _page(

@@ -6,7 +6,7 @@ from datetime import datetime
 
 from pydantic import ConfigDict, Field, ValidationInfo, field_validator
 
-from app.platform.web.schemas import Model, Number, Text
+from app.platform.web.schemas import Int, Model, Number, Text
 from app.study.schemas import Bound, published
 
 BOUNDS = {
@@ -58,3 +58,19 @@ class MarginsChange(Model):
 
     margins: MarginsIn
     reason: Text = Field(max_length=1000)
+
+
+class MarginsLockIn(Model):
+    """Which margins to lock, and why."""
+
+    version: Int = Field(ge=1, le=100_000, description="Of the present margins, as the caller has read them.")
+    reason: Text = Field(max_length=1000, description="What the margins rest on; kept with the lock and in the audit trail.")
+
+
+class MarginsLockOut(Model):
+    """Margins that were locked."""
+
+    version: int
+    reason: str
+    created_at: datetime
+    created_by: str

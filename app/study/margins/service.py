@@ -11,7 +11,7 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import service as study
 from app.study.margins.schemas import MarginsIn
-from app.study.models import MarginsVersion, Participant
+from app.study.models import MarginsLock, MarginsVersion, Participant
 from ml.qoc import Margins
 
 
@@ -43,4 +43,29 @@ def change_margins(db: Session, participant: Participant, change: MarginsIn, rea
     except IntegrityError as error:
         db.rollback()
         raise Conflict("Somebody else changed these margins at the same time.", "Load them again and repeat your change.") from error
+    return row
+
+
+def lock_margins(db: Session, participant: Participant, version: int, reason: str, caller: Caller) -> MarginsLock:
+    """Fix the present margins: sessions that are recorded from now on are judged by them, earlier ones only explore.
+
+    Args:
+        version: of the margins that the caller looked at.
+
+    Raises:
+        Invalid: no reason. Forbidden: the caller approves no plans of this participant. Conflict: newer margins are there, or these are
+            locked already.
+    """
+    study.require(caller, can.APPROVE_PLAN, participant)
+    current = participant.current_margins
+    if current.version != version:
+        raise Conflict(f"The present margins are version {current.version}, not {version}.", "Look at them and lock again.")
+    if participant.margins_locks and participant.margins_locks[-1].margins_version_id == current.id:
+        raise Conflict(f"Version {version} is locked already.", "A new lock would only take away evidence.")
+    if not reason.strip():
+        raise Invalid("A lock needs a reason.", "Say what the margins rest on, in a sentence.")
+    row = MarginsLock(participant_id=participant.id, margins_version_id=current.id, reason=reason.strip(), created_by=caller.label)
+    set_reason(db, row.reason)
+    participant.margins_locks.append(row)
+    db.flush()
     return row

@@ -18,9 +18,10 @@ from sqlalchemy.orm import Session
 from app.platform.database import set_reason
 from app.platform.errors import Invalid
 from app.study import repository
-from app.study.models import GraspTest, Hemisphere, QocRevision, StudySession, TremorSeries
+from app.study.models import Hemisphere, QocRevision, StudySession
 from app.study.outcomes import tremor
 from app.study.outcomes import values as outcome_values
+from app.study.outcomes.models import GraspTest, TremorSeries
 from app.study.outcomes.tremor import Minutes
 from app.study.outcomes.values import Derived
 from ml.qoc import TREMOR_CLASSES
@@ -142,6 +143,8 @@ def derive_for_session(db: Session, session: StudySession) -> list[str]:
     found = outcome_values.derive(db, session)
     if session.status != "confirmed":
         return [f"Session {session.id} is proposed: its QoCs are derived when it is confirmed."] if found else []
+    if session.visit.locked:
+        return [f"Session {session.id}: visit {session.visit.number} is locked, so that its QoCs stay as they are."] if found else []
     repository.lock_session(db, session)
     free = {d.name: d for d in found if person_behind(session, d.name) is None}
     known = session.qoc

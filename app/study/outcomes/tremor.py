@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from app.study.models import TremorSeries
+from app.study.outcomes.models import TremorSeries
 from ml.qoc import SAME_TIME_S, TREMOR_CLASSES
 
 

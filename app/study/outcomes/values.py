@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from app.study import repository
-from app.study.models import GraspTest, Hemisphere, StudySession
+from app.study.models import Hemisphere, StudySession
 from app.study.outcomes import tremor
+from app.study.outcomes.models import GraspTest
 from app.study.outcomes.tremor import SessionMinutes
 from ml.qoc import PLAUSIBLE_INTERVAL_S, TremorReading, grasp_frequency, read_tremor
 

@@ -18,7 +18,7 @@ from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
 from app.study import repository, service
-from app.study.blinding import CONTROLLER_NAMES, arm
+from app.study.blinding import CONTROLLER_NAMES, arm, may_know, require_known
 from app.study.deps import CurrentSession
 from app.study.form_changes import Shown, own_changes
 from app.study.models import QocRevision, Recording, StudySession
@@ -37,11 +37,15 @@ router = APIRouter()
 _QOC_LABELS = {"grasp_hz": "Grasp frequency", "rating": "Rating", "tremor_percent": "Tremor", "reason": "Reason"}
 _CORRECTION_LABELS = {
     "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "control": "Control trace", "correction_reason": "Reason",
+    "stopped_reason": "Stopped for the patient's sake", "medication_h": "Time since the last dose",
 }  # fmt: skip
 _CONDITIONS_LABELS = {
     "lower_bound": "Lower bound B", "xi_beta": "Beta threshold", "min_ma": "Lowest amplitude", "max_ma": "Highest amplitude",
     "lead_amplitude_ma": "Amplitude before", "conditions_reason": "Reason",
 }  # fmt: skip
+
+
+_STATED = ("controller", "hemisphere", "stopped_reason", "medication_h")
 
 
 @dataclass(frozen=True)
@@ -110,13 +114,16 @@ def record_qoc(request: Request, session: CurrentSession, db: Db, caller: Curren
     changes = own_changes(values, seen, _qoc_revisions(session), _QOC_LABELS)
     reason = {"reason": str(values["reason"])} if "reason" in values else {}
     try:
-        service.require(caller, can.WRITE_STUDY, session.visit.participant)
+        service.require(caller, can.WRITE_QOC, session.visit.participant)
         changes.refuse_conflicts()
         service.record_qoc(db, session, parse(QocIn, changes.fields | reason, _QOC_LABELS), caller)
     except BetaloopError as error:
         db.rollback()
+        require_known(session.visit, caller, error)
         return _page(request, db, session, caller, error, typed=changes.fields | reason)
     db.commit()
+    if not may_know(session.visit, caller):
+        return RedirectResponse(f"/visits/{session.visit_id}?done=qoc", 303)
     return RedirectResponse(f"/sessions/{session.id}?done=qoc", 303)
 
 
@@ -148,7 +155,7 @@ def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
     try:
         service.require(caller, can.WRITE_STUDY, session.visit.participant)
         changes.refuse_conflicts()
-        fields: dict[str, Any] = {n: changes.fields[n] for n in ("controller", "hemisphere") if n in changes.fields} | {"reason": reason}
+        fields: dict[str, Any] = {n: changes.fields[n] for n in _STATED if n in changes.fields} | {"reason": reason}
         if "policy" in changes.fields:
             policy = changes.fields["policy"]
             fields["policy_id"] = _policy_id(db, session, policy) if policy else ""
@@ -202,6 +209,8 @@ def _correction(session: StudySession, caller: Caller) -> dict[str, str]:
         "policy": "" if known.policy_id is None else str(known.policy_id),
         "hemisphere": session.hemisphere or "",
         "control": f"{session.control_stream}\t{session.control_channel or ''}",
+        "stopped_reason": session.stopped_reason or "",
+        "medication_h": "" if session.medication_h is None else f"{session.medication_h:g}",
     }
 
 

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 
 from app.study import repository
 from app.study.models import Controller, Hemisphere, Recording, StudySession, Trace
-from app.study.traces import AMPLITUDE_STREAM, StepTable, amplitude_program, shown_table
+from app.study.traces import AMPLITUDE_STREAM, StepTable, TracesOf, amplitude_program, shown_table
 
 SILENT_MA = 0.005
 """Below this, an amplitude is off: devices step by 0.1 mA, tables are rounded."""
@@ -173,7 +173,12 @@ def contradicts(session: StudySession, controller: Controller, side: Delivered) 
 
 
 def delivered(db: Session, session: StudySession) -> list[Delivered]:
-    """The stimulation of every side of a session, from all its recordings, the controlled one first.
+    """The stimulation of every side of a session, from all its recordings, the controlled one first; errors as in `delivered_by`."""
+    return delivered_by(session, lambda recording_id: repository.traces_of_recording(db, recording_id))
+
+
+def delivered_by(session: StudySession, traces_of: TracesOf) -> list[Delivered]:
+    """The same from traces that somebody else read.
 
     Raises:
         Invalid: amplitudes that are not on the participant's grid, or a visit that states both sides and a session that names none.
@@ -188,11 +193,11 @@ def delivered(db: Session, session: StudySession) -> list[Delivered]:
         name = f"{side} side" if side else f"recording {recording.id}"
         if side and sides[side] > 1:
             name += f", recording {recording.id}"
-        traces = [t for t in repository.traces_of_recording(db, recording.id) if t.stream == AMPLITUDE_STREAM]
+        traces = [t for t in traces_of(recording.id) if t.stream == AMPLITUDE_STREAM]
         if not traces:
             found.append(Delivered(name, side, recording.id in control, None))
         for i, trace in enumerate(traces):
-            table = shown_table(session, settings, trace, trace)
+            table = shown_table(session, settings, trace, trace, recording)
             own = f"{name}, {trace.channel}" if len(traces) > 1 else name
             if i and not _stated(session, side, trace):
                 # the first program's cDBS amplitude says nothing about another program

@@ -17,7 +17,7 @@ from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
 from app.study import repository, service
-from app.study.blinding import arm
+from app.study.blinding import arm, may_know, visible_arm
 from app.study.deps import CurrentParticipant, CurrentVisit
 from app.study.form_changes import Shown, own_changes, reason_of
 from app.study.models import Participant, StudySession, Visit
@@ -28,6 +28,7 @@ from app.study.service import may
 from app.study.sessions import pages as session_pages
 from app.study.sessions.data import session_data
 from app.study.visits import form
+from app.study.visits import service as visit_locks
 
 router = APIRouter()
 
@@ -39,7 +40,7 @@ def visits(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
     """All visits of a participant with their sessions."""
     rows, _ = repository.visits(db, participant.id, 1000, 0)
     sessions = repository.sessions_of_participant(db, participant.id)
-    days = [(v, [(s, arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in rows]
+    days = [(v, [(s, visible_arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in rows]
     may_write = may(caller, can.WRITE_STUDY, participant)
     waiting = repository.proposals_of_participant(db, participant.id)
     return HTMLResponse(render(request, "study/visits.html", participant=participant, days=days, waiting=waiting, may_write=may_write))
@@ -74,8 +75,23 @@ def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller:
 
 @router.get("/visits/{visit_id}")
 def visit_page(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """One visit day: its sessions in order."""
+    """One visit day: its sessions in order; to a blinded assessor without what gives the controllers away."""
+    if not may_know(visit, caller):
+        return _blinded_page(request, db, visit, caller)
     return _visit_page(request, db, visit, caller)
+
+
+@router.post("/visits/{visit_id}/lock")
+def lock_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Close the data of a visit, or open them again (`unlock`)."""
+    unlock = values.get("unlock") == "yes"
+    try:
+        (visit_locks.unlock if unlock else visit_locks.lock)(db, visit, str(values.get("lock_reason", ""))[:1000], caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _visit_page(request, db, visit, caller, None, error)
+    db.commit()
+    return RedirectResponse(f"/visits/{visit.id}?done={'unlocked' if unlock else 'locked'}#lock", 303)
 
 
 @router.post("/visits/{visit_id}")
@@ -112,9 +128,18 @@ def _visit_page(
         draft=seen | {"reason": ""} | (typed or {}),
         labels=form.labels(seen),
         may_write=may(caller, can.WRITE_STUDY, visit.participant),
+        may_lock=may(caller, can.LOCK_VISIT, visit.participant),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)
+
+
+def _blinded_page(request: Request, db: Session, visit: Visit, caller: Caller) -> HTMLResponse:
+    sessions, _ = repository.sessions_of_visit(db, visit.id)
+    may_rate = may(caller, can.WRITE_QOC, visit.participant)
+    return HTMLResponse(
+        render(request, "study/visit_blinded.html", visit=visit, participant=visit.participant, sessions=sessions, may_rate=may_rate)
+    )
 
 
 def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str, Any]:

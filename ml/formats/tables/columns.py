@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import FileReport, UndecodableFile
-from ml.formats.tables.delimited import read_delimited
-from ml.formats.tables.numbers import column_name, known_unit, shown, unit_name
+from ml.formats.tables.delimited import TextTable, read_delimited, read_head, rows_behind
+from ml.formats.tables.numbers import MISSING, column_name, iso_time, known_unit, shown, unit_name
+from ml.formats.tables.plain import read_plain
 
-TIME_NAMES = ("t_s", "t", "time_s", "time", "seconds", "t_sec")
+TIME_NAMES = ("t_s", "t", "time_s", "time", "seconds", "t_sec", "timestamp", "datetime", "date_time", "time_utc")
+MILLISECOND_NAMES = ("t_ms", "time_ms", "milliseconds")
 BETA_NAMES = ("beta", "p_beta", "beta_amplitude", "beta_power")
 LFP_NAMES = ("lfp", "raw_lfp", "lfp_raw", "local_field_potential")
 LFP_SCALE = {"nV": 1e-3, "uV": 1.0, "mV": 1e3, "V": 1e6}
@@ -151,7 +153,7 @@ def _check_complete(found: dict[str, int], headers: Sequence[str]) -> None:
 
 
 def _role(key: str, unit: str | None) -> str | None:
-    if key in TIME_NAMES:
+    if key in TIME_NAMES or key in MILLISECOND_NAMES:
         return "t_s"
     if key in BETA_NAMES:
         return "beta"
@@ -183,7 +185,7 @@ def is_lfp(headers: Sequence[str]) -> bool:
 def _header_unit(role: str, unit: str | None, header: str, notes: list[str]) -> str | None:
     """The unit of a column in its one spelling. Raises UndecodableFile for a unit that its numbers cannot be converted from."""
     if unit is None:
-        return _lfp_suffix(column_name(header)[0])
+        return "ms" if column_name(header)[0] in MILLISECOND_NAMES else _lfp_suffix(column_name(header)[0])
     if role == "lfp":
         if unit_name(unit) not in LFP_SCALE:
             raise _unknown_unit(role, unit, header)
@@ -216,15 +218,50 @@ def _unknown_unit(role: str, unit: str, header: str) -> UndecodableFile:
 
 def read_csv(path: Path, options: DecodeOptions) -> Columns:
     """Cells of a text table; see `decode_csv`."""
-    table = read_delimited(path, lambda headers: options.max_lfp_rows if is_lfp(headers) else options.max_table_rows, NEEDED)
-    found, units, unused, notes = match_columns(table.headers)
+    head = read_head(path, NEEDED)
+    found, units, unused, notes = match_columns(head.headers)
+    names = {role: head.headers[index].strip() for role, index in found.items()}
+    most = options.max_lfp_rows if is_lfp(head.headers) else options.max_table_rows
+    with rows_behind(path, head) as lines:
+        plain = read_plain(lines, head.delimiter, len(head.headers), list(found.values()), most)
+    if plain is not None:
+        values = {role: plain[index] for role, index in found.items()}
+        rows = head.lines + 1 + np.arange(values["t_s"].size, dtype=np.int64)
+        return Columns(names, units, rows, values, unused, [*head.notes, *notes])
+    table = read_delimited(path, most, NEEDED)
     table.notes.extend(notes)
-    decimal = table.decimal_mark(list(found.values()))
+    dates = _dates(table, found["t_s"], 0.0 if "lfp" in found else options.period_s)
+    numeric = {role: index for role, index in found.items() if role != "t_s" or dates is None}
+    decimal = table.decimal_mark(list(numeric.values()))
     if decimal == ",":
         table.notes.append("decimal comma read as decimal point")
-    values = {role: table.numbers(index, decimal, role) for role, index in found.items()}
-    names = {role: table.headers[index].strip() for role, index in found.items()}
+    values = {role: table.numbers(index, decimal, role) for role, index in numeric.items()}
+    if dates is not None:
+        values, units["t_s"] = {"t_s": dates} | values, None
+        table.notes.append(
+            "the times are dates: read as seconds from the first row, where the session is taken to start; state its start with the upload"
+        )
     return Columns(names, units, np.array(table.lines, dtype=np.int64), values, unused, table.notes)
+
+
+def _dates(table: TextTable, column: int, first_s: float) -> NDArray[np.float64] | None:
+    """A column of ISO 8601 dates as seconds, [rows], of which the first is `first_s`; NaN for empty cells, None where it holds no dates."""
+    first = next((row[column] for row in table.rows if row[column].strip().lower() not in MISSING), "")
+    if iso_time(first) is None:
+        return None
+    out = np.full(len(table.rows), np.nan)
+    for i, row in enumerate(table.rows):
+        cell = row[column].strip()
+        moment = iso_time(cell)
+        if moment is None and cell.lower() not in MISSING:
+            where, hint = (
+                f"line {table.lines[i]}, column {table.headers[column].strip()}",
+                "Give every time as ISO 8601, or every time in seconds.",
+            )
+            raise UndecodableFile(f"{shown(cell)} is no date", where, hint, "a cell holds no date", f"line {table.lines[i]}, column t_s")
+        out[i] = np.nan if moment is None else moment
+    known = out[np.isfinite(out)]
+    return out - known[0] + first_s
 
 
 def read_parquet(path: Path, options: DecodeOptions) -> Columns:

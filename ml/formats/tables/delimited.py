@@ -1,19 +1,32 @@
-"""Text tables as people save them: comma, semicolon or tab, decimal point or comma, with or without a byte-order mark."""
+"""Text tables as people save them.
+
+Cells lie between commas, semicolons, tabs or pipes, with decimal points or commas; the text is UTF-8, UTF-16 (with or without a byte-order
+mark) or Latin-1. Titles may stand above the header, and a row of units below it.
+"""
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.recording import UndecodableFile
-from ml.formats.tables.numbers import NotANumber, parse_number, shown
+from ml.formats.tables.numbers import TIME_COLUMNS, TIME_UNITS, NotANumber, column_name, known_unit, parse_number, shown
+
+MOSTLY = 0.9
+"""Share of the letters of a table that are Latin."""
+
+MOST_TITLES = 20
+"""Lines that may stand above the header."""
 
 MAX_LINE = 1_000_000
 """Characters a line may have: a longer one is no row of a table, and is not read into memory."""
@@ -78,6 +91,25 @@ class TextTable:
         return math.nan if value is None else value
 
 
+@dataclass(frozen=True, slots=True)
+class TableHead:
+    """What stands above the rows of a text table.
+
+    Attributes:
+        headers: as they stand in the file, with the unit of a row of units in brackets behind them.
+        delimiter: what separates the cells.
+        lines: how many lines to pass over before the first row.
+        encoding: of the text.
+        notes: what was adapted while reading, in sentences.
+    """
+
+    headers: list[str]
+    delimiter: str
+    lines: int
+    encoding: str
+    notes: list[str]
+
+
 def read_delimited(path: Path, max_rows: int | Callable[[Sequence[str]], int], needed: str) -> TextTable:
     """Read a text table.
 
@@ -89,38 +121,110 @@ def read_delimited(path: Path, max_rows: int | Callable[[Sequence[str]], int], n
     Raises:
         UndecodableFile: empty, binary, ragged or too long; names the line.
     """
+    head = read_head(path, needed)
+    most = max_rows if isinstance(max_rows, int) else max_rows(head.headers)
+    with rows_behind(path, head) as source:
+        lines, rows = _cells(source, head.delimiter, len(head.headers), head.lines, most)
+    return TextTable(head.headers, lines, rows, head.delimiter, list(head.notes))
+
+
+def read_head(path: Path, needed: str) -> TableHead:
+    """The headers of a text table and how it is written. Raises UndecodableFile for an empty or a binary file."""
     notes: list[str] = []
-    with _open_text(path, notes, needed) as stream:
-        source = _lines(stream)
-        first = next(source, "")
-        if first.lower().startswith("sep=") and len(first.strip()) == 5:
-            delimiter, offset, first = first.strip()[4], 2, next(source, "")
-        else:
-            delimiter, offset = _delimiter(first), 1
-        if not first.strip():
-            raise UndecodableFile("the file is empty", "line 1", f"Upload a table with the columns {needed}.")
+    encoding = _encoding(path, notes, needed)
+    with path.open("rb") as raw, io.TextIOWrapper(raw, encoding=encoding, errors="replace", newline=None) as stream:
+        top = list(islice(_lines(stream), MOST_TITLES + 2))
+    separator, skipped = None, 0
+    if top and top[0].lower().startswith("sep=") and len(top[0].strip()) == 5:
+        separator, skipped = top[0].strip()[4], 1
+    at = _header_line(top, skipped, separator)
+    first = top[at] if at < len(top) else ""
+    if not first.strip():
+        raise UndecodableFile("the file is empty", "line 1", f"Upload a table with the columns {needed}.")
+    delimiter = separator or _delimiter(first)
+    headers = _split(first, delimiter, at + 1)
+    if at > skipped:
+        notes.append(f"{at - skipped} line{'s' if at - skipped > 1 else ''} above the header passed over")
+    below = top[at + 1] if at + 1 < len(top) else ""
+    units = _units(below, delimiter, len(headers))
+    if units:
+        notes.append("the row of units below the header read as units")
+        headers = [
+            header if not unit or column_name(header)[1] else f"{header.strip()} [{unit}]"
+            for header, unit in zip(headers, units, strict=True)
+        ]
+    return TableHead(headers, delimiter, at + 1 + bool(units), encoding, notes)
+
+
+@contextmanager
+def rows_behind(path: Path, head: TableHead) -> Iterator[Iterator[str]]:
+    """The lines below the head of a table."""
+    with path.open("rb") as raw, io.TextIOWrapper(raw, encoding=head.encoding, errors="replace", newline=None) as stream:
+        lines = _lines(stream)
+        for _ in islice(lines, head.lines):
+            pass
+        yield lines
+
+
+def _header_line(top: list[str], begin: int, separator: str | None) -> int:
+    """Place of the first line that names a column of times; the first line where none of the top does."""
+    for i, line in enumerate(top[begin : begin + MOST_TITLES + 1], start=begin):
         try:
-            headers = next(csv.reader([first], delimiter=delimiter))
-        except csv.Error as error:
-            raise UndecodableFile(f"not readable as a table: {error}", f"line {offset}", "Save the table as CSV (UTF-8).") from error
-        most = max_rows if isinstance(max_rows, int) else max_rows(headers)
-        lines, rows = _cells(source, delimiter, len(headers), offset, most)
-    return TextTable(headers, lines, rows, delimiter, notes)
+            cells = next(csv.reader([line], delimiter=separator or _delimiter(line)), [])
+        except csv.Error:
+            continue
+        if any(column_name(cell)[0] in TIME_COLUMNS for cell in cells):
+            return i
+    return begin
 
 
-def _open_text(path: Path, notes: list[str], needed: str) -> io.TextIOWrapper:
+def _split(line: str, delimiter: str, number: int) -> list[str]:
+    try:
+        return next(csv.reader([line], delimiter=delimiter))
+    except csv.Error as error:
+        raise UndecodableFile(f"not readable as a table: {error}", f"line {number}", "Save the table as CSV (UTF-8).") from error
+
+
+def _units(line: str, delimiter: str, width: int) -> list[str] | None:
+    """Units of a row below the header that holds nothing else; None for every other row."""
+    try:
+        cells = [cell.strip().strip("[]()").strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+    except csv.Error:
+        return None
+    named = [cell for cell in cells if cell not in ("", "-")]
+    if len(cells) != width or not named or not all(known_unit(cell) or cell.lower() in TIME_UNITS for cell in named):
+        return None
+    return ["" if cell == "-" else cell for cell in cells]
+
+
+def _encoding(path: Path, notes: list[str], needed: str) -> str:
+    """How the text is encoded, by its first bytes. Raises UndecodableFile for what is no text."""
     with path.open("rb") as stream:
         head = stream.read(4096)
     if not head:
         raise UndecodableFile("the file is empty", "line 1", f"Upload a table with the columns {needed}.")
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         notes.append("text in UTF-16 read")
-        encoding = "utf-16"
-    elif b"\0" in head:
+        return "utf-16"
+    if b"\0" in head:
+        if (order := utf16_without_mark(head)) is not None:
+            notes.append("text in UTF-16 read")
+            return order
         raise UndecodableFile("this is a binary file, not a table of text", "first bytes", "Save the table as CSV (UTF-8) or Parquet.")
-    else:
-        encoding = "utf-8-sig"
-    return io.TextIOWrapper(path.open("rb"), encoding=encoding, errors="replace", newline=None)
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError:
+        notes.append("text in Latin-1 read")
+        return "cp1252"
+    return "utf-8-sig"
+
+
+def utf16_without_mark(head: bytes) -> str | None:
+    """The encoding of a text in UTF-16 that does not begin with a mark: of Latin letters every other byte is 0. None for anything else."""
+    for encoding, zeros, letters in (("utf-16-le", head[1::2], head[0::2]), ("utf-16-be", head[0::2], head[1::2])):
+        if zeros and zeros.count(0) >= MOSTLY * len(zeros) and 0 not in letters:
+            return encoding
+    return None
 
 
 def _lines(stream: io.TextIOWrapper) -> Iterator[str]:
@@ -135,7 +239,7 @@ def _lines(stream: io.TextIOWrapper) -> Iterator[str]:
 
 
 def _delimiter(header: str) -> str:
-    return max("\t;,", key=lambda mark: (header.count(mark), mark != ","))
+    return max("\t;|,", key=lambda mark: (header.count(mark), mark != ","))
 
 
 def _cells(source: Iterator[str], delimiter: str, width: int, offset: int, max_rows: int) -> tuple[list[int], list[list[str]]]:
@@ -165,13 +269,4 @@ def _cells(source: Iterator[str], delimiter: str, width: int, offset: int, max_r
 
 def read_headers(path: Path) -> list[str]:
     """The headers of a text table, nothing else of it; empty where there are none. Raises UndecodableFile for what is no text."""
-    with _open_text(path, [], "t_s") as stream:
-        source = _lines(stream)
-        first = next(source, "")
-        delimiter = _delimiter(first)
-        if first.lower().startswith("sep=") and len(first.strip()) == 5:
-            delimiter, first = first.strip()[4], next(source, "")
-        try:
-            return next(csv.reader([first], delimiter=delimiter), [])
-        except csv.Error:
-            return []
+    return read_head(path, "t_s").headers

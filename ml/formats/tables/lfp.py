@@ -13,7 +13,7 @@ from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
 from ml.formats.tables.columns import LFP_SCALE, TIME_SCALE, Columns, check_reach, checked_amplitude, compare_amplitudes
 from ml.formats.tables.numbers import known_unit
-from ml.signals import Stretch, row_means
+from ml.signals import BRIDGE_S, Stretch, row_means
 
 GAP = 1.5
 """Two rows further apart than this many samples have a gap between them."""
@@ -28,6 +28,9 @@ LARGEST_UV = 1e6
 """No electrode in a brain gives a volt."""
 
 MIN_ROWS = 8
+LARGEST_RATE_HZ = 100_000.0
+MOST_SAMPLES = 64_000_000
+"""No amplifier is faster, and no table is laid out over more samples with short gaps filled: memory follows no number in a file."""
 
 
 def decode_lfp(columns: Columns, options: DecodeOptions, report: FileReport) -> DecodedFile:
@@ -111,6 +114,10 @@ def _rate(t_s: NDArray[np.float64], columns: Columns, report: FileReport) -> tup
     rate = 1.0 / usual
     if abs(rate - round(rate)) <= ROUND_RATE * rate and round(rate) > 0:
         rate = float(round(rate))
+    bridged = float(steps[steps <= BRIDGE_S].sum()) * rate
+    if rate > LARGEST_RATE_HZ or bridged > MOST_SAMPLES:
+        what = f"the times say {rate:.3g} samples a second" + (f" and {bridged:.3g} samples in all" if rate <= LARGEST_RATE_HZ else "")
+        raise columns.error(what, "t_s", "Give the times in seconds, one row per sample.")
     uneven = np.abs(steps - usual) > MAX_JITTER * usual
     off = inside & uneven
     if off.sum() > 0.01 * steps.size:

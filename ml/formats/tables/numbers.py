@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from datetime import UTC, datetime
 
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "inf", "+inf", "-inf", "infinity", "+infinity", "-infinity"})
 _POINT = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _COMMA = re.compile(r"[+-]?(?:\d+,?\d*|,\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+_DATE = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}", re.ASCII)
 _COLUMN = re.compile(r"^(?P<name>.*?)\s*[\(\[]\s*(?P<unit>[^\)\]]*?)\s*[\)\]]\s*$")
 _SPELLING = str.maketrans({"\u00b5": "u", "\u03bc": "u", "\u00b2": "2"})
 _ELECTRIC = re.compile(r"(?P<prefix>[num]?)(?P<base>[va])(?:\^|\*\*)?(?P<square>2?)(?P<density>/hz)?")
@@ -15,6 +17,32 @@ _WORDS |= {"microampere": "uA", "microamperes": "uA", "milliampere": "mA", "mill
 _WORDS |= {"device unit": "device units", "device units": "device units", "percent": "%", "pct": "%", "%": "%"}
 _WORDS |= {name: name for name in ("fraction", "lsb", "counts")}
 _WORDS |= {"db": "dB", "z": "z", "zscore": "z", "z-score": "z", "z score": "z", "a.u.": "a.u.", "au": "a.u.", "arbitrary units": "a.u."}
+
+
+TIME_COLUMNS = frozenset(
+    {
+        *(
+            "t_s",
+            "t",
+            "time",
+            "time_s",
+            "t_sec",
+            "seconds",
+            "t_ms",
+            "time_ms",
+            "milliseconds",
+            "t_us",
+            "time_us",
+            "timestamp_us",
+            "microseconds",
+        ),
+        *("timestamp", "datetime", "date_time", "time_utc", "open_fist_s", "open_fist_us", "open_fist"),
+        *("minute_start", "start_utc", "minute_start_utc", "start", "start_time", "start_date", "startdate"),
+    }
+)
+"""Names of columns of times, in any table: the line that has one is the header."""
+
+TIME_UNITS = frozenset({"s", "sec", "seconds", "ms", "us", "\u00b5s", "\u03bcs"})
 
 
 class NotANumber(ValueError):
@@ -35,6 +63,18 @@ def parse_number(cell: str, decimal: str = ".") -> float | None:
         raise NotANumber(text)
     value = float(text.replace(",", "."))
     return value if value not in (float("inf"), float("-inf")) else None
+
+
+def iso_time(cell: str) -> float | None:
+    """Unix time of an ISO 8601 date and time, s; one without a zone counts as UTC. None for anything else."""
+    text = cell.strip()
+    if _DATE.match(text) is None:
+        return None
+    try:
+        moment = datetime.fromisoformat(text)
+        return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp()
+    except (ValueError, OverflowError):
+        return None
 
 
 def column_name(header: str) -> tuple[str, str | None]:

@@ -83,9 +83,10 @@ def _write_csv(columns: Columns, target: Path) -> None:
     with target.open("w", encoding="utf-8", newline="") as out:
         out.write(",".join(columns.label(role) for role in columns.values) + "\n")
         at = 2
-        for line, *cells in zip(columns.lines.tolist(), *(v.tolist() for v in columns.values.values()), strict=True):
+        columns_of_cells = [list(map(_cell, v.tolist())) for v in columns.values.values()]
+        for line, row in zip(columns.lines.tolist(), map(",".join, zip(*columns_of_cells, strict=True)), strict=True):
             # blank lines keep every row on its line, so that later reports name the line that the sender sees
-            out.write("\n" * (line - at) + ",".join(map(_cell, cells)) + "\n")
+            out.write("\n" * (line - at) + row + "\n" if line > at else row + "\n")
             at = line + 1
 
 

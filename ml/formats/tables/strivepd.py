@@ -1,10 +1,11 @@
-"""Minutes of tremor: StrivePD exports, wide (fractions per class) and long (seconds per severity), and tables of one class per minute.
+"""Minutes of tremor: StrivePD exports, wide (shares per class) and long (seconds per severity), Apple's results, one class per minute.
 
 Source: format notes, A″.
 """
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -29,16 +30,28 @@ EARLIEST_UNIX_S = 1e9
 
 LATEST_UNIX_S = 1e10
 TIME_NAMES = ("time", "minute_start", "start_utc", "minute_start_utc", "start", "start_time", "timestamp", "start_date", "startdate")
+END_NAMES = ("enddate", "end_date", "end", "end_time", "end_utc")
+LONGEST_S = 3600.0
+"""A watch tells of minutes; an interval longer than this is no measurement."""
+
 CLASS_NAMES = ("class", "tremor_class", "tremor")
 KNOWN = frozenset({*TREMOR_CLASSES, "severity", "duration", "duration_s", "measurement_duration_ns", "stream_type_id", "measurement"})
+_SHARE = re.compile(r"^(percent|fraction|share)|(percent|pct|fraction|share)$")
 WANTED = ", ".join(TREMOR_CLASSES)
 
 
 def looks_like_tremor(headers: Sequence[str]) -> bool:
     """Whether a table with these headers holds minutes of tremor."""
-    keys = {column_name(header)[0] for header in headers}
+    keys = {_key(header) for header in headers}
     named = {"mild", "moderate", "strong"} <= keys or "severity" in keys
     return named or (bool(keys & set(CLASS_NAMES)) and bool(keys & set(TIME_NAMES)))
+
+
+def _key(header: str) -> str:
+    """A column's name; that of its class where it is called like Apple's `percentMild`, or `mild_percent`."""
+    key = column_name(header)[0]
+    plain = _SHARE.sub("", key).strip("_")
+    return plain if plain in TREMOR_CLASSES else key
 
 
 def decode_strivepd(path: Path, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
@@ -50,7 +63,7 @@ def decode_strivepd(path: Path, options: DecodeOptions | None = None, name: str 
         UndecodableFile: none of the layouts, text for a number, an unreadable time; names line and column.
     """
     table = read_delimited(path, (options or DecodeOptions()).max_table_rows, "time and one column per class")
-    columns = {column_name(header)[0]: i for i, header in reversed(list(enumerate(table.headers)))}
+    columns = {_key(header): i for i, header in reversed(list(enumerate(table.headers)))}
     report = FileReport(name or path.name)
     report.repaired.extend(table.notes)
     time = next((columns[key] for key in TIME_NAMES if key in columns), None)
@@ -59,7 +72,7 @@ def decode_strivepd(path: Path, options: DecodeOptions | None = None, name: str 
         what = "no column of times"
         raise UndecodableFile(f"{what}; found: {found}", "line 1", "Name it time or minute_start.", what)
     of_class = next((columns[key] for key in CLASS_NAMES if key in columns), None)
-    used = {time, *(i for key, i in columns.items() if key in KNOWN)}
+    used = {time, *(i for key, i in columns.items() if key in KNOWN or key in END_NAMES)}
     if set(TREMOR_CLASSES) <= set(columns):
         minutes = _wide(table, columns, time, report)
     elif {"severity", "duration"} <= set(columns):
@@ -81,21 +94,36 @@ def _wide(table: TextTable, columns: dict[str, int], time: int, report: FileRepo
     decimal = table.decimal_mark([columns[c] for c in TREMOR_CLASSES])
     start = _starts(table, time, report)
     fractions = np.column_stack([table.numbers(columns[c], decimal, c) for c in TREMOR_CLASSES]) if table.rows else np.empty((0, 6))
+    stated = table.numbers(columns["any_tremor"], decimal, "any_tremor") if "any_tremor" in columns else np.full(start.size, np.nan)
+    total = np.median(fractions.sum(axis=1)) if start.size else 1.0
+    if abs(total - 100.0) <= 100.0 * SUM_TOLERANCE:
+        fractions, stated = fractions / 100.0, stated / 100.0
+        report.repaired.append("shares in per cent read as fractions")
     outside = np.flatnonzero(((fractions < 0) | (fractions > 1 + SUM_TOLERANCE)).any(axis=1))
     if outside.size:
         line = f"line {table.lines[outside[0]]}"
-        hint = "Upload the export as StrivePD wrote it; its fractions lie between 0 and 1."
+        hint = "Upload the export as the watch's app wrote it: the classes of a minute add up to 1, or to 100 in every row."
         raise UndecodableFile("a fraction outside 0 to 1", line, hint)
     off = np.abs(fractions.sum(axis=1) - 1.0) > SUM_TOLERANCE
     if count := int(off.sum()):
         report.flagged.append(f"{count} minutes whose fractions do not add up to 1: kept as they are")
-    stated = table.numbers(columns["any_tremor"], decimal, "any_tremor") if "any_tremor" in columns else np.full(start.size, np.nan)
     any_tremor = np.where(np.isfinite(stated), stated, fractions[:, 2:].sum(axis=1))
-    return _in_order(start, _lengths(table, columns), fractions, any_tremor, report)
+    return _in_order(start, _lengths(table, columns, start), fractions, any_tremor, report)
 
 
-def _lengths(table: TextTable, columns: dict[str, int]) -> NDArray[np.float64]:
-    """Length of each row's minute, s; 60 where the table does not tell."""
+def _lengths(table: TextTable, columns: dict[str, int], start: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Length of each row's minute, s: stated, or up to its end; 60 where the table does not tell."""
+    end = next((columns[key] for key in END_NAMES if key in columns), None)
+    if "duration_s" not in columns and end is not None:
+        ends = np.array([_unix_s(row[end], line)[0] for row, line in zip(table.rows, table.lines, strict=True)], dtype=np.float64)
+        if (odd := np.flatnonzero((ends <= start) | (ends - start > LONGEST_S))).size:
+            where = f"line {table.lines[odd[0]]}, column {table.headers[end].strip()}"
+            what, hint = (
+                "an interval that ends before it begins, or lasts more than an hour",
+                "Upload the export as the watch's app wrote it.",
+            )
+            raise UndecodableFile(what, where, hint, what, f"line {table.lines[odd[0]]}, column end")
+        return ends - start
     if "duration_s" not in columns:
         return np.full(len(table.rows), MINUTE_S)
     length = table.numbers(columns["duration_s"], table.decimal_mark([columns["duration_s"]]), "duration_s")
@@ -113,7 +141,7 @@ def _by_class(table: TextTable, columns: dict[str, int], time: int, of_class: in
             what = "no class of tremor"
             raise UndecodableFile(f"{shown(name)} is {what}", where, f"Write one of {WANTED}.", what, f"line {line}, column class")
         fractions[i, TREMOR_CLASSES.index(name)] = 1.0
-    return _in_order(start, _lengths(table, columns), fractions, fractions[:, 2:].sum(axis=1), report)
+    return _in_order(start, _lengths(table, columns, start), fractions, fractions[:, 2:].sum(axis=1), report)
 
 
 def _long(table: TextTable, columns: dict[str, int], time: int, report: FileReport) -> TremorLog:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings
 from ml.ope.outcomes.minutes import ABOVE, BETA, Minutes, of_buffer
-from ml.ope.outcomes.regressions import ORDER, Outcome, Regression, Sessions, burden_of, fit
+from ml.ope.outcomes.regressions import ORDER, WIDER, Outcome, Regression, Sessions, burden_of, fit
 from ml.ope.scale import FEWEST_OUTCOMES, outcome_table
 from ml.trajectories import ReplayBuffer
 
@@ -126,7 +126,7 @@ class EndModel:
         return np.broadcast_to(self.unseen, (*shape, 4)).copy()
 
 
-def fit_end_model(buffer: ReplayBuffer, draws: int = 0, seed: int = 0, severity: Floats | None = None) -> EndModel:
+def fit_end_model(buffer: ReplayBuffer, draws: int = 0, seed: int = 0, severity: Floats | None = None, wider: float = WIDER) -> EndModel:
     """Fit to all sessions.
 
     A controller that follows beta gives more in a bad hour, so that more stimulation seems to do worse. What it gives depends on beta
@@ -136,6 +136,7 @@ def fit_end_model(buffer: ReplayBuffer, draws: int = 0, seed: int = 0, severity:
     Args:
         draws: D draws of the posterior besides its mean. seed: theirs.
         severity: that level of every session, [n], where the caller's model of beta knows it; it is adjusted for and no policy moves it.
+        wider: factor on the spread of draws; 1 where the caller adds what models get wrong by itself.
     """
     settings, table, minutes = buffer.settings, outcome_table(buffer), of_buffer(buffer)
     means = minutes.means[:, [BETA, ABOVE]]
@@ -154,7 +155,7 @@ def fit_end_model(buffer: ReplayBuffer, draws: int = 0, seed: int = 0, severity:
             continue
         y = table[:, column] / (100.0 if outcome == "tremor" else 1.0)
         tremor = _filled(table[:, 3] / 100.0) if outcome == "rating" and "tremor" in regressions else None
-        regressions[outcome] = fit(outcome, y, minutes, burden, tremor, sessions, size, draws, rng)
+        regressions[outcome] = fit(outcome, y, minutes, burden, tremor, sessions, size, draws, wider, rng)
     seen = (
         all(outcome in regressions or constants[column - 1] == 0 for outcome, column in COLUMN.items()),
         *(outcome in regressions for outcome in ("grasp", "rating", "tremor")),

@@ -25,13 +25,13 @@ class ModelError:
 
 
 MODEL_ERRORS = {
-    "steps": ModelError(0.03, 0.10),
-    "r_end": ModelError(2.0, 6.0),
-    "grasp_hz": ModelError(0.05, 0.20),
-    "rating": ModelError(0.2, 0.6),
-    "tremor_percent": ModelError(3.0, 12.0),
+    "steps": ModelError(0.025, 0.05),
+    "r_end": ModelError(2.0, 4.0),
+    "grasp_hz": ModelError(0.04, 0.06),
+    "rating": ModelError(0.2, 0.35),
+    "tremor_percent": ModelError(5.0, 6.0),
 }
 """By component. `steps`: per unit of the reward between r_b and r_a and of the discounted length; the others in their own unit."""
 
-COMMON_SHARE = 0.6
+COMMON_SHARE = 0.5
 """Share of the error of a mean over few days, common to all policies, that is drawn: its prior of how days differ is wider than they do."""

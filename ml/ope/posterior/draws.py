@@ -27,7 +27,7 @@ class Replays:
 
     Attributes:
         step_return, energy, amplitude, beta: [P, D, n]. outcomes: [P, D, n, 4]. weights: of the draws, [D], summing to 1.
-        summaries: mean dose, late dose, burden of beta of each policy, [P, 3]. behaviour: see `FittedPosterior`, by policy.
+        summaries: `support.SUMMARIES` of each policy, [P, 4]. behaviour: see `FittedPosterior`, by policy.
     """
 
     step_return: Floats

@@ -95,7 +95,7 @@ class Posterior:
         shares = shared_out(predictions.weights, draws)
         severity = sum(predictions.weights[f.key] * f.drawn.levels.mean(0) for f in fits)
         total = sum(shares.values())
-        ends = fit_end_model(buffer, draws=total, seed=c.seed, severity=np.asarray(severity))
+        ends = fit_end_model(buffer, draws=total, seed=c.seed, severity=np.asarray(severity), wider=1.0)
         report(1.0, "fitting the outcomes")
         return FittedPosterior(self.method, c, buffer, scale, tuple(fits), shares, predictions, ends, self.tests)
 
@@ -134,12 +134,17 @@ class FittedPosterior:
         support = SessionSupport(self.buffer)
         supports = [support.of(s) for s in replays.summaries]
         draws = self._draws(replays, everyone, supports, horizon)
-        skill = ordering_skill(self.buffer, self.predictions, self.ends)
+        skill = ordering_skill(self.buffer, self.predictions, self.ends, self.levels)
         look = AmplitudeSupport(self.buffer)
         return {
             name: self._estimate(i, replays, draws, supports[i], skill, list(look.of_policy(chosen[i]).flags()), horizon)
             for i, name in enumerate(names[:-1])
         }
+
+    @property
+    def levels(self) -> Floats:
+        """Level of every session, [n], over structures."""
+        return np.sum([self.predictions.weights[f.key] * f.drawn.levels.mean(0) for f in self.fits], axis=0)
 
     def _replays(self, policies: list[Policy], horizon: int, report: Report) -> Replays:
         """Every structure's replays side by side; the draws of r_end are dealt out over the structures."""
@@ -171,11 +176,12 @@ class FittedPosterior:
         )
 
     def _summaries(self, found: Sequence[Replayed], weights: Floats) -> Floats:
-        """`support.SUMMARIES` of every policy, [P, 3], over sessions and draws."""
+        """`support.SUMMARIES` of every policy, [P, 4], over sessions and draws."""
         each = []
         for r in found:
             late = r.actions[..., -LATE_STEPS:].mean(-1)
-            each.append(np.stack([r.amplitude.mean(-1), late.mean(-1), r.above.mean(-1)], axis=-1))  # [P, D, 3]
+            switching = np.abs(np.diff(r.actions, axis=-1)).mean(-1)
+            each.append(np.stack([v.mean(-1) for v in (r.amplitude, late, r.above, switching)], axis=-1))  # [P, D, 4]
         return np.asarray(np.einsum("pds,d->ps", np.concatenate(each, axis=1), weights), dtype=np.float64)
 
     def _draws(self, replays: Replays, policies: Mapping[str, Policy], supports: Sequence[Support], horizon: int) -> Draws:

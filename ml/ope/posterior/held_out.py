@@ -33,6 +33,9 @@ SHRINK = 0.3
 """Share of the runs' covariance that is taken from its diagonal: 40 runs do not tell ten blocks' covariances."""
 OWN_VARIANCE = 1.0
 """Variance of a block's sum that no run shows, in squared rewards: sums of few distinct rewards are no normals."""
+LEARNING_RATE = 0.25
+"""Power of the densities: every structure is wrong in its own way, so that what is far ahead by its own account is not so far ahead on
+policies that nobody ran (generalised Bayes; Grünwald and van Ommen 2017)."""
 RESAMPLES = 1000
 LEAST_KNOWN = 10
 """Known steps below which a block, or a session's innovations, count for nothing."""
@@ -82,7 +85,7 @@ def weights_of(densities: Mapping[str, Floats], seed: int) -> dict[str, float]:
     if table.shape[1] < 2:
         return dict.fromkeys(keys, 1 / len(keys))
     shares = np.random.default_rng([seed, 0xB0B0]).dirichlet(np.ones(table.shape[1]), RESAMPLES)
-    totals = table.shape[1] * shares @ table.T
+    totals = LEARNING_RATE * table.shape[1] * shares @ table.T
     each = np.exp(totals - totals.max(1, keepdims=True))
     return dict(zip(keys, (each / each.sum(1, keepdims=True)).mean(0).tolist(), strict=True))
 

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student_t
 
 from ml.ope.behaviour import controllers
+from ml.ope.fqe.steps import held_amplitude
 from ml.ope.outcomes.model import EndModel
 from ml.ope.posterior.held_out import HeldOut
 from ml.trajectories import ReplayBuffer
@@ -19,7 +21,10 @@ FEWEST = 6
 """Left-out sessions below which nothing is concluded from them."""
 OPPOSITE = 2.0
 """An observed contrast of so many standard errors whose predicted sign is the other one is not reproduced."""
-NO_BETTER, CONTRASTS, TOO_FEW = "no_better_than_equal", "contrasts_not_reproduced", "too_few_left_out_sessions"
+NO_BETTER, LEVELS, CONTRASTS = "no_better_than_equal", "levels_follow_dose", "contrasts_not_reproduced"
+TOO_FEW = "too_few_left_out_sessions"
+CHANCE = 0.001
+"""Chance below which levels that go with the dose are no chance."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +45,14 @@ class Skill:
         return {"told": self.told, "reasons": list(self.reasons), "held_out_correlation": self.held_out_correlation}
 
 
-def ordering_skill(buffer: ReplayBuffer, predictions: HeldOut, ends: EndModel) -> Skill:
+def ordering_skill(buffer: ReplayBuffer, predictions: HeldOut, ends: EndModel, levels: Floats) -> Skill:
     """Predictions of left-out sessions against calling them all equal, and against contrasts between controllers.
 
     The reward of the amplitude's price is known and orders nothing by itself. Beta may answer to nothing while outcomes do: where r_end of
     left-out sessions is predicted better than by its mean, that alone is skill.
+
+    Args:
+        levels: what the structures leave of each session's beta once its doses are accounted for, [n].
     """
     keys = list(predictions.weights)
     predicted = np.sum([predictions.weights[k] * predictions.predicted[k] for k in keys], axis=0)
@@ -57,9 +65,29 @@ def ordering_skill(buffer: ReplayBuffer, predictions: HeldOut, ends: EndModel) -
     steps_told = float(np.mean((said - was) ** 2)) < float(np.var(was))
     outcomes_told = ends.seen[0] and bool(np.nan_to_num(ends.skill[0]) > 0)
     reasons = [] if steps_told or outcomes_told else [NO_BETTER]
+    if _follow_dose(buffer, levels):
+        reasons.append(LEVELS)
     if _contradicted(buffer, predicted, seen):
         reasons.append(CONTRASTS)
     return Skill(not reasons, tuple(reasons), correlation)
+
+
+def _follow_dose(buffer: ReplayBuffer, levels: Floats) -> bool:
+    """Whether levels of random sessions go with their mean dose within visits: then the answer to a dose is not what structures say.
+
+    What a controller gives in answer to beta follows beta; random doses follow nothing.
+    """
+    random = [i for i, s in enumerate(buffer.sessions) if s.controller == "random" and s.usable().any()]
+    visits = np.array([buffer.sessions[i].visit for i in random])
+    if len(random) - np.unique(visits).size < FEWEST:
+        return False
+    dose, level = np.array([held_amplitude(buffer.sessions[i]).mean() for i in random]), levels[random]
+    for v in np.unique(visits):
+        dose[visits == v] -= dose[visits == v].mean()
+        level[visits == v] -= level[visits == v].mean()
+    freedom, size = len(random) - np.unique(visits).size - 1, float(np.sqrt((dose @ dose) * (level @ level)))
+    r = float(dose @ level) / size if size > 1e-12 else 0.0
+    return bool(2 * student_t.sf(abs(r) * np.sqrt(freedom / max(1 - r**2, 1e-12)), freedom) < CHANCE)
 
 
 def _contradicted(buffer: ReplayBuffer, predicted: Floats, seen: Floats) -> bool:

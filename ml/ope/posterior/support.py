@@ -1,8 +1,9 @@
-"""Which policies the logged sessions can speak about, by what sessions are as a whole: mean dose, late dose, burden of beta.
+"""Which policies the logged sessions can speak about, by what sessions are as a whole: mean and late dose, burden of beta, switching.
 
 A step's amplitude may have been tried a thousand times and yet no session have held it. A policy is supported where at least two sessions
 on two visits lie near what it would do. How far it lies from all of them is its leverage: the share of the variance of a smooth function
-of the summaries that the sessions leave open (a Gaussian process on them), 0 beside many sessions, 1 far from all.
+of the summaries that the sessions leave open (a Gaussian process on them), 0 beside many sessions, 1 far from all. Switching counts for the
+leverage alone: amplitudes that are held say little of a controller that changes them at every step, but do not keep it from being judged.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
 
-SUMMARIES = ("mean dose", "late dose", "burden")
+SUMMARIES = ("mean dose", "late dose", "burden", "switching")
 LATE_STEPS = 60
 """Steps before a session's end whose mean amplitude is its late dose."""
 
-NEAR = np.array([0.10, 0.15, 0.30])
-"""A session is near a policy where no summary differs by more: amplitude fractions, and the share of steps at or above the threshold."""
-LENGTHS = np.array([0.15, 0.20, 0.50])
+NEAR = np.array([0.10, 0.15, 0.30, np.inf])
+"""A session is near a policy where no summary differs by more: amplitude fractions, the share of steps at or above the threshold, and the
+mean change of the amplitude from step to step."""
+LENGTHS = np.array([0.15, 0.20, 0.50, 0.10])
 """Distances over which a smooth function of the summaries changes."""
 NOISE = 0.25
 """Variance of one session around that function, as a share of the function's own."""
@@ -74,7 +76,7 @@ class Support:
 
 
 class SessionSupport:
-    """The summaries of a buffer's sessions, [n, 3], against which policies are held."""
+    """The summaries of a buffer's sessions, [n, 4], against which policies are held."""
 
     def __init__(self, buffer: ReplayBuffer) -> None:
         kept = [s for s in buffer.sessions if s.usable().sum() >= FEWEST_STEPS]
@@ -82,7 +84,8 @@ class SessionSupport:
         rows = []
         for s in kept:
             a = held_amplitude(s)
-            rows.append([a.mean(), a[-LATE_STEPS:].mean(), np.nanmean(np.where(np.isfinite(s.beta), s.beta >= xi, np.nan))])
+            above = np.nanmean(np.where(np.isfinite(s.beta), s.beta >= xi, np.nan))
+            rows.append([a.mean(), a[-LATE_STEPS:].mean(), above, np.abs(np.diff(a)).mean()])
         self.points = np.array(rows, dtype=np.float64).reshape(len(kept), len(SUMMARIES))
         self.visits = np.array([s.visit for s in kept], dtype=np.int64)
         gram = _kernel(self.points, self.points) + NOISE * np.eye(len(kept))
@@ -90,7 +93,7 @@ class SessionSupport:
         self.lowest = self._lowest()
 
     def of(self, summary: Floats) -> Support:
-        """Support of a policy whose sessions have the summaries [3] on average."""
+        """Support of a policy whose sessions have the summaries [4] on average."""
         near = np.all(np.abs(self.points - summary) <= NEAR, axis=1)
         k = _kernel(summary[None], self.points)[0]
         leverage = float(np.clip(1 - k @ self._inverse @ k, 0.0, 1.0))

@@ -178,3 +178,20 @@ def test_margins_that_mean_nothing_are_refused_in_words():
         assess([], energy, flags)
     with pytest.raises(ValueError, match="between 0 and 0"):
         assess(outcomes, energy, flags, alpha=0.5)
+
+
+def test_a_failure_is_not_explained_away_as_a_drift():
+    # the stopped sessions stand last in their visits, where a drift fitted through them would take them out of the contrast
+    visit, place = np.repeat(np.arange(5), 7), np.tile(np.arange(7.0), 5)
+    arms = np.tile([False, True, False, True, False, True, True], 5)
+    stopped = (place == 6) & (visit < 4)
+    rng = np.random.default_rng(3)
+    values = 7 + rng.normal(0, 0.3, visit.size)
+    rating = Measurements.of(values, visit, arms, order=place, resolution=1)
+    energy = Measurements.of(np.where(arms, 0.5, 1.0) + rng.normal(0, 0.01, visit.size), visit, arms, order=place)
+    found = assess([Outcome("rating", rating, stopped, 1.0, True, failure=1.0)], energy, stopped)
+    assert isinstance(found.verdict, Inconclusive)
+    assert found.outcomes[0].average.estimate == pytest.approx(-1.2, abs=0.3)  # four of five visits lose 6 points in one of four sessions
+    as_measured = dict(found.sensitivity)[FailureRule.AS_MEASURED]
+    assert isinstance(as_measured, NonInferiorAndSaving)
+    assert as_measured.high <= 100

@@ -13,7 +13,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.overview.export import export_participant
+from app.overview.package.export import export_participant
 from app.platform.audit import AuditEvent
 from app.platform.errors import Invalid
 from app.study import repository as study

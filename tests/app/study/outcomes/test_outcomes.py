@@ -14,9 +14,10 @@ from app.accounts.permissions import SYSTEM
 from app.platform.audit import AuditEvent
 from app.platform.errors import Invalid
 from app.study import blinding, service
-from app.study.models import Controller, Hemisphere, StudySession, TremorSeries
+from app.study.models import Controller, Hemisphere, StudySession
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
+from app.study.outcomes.models import TremorSeries
 from app.study.schemas import QocIn, SessionChange
 from tests.app.study.conftest import minutes
 

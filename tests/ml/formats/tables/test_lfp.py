@@ -177,3 +177,17 @@ def test_any_pattern_of_gaps_leaves_amplitudes_that_are_true_or_missing(tmp_path
     # a stretch of a few cycles is known less well, and never as more than the sine has
     assert np.all(beta.values[beta.valid] < 0.78)
     assert np.all(beta.values[beta.valid] > 0.5)
+
+
+@pytest.mark.parametrize(("step_s", "gap_s", "what"), [(1e-9, 0.9, "1e\\+09 samples a second"), (2e-5, 0.9, "samples in all")])
+def test_no_memory_follows_the_times_of_a_table(write, step_s, gap_s, what):
+    times = [k * step_s + gap_s * (k // 20) for k in range(30_000)]
+    rows = "".join(f"{t:.9f},1.0\n" for t in times)
+    with pytest.raises(UndecodableFile, match=what):
+        decode(write("t_s,lfp [uV]\n" + rows))
+
+
+def test_a_plain_table_of_lfp_is_read_in_blocks(write, monkeypatch):
+    monkeypatch.setattr("ml.formats.tables.columns.read_delimited", lambda *_: pytest.fail("read cell by cell"))
+    decoded = decode(write(lfp_csv()))
+    assert trace(decoded, "beta").valid.all()

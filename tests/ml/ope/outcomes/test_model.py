@@ -179,3 +179,15 @@ def test_a_stopped_session_is_a_failure_of_what_ran_and_never_a_missing_one():
     before, after = missing.predict(at(0.5, 1.0))[:, 0], stopped.predict(at(0.5, 1.0))[:, 0]
     assert before[0] == pytest.approx(before[1], abs=3)
     assert after[0] < after[1] - 10
+
+
+def test_draws_are_spread_as_far_as_asked_around_the_same_mean():
+    rng = np.random.default_rng(9)
+    doses = np.tile([0.4, 0.6, 0.8, 1.0], 6)
+    buffer = buffer_of(doses, 1 + doses + 0.1 * rng.standard_normal(24), np.arange(24) // 6)
+    narrow, wide = (fit_end_model(buffer, draws=400, wider=factor) for factor in (1.0, 1.4))
+    seen = Minutes(*(v[None] for v in vars(at(0.3)).values()))
+    one, other = (m.each(seen)[:, 0, 1] for m in (narrow, wide))
+    assert 1.15 < other.std() / one.std() < 1.5  # shapes are drawn alike
+    assert other.mean() == pytest.approx(one.mean(), abs=0.05)
+    np.testing.assert_array_equal(narrow.predict(at(0.3)), wide.predict(at(0.3)))

@@ -20,10 +20,10 @@ def buffer_of(*doses: tuple[int, str, float]) -> ReplayBuffer:
     return replace(system.buffer(visits=1), sessions=tuple(sessions))
 
 
-def at(support: SessionSupport, dose: float):
+def at(support: SessionSupport, dose: float, switching: float = 0.0):
     """Support of a policy that holds a dose with the burden that the nearest session had."""
     nearest = support.points[np.argmin(np.abs(support.points[:, 0] - dose))]
-    return support.of(np.array([dose, dose, nearest[2]]))
+    return support.of(np.array([dose, dose, nearest[2], switching]))
 
 
 def test_two_sessions_on_two_visits_near_what_a_policy_would_do_support_it() -> None:
@@ -62,3 +62,10 @@ def test_leverage_grows_with_the_distance_from_all_sessions() -> None:
     assert found == sorted(found)
     assert found[0] < 0.15
     assert found[-1] > 0.9
+
+
+def test_held_amplitudes_leave_open_what_switching_at_every_step_would_do() -> None:
+    support = SessionSupport(buffer_of(*((v, "random", a) for v in (1, 2) for a in (0.6, 0.7, 0.8))))
+    steady, switching = at(support, 0.7), at(support, 0.7, switching=0.25)
+    assert steady.leverage < 0.15 < 0.8 < switching.leverage
+    assert switching.supported

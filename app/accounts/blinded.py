@@ -1,0 +1,32 @@
+"""What is open to a blinded assessor. Everything else is closed, so that a new page or route cannot give a controller away by mistake."""
+
+from __future__ import annotations
+
+import re
+
+OPEN = (
+    ("GET", "/"),
+    ("GET", "/account"),
+    ("POST", "/account/.*"),
+    ("POST", "/sign-out"),
+    ("GET", "(/api/v1)?/participants"),
+    ("GET", "(/api/v1)?/participants/[^/]+"),
+    ("GET", "(/api/v1)?/participants/[^/]+/visits"),
+    ("GET", "(/api/v1)?/participants/[^/]+/analyses(/.*)?"),
+    ("GET", "(/api/v1)?/analyses(/.*)?"),
+    ("GET", "/trial-time"),
+    ("GET", "(/api/v1)?/visits/[0-9]+"),
+    ("GET", "/api/v1/visits/[0-9]+/(sessions|locks)"),
+    ("GET", "(/api/v1)?/sessions/[0-9]+"),
+    ("GET", "/api/v1/sessions/[0-9]+/(qoc|outcomes|trace)"),
+    ("PUT", "/api/v1/sessions/[0-9]+/qoc"),
+    ("POST", "/sessions/[0-9]+/qoc"),
+)
+"""Method and path, as a regular expression. What these show of a visit that is not locked goes through `app.study.blinding`."""
+
+_PATTERNS = [(method, re.compile(path)) for method, path in OPEN]
+
+
+def is_open(method: str, path: str) -> bool:
+    """Whether a blinded assessor may call this."""
+    return any(m == ("GET" if method == "HEAD" else method) and p.fullmatch(path) for m, p in _PATTERNS)

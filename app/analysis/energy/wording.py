@@ -1,0 +1,30 @@
+"""What each measure of energy is, in words that stand beside its number."""
+
+from __future__ import annotations
+
+from app.analysis.energy.measures import Measure
+
+MEASURES: dict[Measure, tuple[str, str, str]] = {
+    Measure.AMPLITUDE: (
+        "Mean amplitude", "cDBS = 1", "Mean over the session's steps of a, the share of the cDBS amplitude, on the controlled side.",
+    ),
+    Measure.SQUARE: (
+        "Mean squared amplitude", "cDBS = 1",
+        "Mean over the session's steps of a² on the controlled side: its energy at the pulse width and rate of cDBS. The tests use "
+        "this.",
+    ),
+    Measure.ALL_SIDES: (
+        "Energy of all sides and programs", "cDBS = 1",
+        "Sum over sides and programs of mean I² · w · f, over the same sum at their cDBS amplitudes; width w and rate f as logged. "
+        "With one side and program the mean of a².",
+    ),
+    Measure.CHARGE: (
+        "Charge", "µC/s", "Sum over sides and programs of mean I · w · f, with width w and rate f as logged; only where all are known.",
+    ),
+    Measure.TEED: (
+        "Total electrical energy delivered", "µW",
+        "Sum over sides and programs of mean I² · R · w · f (Koss et al. 2005, for currents), with the impedance R that you stated "
+        "for all contacts: no recording here names that of the contacts in use.",
+    ),
+}  # fmt: skip
+"""Title, unit and definition."""

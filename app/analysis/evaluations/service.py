@@ -1,0 +1,101 @@
+"""How well each method did on one snapshot, by seed: estimates against the returns of later sessions. Source: Gao et al. 2023, figure 5."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import Caller
+from app.analysis.evaluations import repository
+from app.evaluation.models import Evaluation
+from app.evaluation.ranking.results import driven_sessions, results_by_policy
+from app.learning.models import BufferSnapshot
+from app.study import repository as study
+from app.study.models import Participant
+from app.study.threshold import mdp_settings
+from ml.ope.compare.metrics import accuracy
+from ml.ope.registry import shown
+
+WANTED_SEEDS = 3
+LEAST_POLICIES = 2
+
+
+@dataclass(frozen=True)
+class SeedRow:
+    """One method under one seed.
+
+    Attributes:
+        mae: mean absolute error, reward. mae_of_range, rank_correlation, regret_of_range: None where the returns or estimates are equal.
+    """
+
+    method: str
+    name: str
+    seed: int
+    evaluation_id: int
+    policies: int
+    mae: float
+    mae_of_range: float | None
+    rank_correlation: float | None
+    regret_of_range: float | None
+
+
+@dataclass(frozen=True)
+class BySeed:
+    """The snapshot with most seeds, newest first among equals.
+
+    Attributes:
+        snapshot_id: None without an evaluation. seeds: that were run on it. rows: where later sessions tell. policies: with a return after
+            the snapshot.
+    """
+
+    participant: str
+    snapshot_id: int | None
+    seeds: tuple[int, ...]
+    policies: int
+    rows: tuple[SeedRow, ...]
+
+
+def by_seed(db: Session, participant: Participant, caller: Caller) -> BySeed:
+    """Errors of every method and seed on one snapshot; raises Forbidden as `app.study.blinding`."""
+    by_snapshot: dict[int, dict[int, Evaluation]] = defaultdict(dict)
+    for one in repository.evaluations(db, participant.id):
+        by_snapshot[one.snapshot_id][int(one.config.get("seed", 0))] = one
+    if not by_snapshot:
+        return BySeed(participant.code, None, (), 0, ())
+    snapshot_id = max(by_snapshot, key=lambda i: (min(len(by_snapshot[i]), WANTED_SEEDS), i))
+    seeds = by_snapshot[snapshot_id]
+    returns = _later_returns(db, seeds[min(seeds)], caller)
+    rows: list[SeedRow] = []
+    if len(returns) >= LEAST_POLICIES:
+        rows = [row for seed in sorted(seeds) for row in _rows(seeds[seed], seed, returns)]
+    return BySeed(participant.code, snapshot_id, tuple(sorted(seeds)), len(returns), tuple(rows))
+
+
+def _later_returns(db: Session, evaluation: Evaluation, caller: Caller) -> dict[int, float]:
+    """Mean return by policy of the sessions that the snapshot does not hold, under the evaluation's settings, horizon and discount."""
+    seen = repository.sessions_of_snapshot(db, evaluation.snapshot_id)
+    ran = [s for s in driven_sessions(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller) if s.session_id not in seen]
+    settings = mdp_settings(study.settings_version(db, evaluation.settings_version_id))
+    results = results_by_policy(ran, settings, evaluation.horizon_steps, None)
+    return {i: r.mean_return for i, r in results.items() if r.mean_return is not None}
+
+
+def _rows(evaluation: Evaluation, seed: int, returns: dict[int, float]) -> Sequence[SeedRow]:
+    estimates: dict[str, dict[int, float]] = defaultdict(dict)
+    for e in evaluation.estimates:
+        if e.policy_id in returns:
+            estimates[e.method][e.policy_id] = e.value
+    found = []
+    for method, values in estimates.items():
+        if len(values) < LEAST_POLICIES:
+            continue
+        ids = sorted(values)
+        a = accuracy([returns[i] for i in ids], np.array([values[i] for i in ids]))
+        if a.mae is not None:
+            numbers = (a.mae, a.mae_of_range, a.rank_correlation, a.regret_of_range)
+            found.append(SeedRow(method, shown(method).short, seed, evaluation.id, len(ids), *numbers))
+    return found

@@ -1,0 +1,197 @@
+"""What one session contributes: its metrics, what is missing of them and why, and the stimulation of all its sides. No database."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.platform.errors import Invalid
+from app.study.blinding import Arm
+from app.study.models import Controller, StudySession
+from app.study.sessions.data import qoc_of
+from app.study.sessions.stimulation import delivered_by
+from app.study.traces import AMPLITUDE_STREAM, StepTable, TracesOf, amplitude_program, laid_out
+from ml.energy import mean_square_ma, relative_energy
+
+KNOWN_SHARE = 0.5
+"""Share of a session's steps that must be known for its energy and its mean beta to stand for the session (ours)."""
+
+METRICS = ("energy", "mean_beta", "grasp", "rating", "tremor")
+"""The paper's five metrics, in its order."""
+
+
+class Missing(StrEnum):
+    """Why a session has no value of a metric."""
+
+    NOT_ENTERED = "not_entered"
+    NO_TRACE = "no_trace"
+    MOSTLY_UNKNOWN = "mostly_unknown"
+    NO_CDBS_AMPLITUDE = "no_cdbs_amplitude"
+    OTHER_BETA = "other_beta"
+
+
+class LeftOut(StrEnum):
+    """Why a session counts in no analysis."""
+
+    EXCLUDED = "excluded"
+    NOT_CONFIRMED = "not_confirmed"
+    UNREADABLE = "unreadable"
+    HIDDEN = "hidden"
+
+
+@dataclass(frozen=True)
+class BetaKind:
+    """What makes beta amplitudes comparable."""
+
+    unit: str
+    source: str
+
+
+@dataclass(frozen=True)
+class Side:
+    """Stimulation of one side and program over a session's known steps; None where not known.
+
+    Attributes:
+        name: of the side, for a table. recording_id, program: where its pulses are looked up. is_control: the side that was controlled.
+        fraction, square: means of the amplitude fraction and of its square. milliamperes, square_ma2: the same in mA and mA^2.
+    """
+
+    name: str
+    recording_id: int | None
+    program: int
+    is_control: bool
+    fraction: float | None
+    square: float | None
+    milliamperes: float | None
+    square_ma2: float | None
+
+
+@dataclass(frozen=True)
+class Facts:
+    """One session that counts.
+
+    Attributes:
+        values: by metric, absent where not measured. missing: why, by metric. steps: usable share of beta and amplitude is judged on them.
+        stopped: it was stopped for the patient's sake, for the reason given. medication_h: hours since the last dose, where stated.
+        created_at: when the record of the session came into being.
+    """
+
+    session_id: int
+    visit: int
+    visit_id: int
+    ordinal: int
+    arm: Arm
+    hemisphere: str | None
+    started_at: datetime | None
+    created_at: datetime
+    duration_s: float
+    values: Mapping[str, float]
+    missing: Mapping[str, Missing]
+    beta_kind: BetaKind | None
+    mean_fraction: float | None
+    sides: tuple[Side, ...]
+    stopped: str | None
+    medication_h: float | None
+
+    @property
+    def controller(self) -> Controller:
+        return self.arm.controller
+
+
+@dataclass(frozen=True)
+class Excluded:
+    """A session that the analyses leave out altogether; `detail` is the reason that somebody gave, or what could not be read."""
+
+    session_id: int
+    visit: int
+    ordinal: int
+    why: LeftOut
+    detail: str
+
+
+def read(session: StudySession, arm: Arm, traces: TracesOf) -> Facts:
+    """The facts of one session.
+
+    Raises:
+        Invalid: traces that do not fit the session's grid, or a cDBS amplitude that cannot be told.
+    """
+    settings = session.visit.participant.current_settings
+    table = laid_out(session, settings, traces)
+    during, qoc = table.t_s > 0, qoc_of(session)
+    fraction, beta = table.fraction[during], table.beta[during]
+    found = {
+        "energy": relative_energy(fraction) if _known(fraction) else None,
+        "mean_beta": float(np.nanmean(beta)) if _known(beta) else None,
+        "grasp": qoc.grasp_hz,
+        "rating": qoc.rating,
+        "tremor": qoc.tremor_percent,
+    }
+    values = {name: float(value) for name, value in found.items() if value is not None and math.isfinite(value)}
+    return Facts(
+        session_id=session.id,
+        visit=session.visit.number,
+        visit_id=session.visit_id,
+        ordinal=session.ordinal,
+        arm=arm,
+        hemisphere=session.hemisphere,
+        started_at=session.started_at,
+        created_at=session.created_at,
+        duration_s=session.duration_s,
+        values=values,
+        missing={name: _why(name, table) for name in METRICS if name not in values},
+        beta_kind=BetaKind(table.beta_trace.unit, table.beta_trace.source) if table.beta_trace else None,
+        mean_fraction=float(np.nanmean(fraction)) if _known(fraction) else None,
+        sides=_sides(session, table, traces),
+        stopped=session.stopped_reason,
+        medication_h=session.medication_h,
+    )
+
+
+def _why(metric: str, table: StepTable) -> Missing:
+    if metric not in ("energy", "mean_beta"):
+        return Missing.NOT_ENTERED
+    if (table.amplitude_trace if metric == "energy" else table.beta_trace) is None:
+        return Missing.NO_TRACE
+    if metric == "energy" and table.cdbs_ma is None and np.isnan(table.fraction).all():
+        return Missing.NO_CDBS_AMPLITUDE
+    return Missing.MOSTLY_UNKNOWN
+
+
+def _sides(session: StudySession, table: StepTable, traces: TracesOf) -> tuple[Side, ...]:
+    """Every side and program that was recorded; a session of one amplitude trace has it already in its step table."""
+    recordings = {s.recording_id for s in session.segments}
+    amplitudes = [t for i in recordings for t in traces(i) if t.stream == AMPLITUDE_STREAM]
+    if len(recordings) == 1 and len(amplitudes) <= 1:
+        return (_side("controlled side", True, table),) if amplitudes and any(s.is_control for s in session.segments) else ()
+    try:
+        return tuple(_side(d.name, d.is_control, d.table) for d in delivered_by(session, traces) if d.table is not None)
+    except Invalid:
+        return (_side("controlled side", True, table),)
+
+
+def _side(name: str, is_control: bool, table: StepTable | None) -> Side:
+    if table is None or table.amplitude_trace is None:
+        return Side(name, None, 0, is_control, None, None, None, None)
+    rows = table.t_s > 0
+    fraction, milliamperes = table.fraction[rows], table.amplitude_ma[rows]
+    of_cdbs, in_ma = _known(fraction), _known(milliamperes)
+    return Side(
+        name,
+        table.amplitude_trace.recording_id,
+        amplitude_program(table.amplitude_trace),
+        is_control,
+        float(np.nanmean(fraction)) if of_cdbs else None,
+        relative_energy(fraction) if of_cdbs else None,
+        float(np.nanmean(milliamperes)) if in_ma else None,
+        mean_square_ma(milliamperes) if in_ma else None,
+    )
+
+
+def _known(values: NDArray[np.float64]) -> bool:
+    return bool(values.size) and float(np.mean(~np.isnan(values))) >= KNOWN_SHARE

@@ -1,0 +1,77 @@
+"""Facts of sessions as the statistics want them: one metric of a controller (or a policy) and of cDBS. No database."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.analysis.evidence.facts import BetaKind, Facts, Missing
+from app.study.models import Controller
+from ml.statistics.within_visits.contrasts import Measurements
+
+HIGHER_IS_BETTER = {"energy": False, "mean_beta": False, "grasp": True, "rating": True, "tremor": False}
+RESOLUTION = {"rating": 1.0}
+"""Step between neighbouring values of a metric; 0 where it is continuous."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The sessions of a comparison, aligned with its measurements, n of them.
+
+    Attributes:
+        data: values of one metric. sessions: the facts, [n]. stopped: stopped for the patient's sake, [n].
+        policy: numbers, 0 for none, [n].
+    """
+
+    data: Measurements
+    sessions: tuple[Facts, ...]
+    stopped: NDArray[np.bool_]
+    policy: NDArray[np.int64]
+
+
+def choose(sessions: Sequence[Facts], metric: str, is_tested: Callable[[Facts], bool]) -> Chosen:
+    """One metric of the sessions that `is_tested` names and of all cDBS sessions."""
+    taken = tuple(s for s in sessions if s.controller is Controller.CDBS or is_tested(s))
+    hours = [float("nan") if s.medication_h is None else s.medication_h for s in taken]
+    data = Measurements.of(
+        [s.values.get(metric, float("nan")) for s in taken],
+        [s.visit for s in taken],
+        [s.controller is not Controller.CDBS for s in taken],
+        order=[float(s.ordinal) for s in taken],
+        medication_h=hours,
+        resolution=RESOLUTION.get(metric, 0.0),
+    )
+    stopped = np.array([s.stopped is not None for s in taken], dtype=np.bool_)
+    return Chosen(data, taken, stopped, np.array([s.arm.policy_id or 0 for s in taken], dtype=np.int64))
+
+
+def of_controller(controller: Controller) -> Callable[[Facts], bool]:
+    """Sessions of a controller, whichever policy ran."""
+    return lambda s: s.controller is controller
+
+
+def comparable_beta(sessions: Sequence[Facts], unit: str | None, source: str | None) -> BetaKind | None:
+    """The kind of beta that is compared: the participant's where some session has it, else the most frequent."""
+    kinds = Counter(s.beta_kind for s in sessions if s.beta_kind and "mean_beta" in s.values)
+    wanted = BetaKind(unit or "", source or "")
+    if wanted in kinds or not kinds:
+        return wanted if kinds else None
+    return kinds.most_common(1)[0][0]
+
+
+def with_comparable_beta(sessions: Sequence[Facts], kind: BetaKind | None) -> tuple[Facts, ...]:
+    """The sessions, those with another kind of beta without their mean beta."""
+    return tuple(
+        s
+        if "mean_beta" not in s.values or s.beta_kind == kind
+        else replace(
+            s,
+            values={k: v for k, v in s.values.items() if k != "mean_beta"},
+            missing={**s.missing, "mean_beta": Missing.OTHER_BETA},
+        )
+        for s in sessions
+    )

@@ -1,0 +1,101 @@
+"""The evidence of a participant: facts of all sessions that count, and the sessions that do not, with reasons."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any, TypeVar, cast
+
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import Caller
+from app.analysis.evidence import repository
+from app.analysis.evidence.facts import Excluded, Facts, LeftOut, read
+from app.platform.errors import Invalid
+from app.study import blinding
+from app.study import repository as study
+from app.study.models import Participant
+
+T = TypeVar("T")
+
+KEPT = 512
+"""Results that a process keeps; the oldest goes first."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a caller may know of a participant's sessions.
+
+    Attributes:
+        key: names participant, row versions and what the caller may know: equal keys, equal evidence.
+        sessions: those that count, by visit and order. excluded: the others.
+        beta_unit, beta_source: as the participant's settings have them.
+    """
+
+    participant: str
+    participant_id: int
+    key: Hashable
+    sessions: tuple[Facts, ...]
+    excluded: tuple[Excluded, ...]
+    beta_unit: str | None
+    beta_source: str | None
+
+
+_kept: OrderedDict[Hashable, Any] = OrderedDict()
+_lock = Lock()
+
+
+def kept(key: Hashable, compute: Callable[[], T]) -> T:
+    """A result under a key that names everything it depends on; computed where this process has not kept it."""
+    with _lock:
+        if key in _kept:
+            _kept.move_to_end(key)
+            return cast("T", _kept[key])
+    result = compute()
+    with _lock:
+        _kept[key] = result
+        while len(_kept) > KEPT:
+            _kept.popitem(last=False)
+    return result
+
+
+def forget() -> None:
+    """Drop everything that is kept: for measuring."""
+    with _lock:
+        _kept.clear()
+
+
+def evidence(db: Session, participant: Participant, caller: Caller) -> Evidence:
+    """The evidence of a participant, as the caller may know it; errors as in `app.study.blinding`."""
+    sight = blinding.sight(db, participant, caller)
+    key = ("evidence", participant.id, repository.fingerprint(db, participant.id), sight)
+    return kept(key, lambda: _read(db, participant, caller, key))
+
+
+def of_all(db: Session, participants: Sequence[Participant], caller: Caller) -> list[Evidence]:
+    """The evidence of several participants."""
+    return [evidence(db, p, caller) for p in participants]
+
+
+def _read(db: Session, participant: Participant, caller: Caller, key: Hashable) -> Evidence:
+    held = study.sessions_of_participant(db, participant.id, with_proposals=True)
+    traces = study.traces_of_recordings(db, {s.recording_id for session in held for s in session.segments})
+    counted: list[Facts] = []
+    excluded: list[Excluded] = []
+    for session in held:
+        place = session.id, session.visit.number, session.ordinal
+        if session.excluded_reason:
+            excluded.append(Excluded(*place, LeftOut.EXCLUDED, session.excluded_reason))
+        elif session.status == "proposed":
+            excluded.append(Excluded(*place, LeftOut.NOT_CONFIRMED, ""))
+        elif (arm := blinding.visible_arm(session, caller)) is None:
+            excluded.append(Excluded(*place, LeftOut.HIDDEN, ""))
+        else:
+            try:
+                counted.append(read(session, arm, lambda i: traces.get(i, [])))
+            except Invalid as error:
+                excluded.append(Excluded(*place, LeftOut.UNREADABLE, error.detail))
+    settings = participant.current_settings
+    return Evidence(participant.code, participant.id, key, tuple(counted), tuple(excluded), settings.beta_unit, settings.beta_source)

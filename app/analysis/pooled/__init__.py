@@ -1,0 +1,1 @@
+"""All participants together: a result for each, a summary that claims nothing about a population, and the paper's tables."""

@@ -1,0 +1,53 @@
+"""HTML pages of all participants together."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import HTMLResponse
+
+from app.accounts.deps import CurrentCaller
+from app.analysis import wording
+from app.analysis.metrics import export
+from app.analysis.pooled import service
+from app.analysis.pooled.charts import results
+from app.analysis.trial_time.service import trial_time
+from app.platform.database import Db
+from app.platform.web.templates import render
+
+router = APIRouter()
+
+
+@router.get("/analyses")
+def pooled_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """What the visits of all participants have shown."""
+    participants = service.readable(db, caller)
+    found = service.pooled(db, participants, caller)
+    page = render(
+        request,
+        "analysis/pooled.html",
+        found=found,
+        charts=results(found.paper),
+        trial=service.times_tested(db, participants, caller, found),
+        times=service.computation_times(db, participants),
+        wording=wording,
+    )
+    return HTMLResponse(page)
+
+
+@router.get("/analyses/results.csv")
+def results_table(db: Db, caller: CurrentCaller) -> Response:
+    """The paper's comparisons of all participants as a table."""
+    return export.table(service.pooled(db, service.readable(db, caller), caller).paper, "all")
+
+
+@router.get("/analyses/results.svg")
+def results_figure(db: Db, caller: CurrentCaller) -> Response:
+    """The results figure of all participants."""
+    return export.svg(service.pooled(db, service.readable(db, caller), caller).paper, "all")
+
+
+@router.get("/trial-time")
+def trial_time_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """Minutes of every controller in every participant that the caller may read."""
+    participants = service.readable(db, caller)
+    return HTMLResponse(render(request, "analysis/trial_time.html", trial=trial_time(db, participants, caller)))

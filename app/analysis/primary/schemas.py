@@ -1,0 +1,121 @@
+"""API types of the primary analyses."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+from pydantic import Field
+
+from app.platform.web.schemas import Model
+from app.study.models import Controller
+
+
+class AverageOut(Model):
+    """An average contrast to cDBS over visits; without visits to tell it, `reason` says why."""
+
+    estimate: float | None
+    low: float | None
+    high: float | None
+    p_value: float | None = Field(description="Two-sided, unadjusted.")
+    visits: int
+    adjustment: str | None = Field(description="What the contrast is freed from.")
+    reason: str | None = Field(description="Code of why there is no number.")
+    text: str = Field(description="The same in words; empty where there is a number.")
+
+
+class VisitRowOut(Model):
+    """One visit of a comparison."""
+
+    visit: int
+    contrast: float | None = Field(description="Mean of the controller's sessions less that of cDBS; null without both arms.")
+    session_ids: list[int]
+    cdbs_session_ids: list[int]
+
+
+class SensitivityOut(Model):
+    """An alternative analysis."""
+
+    adjustment: str
+    result: AverageOut
+
+
+class PrimaryComparisonOut(Model):
+    """One metric of a controller against the same visit's cDBS."""
+
+    metric: str
+    title: str
+    unit: str
+    primary: AverageOut
+    p_adjusted: float | None = Field(description="Holm within the planned family, Benjamini-Hochberg in exploration.")
+    cliffs_delta: AverageOut
+    energy_saving_percent: AverageOut | None
+    van_elteren_p: float | None
+    paper_p: float | None = Field(description="The paper's rank-sum test of all sessions, whatever their visit.")
+    disagreement: str | None = Field(description="paper_only, primary_only or no_primary.")
+    order_imbalance: float | None = Field(description="How much later the controller came, in SDs of the place in the visit.")
+    sensitivity: list[SensitivityOut]
+    by_visit: list[VisitRowOut]
+
+
+class TestedOut(Model):
+    """A controller or policy with its comparisons."""
+
+    controller: Controller
+    policy_id: int | None
+    name: str
+    role: str = Field(description="planned or exploration.")
+    basis: str = Field(description="all, confirmation or selection: which sessions of a policy count.")
+    session_ids: list[int]
+    selection_session_ids: list[int] = Field(description="Sessions that may have picked the policy, and do not count.")
+    comparisons: list[PrimaryComparisonOut]
+
+
+class OutcomeVerdictOut(Model):
+    """Non-inferiority of one outcome; contrasts are turned so that higher is better."""
+
+    outcome: str
+    margin: float
+    estimate: float | None
+    low: float | None
+    high: float | None
+    p_non_inferior: float | None
+    failures: int
+    missing: int
+    text: str
+
+
+class VerdictOut(Model):
+    """The verdict on one controller."""
+
+    controller: Controller
+    confirmatory: bool
+    verdict: str = Field(description="non_inferior_and_saving, inferior, inconclusive or not_available.")
+    sentence: str
+    basis: str
+    visits: list[int]
+    more_visits: int | None
+    outcomes: list[OutcomeVerdictOut]
+    energy_saving_percent: AverageOut | None
+    stopped_session_ids: list[int]
+
+
+class MarginsLockedOut(Model):
+    """The margins that the verdicts go by."""
+
+    version: int
+    grasp_share: float
+    rating_points: float
+    tremor_points: float
+    locked_at: datetime | None
+    locked_by: str | None
+
+
+class PrimaryOut(Model):
+    """Controllers and policies against the same visit's cDBS."""
+
+    participant: str
+    level: float
+    family: str
+    margins: MarginsLockedOut
+    verdicts: list[VerdictOut]
+    results: list[TestedOut]

@@ -1,0 +1,181 @@
+"""Primary results as API types and as rows of a table."""
+
+from __future__ import annotations
+
+from app.analysis import wording
+from app.analysis.primary.results import LEVEL, Comparison, ControllerResult
+from app.analysis.primary.schemas import (
+    AverageOut,
+    MarginsLockedOut,
+    OutcomeVerdictOut,
+    PrimaryComparisonOut,
+    PrimaryOut,
+    SensitivityOut,
+    TestedOut,
+    VerdictOut,
+    VisitRowOut,
+)
+from app.analysis.primary.service import Primary
+from app.analysis.primary.verdict import VerdictResult
+from ml.statistics.effects import Saving
+from ml.statistics.noninferiority import Inconclusive, Inferior, NonInferiorAndSaving
+from ml.statistics.ranksum import RankSum
+from ml.statistics.within_visits.contrasts import Average, Unavailable
+from ml.statistics.within_visits.stratified import StratifiedTest
+
+CSV_COLUMNS = (
+    "participant", "controller", "policy_id", "name", "role", "basis", "metric", "unit", "estimate", "low", "high", "level", "p",
+    "p_adjusted", "cliffs_delta", "cliffs_delta_low", "cliffs_delta_high", "van_elteren_p", "paper_p", "visits", "sessions",
+    "cdbs_sessions", "adjustment", "not_available",
+)  # fmt: skip
+VERDICT_NAMES = {NonInferiorAndSaving: "non_inferior_and_saving", Inferior: "inferior", Inconclusive: "inconclusive"}
+
+
+def primary_out(found: Primary) -> PrimaryOut:
+    """Everything of one participant."""
+    margins, locked = found.locked.margins, found.locked
+    return PrimaryOut(
+        participant=found.evidence.participant,
+        level=LEVEL,
+        family=wording.FAMILY,
+        margins=MarginsLockedOut(
+            version=locked.version,
+            grasp_share=margins.grasp_share,
+            rating_points=margins.rating_points,
+            tremor_points=margins.tremor_points,
+            locked_at=locked.locked_at,
+            locked_by=locked.locked_by,
+        ),
+        verdicts=[verdict_out(v, found) for v in found.verdicts],
+        results=[_tested(r, found) for r in found.results],
+    )
+
+
+def average_out(found: Average | Unavailable) -> AverageOut:
+    """An average over visits, or why there is none."""
+    if isinstance(found, Unavailable):
+        return AverageOut(
+            estimate=None,
+            low=None,
+            high=None,
+            p_value=None,
+            visits=0,
+            adjustment=None,
+            reason=found.reason,
+            text=wording.unavailable(found),
+        )
+    return AverageOut(
+        estimate=found.estimate,
+        low=found.low,
+        high=found.high,
+        p_value=found.p_value,
+        visits=found.visits,
+        adjustment=found.adjustment,
+        reason=None,
+        text="",
+    )
+
+
+def saving_out(found: Saving | Unavailable) -> AverageOut:
+    """An energy saving, per cent, or why there is none."""
+    if isinstance(found, Unavailable):
+        return average_out(found)
+    return AverageOut(
+        estimate=found.percent,
+        low=found.low,
+        high=found.high,
+        p_value=found.p_value,
+        visits=len(found.visits),
+        adjustment="none",
+        reason=None,
+        text="",
+    )
+
+
+def verdict_out(result: VerdictResult, found: Primary) -> VerdictOut:
+    """A verdict with what is behind it."""
+    a = result.assessment
+    outcomes = []
+    for o in a.outcomes if a else ():
+        average = o.average if isinstance(o.average, Average) else None
+        outcomes.append(
+            OutcomeVerdictOut(
+                outcome=o.name,
+                margin=o.margin,
+                estimate=average and average.estimate,
+                low=average and average.low,
+                high=average and average.high,
+                p_non_inferior=o.p_non_inferior,
+                failures=o.failures,
+                missing=o.missing,
+                text="" if average else wording.unavailable(o.average) if isinstance(o.average, Unavailable) else "",
+            )
+        )
+    return VerdictOut(
+        controller=result.controller,
+        confirmatory=result.confirmatory,
+        verdict=VERDICT_NAMES[type(a.verdict)] if a else "not_available",
+        sentence=wording.verdict(result),
+        basis=wording.verdict_kind(result, found.locked),
+        visits=list(result.visits),
+        more_visits=a.verdict.more_visits if a and isinstance(a.verdict, Inconclusive) else None,
+        outcomes=outcomes,
+        energy_saving_percent=saving_out(a.saving) if a else None,
+        stopped_session_ids=list(result.stopped),
+    )
+
+
+def csv_rows(found: Primary) -> list[tuple[object, ...]]:
+    """One row per controller or policy and metric, in the order of CSV_COLUMNS."""
+    rows: list[tuple[object, ...]] = []
+    for r in found.results:
+        for c in r.comparisons:
+            out = _comparison(c, found)
+            p, d = out.primary, out.cliffs_delta
+            both = [row for row in out.by_visit if row.contrast is not None]
+            counts = [sum(len(v.session_ids) for v in both), sum(len(v.cdbs_session_ids) for v in both)]
+            t = r.tested
+            named = (found.evidence.participant, t.controller.value, t.policy_id, wording.tested_name(t), t.role.value, t.basis.value)
+            average = (c.metric, out.unit, p.estimate, p.low, p.high, LEVEL, p.p_value, out.p_adjusted)
+            others = (d.estimate, d.low, d.high, out.van_elteren_p, out.paper_p, p.visits, *counts, p.adjustment, p.reason)
+            rows.append((*named, *average, *others))
+    return rows
+
+
+def unit_of(metric: str, found: Primary) -> str:
+    """The unit of a metric; that of beta is the one that is compared."""
+    return wording.TITLES[metric][1] or (found.beta_kind.unit if found.beta_kind else "")
+
+
+def _tested(r: ControllerResult, found: Primary) -> TestedOut:
+    t = r.tested
+    return TestedOut(
+        controller=t.controller,
+        policy_id=t.policy_id,
+        name=wording.tested_name(t),
+        role=t.role,
+        basis=t.basis,
+        session_ids=list(t.sessions),
+        selection_session_ids=list(t.selection_sessions),
+        comparisons=[_comparison(c, found) for c in r.comparisons],
+    )
+
+
+def _comparison(c: Comparison, found: Primary) -> PrimaryComparisonOut:
+    return PrimaryComparisonOut(
+        metric=c.metric,
+        title=wording.TITLES[c.metric][0],
+        unit=unit_of(c.metric, found),
+        primary=average_out(c.result),
+        p_adjusted=c.p_adjusted,
+        cliffs_delta=average_out(c.delta),
+        energy_saving_percent=None if c.saving is None else saving_out(c.saving),
+        van_elteren_p=c.exact.p_value if isinstance(c.exact, StratifiedTest) else None,
+        paper_p=c.paper.p_value if isinstance(c.paper, RankSum) else None,
+        disagreement=c.disagreement,
+        order_imbalance=c.imbalance,
+        sensitivity=[SensitivityOut(adjustment=s.adjustment, result=average_out(s.result)) for s in c.sensitivity],
+        by_visit=[
+            VisitRowOut(visit=v.visit, contrast=v.contrast, session_ids=list(v.tested), cdbs_session_ids=list(v.cdbs)) for v in c.rows
+        ],
+    )

@@ -1,0 +1,116 @@
+"""Primary results of a participant: each controller against the same visit's cDBS, and the verdict on its margins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import Caller
+from app.analysis.evidence.facts import METRICS, BetaKind, Facts
+from app.analysis.evidence.measurements import choose, comparable_beta, of_controller, with_comparable_beta
+from app.analysis.evidence.service import Evidence, evidence, kept
+from app.analysis.primary import repository
+from app.analysis.primary.results import PLANNED, ControllerResult, results
+from app.analysis.primary.verdict import LockedMargins, VerdictResult, verdicts
+from app.platform.errors import NotFound
+from app.study.margins.service import margins_of
+from app.study.models import Controller, Participant
+from ml.statistics.power import Power, Target, power
+from ml.statistics.within_visits.contrasts import Unavailable
+from ml.statistics.within_visits.mixed_models import MixedComparison, linear_comparison, rating_comparison, tremor_comparison
+
+
+@dataclass(frozen=True)
+class Primary:
+    """Everything of one participant.
+
+    Attributes:
+        evidence: the sessions, and those left out. sessions: those that count, with comparable beta. beta_kind: which beta that is.
+        results: controllers, then policies. verdicts: of the learned controllers. locked: the margins that they go by.
+    """
+
+    evidence: Evidence
+    sessions: tuple[Facts, ...]
+    beta_kind: BetaKind | None
+    results: tuple[ControllerResult, ...]
+    verdicts: tuple[VerdictResult, ...]
+    locked: LockedMargins
+
+    @property
+    def controllers(self) -> tuple[ControllerResult, ...]:
+        return tuple(r for r in self.results if r.tested.policy_id is None)
+
+    @property
+    def policies(self) -> tuple[ControllerResult, ...]:
+        return tuple(r for r in self.results if r.tested.policy_id is not None)
+
+
+def primary(db: Session, participant: Participant, caller: Caller) -> Primary:
+    """Primary results, as the caller may know them; errors as in `app.study.blinding`."""
+    held = evidence(db, participant, caller)
+    locked = locked_margins(participant)
+    names, picked = repository.policy_names(db, participant.id), repository.last_picked(db, participant.id)
+    key = ("primary", held.key, locked, tuple(sorted(names.items())), tuple(sorted(picked.items())))
+
+    def compute() -> Primary:
+        kind = comparable_beta(held.sessions, held.beta_unit, held.beta_source)
+        sessions = with_comparable_beta(held.sessions, kind)
+        tested = [c for c in PLANNED if any(s.controller is c for s in sessions)]
+        return Primary(held, sessions, kind, results(sessions, names, picked), tuple(verdicts(sessions, tested, locked)), locked)
+
+    return kept(key, compute)
+
+
+def locked_margins(participant: Participant) -> LockedMargins:
+    """The margins of the newest lock, else the present ones."""
+    if participant.margins_locks:
+        lock = participant.margins_locks[-1]
+        return LockedMargins(margins_of(lock.margins), lock.margins.version, lock.created_at, lock.created_by)
+    present = participant.current_margins
+    return LockedMargins(margins_of(present), present.version, None, None)
+
+
+def result_of(found: Primary, key: str) -> ControllerResult:
+    """The result of a controller (`rl`) or policy (`policy-7`). Raises NotFound."""
+    result = next((r for r in found.results if r.tested.key == key), None)
+    if result is None:
+        raise NotFound(f"Participant {found.evidence.participant} has no sessions of '{key}' that count.", "Choose one from the analyses.")
+    return result
+
+
+MixedFits = tuple[tuple[str, MixedComparison | Unavailable], ...]
+
+
+def mixed_models(found: Primary, controller: Controller) -> MixedFits:
+    """Mixed models by metric, policies nested in the controller: linear, ordinal for the rating, minutes for tremor. Slow: up to 0.3 s."""
+    return kept(("mixed", found.evidence.key, controller), lambda: tuple((m, _fit(found.sessions, m, controller)) for m in METRICS))
+
+
+def policy_names(db: Session, participant: Participant) -> dict[int, str]:
+    """Names of a participant's policies."""
+    return repository.policy_names(db, participant.id)
+
+
+def _fit(sessions: Sequence[Facts], metric: str, controller: Controller) -> MixedComparison | Unavailable:
+    chosen = choose(sessions, metric, of_controller(controller))
+    policies = chosen.policy if len({int(p) for p in chosen.policy[chosen.data.tested]}) > 1 else None
+    if metric == "rating":
+        return rating_comparison(chosen.data, policies)
+    if metric == "tremor":
+        minutes = np.array([s.duration_s / 60 for s in chosen.sessions])
+        counted = replace(chosen.data, value=chosen.data.value / 100 * minutes)
+        return tremor_comparison(counted, minutes, policies)
+    return linear_comparison(chosen.data, policies)
+
+
+def next_visits(found: Primary, controller: Controller, sessions_per_arm: int) -> tuple[tuple[str, Power | Unavailable], ...]:
+    """Power of the primary test after each number of further visits, by metric: simulated from the posterior of both variances."""
+
+    def compute() -> tuple[tuple[str, Power | Unavailable], ...]:
+        tested = of_controller(controller)
+        return tuple((m, power(choose(found.sessions, m, tested).data, Target(), sessions_per_arm=sessions_per_arm)) for m in METRICS)
+
+    return kept(("power", found.evidence.key, controller, sessions_per_arm), compute)

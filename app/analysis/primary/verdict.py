@@ -1,0 +1,118 @@
+"""Is energy saved without loss? Non-inferiority on the participant's margins, then the saving. No database.
+
+A verdict confirms where the margins were locked before every session that it rests on; else it explores. The margin of grasp is a share of
+the frequency under cDBS: the cDBS values are lowered by it, so that what is tested is "no slower than 1 - share of the same visit's cDBS",
+with the spread of that reference in the error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+import numpy as np
+
+from app.analysis.evidence.facts import Facts
+from app.analysis.evidence.measurements import HIGHER_IS_BETTER, Chosen, choose, of_controller
+from app.study.models import Controller
+from ml.qoc import Margins
+from ml.statistics.noninferiority import LEAST_VISITS, Assessment, Outcome, assess
+
+FAILURE = {"grasp": None, "rating": 1.0, "tremor": 100.0}
+"""What a stopped session counts as; of grasp, the worst frequency measured."""
+
+
+@dataclass(frozen=True)
+class LockedMargins:
+    """Margins as they were locked, or the present ones where nobody locked any."""
+
+    margins: Margins
+    version: int
+    locked_at: datetime | None
+    locked_by: str | None
+
+
+@dataclass(frozen=True)
+class VerdictResult:
+    """The verdict on one controller.
+
+    Attributes:
+        confirmatory: every session that it rests on began, and was recorded, after the lock.
+        assessment: of those sessions; None where no outcome was ever measured.
+        visits: with both arms, among the sessions that it rests on. drawn_from: all visits of these sessions.
+        left_to_exploration: visits of before the lock.
+        margin: by outcome, in its unit. stopped: sessions of the controller that were stopped for the patient's sake.
+    """
+
+    controller: Controller
+    confirmatory: bool
+    assessment: Assessment | None
+    visits: tuple[int, ...]
+    drawn_from: tuple[int, ...]
+    left_to_exploration: tuple[int, ...]
+    margin: dict[str, float]
+    stopped: tuple[int, ...]
+
+
+def opened_at(session: Facts) -> datetime:
+    """When somebody could first know of a session: it began, or its record was made."""
+    return min(session.created_at, session.started_at) if session.started_at else session.created_at
+
+
+def verdicts(sessions: Sequence[Facts], controllers: Sequence[Controller], locked: LockedMargins) -> list[VerdictResult]:
+    """For every controller its confirmatory verdict where there is a lock, and its exploratory one where the other lacks visits."""
+    found = []
+    for controller in controllers:
+        confirmed = _after(sessions, locked.locked_at)
+        if locked.locked_at is not None:
+            found.append(_judge(sessions, confirmed, controller, locked.margins, confirmatory=True))
+        if locked.locked_at is None or len(found[-1].visits) < LEAST_VISITS:
+            found.append(_judge(sessions, sessions, controller, locked.margins, confirmatory=False))
+    return found
+
+
+def _after(sessions: Sequence[Facts], moment: datetime | None) -> list[Facts]:
+    """Sessions of the visits of which nothing was there before a moment."""
+    if moment is None:
+        return []
+    early = {s.visit for s in sessions if opened_at(s) <= moment}
+    return [s for s in sessions if s.visit not in early]
+
+
+def _judge(
+    everything: Sequence[Facts], sessions: Sequence[Facts], controller: Controller, margins: Margins, confirmatory: bool
+) -> VerdictResult:
+    tested = of_controller(controller)
+    energy = choose(sessions, "energy", tested)
+    outcomes = [_outcome(choose(sessions, name, tested), name, margins) for name in FAILURE]
+    used = {s.visit for s in sessions}
+    seen = {s.visit for s in sessions if tested(s)} & {s.visit for s in sessions if s.controller is Controller.CDBS}
+    result = None
+    if all(o is not None for o in outcomes) and len(energy.sessions):
+        result = assess([o for o in outcomes if o is not None], energy.data, energy.stopped)
+    return VerdictResult(
+        controller,
+        confirmatory,
+        result,
+        tuple(sorted(seen)),
+        tuple(sorted(used)),
+        tuple(sorted({s.visit for s in everything if tested(s)} - used)),
+        {o.name: o.margin for o in outcomes if o is not None},
+        tuple(s.session_id for s in sessions if tested(s) and s.stopped is not None),
+    )
+
+
+def _outcome(chosen: Chosen, name: str, margins: Margins) -> Outcome | None:
+    """An outcome with its margin; None where no cDBS session tells what a share of the grasp frequency is."""
+    data, margin = chosen.data, {"rating": margins.rating_points, "tremor": margins.tremor_points}.get(name)
+    if margin is None:
+        by_visit = [float(data.value[two].mean()) for _, _, two in data.arms]
+        cdbs = data.value[~data.tested & np.isfinite(data.value)]
+        reference = float(np.mean(by_visit)) if by_visit else float(cdbs.mean()) if cdbs.size else 0.0
+        if not reference > 0:
+            return None
+        margin = margins.grasp_share * reference
+        # lowered by the share and lifted by the margin: the average contrast stays, its spread gains that of the reference
+        data = replace(data, value=np.where(data.tested, data.value, (1 - margins.grasp_share) * data.value + margin))
+    return Outcome(name, data, chosen.stopped, margin, HIGHER_IS_BETTER[name], failure=FAILURE[name])

@@ -1,0 +1,208 @@
+"""Sentences of the analyses, made where somebody reads them; nothing is decided by them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from app.analysis.evidence.facts import Excluded, LeftOut, Missing
+from app.analysis.primary.results import Basis, Comparison, Disagreement, Tested
+from app.analysis.primary.verdict import LockedMargins, VerdictResult
+from app.study.blinding import CONTROLLER_NAMES
+from ml.statistics.noninferiority import (
+    ENERGY,
+    LEAST_VISITS,
+    FailureRule,
+    Inconclusive,
+    Inferior,
+    NonInferiorAndSaving,
+    Verdict,
+)
+from ml.statistics.pooling import Summary
+from ml.statistics.power import MOST_VISITS
+from ml.statistics.within_visits.contrasts import Adjustment, Reason, Unavailable
+
+TITLES: dict[str, tuple[str, str]] = {
+    "energy": ("Stimulation energy", "cDBS = 1"),
+    "mean_beta": ("Mean beta amplitude", ""),
+    "grasp": ("Grasp frequency", "Hz"),
+    "rating": ("Rating", "1\u201310"),
+    "tremor": ("Tremor", "% of session"),
+}
+"""The paper's five metrics: title and unit; the unit of beta is the participant's."""
+
+OUTCOMES = {"grasp": "grasp", "rating": "the rating", "tremor": "tremor", ENERGY: "the energy saved"}
+FAMILY = (
+    "Planned family: the five metrics of RL and of distilled RL, each against the same visit's cDBS; p-values are adjusted by Holm over "
+    "all of them that could be tested. Everything else (other controllers, single policies) is exploration, adjusted by Benjamini and "
+    "Hochberg: a value below .05 there is a lead to follow, not a result."
+)
+STRATEGY = (
+    "A controller counts with every session of it, whichever policy ran, so that nothing is selected by its outcome. A single policy is "
+    "judged by the sessions recorded after it was last put on an approved plan; what was known before may have picked it, and does "
+    "not count."
+)
+ADJUSTMENTS = {
+    Adjustment.NONE: "Not adjusted",
+    Adjustment.ORDER: "Freed from a linear drift over the visit",
+    Adjustment.CARRY_OVER: "Freed from what ran just before",
+    Adjustment.MEDICATION: "Freed from the time since the last dose",
+    Adjustment.BRACKETED: "Only sessions between two cDBS sessions",
+}
+RULES = {
+    FailureRule.WORST_CASE: "a stopped session of the controller counts as a failure, a stopped cDBS session as measured",
+    FailureRule.BOTH_ARMS: "stopped sessions of both arms count as failures",
+    FailureRule.AS_MEASURED: "stopped sessions count as measured",
+}
+MISSING = {
+    Missing.NOT_ENTERED: "nobody entered it",
+    Missing.NO_TRACE: "its recordings hold no such trace",
+    Missing.MOSTLY_UNKNOWN: "more than half of its steps are not known",
+    Missing.NO_CDBS_AMPLITUDE: "the cDBS amplitude is not stated, so that no fraction follows",
+    Missing.OTHER_BETA: "its beta is of another unit or source",
+}
+
+
+def unavailable(why: Unavailable, what: str = "the controller") -> str:
+    """Why a number is not given."""
+    sentences = {
+        Reason.NO_SESSION: f"No session of {what}, or none of cDBS, has this metric.",
+        Reason.NO_VISIT_WITH_BOTH_ARMS: f"No visit has both {what} and cDBS with this metric: no primary evidence.",
+        Reason.TOO_FEW_VISITS: f"{_n(why.found, 'visit')} with both arms; it takes {why.needed}.",
+        Reason.TOO_FEW_PARTICIPANTS: f"{_n(why.found, 'participant')} with a result; it takes {why.needed}.",
+        Reason.NO_VARIANCE: "All values are equal, or too few to tell their spread: nothing can be tested.",
+        Reason.NOT_IDENTIFIED: "The sessions do not tell this apart from the controller.",
+        Reason.NOT_RECORDED: "What it takes was not recorded.",
+        Reason.NO_BRACKETED_SESSION: "No session stands between two cDBS sessions of its visit.",
+    }
+    return sentences[why.reason]
+
+
+def tested_name(tested: Tested) -> str:
+    """A controller, or a policy of it, by name."""
+    if tested.policy_id is None:
+        return CONTROLLER_NAMES[tested.controller]
+    return tested.policy_name or f"policy {tested.policy_id}"
+
+
+def basis(tested: Tested) -> str:
+    """Which sessions of a policy count, and which do not; empty for controllers."""
+    if tested.basis is Basis.ALL:
+        return ""
+    if tested.basis is Basis.SELECTION:
+        return "selection: these sessions may have picked the policy, and confirm nothing"
+    left = len(tested.selection_sessions)
+    return "confirmation" + (f"; {_n(left, 'earlier session')} that may have picked it left out" if left else "")
+
+
+def verdict(result: VerdictResult) -> str:
+    """The verdict in one sentence that a clinician can quote."""
+    name = CONTROLLER_NAMES[result.controller]
+    if result.assessment is None:
+        return f"No verdict on {name}: no cDBS session has a grasp frequency of which the margin would be a share."
+    return verdict_sentence(name, result.assessment.verdict, len(result.visits))
+
+
+def verdict_sentence(name: str, found: Verdict, visits: int) -> str:
+    """A verdict over so many visits, in one sentence."""
+    over = f"over {_n(visits, 'visit')}"
+    if isinstance(found, NonInferiorAndSaving):
+        return (
+            f"{name} is non-inferior to cDBS on grasp, rating and tremor and saves {found.percent:.0f} % of the stimulation energy "
+            f"(95 % interval {found.low:.0f} to {found.high:.0f} %), {over}."
+        )
+    if isinstance(found, Inferior):
+        return f"{name} is inferior to cDBS: {_listed(found.outcomes)} {_are(found.outcomes)} worse by more than the margin, {over}."
+    open_ = f"{name} is not shown to be non-inferior on {_listed(found.open)}"
+    if found.open == (ENERGY,):
+        open_ = f"{name} is non-inferior on grasp, rating and tremor, but a saving of energy is not shown"
+    return f"Inconclusive {over}: {open_}; {_more(found)}."
+
+
+def _more(found: Inconclusive) -> str:
+    few = f"nothing is concluded from fewer than {LEAST_VISITS} visits with both arms" if found.reason is Reason.TOO_FEW_VISITS else ""
+    if found.more_visits is not None:
+        more = f"{_n(found.more_visits, 'more visit')} with both arms would settle it with a probability of 80 %, if what was seen holds"
+        return f"{few}; {more}" if few else more
+    if few:
+        return few
+    if found.reason is not None:
+        return "too little was measured to say how many visits it takes"
+    return f"by what was seen so far, {MOST_VISITS} more visits would not settle it"
+
+
+def verdict_kind(result: VerdictResult, locked: LockedMargins) -> str:
+    """Whether a verdict confirms, and why not."""
+    if result.confirmatory:
+        left = f" Visits before the lock ({_numbers(result.left_to_exploration)}) are left out." if result.left_to_exploration else ""
+        return (
+            f"Confirmatory: margins version {locked.version} were locked on {locked.locked_at:%Y-%m-%d %H:%M} UTC by {locked.locked_by}, "
+            f"before every session that counts here.{left}"
+        )
+    if locked.locked_at is None:
+        return "Exploratory: nobody has locked the margins, so that they could still be chosen by the data."
+    return "Exploratory: this takes in visits from before the margins were locked; it does not confirm."
+
+
+def disagreement(found: Comparison) -> str:
+    """Where the paper's test and the primary one differ; empty where they agree."""
+    if found.disagreement is Disagreement.PAPER_ONLY:
+        return (
+            "The paper's test is below .05 and the primary one is not: to take sessions of one day as independent makes days look like "
+            "evidence."
+        )
+    if found.disagreement is Disagreement.PRIMARY_ONLY:
+        return "The primary test is below .05 and the paper's is not: differences between days hide what is the same within them."
+    if found.disagreement is Disagreement.NO_PRIMARY:
+        return "The paper's test is below .05, but there is no primary evidence: days and controllers cannot be told apart."
+    return ""
+
+
+def lacking(found: Comparison) -> str:
+    """Visits that give no primary evidence; empty where all do."""
+    if not found.lacking_visits:
+        return ""
+    word = "Visit" if len(found.lacking_visits) == 1 else "Visits"
+    return f"{word} {_numbers(found.lacking_visits)} lack one of the arms with this metric and give no primary evidence."
+
+
+def left_out(excluded: Excluded) -> str:
+    """Why a session counts in no analysis."""
+    return {
+        LeftOut.EXCLUDED: excluded.detail,
+        LeftOut.NOT_CONFIRMED: "not confirmed yet",
+        LeftOut.UNREADABLE: f"cannot be read: {excluded.detail}",
+        LeftOut.HIDDEN: "hidden from you until its visit is locked",
+    }[excluded.why]
+
+
+def no_association(why: Unavailable) -> str:
+    """Why two measurements are not set against each other."""
+    if why.reason is Reason.TOO_FEW_VISITS:
+        return f"{_n(why.found, 'visit')} with what it takes; {why.needed} are needed."
+    return "One of the two hardly varies, or one visit alone carries it." if why.reason is Reason.NO_VARIANCE else unavailable(why)
+
+
+def no_population_claim(found: Summary) -> str:
+    """What a summary of so few participants does not say."""
+    k = found.participants
+    floor = f"With {k} participants the two-sided sign test cannot go below {found.smallest_sign_p:.3g}".replace("0.", ".")
+    if found.population_claim:
+        return f"{floor}; the summary describes these {k} participants, and their spread is shown beside it."
+    return f"{floor}: the summary describes these {k} participants and claims nothing about other people."
+
+
+def _listed(names: Sequence[str]) -> str:
+    words = [OUTCOMES.get(n, n) for n in names]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _are(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"
+
+
+def _numbers(numbers: Iterable[int]) -> str:
+    return ", ".join(map(str, numbers))
+
+
+def _n(count: int, word: str) -> str:
+    return f"{count} {word}" if count == 1 else f"{count} {word}s"

@@ -1,0 +1,1 @@
+"""A participant's record as a Frictionless data package, with a script that recomputes the primary tables."""

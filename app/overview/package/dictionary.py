@@ -1,0 +1,198 @@
+"""The dictionary of the data package: every column of every table, and the descriptor that Frictionless defines (datapackage.json)."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import date, datetime
+from typing import Any
+
+from app import __version__
+
+
+@dataclass(frozen=True)
+class Field:
+    """One column; `kind` is a type of Frictionless Table Schema."""
+
+    name: str
+    kind: str
+    text: str
+
+
+class Days:
+    """Times as days since the participant was enrolled, so that no date leaves."""
+
+    def __init__(self, enrolled: datetime) -> None:
+        self._enrolled = enrolled
+
+    def of(self, moment: datetime | None) -> float | None:
+        """A moment, days; None where it is not known."""
+        return None if moment is None else round((moment - self._enrolled).total_seconds() / 86400, 5)
+
+    def of_date(self, day: date | None) -> int | None:
+        """A date, whole days."""
+        return None if day is None else (day - self._enrolled.date()).days
+
+
+TITLES = {
+    "sessions": "one row per confirmed session",
+    "steps": "beta and amplitude on the 2 s grid of every session",
+    "visits": "visit days, and whether their data are locked",
+    "policies": "every policy of the participant",
+    "estimates": "every estimate of a return, with its interval",
+    "coverage": "what the data could say about each policy, checked before it was estimated",
+    "margins": "versions of the non-inferiority margins, and when they were locked",
+    "primary": "controllers and policies against the same visit's cDBS; recompute.py checks those of controllers",
+    "noninferiority": "outcomes of the verdicts; recompute.py checks them",
+}
+
+
+def _fields(text: str) -> tuple[Field, ...]:
+    """`name type meaning`, a line each."""
+    return tuple(Field(*line.strip().split(" ", 2)) for line in text.strip().splitlines())
+
+
+FIELDS: dict[str, tuple[Field, ...]] = {
+    "sessions": _fields("""
+        session_id integer Number of the session.
+        visit integer Number of the visit.
+        ordinal integer Place in the visit.
+        controller string cdbs, rl, distilled, no_dbs, random or other.
+        policy_id integer Policy that ran, in policies.csv.
+        hemisphere string Controlled side.
+        started_day number Start, days since enrolment.
+        recorded_day number When its record was made, days since enrolment.
+        duration_s number Length, s.
+        beta_unit string Unit of beta.
+        beta_source string Where beta comes from; sources are never mixed.
+        beta_compared boolean Whether its mean beta is of the unit and source that are compared.
+        cdbs_amplitude_ma number cDBS amplitude in force, mA.
+        steps_above_cdbs integer Steps above the cDBS amplitude.
+        excluded_reason string Why somebody excluded it; such a session counts in no analysis.
+        stopped_reason string Why it was stopped for the patient's sake; a failure of its controller.
+        medication_h number Hours from the last dose to its start.
+        grasp_hz number Grasp frequency, Hz, newest revision.
+        rating_1_10 integer The participant's rating, 1 worst to 10 best, newest revision.
+        tremor_percent number Share of the session with mild or worse tremor, %, newest revision.
+        qoc_revision integer Revision of these QoCs.
+        problem string Why it has no steps; such a session counts in no analysis.
+    """),
+    "steps": _fields("""
+        session_id integer Number of the session.
+        t_s number End of the window after the session's start, s; 0 or less: before it.
+        beta number Beta amplitude of the window, in the session's beta_unit; empty where invalid.
+        amplitude_ma number Amplitude in force over the window, mA; empty where unknown.
+        amplitude_fraction number The same as a share of the cDBS amplitude; may exceed 1.
+    """),
+    "visits": _fields("""
+        visit integer Number of the visit.
+        day integer Days since enrolment.
+        locked boolean Whether its data are closed for changes.
+        sessions integer Sessions, proposals included.
+    """),
+    "policies": _fields("""
+        policy_id integer Number of the policy.
+        name string Its name.
+        kind string trained, distilled, external or a reference.
+        algorithm string How it was made.
+        teacher_id integer Policy that it was distilled from.
+        snapshot_id integer Buffer snapshot that it was trained on.
+        seed integer Seed of its training.
+        created_day number Days since enrolment.
+        onnx_sha256 string Hash of its file.
+    """),
+    "estimates": _fields("""
+        evaluation_id integer Number of the evaluation.
+        snapshot_id integer Buffer snapshot that it rests on.
+        settings_version_id integer Settings that it rests on.
+        horizon_steps integer H, steps.
+        gamma number Discount per step.
+        policy_id integer Policy.
+        method string Method of evaluation.
+        value number Estimate of E[r_end + sum over t < H of gamma^t r_t].
+        low number Lower end of its interval.
+        high number Upper end of its interval.
+        level number Coverage of the interval.
+        supported boolean Whether the data can say anything about this policy.
+        flags string What to know about it.
+    """),
+    "coverage": _fields("""
+        evaluation_id integer Number of the evaluation.
+        policy_id integer Policy.
+        supported boolean Whether all checks were passed.
+        check string What was checked.
+        value number What was found.
+        limit number What it was held against.
+        limit_is string least or greatest.
+        verdict string Outcome of the check.
+    """),
+    "margins": _fields("""
+        version integer Version of the margins.
+        grasp_share number Grasp may be slower by this share of the frequency under cDBS.
+        rating_points number The rating may be lower by this.
+        tremor_points number Tremor may take up this many more percentage points.
+        created_day number Days since enrolment.
+        locked_day number When this version was locked, days since enrolment; empty where it was not.
+    """),
+    "primary": _fields("""
+        controller string Controller.
+        policy_id integer Policy; empty for the controller with all its policies.
+        name string Its name.
+        role string planned (adjusted by Holm) or exploration (by Benjamini and Hochberg).
+        basis string all, confirmation or selection: which sessions of a policy count.
+        metric string energy (mean squared amplitude fraction), mean_beta, grasp, rating or tremor.
+        unit string Unit of the metric.
+        estimate number Average over visits of the controller's mean less that of the same visit's cDBS.
+        low number Lower end of its interval.
+        high number Upper end of its interval.
+        level number Coverage of the interval.
+        p number Two-sided, on t with visits less 1 degrees of freedom.
+        p_adjusted number Adjusted within its family.
+        cliffs_delta number How much more often the controller's value is the higher one than the lower one, within visits.
+        cliffs_delta_low number Lower end of its interval.
+        cliffs_delta_high number Upper end of its interval.
+        van_elteren_p number Exact test within visits.
+        paper_p number Rank-sum test of all sessions, whatever their visit, as in the paper.
+        visits integer Visits with both arms.
+        sessions integer Sessions of the controller in them.
+        cdbs_sessions integer Sessions of cDBS in them.
+        adjustment string What the contrasts are freed from.
+        not_available string Why there is no number.
+    """),
+    "noninferiority": _fields("""
+        controller string Controller.
+        confirmatory boolean Whether the margins were locked before every session that it rests on.
+        outcome string grasp, rating or tremor.
+        margin number Largest loss that is accepted, in the unit of the outcome.
+        grasp_share number The margin of grasp as a share of the frequency under cDBS.
+        estimate number Average over visits, turned so that higher is better.
+        p_non_inferior number One-sided, of a loss of the margin or more.
+        failures integer Sessions of the controller that were stopped for the patient's sake.
+        visits string Visits whose sessions it rests on.
+    """),
+}
+
+
+def descriptor(code: str, contents: Mapping[str, str]) -> dict[str, Any]:
+    """datapackage.json of these tables, as Frictionless Data Package v1 has it."""
+    resources = []
+    for name, fields in FIELDS.items():
+        content = contents[f"{name}.csv"].encode()
+        schema = {"fields": [{"name": f.name, "type": f.kind, "description": f.text} for f in fields], "missingValues": [""]}
+        if name == "sessions":
+            schema["primaryKey"] = "session_id"
+        resources.append(
+            {
+                "name": name, "path": f"{name}.csv", "title": TITLES[name], "profile": "tabular-data-resource", "format": "csv",
+                "mediatype": "text/csv", "encoding": "utf-8", "bytes": len(content),
+                "hash": f"sha256:{hashlib.sha256(content).hexdigest()}", "schema": schema,
+            }
+        )  # fmt: skip
+    return {
+        "profile": "tabular-data-package",
+        "name": f"betaloop-{code.lower()}",
+        "title": f"Record of participant {code}",
+        "description": f"Made by betaloop {__version__}. Times are days since enrolment; names, dates and serial numbers are not in it.",
+        "resources": resources,
+    }

@@ -1,0 +1,152 @@
+"""A participant's record as a Frictionless data package: tables, their dictionary, and a script that checks them."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from app import __version__
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.analysis.primary.serializers import csv_rows
+from app.analysis.primary.service import Primary, primary
+from app.analysis.tables import csv_of
+from app.evaluation import wording
+from app.evaluation.estimates.coverage import coverage_by_policy
+from app.evaluation.estimates.rows import estimate_of
+from app.learning.models import Policy
+from app.overview import repository
+from app.overview.package import recompute
+from app.overview.package.dictionary import FIELDS, TITLES, Days, descriptor
+from app.platform.errors import BetaloopError
+from app.study import blinding, service
+from app.study import repository as study
+from app.study.models import Participant
+from app.study.schemas import SettingsOut
+from app.study.sessions.data import session_data
+from ml.statistics.within_visits.contrasts import Average
+
+
+def export_participant(db: Session, participant: Participant, caller: Caller) -> bytes:
+    """Everything the caller may know of a participant, as a zipped data package. Controllers come through the blinding gate.
+
+    A session whose steps cannot be read has its row all the same, with the reason in the column `problem`. No date leaves: times are days
+    since the participant was enrolled.
+    """
+    service.require(caller, can.READ, participant)
+    found = primary(db, participant, caller)
+    day = Days(participant.created_at)
+    sessions, steps = _sessions(db, participant, caller, found, day)
+    tables = {
+        "sessions": sessions,
+        "steps": steps,
+        "visits": [(v.number, day.of_date(v.date), v.locked, len(v.sessions)) for v in participant.visits],
+        "policies": [_policy_row(p, day) for p in repository.policies(db, participant.id)],
+        "estimates": _estimate_rows(db, participant),
+        "coverage": _coverage_rows(db, participant),
+        "margins": _margin_rows(participant, day),
+        "primary": [row[1:] for row in csv_rows(found)],
+        "noninferiority": _noninferiority_rows(found),
+    }
+    settings = [SettingsOut.model_validate(s).model_dump(mode="json", exclude={"created_at"}) for s in participant.settings]
+    contents = {
+        f"{name}.csv": csv_of([f.name for f in FIELDS[name]], ([_cell(c) for c in row] for row in rows)) for name, rows in tables.items()
+    }
+    contents |= {
+        "datapackage.json": json.dumps(descriptor(participant.code, contents), indent=2, ensure_ascii=False),
+        "settings.json": json.dumps(settings, indent=2),
+        "recompute.py": Path(recompute.__file__).read_text("utf-8"),
+        "README.txt": _readme(participant),
+    }
+    sink = io.BytesIO()
+    with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in contents.items():
+            archive.writestr(zipfile.ZipInfo(f"{participant.code}/{name}"), text)
+    return sink.getvalue()
+
+
+def _sessions(
+    db: Session, participant: Participant, caller: Caller, found: Primary, day: Days
+) -> tuple[list[tuple[Any, ...]], list[tuple[Any, ...]]]:
+    compared = {s.session_id for s in found.sessions if "mean_beta" in s.values}
+    sessions: list[tuple[Any, ...]] = []
+    steps: list[tuple[Any, ...]] = []
+    for session in study.sessions_of_participant(db, participant.id):
+        arm, qoc = blinding.arm(session, caller), session.qoc
+        try:
+            table, problem = session_data(db, session).table, None
+        except BetaloopError as error:
+            table, problem = None, str(error)
+        beta = table and table.beta_trace
+        sessions.append(
+            (session.id, session.visit.number, session.ordinal, arm.controller.value, arm.policy_id, session.hemisphere,
+             day.of(session.started_at), day.of(session.created_at), session.duration_s, beta and beta.unit, beta and beta.source,
+             session.id in compared, table and table.cdbs_ma, table and table.above_one, session.excluded_reason, session.stopped_reason,
+             session.medication_h, qoc and qoc.grasp_hz, qoc and qoc.rating, qoc and qoc.tremor_percent, qoc and qoc.revision, problem)
+        )  # fmt: skip
+        if table is not None:
+            rows = zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, strict=True)
+            steps.extend((session.id, *(None if v != v else float(v) for v in row)) for row in rows)
+    return sessions, steps
+
+
+def _margin_rows(participant: Participant, day: Days) -> list[tuple[Any, ...]]:
+    locked = {lock.margins_version_id: lock.created_at for lock in participant.margins_locks}
+    return [
+        (m.version, m.grasp_share, m.rating_points, m.tremor_points, day.of(m.created_at), day.of(locked.get(m.id)))
+        for m in participant.margins
+    ]
+
+
+def _noninferiority_rows(found: Primary) -> list[tuple[Any, ...]]:
+    rows = []
+    for v in found.verdicts:
+        for o in v.assessment.outcomes if v.assessment else ():
+            estimate = o.average.estimate if isinstance(o.average, Average) else None
+            drawn = " ".join(map(str, v.drawn_from))
+            share = found.locked.margins.grasp_share
+            rows.append((v.controller.value, v.confirmatory, o.name, o.margin, share, estimate, o.p_non_inferior, o.failures, drawn))
+    return rows
+
+
+def _policy_row(p: Policy, day: Days) -> tuple[Any, ...]:
+    return (p.id, p.name, p.kind, p.algorithm, p.teacher_id, p.snapshot_id, p.seed, day.of(p.created_at), p.onnx_sha256)
+
+
+def _estimate_rows(db: Session, participant: Participant) -> list[tuple[Any, ...]]:
+    return [
+        (e.id, e.snapshot_id, e.settings_version_id, e.horizon_steps, e.gamma, r.policy_id, r.method, r.value, r.low, r.high, r.level,
+         r.supported, wording.joined(estimate_of(r).flags))
+        for e, r in repository.estimates(db, participant.id)
+    ]  # fmt: skip
+
+
+def _coverage_rows(db: Session, participant: Participant) -> list[tuple[Any, ...]]:
+    return [
+        (e.id, policy_id, found.supported, c.name, c.value, c.limit, "least" if c.at_least else "greatest", c.verdict)
+        for e in repository.evaluations(db, participant.id)
+        for policy_id, found in sorted(coverage_by_policy(e).items())
+        for c in found.checks
+    ]
+
+
+def _cell(value: Any) -> Any:
+    """A cell as Frictionless reads it: truth in small letters."""
+    return str(value).lower() if isinstance(value, bool) else value
+
+
+def _readme(participant: Participant) -> str:
+    listed = "\n".join(f"{name + '.csv':22}{text}" for name, text in TITLES.items())
+    return (
+        f"betaloop {__version__}: record of participant {participant.code}, as a Frictionless data package.\n\n"
+        "datapackage.json      the dictionary: every column of every table with its type, unit and meaning\n"
+        f"{listed}\n"
+        "settings.json         every settings version\n"
+        "recompute.py          recomputes the primary tables from sessions and steps with numpy and scipy, and compares\n\n"
+        "Days are counted from the enrolment in the software; what happened before has a day below 0.\n"
+    )

@@ -1,0 +1,67 @@
+"""Tables of what uploaded files say of QoCs."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import CheckConstraint, ForeignKey, LargeBinary, String, UniqueConstraint, func
+from sqlalchemy.orm import Mapped, mapped_column
+
+from app.platform.database import Base
+from app.study.models import Hemisphere
+
+
+class TremorSeries(Base):
+    """Minutes of tremor from one uploaded file of a watch, in UTC.
+
+    Little-endian arrays of `n` minutes in time order: `start_unix_s_f64` and `duration_s_f64` in seconds, `fractions_f32` [n, 6] in the
+    order of `ml.qoc.TREMOR_CLASSES`, `any_tremor_f32`; NaN where the export does not tell.
+    """
+
+    __tablename__ = "tremor_series"
+    __table_args__ = (
+        UniqueConstraint("participant_id", "upload_file_id"),
+        CheckConstraint("n >= 1", name="minutes"),
+        CheckConstraint("last_end_at > first_start_at", name="order"),
+        CheckConstraint(
+            "octet_length(start_unix_s_f64) = 8 * n and octet_length(duration_s_f64) = 8 * n"
+            " and octet_length(fractions_f32) = 24 * n and octet_length(any_tremor_f32) = 4 * n",
+            name="length",
+        ),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"))
+    upload_file_id: Mapped[int] = mapped_column(ForeignKey("upload_file.id"), index=True)
+    first_start_at: Mapped[datetime]
+    last_end_at: Mapped[datetime]
+    n: Mapped[int]
+    start_unix_s_f64: Mapped[bytes] = mapped_column(LargeBinary)
+    duration_s_f64: Mapped[bytes] = mapped_column(LargeBinary)
+    fractions_f32: Mapped[bytes] = mapped_column(LargeBinary)
+    any_tremor_f32: Mapped[bytes] = mapped_column(LargeBinary)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+
+
+class GraspTest(Base):
+    """One hand's grasp test near the end of a session: times of open fists, s (little-endian float64, `n` of them).
+
+    `implausible` lists which of the n - 1 intervals between them are too short or too long to be a grasp.
+    """
+
+    __tablename__ = "grasp_test"
+    __table_args__ = (
+        UniqueConstraint("session_id", "upload_file_id", "hand", postgresql_nulls_not_distinct=True),
+        CheckConstraint("hand in ('left', 'right')", name="hand"),
+        CheckConstraint("n >= 1 and octet_length(open_fist_s_f64) = 8 * n", name="length"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    session_id: Mapped[int] = mapped_column(ForeignKey("session.id", ondelete="CASCADE"))
+    upload_file_id: Mapped[int] = mapped_column(ForeignKey("upload_file.id"), index=True)
+    hand: Mapped[Hemisphere | None] = mapped_column(String(5))
+    n: Mapped[int]
+    open_fist_s_f64: Mapped[bytes] = mapped_column(LargeBinary)
+    implausible: Mapped[list[Any]]
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())

@@ -1,0 +1,52 @@
+"""Lock and unlock a visit: closed for changes, open to blinded assessors. The caller commits."""
+
+from __future__ import annotations
+
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.platform.database import set_reason
+from app.platform.errors import Conflict, Invalid
+from app.study import repository
+from app.study.models import Visit, VisitLock
+
+
+def lock(db: Session, visit: Visit, reason: str, caller: Caller) -> VisitLock:
+    """Close the data of a visit. Raises Conflict where it is locked already or sessions wait for confirmation, Invalid without a reason."""
+    waiting = [s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id]
+    if waiting:
+        raise Conflict(
+            f"Visit {visit.number} has {len(waiting)} proposed session(s) that nobody has confirmed.", "Confirm or discard them, then lock."
+        )
+    return _set(db, visit, True, reason, caller)
+
+
+def unlock(db: Session, visit: Visit, reason: str, caller: Caller) -> VisitLock:
+    """Open the data of a visit again. Raises Conflict where it is not locked, Invalid without a reason."""
+    return _set(db, visit, False, reason, caller)
+
+
+def require_unlocked(visit: Visit) -> None:
+    """Raises Conflict where a visit is locked."""
+    if visit.locked:
+        last = visit.locks[-1]
+        raise Conflict(
+            f"Visit {visit.number} was locked by {last.created_by} on {last.created_at:%Y-%m-%d %H:%M} UTC; nothing was changed.",
+            "A clinician unlocks it first, with a reason.",
+        )
+
+
+def _set(db: Session, visit: Visit, locked: bool, reason: str, caller: Caller) -> VisitLock:
+    site = visit.participant.site
+    caller.require(can.LOCK_VISIT, site.study_id, site.id)
+    if not reason.strip():
+        raise Invalid("A reason is missing.", "Say why; it is kept with the lock.")
+    repository.lock_row(db, visit)
+    if visit.locked is locked:
+        raise Conflict(f"Visit {visit.number} is {'locked already' if locked else 'not locked'}.", "Load the page again.")
+    set_reason(db, reason.strip())
+    row = VisitLock(visit_id=visit.id, locked=locked, reason=reason.strip(), created_by=caller.label)
+    visit.locks.append(row)
+    db.flush()
+    return row

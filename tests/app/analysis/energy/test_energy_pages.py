@@ -1,0 +1,112 @@
+"""What stimulation took, by every measure; a battery's days under stated assumptions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.analysis.energy.measures import Measure, Pulses, pulses_of, taken
+from app.analysis.evidence.facts import Facts, Side
+from app.study.blinding import Arm
+from app.study.models import Controller, Recording
+
+PATH = "/api/v1/participants/P1/analyses/energy"
+
+
+def logged(db: Session, width_us: float, rate_hz: float) -> None:
+    """Every recording says its pulses from its start on."""
+    state = {"rate_hz": rate_hz, "programs": [{"program": 0, "amplitude_ma": 3.0, "pulse_width_us": width_us}]}
+    for recording in db.scalars(select(Recording)):
+        recording.details = {"events": [{"t_s": 0.0, "kind": "stimulation", "label": "", "data": state}, {"t_s": 1.0, "kind": "note"}]}
+    db.commit()
+
+
+def rows(answer: dict[str, Any], measure: str) -> dict[str, dict[str, Any]]:
+    return {r["controller"]: r for r in answer["rows"] if r["measure"] == measure}
+
+
+def test_charge_and_delivered_energy_follow_from_the_logged_pulses(
+    client: TestClient, db: Session, add_session: Callable[..., int]
+) -> None:
+    add_session("cdbs", fraction=1.0)
+    add_session("rl", fraction=0.5)
+    logged(db, 60.0, 130.0)
+    answer = client.get(f"{PATH}?impedance_ohm=1000").json()
+    charge, teed = rows(answer, "charge_uc_per_s"), rows(answer, "teed_uw")
+    # 3 mA * 60 us * 130 Hz = 23.4 uC/s; (3 mA)^2 * 1000 ohm * 60 us * 130 Hz = 70.2 uW
+    assert charge["cdbs"]["mean"] == pytest.approx(23.4, rel=1e-5)
+    assert charge["rl"]["mean"] == pytest.approx(11.7, rel=1e-5)
+    assert teed["cdbs"]["mean"] == pytest.approx(70.2, rel=1e-5)
+    assert teed["rl"]["saved_percent"] == pytest.approx(75.0, rel=1e-5)
+    assert "I²" in teed["rl"]["definition"]
+    assert not rows(client.get(PATH).json(), "teed_uw")
+    assert rows(answer, "mean_a")["rl"]["mean"] == pytest.approx(0.5)
+    assert rows(answer, "mean_a2")["rl"]["mean"] == pytest.approx(0.25)
+
+
+def test_without_logged_pulses_there_is_no_charge_and_the_page_says_so(client: TestClient, add_session: Callable[..., int]) -> None:
+    add_session("cdbs")
+    answer = client.get(PATH).json()
+    assert rows(answer, "charge_uc_per_s")["cdbs"]["mean"] is None
+    assert answer["unknown_sides"] == 1
+    page = client.get("/participants/P1/analyses/energy").text
+    assert "have no logged pulse width, rate or amplitude in mA" in page
+
+
+def facts(*sides: Side) -> Facts:
+    now = datetime(2026, 3, 2, tzinfo=UTC)
+    return Facts(1, 1, 1, 1, Arm(Controller.RL, None), None, None, now, 300.0, {}, {}, None, None, sides, None, None)
+
+
+def test_all_sides_and_programs_count_by_their_pulses() -> None:
+    left = Side("left", 1, 0, True, 0.5, 0.25, 1.0, 1.0)  # cDBS 2 mA: 4 mA^2
+    right = Side("right", 2, 0, False, 1.0, 1.0, 3.0, 9.0)
+    pulses = {(1, 0): Pulses(60.0, 130.0), (2, 0): Pulses(60.0, 65.0)}
+    found = taken(facts(left, right), pulses, None).values
+    assert found[Measure.ALL_SIDES] == pytest.approx((2 * 1 + 9) / (2 * 4 + 9))
+    assert found[Measure.CHARGE] == pytest.approx((1e-3 * 130 + 3e-3 * 65) * 60)
+    partly = taken(facts(left, right), {(1, 0): Pulses(60.0, 130.0)}, 1000.0)
+    assert (partly.values, partly.unknown_sides) == ({}, 1)
+
+
+def test_pulses_that_change_within_a_session_are_not_known() -> None:
+    def event(t_s: float, width: float) -> dict[str, Any]:
+        return {"t_s": t_s, "data": {"rate_hz": 130.0, "programs": [{"program": 0, "pulse_width_us": width}]}}
+
+    events = [event(0, 60), event(100, 90), event(500, 60)]
+    assert pulses_of(events, 0, 10, 90) == Pulses(60.0, 130.0)
+    assert pulses_of(events, 0, 150, 400) == Pulses(90.0, 130.0)
+    assert pulses_of(events, 0, 50, 400) == Pulses(None, 130.0)
+    assert pulses_of(events, 1, 10, 90) == Pulses(None, None)
+
+
+ASSUMED = {
+    "capacity_low_mah": "100", "capacity_high_mah": "120", "voltage_v": "3.7", "other_drain_uw": "200", "impedance_ohm": "1000",
+    "supply_v": "6", "pulse_width_us": "60", "rate_hz": "130", "cdbs_ma": "3", "source": "the manual",
+}  # fmt: skip
+
+
+def test_a_battery_lasts_longer_with_less_and_the_answer_is_a_range(client: TestClient, add_session: Callable[..., int]) -> None:
+    add_session("cdbs")
+    add_session("rl", fraction=0.5)
+    page = client.get("/participants/P1/analyses/energy", params=ASSUMED)
+    assert page.status_code == 200
+    assert "Assumed: the manual" in page.text
+    # cDBS: 100 mAh * 3.7 V over 3 mA * 6 V * 60 us * 130 Hz + 200 uW, to 120 mAh over I^2 R + 200 uW
+    low, high = 100 * 3.7e3 / (140.4 + 200) / 24, 120 * 3.7e3 / (70.2 + 200) / 24
+    assert f"{low:.1f}" in page.text
+    assert f"{high:.1f}" in page.text
+    wrong = client.get("/participants/P1/analyses/energy", params=ASSUMED | {"capacity_low_mah": "500"})
+    assert wrong.status_code == 422
+    assert "Give the smaller capacity first" in wrong.text
+
+
+def test_the_table_has_the_definition_beside_the_number(client: TestClient, add_session: Callable[..., int]) -> None:
+    add_session("cdbs")
+    assert "Mean over the session's steps of a²" in client.get("/participants/P1/analyses/energy.csv").text

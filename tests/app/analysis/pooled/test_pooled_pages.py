@@ -1,0 +1,110 @@
+"""All participants together: the summary, the figure, the tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy.orm import Session
+
+from tests.app.analysis.conftest import adder
+
+
+@pytest.fixture
+def four(client: TestClient, db: Session, enrolled: str) -> dict[str, float]:
+    """Participants P1 to P4 of three visits each; RL lowers the energy by a known share and is a little faster in grasps."""
+    saved = {"P1": 0.5, "P2": 0.4, "P3": 0.6, "P4": 0.3}
+    for code, share in saved.items():
+        if code != enrolled:
+            assert client.post("/api/v1/participants", json={"code": code, "settings": {"cdbs_amplitude_ma": 3.0}}).status_code == 201
+        add = adder(db, code)
+        for visit in (1, 2, 3):
+            for k in range(4):
+                rl = k % 2 == 1
+                fraction = (1 - share) ** 0.5 * (1 + 0.01 * visit) if rl else 1.0
+                add("rl" if rl else "cdbs", fraction=fraction, grasp=2 + 0.1 * visit + 0.05 * rl * k, rating=7, visit=visit)
+    return saved
+
+
+def test_every_participant_and_all_together_with_no_claim_about_others(client: TestClient, four: dict[str, float]) -> None:
+    answer = client.get("/api/v1/analyses").json()
+    energy = next(m for m in answer["metrics"] if m["metric"] == "energy")
+    own = {e["participant"]: e["result"]["estimate"] for e in energy["each"]}
+    # RL has (1 - share) times the mean of 1.01^2, 1.02^2, 1.03^2, cDBS has 1
+    drift = (1.01**2 + 1.02**2 + 1.03**2) / 3
+    assert own == pytest.approx({code: (1 - share) * drift - 1 for code, share in four.items()}, abs=1e-5)
+    together = energy["together"]
+    assert min(own.values()) < together["estimate"] < max(own.values())
+    assert together["smallest_sign_p"] == 0.125
+    assert "cannot go below .125" in together["text"]
+    assert "claims nothing about other people" in client.get("/analyses").text
+
+
+def test_the_page_is_reached_from_the_navigation_and_leads_to_each_participant(client: TestClient, four: dict[str, float]) -> None:
+    assert '<a href="/analyses"' in client.get("/").text
+    page = client.get("/analyses").text
+    for code in four:
+        assert f'href="/participants/{code}/analyses"' in page
+        assert '<a href="/participants/P1/analyses" >Analyses</a>' in client.get("/participants/P1").text
+    assert "Trial time" in page
+
+
+def test_the_figure_is_an_svg_with_every_session(client: TestClient, four: dict[str, float]) -> None:
+    for path in ("/analyses/results.svg", "/api/v1/analyses?format=svg", "/participants/P1/analyses/paper.svg"):
+        answer = client.get(path)
+        assert answer.headers["content-type"].startswith("image/svg+xml")
+        root = ElementTree.fromstring(answer.text)
+        points = root.findall(".//{http://www.w3.org/2000/svg}circle")
+        participants = 1 if "P1" in path else 4
+        assert len(points) == participants * 12 * 4  # four metrics were measured: energy, beta, grasp and rating
+
+
+def test_the_table_has_every_comparison(client: TestClient, four: dict[str, float]) -> None:
+    rows = list(csv.DictReader(io.StringIO(client.get("/analyses/results.csv").text)))
+    assert {(r["participant"], r["controller"]) for r in rows} == {(p, c) for p in four for c in ("cdbs", "rl")}
+    energy = next(r for r in rows if (r["participant"], r["metric"], r["controller"]) == ("P1", "energy", "rl"))
+    assert float(energy["p"]) == pytest.approx(2 / 924)  # 6 against 6, all apart
+
+
+def test_an_asterisk_stands_only_in_the_desired_direction(client: TestClient, add_session: Callable[..., int]) -> None:
+    for i in range(5):
+        add_session("cdbs", fraction=1.0 - 0.001 * i, grasp=2 + 0.01 * i, tremor=5 + i)
+        add_session("rl", fraction=0.7 + 0.001 * i, grasp=1 + 0.01 * i, tremor=50 + i)  # saves energy, and is worse in everything else
+    charts = client.get("/participants/P1/analyses/paper").text
+    assert charts.count("*") - charts.count("/*") >= 1
+    svg = ElementTree.fromstring(client.get("/participants/P1/analyses/paper.svg").text)
+    labels = [t.text or "" for t in svg.iter("{http://www.w3.org/2000/svg}text")]
+    assert [t for t in labels if t.endswith(" *")] == [".008 *"]
+    assert labels.count(".008") == 2
+
+
+def test_computation_time_counts_ended_steps(client: TestClient, db: Session, enrolled: str) -> None:
+    from datetime import UTC, datetime, timedelta
+
+    from app.accounts.permissions import SYSTEM
+    from app.platform.jobs.models import Job, JobStatus, JobStep
+    from app.study import repository
+
+    participant = repository.participant_by_code(db, enrolled, SYSTEM)
+    start = datetime(2026, 3, 2, tzinfo=UTC)
+    fields: dict[str, Any] = {"params": {}, "code_version": "x", "created_by": "test", "kind": "train", "participant_id": participant.id}
+    db.add(Job(id="j", status=JobStatus.SUCCEEDED, finished_at=start, **fields))
+    db.flush()
+    for k, seconds in enumerate((10, 30, 50)):
+        end = start + timedelta(seconds=seconds)
+        step = {"title": "t", "position": k, "status": JobStatus.SUCCEEDED, "started_at": start, "finished_at": end}
+        db.add(JobStep(job_id="j", key=f"train/{k}", **step))
+    db.commit()
+    (row,) = client.get("/api/v1/analyses").json()["computation_time"]
+    assert row == {"job": "train", "step": "train", "n": 3, "median_s": 30.0, "longest_s": 50.0}
+    assert "Computation time" in client.get("/analyses").text
+
+
+def test_without_anything_the_pages_say_so(client: TestClient) -> None:
+    for path in ("/analyses", "/api/v1/analyses", "/analyses/results.csv", "/analyses/results.svg", "/trial-time"):
+        assert client.get(path).status_code == 200, path
