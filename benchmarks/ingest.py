@@ -7,8 +7,8 @@ in the `bench` extra). `peak_rss_mb`: highest memory of a fresh process that dec
 whole, traces and spectra included. `lfp_redact_s`, `lfp_decode_s`: CPU of cleaning a table of raw LFP, and of decoding it.
 `upload_quiet_s`, `upload_training_s`: wall seconds from sending a device recording (the montage of the test recordings, else a synthetic
 one) until its decoded session can be read over the API, median over fresh participants, on a service of its own, quiet and with a training
-job on its worker. `upload_cpu_s`: CPU seconds of the web process and the children that read its files, per upload, which a busy machine does
-not lengthen.
+job on its worker. `upload_cpu_s`: CPU seconds of the web process and of the children that read its files, per upload, which a busy
+machine does not lengthen.
 """
 
 from __future__ import annotations
