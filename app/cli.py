@@ -41,6 +41,7 @@ app.add_typer(upkeep_app)
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Code = Annotated[str, typer.Argument(help="Code of the participant, e.g. P1.")]
 ACTOR = "command line"
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 def main() -> None:
@@ -73,6 +74,8 @@ def serve(
     settings = get_settings()
     supervise_database()
     structlog.get_logger().info("database", lies_in=database_place())
+    if (host or settings.host) not in LOOPBACK and not settings.cookie_secure:
+        structlog.get_logger().warning("other machines reach this service without TLS: use a TLS proxy and set BETALOOP_COOKIE_SECURE")
     service = create_app()
     limited.prepare()  # before the first upload, which would wait for it
     # beside the service, for reading what a crash left behind may take minutes
@@ -253,12 +256,12 @@ def rank(code: Code, as_json: AsJson = False) -> None:
     console = Console()
     title = f"{code}: estimated return over {body['horizon_steps']} steps (method {body['default_method']})"
     table = Table(title=title, caption="STALE: " + body["stale_reason"] if body["stale"] else None)
-    for heading in ("rank", "policy", "return", "interval", "supported"):
+    for heading in ("rank", "policy", "verdict", "return", "interval", "supported"):
         table.add_column(heading)
     for row in body["policies"]:
         best = row["estimates"].get(body["default_method"])
         shown = ("—", "—", "—") if best is None else _estimate_cells(best)
-        table.add_row(str(row["rank"] or "—"), row["name"], *shown)
+        table.add_row(str(row["rank"] or "—"), row["name"], (row["decision"] or "—").replace("_", " "), *shown)
     console.print(table)
     for sentence in body["notes"]:
         console.print(sentence, markup=False, highlight=False)

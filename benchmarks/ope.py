@@ -30,7 +30,7 @@ from support.ope_cases import CDBS, DESIGNS, MATCHED, STEPS, Case, participant_c
 from support.ope_report import figures, report
 from support.page_order import NEEDED, page_order
 
-from app.evaluation.decision import gain_over
+from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate, Estimator
 from ml.ope.registry import POSTERIOR, estimators
 from ml.population.virtual import WORLDS_PER_PART

@@ -80,8 +80,14 @@ class TestedBefore(Model):
     tremor_percent: float | None
 
 
-Decision = Literal["test_next", "needs_data", "reject"]
-DECISION_NAMES: dict[str, str] = {"test_next": "test next", "needs_data": "needs more data", "reject": "reject"}
+Decision = Literal["test", "test_with_care", "same_as_cdbs", "unsafe", "cannot_tell"]
+DECISION_NAMES: dict[str, str] = {
+    "test": "test",
+    "test_with_care": "test with care",
+    "same_as_cdbs": "same as cDBS",
+    "unsafe": "unsafe",
+    "cannot_tell": "cannot tell",
+}
 
 
 class GainOut(Model):
@@ -130,7 +136,10 @@ class RankedPolicy(Model):
     kind: str
     algorithm: str
     teacher_id: int | None
-    rank: int | None = Field(description="1 is best; policies that the data do not support come last. Null for references.")
+    rank: int | None = Field(
+        description="1 is best; unsafe policies, and those that the data do not support, come last. Null for references, and for all "
+        "policies where the data cannot order them."
+    )
     reference: str | None = Field(description="`cdbs`, `best_constant`, `constant`, `proportional` or `cloning`; null for candidates.")
     supported: bool
     probability_best: float | None
@@ -143,7 +152,7 @@ class RankedPolicy(Model):
     coverage: CoverageOut | None = Field(description="Null for an evaluation that did not check it, and where it could not be checked.")
     tested: TestedBefore | None
     gain: GainOut | None = Field(description="Over cDBS by the ranking's method; null where one of the two has no estimate.")
-    decision: Decision | None = Field(description="By stated rules; null for references.")
+    decision: Decision | None = Field(description="By stated rules from the posterior and the participant's margins; null for references.")
     decision_reasons: list[ReasonOut] = Field(description="What the decision rests on; empty for references.")
     decision_reason: str = Field(description="The reasons in words.")
 
@@ -160,53 +169,8 @@ class RankedSnapshot(Model):
     settings_version: int
 
 
-class SkillOut(Model):
-    """How one method predicted controllers that were left out of its fit."""
-
-    model_config = ConfigDict(extra="ignore")  # stored with the evaluation: an older or newer one may hold more
-
-    method: str
-    controllers: int
-    difference_error: float = Field(description="Mean error of predicted differences between two controllers, share of the observed range.")
-    error: float = Field(description="Mean absolute error, share of the observed range.")
-    bias: float = Field(description="Root mean squared error, unit of the return.")
-    excess: float | None = Field(None, description="Error beyond the noise of the observed means, unit of the return: widens intervals.")
-    rank_correlation: float | None
-    pairs_in_order: float = Field(description="Share of pairs of controllers predicted in the observed order.")
-
-
-class HeldOutOut(Model):
-    """One prediction of a left-out controller."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    method: str
-    controller: str
-    sessions: int
-    predicted: float
-    observed: float
-    observed_standard_error: float | None
-    supported: bool
-
-
-class ChoiceOut(Model):
-    """Why the evaluation's default method is the default one."""
-
-    method: str
-    chosen_by_data: bool = Field(description="False: a stated order decided, for the reason given.")
-    reasons: list[ReasonOut] = Field(description="Why; empty for a choice that betaloop 0.1.0 stored, which has words alone.")
-    reason: str = Field(description="The reasons in words.")
-    table: list[SkillOut] = Field(description="Best first.")
-    no_difference_error: float | None = Field(
-        None, description="Error of differences of a prediction that all controllers return the same: a method above it has no skill."
-    )
-    predictions: list[HeldOutOut]
-    failed: dict[str, str]
-    not_compared: list[str] = Field(description="Methods with estimates that were not held against left-out controllers.")
-
-
 class RankingOut(Model):
-    """Candidate policies from best to worst by the default method, and references beside them."""
+    """Candidate policies from best to worst by the default method, the posterior, and references beside them."""
 
     participant: str
     evaluation_id: int
@@ -227,7 +191,7 @@ class RankingOut(Model):
     policies: list[RankedPolicy]
     references: list[RankedPolicy]
     coverage_failed: str | None = Field(description="Why what the data cover could not be checked.")
-    choice: ChoiceOut | None = Field(description="Null for an evaluation from before methods were held against left-out controllers.")
+    choice: None = Field(description="Always null: the posterior ranks, and no method is chosen.")
     hidden: int = Field(0, description="Candidates that the filter leaves out.")
 
 

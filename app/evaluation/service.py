@@ -8,8 +8,9 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.evaluation import repository
-from app.evaluation.estimates.choice import choose, combined, widened
-from app.evaluation.estimates.coverage import STORED, refused
+from app.evaluation.estimates import coverage as checks
+from app.evaluation.estimates import held_out
+from app.evaluation.estimates.held_out import combined, widened
 from app.evaluation.estimates.rows import row_of
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.service import current_ranking as current_ranking
@@ -21,8 +22,9 @@ from app.platform.errors import Invalid
 from app.platform.jobs import service as jobs
 from app.study import repository as study_repository
 from app.study.models import Participant
+from ml.ope.compare.ranking import default_method
 from ml.ope.estimate import Estimate
-from ml.ope.registry import AGGREGATE, shown
+from ml.ope.registry import AGGREGATE, POSTERIOR, shown
 
 
 def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams) -> list[Policy]:
@@ -69,13 +71,16 @@ def store_evaluation(
 ) -> Evaluation:
     """Store every method's estimates of every policy; a job that has stored its evaluation gets that one.
 
+    The ranking follows the posterior; where it could not speak, the first method of the usual order that supports a candidate, and then no
+    candidate is proposed.
+
     Args:
         db: the session. job_id: the job. created_by: who asked for it.
         snapshot: what all estimates rest on. horizon_steps: H.
         candidates: ids of the policies that are ranked; the others are references.
         results: by method `{"estimates": {policy id: Estimate.to_json()}}`, or `{"failed": reason}`.
         config: how the methods ran; where its `methods` name the combination, that is computed here from the others.
-        skill: what `choose_method` found out on left-out controllers; without it a stated order chooses the default method.
+        skill: what `choose_method` found out on left-out controllers: it widens the intervals of the single methods.
         coverage: what `check_coverage` found out; a policy that it refuses is not supported by the data, whatever a method says of it.
 
     Raises:
@@ -97,12 +102,12 @@ def store_evaluation(
             failed[AGGREGATE] = made["failed"]
         else:
             estimates[AGGREGATE] = made["estimates"]
-    estimates = refused(widened(estimates, skill), coverage)
+    estimates = checks.refused(widened(estimates, skill), coverage)
     if not estimates:
         reasons = "; ".join(f"{shown(m).name}: {reason}" for m, reason in failed.items())
         raise Invalid(f"No method could estimate these policies: {reasons}.", "Collect more sessions, then evaluate again.")
     ranked = {m: {i: e for i, e in table.items() if int(i) in set(candidates)} for m, table in estimates.items()}
-    choice = choose({m: table for m, table in ranked.items() if table}, skill)
+    able = {m: table for m, table in ranked.items() if table}
     row = Evaluation(
         participant_id=snapshot.participant_id,
         snapshot_id=snapshot.id,
@@ -110,9 +115,14 @@ def store_evaluation(
         job_id=job_id,
         horizon_steps=horizon_steps,
         gamma=study_repository.settings_version(db, snapshot.settings_version_id).gamma,
-        default_method=choice["method"],
+        default_method=POSTERIOR if POSTERIOR in able else default_method(able),
         config=dict(config),
-        diagnostics={"failed": failed, "candidates": list(candidates), "choice": choice, STORED: dict(coverage or {})},
+        diagnostics={
+            "failed": failed,
+            "candidates": list(candidates),
+            held_out.STORED: held_out.stored(skill, able),
+            checks.STORED: dict(coverage or {}),
+        },
         code_version=jobs.code_version(),
         created_by=created_by,
     )

@@ -22,30 +22,40 @@ def joined(flags: Sequence[Flag]) -> str:
 
 
 def decision(reasons: Sequence[Flag]) -> str:
-    """The reasons of a decision in one line: what it rests on, and what speaks against the policy or that nothing does.
+    """The reasons of a verdict in one line.
 
     Args:
-        reasons: as `app.evaluation.decision.decide` gives them.
+        reasons: as `app.evaluation.ranking.verdicts.decide` gives them.
     """
-    if not reasons:
+    told = [reason for reason in reasons if reason.code not in ("sessions_needed", "near_amplitude")]
+    more = further_sessions(reasons)
+    return "; ".join([*map(sentence, told), *([more] if more else [])])
+
+
+def plainly(reasons: Sequence[Flag], limit: float | None = None, limit_ma: float | None = None) -> str:
+    """A verdict's reason for a reader in a hurry: the deciding finding in plain words, without methods.
+
+    Args:
+        reasons: of the verdict. limit, limit_ma: lowest amplitude of a test with care, fraction of cDBS and mA.
+    """
+    if limit is not None:
+        return f"lower than two sessions ever held: not below {amplitude(limit, limit_ma)}"
+    more = further_sessions(reasons)
+    found = [_PLAINLY[r.code](r) for r in reasons if r.code in _PLAINLY]
+    return "; ".join([*found[:2], *([more] if more else [])])
+
+
+def amplitude(fraction: float, ma: float | None) -> str:
+    """An amplitude in mA; as a share of cDBS where that is not known in mA."""
+    return f"{ma:.1f} mA" if ma is not None else f"{_percent(fraction)} of the cDBS amplitude"
+
+
+def further_sessions(reasons: Sequence[Flag]) -> str:
+    """How many further sessions near which amplitude would tell; empty where none is named."""
+    by_code = {reason.code: reason for reason in reasons}
+    if not {"sessions_needed", "near_amplitude"} <= by_code.keys():
         return ""
-    first, rest = reasons[0], reasons[1:]
-    if first.code == "reference_unsupported":
-        return f"{sentence(first)} {joined(rest)}"
-    if first.code == "not_supported" and rest:
-        return f"{sentence(first)}; {joined(rest)}"
-    if first.code == "gain" and rest:
-        joint = ": " if rest[0].code in _VERDICTS else ", but "
-        return f"{sentence(first)}{joint}{joined(rest)}"
-    return joined(reasons)
-
-
-def choice(reasons: Sequence[Flag]) -> str:
-    """Why a method ranks by default, in words; the last reason may be the usual order, which stands in a sentence of its own."""
-    usual = [reason for reason in reasons if reason.code == "usual_order"]
-    found = [sentence(reason) for reason in reasons if reason.code not in ("usual_order", "beats_usual_order")]
-    text = "; ".join(found) + "".join(f", {sentence(reason)}" for reason in reasons if reason.code == "beats_usual_order")
-    return ". ".join([text[:1].upper() + text[1:], *(sentence(reason) for reason in usual)])
+    return f"{sentence(by_code['sessions_needed'])} {sentence(by_code['near_amplitude'])} would tell"
 
 
 def method_name(key: str) -> str:
@@ -53,10 +63,10 @@ def method_name(key: str) -> str:
     return shown(key).name
 
 
-def signed(value: float) -> str:
-    """A difference with its sign, to one decimal."""
-    shown = round(value, 1)
-    return f"{shown:+.1f}".replace("-", "\N{MINUS SIGN}") if shown else "0.0"
+def signed(value: float, digits: int = 1) -> str:
+    """A difference with its sign."""
+    shown = round(value, digits)
+    return f"{shown:+.{digits}f}".replace("-", "\N{MINUS SIGN}") if shown else f"{0:.{digits}f}"
 
 
 def count(n: int, one: str, many: str) -> str:
@@ -85,12 +95,20 @@ def _thin(flag: Flag) -> str:
     )
 
 
-def _gain(flag: Flag) -> str:
-    low, high = signed(flag.fact("low")), signed(flag.fact("high"))
-    words = f"gain over cDBS {signed(_value(flag))}, {_percent(flag.fact('level'))} interval {low} to {high}"
-    if flag.fact("widened"):
-        return words
-    return f"{words} (not widened: how {method_name(flag.fact('method'))} errs on controllers that it has not seen is not known)"
+OUTCOME_NAMES = {"grasp_hz": "grasp", "rating": "rating", "tremor_percent": "tremor"}
+
+_UNSKILLED = {
+    "no_better_than_equal": "left-out sessions are predicted no better than by calling all of them equal",
+    "contrasts_not_reproduced": "how controllers differed in the sessions is predicted the other way round",
+    "too_few_left_out_sessions": "too few sessions could be left out to see whether they are predicted",
+    "levels_follow_dose": "beta drifted along with the dose, so that the two cannot be told apart",
+}
+"""Why the data cannot order policies, by the codes of `ml.ope.posterior.skill`."""
+
+
+def _no_ordering_skill(flag: Flag) -> str:
+    why = [_UNSKILLED.get(code, code.replace("_", " ")) for code in flag.fact("reasons")]
+    return "the data cannot order policies" + (f": {', and '.join(why)}" if why else "")
 
 
 def _difference_error(flag: Flag) -> str:
@@ -133,7 +151,26 @@ def _cdbs_above(flag: Flag) -> str:
     )
 
 
-_ALIKE = "better than if it had said that all return the same"
+_PLAINLY: dict[str, Callable[[Flag], str]] = {
+    "retired": lambda f: f"retired: {f.fact('text')}",
+    "no_posterior": lambda f: "evaluated by an earlier betaloop: evaluate again",
+    "adverse_event": lambda f: "serious adverse event, not cleared by a clinician",
+    "nearly_off": lambda f: f"nearly off {_percent(f.value)} of the time",
+    "beyond_margin": lambda f: f"{_percent(f.value)} likely worse than cDBS, {OUTCOME_NAMES[f.fact('outcome')]} most of all",
+    "all_below_zero": lambda f: "likely worse than cDBS",
+    "few_near_sessions": lambda f: "hardly any session came near what it does",
+    "few_near_visits": lambda f: "only one visit came near what it does",
+    "outside_range": lambda f: "it asks for amplitudes that nobody has tried",
+    "thin": lambda f: "it asks for amplitudes that were hardly ever tried",
+    "far": lambda f: "it does what no session has shown",
+    "no_ordering_skill": lambda f: "the recordings so far cannot tell policies apart",
+    "coverage_unchecked": lambda f: "what the recordings cover could not be checked",
+    "reference_missing": lambda f: "there is no estimate of cDBS to hold it against",
+    "reference_unsupported": lambda f: "too few sessions of cDBS to hold it against",
+    "outcomes_unknown": lambda f: "no session has grasp, rating or tremor",
+    "undecided": lambda f: "as good as cDBS or worse: still open",
+}
+"""For the first screen of the ranking, by code; what is not here is told further down alone."""
 
 _SENTENCES: dict[str, Callable[[Flag], str]] = {
     TEXT: lambda f: str(f.fact("text")),
@@ -198,24 +235,33 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "no_answer_to_amplitude": lambda f: (
         "the model's answer to the amplitude is no better than none: in left-out sessions it misses how controllers differ"
     ),
-    # of decisions
+    # of verdicts
     "retired": lambda f: f"retired: {f.fact('text')}",
-    "no_estimate": lambda f: f"{method_name(f.fact('method'))} has no estimate of it",
-    "not_supported": lambda f: UNSUPPORTED,
+    "no_posterior": lambda f: "this ranking is of before verdicts were asked of the chances of every outcome: evaluate again",
+    "all_below_zero": lambda f: "its whole estimated gain over cDBS is below 0",
     "coverage_unchecked": lambda f: f"what the data cover could not be checked: {f.fact('text')}",
     "reference_missing": lambda f: "the cDBS reference, which it is held against, has no estimate",
-    "reference_unsupported": lambda f: "the cDBS reference, which it is held against, is itself",
-    "gain": _gain,
-    "all_below_zero": lambda f: "all of it below 0",
-    "may_be_none": lambda f: "it may be none",
-    "nothing_against": lambda f: "its lower 95 % bound is above 0, and no other check speaks against it",
-    "rating_lower": lambda f: f"its rating is predicted at {_value(f):.1f} against {f.fact('cdbs'):.1f} under cDBS",
-    "tremor_higher": lambda f: f"its tremor is predicted at {_value(f):.0f} % against {f.fact('cdbs'):.0f} % under cDBS",
-    "grasp_slower": lambda f: f"its grasp is predicted at {_value(f):.2f} Hz against {f.fact('cdbs'):.2f} Hz under cDBS",
-    "method_sees_loss": lambda f: f"{method_name(f.fact('method'))} sees a loss ({signed(f.fact('low'))} to {signed(f.fact('high'))})",
-    "returned_less": lambda f: (
-        f"its {f.fact('sessions'):.0f} sessions returned {_value(f):.1f} on average, below the estimate's {f.limit:.1f}"
+    "reference_unsupported": lambda f: "the data do not support the cDBS reference, which it is held against",
+    "outcomes_unknown": lambda f: "no session has grasp, rating or tremor: whether it is worse than cDBS cannot be told",
+    "energy_unknown": lambda f: "its energy is not predicted",
+    "no_ordering_skill": _no_ordering_skill,
+    "undecided": lambda f: "neither likely enough to be as good as cDBS nor likely enough to be worse",
+    "adverse_event": lambda f: "a serious adverse event under it has not been cleared by a clinician",
+    "nearly_off": lambda f: f"nearly off, below 20 % of the cDBS amplitude, {_percent(f.value)} of the time (at most {_percent(f.limit)})",
+    "beyond_margin": lambda f: (
+        f"{_percent(f.value)} likely worse than cDBS by more than a margin, {OUTCOME_NAMES[f.fact('outcome')]} most of all "
+        f"(unsafe from {_percent(f.limit)})"
     ),
+    "extrapolates": lambda f: (
+        f"it would hold {_percent(f.value)} of the cDBS amplitude on average; the lowest that two sessions held is {_percent(f.limit)}"
+    ),
+    "acts_like_cdbs": lambda f: f"acts like cDBS: {_percent(f.value)} of its amplitude away from it on average",
+    "within_margins": lambda f: (
+        f"{_percent(f.value)} likely at least as good as cDBS within the margins (a test asks for {_percent(f.limit)})"
+    ),
+    "saves_energy": lambda f: f"{_percent(f.value)} likely to use less energy (a test asks for {_percent(f.limit)})",
+    "sessions_needed": lambda f: count(int(_value(f)), "session", "sessions"),
+    "near_amplitude": lambda f: f"held near {f.value:.1f} mA" if f.unit == "mA" else f"held near {_percent(f.value)} of the cDBS amplitude",
     # of the choice of a method
     "difference_error": _difference_error,
     "beats_usual_order": lambda f: (
@@ -223,21 +269,6 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     ),
     "not_beaten": lambda f: "none was better by more than a standard error than this first of the usual order",
     "too_few_controllers": lambda f: f"the data cannot choose: {_value(f):.0f} controllers could be left out, {f.limit:.0f} are needed",
-    "not_compared": lambda f: "no method was held against left-out controllers",
-    "cannot_choose": lambda f: f"the data cannot choose: {f.fact('text')}",
-    "no_skill": lambda f: f"no method predicted left-out controllers {_ALIKE}",
-    "best_supports_none": lambda f: (
-        f"{method_name(f.fact('method'))} predicted left-out controllers best, but supports none of the candidates"
-    ),
-    "best_has_no_estimate": lambda f: (
-        f"{method_name(f.fact('method'))} predicted left-out controllers best, but has no estimate of these policies"
-    ),
-    "nor_another": lambda f: f"nor does another one that predicted them {_ALIKE}",
-    "skilled": lambda f: f"{method_name(f.fact('method'))} predicted the differences between left-out controllers {_ALIKE}",
-    "best_of_supporting": lambda f: f"{method_name(f.fact('method'))} is the best of those that support a candidate",
-    "usual_order": lambda f: (
-        "Taken is the first method of the usual order that supports a candidate: " + ", ".join(method_name(m) for m in f.fact("methods"))
-    ),
     # of a ranking that the study has left behind
     "settings_changed": lambda f: f"settings version {_value(f):.0f} is in force; this ranking used version {f.limit:.0f}",
     "sessions_changed": _sessions_changed,
@@ -256,5 +287,3 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         + "."
     ),
 }
-
-_VERDICTS = ("all_below_zero", "may_be_none", "nothing_against")

@@ -1,4 +1,4 @@
-"""The kind `evaluate`, and its stages for longer jobs: fit the DLSM, check coverage, estimate by every method, choose one, rank."""
+"""The kind `evaluate`, and its stages for longer jobs: fit the DLSM, check coverage, estimate by every method, rank by the posterior."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from sqlalchemy.orm import Session
 
 from app.evaluation import repository, service
 from app.evaluation.estimates import compute
+from app.evaluation.ranking.results import driven_sessions, tests_of
 from app.evaluation.schemas import EvaluateParams
 from app.learning.models import BufferSnapshot
 from app.learning.policies.baselines import ensure_baselines
 from app.learning.snapshots.buffers import read_buffer
-from app.pipeline.stages import STORE_WEIGHT, ComputeStep, participant_of, plan_on_snapshot
+from app.pipeline.stages import STORE_WEIGHT, ComputeStep, acting, participant_of, plan_on_snapshot
 from app.platform import files
 from app.platform.jobs import JobContext
-from ml.ope.registry import AGGREGATE, shown
+from ml.ope.registry import AGGREGATE, POSTERIOR, shown
 
 FIT_WEIGHT = 15.0
 COVERAGE_STEP = "coverage"
@@ -75,19 +76,23 @@ def store_members(job: JobContext, results: Sequence[dict[str, Any]]) -> dict[st
 
 
 def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, Any], models: dict[str, Any]) -> dict[str, Any]:
-    """Check coverage, estimate candidates and references by every method, choose the default one by left-out controllers, rank."""
+    """Check coverage, estimate candidates and references by every method, the posterior with what tested sessions showed, and rank."""
 
     def choose(db: Session) -> dict[str, Any]:
         row = db.get_one(BufferSnapshot, snapshot["id"])
         candidates = service.policies_to_rank(db, row.participant_id, params)
         buffer = read_buffer(row.file_sha256)
         references = ensure_baselines(db, participant_of(db, job), row, buffer, job.created_by)
+        horizon = params.horizon_steps or row.median_steps
+        everyone = (*candidates, *references)
+        ran = driven_sessions(db, row, acting(job))
         driven = repository.policies_by_id(db, sorted({s.policy_id for s in buffer.sessions if s.policy_id is not None}))
         return {
             "candidates": [p.id for p in candidates],
             "ran": [{"id": p.id, "sha256": p.onnx_sha256} for p in driven.values()],
-            "policies": [{"id": p.id, "sha256": p.onnx_sha256} for p in (*candidates, *references)],
-            "horizon_steps": params.horizon_steps or row.median_steps,
+            "policies": [{"id": p.id, "sha256": p.onnx_sha256} for p in everyone],
+            "horizon_steps": horizon,
+            "tests": tests_of(ran, buffer.settings, horizon, {p.id for p in everyone}),
         }
 
     chosen = job.transact("choose-policies", choose)
@@ -99,10 +104,9 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
         "policies": chosen["policies"],
     }
     methods = _fitted(params)
+    own: dict[str, dict[str, Any]] = {"dlsm": models, POSTERIOR: {"tests": chosen["tests"]}}
     calls: list[ComputeStep] = [(COVERAGE_STEP, "check_coverage", common)]
-    calls += [
-        (f"estimate/{method}", "evaluate_method", common | {"method": method} | (models if method == "dlsm" else {})) for method in methods
-    ]
+    calls += [(f"estimate/{method}", "evaluate_method", common | {"method": method} | own.get(method, {})) for method in methods]
     calls.append((SKILL_STEP, "choose_method", common | {"methods": params.methods, "policies": chosen["ran"]}))
     coverage, *estimates, skill = job.compute_all(calls)
     results = dict(zip(methods, estimates, strict=True))
@@ -126,8 +130,8 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
 
 
 def _fitted(params: EvaluateParams) -> list[str]:
-    """Methods with a compute step: all but the combination, which is computed from their estimates."""
-    return [m for m in params.methods if m != AGGREGATE]
+    """Methods with a compute step: all but the combination, which is computed from their estimates; the posterior always, as it ranks."""
+    return [m for m in dict.fromkeys([*params.methods, POSTERIOR]) if m != AGGREGATE]
 
 
 def _members(params: EvaluateParams) -> int:

@@ -11,8 +11,7 @@ from typing import Protocol
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.evaluation.ranking.service import current_ranking
-from app.evaluation.schemas import RankedPolicy
+from app.evaluation.ranking.service import current_assessment
 from app.learning import repository as learning
 from app.learning.models import Policy
 from app.pipeline.service import start_job
@@ -163,11 +162,13 @@ class ParticipantLoop:
         return ordered[: self.design.preset.policies_per_kind]
 
     def _draft(self, db: Session, person: Participant, visit: Visit) -> None:
-        """Draft the visit from the best-ranked policies of each kind."""
-        ranked = sorted((r for r in current_ranking(db, person, self.caller).policies if r.rank and not r.retired), key=_rank)
-        chosen = [
-            row.policy_id for kind in LEARNED_KINDS for row in [r for r in ranked if r.kind == kind][: self.design.preset.policies_per_kind]
-        ]
+        """Draft the visit from the first policies of each kind in the ranking, without unsafe ones, and with one test with care at most."""
+        found = current_assessment(db, person, self.caller)
+        fit = [a for a in found.candidates if a.decided and not a.decided.needs_override and not a.policy.retired_reason]
+        careful = [a for a in fit if a.decided and a.decided.decision == "test_with_care"]
+        fit = [a for a in fit if a not in careful[1:]]
+        each = self.design.preset.policies_per_kind
+        chosen = [a.policy.id for kind in LEARNED_KINDS for a in [a for a in fit if a.policy.kind == kind][:each]]
         minutes = float(self.design.preset.session_minutes)
         draft = PlanIn(
             policy_ids=chosen,
@@ -175,7 +176,7 @@ class ParticipantLoop:
             washout_minutes=_WASHOUT_MINUTES,
             no_dbs=True,
             seed=(self.design.seed + visit.number) % planning.MAX_SEED,
-            note="Drafted by the simulated study from the best-ranked policies of each kind.",
+            note="Drafted by the simulated study from the first policies of each kind in the ranking.",
         )
         needed = total_minutes(len(chosen), planning.rules_of(draft))
         planning.draft_plan(db, visit, draft.model_copy(update={"total_minutes": max(needed, draft.total_minutes)}), self.caller)
@@ -221,10 +222,6 @@ def _placed(position: int, controller: Controller, policy: Policy | None, day: d
     begins = dt.datetime.combine(day, MORNING) + dt.timedelta(hours=hour)
     begins = begins.replace(microsecond=0)
     return PlacedSession(position=position, controller=controller, policy=policy, begins=begins, hour=hour, steps=steps)
-
-
-def _rank(row: RankedPolicy) -> int:
-    return row.rank or 0
 
 
 def _name(one: PlacedSession) -> str:

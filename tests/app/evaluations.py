@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -16,6 +17,7 @@ from app.learning.snapshots.service import collect, take_snapshot
 from app.study.repository import participant_by_code
 from ml.ope.estimate import Estimate
 from ml.ope.support.coverage import thin
+from tests.ml.ope.posterior.draws import cdbs, constructed
 
 Upload = Callable[..., int]
 
@@ -38,6 +40,11 @@ def estimate(method: str, value: float, *, supported: bool = True, spread: float
     ).to_json()
 
 
+def judged(value: float, **changed: Any) -> dict[str, Any]:
+    """A posterior estimate whose verdict is known: worth a test, but for what `changed` (`tests/ml/ope/posterior/draws.py`) says."""
+    return replace(constructed(value=value, **changed), step_return=value - 80, end_reward=80.0).to_json()
+
+
 @pytest.fixture
 def policies(client: TestClient, upload: Upload) -> list[int]:
     """Ids of three policies made elsewhere, for a participant with four sessions."""
@@ -50,6 +57,34 @@ def policies(client: TestClient, upload: Upload) -> list[int]:
         )
         ids.append(int(answer.json()["id"]))
     return ids
+
+
+@pytest.fixture
+def judge(db: Session, policies: list[int]) -> Callable[..., int]:
+    """Store an evaluation with the posterior of policies by id, and that of cDBS beside them."""
+
+    def store(posterior: dict[int, dict[str, Any]], reference: dict[str, Any] | None = None, **more: Any) -> int:
+        db.rollback()
+        participant = participant_by_code(db, "P1", SYSTEM)
+        snapshot = take_snapshot(db, participant, SYSTEM)
+        baselines = ensure_baselines(db, participant, snapshot, collect(db, participant).buffer, "test")
+        held = next(p.id for p in baselines if p.config.get("amplitude") == 1.0)
+        table = {str(i): e for i, e in posterior.items()} | {str(held): reference or cdbs().to_json()}
+        row = store_evaluation(
+            db,
+            job_id=None,
+            created_by="test",
+            snapshot=snapshot,
+            horizon_steps=snapshot.median_steps,
+            candidates=list(posterior),
+            results={"posterior": {"estimates": table}},
+            config={},
+            **more,
+        )
+        db.commit()
+        return row.id
+
+    return store
 
 
 @pytest.fixture

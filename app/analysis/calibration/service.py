@@ -30,8 +30,8 @@ from app.evaluation import repository
 from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.actual import QUANTITIES, Actual, actual
+from app.evaluation.ranking.assessment import is_cdbs
 from app.evaluation.ranking.results import DrivenSession, driven_sessions
-from app.evaluation.ranking.service import is_cdbs
 from app.learning.models import BufferSnapshot, Policy
 from app.study import blinding
 from app.study import repository as study_repository

@@ -13,6 +13,8 @@ from app.platform.jobs import StepReport, write_atomically
 from ml import progress
 from ml.ope.compare.skill import choose_default
 from ml.ope.dlsm.config import DlsmConfig
+from ml.ope.posterior.further_sessions import session_noise
+from ml.ope.posterior.gaussian import TestedDifference
 from ml.ope.registry import AGGREGATE, Size, build, quick_estimators
 from ml.ope.support.diagnostics import diagnose
 from ml.policies.onnx_policy import OnnxPolicy
@@ -21,6 +23,7 @@ from ml.trajectories import ReplayBuffer
 
 if TYPE_CHECKING:
     from ml.ope.dlsm.estimator import Dlsm
+    from ml.ope.posterior.estimator import Posterior
 
 FIT_SHARE = 0.5
 """Share of an evaluation step's progress that fitting takes."""
@@ -64,7 +67,8 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -
 
     Args:
         params: `snapshot_sha256`, `preset`, `seed`, `method`, `horizon_steps`, `policies` as [{`id`, `sha256`}], and for the DLSM
-            `members`, the stored files of its ensemble; or `failed`, the reason why its ensemble could not be fitted.
+            `members`, the stored files of its ensemble; or `failed`, the reason why its ensemble could not be fitted; for the posterior
+            `tests`, tested sessions as the fields of `TestedDifference`.
         workdir: scratch.
         report: progress, and learning curves where the method trains a network.
 
@@ -75,6 +79,8 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -
         return {"failed": params["failed"]}
     buffer = read_buffer(params["snapshot_sha256"])
     estimator = build(params["method"], params["seed"], _size(params))
+    if params.get("tests"):
+        estimator = cast("Posterior", estimator).with_tests([TestedDifference(**test) for test in params["tests"]])
     for k, sha256 in enumerate(params.get("members", [])):
         write_atomically(workdir / member_file(k), files.read(sha256))
     policies = _policies(params["policies"], buffer)
@@ -109,15 +115,15 @@ def check_coverage(params: dict[str, Any], workdir: Path, report: StepReport) ->
         workdir: not used. report: progress over policies.
 
     Returns:
-        `policies`, by policy id what `ml.ope.support.diagnostics.Diagnostics` holds; or `failed` with the reason where these data cannot be
-        checked.
+        `session_noise`, the standard deviation of each outcome from session to session, and `policies`, by policy id what
+        `ml.ope.support.diagnostics.Diagnostics` holds; or `failed` with the reason where these data cannot be checked.
     """
     buffer = read_buffer(params["snapshot_sha256"])
     try:
         found = diagnose(buffer, _policies(params["policies"], buffer), params["horizon_steps"], report.curves(1.0))
     except ValueError as error:
-        return {"failed": str(error)}
-    return {"policies": {policy_id: _finite(d.to_json()) for policy_id, d in found.items()}}
+        return {"failed": str(error), "session_noise": session_noise(buffer)}
+    return {"policies": {policy_id: _finite(d.to_json()) for policy_id, d in found.items()}, "session_noise": session_noise(buffer)}
 
 
 def choose_method(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:

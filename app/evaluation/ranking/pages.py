@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -10,13 +11,14 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
-from app.evaluation.decision import RULES
-from app.evaluation.estimates import coverage
+from app.evaluation import wording
+from app.evaluation.estimates import coverage, held_out
 from app.evaluation.estimates.methods import names
 from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
+from app.evaluation.ranking.answer import Answer, answer
 from app.evaluation.ranking.export import csv_of
-from app.evaluation.schemas import DECISION_NAMES, RANKING_KINDS, FlagOut, RankedPolicy, RankingFilter, RankingOut
+from app.evaluation.schemas import DECISION_NAMES, RANKING_KINDS, RankingFilter, RankingOut
 from app.learning.snapshots.service import not_ready
 from app.platform.database import Db
 from app.platform.errors import NotFound
@@ -29,7 +31,6 @@ from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.service import may
 from ml.ope import registry as estimators
-from ml.ope.flags import TEXT
 
 router = APIRouter()
 
@@ -50,9 +51,16 @@ def ranking_page(
     """Policies and ranking; the filter form leaves empty what it does not ask for."""
     shown = parse(RankingFilter, {"supported": supported, "kind": kind, "tested": tested})
     found: RankingOut | None = None
+    answered: Answer | None = None
+    held: dict[str, Any] = {}
+    weights: Mapping[str, float] = {}
+    correlation: float | None = None
     missing: dict[str, Any] | None = None
     try:
-        found = ranking.current_ranking(db, participant, caller, method or None, shown)
+        assessment = ranking.current_assessment(db, participant, caller, method or None)
+        found, answered = ranking.ranking_of(db, assessment, shown), answer(assessment)
+        held = held_out.of_evaluation(assessment.evaluation)
+        weights, correlation = assessment.weights, assessment.held_out_correlation
     except NotFound as error:
         missing = error.problem(request.url.path)
     live = _live_jobs(db, participant)
@@ -62,6 +70,16 @@ def ranking_page(
         "evaluation/ranking.html",
         participant=participant,
         ranking=found,
+        answer=answered,
+        held=held,
+        plainly=wording.plainly,
+        amplitude=wording.amplitude,
+        signed=wording.signed,
+        further=wording.further_sessions,
+        weights=weights,
+        correlation=correlation,
+        unfolded=bool(method or shown != RankingFilter()),
+        margins=participant.current_margins,
         missing=missing,
         forest=charts.forest(found) if found else None,
         references=charts.shown_references(found) if found else [],
@@ -69,9 +87,7 @@ def ranking_page(
         method_names=names(),
         method_short={m.key: m.short for m in estimators.methods()},
         decision_names=DECISION_NAMES,
-        beside_decision=_beside_decision,
         coverage=coverage,
-        rules=RULES,
         shown=shown,
         live=live,
         kinds={job.kind: registry.kind(job.kind).title for job in live},
@@ -90,12 +106,6 @@ def ranking_page(
 def ranking_csv(participant: CurrentParticipant, db: Db, caller: CurrentCaller, method: str | None = None) -> Response:
     """The ranking as CSV, by the method that the page ranks by."""
     return csv_of(ranking.current_ranking(db, participant, caller, method))
-
-
-def _beside_decision(policy: RankedPolicy) -> list[FlagOut]:
-    """A policy's flags that its decision does not rest on."""
-    named = {(r.code, r.value, r.limit) for r in policy.decision_reasons}
-    return [f for f in policy.flags if f.code == TEXT or (f.code, f.value, f.limit) not in named]
 
 
 def _live_jobs(db: Session, participant: Participant) -> list[Any]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from sqlalchemy.orm import Session
 
@@ -19,6 +21,7 @@ from app.study.blinding import Arm
 from app.study.models import Controller, SettingsVersion, StudySession
 from app.study.traces import step_table
 from ml.mdp import MdpSettings
+from ml.ope.posterior.tested import TestSession, differences_to_cdbs
 from ml.trajectories import SessionTrajectory
 
 
@@ -82,6 +85,25 @@ def results_by_policy(ran: list[DrivenSession], settings: MdpSettings, horizon_s
         )
         for policy_id, found in results.items()
     }
+
+
+def tests_of(ran: Sequence[DrivenSession], settings: MdpSettings, horizon_steps: int, policy_ids: Collection[int]) -> list[dict[str, Any]]:
+    """Sessions of policies as differences to the same visit's cDBS, for the posterior: fields of `TestedDifference`, JSON-able.
+
+    Args:
+        ran: sessions of policies and of cDBS. settings, horizon_steps: of the estimates.
+        policy_ids: what is evaluated; a session of another policy says nothing here.
+    """
+    sessions = []
+    for session in ran:
+        if session.trajectory is None or (session.policy_id is not None and session.policy_id not in policy_ids):
+            continue
+        result = actual(session.trajectory, settings, horizon_steps)
+        values = {name: v for name, v in result.shown.items() if name != "mean_beta"}
+        if result.value is not None:
+            values["return"] = result.value
+        sessions.append(TestSession(None if session.policy_id is None else str(session.policy_id), session.visit, values))
+    return [asdict(test) for test in differences_to_cdbs(sessions)]
 
 
 def _read(db: Session, session: StudySession, arm: Arm, version: SettingsVersion, snapshot: BufferSnapshot) -> SessionTrajectory | str:

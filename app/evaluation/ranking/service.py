@@ -2,47 +2,29 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Mapping
-
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation import repository, wording
-from app.evaluation.decision import Decided, decide, gain_over
-from app.evaluation.estimates.choice import stored_reasons
-from app.evaluation.estimates.coverage import coverage_by_policy, coverage_failed
-from app.evaluation.estimates.rows import estimate_of
+from app.evaluation.estimates.coverage import coverage_failed
 from app.evaluation.models import Evaluation
+from app.evaluation.ranking.assessment import Assessed, Assessment, assess
 from app.evaluation.ranking.notes import ranking_notes
 from app.evaluation.ranking.results import driven_sessions, results_by_policy
 from app.evaluation.ranking.staleness import stale_reasons
-from app.evaluation.schemas import (
-    ChoiceOut,
-    CoverageOut,
-    EstimateOut,
-    FlagOut,
-    GainOut,
-    RankedPolicy,
-    RankedSnapshot,
-    RankingFilter,
-    RankingOut,
-    TestedBefore,
-)
+from app.evaluation.schemas import CoverageOut, EstimateOut, FlagOut, GainOut, RankedPolicy, RankedSnapshot, RankingFilter, RankingOut
 from app.evaluation.shown import estimate_out, flag_out, reason_out
-from app.learning.models import BufferSnapshot, Policy
+from app.learning.models import BufferSnapshot
 from app.platform.errors import Invalid, NotFound
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Participant
 from app.study.threshold import mdp_settings
-from ml.ope.compare.ranking import rank_policies
+from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate
-from ml.ope.flags import TEXT, distinct
+from ml.ope.flags import distinct
 from ml.ope.registry import method_keys
-
-Table = dict[int, dict[str, Estimate]]
 
 
 def current_ranking(
@@ -53,50 +35,68 @@ def current_ranking(
     Args:
         db: the session. participant: whose.
         caller: decides what may be said about sessions.
-        method: whose estimates rank; the evaluation's default where not given.
+        method: whose estimates rank; the evaluation's default where not given. Verdicts are the posterior's all the same.
         shown: which candidates to give; all where not given.
 
     Raises:
         NotFound: nothing was evaluated yet. Invalid: the method is not in this evaluation.
     """
+    return ranking_of(db, current_assessment(db, participant, caller, method), shown)
+
+
+def current_assessment(db: Session, participant: Participant, caller: Caller, method: str | None = None) -> Assessment:
+    """What the newest evaluation says of every policy, with the verdicts by the margins in force now. Raises as `current_ranking`."""
     study.require(caller, can.READ, participant)
     evaluation = repository.newest_evaluation(db, participant.id)
     if evaluation is None:
         raise NotFound(
             f"Participant {participant.code} has no ranking yet.", "Start a job of kind 'pipeline', or 'evaluate' where there are policies."
         )
-    table = _table(evaluation)
-    methods = [m for m in method_keys() if any(m in by_method for by_method in table.values())]
+    found = assessment_of(db, participant, evaluation, method)
+    settings = mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
+    ran = driven_sessions(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller)
+    return found.with_tests(results_by_policy(ran, settings, evaluation.horizon_steps, found.cdbs_id))
+
+
+def assessment_of(db: Session, participant: Participant, evaluation: Evaluation, method: str | None = None) -> Assessment:
+    """What one evaluation says of every policy, the newest or not, without what sessions showed since.
+
+    Raises:
+        Invalid: it has no estimate by the method.
+    """
+    there = {row.method for row in evaluation.estimates}
+    methods = [m for m in method_keys() if m in there]
     chosen = method or evaluation.default_method
     if chosen not in methods:
         raise Invalid(f"This ranking has no estimates by '{chosen}'.", f"Choose one of {', '.join(methods)}.")
-    policies = repository.policies_by_id(db, list(table))
-    snapshot = db.get_one(BufferSnapshot, evaluation.snapshot_id)
-    settings = mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
-    cdbs = next((i for i, p in policies.items() if is_cdbs(p)), None)
-    tested = results_by_policy(driven_sessions(db, snapshot, caller), settings, evaluation.horizon_steps, cdbs)
-    rows = _rows(evaluation, table, policies, chosen, tested)
-    candidates, references = [r for r in rows if r.reference is None], [r for r in rows if r.reference is not None]
+    policies = repository.policies_by_id(db, [row.policy_id for row in evaluation.estimates])
+    return assess(evaluation, policies, chosen, participant, study_repository.settings_version(db, evaluation.settings_version_id))
+
+
+def ranking_of(db: Session, found: Assessment, shown: RankingFilter | None = None) -> RankingOut:
+    """An assessment as the interface has it."""
+    evaluation, participant = found.evaluation, found.participant
+    candidates, references = [_ranked(found, a) for a in found.candidates], [_ranked(found, a) for a in found.references]
     reasons = [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation)]
     return RankingOut(
         participant=participant.code,
         evaluation_id=evaluation.id,
         job_id=evaluation.job_id,
         created_at=evaluation.created_at,
-        default_method=chosen,
-        methods=methods,
+        default_method=found.method,
+        methods=[m for m in method_keys() if any(m in a.estimates for a in found.assessed)],
         failed_methods=evaluation.diagnostics.get("failed", {}),
         horizon_steps=evaluation.horizon_steps,
         gamma=evaluation.gamma,
-        snapshot=_snapshot_out(db, snapshot),
+        snapshot=_snapshot_out(db, db.get_one(BufferSnapshot, evaluation.snapshot_id)),
         stale=bool(reasons),
         stale_reasons=reasons,
         stale_reason="; ".join(reasons) or None,
-        notes=[wording.sentence(n) for n in ranking_notes(candidates, references, chosen)],
+        notes=[wording.sentence(n) for n in ranking_notes(candidates, references, found.method)],
         policies=[p for p in candidates if _passes(p, shown)],
         references=references,
         coverage_failed=coverage_failed(evaluation),
-        choice=_choice_out(evaluation),
+        choice=None,
         hidden=sum(not _passes(p, shown) for p in candidates),
     )
 
@@ -109,69 +109,36 @@ def _passes(policy: RankedPolicy, shown: RankingFilter | None) -> bool:
     return (policy.supported or not shown.supported) and shown.kind in (None, policy.kind) and shown.tested in (None, tested)
 
 
-def evaluation_notes(db: Session, evaluation: Evaluation) -> list[str]:
+def evaluation_notes(found: Assessment) -> list[str]:
     """The notes of an evaluation's ranking by its own method, whether or not it is the newest."""
-    table = _table(evaluation)
-    rows = _rows(evaluation, table, repository.policies_by_id(db, list(table)), evaluation.default_method, {})
-    candidates, references = [r for r in rows if r.reference is None], [r for r in rows if r.reference is not None]
-    return [wording.sentence(n) for n in ranking_notes(candidates, references, evaluation.default_method)]
+    candidates, references = [_ranked(found, a) for a in found.candidates], [_ranked(found, a) for a in found.references]
+    return [wording.sentence(n) for n in ranking_notes(candidates, references, found.method)]
 
 
-def _table(evaluation: Evaluation) -> Table:
-    table: Table = defaultdict(dict)
-    for row in evaluation.estimates:
-        table[row.policy_id][row.method] = estimate_of(row)
-    return table
-
-
-def _rows(
-    evaluation: Evaluation, table: Table, policies: Mapping[int, Policy], method: str, tested: Mapping[int, TestedBefore]
-) -> list[RankedPolicy]:
-    coverage, unchecked = coverage_by_policy(evaluation), coverage_failed(evaluation)
-    references = {i: _reference(p) for i, p in policies.items() if p.kind == "baseline"}
-    by_method = {i: by[method] for i, by in table.items() if method in by}
-    constants = {i: by_method[i] for i, r in references.items() if r in ("cdbs", "constant") and i in by_method and by_method[i].supported}
-    if constants:
-        best = max(constants, key=lambda i: constants[i].value)
-        if references[best] == "constant":
-            references[best] = "best_constant"
-    candidates = {str(i): e for i, e in by_method.items() if i not in references}
-    places = {int(r.policy): r for r in rank_policies({method: candidates}, method)} if candidates else {}
-    order = sorted(places, key=lambda i: places[i].rank) + sorted(
-        references, key=lambda i: -(by_method[i].value if i in by_method else 0.0)
+def _ranked(found: Assessment, one: Assessed) -> RankedPolicy:
+    policy, chosen, cdbs, decided = one.policy, one.estimate, found.cdbs_estimates.get(found.method), one.decided
+    gain = gain_over(chosen, cdbs) if chosen and cdbs and policy.id != found.cdbs_id else None
+    return RankedPolicy(
+        policy_id=policy.id,
+        name=policy.name,
+        kind=policy.kind,
+        algorithm=policy.algorithm,
+        teacher_id=policy.teacher_id,
+        rank=one.rank,
+        reference=one.reference,
+        supported=chosen.supported if chosen else False,
+        probability_best=one.probability_best,
+        retired=policy.retired_reason is not None,
+        estimates={m: estimate_out(one.estimates[m], EstimateOut) for m in method_keys() if m in one.estimates},
+        predicted=chosen.predicted if chosen else {},
+        flags=_flags(chosen, one.coverage, one.reference is not None),
+        coverage=one.coverage,
+        tested=one.tested,
+        gain=GainOut.model_validate(gain) if gain else None,
+        decision=decided.decision if decided else None,
+        decision_reasons=[reason_out(r) for r in decided.reasons] if decided else [],
+        decision_reason=wording.decision(decided.reasons) if decided else "",
     )
-    cdbs = next((table[i] for i, r in references.items() if r == "cdbs"), {})
-    rows = []
-    for i in order:
-        policy, place, chosen = policies[i], places.get(i), by_method.get(i)
-        gain = gain_over(chosen, cdbs[method]) if chosen and method in cdbs and table[i] is not cdbs else None
-        decided: Decided | None = None
-        if i in places:
-            decided = decide(table[i], cdbs, method, retired_reason=policy.retired_reason, tested=tested.get(i), unchecked=unchecked)
-        rows.append(
-            RankedPolicy(
-                policy_id=i,
-                name=policy.name,
-                kind=policy.kind,
-                algorithm=policy.algorithm,
-                teacher_id=policy.teacher_id,
-                rank=place.rank if place else None,
-                reference=references.get(i),
-                supported=chosen.supported if chosen else False,
-                probability_best=place.probability_best if place else None,
-                retired=policy.retired_reason is not None,
-                estimates={m: estimate_out(table[i][m], EstimateOut) for m in method_keys() if m in table[i]},
-                predicted=chosen.predicted if chosen else {},
-                flags=_flags(chosen, coverage.get(i), i in references),
-                coverage=coverage.get(i),
-                tested=tested.get(i),
-                gain=GainOut.model_validate(gain) if gain else None,
-                decision=decided.decision if decided else None,
-                decision_reasons=[reason_out(r) for r in decided.reasons] if decided else [],
-                decision_reason=wording.decision(decided.reasons) if decided else "",
-            )
-        )
-    return rows
 
 
 def _flags(estimate: Estimate | None, coverage: CoverageOut | None, is_reference: bool) -> list[FlagOut]:
@@ -179,26 +146,6 @@ def _flags(estimate: Estimate | None, coverage: CoverageOut | None, is_reference
     own = distinct(estimate.flags) if estimate else ()
     shown = [flag_out(f) for f in own if not (is_reference and f.code == "no_closed_loop")]
     return shown + [note for note in (coverage.notes if coverage else ()) if note not in shown]
-
-
-def _reference(policy: Policy) -> str:
-    if policy.algorithm != "constant":
-        return policy.algorithm
-    return "cdbs" if is_cdbs(policy) else "constant"
-
-
-def is_cdbs(policy: Policy) -> bool:
-    """Whether a policy is the reference that holds the cDBS amplitude."""
-    return policy.kind == "baseline" and policy.algorithm == "constant" and policy.config.get("amplitude") == 1.0
-
-
-def _choice_out(evaluation: Evaluation) -> ChoiceOut | None:
-    choice = evaluation.diagnostics.get("choice")
-    if not choice:
-        return None
-    reasons = stored_reasons(choice)
-    shown = [reason_out(r) for r in reasons if r.code != TEXT]
-    return ChoiceOut.model_validate(choice | {"reasons": shown, "reason": wording.choice(reasons)})
 
 
 def _snapshot_out(db: Session, row: BufferSnapshot) -> RankedSnapshot:

@@ -25,6 +25,18 @@ def recordings_newest_first(db: Session, participant_id: int, hemisphere: Hemisp
     return db.scalars(query.order_by(Recording.started_at.desc().nulls_last(), Recording.id.desc())).all()
 
 
+def planned_limits(db: Session, participant_id: int, policy_id: int) -> Sequence[float]:
+    """Lowest amplitudes, fractions of cDBS, that the participant's approved plans state for a policy, newest plan first."""
+    found = db.scalars(
+        select(PlanItem.min_fraction)
+        .join(Plan, Plan.id == PlanItem.plan_id)
+        .join(Visit, Visit.id == Plan.visit_id)
+        .where(Visit.participant_id == participant_id, Plan.status == "approved", PlanItem.policy_id == policy_id)
+        .order_by(Plan.id.desc())
+    )
+    return [limit for limit in found if limit is not None]
+
+
 def approved_plans(db: Session, participant_id: int, policy_id: int) -> Sequence[tuple[Plan, int]]:
     """The participant's approved visit plans that a policy stands in, each with its visit's number."""
     rows = db.execute(

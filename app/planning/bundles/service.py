@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -46,8 +47,8 @@ _ZIP = "application/zip"
 class Limits:
     """The clinician's limits of a bundle, mA and mA/s; None takes the default.
 
-    Defaults: the stimulator's own lower limit, or 0 mA where no recording holds one, to the cDBS amplitude, and a ramp that covers this
-    range within one period, as the study's sessions had it.
+    Defaults: the stimulator's own lower limit, or 0 mA where no recording holds one, or that of a test with care in the newest approved
+    plan where it is higher, to the cDBS amplitude, and a ramp that covers this range within one period, as the study's sessions had it.
     """
 
     min_ma: float | None = None
@@ -213,7 +214,7 @@ def _manifest(
             beta_low_hz=version.beta_low_hz,
             beta_high_hz=version.beta_high_hz,
             min_valid_fraction=version.min_valid_fraction,
-            min_ma=(device.min_ma if device else 0.0) if limits.min_ma is None else limits.min_ma,
+            min_ma=_lowest(db, participant, policy, limits, device, cdbs),
             max_ma=cdbs if limits.max_ma is None else limits.max_ma,
             cdbs_ma=cdbs,
             ramp_ma_per_s=cdbs / version.period_s if limits.ramp_ma_per_s is None else limits.ramp_ma_per_s,
@@ -236,6 +237,25 @@ def _manifest(
     except BundleError as error:
         raise _unmade(policy, error) from error
     return manifest, probe_windows(usable, version)
+
+
+def _lowest(db: Session, participant: Participant, policy: Policy, limits: Limits, device: DeviceLimits | None, cdbs_ma: float) -> float:
+    """The lower limit, mA: what is stated, else the highest of the stimulator's own and that of the newest approved plan with the policy.
+
+    Raises:
+        Invalid: a stated limit below that of the plan: the policy was approved to be tested with care, down to that amplitude.
+    """
+    planned = repository.planned_limits(db, participant.id, policy.id)
+    # to the hundredth of a milliampere, upwards, so that rounding never goes below what was approved
+    least = math.ceil(100 * planned[0] * cdbs_ma - 1e-6) / 100 if planned else 0.0
+    if limits.min_ma is None:
+        return max(least, device.min_ma if device else 0.0)
+    if limits.min_ma < least:
+        raise Invalid(
+            f"A lower limit of {limits.min_ma:g} mA is below the {least:g} mA with which policy '{policy.name}' was approved to be tested.",
+            "Raise the lower limit, or leave it out.",
+        )
+    return limits.min_ma
 
 
 def _unmade(policy: Policy, error: Exception) -> Invalid:

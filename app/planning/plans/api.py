@@ -99,5 +99,8 @@ def _session_out(line: PlanLine) -> PlannedSessionOut:
         washout_minutes=line.item.washout_minutes,
         estimate=estimate_out(line.estimate, PlanEstimateOut) if line.estimate else None,
         predicted_energy=line.predicted_energy,
+        verdict=line.item.verdict,
+        min_fraction=line.item.min_fraction,
+        override_reason=line.item.override_reason,
         design=PlannedDesignOut.model_validate(line.design.as_json()) if line.design else None,
     )

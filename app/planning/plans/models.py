@@ -45,6 +45,8 @@ class PlanItem(Base):
         UniqueConstraint("plan_id", "position"),
         CheckConstraint("minutes > 0 and washout_minutes >= 0", name="minutes"),
         CheckConstraint("controller in ('cdbs', 'rl', 'distilled', 'no_dbs', 'random', 'other')", name="controller"),
+        CheckConstraint("min_fraction > 0 and min_fraction <= 1", name="min_fraction"),
+        CheckConstraint("override_reason is null or override_reason <> ''", name="override_reason"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
@@ -55,5 +57,11 @@ class PlanItem(Base):
     minutes: Mapped[float]
     washout_minutes: Mapped[float]
     note: Mapped[str] = mapped_column(Text, server_default="")
+    verdict: Mapped[str | None] = mapped_column(String(20))
+    """What the ranking said of the policy when the plan was drafted."""
+    min_fraction: Mapped[float | None]
+    """Lowest amplitude of the session's envelope, fraction of the cDBS amplitude; None where the plan states none."""
+    override_reason: Mapped[str | None] = mapped_column(Text)
+    """Why a clinician plans an unsafe policy all the same."""
     design: Mapped[dict[str, Any] | None] = mapped_column(JSONB(none_as_null=True))
     """What a random session shall try, `app.planning.plans.designs.Planned.as_json`; null for other controllers and in plans of before."""

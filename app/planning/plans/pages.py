@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -12,16 +13,21 @@ from pydantic import Field
 from sqlalchemy.orm import Session
 from starlette.datastructures import FormData
 
+from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
-from app.evaluation.ranking.service import current_ranking
-from app.evaluation.schemas import RankingOut
+from app.evaluation import wording as evaluation_wording
+from app.evaluation.ranking.answer import Row, answer
+from app.evaluation.ranking.assessment import Assessment
+from app.evaluation.ranking.service import current_assessment
+from app.evaluation.schemas import DECISION_NAMES
 from app.evaluation.wording import method_name, sentence
 from app.learning import repository as learning
+from app.learning.models import Policy
 from app.planning import wording
 from app.planning.plans import repository, service
 from app.planning.plans.schedule import most_policies, total_minutes
-from app.planning.plans.schemas import Id, PlanIn, PlanOptions
+from app.planning.plans.schemas import Id, LimitIn, PlanIn, PlanOptions
 from app.planning.plans.service import PlanView, rules_of
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, NotFound
@@ -30,6 +36,7 @@ from app.platform.web.schemas import Int, Model, PagingQuery
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant, CurrentVisit
 from app.study.models import Participant, Visit
+from app.study.service import may
 
 router = APIRouter()
 
@@ -42,6 +49,7 @@ LABELS = {
     "washout_minutes": "Washout",
     "random_sessions": "Random sessions",
     "note": "Note on the sheet",
+    "min_fraction": "Lowest amplitude, share of cDBS",
     "reason": "Why the approved plan is replaced",
     "visit_id": "Visit",
     "visit_number": "Number of the new visit",
@@ -124,7 +132,12 @@ def _draft(values: FormData) -> PlanIn:
     if len(ids) > 20:
         raise Invalid(f"{len(ids)} policies are chosen; a visit takes 20 at most.", "Tick fewer.")
     options = parse(PlanOptions, values, LABELS)
-    return PlanIn(policy_ids=[int(i) for i in ids], **options.model_dump(exclude_unset=True))
+    reasons, lowest = ({i: str(values.get(f"{name}_{i}", "")).strip() for i in ids} for name in ("override", "limit"))
+    overrides = [{"policy_id": int(i), "reason": text} for i, text in reasons.items() if text]
+    limits = [parse(LimitIn, {"policy_id": i, "min_fraction": text}, LABELS) for i, text in lowest.items() if text]
+    return PlanIn.model_validate(
+        {"policy_ids": [int(i) for i in ids], "overrides": overrides, "limits": limits} | options.model_dump(exclude_unset=True)
+    )
 
 
 def _page(
@@ -136,11 +149,11 @@ def _page(
     except NotFound:
         view = None
     try:
-        ranking: RankingOut | None = current_ranking(db, participant, caller)
+        found: Assessment | None = current_assessment(db, participant, caller)
     except NotFound:
-        ranking = None
+        found = None
     defaults = rules_of(PlanOptions())
-    choices = _choices(db, participant, ranking)
+    choices = _choices(db, participant, found)
     form = _form_values(view, values, choices)
     return render(
         request,
@@ -149,14 +162,19 @@ def _page(
         participant=participant,
         site=participant.site,
         view=view,
-        ranking=ranking,
+        ranking=found,
+        decision_names=DECISION_NAMES,
+        plainly=evaluation_wording.plainly,
+        amplitude=evaluation_wording.amplitude,
+        signed=evaluation_wording.signed,
+        typed=values or {},
+        may_override=may(caller, can.APPROVE_PLAN, participant),
         in_words=sentence,
         design_name=wording.design_name,
         design_words=wording.design_words,
         bound_words=wording.bound_words,
         schedule_words=wording.schedule_words,
         leave_at_once=wording.LEAVE_AT_ONCE,
-        method=method_name(ranking.default_method) if ranking else "",
         plan_method=method_name(view.evaluation.default_method) if view and view.evaluation else "",
         choices=choices,
         form_values=form,
@@ -167,12 +185,21 @@ def _page(
     )
 
 
-def _choices(db: Session, participant: Participant, ranking: RankingOut | None) -> list[dict[str, Any]]:
-    """Policies that may be planned, best first; those that no ranking holds come last."""
-    ranked = {p.policy_id: p for p in ranking.policies} if ranking else {}
-    places = {i: p.rank for i, p in ranked.items() if p.rank is not None}
-    policies = sorted(learning.candidates(db, participant.id), key=lambda p: (places.get(p.id, len(places) + 1), p.id))
-    return [{"policy": p, "ranked": ranked.get(p.id)} for p in policies]
+@dataclass(frozen=True)
+class Choice:
+    """A policy that may be planned, and what the ranking says of it; `row` is None for what no ranking holds."""
+
+    policy: Policy
+    row: Row | None
+
+
+def _choices(db: Session, participant: Participant, found: Assessment | None) -> list[Choice]:
+    """Policies that may be planned, what to test first; those that no ranking holds come last."""
+    answered = answer(found) if found is not None else None
+    rows = answered.everyone() if answered is not None else {}
+    places = {i: k for k, i in enumerate(rows)}
+    policies = sorted(learning.candidates(db, participant.id), key=lambda p: (places.get(p.id, len(places)), p.id))
+    return [Choice(p, rows.get(p.id)) for p in policies]
 
 
 def _chosen(view: PlanView | None, values: FormData | None) -> Sequence[int]:

@@ -31,11 +31,33 @@ class PlanOptions(Model):
     )
 
 
+class OverrideIn(Model):
+    """Why an unsafe policy is planned all the same."""
+
+    policy_id: Id
+    reason: Text = Field(max_length=1000)
+
+
+class LimitIn(Model):
+    """The lowest amplitude under which a policy may run."""
+
+    policy_id: Id
+    min_fraction: Number = Field(gt=0, le=1, description="Fraction of the cDBS amplitude.")
+
+
 class PlanIn(PlanOptions):
     """A plan to draft."""
 
     policy_ids: list[Id] = Field(
         default_factory=list, max_length=20, description="Policies to test, each in one session; none for a visit of random sessions alone."
+    )
+    overrides: list[OverrideIn] = Field(
+        default_factory=list, max_length=20, description="For each unsafe policy the reason of a clinician who may approve plans."
+    )
+    limits: list[LimitIn] = Field(
+        default_factory=list,
+        max_length=20,
+        description="Lowest amplitudes; a policy to be tested with care takes that of its verdict where none is given, and none below it.",
     )
 
 
@@ -95,6 +117,9 @@ class PlannedSessionOut(Model):
     washout_minutes: float
     estimate: PlanEstimateOut | None
     predicted_energy: float | None = Field(description="Mean squared amplitude fraction; cDBS = 1.")
+    verdict: str | None = Field(description="What the ranking said of the policy when the plan was drafted; null for what is not ranked.")
+    min_fraction: float | None = Field(description="Lowest amplitude of the session, fraction of the cDBS amplitude.")
+    override_reason: str | None = Field(description="Why a clinician plans an unsafe policy all the same.")
     design: PlannedDesignOut | None = Field(description="Of a random session: what it shall try; null in plans of before.")
 
 

@@ -15,12 +15,16 @@ from app.evaluation import repository as evaluations
 from app.evaluation import wording
 from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
-from app.evaluation.ranking.service import current_ranking, evaluation_notes
+from app.evaluation.ranking.assessment import Assessment
+from app.evaluation.ranking.service import assessment_of, evaluation_notes
+from app.evaluation.ranking.staleness import stale_reasons
 from app.learning import repository as learning
 from app.learning.models import Policy
+from app.planning import wording as plan_wording
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of, planned_sessions
 from app.planning.plans.models import Plan, PlanItem
+from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
 from app.planning.plans.schedule import Candidate, Rules, schedule
 from app.planning.plans.schemas import PlanIn, PlanOptions
 from app.platform.database import now, set_reason
@@ -86,8 +90,9 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
     """Lay out a visit day from chosen policies. An earlier plan is superseded; an approved one only by who may approve, with a reason.
 
     Raises:
-        NotFound: a policy or ranking that the participant does not have. Forbidden: an approved plan, and a caller who may not approve.
-        Invalid: a retired policy, a day that does not fit, or no reason why an approved plan is replaced.
+        NotFound: a policy or ranking that the participant does not have. Forbidden: an approved plan, or an unsafe policy, and a caller
+            who may not approve. Invalid: a retired policy, a day that does not fit, no reason why an approved plan is replaced, or what
+            `safeguards` refuses.
     """
     participant = visit.participant
     study.require(caller, can.DRAFT_PLAN, participant)
@@ -96,6 +101,9 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
     seed = secrets.randbelow(MAX_SEED) if draft.seed is None else draft.seed
     day = schedule([Candidate(p.id, controller_of(p)) for p in chosen], rules, seed)
     evaluation = _evaluation(db, participant, draft.evaluation_id)
+    found = assessment_of(db, participant, evaluation) if evaluation else None
+    overrides, limits = {o.policy_id: o.reason for o in draft.overrides}, {v.policy_id: v.min_fraction for v in draft.limits}
+    guarded = safeguards(found, chosen, overrides, limits, may_override=study.may(caller, can.APPROVE_PLAN, participant))
     repository.lock_visit(db, visit.id)
     _supersede(db, visit, draft.reason, caller)
     plan = Plan(
@@ -116,6 +124,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
             minutes=s.minutes,
             washout_minutes=s.washout_minutes,
             note="",
+            **asdict(Safeguard() if s.policy_id is None else guarded[s.policy_id]),
             design=next(to_try).as_json() if s.controller is Controller.RANDOM else None,
         )
         for i, s in enumerate(day, start=1)
@@ -133,7 +142,8 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, plan_id: int | None 
         plan_id: the draft that was looked at; None for whatever is there.
 
     Raises:
-        NotFound: no plan. Conflict: approved already, replaced meanwhile, or with a policy that was retired since it was drafted.
+        NotFound: no plan. Conflict: approved already, replaced meanwhile, with a policy that was retired since it was drafted, or what
+            `safeguards.refuse_approval` refuses.
         Invalid: random sessions of held draws, and no cDBS amplitude by which their lower bound is one in milliamperes.
     """
     study.require(caller, can.APPROVE_PLAN, visit.participant)
@@ -150,6 +160,8 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, plan_id: int | None 
                 f"Policy '{line.policy.name}' was retired after this plan was drafted: {line.policy.retired_reason}.",
                 "Draft the visit anew.",
             )
+    stated = [(v.policy, Safeguard(v.item.verdict, v.item.min_fraction, v.item.override_reason)) for v in view.lines if v.policy]
+    refuse_approval(assessment_of(db, visit.participant, view.evaluation) if view.evaluation else None, stated)
     _sign_designs(visit, plan)
     plan.status, plan.approved_at, plan.approved_by = "approved", now(), caller.label
     db.flush()
@@ -252,6 +264,7 @@ def _supersede(db: Session, visit: Visit, reason: str | None, caller: Caller) ->
 
 def _view(db: Session, plan: Plan, visit: Visit, caller: Caller) -> PlanView:
     evaluation = repository.evaluation(db, plan.evaluation_id) if plan.evaluation_id else None
+    found = assessment_of(db, visit.participant, evaluation) if evaluation else None
     estimates = {e.policy_id: estimate_of(e) for e in evaluation.estimates if e.method == evaluation.default_method} if evaluation else {}
     policies = evaluations.policies_by_id(db, [i.policy_id for i in plan.items if i.policy_id is not None])
     lines, start = [], 0.0
@@ -260,8 +273,8 @@ def _view(db: Session, plan: Plan, visit: Visit, caller: Caller) -> PlanView:
         policy = policies.get(item.policy_id) if item.policy_id else None
         lines.append(PlanLine(item, start, policy, estimate, _energy(item, estimate), _design(visit, item)))
         start += item.minutes + item.washout_minutes
-    stale = _stale_reasons(db, visit.participant, evaluation, caller)
-    return PlanView(plan, visit, lines, evaluation, stale, _warnings(db, visit, plan, lines, evaluation, stale))
+    stale = _stale_reasons(db, visit.participant, evaluation)
+    return PlanView(plan, visit, lines, evaluation, stale, _warnings(db, visit, plan, lines, found, stale))
 
 
 def _random_sessions(db: Session, visit: Visit, rules: Rules) -> list[Planned]:
@@ -300,27 +313,29 @@ def _energy(item: PlanItem, estimate: Estimate | None) -> float | None:
     return None if predicted is None else float(predicted)
 
 
-def _stale_reasons(db: Session, participant: Participant, evaluation: Evaluation | None, caller: Caller) -> list[str]:
-    if evaluation is None:
+def _stale_reasons(db: Session, participant: Participant, evaluation: Evaluation | None) -> list[str]:
+    newest = evaluations.newest_evaluation(db, participant.id)
+    if evaluation is None or newest is None:
         return []
-    ranking = current_ranking(db, participant, caller)
-    if ranking.evaluation_id != evaluation.id:
-        return [f"there is a newer ranking (evaluation {ranking.evaluation_id}); this plan rests on evaluation {evaluation.id}"]
-    return ranking.stale_reasons
+    if newest.id != evaluation.id:
+        return [f"there is a newer ranking (evaluation {newest.id}); this plan rests on evaluation {evaluation.id}"]
+    return [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation)]
 
 
 def _warnings(
-    db: Session, visit: Visit, plan: Plan, lines: Sequence[PlanLine], evaluation: Evaluation | None, stale: Sequence[str]
+    db: Session, visit: Visit, plan: Plan, lines: Sequence[PlanLine], found: Assessment | None, stale: Sequence[str]
 ) -> list[str]:
     warnings = [f"The ranking is out of date: {reason}." for reason in stale]
-    if evaluation:
-        warnings += evaluation_notes(db, evaluation)
+    if found:
+        warnings += evaluation_notes(found)
     elif any(line.policy for line in lines):
         warnings.append("No ranking stands behind this plan: the participant's policies have not been evaluated.")
     for line in lines:
         if line.policy is None:
             continue
-        if evaluation and line.estimate is None:
+        cdbs_ma = found.cdbs_ma if found else None
+        warnings += plan_wording.of_item(line.policy.name, line.item.min_fraction, line.item.override_reason, cdbs_ma)
+        if found and line.estimate is None:
             warnings.append(f"Policy '{line.policy.name}' is not in the ranking.")
         flags = wording.joined(line.estimate.flags) if line.estimate else ""
         if line.estimate and not line.estimate.supported:

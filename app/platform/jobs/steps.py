@@ -28,6 +28,9 @@ from app.settings import get_settings, private_folder
 
 log = logging.getLogger(__name__)
 
+KILLED_RETRIES = 1
+"""How often a step is tried again, from its checkpoint, when its process was killed from outside."""
+
 
 @dataclass
 class StopRequests:
@@ -66,9 +69,13 @@ class JobSteps:
         with self.slots.hold(self.ledger.job_id, self.requests.check):
             if skip():
                 return {"ok": False, "skipped": True}
-            if (known := self.ledger.begin(key)) is not None:
-                return known
-            outcome = self.children.run(call, lambda messages: self.ledger.record(key, messages), self.requests.check)
+            for attempt in range(1 + KILLED_RETRIES):
+                if (known := self.ledger.begin(key)) is not None:
+                    return known
+                outcome = self.children.run(call, lambda messages: self.ledger.record(key, messages), self.requests.check)
+                if outcome["ok"] or outcome["cause"] != "killed" or attempt == KILLED_RETRIES:
+                    break
+                log.warning("step %s of job %s: %s It is tried once more", key, self.ledger.job_id, outcome["message"])
         if outcome["ok"]:
             return {"ok": True, "result": self.ledger.commit_step(key, lambda _: outcome["result"])}
         self.ledger.fail_step(key, outcome["message"], outcome["log"])

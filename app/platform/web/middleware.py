@@ -22,6 +22,7 @@ from starlette.middleware.base import RequestResponseEndpoint
 from app.platform.errors import BetaloopError, DatabaseAway, Forbidden, StorageFull, Unauthorized
 from app.platform.web.body_limit import BodyLimit
 from app.platform.web.templates import render
+from app.settings import get_settings
 
 log = structlog.get_logger()
 
@@ -64,6 +65,8 @@ def _secured(request: Request, response: Response) -> Response:
     response.headers["Content-Security-Policy"] = CONTENT_SECURITY_POLICY
     response.headers["X-Content-Type-Options"] = "nosniff"
     response.headers["Referrer-Policy"] = "same-origin"
+    if get_settings().cookie_secure:
+        response.headers["Strict-Transport-Security"] = "max-age=31536000"
     if not request.url.path.startswith("/static/"):
         response.headers.setdefault("Cache-Control", "no-store")
     return response

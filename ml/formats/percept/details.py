@@ -91,13 +91,23 @@ def _program(program: dict[str, Any], side: str, rate_hz: float | None) -> dict[
     own = finite(program.get("RateInHertz"))
     return {
         "side": side,
-        "amplitude_ma": finite(program.get("AmplitudeInMilliAmps")),
+        "amplitude_ma": _amplitude(program),
         "lower_ma": finite(program.get("LowerLimitInMilliAmps")),
         "upper_ma": finite(program.get("UpperLimitInMilliAmps")),
         "rate_hz": rate_hz if own is None else own,
         "pulse_width_us": finite(program.get("PulseWidthInMicroSecond")),
         "contacts": contacts(program.get("ElectrodeState")),
     }
+
+
+def _amplitude(program: dict[str, Any]) -> float | None:
+    """A program's amplitude in mA; of a lead whose segments have amplitudes of their own (SenSight) the sum over its cathodes."""
+    whole = finite(program.get("AmplitudeInMilliAmps"))
+    if whole is not None:
+        return whole
+    cathodes = (e for e in entries(program.get("ElectrodeState")) if word(e.get("ElectrodeStateResult")) == "Negative")
+    known = [own for e in cathodes if (own := finite(e.get("ElectrodeAmplitudeInMilliAmps"))) is not None]
+    return round(sum(known), 3) if known else None
 
 
 def contacts(value: Any) -> str:

@@ -22,7 +22,7 @@ from ml.formats.options import DecodeOptions
 from ml.formats.percept import details
 from ml.formats.percept.enums import word
 from ml.formats.percept.history import history_recording
-from ml.formats.percept.report_json import SIDES, entries, inside, looks_like_report, moment, read_report, side_of
+from ml.formats.percept.report_json import SIDES, entries, inside, looks_like_report, moment, read_report, side_of, utc_offset_h
 from ml.formats.percept.streams import DevicePower, Side, TimeDomain, device_powers, time_domains
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
 from ml.signals import row_means
@@ -144,7 +144,8 @@ def decode_report(report: dict[str, Any], said: FileReport, options: DecodeOptio
     _check_dates(report, recordings, said)
     if not recordings:
         said.flagged.append("a report without data: none of its sections holds samples, history or events")
-    return tuple(replace(r, device_key=device) for r in recordings)
+    offset = {"utc_offset_h": utc_offset_h(report.get("ProgrammerUtcOffset"))}
+    return tuple(replace(r, device_key=device, settings={**r.settings, **offset}) for r in recordings)
 
 
 def device_name(report: dict[str, Any]) -> str | None:

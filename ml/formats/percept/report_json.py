@@ -44,6 +44,7 @@ _TOP_KEY = re.compile(r'"([A-Za-z]{6,40})"\s*:')
 _OPEN_STRING = re.compile(r'"(?:[^"\\]++|\\.)*+\\?\Z', re.DOTALL)
 _INF = re.compile(r"(?<=[\[:,\s])([+-]?)(?:INF|Inf|inf)(?=[\],}\s])")
 _CONTACT = r"(?:ZERO|ONE|TWO|THREE|FOUR|FIVE|SIX|SEVEN|EIGHT|NINE|TEN|ELEVEN)(?:_?[ABC])?"
+_OFFSET = re.compile(r"(?P<sign>[+-])(?P<h>\d\d):(?P<m>[0-5]\d)(:\d\d)?", re.ASCII)
 _CHANNEL = re.compile(rf"(?:ELECTRODE_)?{_CONTACT}(?:_(?:AND|{_CONTACT}|LEFT|RIGHT|RING|SEGMENT)){{0,8}}")
 
 
@@ -160,6 +161,15 @@ def moment(value: Any) -> datetime | None:
     except (ValueError, OverflowError):
         return None
     return when if 1990 <= when.year <= 2200 else None
+
+
+def utc_offset_h(value: Any) -> float | None:
+    """Hours that the programmer's clock was ahead of UTC, from a text like `+01:00`; None for anything else."""
+    found = _OFFSET.fullmatch(value.strip()) if isinstance(value, str) else None
+    if found is None:
+        return None
+    hours = int(found["h"]) + int(found["m"]) / 60.0
+    return None if hours > 14 else -hours if found["sign"] == "-" else hours
 
 
 def side_of(value: Any) -> Literal["left", "right"] | None:

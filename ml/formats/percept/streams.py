@@ -25,6 +25,10 @@ MAX_SPAN_MS = 3 * 24 * 3600 * 1000.0
 """Ticks of one run that span more are broken: nobody streams for three days."""
 
 DEFAULT_RATE_HZ = 250.0
+RATE_TOLERANCE = 0.15
+"""A stated rate may differ by so much from what the ticks say, which count in steps of 50 ms."""
+
+LEAST_PACKETS = 5
 DEFAULT_LFP_RATE_HZ = 2.0
 
 
@@ -113,10 +117,24 @@ def time_domains(section: str, value: Any) -> list[TimeDomain]:
         )
         if data.rate_hz != rate:
             data.notes.append(f"no sampling rate given, {DEFAULT_RATE_HZ:g} Hz assumed")
-        ticks = packet_list(entry.get("TicksInMses", entry.get("TicksInMs")))
-        place(data, packet_list(entry.get("GlobalPacketSizes")), ticks, entry.get("GlobalSequences"))
+        ticks, sizes = packet_list(entry.get("TicksInMses", entry.get("TicksInMs"))), packet_list(entry.get("GlobalPacketSizes"))
+        _check_rate(data, sizes, ticks)
+        place(data, sizes, ticks, entry.get("GlobalSequences"))
         out.append(data)
     return out
+
+
+def _check_rate(data: TimeDomain, sizes: NDArray[np.float64], ticks_ms: NDArray[np.float64]) -> None:
+    """Take the rate from sizes and ticks of the packets where it contradicts the stated one; losses make single packets seem slow."""
+    n = min(sizes.size, ticks_ms.size)
+    if n < LEAST_PACKETS or not _usable(ticks_ms[:n]) or not np.all(np.isfinite(sizes[:n])):
+        return
+    at, first = np.unique(unrolled(ticks_ms[:n]), return_index=True)
+    count = np.add.reduceat(sizes[:n], first)
+    by_ticks = float(np.median(1000.0 * count[1:] / np.diff(at))) if at.size >= LEAST_PACKETS and np.all(np.diff(first) > 0) else 0.0
+    if 1 <= by_ticks <= 10_000 and abs(by_ticks / data.rate_hz - 1.0) > RATE_TOLERANCE:
+        data.notes.append(f"{data.rate_hz:g} Hz is stated, the packets' ticks say {round(by_ticks)} Hz: the ticks count")
+        data.rate_hz = float(round(by_ticks))
 
 
 def place(data: TimeDomain, sizes: NDArray[np.float64], ticks_ms: NDArray[np.float64], sequences: Any = None) -> None:
@@ -137,7 +155,17 @@ def place(data: TimeDomain, sizes: NDArray[np.float64], ticks_ms: NDArray[np.flo
     counts = sizes[:n].astype(np.int64)
     first = np.concatenate(([0], np.cumsum(counts)[:-1]))
     keep = _not_repeated(ticks_ms, packet_list(sequences), data)
-    _pieces(data, first[keep], counts[keep], ticks_ms[keep], int(counts.sum()))
+    listed = int(counts.sum())
+    first, counts, ticks_ms = _one_per_tick(first[keep], counts[keep], ticks_ms[keep])
+    _pieces(data, first, counts, ticks_ms, listed)
+
+
+def _one_per_tick(
+    first: NDArray[np.int64], counts: NDArray[np.int64], ticks_ms: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Packets that follow each other under one tick as one packet: the tick is that of its last sample, and no signal is missing within."""
+    starts = np.flatnonzero(np.concatenate(([True], (np.diff(ticks_ms) != 0) | (first[1:] != first[:-1] + counts[:-1]))))
+    return first[starts], np.add.reduceat(counts, starts), ticks_ms[starts]
 
 
 def _true_sizes(data: TimeDomain, sizes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -224,14 +252,14 @@ def device_powers(value: Any) -> list[DevicePower]:
             continue
         ticks = unrolled(ticks)
         forward = np.concatenate(([True], ticks[1:] > np.maximum.accumulate(ticks)[:-1])) & (ticks - ticks[0] < MAX_SPAN_MS)
-        rate = finite(entry.get("SampleRateInHz"))
+        interval_ms, note = _interval_ms(finite(entry.get("SampleRateInHz")), ticks[forward])
         channels = channel_names(entry.get("Channel"))
         snapshot = entry.get("TherapySnapshot")
         data = DevicePower(
             channels=channels,
             first_packet=moment(entry.get("FirstPacketDateTime")),
             ticks_ms=ticks[forward],
-            interval_ms=1000.0 / (rate if rate is not None and 0.01 <= rate <= 1000 else DEFAULT_LFP_RATE_HZ),
+            interval_ms=interval_ms,
             power={},
             amplitude_ma={},
             snapshot=snapshot if isinstance(snapshot, dict) else {},
@@ -239,12 +267,25 @@ def device_powers(value: Any) -> list[DevicePower]:
         for side in SIDES:
             data.power[side] = _column(rows, side, "LFP")[forward]
             data.amplitude_ma[side] = _column(rows, side, "mA")[forward]
+        if note:
+            data.notes.append(note)
         if dropped := int(np.sum(~forward)):
             data.notes.append(f"{dropped} power values that do not come later than those before them: left out")
         if not channels:
             data.channels = [f"POWER_{side.upper()}" for side in SIDES if np.nanmax(data.power[side], initial=0.0) > 0]
         out.append(data)
     return out
+
+
+def _interval_ms(rate_hz: float | None, ticks_ms: NDArray[np.float64]) -> tuple[float, str | None]:
+    """What one value of the power stands for, ms, and a sentence where the stated rate is not that of the ticks: then the ticks count."""
+    stated = 1000.0 / (rate_hz if rate_hz is not None and 0.01 <= rate_hz <= 1000 else DEFAULT_LFP_RATE_HZ)
+    if ticks_ms.size < LEAST_PACKETS:
+        return stated, None
+    by_ticks = float(np.median(np.diff(ticks_ms)))
+    if abs(by_ticks / stated - 1.0) <= RATE_TOLERANCE or not 1.0 <= by_ticks <= 100_000.0:
+        return stated, None
+    return by_ticks, f"a power value every {stated:g} ms is stated, the ticks say every {by_ticks:g} ms: the ticks count"
 
 
 def _column(rows: list[dict[str, Any]], side: Side, key: str) -> NDArray[np.float64]:

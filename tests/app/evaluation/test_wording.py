@@ -18,9 +18,10 @@ from app.evaluation.models import EstimateRow, Evaluation
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag, distinct
 from ml.ope.support.coverage import thin
-from tests.app.evaluations import estimate
+from tests.app.evaluations import estimate, judged
 
 RANKING = "/api/v1/participants/P1/ranking"
+NEARLY_OFF = {"below_cdbs_20_percent": 0.5}
 WORDS = ("text", "decision_reason", "reason", "notes", "stale_reasons", "stale_reason")
 
 
@@ -32,17 +33,18 @@ def without_words(found: Any) -> Any:
 
 
 def test_reworded_sentences_change_no_rank_support_or_decision(
-    client: TestClient, policies: list[int], evaluate: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+    client: TestClient, policies: list[int], judge: Callable[..., int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     a, b, c = policies
-    evaluate({a: estimate("dlsm", 60.0), b: estimate("dlsm", 99.0, supported=False), c: estimate("dlsm", 30.0)}, {1.0: 45.0, 0.7: 20.0})
+    judge({a: judged(60.0), b: judged(50.0, supported=False, support={"lowest_supported": None}), c: judged(30.0, behaviour=NEARLY_OFF)})
     before = client.get(RANKING).json()
-    assert [p["decision"] for p in before["policies"]] == ["test_next", "reject", "needs_data"]
+    assert [p["decision"] for p in before["policies"]] == ["test", "cannot_tell", "unsafe"]
     page = client.get("/participants/P1/ranking").text
     for name, made in inspect.getmembers(wording, inspect.isfunction):
         if made.__module__ == wording.__name__:
             monkeypatch.setattr(wording, name, lambda *_: "x")
     monkeypatch.setattr(wording, "_SENTENCES", {})
+    monkeypatch.setattr(wording, "_PLAINLY", {})
     after = client.get(RANKING).json()
     assert {f["text"] for p in after["policies"] for f in p["flags"]} == {p["decision_reason"] for p in after["policies"]} == {"x"}
     assert without_words(after) == without_words(before)
@@ -64,18 +66,19 @@ def test_an_evaluation_of_0_1_0_opens_with_its_sentences_and_its_stored_support(
     a, b, c = policies
     evaluate({a: estimate("dlsm", 60.0), b: estimate("dlsm", 99.0, supported=False), c: estimate("dlsm", 50.0)}, {1.0: 45.0})
     row = db.get_one(Evaluation, client.get(RANKING).json()["evaluation_id"])
-    choice = {name: v for name, v in row.diagnostics["choice"].items() if name != "reasons"}
-    row.diagnostics = row.diagnostics | {"choice": choice | {"reason": "linear erred least"}}
+    held = {"method": "dlsm", "chosen_by_data": True, "table": [], "predictions": [], "failed": {}, "not_compared": []}
+    kept = {name: v for name, v in row.diagnostics.items() if name != "held_out"}
+    row.diagnostics = kept | {"choice": held | {"reason": "linear erred least"}}
     db.commit()
     body = client.get(RANKING).json()
     assert [(p["policy_id"], p["supported"], p["decision"]) for p in body["policies"]] == [
-        (a, True, "test_next"), (c, True, "test_next"), (b, False, "needs_data")
+        (a, True, "cannot_tell"), (c, True, "cannot_tell"), (b, False, "cannot_tell")
     ]  # fmt: skip
     assert body["policies"][2]["flags"] == [
         {"code": "text", "value": None, "limit": None, "unit": "", "text": "far from the data, as somebody put it once"}
     ]
-    assert body["policies"][2]["decision_reason"] == "not supported by the data; far from the data, as somebody put it once"
-    assert (body["choice"]["reasons"], body["choice"]["reason"]) == ([], "Linear erred least")
+    assert "evaluate again" in body["policies"][2]["decision_reason"]
+    assert body["choice"] is None
     assert client.get("/participants/P1/ranking").status_code == 200
 
 
@@ -83,7 +86,7 @@ def test_every_code_that_the_science_or_a_rule_makes_has_a_sentence() -> None:
     root = Path(wording.__file__).parents[2]
     sources = [*(root / "ml/ope").rglob("*.py"), *(root / "app/evaluation").rglob("*.py")]
     made = {code for path in sources for code in re.findall(r'(?:Flag|Flag\.of|few_effective)\(\s*"([a-z_]+)"', path.read_text())}
-    assert {"thin", "far", "gain", "usual_order", "few_effective_sessions"} <= made
+    assert {"thin", "far", "beyond_margin", "sessions_needed", "few_effective_sessions"} <= made
     assert made <= set(wording._SENTENCES)
 
 
@@ -96,21 +99,20 @@ def test_flags_survive_their_stored_form_and_are_told_once() -> None:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("reasons", "read"),
-    [
-        ([Flag("no_skill")], "No method predicted left-out controllers better than if it had said that all return the same"),
-        (
-            [Flag.of("difference_error", 0.12, 0.1, "share of range", method="fqe", controllers=4.0), Flag("not_beaten")],
-            "Fitted Q evaluation predicted the differences between 4 left-out controllers with a mean error of 12 % of their range (least "
-            "of all: 10 %); none was better by more than a standard error than this first of the usual order",
-        ),
-        (
-            [Flag.of("difference_error", 0.1, 0.1, "", method="fqe", controllers=4.0), Flag.of("beats_usual_order", method="linear")],
-            "Fitted Q evaluation predicted the differences between 4 left-out controllers with a mean error of 10 % of their range (least "
-            "of all: 10 %), by more than a standard error better than Linear model, the first of the usual order",
-        ),
-    ],
-)
-def test_the_reasons_of_a_choice_read_as_one_sentence_with_methods_by_name(reasons: list[Flag], read: str) -> None:
-    assert wording.choice(reasons) == read
+def test_the_reasons_of_a_verdict_read_as_one_sentence_and_plainly() -> None:
+    reasons = [Flag("undecided"), Flag("within_margins", 0.7, 0.8, "probability"), Flag("sessions_needed", 3.0, None, "sessions")]
+    reasons.append(Flag("near_amplitude", 1.8, None, "mA"))
+    assert wording.decision(reasons) == (
+        "neither likely enough to be as good as cDBS nor likely enough to be worse; 70 % likely at least as good as cDBS within the "
+        "margins (a test asks for 80 %); 3 sessions held near 1.8 mA would tell"
+    )
+    assert wording.plainly(reasons) == "as good as cDBS or worse: still open; 3 sessions held near 1.8 mA would tell"
+    assert wording.plainly([Flag("extrapolates", 0.4, 0.5)], 0.5, 1.5) == "lower than two sessions ever held: not below 1.5 mA"
+    assert (
+        wording.plainly([Flag("extrapolates", 0.4, 0.5)], 0.5) == "lower than two sessions ever held: not below 50 % of the cDBS amplitude"
+    )
+
+
+def test_every_plain_reason_is_a_code_that_has_a_sentence_too() -> None:
+    later = {"few_near_visits"}  # of `ml.ope.posterior.support`
+    assert set(wording._PLAINLY) - later <= set(wording._SENTENCES)

@@ -35,7 +35,8 @@ from ml.ope.support.coverage import AmplitudeSupport, flags_of
 from ml.ope.support.diagnostics import diagnose
 from ml.policies.onnx_policy import OnnxPolicy
 from tests.app.evaluation.estimates.test_compute import buffer_of, call, sessions
-from tests.app.evaluations import estimate
+from tests.app.evaluations import estimate, judged
+from tests.ml.ope.posterior.draws import cdbs as held
 
 RANKING = "/api/v1/participants/P1/ranking"
 REFUSAL = Flag.of("outside_range", 0.4, 0.2, "share", refuses=True, low=0.3, high=1.0)
@@ -63,7 +64,7 @@ def checked(*, failing: tuple[Flag, ...] = (), notes: tuple[Flag, ...] = ()) -> 
 
 @pytest.fixture
 def store(db: Session, policies: list[int]) -> Callable[..., Evaluation]:
-    """Store an evaluation by two methods, with a coverage outcome; cDBS is at 45, the candidates at 60, 99 and 50."""
+    """Store an evaluation by the posterior and two methods, with a coverage outcome; cDBS is at 45, the candidates at 60, 99 and 50."""
 
     def make(outcome: Callable[[list[int]], dict[str, Any]] | dict[str, Any] | None) -> Evaluation:
         participant = participant_by_code(db, "P1", SYSTEM)
@@ -72,6 +73,8 @@ def store(db: Session, policies: list[int]) -> Callable[..., Evaluation]:
         cdbs = next(p.id for p in made if p.config.get("amplitude") == 1.0)
         values = dict(zip(policies, (60.0, 99.0, 50.0), strict=True)) | {cdbs: 45.0}
         results = {m: {"estimates": {str(i): estimate(m, v) for i, v in values.items()}} for m in ("dlsm", "linear")}
+        reference = held(value=45.0).to_json()
+        results["posterior"] = {"estimates": {str(i): reference if i == cdbs else judged(v) for i, v in values.items()}}
         row = store_evaluation(
             db, job_id=None, created_by="test", snapshot=snapshot, horizon_steps=60, candidates=policies, results=results, config={},
             coverage=outcome(list(values)) if callable(outcome) else outcome,
@@ -109,15 +112,15 @@ def test_a_refused_policy_is_unsupported_by_every_method_and_ranks_after_all_oth
 ) -> None:
     a, b, c = policies
     row = store(lambda ids: {"policies": {str(i): checked(failing=(REFUSAL,) if i == b else ()) for i in ids}})
-    assert {(e.method, e.policy_id) for e in row.estimates if not e.supported} == {("dlsm", b), ("linear", b)}
-    for method in ("dlsm", "linear"):
+    assert {(e.method, e.policy_id) for e in row.estimates if not e.supported} == {("dlsm", b), ("linear", b), ("posterior", b)}
+    for method in ("dlsm", "linear", "posterior"):
         body = client.get(RANKING, params={"method": method}).json()
         assert [(p["policy_id"], p["supported"]) for p in body["policies"]] == [(a, True), (c, True), (b, False)]
         refused = body["policies"][2]
-        assert (refused["decision"], refused["decision_reason"]) == ("needs_data", REFUSED)
-        assert (refused["decision_reasons"], refused["flags"][0]["text"]) == (
-            [{"code": "outside_range", "value": 0.4, "limit": 0.2, "unit": "share"}], REFUSED
-        )  # fmt: skip
+        assert refused["decision"] == "test_with_care", "promising, and only down to the lowest dose that two sessions held"
+        assert REFUSED in refused["decision_reason"]
+        assert {"code": "outside_range", "value": 0.4, "limit": 0.2, "unit": "share"} in refused["decision_reasons"]
+        assert refused["flags"][0]["text"] == REFUSED
         assert refused["probability_best"] == 0.0
         assert (refused["coverage"]["supported"], [f["text"] for f in refused["coverage"]["failing"]]) == (False, [REFUSED])
     assert [p["policy_id"] for p in client.get(RANKING, params={"supported": "true"}).json()["policies"]] == [a, c]
@@ -127,7 +130,7 @@ def test_a_note_is_told_and_refuses_nothing(client: TestClient, policies: list[i
     a, b, _ = policies
     store(lambda ids: {"policies": {str(i): checked(notes=(NOTE,) if i == b else ()) for i in ids}})
     ranked = client.get(RANKING).json()["policies"]
-    assert [(p["policy_id"], p["supported"], p["decision"]) for p in ranked[:2]] == [(b, True, "test_next"), (a, True, "test_next")]
+    assert [(p["policy_id"], p["supported"], p["decision"]) for p in ranked[:2]] == [(b, True, "test"), (a, True, "test")]
     assert ([f["code"] for f in ranked[0]["flags"]], ranked[1]["flags"]) == (["unseen_dose"], [])
     assert NOTED in html.unescape(client.get("/participants/P1/ranking").text)
 
@@ -174,7 +177,7 @@ def test_where_nothing_could_be_checked_no_candidate_is_proposed(
     store({"failed": "no session has a complete window"})
     body = client.get(RANKING).json()
     assert body["coverage_failed"] == "no session has a complete window"
-    assert {p["decision"] for p in body["policies"]} == {"needs_data"}
+    assert {p["decision"] for p in body["policies"]} == {"cannot_tell"}
     assert "could not be checked: no session has a complete window" in body["policies"][0]["decision_reason"]
     page = client.get("/participants/P1/ranking").text
     assert "What the data cover could not be checked" in page
@@ -189,7 +192,7 @@ def test_an_evaluation_from_before_the_checks_still_shows(
     db.commit()
     body = client.get(RANKING).json()
     assert [p["coverage"] for p in body["policies"]] == [None] * 3
-    assert (body["coverage_failed"], body["policies"][0]["decision"]) == (None, "test_next")
+    assert (body["coverage_failed"], body["policies"][0]["decision"]) == (None, "test")
     assert "This evaluation was made before these checks were stored" in client.get("/participants/P1/ranking").text
 
 

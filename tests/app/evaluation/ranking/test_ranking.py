@@ -222,7 +222,7 @@ def test_the_csv_has_a_row_for_every_policy_and_method_and_no_formulas(
     ):  # fmt: skip
         assert column in rows[0], column
     assert [r["supported"] for r in rows] == ["True"] * 3
-    assert (rows[0]["decision"], rows[0]["tested_sessions"]) == ("needs_data", "0")
+    assert (rows[0]["decision"], rows[0]["tested_sessions"]) == ("cannot_tell", "0")
     assert client.get("/participants/P1/ranking.csv").text == answer.text
 
 
@@ -267,19 +267,24 @@ def test_the_filter_keeps_ranks_and_says_how_many_it_leaves_out(
     page = client.get("/participants/P1/ranking", params={"method": "dlsm", "supported": "", "kind": "", "tested": "yes"})
     assert page.status_code == 200
     assert "2 of 3 left out" in page.text
-    assert f'name="policy_ids" value="{c}"' in page.text
-    assert f'name="policy_ids" value="{a}"' not in page.text
+    assert '<details class="fold" open>' in page.text, "what was asked of the fold is not hidden in it"
+    fold = page.text[page.text.index('class="fold"') : page.text.index("Single methods") if "Single methods" in page.text else None]
+    candidates = fold[fold.index("Candidates by DLSM") : fold.index("caption>References")]
+    assert f'/policies/{c}"' in candidates
+    assert f'/policies/{a}"' not in candidates
     assert "No candidate passes this filter" in client.get("/participants/P1/ranking", params={"kind": "distilled"}).text
     assert client.get("/participants/P1/ranking", params={"tested": "perhaps"}).status_code == 422
 
 
-def test_every_candidate_has_a_decision_with_its_reason(
-    client: TestClient, policies: list[int], evaluate: Callable[..., int], db: Session
+def test_an_evaluation_without_a_posterior_proposes_nothing_and_says_so(
+    client: TestClient, policies: list[int], evaluate: Callable[..., int]
 ) -> None:
+    """What 0.1.0 called *test next* and *needs more data* cannot be told, what it rejected for a loss is unsafe."""
     a, b, c = policies
     evaluate({a: estimate("dlsm", 60.0), b: estimate("dlsm", 30.0), c: estimate("dlsm", 70.0, supported=False)}, {1.0: 45.0})
     found = {p["policy_id"]: p for p in ranked(client)["policies"]}
-    assert {i: p["decision"] for i, p in found.items()} == {a: "test_next", b: "reject", c: "needs_data"}
+    assert {i: p["decision"] for i, p in found.items()} == {a: "cannot_tell", b: "unsafe", c: "cannot_tell"}
+    assert {i: p["rank"] for i, p in found.items()} == {a: 1, c: 2, b: 3}, "unsafe and unsupported come last"
     reach = 1.645 * 2**0.5 / 1.64  # two independent standard errors of 1 / 1.64
     assert found[a]["gain"] == {
         "value": 15.0,
@@ -287,12 +292,15 @@ def test_every_candidate_has_a_decision_with_its_reason(
         "high": pytest.approx(15 + reach, abs=1e-3),
         "level": 0.9,
     }
-    assert "60 % of steps" in found[c]["decision_reason"]
+    assert [r["code"] for r in found[b]["decision_reasons"]] == ["all_below_zero", "no_posterior"]
     client.patch(f"/api/v1/policies/{a}", json={"retired_reason": "worn out"})
-    assert ranked(client)["policies"][0]["decision_reason"] == "retired: worn out"
+    assert (ranked(client)["policies"][0]["decision"], ranked(client)["policies"][0]["decision_reason"]) == (
+        "cannot_tell",
+        "retired: worn out",
+    )
     page = client.get("/participants/P1/ranking").text
-    assert "test next" not in page.split("The rules, in their order")[0]
-    assert "reject; gain over cDBS" in page
+    assert "No policy is worth a visit yet" in page
+    assert "evaluate again" in page
 
 
 @pytest.mark.parametrize(
@@ -350,7 +358,8 @@ def test_without_end_of_session_rewards_the_predicted_outcomes_stand_beside_the_
     shown = ranked(client)["policies"][0]
     assert (shown["estimates"]["dlsm"]["end_reward"], shown["predicted"]["rating"], shown["predicted"]["grasp_hz"]) == (0.0, 7.5, 2.1)
     page = client.get("/participants/P1/ranking").text
-    row = page[page.index(f'name="policy_ids" value="{policies[0]}"') :].split("</tr>")[0]
+    fold = page[page.index("Candidates by DLSM") :]
+    row = fold[fold.index(f'/policies/{policies[0]}"') :].split("</tr>")[0]
     cells = [cell.split("<")[0] for cell in row.split('<td class="num">')[1:]]
     for value in ("\N{MINUS SIGN}30.00", "0.00", "40 %", "0.9", "2.1", "7.5", "12"):
         assert any(cell.strip().startswith(value) for cell in cells), (value, cells)

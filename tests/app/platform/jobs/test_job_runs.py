@@ -89,6 +89,15 @@ def test_a_step_that_fails_fails_its_job_with_its_message_and_nothing_else(jobs)
     assert worker.poll() is None
 
 
+def test_a_step_whose_process_was_killed_is_tried_once_more(jobs):
+    jobs.start_worker()
+    once, always = jobs.submit("fail", how="killed once"), jobs.submit("fail", how="killed")
+    job = jobs.ended(once)
+    assert (job.status, job.result, [s.attempts for s in job.steps]) == ("succeeded", {"tries": 2}, [2])
+    job = jobs.ended(always)
+    assert (job.status, [s.attempts for s in job.steps]) == ("failed", [2])
+
+
 def test_cancelling_kills_the_children_within_two_seconds(jobs):
     worker = jobs.start_worker(beat_s=5.0)
     job_id = jobs.submit(parts=3, numbers=1000, pause_s=0.1)

@@ -9,8 +9,9 @@ import pytest
 
 from ml.formats import DecodeOptions, decode, sniff
 from ml.formats.identity import redact
+from ml.formats.percept.details import groups
 from ml.formats.percept.enums import word
-from ml.formats.percept.report_json import channel_names, packet_list, side_of
+from ml.formats.percept.report_json import channel_names, packet_list, side_of, utc_offset_h
 from ml.formats.percept.streams import device_powers, time_domains
 from ml.signals import band_pass
 
@@ -319,3 +320,45 @@ def test_enumerations_channels_and_sides_are_read_by_their_shape():
     assert channel_names("ADA_LOVELACE") == []
     assert (side_of("ZERO_AND_THREE_LEFT_RING"), side_of("LEFT_RIGHT"), side_of(None)) == ("left", None, None)
     np.testing.assert_array_equal(packet_list("[1, 2]"), packet_list("1,2,"))
+
+
+def test_a_stated_rate_that_the_ticks_contradict_voids_neither_power_nor_amplitude(write, percept):
+    power = percept.power("ZERO_TWO_LEFT", 40, left_ma=2.0)
+    power["SampleRateInHz"] = 250
+    decoded = decode(write(percept.report(BrainSenseLfp=[power])))
+    left = of_side(decoded, "left")
+    assert trace(left, "band_power").valid.all()
+    assert trace(left, "amplitude").values.tolist() == [2.0] * 10
+    assert any("the ticks say every 500 ms" in text for text in decoded.reports[0].repaired)
+
+
+def test_packets_in_pairs_keep_their_spectrum(write, percept):
+    entry = percept.time_domain("ONE_THREE_RIGHT", percept.sine(20.0), spelling="list")
+    sizes, ticks = [62, 63] * 40, [t for t in entry["TicksInMses"] for _ in range(2)]
+    entry |= {"GlobalPacketSizes": sizes, "TicksInMses": ticks, "GlobalSequences": list(range(80))}
+    (recording,) = decode(write(percept.report(BrainSenseTimeDomain=[entry]))).recordings[:1]
+    (spectrum,) = recording.spectra
+    assert spectrum.hz[np.argmax(spectrum.density)] == 20.0
+    assert spectrum.seconds == 20.0
+
+
+def test_the_programmers_offset_from_utc_stands_with_every_recording(write, percept):
+    run = percept.time_domain("ONE_THREE_RIGHT", percept.sine(20.0))
+    recordings = decode(write(percept.report(BrainSenseTimeDomain=[run]))).recordings
+    assert recordings
+    assert {r.settings["utc_offset_h"] for r in recordings} == {1.0}
+    assert [utc_offset_h(text) for text in ("-07:30", "+05:45:00", "+15:00", "soon", None)] == [-7.5, 5.75, None, None, None]
+
+
+def test_a_group_of_a_directional_lead_has_the_amplitude_of_its_cathodes():
+    def electrode(name, sign, ma=None):
+        state = {"Electrode": f"ElectrodeDef.{name}", "ElectrodeStateResult": f"ElectrodeStateDef.{sign}"}
+        return state if ma is None else state | {"ElectrodeAmplitudeInMilliAmps": ma}
+
+    states = [electrode("SenSight_1a", "Negative", 1.2), electrode("SenSight_1b", "Negative", 0.7), electrode("Case", "Positive", 1.9)]
+    program = {"ProgramId": "ProgramIdDef.FIRST_LEFT", "ElectrodeState": states, "PulseWidthInMicroSecond": 60}
+    group = {"GroupId": "GroupIdDef.GROUP_A", "ProgramSettings": {"LeftHemisphere": {"Programs": [program]}}}
+    assert groups([group])[0]["programs"][0]["amplitude_ma"] == 1.9
+    assert groups([json.loads(json.dumps(group).replace("ElectrodeAmplitudeInMilliAmps", "X"))])[0]["programs"][0]["amplitude_ma"] is None
+    program["AmplitudeInMilliAmps"] = 2.0
+    assert groups([group])[0]["programs"][0]["amplitude_ma"] == 2.0

@@ -139,3 +139,39 @@ def test_whatever_the_lists_hold_every_sample_is_placed_once_and_forward(sizes, 
         assert used <= samples
         assert np.all(np.diff(times_ms(data)) > 0)
         assert data.end_ms - data.begin_ms < 4 * 24 * 3600e3
+
+
+def test_packets_in_pairs_under_one_tick_are_one_stretch():
+    data = placed([62, 63] * 20, np.repeat(1000.0 + 500.0 * np.arange(20), 2))
+    assert (len(data.pieces), data.lost, data.notes) == (1, 0, [])
+    assert (data.begin_ms, data.end_ms) == (500.0, 10_500.0)
+
+
+def test_a_pair_that_is_missing_is_lost_once():
+    ticks = np.repeat(1000.0 + 500.0 * np.delete(np.arange(20), 7), 2)
+    data = placed([62, 63] * 19, ticks)
+    assert (len(data.pieces), data.lost) == (2, 125)
+
+
+def test_a_power_rate_that_the_ticks_contradict_is_that_of_the_ticks():
+    rows = [{"TicksInMs": 1000 + 500 * k, "Left": {"LFP": 10 + k, "mA": 2.0}, "Right": {"LFP": 0, "mA": 0.0}} for k in range(40)]
+    (stated,) = device_powers([{"Channel": "ZERO_TWO_LEFT", "SampleRateInHz": 2, "LfpData": rows}])
+    (wrong,) = device_powers([{"Channel": "ZERO_TWO_LEFT", "SampleRateInHz": 250, "LfpData": rows}])
+    assert (stated.interval_ms, stated.notes) == (500.0, [])
+    assert wrong.interval_ms == 500.0
+    assert wrong.notes == ["a power value every 4 ms is stated, the ticks say every 500 ms: the ticks count"]
+
+
+@pytest.mark.parametrize(("stated", "notes"), [(250, 0), (125, 1), (1000, 1)])
+def test_a_sampling_rate_that_the_ticks_contradict_is_that_of_the_ticks(stated, notes):
+    kept = np.delete(np.arange(40), [10, 11, 25])
+    entry = {
+        "Channel": "ONE_THREE_RIGHT",
+        "SampleRateInHz": stated,
+        "TimeDomainData": [1.0] * (125 * kept.size),
+        "GlobalPacketSizes": [125] * kept.size,
+        "TicksInMses": (1000 + 500 * kept).tolist(),
+        "GlobalSequences": kept.tolist(),
+    }
+    (data,) = time_domains("BrainSenseTimeDomain", [entry])
+    assert (data.rate_hz, data.lost, len(data.notes)) == (250.0, 375, notes)

@@ -1,4 +1,4 @@
-"""The default method is the one with the best held-out skill; a stated order decides where the data cannot."""
+"""What left-out controllers showed of each method: its intervals, the combination, what is stored and shown."""
 
 from __future__ import annotations
 
@@ -13,22 +13,17 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation import wording
-from app.evaluation.decision import gain_over
-from app.evaluation.estimates.choice import choose, combined, difference_errors, no_difference_error, widened
+from app.evaluation.estimates.held_out import combined, difference_errors, no_difference_error, widened
 from app.evaluation.models import Evaluation
 from app.evaluation.service import store_evaluation
 from app.learning.snapshots.service import take_snapshot
 from app.study.repository import participant_by_code
+from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag
-from tests.app.evaluations import estimate
+from tests.app.evaluations import estimate, judged
 
 LEAST = Flag.of("difference_error", 0.2, 0.2, "share of range", method="fqe", controllers=4.0)
-
-
-def words(found: dict[str, Any]) -> str:
-    return wording.choice([Flag.from_json(reason) for reason in found["reasons"]])
 
 
 def skill(method: str, error: float, bias: float = 1.0) -> dict[str, Any]:
@@ -65,54 +60,11 @@ def tables(**supported: bool) -> dict[str, Any]:
     }
 
 
-def test_the_method_with_the_best_skill_is_the_default() -> None:
-    found = choose(tables(dlsm=True, linear=True, fqe=True), outcome("fqe", skill("fqe", 0.1), skill("linear", 0.3)))
-    assert (found["method"], found["chosen_by_data"], found["reasons"]) == ("fqe", True, [LEAST.to_json()])
-    assert found["not_compared"] == ["dlsm"]
-
-
-@pytest.mark.parametrize(
-    ("given", "named"),
-    [
-        (None, "No method was held against left-out controllers"),
-        ({"failed": "too few sessions"}, "The data cannot choose: too few sessions"),
-        (
-            outcome("fqe", by_data=False, reason=Flag("too_few_controllers", 2.0, 3.0, "controllers")),
-            "The data cannot choose: 2 controllers could be left out, 3 are needed. Taken",
-        ),
-        (outcome("wdr", skill("wdr", 0.1)), "Weighted doubly robust predicted left-out controllers best, but has no estimate"),
-        (NO_SKILL, "No method predicted left-out controllers better than if it had said that all return the same"),
-        (outcome("wis", skill("wis", 0.1)), "predicted left-out controllers best, but supports none of the candidates"),
-    ],
-    ids=["not run", "failed", "too few controllers", "no estimate", "no skill", "supports nothing"],
-)
-def test_where_the_data_cannot_choose_the_stated_order_does_and_says_so(given: dict[str, Any] | None, named: str) -> None:
-    found = choose(tables(dlsm=True, linear=True, fqe=True, wis=False), given)
-    assert (found["method"], found["chosen_by_data"]) == ("linear", False)
-    assert named in words(found)
-    assert "usual order" in words(found)
-
-
-def test_where_the_best_method_supports_no_candidate_the_next_best_that_does_is_taken() -> None:
-    skills = (skill("wis", 0.1), skill("fqe", 0.3), skill("linear", 0.4))
-    found = choose(tables(dlsm=True, linear=True, fqe=True, wis=False), outcome("wis", *skills))
-    assert (found["method"], found["chosen_by_data"]) == ("fqe", True)
-    assert "Weighted importance sampling predicted left-out controllers best, but supports none" in words(found)
-    assert "Fitted Q evaluation is the best of those that support a candidate" in words(found)
-
-
 def test_the_error_without_skill_is_that_of_saying_that_all_controllers_are_alike() -> None:
     predictions = NO_SKILL["choice"]["predictions"]
     assert no_difference_error(predictions) == pytest.approx((4 + 10 + 6) / 3 / 10)
     assert no_difference_error(predictions[:1]) is None
     assert no_difference_error([]) is None
-    better = outcome("fqe", skill("fqe", 0.6), skill("linear", 0.9))
-    better["choice"]["predictions"] = predictions
-    assert choose(tables(fqe=True, linear=True), better)["chosen_by_data"] is True
-    # what is next in skill is not taken when it has none
-    worse = outcome("fqe", skill("fqe", 0.6), skill("wdr", 0.9))
-    worse["choice"]["predictions"] = predictions
-    assert choose(tables(linear=True, fqe=False, wdr=True), worse)["method"] == "linear"
 
 
 def test_only_methods_of_known_bias_are_combined() -> None:
@@ -150,47 +102,46 @@ def test_intervals_are_widened_by_the_errors_on_left_out_controllers() -> None:
     assert widened(raw, None) == raw
 
 
-def test_the_choice_is_stored_and_shown_with_its_table(client: TestClient, policies: list[int], db: Session) -> None:
+def test_what_left_out_controllers_showed_is_stored_and_shown_in_the_fold_and_chooses_nothing(
+    client: TestClient, policies: list[int], db: Session
+) -> None:
     participant = participant_by_code(db, "P1", SYSTEM)
     results = {m: {"estimates": {str(i): estimate(m, v) for i, v in zip(policies, values, strict=True)}} for m, values in (
         ("dlsm", (3.0, 2.0, 1.0)), ("fqe", (1.0, 2.0, 3.0)), ("linear", (1.0, 2.0, 3.0))
     )}  # fmt: skip
+    results["posterior"] = {"estimates": {str(i): judged(float(k)) for k, i in enumerate(policies)}}
     store_evaluation(
         db, job_id=None, created_by="test", snapshot=take_snapshot(db, participant, SYSTEM), horizon_steps=60, candidates=policies,
-        results=results, config={"methods": ["dlsm", "fqe", "linear", "aggregate"]},
+        results=results, config={"methods": ["dlsm", "fqe", "linear", "aggregate", "posterior"]},
         skill=outcome("fqe", skill("fqe", 0.12), skill("linear", 0.34)),
     )  # fmt: skip
     db.commit()
-    stored = db.scalars(select(Evaluation)).one()
-    assert (stored.default_method, stored.diagnostics["choice"]["chosen_by_data"]) == ("fqe", True)
+    found = db.scalars(select(Evaluation)).one()
+    assert found.default_method == "posterior"
+    assert [row["difference_error"] for row in found.diagnostics["held_out"]["table"]] == [0.12, 0.34]
     body = client.get("/api/v1/participants/P1/ranking").json()
-    assert [p["policy_id"] for p in body["policies"]] == policies[::-1]
-    assert body["methods"] == ["dlsm", "linear", "fqe", "aggregate"]
-    assert [s["difference_error"] for s in body["choice"]["table"]] == [0.12, 0.34]
+    assert body["choice"] is None
+    assert set(body["methods"]) == {"dlsm", "linear", "fqe", "aggregate", "posterior"}
     page = client.get("/participants/P1/ranking").text
-    assert "Fitted Q evaluation ranks by default. Fitted Q evaluation predicted the differences between 4 left-out controllers" in page
-    assert "Which method to believe" in page
-    assert "best on left-out controllers" in page
+    fold = page[page.index('class="fold"') :]
+    assert "Single methods on controllers that they had not seen" in fold
+    assert "Fitted Q evaluation" not in page[page.index('id="ranking"') : page.index('class="fold"')]
 
 
-def test_the_reason_on_the_page_names_the_method(client: TestClient, policies: list[int], db: Session) -> None:
-    participant = participant_by_code(db, "P1", SYSTEM)
-    results = {m: {"estimates": {str(i): estimate(m, 1.0) for i in policies}} for m in ("fqe", "linear")}
-    store_evaluation(
-        db, job_id=None, created_by="test", snapshot=take_snapshot(db, participant, SYSTEM), horizon_steps=60, candidates=policies,
-        results=results, config={}, skill=outcome("fqe", skill("fqe", 0.12), skill("linear", 0.34)),
-    )  # fmt: skip
-    db.commit()
-    assert client.get("/api/v1/participants/P1/ranking").json()["choice"]["reason"].startswith("Fitted Q evaluation predicted")
-    page = client.get("/participants/P1/ranking").text
-    assert "Fitted Q evaluation ranks by default. Fitted Q evaluation predicted the differences" in page
-    assert "fqe predicted" not in page
-
-
-def test_an_evaluation_without_a_choice_is_still_shown(
+def test_why_no_method_could_be_held_against_the_sessions_is_shown(
     client: TestClient, policies: list[int], evaluate: Callable[..., int], db: Session
 ) -> None:
     evaluate({i: estimate("dlsm", 50.0) for i in policies})
-    body = client.get("/api/v1/participants/P1/ranking").json()
-    assert body["choice"]["chosen_by_data"] is False
-    assert "No method was held against left-out controllers" in body["choice"]["reason"]
+    assert "Single methods on controllers" not in client.get("/participants/P1/ranking").text
+    participant = participant_by_code(db, "P1", SYSTEM)
+    store_evaluation(
+        db, job_id=None, created_by="test", snapshot=take_snapshot(db, participant, SYSTEM), horizon_steps=60, candidates=policies,
+        results={"dlsm": {"estimates": {str(i): estimate("dlsm", 1.0) for i in policies}}}, config={}, skill={"failed": "too few sessions"},
+    )  # fmt: skip
+    db.commit()
+    assert "could not predict left-out controllers: too few sessions" in client.get("/participants/P1/ranking").text
+
+
+def test_the_posterior_is_no_part_of_the_combination() -> None:
+    made = combined(tables(dlsm=True, linear=True, posterior=True), None)
+    assert set(made["estimates"]["1"].details["weights"]) == {"dlsm", "linear"}

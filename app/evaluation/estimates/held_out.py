@@ -1,87 +1,55 @@
-"""The method that a ranking rests on: of those that support a candidate the one that predicted left-out controllers best, else the first
-of a stated order; and the combination of all methods. Which way it was, and the scores behind it, are stored with the evaluation.
+"""What controllers that were left out of the fits showed of each method, stored with the evaluation and shown beside the methods.
+
+A method's intervals are widened by it, and the combination of all methods leaves out methods whose bias it does not tell.
 """
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
+from app.evaluation.models import Evaluation
 from ml.ope.compare.aggregate import combine
-from ml.ope.compare.ranking import default_method
 from ml.ope.compare.skill import with_held_out_error
 from ml.ope.estimate import Estimate
-from ml.ope.flags import Flag
-from ml.ope.registry import AGGREGATE, preference, shown
+from ml.ope.registry import AGGREGATE, POSTERIOR, shown
+
+STORED = "held_out"
+"""Member of an evaluation's diagnostics; `choice` in those of 0.1.0."""
 
 Tables = Mapping[str, Mapping[str, Estimate]]
 
 
-def choose(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The default method of a ranking, JSON-able for the evaluation's diagnostics.
+def stored(outcome: Mapping[str, Any] | None, methods: Iterable[str]) -> dict[str, Any]:
+    """What left-out controllers showed of the methods, JSON-able for the evaluation's diagnostics.
 
     Args:
-        estimates: method -> candidate -> estimate; every method that could speak.
-        outcome: what the compute function `choose_method` gave; None where it was not run.
+        outcome: what the compute function `choose_method` gave; None where it was not run. methods: those with estimates.
 
     Returns:
-        `method`, `chosen_by_data`, `reasons` (flags as JSON), `table` of held-out skill, `no_difference_error`, `predictions`, `failed` and
+        `table` of held-out skill, `no_difference_error`, `predictions`, `failed` by method (or one reason for all under the key "") and
         `not_compared`, the methods with estimates that were not held against left-out controllers.
-
-    Raises:
-        ValueError: no method has any estimate.
     """
     held: Mapping[str, Any] = (outcome or {}).get("choice") or {}
-    table, base = list(held.get("table", [])), no_difference_error(held.get("predictions", []))
-    result = {
+    table = list(held.get("table", []))
+    failed = dict(held.get("failed", {})) | ({"": str(outcome["failed"])} if outcome and "failed" in outcome else {})
+    return {
         "table": table,
-        "no_difference_error": base,
+        "no_difference_error": no_difference_error(held.get("predictions", [])),
         "predictions": list(held.get("predictions", [])),
-        "failed": dict(held.get("failed", {})),
-        "not_compared": [m for m in estimates if m not in {row["method"] for row in table}],
+        "failed": failed,
+        "not_compared": [m for m in methods if m not in {row["method"] for row in table}],
     }
-    if held.get("chosen_by_data"):
-        method, reasons = _by_skill(estimates, held, base)
-        if method is not None:
-            return result | {"method": method, "chosen_by_data": True, "reasons": [r.to_json() for r in reasons]}
-    elif outcome is None:
-        reasons = [Flag("not_compared")]
-    elif "failed" in outcome:
-        reasons = [Flag.of("cannot_choose", text=str(outcome["failed"]))]
-    else:
-        reasons = stored_reasons(held)
-    usual = Flag.of("usual_order", methods=tuple(m for m in preference() if m in estimates))
-    return result | {"method": default_method(estimates), "chosen_by_data": False, "reasons": [r.to_json() for r in (*reasons, usual)]}
 
 
-def stored_reasons(choice: Mapping[str, Any]) -> list[Flag]:
-    """The reasons of a stored choice; betaloop 0.1.0 stored one sentence."""
-    return [Flag.from_json(r) for r in choice.get("reasons", [choice["reason"]] if "reason" in choice else [])]
-
-
-def _by_skill(estimates: Tables, held: Mapping[str, Any], base: float | None) -> tuple[str | None, list[Flag]]:
-    """The most skilful method that supports a candidate with the reasons; None with the reasons against all of them.
-
-    A method whose error of differences is no less than `base`, that of calling all controllers alike, has no skill to be chosen for.
-    """
-    first, most = str(held["method"]), max((row["controllers"] for row in held["table"]), default=0)
-    errors = {row["method"]: float(row["difference_error"]) for row in held["table"] if row["controllers"] == most}
-    skilled = [m for m in dict.fromkeys([first, *errors]) if m in errors and (base is None or errors[m] < base)]
-    able = [m for m in skilled if _supports(estimates.get(m, {}))]
-    if not skilled:
-        return None, [Flag("no_skill")]
-    if able[:1] == [first]:
-        return first, stored_reasons(held)
-    doubt = Flag.of("best_supports_none" if estimates.get(skilled[0]) else "best_has_no_estimate", method=skilled[0])
-    if not able:
-        return None, [doubt, Flag("nor_another")] if len(skilled) > 1 else [doubt]
-    if able[0] == skilled[0]:
-        return able[0], [Flag.of("skilled", method=able[0])]
-    return able[0], [doubt, Flag.of("best_of_supporting", method=able[0])]
+def of_evaluation(evaluation: Evaluation) -> dict[str, Any]:
+    """What `stored` gave when an evaluation was made; empty for one that was made before methods were held against left-out controllers."""
+    kept = evaluation.diagnostics.get(STORED) or evaluation.diagnostics.get("choice") or {}
+    return {"table": [], "no_difference_error": None, "predictions": [], "failed": {}, "not_compared": []} | kept if kept else {}
 
 
 def widened(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, dict[str, Estimate]]:
@@ -142,22 +110,18 @@ def _name(method: str) -> str:
     return shown(method).name
 
 
-def _supports(table: Mapping[str, Estimate]) -> bool:
-    return any(e.supported for e in table.values())
-
-
 def combined(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, Any]:
     """The combination as one more method's result: `{"estimates": {policy id: Estimate}}` or `{"failed": reason}`.
 
-    A method's error has a part that no resampling shows: its bias. Where left-out controllers have shown it, only methods of known bias
-    take part, so that an unknown bias is not taken for none.
+    The posterior, an average of its own, is no part of it. A method's error has a part that no resampling shows: its bias. Where left-out
+    controllers have shown it, only methods of known bias take part, so that an unknown bias is not taken for none.
 
     Args:
         estimates: method -> policy -> estimate. outcome: of `choose_method`.
     """
     table = ((outcome or {}).get("choice") or {}).get("table", [])
     bias = {row["method"]: float(row["bias"]) for row in table if row["method"] != AGGREGATE}
-    parts = {m: by_policy for m, by_policy in estimates.items() if m != AGGREGATE and (not bias or m in bias)}
+    parts = {m: by_policy for m, by_policy in estimates.items() if m not in (AGGREGATE, POSTERIOR) and (not bias or m in bias)}
     if len(parts) < 2:
         spoke = ", ".join(_name(m) for m in parts) or "none"
         return {"failed": f"at least two methods are needed to combine; those that can take part: {spoke}"}

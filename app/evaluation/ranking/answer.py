@@ -1,0 +1,162 @@
+"""What the ranking page answers first: what to test, at what cost and risk, one row per distinct behaviour. Values only, no sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.evaluation.ranking.assessment import Assessed, Assessment
+from app.evaluation.ranking.verdicts import Decided
+from ml.ope.estimate import Estimate
+from ml.ope.posterior.verdict import outcome_draws
+
+ORDER = ("test", "test_with_care", "cannot_tell", "unsafe", "same_as_cdbs")
+"""Rows by what to do with them; within a verdict as the ranking has them."""
+
+SAME_BEHAVIOUR = 0.02
+"""A student whose mean amplitude and distance to cDBS differ from its teacher's by less does what its teacher does."""
+
+OFF_SHARE = 0.8
+"""A policy that is nearly off in more than this share of its steps acts like no stimulation."""
+
+QUANTITIES = ("energy", "grasp_hz", "rating", "tremor_percent")
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A predicted quantity less that under cDBS, with its 90 % interval; energy as a share of that of cDBS."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """One behaviour among the candidates.
+
+    Attributes:
+        twins: policies that do the same, such as its students. decided: the verdict.
+        differences: to cDBS, by quantity; a quantity is absent where it is not predicted.
+        limit_ma: for a test with care, the lowest amplitude, mA (fraction in `limit` where the cDBS amplitude is not known).
+    """
+
+    one: Assessed
+    twins: tuple[Assessed, ...]
+    decided: Decided
+    differences: dict[str, Difference]
+    limit: float | None
+    limit_ma: float | None
+
+    @property
+    def within(self) -> float | None:
+        """Probability of being at least as good as cDBS within the margins."""
+        return self.decided.verdict.within if self.decided.verdict else None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The candidates for a reader: what is worth a visit, what is not, and what is cDBS or no stimulation by another name.
+
+    Attributes:
+        rows: distinct behaviours, what to test first. like_cdbs, like_off: folded away.
+    """
+
+    rows: tuple[Row, ...]
+    like_cdbs: tuple[Row, ...]
+    like_off: tuple[Row, ...]
+    ordered: bool
+
+    def of(self, code: str) -> list[Row]:
+        """Rows with a verdict that are not retired."""
+        return [r for r in self.rows if r.decided.decision == code and r.one.policy.retired_reason is None]
+
+    @property
+    def hazards(self) -> list[Row]:
+        """What is not to be run without a clinician's word, whatever its verdict."""
+        return [r for r in (*self.rows, *self.like_off) if r.decided.needs_override and not r.one.policy.retired_reason]
+
+    def everyone(self) -> dict[int, Row]:
+        """Every candidate's row by the id of its policy, what to test first; twins have the row of what they do the same as."""
+        rows = (*self.rows, *self.like_cdbs, *self.like_off)
+        return {a.policy.id: r for r in rows for a in (r.one, *r.twins)}
+
+    @property
+    def cheapest(self) -> Row | None:
+        """The row that the fewest further sessions would tell."""
+        told = [(n, r) for r in self.rows for n in [_needed(r)] if n is not None]
+        return min(told, key=lambda pair: pair[0])[1] if told else None
+
+
+def answer(found: Assessment) -> Answer:
+    """What to say of an assessment's candidates."""
+    rows = _distinct(found)
+    rows.sort(key=lambda r: ORDER.index(r.decided.decision))  # stable: within a verdict as ranked
+    off = [r for r in rows if _like_off(r.one.posterior)]
+    same = [r for r in rows if r.decided.decision == "same_as_cdbs" and r not in off]
+    return Answer(tuple(r for r in rows if r not in off and r not in same), tuple(same), tuple(off), found.ordered)
+
+
+def differences(own: Estimate | None, cdbs: Estimate | None) -> dict[str, Difference]:
+    """Predicted quantities less those under cDBS, from aligned draws."""
+    found: dict[str, Difference] = {}
+    if own is None or cdbs is None:
+        return found
+    for name in QUANTITIES:
+        ours, theirs = outcome_draws(own, name), outcome_draws(cdbs, name)
+        if ours is None or theirs is None or ours.size != theirs.size:
+            continue
+        apart = (ours - theirs) / np.mean(theirs) if name == "energy" else ours - theirs
+        low, high = np.quantile(apart, [0.05, 0.95])
+        found[name] = Difference(float(apart.mean()), float(low), float(high))
+    return found
+
+
+def _distinct(found: Assessment) -> list[Row]:
+    """Candidates with the students that do the same folded under their teacher."""
+    candidates = [a for a in found.candidates if a.decided is not None]
+    by_id = {a.policy.id: a for a in candidates}
+    twins: dict[int, list[Assessed]] = {}
+    for a in candidates:
+        teacher = by_id.get(a.policy.teacher_id) if a.policy.teacher_id is not None else None
+        if teacher is not None and _same(a, teacher):
+            twins.setdefault(teacher.policy.id, []).append(a)
+    folded = {a.policy.id for group in twins.values() for a in group}
+    return [_row(found, a, twins.get(a.policy.id, ())) for a in candidates if a.policy.id not in folded]
+
+
+def _row(found: Assessment, one: Assessed, twins: Sequence[Assessed]) -> Row:
+    if one.decided is None:
+        raise ValueError(f"policy {one.policy.id} is a reference and has no verdict")
+    limit = one.decided.limit
+    cdbs = found.cdbs.posterior if found.cdbs else None
+    ma = None if limit is None or found.cdbs_ma is None else limit * found.cdbs_ma
+    return Row(one, tuple(twins), one.decided, differences(one.posterior, cdbs), limit, ma)
+
+
+def _same(student: Assessed, teacher: Assessed) -> bool:
+    if student.decided is None or teacher.decided is None or student.decided.decision != teacher.decided.decision:
+        return False
+    if student.decided.needs_override != teacher.decided.needs_override:
+        return False
+    if (student.policy.retired_reason is None) != (teacher.policy.retired_reason is None):
+        return False
+    ours, theirs = _behaviour(student.posterior), _behaviour(teacher.posterior)
+    return bool(ours) and bool(theirs) and all(abs(a - b) < SAME_BEHAVIOUR for a, b in zip(ours, theirs, strict=True))
+
+
+def _behaviour(estimate: Estimate | None) -> tuple[float, ...]:
+    known = (estimate.details.get("behaviour") or {}) if estimate is not None else {}
+    names = ("mean_amplitude", "closeness_to_cdbs", "below_cdbs_20_percent")
+    return tuple(float(known[name]) for name in names) if all(known.get(name) is not None for name in names) else ()
+
+
+def _like_off(estimate: Estimate | None) -> bool:
+    known = (estimate.details.get("behaviour") or {}) if estimate is not None else {}
+    return float(known.get("below_cdbs_20_percent") or 0.0) > OFF_SHARE
+
+
+def _needed(row: Row) -> float | None:
+    return next((r.value for r in row.decided.reasons if r.code == "sessions_needed"), None)

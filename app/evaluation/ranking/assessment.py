@@ -1,0 +1,196 @@
+"""What one evaluation says of every policy: its place, its verdict, what the data cover, and what its sessions showed."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from app.evaluation.estimates.coverage import coverage_by_policy, coverage_failed
+from app.evaluation.estimates.rows import estimate_of
+from app.evaluation.models import Evaluation
+from app.evaluation.ranking.verdicts import Circumstances, Decided, decide, ordering_told, session_noise
+from app.evaluation.schemas import CoverageOut, TestedBefore
+from app.learning.models import Policy
+from app.platform.errors import Invalid
+from app.study import cdbs_amplitude
+from app.study.models import Participant, SettingsVersion
+from ml.ope.compare.ranking import rank_policies
+from ml.ope.estimate import Estimate
+from ml.ope.registry import POSTERIOR
+
+_LAST = ("unsafe",)
+"""Verdicts that come last whatever is estimated, beside policies that the data do not support."""
+
+
+@dataclass(frozen=True)
+class Assessed:
+    """One policy in an evaluation.
+
+    Attributes:
+        reference: `cdbs`, `constant`, `best_constant`, `proportional`, `cloning`; None for a candidate.
+        estimate: by the ranking's method; None where it has none. estimates: of every method.
+        rank: 1 is best; None for references, and where the data cannot order policies. probability_best: likewise.
+        decided: the verdict; None for references. coverage: None where nothing was checked. tested: None where it never ran.
+    """
+
+    policy: Policy
+    reference: str | None
+    estimate: Estimate | None
+    estimates: Mapping[str, Estimate]
+    rank: int | None
+    probability_best: float | None
+    decided: Decided | None
+    coverage: CoverageOut | None
+    tested: TestedBefore | None = None
+
+    @property
+    def posterior(self) -> Estimate | None:
+        """What the verdict rests on."""
+        return self.estimates.get(POSTERIOR)
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """All policies of an evaluation, candidates from best to worst (by name where the data cannot order them), then references.
+
+    Attributes:
+        method: whose estimates rank. cdbs_ma: the cDBS amplitude now, mA; None where it is not known or differs by side.
+        ordered: whether the data can order policies.
+    """
+
+    evaluation: Evaluation
+    participant: Participant
+    method: str
+    assessed: tuple[Assessed, ...]
+    cdbs_ma: float | None
+    ordered: bool
+
+    @property
+    def candidates(self) -> list[Assessed]:
+        """What is ranked."""
+        return [a for a in self.assessed if a.reference is None]
+
+    @property
+    def references(self) -> list[Assessed]:
+        """What candidates are held against."""
+        return [a for a in self.assessed if a.reference is not None]
+
+    @property
+    def cdbs(self) -> Assessed | None:
+        """The cDBS reference."""
+        return next((a for a in self.assessed if a.reference == "cdbs"), None)
+
+    @property
+    def cdbs_id(self) -> int | None:
+        """Id of the policy that holds the cDBS amplitude."""
+        return self.cdbs.policy.id if self.cdbs else None
+
+    @property
+    def cdbs_estimates(self) -> Mapping[str, Estimate]:
+        """Estimates of cDBS by method."""
+        return self.cdbs.estimates if self.cdbs else {}
+
+    @property
+    def weights(self) -> Mapping[str, float]:
+        """How the structures behind the posterior were averaged, the same for all policies; empty where there is no posterior."""
+        return self._posterior_detail("weights")
+
+    @property
+    def held_out_correlation(self) -> float | None:
+        """Of predicted with observed rewards of left-out sessions; None where it is not known."""
+        return self._posterior_detail("skill").get("held_out_correlation")
+
+    def _posterior_detail(self, name: str) -> Mapping[str, Any]:
+        found = next((a.posterior for a in self.assessed if a.posterior is not None), None)
+        return (found.details.get(name) or {}) if found is not None else {}
+
+    def of(self, policy_id: int) -> Assessed | None:
+        """One policy; None where the evaluation does not have it."""
+        return next((a for a in self.assessed if a.policy.id == policy_id), None)
+
+    def with_tests(self, tested: Mapping[int, TestedBefore]) -> Assessment:
+        """The same with what sessions showed, by policy."""
+        return replace(self, assessed=tuple(replace(a, tested=tested.get(a.policy.id)) for a in self.assessed))
+
+
+def assess(
+    evaluation: Evaluation, policies: Mapping[int, Policy], method: str, participant: Participant, version: SettingsVersion
+) -> Assessment:
+    """What an evaluation says of its policies by one method, with the verdicts by the participant's margins of now.
+
+    Args:
+        evaluation: with its estimates. policies: all of them, by id. method: whose estimates rank; one of the evaluation's.
+        participant: whose. version: the settings that the evaluation rests on.
+    """
+    table: dict[int, dict[str, Estimate]] = defaultdict(dict)
+    for row in evaluation.estimates:
+        table[row.policy_id][row.method] = estimate_of(row)
+    coverage, by_method = coverage_by_policy(evaluation), {i: by[method] for i, by in table.items() if method in by}
+    references = _references(policies, by_method)
+    cdbs = next((table[i] for i, r in references.items() if r == "cdbs"), {})
+    cdbs_ma = _cdbs_ma(participant)
+    given = Circumstances(
+        evaluation.id,
+        evaluation.created_at,
+        participant.current_margins,
+        coverage_failed(evaluation),
+        session_noise(evaluation),
+        version.lower_bound,
+        cdbs_ma,
+    )
+    candidates = {i: e for i, e in by_method.items() if i not in references}
+    decided = {
+        i: decide(table[i], cdbs, evaluation.default_method, given, i, retired_reason=policies[i].retired_reason) for i in candidates
+    }
+    ordered = ordering_told({i: by[POSTERIOR] for i, by in table.items() if POSTERIOR in by and i not in references})
+    # who is unsafe comes last, as who is not supported does
+    held_back = {str(i): replace(e, supported=e.supported and decided[i].decision not in _LAST) for i, e in candidates.items()}
+    places = {int(r.policy): r for r in rank_policies({method: held_back}, method)} if candidates else {}
+    order = sorted(places, key=lambda i: places[i].rank) if ordered else sorted(places, key=lambda i: (policies[i].name, i))
+    order += sorted(references, key=lambda i: -(by_method[i].value if i in by_method else 0.0))
+    found = tuple(
+        Assessed(
+            policies[i],
+            references.get(i),
+            by_method.get(i),
+            table[i],
+            places[i].rank if i in places and ordered else None,
+            places[i].probability_best if i in places and ordered else None,
+            decided.get(i),
+            coverage.get(i),
+        )
+        for i in order
+    )
+    return Assessment(evaluation, participant, method, found, cdbs_ma, ordered)
+
+
+def _references(policies: Mapping[int, Policy], by_method: Mapping[int, Estimate]) -> dict[int, str]:
+    """Kinds of the policies that are not ranked; the best constant is so by its own estimate."""
+    references = {i: _reference(p) for i, p in policies.items() if p.kind == "baseline"}
+    constants = {i: by_method[i] for i, r in references.items() if r in ("cdbs", "constant") and i in by_method and by_method[i].supported}
+    if constants:
+        best = max(constants, key=lambda i: constants[i].value)
+        if references[best] == "constant":
+            references[best] = "best_constant"
+    return references
+
+
+def _reference(policy: Policy) -> str:
+    if policy.algorithm != "constant":
+        return policy.algorithm
+    return "cdbs" if is_cdbs(policy) else "constant"
+
+
+def is_cdbs(policy: Policy) -> bool:
+    """Whether a policy is the reference that holds the cDBS amplitude."""
+    return policy.kind == "baseline" and policy.algorithm == "constant" and policy.config.get("amplitude") == 1.0
+
+
+def _cdbs_ma(participant: Participant) -> float | None:
+    """The cDBS amplitude, mA; None where nobody stated one, or each side has its own: amplitudes are then told as shares of cDBS."""
+    try:
+        return cdbs_amplitude.in_force_now(participant, None)
+    except Invalid:
+        return None

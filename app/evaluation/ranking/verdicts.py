@@ -1,0 +1,153 @@
+"""The verdict on each candidate of an evaluation: from the posterior, the participant's margins and levels, and what is known besides."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from app.evaluation.models import Evaluation
+from app.evaluation.schemas import Decision
+from app.study.margins.service import margins_of
+from app.study.models import MarginsVersion
+from ml.ope.compare.gain import gain_over
+from ml.ope.estimate import Estimate
+from ml.ope.flags import Flag
+from ml.ope.posterior.further_sessions import sessions_to_tell
+from ml.ope.posterior.verdict import HAZARDS, Levels, Verdict, slacks, verdict
+from ml.ope.registry import POSTERIOR
+
+SESSION_NOISE = "session_noise"
+"""Member of what `check_coverage` found: standard deviation of each outcome from session to session."""
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """What verdicts of one evaluation share.
+
+    Attributes:
+        evaluation_id, evaluated_at: of the evaluation. margins: of the participant, in force now.
+        unchecked: why what the data cover could not be checked; None where it was.
+        noise: of a session, by outcome. lowest_dose: B, below which no further session is asked for.
+        cdbs_ma: the cDBS amplitude, mA; None where it is not known.
+    """
+
+    evaluation_id: int
+    evaluated_at: datetime
+    margins: MarginsVersion
+    unchecked: str | None
+    noise: Mapping[str, float]
+    lowest_dose: float
+    cdbs_ma: float | None
+
+
+@dataclass(frozen=True)
+class Decided:
+    """A verdict with its reasons, in the order in which they count; `wording.decision` makes a sentence of them."""
+
+    decision: Decision
+    reasons: tuple[Flag, ...]
+    verdict: Verdict | None = None
+
+    @property
+    def hazards(self) -> tuple[Flag, ...]:
+        """The reasons for which it is not to be run without a clinician's word."""
+        return tuple(reason for reason in self.reasons if reason.code in HAZARDS)
+
+    @property
+    def needs_override(self) -> bool:
+        """Whether it may only be planned with a clinician's stated reason."""
+        return self.decision == "unsafe" or bool(self.hazards)
+
+    @property
+    def limit(self) -> float | None:
+        """For a test with care: the lowest amplitude of its envelope, fraction of cDBS."""
+        return self.verdict.limit if self.verdict else None
+
+
+def decide(
+    estimates: Mapping[str, Estimate],
+    cdbs: Mapping[str, Estimate],
+    method: str,
+    given: Circumstances,
+    policy_id: int,
+    *,
+    retired_reason: str | None = None,
+    adverse_event: bool = False,
+) -> Decided:
+    """The verdict on one candidate.
+
+    A retired policy cannot be told: it is not proposed, whatever is predicted. Nor can one of an evaluation without a posterior: a single
+    method knows no chance of keeping within the margins. What rankings of before called *reject*, a whole interval of the gain over cDBS
+    below 0, is *unsafe*; their *test next* and *needs more data* are *cannot tell* until the policies are evaluated again.
+
+    Args:
+        estimates: of the candidate, by method. cdbs: of the cDBS reference, by method; empty where it has none.
+        method: that the evaluation ranks by.
+        given: what all verdicts of the evaluation share. policy_id: whose.
+        retired_reason: why a person withdrew it.
+        adverse_event: whether a serious adverse event under it has not been cleared. Nothing records such events yet: it is False for all.
+    """
+    if retired_reason:
+        return Decided("cannot_tell", (Flag.of("retired", text=retired_reason),))
+    own = estimates.get(POSTERIOR)
+    if own is None:
+        return _without_posterior(estimates.get(method), cdbs.get(method))
+    reference, levels = cdbs.get(POSTERIOR), levels_of(given.margins)
+    found = verdict(own, reference, margins_of(given.margins), levels, adverse_event=adverse_event, unchecked=given.unchecked)
+    more = _further(own, reference, given, levels, policy_id) if found.code == "cannot_tell" and not found.hazards else ()
+    return Decided(found.code, (*found.reasons, *more), found)
+
+
+def levels_of(margins: MarginsVersion) -> Levels:
+    """The levels of a version, for science."""
+    return Levels(margins.test_within, margins.test_saves, margins.unsafe_beyond, margins.nearly_off_share)
+
+
+def ordering_told(posterior: Mapping[int, Estimate]) -> bool:
+    """Whether the data can order policies; True where an evaluation has no posterior, and its order is that of a single method."""
+    return all((e.details.get("skill") or {}).get("told", False) for e in posterior.values())
+
+
+def session_noise(evaluation: Evaluation) -> dict[str, float]:
+    """Standard deviation of each outcome from session to session, as it was when the evaluation was made; empty where it is not known."""
+    stored: Mapping[str, Any] = evaluation.diagnostics.get("coverage") or {}
+    return {name: float(v) for name, v in (stored.get(SESSION_NOISE) or {}).items()}
+
+
+def _without_posterior(own: Estimate | None, reference: Estimate | None) -> Decided:
+    unknown = Flag("no_posterior")
+    if own is not None and reference is not None:
+        over = gain_over(own, reference)
+        if over.high < 0:
+            return Decided("unsafe", (Flag("all_below_zero", over.high, 0.0, "reward"), unknown))
+    return Decided("cannot_tell", (unknown,))
+
+
+_needed: OrderedDict[tuple[int, datetime, int, int], int | None] = OrderedDict()
+"""Simulated numbers of sessions by evaluation, policy and margins version, none of which ever changes."""
+_KEPT = 5000
+
+
+def _further(own: Estimate, cdbs: Estimate | None, given: Circumstances, levels: Levels, policy_id: int) -> tuple[Flag, ...]:
+    """How many further sessions near which amplitude would tell, and that amplitude; empty where none would."""
+    support = own.details.get("support") or {}
+    dose = support.get("dose")
+    if cdbs is None or dose is None:
+        return ()
+    key = (given.evaluation_id, given.evaluated_at, policy_id, given.margins.id)
+    if key not in _needed:
+        gaps = slacks(own, cdbs, margins_of(given.margins))
+        near = int(support.get("near_sessions") or 0)
+        _needed[key] = sessions_to_tell(gaps, given.noise, levels, already_near=near, supported=own.supported)
+        while len(_needed) > _KEPT:
+            _needed.popitem(last=False)
+    if _needed[key] is None:
+        return ()
+    wanted = max(float(dose), given.lowest_dose)
+    at = Flag("near_amplitude", wanted, None, "of cDBS")
+    if given.cdbs_ma is not None:
+        at = Flag("near_amplitude", wanted * given.cdbs_ma, None, "mA")
+    return (Flag("sessions_needed", float(_needed[key] or 0), None, "sessions"), at)

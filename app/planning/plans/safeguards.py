@@ -1,0 +1,133 @@
+"""What stands between a verdict and a visit: unsafe policies need a clinician's reason, tests with care their lowest amplitude."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from app.evaluation import wording
+from app.evaluation.ranking.assessment import Assessment
+from app.evaluation.ranking.verdicts import Decided
+from app.learning.models import Policy
+from app.platform.errors import Conflict, Forbidden, Invalid
+
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Safeguard:
+    """What a plan records of one policy.
+
+    Attributes:
+        verdict: of the ranking; None where the policy is not in it.
+        min_fraction: lowest amplitude, fraction of cDBS; None where the plan states none. override_reason: a clinician's.
+    """
+
+    verdict: str | None = None
+    min_fraction: float | None = None
+    override_reason: str | None = None
+
+
+def safeguards(
+    found: Assessment | None, policies: Sequence[Policy], overrides: Mapping[int, str], limits: Mapping[int, float], *, may_override: bool
+) -> dict[int, Safeguard]:
+    """What the plan records of each policy.
+
+    Args:
+        found: the ranking behind the plan; None without one. policies: to test.
+        overrides: reasons for unsafe policies, by id. limits: stated lowest amplitudes, by id.
+        may_override: whether whoever drafts may approve plans.
+
+    Raises:
+        Invalid: an unsafe policy without a reason, two tests with care, a limit below that of the verdict, or a reason or limit for a
+            policy that is not in the plan. Forbidden: a reason of somebody who may not approve plans.
+    """
+    _all_planned(policies, overrides, limits)
+    made, careful = {}, []
+    for policy in policies:
+        decided = _decided(found, policy.id)
+        reason, limit = overrides.get(policy.id, "").strip() or None, limits.get(policy.id)
+        unsafe = decided is not None and decided.needs_override
+        if decided is not None and unsafe:
+            _require_override(policy, decided, reason, may_override)
+        if decided is not None and decided.decision == "test_with_care":
+            careful.append(policy)
+            limit = _checked_limit(policy, decided, limit)
+        # a reason that nothing asks for is not kept: it would look as if something had been overridden
+        made[policy.id] = Safeguard(decided.decision if decided else None, limit, reason if unsafe else None)
+    if len(careful) > 1:
+        raise Invalid(f"{_names(careful)} are each to be tested with care; a visit takes one of them.", "Leave all but one out.")
+    return made
+
+
+def refuse_approval(found: Assessment | None, planned: Sequence[tuple[Policy, Safeguard]]) -> None:
+    """Hold a draft against the verdicts of now, which margins and later findings may have changed since it was drafted.
+
+    Raises:
+        Conflict: a policy that is unsafe now and has no clinician's reason, one to be tested with care without a lowest amplitude or with
+            one below the verdict's, or two of these.
+    """
+    careful = []
+    for policy, stated in planned:
+        decided = _decided(found, policy.id)
+        if decided is None:
+            continue
+        if decided.needs_override and not stated.override_reason:
+            raise Conflict(
+                f"Policy '{policy.name}' is not to be run without a clinician's word: {_why(decided)}.",
+                "Draft the visit anew without it, or with the reason why it is tested all the same.",
+            )
+        if decided.decision == "test_with_care":
+            careful.append(policy)
+            if stated.min_fraction is None or (decided.limit is not None and stated.min_fraction < decided.limit - ROUNDING):
+                least = f" of at least {decided.limit:.2f} of the cDBS amplitude" if decided.limit is not None else ""
+                raise Conflict(
+                    f"Policy '{policy.name}' is to be tested with care, and the plan states no lowest amplitude{least} for it.",
+                    "Draft the visit anew with that limit.",
+                )
+    if len(careful) > 1:
+        raise Conflict(f"{_names(careful)} are each to be tested with care; a visit takes one of them.", "Draft the visit anew with one.")
+
+
+def _require_override(policy: Policy, decided: Decided, reason: str | None, may_override: bool) -> None:
+    if reason is None:
+        raise Invalid(
+            f"Policy '{policy.name}' is not to be run without a clinician's word: {_why(decided)}.",
+            "Leave it out, or have a clinician who may approve plans state why it is tested all the same (`overrides`).",
+        )
+    if not may_override:
+        raise Forbidden(f"Policy '{policy.name}' is unsafe; only those who may approve plans can plan it.", "Ask a clinician of the study.")
+
+
+def _checked_limit(policy: Policy, decided: Decided, stated: float | None) -> float | None:
+    """The lowest amplitude of a test with care: what was stated, else the verdict's; never below that."""
+    if stated is None or decided.limit is None:
+        return decided.limit if stated is None else stated
+    if stated < decided.limit - ROUNDING:
+        raise Invalid(
+            f"Policy '{policy.name}' may be tested down to {decided.limit:.2f} of the cDBS amplitude, not to {stated:.2f}: no two sessions "
+            "held less.",
+            "Leave the limit out, or raise it.",
+        )
+    return stated
+
+
+def _all_planned(policies: Sequence[Policy], *stated: Mapping[int, object]) -> None:
+    ids = {p.id for p in policies}
+    for found in stated:
+        stray = sorted(set(found) - ids)
+        if stray:
+            raise Invalid(f"Policy {stray[0]} has a reason or a limit, but is not among the policies to test.", "Name it there too.")
+
+
+def _decided(found: Assessment | None, policy_id: int) -> Decided | None:
+    one = found.of(policy_id) if found is not None else None
+    return one.decided if one is not None else None
+
+
+def _why(decided: Decided) -> str:
+    return wording.plainly(decided.hazards or decided.reasons)
+
+
+def _names(policies: Sequence[Policy]) -> str:
+    return " and ".join(f"'{p.name}'" for p in policies)

@@ -1,0 +1,230 @@
+"""What to say of a candidate: worth a test, a test with care, the same as cDBS, unsafe, or not to be told. Pure, from posterior draws.
+
+Every probability is a share of draws that are aligned between the policy and cDBS, so that what the posterior gets wrong for both alike
+cancels. The order of precedence is safety first: unsafe, cannot tell, same as cDBS, test with care, test. Where the data cannot order
+policies at all, every verdict is *cannot tell*; what is dangerous whatever the data say (`HAZARDS`) still stands among its reasons.
+
+The verdict asks for non-inferiority of the outcomes and for less energy, because that is what a test is for; superiority is for
+conclusions, which rest on visits and not on estimates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.ope.estimate import Estimate
+from ml.ope.flags import Flag
+from ml.qoc import Margins
+
+Floats = NDArray[np.float64]
+Code = Literal["test", "test_with_care", "same_as_cdbs", "unsafe", "cannot_tell"]
+
+NEARLY_OFF = 0.2
+"""Amplitudes below this fraction of the cDBS amplitude are nearly off."""
+
+SAME_AMPLITUDE = 0.05
+"""A policy whose amplitude is this close to that of cDBS on average (0.15 mA at 3 mA) does what cDBS does."""
+
+FEWEST_DRAWS = 50
+"""Fewer draws cannot tell a probability of 0.8 from one of 0.9."""
+
+HAZARDS = frozenset({"adverse_event", "nearly_off", "beyond_margin"})
+"""Codes of reasons for which a policy is not to be run without a clinician's word, whatever the verdict."""
+
+OUTCOMES = ("grasp_hz", "rating", "tremor_percent")
+
+
+@dataclass(frozen=True)
+class Levels:
+    """How sure a verdict must be; the defaults are those of the study's settings.
+
+    Attributes:
+        test_within: least probability that all outcomes lie within their margins for a test.
+        test_saves: least probability of less energy than cDBS for a test.
+        unsafe_beyond: probability of an outcome beyond its margin from which a policy is unsafe.
+        nearly_off_share: share of steps below `NEARLY_OFF` of cDBS above which a policy is unsafe.
+
+    Raises:
+        ValueError: a level that is no probability, or none that could ever be reached.
+    """
+
+    test_within: float = 0.8
+    test_saves: float = 0.9
+    unsafe_beyond: float = 0.5
+    nearly_off_share: float = 0.2
+
+    def __post_init__(self) -> None:
+        if not (0 < self.test_within < 1 and 0 < self.test_saves < 1 and 0 < self.unsafe_beyond < 1 and 0 <= self.nearly_off_share < 1):
+            raise ValueError(f"levels of verdicts must be probabilities between 0 and 1: {self}")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to say of one candidate.
+
+    Attributes:
+        code: the verdict.
+        reasons: what it rests on, the deciding finding first.
+        within: probability that all known outcomes lie within their margins of cDBS; None where no outcome is known.
+        saves: probability of less energy than cDBS; None where energy is not predicted.
+        limit: for `test_with_care` alone: lowest amplitude (fraction of cDBS) of the envelope under which it may be tested.
+    """
+
+    code: Code
+    reasons: tuple[Flag, ...]
+    within: float | None = None
+    saves: float | None = None
+    limit: float | None = None
+
+    @property
+    def hazards(self) -> tuple[Flag, ...]:
+        """The reasons for which it is not to be run without a clinician's word."""
+        return tuple(reason for reason in self.reasons if reason.code in HAZARDS)
+
+    @property
+    def proposed(self) -> bool:
+        """Whether it may be proposed for a visit."""
+        return self.code in ("test", "test_with_care")
+
+
+def verdict(
+    own: Estimate, cdbs: Estimate | None, margins: Margins, levels: Levels, *, adverse_event: bool = False, unchecked: str | None = None
+) -> Verdict:
+    """The verdict on a candidate.
+
+    Args:
+        own: its posterior, with the details that `ml.ope.posterior` gives (draws, behaviour, support, skill).
+        cdbs: that of cDBS; None where there is none.
+        margins: by how much an outcome may be worse. levels: how sure the verdict must be.
+        adverse_event: whether a serious adverse event under it has not been cleared by a clinician.
+        unchecked: why what the data cover could not be checked; None where it was.
+    """
+    gaps = slacks(own, cdbs, margins) if cdbs is not None else {}
+    within = float(np.mean(_all_within(gaps))) if gaps else None
+    saves = _saves(own, cdbs) if cdbs is not None else None
+    chances = _chances(within, saves, levels)
+    hazards = _hazards(own, gaps, levels, adverse_event)
+
+    def told(code: Code, *reasons: Flag, limit: float | None = None) -> Verdict:
+        return Verdict(code, (*reasons, *chances), within, saves, limit)
+
+    skill: Mapping[str, Any] = own.details.get("skill") or {}
+    if not skill.get("told", False):
+        unskilled = Flag.of(
+            "no_ordering_skill", skill.get("held_out_correlation"), None, "correlation", reasons=tuple(skill.get("reasons", ()))
+        )
+        return told("cannot_tell", unskilled, *hazards)
+    if hazards:
+        return told("unsafe", *hazards)
+    doubt = _cannot_tell(own, cdbs, gaps, saves, unchecked)
+    if doubt is not None:
+        return told("cannot_tell", doubt)
+    promising = _promising(within, saves, levels)
+    lowest = _support(own).get("lowest_supported")
+    if not own.supported and not (promising and lowest is not None):
+        return told("cannot_tell", _unsupported(own))
+    distance = (own.details.get("behaviour") or {}).get("closeness_to_cdbs")
+    if distance is not None and distance <= SAME_AMPLITUDE:
+        return told("same_as_cdbs", Flag("acts_like_cdbs", float(distance), SAME_AMPLITUDE, "of cDBS"))
+    if not own.supported and lowest is not None:
+        limit = float(lowest)
+        return told("test_with_care", Flag("extrapolates", _support(own).get("dose"), limit, "of cDBS"), _unsupported(own), limit=limit)
+    if promising:
+        return told("test")
+    return told("cannot_tell", Flag("undecided"))
+
+
+def slacks(own: Estimate, cdbs: Estimate, margins: Margins) -> dict[str, Floats]:
+    """By how much each known outcome keeps within its margin of cDBS, draw by draw, [draws]; below 0 it is beyond.
+
+    Raises:
+        ValueError: draws of the policy and of cDBS that are not aligned.
+    """
+    found = {}
+    for name in OUTCOMES:
+        ours, theirs = outcome_draws(own, name), outcome_draws(cdbs, name)
+        if ours is None or theirs is None:
+            continue
+        if ours.size != theirs.size:
+            raise ValueError(f"draws of {name} are not aligned: {ours.size} of the policy, {theirs.size} of cDBS")
+        if name == "grasp_hz":
+            found[name] = ours - (1 - margins.grasp_share) * theirs
+        elif name == "rating":
+            found[name] = ours - theirs + margins.rating_points
+        else:
+            found[name] = theirs + margins.tremor_points - ours
+    return found
+
+
+def outcome_draws(estimate: Estimate, name: str) -> Floats | None:
+    """Draws of one predicted quantity, [draws]; None where there are too few to tell a probability, or one is not finite."""
+    drawn = np.asarray((estimate.details.get("outcome_draws") or {}).get(name) or [], dtype=np.float64)
+    return drawn if drawn.size >= FEWEST_DRAWS and bool(np.isfinite(drawn).all()) else None
+
+
+def _all_within(gaps: Mapping[str, Floats]) -> NDArray[np.bool_]:
+    return np.asarray(np.min(np.stack(list(gaps.values())), axis=0) >= 0)
+
+
+def _saves(own: Estimate, cdbs: Estimate) -> float | None:
+    ours, theirs = outcome_draws(own, "energy"), outcome_draws(cdbs, "energy")
+    if ours is None or theirs is None:
+        return None
+    return float(np.mean(ours < theirs))
+
+
+def _promising(within: float | None, saves: float | None, levels: Levels) -> bool:
+    return within is not None and saves is not None and within >= levels.test_within and saves >= levels.test_saves
+
+
+def _chances(within: float | None, saves: float | None, levels: Levels) -> tuple[Flag, ...]:
+    """The two probabilities that every verdict states, where they are known."""
+    found = []
+    if within is not None:
+        found.append(Flag("within_margins", within, levels.test_within, "probability"))
+    if saves is not None:
+        found.append(Flag("saves_energy", saves, levels.test_saves, "probability"))
+    return tuple(found)
+
+
+def _hazards(own: Estimate, gaps: Mapping[str, Floats], levels: Levels, adverse_event: bool) -> list[Flag]:
+    found = [Flag("adverse_event")] if adverse_event else []
+    off = (own.details.get("behaviour") or {}).get("below_cdbs_20_percent")
+    if off is not None and off > levels.nearly_off_share:
+        found.append(Flag("nearly_off", float(off), levels.nearly_off_share, "share"))
+    if gaps:
+        beyond = 1 - float(np.mean(_all_within(gaps)))
+        if beyond >= levels.unsafe_beyond:
+            worst = max(gaps, key=lambda name: float(np.mean(gaps[name] < 0)))
+            found.append(Flag.of("beyond_margin", beyond, levels.unsafe_beyond, "probability", outcome=worst))
+    return found
+
+
+def _cannot_tell(
+    own: Estimate, cdbs: Estimate | None, gaps: Mapping[str, Floats], saves: float | None, unchecked: str | None
+) -> Flag | None:
+    """What stands against saying anything, whatever the policy does; None where nothing does."""
+    if unchecked is not None:
+        return Flag.of("coverage_unchecked", text=unchecked)
+    if cdbs is None:
+        return Flag("reference_missing")
+    if not cdbs.supported:
+        return Flag("reference_unsupported")
+    if not gaps:
+        return Flag("outcomes_unknown")
+    return None if saves is not None else Flag("energy_unknown")
+
+
+def _support(estimate: Estimate) -> Mapping[str, Any]:
+    return estimate.details.get("support") or {}
+
+
+def _unsupported(own: Estimate) -> Flag:
+    """The first finding that refuses the policy, or that too few sessions came near what it does."""
+    refusing = next((flag for flag in own.flags if flag.refuses), None)
+    return refusing or Flag("few_near_sessions", _support(own).get("near_sessions"), 2.0, "sessions")

@@ -1,0 +1,144 @@
+"""Verdicts in the ranking: from the posterior, by the participant's margins, with rank and reasons; and what the page says first."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from tests.app.evaluations import judged
+from tests.ml.ope.posterior.draws import N, cdbs, share
+
+RANKING = "/api/v1/participants/P1/ranking"
+PAGE = "/participants/P1/ranking"
+WORSE = {"outcome_draws": {"tremor_percent": [45.0] * N}}
+NEARLY_OFF = {"behaviour": {"below_cdbs_20_percent": 0.42}}
+Judge = Callable[..., int]
+BANNED = ("E[", "horizon", "logged", "saturated", "the data support it", "DLSM", "FQE", "QoC", "ξβ", "xi_beta", "r_end", "posterior")
+"""Words of methods, which the first screen does without."""
+
+
+def ranked(client: TestClient) -> dict[str, Any]:
+    answer = client.get(RANKING)
+    assert answer.status_code == 200, answer.text
+    body: dict[str, Any] = answer.json()
+    return body
+
+
+def first_screen(client: TestClient) -> str:
+    """The page's words above the fold."""
+    page = client.get(PAGE)
+    assert page.status_code == 200
+    main = page.text[page.text.index('id="ranking"') : page.text.index('class="fold"')]
+    return " ".join(re.sub(r"<[^>]+>", " ", main).split())
+
+
+def test_the_posterior_ranks_and_its_verdicts_stand_in_the_contract(client: TestClient, policies: list[int], judge: Judge) -> None:
+    a, b, c = policies
+    judge({a: judged(50.0), b: judged(60.0, **WORSE), c: judged(70.0, supported=False)})
+    body = ranked(client)
+    assert (body["default_method"], body["methods"], body["choice"]) == ("posterior", ["posterior"], None)
+    # b is worth more by its return and c most of all; unsafe and unsupported ones come last
+    assert [(p["policy_id"], p["rank"], p["decision"]) for p in body["policies"]] == [
+        (a, 1, "test"), (c, 2, "test_with_care"), (b, 3, "unsafe")
+    ]  # fmt: skip
+    assert set(body["policies"][0]["estimates"]["posterior"]) >= {"value", "low", "high", "level"}
+    assert body["policies"][0]["decision_reasons"] == [
+        {"code": "within_margins", "value": 1.0, "limit": 0.8, "unit": "probability"},
+        {"code": "saves_energy", "value": 1.0, "limit": 0.9, "unit": "probability"},
+    ]
+    assert body["policies"][0]["gain"]["value"] == 50.0
+    assert "likely at least as good as cDBS" in body["policies"][0]["decision_reason"]
+
+
+def test_a_change_of_margins_changes_the_verdict_at_once(client: TestClient, policies: list[int], judge: Judge) -> None:
+    judge({policies[0]: judged(50.0, outcome_draws={"tremor_percent": [26.0] * N})})
+    before = ranked(client)
+    assert before["policies"][0]["decision"] == "test"
+    change = {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}
+    assert client.put("/api/v1/participants/P1/margins", json=change).status_code == 200
+    body = ranked(client)
+    assert body["policies"][0]["decision"] == "unsafe"
+    assert body["stale_reasons"] == before["stale_reasons"], "margins are asked of the stored posterior: nothing has to be evaluated again"
+
+
+def test_without_ordering_skill_there_are_no_ranks_and_nothing_is_proposed(client: TestClient, policies: list[int], judge: Judge) -> None:
+    a, b, c = policies
+    judge({a: judged(50.0, told=False), b: judged(99.0, told=False), c: judged(70.0, told=False, **NEARLY_OFF)}, cdbs(told=False).to_json())
+    body = ranked(client)
+    assert {(p["rank"], p["probability_best"], p["decision"]) for p in body["policies"]} == {(None, None, "cannot_tell")}
+    assert [p["name"] for p in body["policies"]] == ["p0", "p1", "p2"], "by name, not by value"
+    words = first_screen(client)
+    assert "No policy is worth a visit yet. The recordings so far cannot tell policies apart." in words
+    assert "Not advised: p2 : nearly off 42 % of the time" in words
+    assert "#" not in words.split("Each behaviour against cDBS")[1].split("Policy")[0]
+
+
+def test_the_first_screen_says_what_to_test_why_and_at_what_risk_without_a_word_of_methods(
+    client: TestClient, policies: list[int], judge: Judge
+) -> None:
+    a, b, c = policies
+    likely = {"energy": [0.71] * N, "grasp_hz": [1.8] * 400 + [1.85] * 600, "tremor_percent": share(0.15, 21.0, 40.0)}
+    judge({a: judged(50.0, outcome_draws=likely), b: judged(60.0, **NEARLY_OFF), c: judged(70.0, supported=False)})
+    words = first_screen(client)
+    assert (
+        "Worth a test: p0 : energy \N{MINUS SIGN}29 %, grasp \N{MINUS SIGN}0.2 Hz, rating 0.0 points, tremor +4 points; 85 % likely"
+        in words
+    )
+    assert "Worth a test with care, one of them at a visit: p2 , not below 1.5 mA" in words
+    assert "Not advised: p1 : nearly off 42 % of the time" in words
+    assert [word for word in BANNED if word in words] == []
+
+
+def test_only_what_may_be_planned_without_a_clinicians_reason_can_be_ticked(client: TestClient, policies: list[int], judge: Judge) -> None:
+    a, b, c = policies
+    judge({a: judged(50.0), b: judged(60.0, **WORSE), c: judged(70.0, outcome_draws={"rating": share(0.3, 7.0, 1.0)})})
+    page = client.get(PAGE).text
+    assert {i: f'name="policy_ids" value="{i}"' in page for i in policies} == {a: True, b: False, c: True}
+
+
+def test_behaviours_that_are_cdbs_or_no_stimulation_by_another_name_are_folded(
+    client: TestClient, policies: list[int], judge: Judge
+) -> None:
+    a, b, c = policies
+    judge(
+        {a: judged(50.0), b: judged(60.0, behaviour={"closeness_to_cdbs": 0.01}), c: judged(9.0, behaviour={"below_cdbs_20_percent": 0.95})}
+    )
+    page = client.get(PAGE).text
+    assert "1 acts like cDBS" in page
+    assert "1 acts like no stimulation" in page
+    table = page[page.index("Candidates against cDBS") : page.index("1 acts like cDBS")]
+    assert {i: f'/policies/{i}"' in table for i in policies} == {a: True, b: False, c: False}
+
+
+def test_how_many_sessions_near_which_amplitude_would_tell_is_said(client: TestClient, policies: list[int], judge: Judge) -> None:
+    noise = {"coverage": {"policies": {}, "session_noise": {"tremor_percent": 4.0}}}
+    judge(
+        {policies[0]: judged(50.0, outcome_draws={"tremor_percent": [10.0 + 0.03 * i for i in range(N)]}, support={"dose": 0.6})}, **noise
+    )
+    found = ranked(client)["policies"][0]
+    by_code = {r["code"]: r for r in found["decision_reasons"]}
+    assert found["decision"] == "cannot_tell"
+    assert by_code["near_amplitude"] == {"code": "near_amplitude", "value": pytest.approx(1.8), "limit": None, "unit": "mA"}
+    n = int(by_code["sessions_needed"]["value"])
+    assert n in (1, 2, 3, 4, 6)
+    assert f"{n} session{'s' if n > 1 else ''} held near 1.8 mA would tell" in first_screen(client)
+
+
+def test_no_session_is_asked_for_below_the_participants_lower_bound(client: TestClient, policies: list[int], judge: Judge) -> None:
+    noise = {"coverage": {"policies": {}, "session_noise": {"tremor_percent": 4.0}}}
+    draws = {"tremor_percent": [10.0 + 0.03 * i for i in range(N)]}
+    judge({policies[0]: judged(50.0, outcome_draws=draws, support={"dose": 0.1})}, **noise)
+    by_code = {r["code"]: r["value"] for r in ranked(client)["policies"][0]["decision_reasons"]}
+    assert by_code["near_amplitude"] == pytest.approx(0.9), "B is 0.3 of 3 mA, the policy's own dose 0.3 mA"
+
+
+def test_another_method_can_order_the_fold_and_the_verdicts_stay(client: TestClient, policies: list[int], judge: Judge) -> None:
+    a, b, _ = policies
+    judge({a: judged(50.0), b: judged(60.0, **WORSE)})
+    body = client.get(RANKING, params={"method": "posterior"}).json()
+    assert [p["decision"] for p in body["policies"]] == ["test", "unsafe"]
+    assert "Weights of the structures" in client.get(PAGE).text

@@ -1,0 +1,158 @@
+"""Verdicts and plans: unsafe policies need a clinician's reason, tests with care their lowest amplitude, and one of them a visit."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+
+from tests.app.evaluations import judge as judge
+from tests.app.evaluations import judged
+from tests.app.evaluations import policies as policies
+from tests.ml.ope.posterior.draws import N
+
+Judge = Callable[..., int]
+UNSAFE = {"behaviour": {"below_cdbs_20_percent": 0.42}}
+CAREFUL: dict[str, Any] = {"supported": False, "support": {"lowest_supported": 0.5, "dose": 0.4}}
+
+
+@pytest.fixture
+def visit(client: TestClient, policies: list[int]) -> int:
+    """An open visit of P1."""
+    return int(client.post("/api/v1/participants/P1/visits", json={"number": 2}).json()["id"])
+
+
+def draft(client: TestClient, visit: int, *chosen: int, **more: Any) -> Any:
+    return client.post(f"/api/v1/visits/{visit}/plan", json={"policy_ids": list(chosen), "seed": 1, **more})
+
+
+def approve(client: TestClient, visit: int) -> Any:
+    return client.post(f"/api/v1/visits/{visit}/plan/approve")
+
+
+def test_an_unsafe_policy_is_planned_only_with_a_clinicians_reason(
+    client: TestClient, client_as: Callable[..., TestClient], policies: list[int], judge: Judge, visit: int
+) -> None:
+    a, b, _ = policies
+    judge({a: judged(50.0), b: judged(60.0, **UNSAFE)})
+    refused = draft(client, visit, a, b)
+    assert (refused.status_code, "nearly off 42 % of the time" in refused.json()["detail"]) == (422, True)
+    override = [{"policy_id": b, "reason": "asked for by the family, 5 minutes, watched"}]
+    assert draft(client_as("engineer"), visit, a, b, overrides=override).status_code == 403
+    plan = draft(client, visit, a, b, overrides=override)
+    assert plan.status_code == 201
+    stated = {s["policy_id"]: (s["verdict"], s["override_reason"]) for s in plan.json()["sessions"] if s["policy_id"]}
+    assert stated == {a: ("test", None), b: ("unsafe", "asked for by the family, 5 minutes, watched")}
+    assert any("unsafe and planned all the same: asked for by the family" in w for w in plan.json()["warnings"])
+    assert approve(client, visit).status_code == 200
+
+
+def test_what_is_dangerous_whatever_the_data_say_needs_the_reason_even_where_nothing_can_be_told(
+    client: TestClient, policies: list[int], judge: Judge, visit: int
+) -> None:
+    judge({policies[0]: judged(50.0, told=False, **UNSAFE), policies[1]: judged(50.0, told=False)})
+    assert draft(client, visit, policies[0]).status_code == 422
+    assert draft(client, visit, policies[1]).status_code == 201, "what cannot be told may be tested: that is how it gets told"
+
+
+def test_one_test_with_care_a_visit_and_its_lowest_amplitude_stands_in_the_plan(
+    client: TestClient, policies: list[int], judge: Judge, visit: int
+) -> None:
+    a, b, c = policies
+    judge({a: judged(50.0, **CAREFUL), b: judged(60.0, **CAREFUL), c: judged(40.0)})
+    two = draft(client, visit, a, b)
+    assert (two.status_code, "a visit takes one of them" in two.json()["detail"]) == (422, True)
+    low = draft(client, visit, a, c, limits=[{"policy_id": a, "min_fraction": 0.3}])
+    assert (low.status_code, "not to 0.30" in low.json()["detail"]) == (422, True)
+    plan = draft(client, visit, a, c).json()
+    assert {s["policy_id"]: s["min_fraction"] for s in plan["sessions"] if s["policy_id"]} == {a: 0.5, c: None}
+    assert "Policy 'p0' may not go below 1.5 mA." in plan["warnings"]
+    higher = draft(client, visit, a, limits=[{"policy_id": a, "min_fraction": 0.7}]).json()
+    assert [s["min_fraction"] for s in higher["sessions"] if s["policy_id"]] == [0.7]
+    assert approve(client, visit).status_code == 200
+
+
+def test_no_plan_with_a_test_with_care_is_approved_without_its_limit(
+    client: TestClient, policies: list[int], judge: Judge, visit: int, db: Session
+) -> None:
+    judge({policies[0]: judged(50.0, **CAREFUL)})
+    assert draft(client, visit, policies[0]).status_code == 201
+    db.execute(text("update plan_item set min_fraction = null"))
+    db.commit()
+    answer = approve(client, visit)
+    assert (answer.status_code, "states no lowest amplitude of at least 0.50" in answer.json()["detail"]) == (409, True)
+    db.execute(text("update plan_item set min_fraction = 0.4 where policy_id is not null"))
+    db.commit()
+    assert approve(client, visit).status_code == 409
+
+
+def test_verdicts_are_asked_again_at_approval(client: TestClient, policies: list[int], judge: Judge, visit: int) -> None:
+    judge({policies[0]: judged(50.0, outcome_draws={"tremor_percent": [26.0] * N})})
+    assert draft(client, visit, policies[0]).status_code == 201
+    client.put("/api/v1/participants/P1/margins", json={"margins": {"tremor_points": 5}, "reason": "she fears tremor most"})
+    answer = approve(client, visit)
+    assert (answer.status_code, "likely worse than cDBS, tremor most of all" in answer.json()["detail"]) == (409, True)
+
+
+def test_a_reason_for_what_is_not_unsafe_is_not_kept_and_one_for_what_is_not_planned_is_refused(
+    client: TestClient, policies: list[int], judge: Judge, visit: int
+) -> None:
+    a, b, _ = policies
+    judge({a: judged(50.0), b: judged(50.0)})
+    plan = draft(client, visit, a, overrides=[{"policy_id": a, "reason": "why not"}]).json()
+    assert [s["override_reason"] for s in plan["sessions"]] == [None] * len(plan["sessions"])
+    stray = draft(client, visit, a, limits=[{"policy_id": b, "min_fraction": 0.5}])
+    assert (stray.status_code, f"Policy {b} has a reason or a limit" in stray.json()["detail"]) == (422, True)
+
+
+def test_the_form_asks_for_the_reason_and_the_limit_and_keeps_what_was_typed(
+    client: TestClient, policies: list[int], judge: Judge, visit: int
+) -> None:
+    a, b, _ = policies
+    judge({a: judged(50.0, **UNSAFE), b: judged(60.0, **CAREFUL)})
+    page, path = client.get(f"/visits/{visit}/plan").text, f"/visits/{visit}/plan"
+    assert f'name="override_{a}"' in page
+    assert f'name="limit_{b}"' in page
+    assert 'value="0.5000"' in page
+    headers = {"Sec-Fetch-Site": "same-origin"}
+    low = client.post(path, data={"policy_ids": [a, b], f"override_{a}": "watched", f"limit_{b}": "0.2"}, headers=headers)
+    assert low.status_code == 422
+    assert 'value="watched"' in low.text
+    assert 'value="0.2"' in low.text
+    wrong = client.post(path, data={"policy_ids": [b], f"limit_{b}": "low"}, headers=headers)
+    assert (wrong.status_code, "is no number" in wrong.text) == (422, True)
+    done = client.post(
+        path, data={"policy_ids": [a, b], f"override_{a}": "watched", f"limit_{b}": "0.6"}, headers=headers, follow_redirects=False
+    )
+    assert done.status_code == 303
+    plan = client.get(f"/api/v1{path}").json()
+    stated = {s["policy_id"]: (s["min_fraction"], s["override_reason"]) for s in plan["sessions"] if s["policy_id"]}
+    assert stated == {a: (None, "watched"), b: (0.6, None)}
+
+
+def test_a_bundle_of_a_policy_tested_with_care_does_not_go_below_the_approved_limit(
+    client: TestClient, policies: list[int], judge: Judge, visit: int
+) -> None:
+    bundle = f"/api/v1/policies/{policies[0]}/bundle"
+    judge({policies[0]: judged(50.0, **CAREFUL)})
+    assert draft(client, visit, policies[0]).status_code == 201
+    assert lowest_ma(client.get(bundle).content) == 0.0, "a draft limits nothing"
+    assert approve(client, visit).status_code == 200
+    assert lowest_ma(client.get(bundle).content) == 1.5
+    below = client.get(bundle, params={"min_ma": 1.2})
+    assert (below.status_code, "below the 1.5 mA" in below.json()["detail"]) == (422, True)
+    assert lowest_ma(client.get(bundle, params={"min_ma": 2.0}).content) == 2.0
+
+
+def lowest_ma(content: bytes) -> float:
+    """The lower limit that a bundle states, mA."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        (name,) = [n for n in archive.namelist() if n.endswith("manifest.json")]
+        return float(json.loads(archive.read(name))["min_ma"])

@@ -1,0 +1,84 @@
+"""How many sessions would tell: against the closed form of a normal mean, and at its limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from ml.mdp import MdpSettings
+from ml.ope.posterior.further_sessions import session_noise, sessions_to_tell
+from ml.ope.posterior.verdict import Levels
+from ml.qoc import Qoc
+from ml.trajectories import ReplayBuffer, SessionTrajectory
+from tests.ml.ope.posterior.draws import RANKS
+
+
+def normal_draws(mean: float, sd: float) -> np.ndarray:
+    """Draws without chance."""
+    return np.asarray(norm.ppf(RANKS, mean, sd))
+
+
+def told_share(mean: float, sd: float, noise: float, n: int) -> float:
+    """Closed form: how often the mean of n differences decides P(within) >= 0.8 or <= 0.5, one normal outcome.
+
+    The posterior given the data is normal with variance v = 1 / (1 / sd^2 + n / (2 noise^2)); its mean is normal around `mean` with
+    variance sd^2 - v; P(within) = Phi(posterior mean / sqrt(v)).
+    """
+    v = 1 / (1 / sd**2 + n / (2 * noise**2))
+    spread = np.sqrt(sd**2 - v)
+    return float(norm.sf(norm.ppf(0.8) * np.sqrt(v), mean, spread) + norm.cdf(0.0, mean, spread))
+
+
+@pytest.mark.parametrize(("mean", "sd", "noise"), [(1.0, 2.0, 1.0), (0.5, 2.0, 2.0), (1.0, 1.5, 3.0)])
+def test_the_number_is_that_of_the_closed_form(mean: float, sd: float, noise: float) -> None:
+    found = sessions_to_tell({"rating": normal_draws(mean, sd)}, {"rating": noise}, Levels())
+    shares = {n: told_share(mean, sd, noise, n) for n in (1, 2, 3, 4, 6, 8, 12, 16, 24)}
+    # 200 futures: the share has a standard error of 0.03
+    surely, hardly = (next((n for n, p in shares.items() if p >= level), None) for level in (0.86, 0.74))
+    assert hardly is not None
+    assert found is not None
+    assert hardly <= found <= (surely or 24)
+
+
+def test_noisier_sessions_take_more_of_them_and_hopeless_ones_give_no_number() -> None:
+    gaps = {"tremor_percent": normal_draws(3.0, 10.0)}
+    quiet, loud = (sessions_to_tell(gaps, {"tremor_percent": noise}, Levels()) for noise in (2.0, 15.0))
+    assert quiet is not None
+    assert loud is None or loud > quiet
+    assert sessions_to_tell(gaps, {"tremor_percent": 1000.0}, Levels()) is None
+    assert sessions_to_tell(gaps, {}, Levels()) is None, "without the noise of a session no number is told"
+
+
+def test_an_unsupported_policy_needs_two_sessions_near_it_whatever_is_predicted() -> None:
+    sure = {"rating": normal_draws(5.0, 0.5)}
+    assert sessions_to_tell(sure, {"rating": 1.0}, Levels()) == 1
+    assert sessions_to_tell(sure, {"rating": 1.0}, Levels(), supported=False) == 2
+    assert sessions_to_tell(sure, {"rating": 1.0}, Levels(), supported=False, already_near=1) == 1
+
+
+def buffer_of(*rows: tuple[int, str, int | None]) -> ReplayBuffer:
+    """Sessions of visit, controller and rating."""
+    beta = np.ones(5)
+    sessions = [
+        SessionTrajectory(i, visit, controller, np.ones(3), beta, beta, Qoc(rating=rating))
+        for i, (visit, controller, rating) in enumerate(rows)
+    ]
+    return ReplayBuffer(MdpSettings(xi_beta=1.0, window=3), tuple(sessions), "uV", "table")
+
+
+def test_the_noise_of_a_session_is_that_within_controller_and_visit() -> None:
+    """Visits and controllers differ by 5 points, sessions of one group by 2: squares of 2 in each of three groups of two."""
+    rows = [(1, "cdbs", 7), (1, "cdbs", 9), (2, "cdbs", 2), (2, "cdbs", 4), (2, "rl", 8), (2, "rl", 10), (3, "cdbs", None)]
+    assert session_noise(buffer_of(*rows)) == {"rating": pytest.approx(np.sqrt(2.0))}
+
+
+def test_random_sessions_count_only_where_the_others_are_too_few() -> None:
+    random = [(1, "random", 1), (1, "random", 9), (1, "random", 1), (1, "random", 9)]
+    assert session_noise(buffer_of(*random, (1, "cdbs", 7))) == {"rating": pytest.approx(np.sqrt(64 / 3))}
+    steady = [(1, "cdbs", 7), (1, "cdbs", 7), (2, "cdbs", 7), (2, "cdbs", 8), (2, "cdbs", 8)]
+    assert session_noise(buffer_of(*random, *steady))["rating"] < 1
+
+
+def test_too_few_sessions_tell_no_noise() -> None:
+    assert session_noise(buffer_of((1, "cdbs", 7), (1, "cdbs", 9), (2, "cdbs", 3))) == {}
