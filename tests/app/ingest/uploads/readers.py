@@ -12,7 +12,7 @@ import numpy as np
 
 from app.ingest.uploads import compute
 from app.platform.jobs import StepReport
-from tests.app.ingest.uploads.planted import NOTE, WHO
+from tests.app.ingest.safety.planted import NOTE, WHO
 
 
 def kill(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:

@@ -20,8 +20,9 @@ from app.learning.policies.baselines import constant_onnx
 from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
 from tests.app.ingest.conftest import Send
-from tests.app.ingest.uploads import planted, readers
-from tests.app.ingest.uploads.planted import NAME, NOTE, TOKENS, WHO
+from tests.app.ingest.safety import planted
+from tests.app.ingest.safety.planted import NAME, NOTE, TOKENS, WHO
+from tests.app.ingest.uploads import readers
 
 PAGE = {"Accept": "text/html"}
 

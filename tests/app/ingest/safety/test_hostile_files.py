@@ -14,7 +14,7 @@ import httpx2 as httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from tests.app.ingest.uploads import hostile
+from tests.app.ingest.safety import hostile
 from tests.app.learning.policies.test_foreign_policies import constant_of
 
 ROOT = Path(__file__).resolve().parents[4]
