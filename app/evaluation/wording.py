@@ -50,6 +50,11 @@ def amplitude(fraction: float, ma: float | None) -> str:
     return f"{ma:.1f} mA" if ma is not None else f"{_percent(fraction)} of the cDBS amplitude"
 
 
+def chance(share: float) -> str:
+    """A probability from some hundred draws: they can show none of 0 and none of 1."""
+    return "> 99 %" if share > 0.99 else "< 1 %" if share < 0.01 else _percent(share)
+
+
 def further_sessions(reasons: Sequence[Flag]) -> str:
     """How many further sessions near which amplitude would tell; empty where none is named."""
     by_code = {reason.code: reason for reason in reasons}
@@ -156,7 +161,7 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "no_posterior": lambda f: "evaluated by an earlier betaloop: evaluate again",
     "adverse_event": lambda f: "serious adverse event, not cleared by a clinician",
     "nearly_off": lambda f: f"nearly off {_percent(f.value)} of the time",
-    "beyond_margin": lambda f: f"{_percent(f.value)} likely worse than cDBS, {OUTCOME_NAMES[f.fact('outcome')]} most of all",
+    "beyond_margin": lambda f: f"{chance(_value(f))} likely worse than cDBS, {OUTCOME_NAMES[f.fact('outcome')]} most of all",
     "all_below_zero": lambda f: "likely worse than cDBS",
     "few_near_sessions": lambda f: "hardly any session came near what it does",
     "few_near_visits": lambda f: "only one visit came near what it does",
@@ -249,7 +254,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "adverse_event": lambda f: "a serious adverse event under it has not been cleared by a clinician",
     "nearly_off": lambda f: f"nearly off, below 20 % of the cDBS amplitude, {_percent(f.value)} of the time (at most {_percent(f.limit)})",
     "beyond_margin": lambda f: (
-        f"{_percent(f.value)} likely worse than cDBS by more than a margin, {OUTCOME_NAMES[f.fact('outcome')]} most of all "
+        f"{chance(_value(f))} likely worse than cDBS by more than a margin, {OUTCOME_NAMES[f.fact('outcome')]} most of all "
         f"(unsafe from {_percent(f.limit)})"
     ),
     "extrapolates": lambda f: (
@@ -257,9 +262,9 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     ),
     "acts_like_cdbs": lambda f: f"acts like cDBS: {_percent(f.value)} of its amplitude away from it on average",
     "within_margins": lambda f: (
-        f"{_percent(f.value)} likely at least as good as cDBS within the margins (a test asks for {_percent(f.limit)})"
+        f"{chance(_value(f))} likely at least as good as cDBS within the margins (a test asks for {_percent(f.limit)})"
     ),
-    "saves_energy": lambda f: f"{_percent(f.value)} likely to use less energy (a test asks for {_percent(f.limit)})",
+    "saves_energy": lambda f: f"{chance(_value(f))} likely to use less energy (a test asks for {_percent(f.limit)})",
     "sessions_needed": lambda f: count(int(_value(f)), "session", "sessions"),
     "near_amplitude": lambda f: f"held near {f.value:.1f} mA" if f.unit == "mA" else f"held near {_percent(f.value)} of the cDBS amplitude",
     # of the choice of a method

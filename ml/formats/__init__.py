@@ -82,6 +82,8 @@ def sniff(path: Path) -> FileKind:
     if looks_like_report(head):
         return "percept"
     text = head.lstrip(b"\xef\xbb\xbf \t\r\n")
+    if text and len(head) < HEAD and text.strip(b"\0 \t\r\n,[]{}") == b"":
+        raise UndecodableFile("the file is empty: it holds nothing but brackets or zero bytes", "file", HINT)
     if text.startswith((b"[", b"{")):
         what = "a single JSON file, neither a whole RC+S session nor a Percept session report"
         raise UndecodableFile(what, "file", "Zip the whole session folder and upload that.")

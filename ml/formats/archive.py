@@ -160,6 +160,8 @@ class ZipFiles:
 
     def _check(self, infos: list[zipfile.ZipInfo]) -> None:
         limits = self._limits
+        if not infos:
+            raise UndecodableFile("the archive is empty", "archive", "Zip the folder again, with its files, and upload that.")
         if len(infos) > limits.members:
             raise UndecodableFile(
                 f"the archive holds {len(infos)} files, more than {limits.members}", "archive", "Upload one session folder."

@@ -75,6 +75,7 @@ def ranking_page(
         plainly=wording.plainly,
         amplitude=wording.amplitude,
         signed=wording.signed,
+        chance=wording.chance,
         further=wording.further_sessions,
         weights=weights,
         correlation=correlation,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 from app.ingest import wording
 from app.ingest.models import UploadFile
@@ -37,6 +37,14 @@ def count_equal_lines(report: FileReport) -> None:
     """Make one line, with a count, of equal lines in each of a report's lists."""
     for lines in (report.understood, report.repaired, report.ignored, report.flagged, report.removed):
         lines[:] = [line if n == 1 else f"{line} ({n}×)" for line, n in Counter(lines).items()]
+
+
+def alike_together(reports: Sequence[FileReport]) -> list[FileReport]:
+    """Reports that say the same of different files as one, named by how many there are and the first of them."""
+    alike: dict[str, list[FileReport]] = defaultdict(list)
+    for report in reports:
+        alike[repr(replace(report, name=""))].append(report)
+    return [same[0] if len(same) == 1 else replace(same[0], name=f"{same[0].name} and {len(same) - 1} more") for same in alike.values()]
 
 
 def stored_reports(row: UploadFile) -> list[FileReport]:

@@ -22,7 +22,7 @@ from app.ingest.uploads import reading
 from app.ingest.uploads.in_progress import in_progress, tell_file
 from app.ingest.uploads.incoming import Incoming, arrange
 from app.ingest.uploads.receiving import LETHAL, BetaStated, FileOutcome, Receiver
-from app.ingest.uploads.reports import known_recordings, store_reports, stored_reports, unreadable_members
+from app.ingest.uploads.reports import alike_together, known_recordings, store_reports, stored_reports, unreadable_members
 from app.platform import files
 from app.platform.errors import BetaloopError, Conflict, Invalid, TooLarge
 from app.platform.jobs.children.child import places
@@ -162,7 +162,7 @@ def receive(
     with in_progress(upload.id):
         arranged = arrange(incoming)
         receiver = Receiver(db, participant, upload, decode_options(participant, beta), beta)
-        outcome = UploadOutcome(upload, participant, [], arranged.asides)
+        outcome = UploadOutcome(upload, participant, [], alike_together(arranged.asides))
         try:
             _take(receiver, outcome, arranged.incoming)
             finish(db, outcome, stated)

@@ -167,6 +167,7 @@ def _page(
         plainly=evaluation_wording.plainly,
         amplitude=evaluation_wording.amplitude,
         signed=evaluation_wording.signed,
+        chance=evaluation_wording.chance,
         typed=values or {},
         may_override=may(caller, can.APPROVE_PLAN, participant),
         in_words=sentence,

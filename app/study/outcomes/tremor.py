@@ -39,9 +39,12 @@ class Minutes:
 
     def equal(self, i: int, other: Minutes, j: int) -> bool:
         """Whether two minutes say the same, to the precision that is stored."""
-        return np.allclose(self.fractions[i], other.fractions[j], atol=1e-6, equal_nan=True) and np.allclose(
-            self.any_tremor[i], other.any_tremor[j], atol=1e-6, equal_nan=True
-        )
+        return bool(self.at(np.array([i])).equals(other.at(np.array([j])))[0])
+
+    def equals(self, other: Minutes) -> NDArray[np.bool_]:
+        """Whether each of these minutes says the same as the other's, to the precision that is stored, shape [n]."""
+        fractions = np.isclose(self.fractions, other.fractions, atol=1e-6, equal_nan=True).all(axis=1)
+        return np.asarray(fractions & np.isclose(self.any_tremor, other.any_tremor, atol=1e-6, equal_nan=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,13 +121,16 @@ def within(series: Sequence[TremorSeries], start_unix_s: float, stop_unix_s: flo
 def compare(minutes: Minutes, others: Sequence[TremorSeries]) -> tuple[int, int]:
     """How many minutes of a file begin when a minute of other files does and say the same, and how many say something else."""
     same = different = 0
-    known = [(unpack(row), row) for row in others]
-    index = {round(float(t)): (m, j) for m, _ in known for j, t in enumerate(m.start_unix_s)}
-    for i, start in enumerate(minutes.start_unix_s):
-        found = index.get(round(float(start)))
-        if found is not None:
-            equal = minutes.equal(i, *found)
-            same, different = same + equal, different + (not equal)
+    begins, unseen = np.rint(minutes.start_unix_s), np.ones(minutes.start_unix_s.size, dtype=np.bool_)
+    for row in reversed(others):  # one at a time, for each may be a year; of several files the last one counts
+        other = unpack(row)
+        known = np.rint(other.start_unix_s)
+        at = np.searchsorted(known, begins, side="right") - 1
+        found = np.flatnonzero(unseen & (at >= 0))
+        found = found[known[at[found]] == begins[found]]
+        equal = minutes.at(found).equals(other.at(at[found]))
+        same, different = same + int(equal.sum()), different + int((~equal).sum())
+        unseen[found] = False
     return same, different
 
 

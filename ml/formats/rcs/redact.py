@@ -81,6 +81,9 @@ def redact_rcs_zip(source: Path, target: Path, key: bytes, limits: ArchiveLimits
         with zipfile.ZipFile(target, "w") as archive:
             for name, stem, label, origin in members:
                 _write_member(archive, name, f"{label}{stem}.json", files, origin, scrub, done)
+        if len(done.unreadable) == len(members):
+            what = "every file of the RC+S session is empty or cannot be read"
+            raise UndecodableFile(what, "archive", "Zip the session's Device folder again, from where it was recorded.")
         done.removed = ["names of folders", *scrub.sentences()]
         return done
 

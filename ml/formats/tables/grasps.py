@@ -13,6 +13,7 @@ from ml.formats.recording import DecodedFile, FileReport, GraspLog, Hemisphere, 
 from ml.formats.tables.columns import BETA_NAMES
 from ml.formats.tables.delimited import TextTable, read_delimited
 from ml.formats.tables.numbers import column_name, shown
+from ml.formats.tables.removed import removed_columns
 from ml.qoc import PLAUSIBLE_INTERVAL_S
 
 SECONDS = frozenset({"t_s", "t", "time", "time_s", "open_fist_s", "seconds"})
@@ -49,9 +50,7 @@ def decode_grasps(path: Path, options: DecodeOptions | None = None, name: str | 
     times = table.numbers(column, table.decimal_mark([column]), "t_s") * scale
     report = FileReport(name or path.name)
     report.repaired.extend(table.notes)
-    others = len(names) - 1 - (hand_column is not None)
-    if others:
-        report.removed.append(f"{others} other column{'s' if others > 1 else ''}")
+    report.removed.extend(removed_columns(header for i, header in enumerate(table.headers) if i not in (column, hand_column)))
     hands: dict[Hemisphere | None, list[int]] = {}
     for i, row in enumerate(table.rows):
         hands.setdefault(None if hand_column is None else _hand(row[hand_column], table.lines[i]), []).append(i)

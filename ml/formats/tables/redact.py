@@ -16,6 +16,7 @@ from ml.formats.redaction_record import Redaction
 from ml.formats.tables.columns import Columns, read_csv, read_parquet
 from ml.formats.tables.control_log import redact_log
 from ml.formats.tables.grasps import decode_grasps
+from ml.formats.tables.removed import removed_columns
 from ml.formats.tables.steps import decode_columns
 from ml.formats.tables.strivepd import decode_strivepd
 
@@ -47,9 +48,7 @@ def redact_table(source: Path, target: Path, kind: TableKind, options: DecodeOpt
         _write_csv(columns, target)
     else:
         _write_parquet(columns, target)
-    others = len(columns.ignored)
-    removed = [f"{others} other column{'s' if others != 1 else ''}"] if others else []
-    return Redaction(removed=removed, repaired=list(columns.notes))
+    return Redaction(removed=removed_columns(columns.ignored), repaired=list(columns.notes))
 
 
 def _redact_outcomes(source: Path, target: Path, kind: str, options: DecodeOptions) -> Redaction:

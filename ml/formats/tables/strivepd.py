@@ -18,6 +18,7 @@ from ml.formats.options import DecodeOptions
 from ml.formats.recording import TREMOR_CLASSES, DecodedFile, FileReport, TremorLog, UndecodableFile
 from ml.formats.tables.delimited import TextTable, read_delimited
 from ml.formats.tables.numbers import NotANumber, column_name, parse_number, shown
+from ml.formats.tables.removed import removed_columns
 
 SUMMARY = "all"
 """slight + mild + moderate + strong of the same minute: no class of its own, never added to the others."""
@@ -82,8 +83,7 @@ def decode_strivepd(path: Path, options: DecodeOptions | None = None, name: str 
     else:
         hint = f"A wide export has the columns time, {WANTED}; a long one time, severity, duration; a table per minute minute_start, class."
         raise UndecodableFile("no layout of a tremor export", "line 1", hint)
-    if others := len(table.headers) - len(used):
-        report.removed.append(f"{others} other column{'s' if others > 1 else ''}, such as patient and device identifiers")
+    report.removed.extend(removed_columns(header for i, header in enumerate(table.headers) if i not in used))
     if minutes.start_unix_s.size == 0:
         raise UndecodableFile("the table holds no minute of tremor", "after line 1", "Upload the export as StrivePD wrote it.")
     report.understood.append(f"{minutes.start_unix_s.size} minutes of tremor")

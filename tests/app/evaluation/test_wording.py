@@ -113,6 +113,10 @@ def test_the_reasons_of_a_verdict_read_as_one_sentence_and_plainly() -> None:
     )
 
 
+def test_draws_show_no_probability_of_nothing_or_of_certainty() -> None:
+    assert [wording.chance(p) for p in (0.0, 0.004, 0.5, 0.987, 1.0)] == ["< 1 %", "< 1 %", "50 %", "99 %", "> 99 %"]
+
+
 def test_every_plain_reason_is_a_code_that_has_a_sentence_too() -> None:
     later = {"few_near_visits"}  # of `ml.ope.posterior.support`
     assert set(wording._PLAINLY) - later <= set(wording._SENTENCES)

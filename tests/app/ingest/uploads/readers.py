@@ -12,6 +12,7 @@ import numpy as np
 
 from app.ingest.uploads import compute
 from app.platform.jobs import StepReport
+from tests.app.ingest.safety.planted import NOTE, WHO
 
 
 def kill(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
@@ -71,3 +72,8 @@ def fault_of_cleaning(params: dict[str, Any], workdir: Path, report: StepReport)
             Path(params["target"]).write_bytes(b"SYN000001H, half cleaned")
             raise ZeroDivisionError("a fault of ours, in the file of Ada Lovelace")
     return compute.clean(params, workdir, report)
+
+
+def fault_that_quotes(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Fail with an error that quotes the whole file, as errors of libraries do."""
+    return {"number": float(WHO + NOTE)}

@@ -15,8 +15,10 @@ from fastapi.testclient import TestClient
 
 from app.ingest.uploads import reading
 from app.ingest.uploads.incoming import Incoming, arrange
+from app.ingest.uploads.reports import count_equal_lines
 from app.platform import files
 from app.settings import get_settings
+from ml.formats.recording import FileReport
 from tests.app.ingest.conftest import device_zip, loose, steady, table
 from tests.app.ingest.uploads import readers
 
@@ -271,3 +273,43 @@ def test_the_report_names_hashes_and_the_redactor(send: Any) -> None:
     assert told["stored_sha256"] != told["sha256"]
     assert told["redactor_version"] >= 2
     assert hashlib.sha256(files.read(told["stored_sha256"])).hexdigest() == told["stored_sha256"]
+
+
+EMPTY_ARCHIVE = b"PK\x05\x06" + bytes(18)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b" \r\n \n", b"\xef\xbb\xbf", b"[]", b"[{}]", b"{ }", bytes(300), EMPTY_ARCHIVE, zipped({"DeviceX/RawDataTD.json": b""})],
+    ids=["no byte", "blanks", "a mark", "a list", "a list of nothing", "an object", "zeros", "an archive", "an archive of empty files"],
+)
+def test_an_empty_file_says_that_it_is_empty(send: Any, content: bytes) -> None:
+    problem = send(("session.json", content), visit=1).json()["report"][0]["problem"]
+    assert "empty" in problem["what"]
+    assert problem["hint"]
+
+
+def test_twenty_equal_lines_are_one_line_with_their_count(send: Any) -> None:
+    session = loose(device_zip())
+    nested = {f"inner {n}.zip": b"PK" for n in range(20)}
+    archive = zipped(dict(session) | nested)
+    litter = [(f"folder/._{n}", b"x") for n in range(20)]
+    answer = send(("s.zip", archive), *litter, visit=1, controller="random").json()
+    ignored = next(r for r in answer["report"] if r["name"] == "s.zip")["ignored"]
+    told = "an archive inside the archive; unpack it and upload it by itself"
+    (line,) = [text for text in ignored if told in text]
+    first = len(session) + 1
+    assert line == f"20 members (.zip, number {', '.join(str(first + n) for n in range(5))}, …): {told}"
+    (aside,) = [r for r in answer["report"] if "left by the operating system" in repr(r["ignored"])]
+    assert aside["name"] == "._0 and 19 more"
+    report = FileReport("x", flagged=["the same", *["again"] * 20, "other"])
+    count_equal_lines(report)
+    assert report.flagged == ["the same", "again (20×)", "other"]
+
+
+def test_what_was_removed_is_named_by_its_kind(send: Any) -> None:
+    head = "t_s,beta,amplitude_fraction,patientName,Date of birth,clinician note,serial no,battery rate,zzz"
+    content = "\n".join([head, *(f"{2 * k},1,1,a,b,c,d,e,f" for k in range(5))]).encode()
+    (line,) = send(("t.csv", content), visit=1).json()["report"][0]["removed"]
+    kinds = "1 called like a date, 1 called like a note, 2 called like an identifier, 1 called like a measurement, 1 of no known kind"
+    assert line == f"6 other columns: {kinds}"

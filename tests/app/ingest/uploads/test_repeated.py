@@ -13,9 +13,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.ingest.models import UploadFile
+from app.ingest.uploads import reading
 from app.platform.files import StoredFile
 from app.settings import get_settings
-from ml import formats
 from ml.formats.recording import UndecodableFile
 from tests.app.ingest.conftest import steady
 from tests.app.ingest.proposals.test_proposals import correct, post
@@ -45,7 +45,7 @@ def test_a_cleaned_file_that_cannot_be_decoded_is_kept_once(send: Any, db: Sessi
     def refuse(*_: Any, **__: Any) -> None:
         raise UndecodableFile("the decoder knows no such table", "file", "Send another one.")
 
-    monkeypatch.setattr(formats, "decode", refuse)
+    monkeypatch.setattr(reading, "decode", refuse)
     for _ in range(3):
         assert send(("t.csv", steady(1))).status_code == 422
     assert len(list(db.scalars(select(UploadFile)))) == 1

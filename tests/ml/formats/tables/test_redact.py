@@ -28,7 +28,7 @@ def test_a_redacted_table_holds_the_known_columns_alone_and_decodes_to_the_same_
     done = redact_table(source, target, "csv", DecodeOptions())
     redact_table(source, again, "csv", DecodeOptions())
     assert target.read_bytes() == again.read_bytes()
-    assert done.removed == ["1 other column"]
+    assert [text.split(":")[0] for text in done.removed] == ["1 other column"]
     assert not any(word in target.read_text() for word in ("Jane", "Doe", "4711", "1950"))
     first, second = decode(source), decode(target, name="s.csv")
     assert same_recording(first.recordings[0], second.recordings[0])
@@ -48,7 +48,7 @@ def test_a_redacted_parquet_table_has_no_foreign_column_and_no_metadata(tmp_path
     columns = {"t_s": [2, 4], "beta": [0.1, None], "a": [0.3, float("inf")], "Jane": ["Doe", "Doe"], "MRN": [4711, 4711]}
     source, target, again = tmp_path / "s.parquet", tmp_path / "t.parquet", tmp_path / "u.parquet"
     pq.write_table(pa.table(columns, schema=pa.schema(fields, metadata={"patient": "Jane Doe"})), source)
-    assert redact_table(source, target, "parquet", DecodeOptions()).removed == ["2 other columns"]
+    assert [t.split(":")[0] for t in redact_table(source, target, "parquet", DecodeOptions()).removed] == ["2 other columns"]
     redact_table(source, again, "parquet", DecodeOptions())
     assert target.read_bytes() == again.read_bytes()
     assert pq.read_schema(target).names == ["t_s", "beta [uV]", "amplitude_fraction"]
@@ -121,7 +121,7 @@ def test_a_redacted_table_of_raw_lfp_is_the_same_recording(tmp_path, same_record
     source, target = tmp_path / "s.csv", tmp_path / "t.csv"
     source.write_text("t_s,lfp_mV,amplitude_ma,name\n" + rows)
     done = redact(source, target, "csv", KEY)
-    assert done.removed == ["1 other column"]
+    assert [text.split(":")[0] for text in done.removed] == ["1 other column"]
     assert "Jane" not in target.read_text()
     assert same_recording(decode(source).recordings[0], decode(target).recordings[0])
 
