@@ -127,7 +127,7 @@ def _more(found: Inconclusive) -> str:
         return few
     if found.reason is not None:
         return "too little was measured to say how many visits it takes"
-    return f"by what was seen so far, {MOST_VISITS} more visits would not settle it"
+    return f"by what was seen so far, even {MOST_VISITS} more visits would not settle it"
 
 
 def verdict_kind(result: VerdictResult, locked: LockedMargins) -> str:
@@ -135,8 +135,8 @@ def verdict_kind(result: VerdictResult, locked: LockedMargins) -> str:
     if result.confirmatory:
         left = f" Visits before the lock ({_numbers(result.left_to_exploration)}) are left out." if result.left_to_exploration else ""
         return (
-            f"Confirmatory: margins version {locked.version} were locked on {locked.locked_at:%Y-%m-%d %H:%M} UTC by {locked.locked_by}, "
-            f"before every session that counts here.{left}"
+            f"Confirmatory: the margins (version {locked.version}) were locked on {locked.locked_at:%Y-%m-%d %H:%M} UTC by "
+            f"{locked.locked_by}, before every session that counts here.{left}"
         )
     if locked.locked_at is None:
         return "Exploratory: nobody has locked the margins, so that they could still be chosen by the data."
@@ -161,8 +161,10 @@ def lacking(found: Comparison) -> str:
     """Visits that give no primary evidence; empty where all do."""
     if not found.lacking_visits:
         return ""
-    word = "Visit" if len(found.lacking_visits) == 1 else "Visits"
-    return f"{word} {_numbers(found.lacking_visits)} lack one of the arms with this metric and give no primary evidence."
+    one = len(found.lacking_visits) == 1
+    lacks, give = ("lacks", "gives") if one else ("lack", "give")
+    visits = f"{'Visit' if one else 'Visits'} {_numbers(found.lacking_visits)}"
+    return f"{visits} {lacks} one of the arms with this metric and {give} no primary evidence."
 
 
 def left_out(excluded: Excluded) -> str:

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 
 import numpy as np
+from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.ingest import repository
+from app.ingest import channels, repository
 from app.platform.errors import Conflict, Invalid
 from app.study import blinding, cdbs_amplitude
 from app.study import repository as study
@@ -101,7 +102,7 @@ def place(db: Session, participant: Participant, recordings: Sequence[Recording]
     A stated start counts where it lies within the recording: a recording's own clock is never overruled, but the notes say so.
     """
     settings = participant.current_settings
-    choices = [(_control(study.traces_of_recording(db, r.id), settings.beta_source), r) for r in recordings]
+    choices = [(_control(study.traces_of_recording(db, r.id), settings.beta_source, r, stated.hemisphere), r) for r in recordings]
     # the stated side first, then recordings that a controller could have seen
     choices.sort(key=lambda c: (stated.hemisphere is not None and c[1].hemisphere != stated.hemisphere, c[0] is None))
     trace, control = choices[0]
@@ -130,14 +131,14 @@ def _inside(moment: datetime, recording: Recording) -> bool:
     return recording.started_at is None or 0 <= (moment - recording.started_at).total_seconds() < recording.duration_s
 
 
-def _control(traces: Sequence[Trace], wanted_source: str | None) -> Trace | None:
+def _control(traces: Sequence[Trace], wanted_source: str | None, recording: Recording, side: Hemisphere | None) -> Trace | None:
     """The trace that the controller is taken to have seen: of the participant's source where there is one, else of the first stream.
 
-    Of several channels it is the one with the most valid steps, and the first of equals.
+    Of several channels by target and montage, as `app.ingest.channels.choose`.
     """
     candidates = [t for stream in CONTROL_STREAMS for t in traces if t.stream == stream and any(t.valid_bits)]
     wanted = [t for t in candidates if t.source == wanted_source] or [t for t in candidates if t.stream == candidates[0].stream]
-    return max(wanted, key=lambda t: int(np.sum(~np.isnan(unpack(t)))), default=None)
+    return channels.choose(wanted, recording, side or recording.hemisphere)
 
 
 def offset_s(recording: Recording, started_at: datetime | None, period_s: float) -> float:
@@ -247,6 +248,22 @@ def refuse_overlap(db: Session, session: StudySession) -> None:
                     f"({other.start_s:.0f} to {other.stop_s:.0f} s of the recording).",
                     "Choose another part of the recording, or correct that session first.",
                 )
+
+
+def count(db: Session, session: StudySession) -> None:
+    """Let a session count. Raises Conflict where another one with the same minutes of its device was let count at the same time."""
+    session.status = "confirmed"
+    try:
+        db.flush()
+    except IntegrityError as error:
+        if "counted_time_once" not in str(error.orig):
+            raise
+        number = session.id
+        db.rollback()
+        raise Conflict(
+            f"Somebody else confirmed a session with the same minutes of this device as session {number} at the same time.",
+            "Load the page again: it names the other session.",
+        ) from error
 
 
 def counted_minutes(db: Session, placement: Placement) -> bool:

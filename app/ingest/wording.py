@@ -72,6 +72,22 @@ def _amplitude(facts: Mapping[str, Any]) -> str:
     return f"the sides do not agree, so that a person must say which controller it was ({each})"
 
 
+def _survey(facts: Mapping[str, Any]) -> str:
+    return (
+        f"recording {facts['recording']} is a survey of {facts['montages']} montages of sensing contacts, in which no controller was at "
+        "work: drop it, or say what it was"
+    )
+
+
+def _channel(facts: Mapping[str, Any]) -> str:
+    name = f"{facts['stream'].replace('_', ' ')} {facts['channel']}".strip()
+    lead = facts["lead"]
+    said = f"{name} of the {lead}" if lead else f"{name}, whose target the recording does not tell"
+    why = {"shorted": "one contact against itself"}
+    passed = [f"{p['channel']} ({why.get(p['why'], p['why'])})" for p in facts["passed"] if p["why"]]
+    return f"{said}; not {', '.join(passed)}" if passed else said
+
+
 _NO_AMPLITUDE = "the file states no amplitude"
 
 
@@ -102,6 +118,8 @@ _SENTENCES: dict[Reason, Callable[[Mapping[str, Any]], str]] = {
     Reason.SEVERAL_VISITS: lambda f: f"{f['visits']} visits are dated {f['day']}: choose one",
     Reason.NO_VISIT_OF_DAY: lambda f: f"recorded on {f['day']}, and no visit has that date: choose the visit, or add it",
     Reason.AMPLITUDE: _amplitude,
+    Reason.SURVEY: _survey,
+    Reason.CHANNEL: _channel,
     Reason.UNREADABLE: lambda f: f"its steps cannot be read: {f['detail']}",
     Reason.RECORDED_SIDE: lambda f: "of the recording that a controller could have seen",
     Reason.NO_SIDE: lambda f: "the file states no side",

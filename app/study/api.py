@@ -20,6 +20,7 @@ from app.study.schemas import (
     ParticipantOut,
     QocIn,
     QocOut,
+    RecordedTraceOut,
     SessionChange,
     SessionOut,
     SettingsChange,
@@ -31,9 +32,10 @@ from app.study.schemas import (
     VisitLockOut,
     VisitOut,
 )
-from app.study.serializers import outcome_out, participant_out, session_out, trace_out, visit_out
+from app.study.serializers import outcome_out, participant_out, recorded_trace_out, session_out, trace_out, visit_out
 from app.study.sessions import conditions
 from app.study.sessions.data import session_data
+from app.study.traces import recorded_traces
 from app.study.visits import service as visits
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
@@ -151,6 +153,12 @@ def read_trace(session: CurrentSession, db: Db, caller: CurrentCaller) -> TraceO
     """Beta and amplitude on the 2 s grid; rows with t_s <= 0 are the window before the session."""
     require_known(session.visit, caller)
     return trace_out(session_data(db, session))
+
+
+@router.get("/sessions/{session_id}/traces")
+def read_traces(session: CurrentSession, db: Db) -> list[RecordedTraceOut]:
+    """Every trace of every recording of the session: all channels and powers, the amplitudes of all programs and sides."""
+    return [recorded_trace_out(t) for t in recorded_traces(db, session, session.visit.participant.current_settings)]
 
 
 @router.get("/sessions/{session_id}/conditions")

@@ -112,9 +112,7 @@ class SettingsFields(Model):
     design_ladder: Bool = Field(False, description="Stratified design: the first random session of a visit is a titration ladder.")
     early_visits: Int = Field(3, description="Stratified design: visits over which the levels of random sessions are spread.")
     pool_programmings: Bool = Field(
-        False,
-        description="Sessions under other contacts, pulse widths or rates than the participant's newest enter buffers too; a clinician's "
-        "word, for the same fraction is another dose there.",
+        False, description="Sessions under other contacts, pulse widths or rates than the newest enter buffers too, as another dose."
     )
 
 
@@ -402,3 +400,20 @@ class TraceOut(Model):
     beta: list[float | None]
     amplitude_ma: list[float | None]
     amplitude_fraction: list[float | None]
+
+
+class RecordedTraceOut(Model):
+    """One trace of one recording of a session, on its own rows; null where a row is invalid."""
+
+    id: int
+    recording_id: int
+    hemisphere: Hemisphere | None
+    stream: str
+    channel: str
+    unit: str
+    source: str
+    decode_version: int
+    is_control: bool = Field(description="The trace that the controller is taken to have seen.")
+    details: dict[str, Any] = Field(description="How the values were made.")
+    t_s: list[float] = Field(description="End of each row, s from the session's start; rows with t_s <= 0 lie before it.")
+    values: list[float | None]

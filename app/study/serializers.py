@@ -14,12 +14,14 @@ from app.study.schemas import (
     OutcomeOut,
     ParticipantOut,
     QocOut,
+    RecordedTraceOut,
     SessionOut,
     SettingsOut,
     TraceOut,
     VisitOut,
 )
 from app.study.sessions.data import SessionData
+from app.study.traces import RecordedTrace
 
 
 def outcome_out(session: StudySession, derived: outcome_values.Derived) -> OutcomeOut:
@@ -86,6 +88,18 @@ def trace_out(data: SessionData) -> TraceOut:
         beta=_nullable(table.beta),
         amplitude_ma=_nullable(table.amplitude_ma),
         amplitude_fraction=_nullable(table.fraction),
+    )
+
+
+def recorded_trace_out(found: RecordedTrace) -> RecordedTraceOut:
+    """A trace of a recording for the API."""
+    trace = found.trace
+    return RecordedTraceOut(
+        is_control=found.is_control,
+        hemisphere=trace.recording.hemisphere,
+        t_s=[round(t, 6) for t in found.t_s.tolist()],
+        values=_nullable(found.values),
+        **{n: getattr(trace, n) for n in ("id", "recording_id", "stream", "channel", "unit", "source", "decode_version", "details")},
     )
 
 

@@ -146,7 +146,7 @@ def change_session(db: Session, session: StudySession, change: SessionChange, ca
         policy_id = given.pop("policy_id", kept)
         _check_policy(db, session, controller, policy_id)
         blinding.assign(session, controller, policy_id)
-    _check_control(db, session, given)
+    check_control(db, session, given)
     if "excluded_reason" in given and not (given["excluded_reason"] or "").strip() and session.excluded_reason is not None:
         repeated.refuse(db, session)
     for name, value in given.items():
@@ -178,7 +178,7 @@ def _check_policy(db: Session, session: StudySession, controller: Controller, po
         raise Invalid(f"Participant {participant.code} has no policy {policy_id}.", "Name one of this participant's policies.")
 
 
-def _check_control(db: Session, session: StudySession, given: dict[str, Any]) -> None:
+def check_control(db: Session, session: StudySession, given: dict[str, Any]) -> None:
     """A session can only be controlled by a trace that one of its recordings has."""
     if given.get("control_stream") is None and given.get("control_channel") is None:
         return

@@ -149,6 +149,35 @@ def shown_table(
     return _table(t_s, beta, amount, trace, amplitude, cdbs)
 
 
+@dataclass(frozen=True)
+class RecordedTrace:
+    """One trace within a session: ends of its rows, s from the session's start, and values with NaN where invalid, both [n]."""
+
+    trace: Trace
+    is_control: bool
+    t_s: NDArray[np.float64]
+    values: NDArray[np.float64]
+
+
+def recorded_traces(db: Session, session: StudySession, settings: SettingsVersion) -> list[RecordedTrace]:
+    """Every trace of every recording of a session, the control recording first, from the state window before the session on.
+
+    Rows stay where the recording has them; the grid of the session's steps is not asked.
+    """
+    found = []
+    lead = settings.window * settings.period_s
+    for recording_id in dict.fromkeys(s.recording_id for s in sorted(session.segments, key=lambda s: (not s.is_control, s.start_s))):
+        traces = repository.traces_of_recording(db, recording_id)
+        control = any(s.is_control and s.recording_id == recording_id for s in session.segments)
+        seen = _chosen(session, traces)[0] if control else None
+        origin = session_offset_s(session, recording_id)
+        for trace in traces:
+            t_s = trace.first_end_s - origin + trace.dt_s * np.arange(trace.n, dtype=np.float64)
+            inside = (t_s > -lead + 1e-6) & (t_s <= session.duration_s + trace.dt_s / 2)
+            found.append(RecordedTrace(trace, trace is seen, t_s[inside], unpack(trace)[inside]))
+    return found
+
+
 def amplitude_program(trace: Trace | repository.TraceHead) -> int:
     """The stimulation program of an amplitude trace; 0 where it names none."""
     word, _, number = trace.channel.rpartition(" ")

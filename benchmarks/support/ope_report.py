@@ -12,6 +12,7 @@ import numpy as np
 
 from .figure import draw
 from .ope_scores import Told, over_worlds, scores_of_tests, signs, world_scores
+from .worlds_figure import draw_worlds
 
 DESIGNS = ("stratified", "paper")
 ORACLES = ("days alone", "tested")
@@ -111,7 +112,11 @@ def report(names: Iterable[str], cells: Table, headline: str, figure: Path, out:
         for design in DESIGNS
     }
     figure.write_text(draw({d: t for d, t in found.items() if t}, tuple(DRAWN.values())))
-    out(f"figure: {figure}\n")
+    ranks = {f"{m}, {d}": [x for x in row.scores["rank"] if x is not None] for (d, m), row in summary.items() if row.worlds}
+    over_worlds_figure = figure.with_name(f"{figure.stem}-worlds.svg")
+    title = "rank correlation, one dot per world (long bar: mean, short bar: worst decile)"
+    over_worlds_figure.write_text(draw_worlds({label: x for label, x in ranks.items() if x}, title))
+    out(f"figures: {figure}, {over_worlds_figure}\n")
     return summary
 
 

@@ -115,6 +115,11 @@ INTENDED: dict[str, str] = {
         ),
         "API: settings have `design`, `design_ladder` and `early_visits`, and a planned session has `design`.",
     ),
+    **dict.fromkeys(
+        ("components > schemas > RecordedTraceOut", "paths > /api/v1/sessions/{session_id}/traces"),
+        "API: `GET /sessions/{id}/traces` gives every trace of a session's recordings, not the control trace alone.",
+    ),
+    "components > schemas > ProposalChange": "API: `control_stream` and `control_channel` of a proposal can be corrected.",
     "components > schemas > ProposalOut": "API: a proposal has `usable_steps`.",
     "components > schemas > UsableStepsOut": "API: a proposal has `usable_steps`.",
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",

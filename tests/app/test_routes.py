@@ -28,6 +28,7 @@ READABLE = (
     "/api/v1/visits/{visit_id}/sessions",
     "/api/v1/sessions/{session_id}",
     "/api/v1/sessions/{session_id}/trace",
+    "/api/v1/sessions/{session_id}/traces",
     "/api/v1/sessions/{session_id}/conditions",
     "/api/v1/sessions/{session_id}/qoc",
     "/api/v1/sessions/{session_id}/outcomes",

@@ -138,6 +138,10 @@ def test_figures_come_from_the_headline_and_the_baseline_from_the_papers_page(mo
     assert (figures["dose_sign_right"], figures["dose_sign_unknown"], figures["mae_mean"]) == (1, 0, 0)
     assert "A01" in "".join(text)
     assert (tmp_path / "ope.svg").read_text().startswith("<svg")
+    dots = (tmp_path / "ope-worlds.svg").read_text()
+    # one world each: the baseline with both designs, linear, and both oracles with both; the flat world stands nowhere
+    assert dots.count("<circle") == 7
+    assert "page, paper" in dots
     assert json.dumps(figures)
 
 

@@ -17,7 +17,6 @@ from app.analysis.primary.service import Primary, primary
 from app.analysis.trial_time.service import TrialTime, trial_time
 from app.study import repository as study
 from app.study.models import Controller, Participant
-from ml.statistics.effects import Saving
 from ml.statistics.pooling import Summary, pool
 from ml.statistics.within_visits.contrasts import Average, Reason, Unavailable
 
@@ -35,7 +34,6 @@ class PooledMetric:
 
     metric: str
     each: tuple[tuple[str, Average | Unavailable], ...]
-    savings: tuple[tuple[str, Saving | Unavailable], ...]
     summary: Summary | Unavailable
 
 
@@ -101,7 +99,6 @@ def _controller(found: Sequence[Primary], controller: Controller) -> PooledContr
 
 def _metric(found: Sequence[Primary], controller: Controller, metric: str) -> PooledMetric:
     each: list[tuple[str, Average | Unavailable]] = []
-    savings: list[tuple[str, Saving | Unavailable]] = []
     units = set()
     for p in found:
         mine = next((r for r in p.controllers if r.tested.controller is controller), None)
@@ -109,9 +106,7 @@ def _metric(found: Sequence[Primary], controller: Controller, metric: str) -> Po
             continue
         comparison = mine.of(metric)
         each.append((p.evidence.participant, comparison.result))
-        if comparison.saving is not None:
-            savings.append((p.evidence.participant, comparison.saving))
         if isinstance(comparison.result, Average):
             units.add(p.beta_kind if metric == "mean_beta" else None)
     summary = pool([r for _, r in each]) if len(units) < 2 else Unavailable(Reason.NOT_IDENTIFIED)
-    return PooledMetric(metric, tuple(each), tuple(savings), summary)
+    return PooledMetric(metric, tuple(each), summary)

@@ -7,9 +7,10 @@ controllers, single policies) is exploration, with the share of false discoverie
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import StrEnum
+from functools import cached_property
 
 from app.analysis.evidence.facts import METRICS, Facts
 from app.analysis.evidence.measurements import Chosen, choose, of_controller
@@ -19,6 +20,7 @@ from ml.statistics.multiplicity import benjamini_hochberg, holm
 from ml.statistics.ranksum import RankSum, as_in_the_paper
 from ml.statistics.within_visits.contrasts import (
     Average,
+    Measurements,
     Unavailable,
     VisitContrasts,
     order_imbalance,
@@ -87,26 +89,43 @@ class VisitRow:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One metric of one controller.
+    """One metric of one controller. What only the page of its visits shows is computed when it is first asked for.
 
     Attributes:
-        result: the primary average over visits, or why there is none. p_adjusted: by Holm (planned) or Benjamini-Hochberg (exploration).
-        delta: Cliff's delta over visits. saving: of energy alone, else None. exact: van Elteren's test. paper: the paper's test.
-        sensitivity: alternative analyses. imbalance: of the order, in SDs of the place. rows: every visit with a session of the controller
-            or of cDBS. disagreement: of the paper's test with the primary one; None where they agree.
+        data: what it is computed of. result: the primary average over visits, or why there is none.
+        p_adjusted: by Holm (planned) or Benjamini-Hochberg (exploration). paper: the paper's test.
+        imbalance: of the order, in SDs of the place. rows: every visit with a session of the controller or of cDBS.
+        disagreement: of the paper's test with the primary one; None where they agree.
     """
 
     metric: str
+    data: Measurements = field(repr=False, compare=False)
     result: Average | Unavailable
     p_adjusted: float | None
-    delta: Average | Unavailable
-    saving: Saving | Unavailable | None
-    exact: StratifiedTest | Unavailable
     paper: RankSum | Unavailable
-    sensitivity: tuple[Sensitivity, ...]
     imbalance: float | None
     rows: tuple[VisitRow, ...]
     disagreement: Disagreement | None
+
+    @cached_property
+    def delta(self) -> Average | Unavailable:
+        """Cliff's delta over visits."""
+        return cliffs_delta(self.data, LEVEL)
+
+    @cached_property
+    def saving(self) -> Saving | Unavailable | None:
+        """Energy saved; None of other metrics."""
+        return energy_saving(self.data, LEVEL) if self.metric == "energy" else None
+
+    @cached_property
+    def exact(self) -> StratifiedTest | Unavailable:
+        """Van Elteren's test."""
+        return van_elteren(self.data)
+
+    @cached_property
+    def sensitivity(self) -> tuple[Sensitivity, ...]:
+        """Alternative analyses."""
+        return sensitivities(self.data, LEVEL)
 
     @property
     def evidence_visits(self) -> tuple[int, ...]:
@@ -175,13 +194,10 @@ def _comparison(chosen: Chosen, metric: str) -> Comparison:
     found, paper = primary(data, LEVEL), as_in_the_paper(data, LEVEL)
     return Comparison(
         metric=metric,
+        data=data,
         result=found,
         p_adjusted=None,
-        delta=cliffs_delta(data, LEVEL),
-        saving=energy_saving(data, LEVEL) if metric == "energy" else None,
-        exact=van_elteren(data),
         paper=paper,
-        sensitivity=sensitivities(data, LEVEL),
         imbalance=order_imbalance(data),
         rows=_rows(chosen, visit_contrasts(data)),
         disagreement=_disagreement(found, paper),

@@ -22,7 +22,7 @@ from app.study.sessions.usable_steps import UsableSteps
 
 LABELS = {
     "visit": "Visit", "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "from": "From", "to": "To",
-    "started_at": "Start", "start_s": "From", "stop_s": "To",
+    "control": "Control channel", "started_at": "Start", "start_s": "From", "stop_s": "To",
 }  # fmt: skip
 PARTS = 6
 """Rows of the form that cuts a recording; longer days are cut twice, or over the interface."""
@@ -80,6 +80,7 @@ def texts(db: Session, session: StudySession, proposal: SessionProposal, caller:
         "controller": arm.controller.value if arm else "",
         "policy": study.policy_name(db, arm.policy_id if arm else None) or "",
         "hemisphere": session.hemisphere or "",
+        "control": f"{session.control_stream}|{session.control_channel or ''}",
         "from": _time(session, control.start_s),
         "to": _time(session, control.stop_s),
         "started_at": _clock(session.started_at) if session.started_at else "",
@@ -114,6 +115,8 @@ def as_change(session: StudySession, version: str, stored: Mapping[str, str], ty
     fields: dict[str, Any] = {n: own[n] for n in ("visit", "controller", "policy", "hemisphere", "started_at") if n in own}
     if "visit" in own and not own["visit"]:
         del fields["visit"]  # an open visit stays open
+    if own.get("control"):
+        fields["control_stream"], _, fields["control_channel"] = own["control"].partition("|")
     errors = []
     for name, target in (("from", "start_s"), ("to", "stop_s")):
         if name in own:

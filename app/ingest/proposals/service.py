@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from datetime import timedelta
 from itertools import pairwise
 
-from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
 from app.ingest import repository, sessions, wording
 from app.ingest.models import SessionProposal, Upload
+from app.ingest.proposals import control_channel
 from app.ingest.proposals.evidence import BY_CUT, BY_UPLOAD, Evidence, Reason, Source, guess_controller, guess_visit
 from app.ingest.schemas import PartIn, ProposalChange
 from app.ingest.sessions import Placement, StatedSession, add_session, set_segments
@@ -85,6 +85,7 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
         blinding.assign(session, controller, stated.policy_id if controller in POLICY_CONTROLLERS else None)
     of_recording = Evidence(Source.RECORDING, Reason.RECORDED_SIDE if session.hemisphere else Reason.NO_SIDE)
     evidence["hemisphere"] = BY_UPLOAD if stated.hemisphere else of_recording
+    evidence["control"] = control_channel.why(db, session)
     proposal = SessionProposal(
         session_id=session.id,
         upload_id=upload.id,
@@ -119,6 +120,8 @@ def _seen(session: StudySession, placement: Placement) -> str:
 
 
 def _guess_controller(db: Session, session: StudySession) -> tuple[Controller | None, Evidence]:
+    if (survey := control_channel.survey(session)) is not None:
+        return None, survey
     try:
         return guess_controller(delivered(db, session))
     except Invalid as error:
@@ -207,11 +210,17 @@ def _correct(db: Session, session: StudySession, wanted: ProposalChange, caller:
     _name_controller(db, session, given, caller)
     if "hemisphere" in given:
         _choose_side(db, session, given)
+    if {"control_stream", "control_channel"} & given.keys():
+        control_channel.choose(db, session, given)
     if {"start_s", "stop_s", "started_at"} & given.keys():
         _choose_part(session, given)
     stated = {name: _by(caller) for name in ("visit", "controller", "hemisphere") if given.get(name) is not None}
     if "controller" in given and given["controller"] is None:
         stated["controller"] = _by(caller, open=True)
+    if given.get("control_stream") is not None or given.get("control_channel") is not None:
+        stated["control"] = _by(caller)
+    elif "hemisphere" in given:
+        stated["control"] = control_channel.why(db, session)
     proposal.evidence = {**proposal.evidence, **{name: e.as_json() for name, e in stated.items()}}
     if RESTS_ON & given.keys():
         db.flush()
@@ -244,17 +253,7 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
         raise Invalid(f"Session {session.id} cannot be confirmed yet: its {' and '.join(missing)} is open ({why}).", "State it.")
     require_unlocked(session.visit)
     sessions.refuse_overlap(db, session)
-    session.status = "confirmed"
-    try:
-        db.flush()
-    except IntegrityError as error:
-        if "counted_time_once" not in str(error.orig):
-            raise
-        db.rollback()
-        raise Conflict(
-            f"Somebody else confirmed a session with the same minutes of this device as session {session.id} at the same time.",
-            "Load the page again: it names the other session.",
-        ) from error
+    sessions.count(db, session)
     kept_as_fractions = sessions.fix_milliamperes(db, session)
     conditions.record(db, session, caller.label)
     return [*kept_as_fractions, *sentences(contradictions(db, session)), *outcomes_intake.derive(db, session)]

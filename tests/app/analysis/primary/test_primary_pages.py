@@ -46,7 +46,7 @@ def test_a_visit_without_both_arms_gives_no_evidence(client: TestClient, add_vis
     found = comparison(client.get(PRIMARY).json(), "grasp")
     assert found["primary"]["visits"] == 3
     assert found["by_visit"][-1] == {**found["by_visit"][-1], "visit": 8, "contrast": None}
-    assert "give no primary evidence" in client.get(PAGE).text
+    assert "gives no primary evidence" in client.get(PAGE).text
 
 
 def test_where_days_and_arms_are_mixed_up_the_naive_test_is_warned_of(client: TestClient, add_session: AddSession) -> None:

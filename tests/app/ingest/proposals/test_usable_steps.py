@@ -21,14 +21,15 @@ def test_a_recording_with_packet_loss_has_20_usable_time_domain_steps(send: Any,
     answer = send(montage(recordings)).json()
     (proposal,) = answer["proposals"]
     first, *rest = proposal["usable_steps"]
-    assert (first["channel"], first["source"], first["is_control"]) == ("key 2 +9-8", "time_domain", True)
+    # of the subthalamic lead, though a channel of motor cortex has more valid steps
+    assert (first["channel"], first["source"], first["is_control"]) == ("key 1 +3-1", "time_domain", True)
     # three configurations that were sensed one after another
     found = {u["channel"]: u["usable"] for u in proposal["usable_steps"]}
-    assert [found["key 0 +2-0"], first["usable"], found["key 2 +11-9"]] == [4, 18, 3]
+    assert [found["key 0 +2-0"], found["key 2 +9-8"], found["key 2 +11-9"]] == [4, 18, 3]
     assert first["reason"] is None
     assert len(rest) == 12
     assert all((u["reason"] is None) == (u["usable"] > 0) for u in rest)
-    assert f"Usable steps: {first['usable']} of 103 on beta key 2 +9-8" in told(answer)
+    assert f"Usable steps: {first['usable']} of 103 on beta key 1 +3-1" in told(answer)
     page = client.get(f"/proposals/{proposal['session']['id']}", headers={"Accept": "text/html"}).text
     assert "Steps that can be learned from, of 103" in page
     assert f"<td>{first['usable']}</td>" in page
@@ -54,7 +55,7 @@ def test_every_recording_shows_its_usable_steps_or_says_why_it_has_none(send: An
             continue
         if answer["proposals"]:
             assert all(u["usable"] or u["reason"] for p in answer["proposals"] for u in p["usable_steps"]), path.name
-            assert "Usable steps: " in told(answer), path.name
+            assert "Usable steps: " in told(answer) or "The same minutes of this device came before" in told(answer), path.name
         else:
             assert any(report["flagged"] or report["understood"] for report in answer["report"]), path.name
 

@@ -1,0 +1,121 @@
+"""Which channel a controller is taken to have seen: by the target of its lead and by its contacts, before the number of its valid steps."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.study.models import Hemisphere, Recording, Trace
+from app.study.traces import unpack
+
+STIMULATED = ("STN", "GPi")
+"""Targets whose beta follows the stimulation of Parkinson's disease; other deep targets come after them."""
+CORTEX = ("M1", "S1", "PMC", "SMA", "PFC", "OFC", "ACC")
+_PAIR = re.compile(r"\+(\d+)-(\d+)")
+SURVEY_MONTAGES = 3
+"""So many sets of sensing contacts within one recording are a survey of montages: a controller keeps the one it was trained on."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a channel was measured.
+
+    Attributes:
+        lead: side and target as the device's settings have them, such as `left STN`; empty where they do not tell.
+        contacts: plus and minus; None where they are not known. shorted: both are the same contact, so that there is no signal.
+    """
+
+    lead: str
+    contacts: tuple[int, int] | None
+
+    @property
+    def shorted(self) -> bool:
+        """Whether the pair is one contact twice."""
+        return self.contacts is not None and self.contacts[0] == self.contacts[1]
+
+    @property
+    def target(self) -> str:
+        """`STN` of `left STN`; empty where it is not known."""
+        words = self.lead.split()
+        return words[-1] if words and words[-1] not in ("left", "right") else ""
+
+
+def place_of(trace: Trace, recording: Recording) -> Place:
+    """Where the channel of a trace was measured, by the recording's settings."""
+    key = trace.details.get("channel_key")
+    if key is None and (named := re.match(r"key (\d)", trace.channel)):
+        key = int(named[1])
+    settings = recording.details.get("settings") or {}
+    leads = [str(x or "") for x in settings.get("leads") or []]
+    bore = leads[2 * (int(key) // 2) : 2 * (int(key) // 2) + 2] if key is not None else leads
+    named_leads = {lead for lead in bore if lead}
+    pair = _PAIR.search(trace.channel) or _PAIR.search(_contacts_of_key(settings, key))
+    return Place(named_leads.pop() if len(named_leads) == 1 else "", (int(pair[1]), int(pair[2])) if pair else None)
+
+
+def _contacts_of_key(settings: dict[str, object], key: int | None) -> str:
+    """Contacts of a sensing key where they never changed; empty otherwise."""
+    sensing = settings.get("sensing")
+    rows = sensing if isinstance(sensing, list) else []
+    pairs = {str(s["contacts"][key]) for s in rows if key is not None and len(s.get("contacts") or []) > key}
+    return pairs.pop() if len(pairs) == 1 else ""
+
+
+def choose(candidates: Sequence[Trace], recording: Recording, side: Hemisphere | None) -> Trace | None:
+    """The channel that a controller is taken to have seen, of those of one kind.
+
+    Not one contact against itself, not of the other side, of a deep target before one that is not known and that before cortex, around the
+    stimulating contact before beside it and that before with it; of equals the one with the most valid steps, then the first.
+    """
+    cathodes = _cathodes(recording)
+
+    def rank(trace: Trace) -> tuple[bool, bool, int, int, int]:
+        place = place_of(trace, recording)
+        other_side = side is not None and place.lead.split()[:1] in (["left"], ["right"]) and place.lead.split()[0] != side
+        return (place.shorted, other_side, _of_target(place.target), _of_contacts(place, cathodes), -int(np.sum(~np.isnan(unpack(trace)))))
+
+    return min(candidates, key=rank, default=None)
+
+
+def _of_target(target: str) -> int:
+    if target in STIMULATED:
+        return 0
+    return 2 if not target else 3 if target in CORTEX else 1
+
+
+def _of_contacts(place: Place, cathodes: frozenset[int]) -> int:
+    """0: the stimulating contacts lie between the pair; 1: beside it, or not known; 2: the pair has one of them, and its artefact."""
+    if place.contacts is None or not cathodes:
+        return 1
+    low, high = sorted(place.contacts)
+    if cathodes & {low, high}:
+        return 2
+    return 0 if all(low < c < high for c in cathodes) else 1
+
+
+def _cathodes(recording: Recording) -> frozenset[int]:
+    """Numbers of the contacts that stimulate, as far as the recording's stimulation log tells."""
+    programs = [
+        p
+        for e in recording.details.get("events") or []
+        if e.get("kind") == "stimulation" and (e.get("data") or {}).get("therapy_on")
+        for p in e["data"].get("programs") or []
+        if p.get("amplitude_ma")
+    ]
+    return frozenset(int(c) for p in programs for c in re.findall(r"-(\d+)", str(p.get("contacts") or "")))
+
+
+def montages(recording: Recording) -> int:
+    """How many sets of sensing contacts a recording went through, those aside that were replaced before it began."""
+    states = (recording.details.get("settings") or {}).get("sensing") or []
+    begun = [i for i, s in enumerate(states) if float(s.get("from_s") or 0.0) <= 0.0]
+    inside = [s for s in states[begun[-1] if begun else 0 :] if float(s.get("from_s") or 0.0) < recording.duration_s]
+    return len({tuple(s.get("contacts") or ()) for s in inside})
+
+
+def is_survey(recording: Recording) -> bool:
+    """Whether a recording is a survey of sensing montages, in which no controller was at work."""
+    return montages(recording) >= SURVEY_MONTAGES

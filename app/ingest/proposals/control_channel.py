@@ -1,0 +1,42 @@
+"""The control channel of a proposal: why it is the one, another one by a person's word, and recordings that have none."""
+
+from __future__ import annotations
+
+from sqlalchemy.orm import Session
+
+from app.ingest import channels
+from app.ingest.proposals.evidence import Evidence, Reason, Source
+from app.study import repository as study
+from app.study import service
+from app.study.models import StudySession
+from app.study.sessions.contradictions import control_recording
+
+
+def survey(session: StudySession) -> Evidence | None:
+    """That a recording is a survey of sensing montages, in which no controller was at work; None where it is none."""
+    recording = control_recording(session)
+    if not channels.is_survey(recording):
+        return None
+    return Evidence(Source.RECORDING, Reason.SURVEY, {"recording": recording.id, "montages": channels.montages(recording)})
+
+
+def why(db: Session, session: StudySession) -> Evidence:
+    """Why the control channel is what it is."""
+    recording = control_recording(session)
+    traces = [t for t in study.traces_of_recording(db, recording.id) if t.stream == session.control_stream and any(t.valid_bits)]
+    chosen = next((t for t in traces if t.channel == session.control_channel), None)
+    facts: dict[str, object] = {"stream": session.control_stream, "channel": session.control_channel or "", "lead": "", "passed": []}
+    if chosen is not None:
+        places = {t.channel: channels.place_of(t, recording) for t in traces}
+        facts["lead"] = places[chosen.channel].lead
+        others = {c: p for c, p in places.items() if c != chosen.channel}
+        facts["passed"] = [{"channel": c, "why": "shorted" if p.shorted else p.lead} for c, p in others.items()]
+    return Evidence(Source.RECORDING, Reason.CHANNEL, facts)
+
+
+def choose(db: Session, session: StudySession, given: dict[str, object]) -> None:
+    """The stated channel, which a control recording of the session must have."""
+    service.check_control(db, session, given)
+    session.control_stream = str(given.get("control_stream") or session.control_stream)
+    if "control_channel" in given:
+        session.control_channel = None if given["control_channel"] is None else str(given["control_channel"])
