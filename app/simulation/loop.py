@@ -19,7 +19,7 @@ from app.planning.plans import repository as plans
 from app.planning.plans import service as planning
 from app.planning.plans.designs import planned_sessions
 from app.planning.plans.schedule import total_minutes
-from app.planning.plans.schemas import PlanIn
+from app.planning.plans.schemas import OverrideIn, PlanIn
 from app.platform.database import new_session, set_actor
 from app.platform.errors import BetaloopError, Conflict, NotFound
 from app.platform.jobs import repository as jobs
@@ -162,16 +162,22 @@ class ParticipantLoop:
         return ordered[: self.design.preset.policies_per_kind]
 
     def _draft(self, db: Session, person: Participant, visit: Visit) -> None:
-        """Draft the visit from the first policies of each kind in the ranking, without unsafe ones, and with one test with care at most."""
+        """Draft the visit from the first policies of each kind in the ranking, and with one test with care at most.
+
+        Unsafe ones fill what would stay empty, with a reason: nobody is harmed here, and an arm without sessions measures nothing.
+        """
         found = current_assessment(db, person, self.caller)
-        fit = [a for a in found.candidates if a.decided and not a.decided.needs_override and not a.policy.retired_reason]
+        fit = [a for a in found.candidates if a.decided and not a.policy.retired_reason]
+        fit.sort(key=lambda a: a.decided is not None and a.decided.needs_override)  # stable: the ranking's order otherwise
         careful = [a for a in fit if a.decided and a.decided.decision == "test_with_care"]
         fit = [a for a in fit if a not in careful[1:]]
         each = self.design.preset.policies_per_kind
         chosen = [a.policy.id for kind in LEARNED_KINDS for a in [a for a in fit if a.policy.kind == kind][:each]]
+        unsafe = [a.policy.id for a in fit if a.policy.id in chosen and a.decided and a.decided.needs_override]
         minutes = float(self.design.preset.session_minutes)
         draft = PlanIn(
             policy_ids=chosen,
+            overrides=[OverrideIn(policy_id=i, reason="a simulated participant: its arm would be empty without it") for i in unsafe],
             minutes_per_session=minutes,
             washout_minutes=_WASHOUT_MINUTES,
             no_dbs=True,
