@@ -334,7 +334,7 @@ def control_(
     as_json: AsJson = False,
 ) -> None:
     """Verify a controller bundle and run it on a stream of beta, as the tablet does."""
-    from app.tablet.control import Task, control, lines
+    from app.tablet.command import Task, control, lines
     from app.tablet.sources import Wish
 
     if speed not in ("realtime", "fast"):

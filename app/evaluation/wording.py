@@ -25,7 +25,7 @@ def decision(reasons: Sequence[Flag]) -> str:
     """The reasons of a verdict in one line.
 
     Args:
-        reasons: as `app.evaluation.ranking.verdicts.decide` gives them.
+        reasons: as `app.evaluation.ranking.decisions.decide` gives them.
     """
     told = [reason for reason in reasons if reason.code not in ("sessions_needed", "near_amplitude")]
     more = further_sessions(reasons)

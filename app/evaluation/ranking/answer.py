@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.evaluation.ranking.assessment import Assessed, Assessment
-from app.evaluation.ranking.verdicts import Decided
+from app.evaluation.ranking.decisions import Decided
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.verdict import outcome_draws
 

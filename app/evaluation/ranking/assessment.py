@@ -10,7 +10,7 @@ from typing import Any
 from app.evaluation.estimates.coverage import coverage_by_policy, coverage_failed
 from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
-from app.evaluation.ranking.verdicts import Circumstances, Decided, decide, ordering_told, session_noise
+from app.evaluation.ranking.decisions import Circumstances, Decided, decide, ordering_told, session_noise
 from app.evaluation.schemas import CoverageOut, TestedBefore
 from app.learning.models import Policy
 from app.platform.errors import Invalid

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from app.evaluation import wording
 from app.evaluation.ranking.assessment import Assessment
-from app.evaluation.ranking.verdicts import Decided
+from app.evaluation.ranking.decisions import Decided
 from app.learning.models import Policy
 from app.platform.errors import Conflict, Forbidden, Invalid
 

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from app.cli import app as command_line
 from app.platform.errors import Invalid, NotFound
 from app.settings import get_settings
-from app.tablet.control import Run, Task, control, drive, verified
+from app.tablet.command import Run, Task, control, drive, verified
 from app.tablet.sources import Row, Source, Wish, open_source
 from ml.deploy.bundle import build_bundle, sign
 from ml.deploy.runtime.envelope import BetaSample, Signal

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from app.cli import app as command_line
 from app.platform.errors import Invalid
-from app.tablet.control import Run, Task, control, drive, lines, verified
+from app.tablet.command import Run, Task, control, drive, lines, verified
 from app.tablet.sources import Row, Source, Wish, open_source
 from ml.deploy.manifest import Approval
 from ml.deploy.runtime.envelope import BetaSample, Reason, Signal

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from app.tablet.control import Run, drive, verified
+from app.tablet.command import Run, drive, verified
 from app.tablet.sources import Row, Source
 from ml.deploy.runtime.decision_log import COLUMNS, kind_line
 from ml.deploy.runtime.envelope import BetaSample, Signal
