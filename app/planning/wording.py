@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from app.evaluation.wording import amplitude
+from app.evaluation.wording import amplitude, chance
 from app.planning.plans.designs import Bound, Planned, delivered_ma
 from ml.deploy.manifest import BundleManifest
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
+from ml.ope.posterior.portfolio import Suggestion
 
 LEAVE_AT_ONCE = "A stop, an adverse event or a lost link: back to cDBS at once; the rest of the session is not made up for."
 
@@ -28,6 +29,17 @@ def of_item(policy: str, min_fraction: float | None, override_reason: str | None
     if override_reason:
         found.append(f"Policy '{policy}' is unsafe and planned all the same: {override_reason}.")
     return found
+
+
+def suggestion(why: Suggestion, first: bool) -> str:
+    """Why a policy is suggested for a visit, in one sentence."""
+    than = "than cDBS" if first else "than all above"
+    tells = f"; its test alone would settle {chance(why.informs)} of what is open about the others" if why.informs >= TELLING else ""
+    return f"{chance(why.better)} likely to turn out better on the whole {than}{tells}."
+
+
+TELLING = 0.2
+"""Share of what is open about the other candidates from which a policy's test is said to tell about them."""
 
 
 def design_name(planned: Planned) -> str:

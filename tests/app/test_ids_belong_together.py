@@ -34,10 +34,10 @@ Ids = dict[str, Any]
 
 
 def routes_with_two_ids(app: Any) -> set[tuple[str, str]]:
-    """(method, path) of every page and route of the interface whose path names two objects."""
+    """(method, path) of every page and route whose path names two objects; `key` is a word for a comparison, no object."""
     found = set()
     for context in iter_route_contexts(app.routes):
-        if context.path and context.path.count("{") >= 2:
+        if context.path and context.path.replace("{key}", "").count("{") >= 2:
             found |= {(method, context.path) for method in (context.methods or set()) - {"HEAD", "OPTIONS"}}
     return found
 

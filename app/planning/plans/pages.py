@@ -29,6 +29,7 @@ from app.planning.plans import repository, service
 from app.planning.plans.schedule import most_policies, total_minutes
 from app.planning.plans.schemas import Id, LimitIn, PlanIn, PlanOptions
 from app.planning.plans.service import PlanView, rules_of
+from app.planning.plans.suggested import suggested
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, NotFound
 from app.platform.web.forms import FormValues, parse
@@ -155,6 +156,7 @@ def _page(
     defaults = rules_of(PlanOptions())
     choices = _choices(db, participant, found)
     form = _form_values(view, values, choices)
+    suggestions = suggested(found, most_policies(defaults))
     return render(
         request,
         "planning/plan.html",
@@ -178,6 +180,7 @@ def _page(
         leave_at_once=wording.LEAVE_AT_ONCE,
         plan_method=method_name(view.evaluation.default_method) if view and view.evaluation else "",
         choices=choices,
+        suggestions=[(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],
         form_values=form,
         chosen=_chosen(view, values),
         problem=error.problem(request.url.path) if error else None,

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from app.accounts import service
 from app.accounts.addresses import normal_address
 from app.accounts.models import Role
-from app.accounts.permissions import APPROVE_PLAN, MANAGE_ACCOUNTS, PERMISSIONS, READ, WRITE_STUDY, Caller, Grant
+from app.accounts.permissions import APPROVE_PLAN, MANAGE_ACCOUNTS, PERMISSIONS, READ, READ_ARMS, WRITE_STUDY, Caller, Grant
 from app.platform.database import new_session
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 
@@ -123,7 +123,8 @@ def test_bad_accounts_are_refused(db: Session, email: str, password: str) -> Non
 
 
 def test_roles_include_what_they_should() -> None:
-    assert PERMISSIONS[Role.VIEWER] == {READ}
+    assert PERMISSIONS[Role.VIEWER] == {READ, READ_ARMS}
+    assert READ_ARMS not in PERMISSIONS[Role.BLINDED_ASSESSOR]
     assert APPROVE_PLAN in PERMISSIONS[Role.CLINICIAN]
     assert APPROVE_PLAN not in PERMISSIONS[Role.ENGINEER]
     assert all(PERMISSIONS[r] <= PERMISSIONS[Role.ADMIN] for r in Role)

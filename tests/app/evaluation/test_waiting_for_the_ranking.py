@@ -61,13 +61,13 @@ def test_no_page_asks_for_the_job_that_runs(client: TestClient, pipeline: str) -
         text = page(client, path)
         assert "Start a job of kind" not in text
         assert "one evaluation of this participant" not in text
-    assert 'id="ranking" data-refresh=' in page(client, "/participants/P1/ranking")
+    assert 'id="ranking" class="stack" data-refresh=' in page(client, "/participants/P1/ranking")
     with transaction("test") as db:
         job = db.get_one(Job, pipeline)
         job.status, job.finished_at, job.error = JobStatus.FAILED, now(), "stopped by the test"
     text = page(client, "/participants/P1/ranking")
     assert "Not enough data" in text
-    assert 'id="ranking" data-refresh=' not in text
+    assert 'id="ranking" class="stack" data-refresh=' not in text
     assert "First ranking" not in page(client, "/")
 
 

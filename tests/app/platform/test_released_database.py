@@ -40,6 +40,7 @@ IDS = {
     "snapshot_id": "select id from buffer_snapshot",
     "sweep_id": "select id from sweep",
     "job_id": "select id::text from job",
+    "key": "select 'random'",  # a word for a comparison
 }
 
 # what has no such record yet, and says so with 404: (route, rows)

@@ -19,7 +19,7 @@ from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[3]
-SIGNALS = [signal.SIGTERM, signal.SIGINT]
+SIGNALS = [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
 
 
 @pytest.fixture

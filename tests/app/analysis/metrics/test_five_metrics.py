@@ -144,7 +144,7 @@ def test_a_participant_without_sessions_has_an_empty_analysis(client: TestClient
 
 
 def test_the_page_shows_charts_tables_tests_and_limits(client: TestClient, study_of_ten: None) -> None:
-    page = client.get("/participants/P1/analyses", headers={"Accept": "text/html"})
+    page = client.get("/participants/P1/analyses/paper", headers={"Accept": "text/html"})
     assert page.status_code == 200
     assert page.text.count("data-chart") == 5
     for words in ("0.0286", "too few", "not independent", "Hodges-Lehmann", "exact", "covers all 5 comparisons"):
@@ -168,7 +168,7 @@ def test_sessions_whose_amplitudes_contradict_their_controller_are_named_and_cou
     answer = client.get(PATH).json()
     assert {w["session_id"]: (w["controller"], pytest.approx(w["mean_fraction"], abs=1e-5)) for w in answer["warnings"]} == wrong
     assert answer["sessions"] == 8
-    for path in ("/participants/P1/analyses", "/participants/P1"):
+    for path in ("/participants/P1/analyses/paper", "/participants/P1"):
         page = client.get(path, headers={"Accept": "text/html"}).text
         assert "Sessions whose amplitudes contradict their controller" in page
         assert "mean amplitude fraction is 1.20; 0.9 to 1.1 is expected" in page
@@ -178,7 +178,7 @@ def test_a_participant_without_cdbs_sessions_has_a_page_that_says_so(client: Tes
     table = b"t_s,beta,amplitude_fraction\n0,1,1\n2,1,0.5\n4,1,0.6\n"
     data = {"participant": enrolled, "visit": "1", "controller": "random"}
     assert client.post("/api/v1/uploads", data=data, files={"file": ("s.csv", table)}).status_code == 201
-    for path in ("/participants/P1/analyses", "/participants/P1"):
+    for path in ("/participants/P1/analyses/paper", "/participants/P1"):
         page = client.get(path, headers={"Accept": "text/html"})
         assert page.status_code == 200
         assert "cDBS 0" in page.text

@@ -163,7 +163,7 @@ def test_the_participants_record_has_a_row_for_every_check(policies: list[int], 
     record = export_participant(db, participant_by_code(db, "P1", SYSTEM), SYSTEM)
     with zipfile.ZipFile(io.BytesIO(record)) as archive:
         rows = list(csv.DictReader(io.StringIO(archive.read("P1/coverage.csv").decode())))
-    assert {(r["evaluation_id"], r["policy_id"], r["supported"]) for r in rows} == {(str(row.id), str(policies[1]), "False")}
+    assert {(r["evaluation_id"], r["policy_id"], r["supported"]) for r in rows} == {(str(row.id), str(policies[1]), "false")}
     found = {r["check"]: (r["value"], r["limit"], r["limit_is"], r["verdict"]) for r in rows}
     assert set(found) == set(CHECKS)
     assert found["outside_range"] == ("0.4", "0.2", "greatest", "refused")

@@ -1,0 +1,41 @@
+"""Which of the candidates a visit's plan suggests: the portfolio of those that may be proposed. The clinician decides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.evaluation.ranking.answer import answer
+from app.evaluation.ranking.assessment import Assessment
+from app.learning.models import Policy
+from ml.ope.posterior.portfolio import Suggestion, portfolio
+from ml.ope.posterior.verdict import FEWEST_DRAWS
+
+
+@dataclass(frozen=True)
+class Suggested:
+    """A policy of the portfolio, and why it is in it."""
+
+    policy: Policy
+    why: Suggestion
+
+
+def suggested(found: Assessment | None, slots: int) -> tuple[Suggested, ...]:
+    """The policies that teach most in a visit with so many slots, each behaviour once; none where the data cannot order policies.
+
+    Only candidates whose verdict is *test* or *test with care* are asked, and at most one of the latter is taken.
+    """
+    if found is None or not found.ordered or found.cdbs is None or found.cdbs.posterior is None:
+        return ()
+    theirs = np.asarray(found.cdbs.posterior.details.get("draws") or [], dtype=np.float64)
+    answered = answer(found)
+    careful = {str(row.one.policy.id) for row in answered.of("test_with_care")}
+    differences, policies = {}, {}
+    for row in (*answered.of("test"), *answered.of("test_with_care")):
+        own = row.one.posterior
+        ours = np.asarray(own.details.get("draws") or [], dtype=np.float64) if own is not None else np.empty(0)
+        if ours.size == theirs.size >= FEWEST_DRAWS:
+            differences[str(row.one.policy.id)] = ours - theirs
+            policies[str(row.one.policy.id)] = row.one.policy
+    return tuple(Suggested(policies[s.name], s) for s in portfolio(differences, slots, careful))

@@ -1,0 +1,68 @@
+"""What the plan's page suggests: the portfolio of what may be proposed, one sentence each; nothing unsafe, nothing that cannot be told."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from tests.app.evaluations import judge as judge
+from tests.app.evaluations import judged
+from tests.app.evaluations import policies as policies
+from tests.ml.ope.posterior.draws import N
+
+Judge = Callable[..., int]
+UNSAFE = {"behaviour": {"below_cdbs_20_percent": 0.42}}
+CAREFUL: dict[str, Any] = {"supported": False, "support": {"lowest_supported": 0.5, "dose": 0.4}}
+
+
+def drawn(value: float, spread: float, first_half: int) -> list[float]:
+    """Half of the draws `value` + `spread`, half less: opposite halves are opposite chances."""
+    return [value + first_half * (spread if k < N / 2 else -spread) for k in range(N)]
+
+
+@pytest.fixture
+def suggested(client: TestClient, policies: list[int]) -> Callable[[], list[str]]:
+    """The suggestions on the page of an open visit, as text."""
+    visit = client.post("/api/v1/participants/P1/visits", json={"number": 2}).json()["id"]
+
+    def read() -> list[str]:
+        page = client.get(f"/visits/{visit}/plan", headers={"accept": "text/html"})
+        assert page.status_code == 200
+        found = re.search(r"<ol id=\"suggested\">(.*?)</ol>", page.text, re.S)
+        items = re.findall(r"<li>(.*?)</li>", found.group(1), re.S) if found else []
+        return [html.unescape(re.sub(r"<[^>]+>", "", item)) for item in items]
+
+    return read
+
+
+def test_the_best_comes_first_and_then_what_may_turn_out_better(
+    policies: list[int], judge: Judge, suggested: Callable[[], list[str]]
+) -> None:
+    a, b, c = policies
+    first, twin, other = drawn(10.0, 4.0, 1), drawn(9.9, 4.0, 1), drawn(8.0, 4.0, -1)
+    judge({a: _with(10.0, first), b: _with(9.9, twin), c: _with(8.0, other)})
+    found = suggested()
+    assert [item.split(":")[0] for item in found] == ["p0", "p2"]
+    assert found[0].startswith("p0: > 99 % likely to turn out better on the whole than cDBS; its test alone would settle")
+    assert found[1].startswith("p2: 50 % likely to turn out better on the whole than all above")
+
+
+def test_neither_unsafe_nor_untold_policies_are_suggested_and_one_with_care_at_most(
+    policies: list[int], judge: Judge, suggested: Callable[[], list[str]]
+) -> None:
+    a, b, c = policies
+    judge({a: judged(90.0, **UNSAFE), b: judged(60.0, **CAREFUL), c: _with(59.0, drawn(59.0, 10.0, 1), **CAREFUL)})
+    assert [item.split(":")[0] for item in suggested()] in (["p1"], ["p2"])
+    judge({a: judged(90.0, told=False), b: judged(60.0, told=False), c: judged(50.0, told=False)})
+    assert suggested() == []
+
+
+def _with(value: float, draws: list[float], **changed: Any) -> dict[str, Any]:
+    estimate = judged(value, **changed)
+    estimate["details"]["draws"] = draws
+    return estimate
