@@ -16,8 +16,8 @@ import shutil
 import subprocess
 import tarfile
 import tempfile
-import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,13 +31,13 @@ from app.platform.database import database_url, get_engine, now
 from app.platform.embedded.server import wheel_binaries
 from app.platform.errors import BetaloopError
 from app.platform.migrate import migrate
-from app.platform.upkeep.sealing import CHUNK, KEY_BYTES, NotOpened, SealedReader, SealedWriter
+from app.platform.upkeep.sealing import CHUNK, KEY_BYTES, SealedReader, SealedWriter
 from app.settings import get_settings, private_folder
 
 DATABASE, FILES, KEYS, MANIFEST = "database.sealed", "files.sealed", "keys.sealed", "manifest.json"
 FORM = 1
 SERVER_PASSWORDS = ("database", "database-admin")
-_UNKNOWN_TO_OLDER_SERVERS = b"SET transaction_timeout = "
+_SETTING = re.compile(rb"SET (\w+) = ")
 
 
 class BackupError(BetaloopError):
@@ -205,45 +205,75 @@ def _dump(out: SealedWriter) -> None:
 
 
 def _load(source: SealedReader) -> None:
-    """Archive to SQL to psql, and not straight into the database: the archive sets options that older servers do not know."""
+    """Archive to SQL to psql in one transaction, without the settings that the server, which may be older, does not have.
+
+    psql commits at the end of what it reads, so it sees an end only when the archive was read whole; else it is killed and nothing is kept.
+    """
     target, env = _target()
     unpack = [_program("pg_restore"), "--no-owner", "--no-privileges", "--file=-"]
     apply = [_program("psql"), "--no-psqlrc", "--quiet", "--set=ON_ERROR_STOP=1", "--single-transaction", f"--dbname={target}"]
+    known = _server_settings(get_engine())
     with (
         tempfile.TemporaryFile() as said,
         subprocess.Popen(unpack, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said) as unpacking,
         subprocess.Popen(apply, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, env=env) as applying,
+        ThreadPoolExecutor(max_workers=1) as pool,
     ):
-        feeding = threading.Thread(target=_feed, args=(source, unpacking), daemon=True)
-        feeding.start()
+        fed = pool.submit(_feed, source, unpacking)
         assert unpacking.stdout is not None
         assert applying.stdin is not None
         try:
-            options = True  # they stand before the first rows
-            for line in unpacking.stdout:
-                options = options and not line.startswith(b"COPY ")
-                if not (options and line.startswith(_UNKNOWN_TO_OLDER_SERVERS)):
-                    applying.stdin.write(line)
-            applying.stdin.close()
-        except BrokenPipeError:
-            unpacking.kill()  # psql ended early: its exit code and words say why
+            for line in _for_server(unpacking.stdout, known):
+                applying.stdin.write(line)
+            if unpacking.wait() == 0:
+                applying.stdin.close()
+            else:
+                _give_up(applying)
+        except BrokenPipeError:  # psql ended early: its exit code and words say why
+            _give_up(applying)
+            unpacking.kill()
         applying.wait()
         unpacking.wait()
-        feeding.join()
+        fed.result()
         _require(applying, said, "restored")
         _require(unpacking, said, "restored")
 
 
 def _feed(source: SealedReader, process: subprocess.Popen[bytes]) -> None:
-    """Hand the archive on; where it is damaged or the reader has ended, the process sees an early end and says so."""
+    """Hand the archive on. Raises NotOpened where it is damaged; the process is killed then, and sees no end of it."""
     assert process.stdin is not None
     try:
         shutil.copyfileobj(source, process.stdin, CHUNK)
-    except (BrokenPipeError, NotOpened):
-        process.kill()
-    finally:
-        with contextlib.suppress(BrokenPipeError):
-            process.stdin.close()
+        process.stdin.close()
+    except BrokenPipeError:  # it ended early: its exit code says so
+        _give_up(process)
+    except BaseException:
+        _give_up(process)
+        raise
+
+
+def _give_up(process: subprocess.Popen[bytes]) -> None:
+    """End a process that must not take what it was given so far for all of it."""
+    process.kill()
+    assert process.stdin is not None
+    with contextlib.suppress(BrokenPipeError):  # what is still buffered has nowhere to go
+        process.stdin.close()
+
+
+def _server_settings(engine: Engine) -> frozenset[str]:
+    with engine.connect() as connection:
+        return frozenset(connection.scalars(text("select name from pg_settings")))
+
+
+def _for_server(sql: Iterator[bytes], known: frozenset[str]) -> Iterator[bytes]:
+    """The lines of a dump but for settings that the server does not have; settings stand before the first rows."""
+    for line in sql:
+        setting = _SETTING.match(line)
+        if setting is None or setting[1].decode() in known:
+            yield line
+        if line.startswith(b"COPY "):
+            break
+    yield from sql
 
 
 def _require(process: subprocess.Popen[bytes], said: IO[bytes], done: str) -> None:

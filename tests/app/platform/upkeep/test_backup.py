@@ -10,9 +10,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import psycopg
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import create_engine, inspect
 
 from app import main
 from app.platform.database import transaction
@@ -22,6 +24,7 @@ from app.platform.files import path_of
 from app.platform.upkeep import backup as backups
 from app.platform.upkeep.backup import BackupError
 from app.platform.upkeep.doctor import examine, newest_revision
+from app.platform.upkeep.sealing import SealedReader
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -153,6 +156,45 @@ def test_a_damaged_backup_is_refused_before_anything_is_written(place: Path, fil
     with pytest.raises(BackupError, match="missing or damaged"):
         backups.restore(folder, key)
     assert rows() == filled
+
+
+def test_a_restore_that_breaks_off_leaves_no_half_of_the_database(
+    place: Path, filled: dict[str, int], server: EmbeddedPostgres, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """psql commits at the end of its input: an archive that breaks off in the middle must not look like one that ends."""
+    folder, key = made(place)
+    with psycopg.connect(server.admin_conninfo(), autocommit=True) as connection:
+        connection.execute("drop database if exists restored with (force)")
+        connection.execute("create database restored owner betaloop")
+    engine = create_engine(server.url("restored"))
+    monkeypatch.setattr(backups, "get_engine", lambda: engine)
+    monkeypatch.setattr(backups, "database_url", lambda: server.url("restored"))
+
+    def breaks_off(lines: Iterator[bytes], known: frozenset[str]) -> Iterator[bytes]:
+        for line in whole(lines, known):
+            yield line
+            if line.startswith(b"COPY public.visit "):
+                broken.append(1)
+                next(p for p in psutil.Process().children() if p.name() == "pg_restore").kill()
+                return
+
+    whole, broken = backups._for_server, []
+    monkeypatch.setattr(backups, "_for_server", breaks_off)
+    try:
+        with pytest.raises(BackupError, match="cannot be restored"), (folder / "database.sealed").open("rb") as source:
+            backups._load(SealedReader(source, backups.read_key(key)))
+        assert broken
+        assert inspect(engine).get_table_names() == []
+    finally:
+        engine.dispose()
+        with psycopg.connect(server.admin_conninfo(), autocommit=True) as connection:
+            connection.execute("drop database restored with (force)")
+    assert filled
+
+
+def test_settings_that_a_server_lacks_are_left_out_and_rows_are_not() -> None:
+    dump = [b"SET old = 1;\n", b"SET new = 2;\n", b"COPY public.note (text) FROM stdin;\n", b"SET new = 2;\n", b"\\.\n"]
+    assert list(backups._for_server(iter(dump), frozenset({"old"}))) == [dump[0], *dump[2:]]
 
 
 def test_a_key_beside_what_it_protects_is_refused(place: Path, filled: dict[str, int]) -> None:
