@@ -38,11 +38,11 @@ PERMISSIONS: dict[Role, frozenset[str]] = {
 
 SCOPES: dict[Scope, frozenset[str] | None] = {
     Scope.FULL: None,
-    Scope.READ: frozenset({READ}),
-    Scope.UPLOAD: frozenset({READ, UPLOAD}),
-    Scope.JOBS: frozenset({READ, RUN_JOBS}),
+    Scope.READ: _VIEWER,
+    Scope.UPLOAD: _VIEWER | {UPLOAD},
+    Scope.JOBS: _VIEWER | {RUN_JOBS},
 }
-"""The permissions that a token's scope leaves of its user's; None leaves all."""
+"""The permissions that a token's scope leaves of its user's; None leaves all. Blinding follows the role alone."""
 
 
 @dataclass(frozen=True)

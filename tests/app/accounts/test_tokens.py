@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import service
 from app.accounts.models import Role, Scope, User
-from app.accounts.permissions import PERMISSIONS, SCOPES, Caller, Grant
+from app.accounts.permissions import PERMISSIONS, READ_ARMS, SCOPES, Caller, Grant
 from app.platform.database import now
 from app.platform.errors import Forbidden, Invalid, TooMany
 from tests.conftest import PASSWORD
@@ -53,6 +53,12 @@ def test_a_narrow_token_is_refused_in_words(db: Session, ada: str, client_with: 
     upload = client.post("/api/v1/uploads", files={"file": ("a.csv", b"x")}, data={"participant": "P1"})
     assert upload.status_code == 403
     assert upload.json()["detail"] == "A token for 'read' may not do this ('upload')."
+
+
+@pytest.mark.parametrize("scope", list(Scope))
+def test_a_scope_blinds_nobody_whose_role_may_know_what_ran(scope: Scope) -> None:
+    for role, knows in ((Role.VIEWER, True), (Role.CLINICIAN, True), (Role.BLINDED_ASSESSOR, False)):
+        assert Caller("x", 1, (Grant(1, None, role),), token_scope=scope).may(READ_ARMS, 1) is knows, role
 
 
 def test_a_token_ends_on_its_day(db: Session, ada: str) -> None:
