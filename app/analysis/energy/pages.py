@@ -53,7 +53,7 @@ def energy_page(
         try:
             stated = parse(ImplantIn, typed, {name: label for name, (label, _) in FIELDS.items()})
             implant = _implant(stated)
-            rows = service.battery(found, implant, stated.cdbs_ma)
+            rows = _battery(found, implant, stated.cdbs_ma)
         except BetaloopError as error:
             problem = error
     page = render(
@@ -76,6 +76,14 @@ def energy_page(
 def energy_table(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
     """Every measure of energy as a table."""
     return download(csv_of(CSV_COLUMNS, csv_rows(service.energy(db, participant, caller))), f"{participant.code}-energy.csv")
+
+
+def _battery(found: service.Energy, implant: Implant, cdbs_ma: float) -> list[service.BatteryRow]:
+    """Raises Invalid where a controller draws nothing and nothing else does."""
+    try:
+        return service.battery(found, implant, cdbs_ma)
+    except ValueError as error:
+        raise Invalid(f"No life follows from these assumptions: {error}.", "State all other drain of the implant, above 0.") from error
 
 
 def _implant(stated: ImplantIn) -> Implant:

@@ -164,7 +164,10 @@ def _why(metric: str, table: StepTable) -> Missing:
 
 
 def _sides(session: StudySession, table: StepTable, traces: TracesOf) -> tuple[Side, ...]:
-    """Every side and program that was recorded; a session of one amplitude trace has it already in its step table."""
+    """Every side and program that was recorded; a session of one amplitude trace has it already in its step table.
+
+    Where another side cannot be read, it is there without numbers, so that no sum over sides passes for the whole.
+    """
     recordings = {s.recording_id for s in session.segments}
     amplitudes = [t for i in recordings for t in traces(i) if t.stream == AMPLITUDE_STREAM]
     if len(recordings) == 1 and len(amplitudes) <= 1:
@@ -172,7 +175,7 @@ def _sides(session: StudySession, table: StepTable, traces: TracesOf) -> tuple[S
     try:
         return tuple(_side(d.name, d.is_control, d.table) for d in delivered_by(session, traces) if d.table is not None)
     except Invalid:
-        return (_side("controlled side", True, table),)
+        return (_side("controlled side", True, table), _side("other side", False, None))
 
 
 def _side(name: str, is_control: bool, table: StepTable | None) -> Side:

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from app.analysis.energy.measures import Measure, Pulses, pulses_of, taken
 from app.analysis.evidence.facts import Facts, Side
 from app.study.blinding import Arm
-from app.study.models import Controller, Recording
+from app.study.models import Controller, Recording, SessionSegment, Trace
 
 PATH = "/api/v1/participants/P1/analyses/energy"
 
@@ -105,6 +105,32 @@ def test_a_battery_lasts_longer_with_less_and_the_answer_is_a_range(client: Test
     wrong = client.get("/participants/P1/analyses/energy", params=ASSUMED | {"capacity_low_mah": "500"})
     assert wrong.status_code == 422
     assert "Give the smaller capacity first" in wrong.text
+
+
+def test_a_battery_from_which_nothing_draws_is_said_to_have_no_life(client: TestClient, add_session: Callable[..., int]) -> None:
+    add_session("cdbs")
+    add_session("no_dbs", fraction=0.0)
+    page = client.get("/participants/P1/analyses/energy", params=ASSUMED | {"other_drain_uw": "0"})
+    assert page.status_code == 422
+    assert "a battery from which nothing draws has no life to state" in page.text
+    assert "State all other drain of the implant, above 0." in page.text
+
+
+def test_a_side_that_cannot_be_read_leaves_no_sum_over_sides(client: TestClient, db: Session, add_session: Callable[..., int]) -> None:
+    add_session("cdbs")
+    session = add_session("rl", fraction=0.5)
+    other = add_session("cdbs", visit=2)
+    logged(db, 60.0, 130.0)
+    recording = db.scalars(select(SessionSegment.recording_id).where(SessionSegment.session_id == other)).one()
+    db.add(SessionSegment(session_id=session, recording_id=recording, start_s=0.0, stop_s=300.0, is_control=False))
+    for trace in db.scalars(select(Trace).where(Trace.recording_id == recording)):
+        trace.dt_s = 1.0
+    db.commit()
+    answer = client.get(PATH).json()
+    assert rows(answer, "mean_a")["rl"]["mean"] == pytest.approx(0.5)
+    assert rows(answer, "charge_uc_per_s")["rl"]["mean"] is None
+    assert rows(answer, "all_sides_a2")["rl"]["mean"] is None
+    assert answer["unknown_sides"] >= 1
 
 
 def test_the_table_has_the_definition_beside_the_number(client: TestClient, add_session: Callable[..., int]) -> None:
