@@ -45,7 +45,7 @@ class SeedRow:
 
 @dataclass(frozen=True)
 class BySeed:
-    """The snapshot with most seeds, newest first among equals.
+    """The snapshot with most seeds under one horizon and settings version, newest first among equals.
 
     Attributes:
         snapshot_id: None without an evaluation. seeds: that were run on it. rows: where later sessions tell. policies: with a return after
@@ -61,13 +61,14 @@ class BySeed:
 
 def by_seed(db: Session, participant: Participant, caller: Caller) -> BySeed:
     """Errors of every method and seed on one snapshot; raises Forbidden as `app.study.blinding`."""
-    by_snapshot: dict[int, dict[int, Evaluation]] = defaultdict(dict)
+    alike: dict[tuple[int, int, int], dict[int, Evaluation]] = defaultdict(dict)
     for one in repository.evaluations(db, participant.id):
-        by_snapshot[one.snapshot_id][int(one.config.get("seed", 0))] = one
-    if not by_snapshot:
+        # seeds are compared where nothing else differs: returns under another horizon or settings are other numbers
+        alike[(one.snapshot_id, one.settings_version_id, one.horizon_steps)][int(one.config.get("seed", 0))] = one
+    if not alike:
         return BySeed(participant.code, None, (), 0, ())
-    snapshot_id = max(by_snapshot, key=lambda i: (min(len(by_snapshot[i]), WANTED_SEEDS), i))
-    seeds = by_snapshot[snapshot_id]
+    chosen = max(alike, key=lambda k: (min(len(alike[k]), WANTED_SEEDS), k[0], max(e.id for e in alike[k].values())))
+    snapshot_id, seeds = chosen[0], alike[chosen]
     returns = _later_returns(db, seeds[min(seeds)], caller)
     rows: list[SeedRow] = []
     if len(returns) >= LEAST_POLICIES:
