@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import pytest
+from fastapi import FastAPI
+from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 
 from app.accounts.blinded import is_open
@@ -109,3 +112,37 @@ def test_whatever_is_not_listed_is_closed_to_blinded_assessors(client: TestClien
     assert blinded.get("/participants/P1/export.zip").status_code == 403
     assert not is_open("GET", "/participants/P1/some-new-page")
     assert client.get("/participants/P1").status_code == 200
+
+
+def test_nothing_open_to_a_blinded_assessor_depends_on_which_controller_ran(
+    client: TestClient, service_app: FastAPI, upload: Upload, client_as: Clients
+) -> None:
+    """Every open page and route answers the same where the arms of two sessions of an unlocked visit change places."""
+    sessions = [upload("cdbs"), upload("rl")]
+    visit = client.get(f"/api/v1/sessions/{sessions[0]}").json()["visit_id"]
+    blinded = client_as("blinded_assessor")
+    blinded.get("/account")
+    named = {"code": "P1", "visit_id": visit, "key": "rl"}
+    paths = {
+        context.path.format(**named, session_id=session)
+        for context in iter_route_contexts(service_app.routes)
+        for session in sessions
+        if context.path
+        and "GET" in (getattr(context, "methods", None) or ())
+        and set(re.findall(r"{(\w+)", context.path)) <= {*named, "session_id"}
+    }
+    opened = sorted(p for p in paths if is_open("GET", p))
+    assert len(opened) > 40
+
+    def answers(caller: TestClient) -> dict[str, str]:
+        changing = r'"request_id":"\w+"|name="csrf[^>]*>|nonce-?="?[\w-]+'
+        return {p: re.sub(changing, "", caller.get(p).text) for p in opened if p != "/account"}
+
+    seen, known = answers(blinded), answers(client)
+    for session, controller in zip(sessions, ("rl", "cdbs"), strict=True):
+        body = {"controller": controller, "reason": "swapped"}
+        assert client.patch(f"/api/v1/sessions/{session}", json=body).status_code == 200
+    again = answers(client)
+    assert sum(known[p] != again[p] for p in opened if p in known) >= 5, "the swap shows to those who may know"
+    now = answers(blinded)
+    assert [p for p in seen if seen[p] != now[p]] == []
