@@ -77,6 +77,11 @@ def unavailable(why: Unavailable, what: str = "the controller") -> str:
     return sentences[why.reason]
 
 
+def not_pooled(why: Unavailable) -> str:
+    """Why a metric has no summary over participants."""
+    return "Beta of different unit or source is not pooled." if why.reason is Reason.NOT_IDENTIFIED else unavailable(why)
+
+
 def tested_name(tested: Tested) -> str:
     """A controller, or a policy of it, by name."""
     if tested.policy_id is None:

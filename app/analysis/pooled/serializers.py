@@ -51,6 +51,6 @@ def pooled_out(found: Pooled, trial: TrialTime, times: Sequence[StepTime]) -> Po
 def _summary(found: Summary | Unavailable) -> SummaryOut:
     if isinstance(found, Unavailable):
         empty = dict.fromkeys(("estimate", "low", "high", "between_sd", "predicted_low", "predicted_high", "smallest_sign_p"))
-        return SummaryOut.model_validate({**empty, "participants": found.found, "text": wording.unavailable(found)})
+        return SummaryOut.model_validate({**empty, "participants": found.found, "text": wording.not_pooled(found)})
     names = ("estimate", "low", "high", "between_sd", "predicted_low", "predicted_high", "participants", "smallest_sign_p")
     return SummaryOut.model_validate({n: getattr(found, n) for n in names} | {"text": wording.no_population_claim(found)})

@@ -12,6 +12,11 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
+from app.analysis.pooled.serializers import pooled_out
+from app.analysis.pooled.service import Pooled, PooledController, PooledMetric
+from app.analysis.trial_time.service import TrialTime
+from app.study.models import Controller
+from ml.statistics.within_visits.contrasts import Reason, Unavailable
 from tests.app.analysis.conftest import adder
 
 
@@ -108,3 +113,9 @@ def test_computation_time_counts_ended_steps(client: TestClient, db: Session, en
 def test_without_anything_the_pages_say_so(client: TestClient) -> None:
     for path in ("/analyses", "/api/v1/analyses", "/analyses/results.csv", "/analyses/results.svg", "/trial-time"):
         assert client.get(path).status_code == 200, path
+
+
+def test_beta_that_is_not_pooled_has_the_same_reason_on_the_page_and_over_rest() -> None:
+    beta = PooledMetric("mean_beta", (), Unavailable(Reason.NOT_IDENTIFIED))
+    answer = pooled_out(Pooled((), (), (PooledController(Controller.RL, (beta,)),)), TrialTime([], [], [], []), [])
+    assert answer.metrics[0].together.text == "Beta of different unit or source is not pooled."
