@@ -41,6 +41,7 @@ class EndModel:
         skill: 1 - leave-one-session-out error / variance, [4]; NaN where unseen.
         residual: root mean squared leave-one-session-out error, [4]; 0 where unseen.
         day_share: share of an outcome's unexplained variance that sessions of one visit have in common, [4]; NaN where unseen.
+        left_out: leave-one-session-out predictions, [n, 4]; NaN where there is none.
     """
 
     constants: Floats
@@ -54,6 +55,7 @@ class EndModel:
     skill: Floats
     residual: Floats
     day_share: Floats
+    left_out: Floats
 
     def predict(self, minutes: Minutes, own: Sessions | None = None) -> Floats:
         """Posterior mean [..., 4] of sessions of any leading shape on a new day; with `own` their last axis is those sessions."""
@@ -161,11 +163,11 @@ def fit_end_model(buffer: ReplayBuffer, draws: int = 0, seed: int = 0, severity:
         *(outcome in regressions for outcome in ("grasp", "rating", "tremor")),
     )
     unseen = np.array([float(np.nanmean(column)) if np.isfinite(column).any() else 0.0 for column in table.T])
-    skill, residual = _left_out(table, regressions, constants, seen)
+    skill, residual, left_out = _left_out(table, regressions, constants, seen)
     share = np.full(4, np.nan)
     for outcome, r in regressions.items():
         share[COLUMN[outcome]] = r.day_share
-    return EndModel(constants, regressions, unseen, centre, spread, sessions, draws, seen, skill, residual, share)
+    return EndModel(constants, regressions, unseen, centre, spread, sessions, draws, seen, skill, residual, share, left_out)
 
 
 def _constants(settings: MdpSettings) -> Floats:
@@ -184,8 +186,10 @@ def _filled(values: Floats) -> Floats:
     return np.where(np.isfinite(values), values, np.nanmean(values))
 
 
-def _left_out(table: Floats, regressions: dict[Outcome, Regression], constants: Floats, seen: tuple[bool, ...]) -> tuple[Floats, Floats]:
-    """Skill and root mean squared error of leave-one-session-out predictions, [4] each."""
+def _left_out(
+    table: Floats, regressions: dict[Outcome, Regression], constants: Floats, seen: tuple[bool, ...]
+) -> tuple[Floats, Floats, Floats]:
+    """Skill and root mean squared error of leave-one-session-out predictions, [4] each, and the predictions, [n, 4]."""
     predicted = np.full(table.shape, np.nan)
     for outcome, r in regressions.items():
         predicted[r.sessions, COLUMN[outcome]] = r.left_out * (100.0 if outcome == "tremor" else 1.0)
@@ -199,4 +203,4 @@ def _left_out(table: Floats, regressions: dict[Outcome, Regression], constants: 
         error = float(np.mean((table[both, j] - predicted[both, j]) ** 2))
         variance = float(table[both, j].var())
         residual[j], skill[j] = np.sqrt(error), 1 - error / variance if variance > 0 else 0.0
-    return skill, residual
+    return skill, residual, predicted

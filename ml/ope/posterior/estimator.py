@@ -24,7 +24,7 @@ from ml.ope.posterior.draws import Draws, Replays, joint_draws
 from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference, similarity, updated
 from ml.ope.posterior.held_out import HeldOut, held_out
 from ml.ope.posterior.skill import Skill, ordering_skill
-from ml.ope.posterior.structures import STRUCTURES, Fit
+from ml.ope.posterior.structures import STRUCTURES, Fit, no_answer
 from ml.ope.posterior.support import LATE_STEPS, SessionSupport, Support
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale
@@ -91,13 +91,15 @@ class Posterior:
             fits.append(fitter(buffer, scale, draws, c.seed, before))
             report(0.4 * (k + 1) / len(STRUCTURES), "fitting the structures")
         predictions = held_out(buffer, scale, fits, c.seed)
+        linear = next(f for f in fits if f.key == "linear")
+        equal = held_out(buffer, scale, [no_answer(linear, buffer)], c.seed).predicted["equal"]
         report(0.9, "predicting left-out sessions")
         shares = shared_out(predictions.weights, draws)
         severity = sum(predictions.weights[f.key] * f.drawn.levels.mean(0) for f in fits)
         total = sum(shares.values())
         ends = fit_end_model(buffer, draws=total, seed=c.seed, severity=np.asarray(severity), wider=1.0)
         report(1.0, "fitting the outcomes")
-        return FittedPosterior(self.method, c, buffer, scale, tuple(fits), shares, predictions, ends, self.tests)
+        return FittedPosterior(self.method, c, buffer, scale, tuple(fits), shares, predictions, equal, ends, self.tests)
 
 
 def shared_out(weights: Mapping[str, float], draws: int) -> dict[str, int]:
@@ -107,7 +109,7 @@ def shared_out(weights: Mapping[str, float], draws: int) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class FittedPosterior:
-    """Fitted structures with their weights, and the tests."""
+    """Fitted structures with their weights, what is predicted of left-out sessions without any answer (`equal`), and the tests."""
 
     method: str
     config: PosteriorConfig
@@ -116,6 +118,7 @@ class FittedPosterior:
     fits: tuple[Fit, ...]
     shares: dict[str, int]
     predictions: HeldOut
+    equal: Floats
     ends: EndModel
     tests: tuple[TestedDifference, ...]
 
@@ -134,7 +137,7 @@ class FittedPosterior:
         support = SessionSupport(self.buffer)
         supports = [support.of(s) for s in replays.summaries]
         draws = self._draws(replays, everyone, supports, horizon)
-        skill = ordering_skill(self.buffer, self.predictions, self.ends, self.levels)
+        skill = ordering_skill(self.buffer, self.predictions, self.equal, self.ends, self.levels)
         look = AmplitudeSupport(self.buffer)
         return {
             name: self._estimate(i, replays, draws, supports[i], skill, list(look.of_policy(chosen[i]).flags()), horizon)

@@ -23,6 +23,10 @@ OPPOSITE = 2.0
 """An observed contrast of so many standard errors whose predicted sign is the other one is not reproduced."""
 NO_BETTER, LEVELS, CONTRASTS = "no_better_than_equal", "levels_follow_dose", "contrasts_not_reproduced"
 TOO_FEW = "too_few_left_out_sessions"
+MARGIN = 2.0
+"""Squared errors of left-out sessions must fall by more than so many of their standard errors below those of calling all doses equal."""
+SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""How much of the level of a visit may be told by its other sessions; the share that errs least counts."""
 CHANCE = 0.001
 """Chance below which levels that go with the dose are no chance."""
 
@@ -45,13 +49,15 @@ class Skill:
         return {"told": self.told, "reasons": list(self.reasons), "held_out_correlation": self.held_out_correlation}
 
 
-def ordering_skill(buffer: ReplayBuffer, predictions: HeldOut, ends: EndModel, levels: Floats) -> Skill:
-    """Predictions of left-out sessions against calling them all equal, and against contrasts between controllers.
+def ordering_skill(buffer: ReplayBuffer, predictions: HeldOut, equal: Floats, ends: EndModel, levels: Floats) -> Skill:
+    """Predictions of left-out sessions against calling all doses equal, and against contrasts between controllers.
 
-    The reward of the amplitude's price is known and orders nothing by itself. Beta may answer to nothing while outcomes do: where r_end of
-    left-out sessions is predicted better than by its mean, that alone is skill.
+    The reward of the amplitude's price is known and orders nothing by itself. The level of a visit, or of the window before a session,
+    orders no doses either: what predictions are held against knows both. Beta may answer to nothing while outcomes do: where r_end of
+    left-out sessions is predicted better than by its visit's level, that alone is skill.
 
     Args:
+        equal: mean reward of each left-out session where beta answers to no amplitude (`structures.no_answer`), as `predictions.predicted`.
         levels: what the structures leave of each session's beta once its doses are accounted for, [n].
     """
     keys = list(predictions.weights)
@@ -62,14 +68,39 @@ def ordering_skill(buffer: ReplayBuffer, predictions: HeldOut, ends: EndModel, l
         return Skill(False, (TOO_FEW,), None)
     said, was = predicted[known], seen[known]
     correlation = float(np.corrcoef(said, was)[0, 1]) if min(said.std(), was.std()) > 1e-9 else None
-    steps_told = float(np.mean((said - was) ** 2)) < float(np.var(was))
-    outcomes_told = ends.seen[0] and bool(np.nan_to_num(ends.skill[0]) > 0)
-    reasons = [] if steps_told or outcomes_told else [NO_BETTER]
+    reasons = [] if _better(was, said, equal[known]) or _outcomes_told(buffer, ends) else [NO_BETTER]
     if _follow_dose(buffer, levels):
         reasons.append(LEVELS)
     if _contradicted(buffer, predicted, seen):
         reasons.append(CONTRASTS)
     return Skill(not reasons, tuple(reasons), correlation)
+
+
+def _better(was: Floats, said: Floats, equal: Floats) -> bool:
+    """Whether squared errors fall, session by session, by more than chance would let them."""
+    gain = (was - equal) ** 2 - (was - said) ** 2
+    return bool(gain.mean() > MARGIN * gain.std(ddof=1) / np.sqrt(gain.size))
+
+
+def _outcomes_told(buffer: ReplayBuffer, ends: EndModel) -> bool:
+    """Whether r_end of left-out sessions is predicted better than by the other sessions, however much those of its visit count."""
+    found = np.array([s.end_reward(buffer.settings) for s in buffer.sessions], dtype=np.float64)
+    known = np.isfinite(found) & np.isfinite(ends.left_out[:, 0])
+    if not ends.seen[0] or known.sum() < FEWEST:
+        return False
+    was, visits = found[known], np.array([s.visit for s in buffer.sessions])[known]
+    everyone, own = np.ones((was.size, was.size)), (visits[:, None] == visits).astype(np.float64)
+    all_others, of_visit = (_mean_of_others(was, among) for among in (everyone, own))
+    of_visit = np.where(np.isfinite(of_visit), of_visit, all_others)
+    shrunk = [all_others + share * (of_visit - all_others) for share in SHARES]
+    return _better(was, ends.left_out[known, 0], min(shrunk, key=lambda equal: float(np.mean((was - equal) ** 2))))
+
+
+def _mean_of_others(values: Floats, among: Floats) -> Floats:
+    """Mean of the other values among which each stands, [n], by a matrix of 0 and 1, [n, n]; NaN where it stands alone."""
+    others = among - np.eye(values.size)
+    count = others.sum(1)
+    return np.asarray(np.where(count > 0, others @ values / np.maximum(count, 1), np.nan), dtype=np.float64)
 
 
 def _follow_dose(buffer: ReplayBuffer, levels: Floats) -> bool:

@@ -5,10 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from ml.ope.outcomes.model import fit_end_model
+from ml.ope.posterior.estimator import Posterior, PosteriorConfig
 from ml.ope.posterior.held_out import HeldOut
 from ml.ope.posterior.skill import ordering_skill
+from ml.policies.policy import ConstantPolicy
+from ml.qoc import Qoc
+from ml.trajectories import ReplayBuffer
 from tests.ml.ope.posterior.known_system import KnownSystem
 
 BUFFER = KnownSystem().buffer()
@@ -18,9 +23,12 @@ RNG = np.random.default_rng(0)
 OBSERVED = -0.8 + 0.5 * DOSES + 0.05 * RNG.standard_normal(N)
 
 
-def skill(predicted, levels=None, buffer=BUFFER):
+EQUAL = np.full(N, OBSERVED.mean())
+
+
+def skill(predicted, levels=None, buffer=BUFFER, equal=EQUAL):
     found = HeldOut({"a": np.zeros(N)}, {"a": np.asarray(predicted)}, OBSERVED, {"a": 1.0})
-    return ordering_skill(buffer, found, fit_end_model(buffer), np.zeros(N) if levels is None else levels)
+    return ordering_skill(buffer, found, equal, fit_end_model(buffer), np.zeros(N) if levels is None else levels)
 
 
 def test_predictions_that_follow_what_happened_are_skill() -> None:
@@ -43,4 +51,41 @@ def test_levels_of_random_sessions_that_go_with_their_dose_are_named() -> None:
 def test_few_sessions_tell_nothing() -> None:
     few = replace(BUFFER, sessions=BUFFER.sessions[:4])
     found = HeldOut({"a": np.zeros(4)}, {"a": OBSERVED[:4]}, OBSERVED[:4], {"a": 1.0})
-    assert ordering_skill(few, found, fit_end_model(few), np.zeros(4)).reasons == ("too_few_left_out_sessions",)
+    assert ordering_skill(few, found, EQUAL[:4], fit_end_model(few), np.zeros(4)).reasons == ("too_few_left_out_sessions",)
+
+
+def of_visits_alone(seed: int) -> ReplayBuffer:
+    """Sessions that differ in the level of their visit, in beta and in outcomes, and answer to nothing."""
+    buffer, rng = KnownSystem(depth=0.0).buffer(seed=seed), np.random.default_rng([seed, 9])
+    level, rating = np.exp(0.2 * rng.standard_normal(4)), rng.standard_normal(4)
+    sessions = []
+    for s in buffer.sessions:
+        qoc = Qoc(2.5 + 0.1 * rng.standard_normal(), int(np.clip(np.round(6 + rating[s.visit] + rng.standard_normal()), 1, 10)), 0.0)
+        sessions.append(replace(s, beta=s.beta * level[s.visit], lead_beta=s.lead_beta * level[s.visit], qoc=qoc))
+    return replace(buffer, sessions=tuple(sessions), settings=replace(buffer.settings, xi_beta=1.0))
+
+
+def told(buffer: ReplayBuffer) -> bool:
+    found = Posterior(PosteriorConfig(draws=24)).fit(buffer).evaluate({"half": ConstantPolicy(0.5)}, 40)
+    return bool(found["half"].details["skill"]["told"])
+
+
+def test_levels_of_visits_are_no_skill() -> None:
+    assert not any(told(of_visits_alone(seed)) for seed in range(2))
+
+
+@pytest.mark.slow
+def test_noise_is_seldom_taken_for_skill() -> None:
+    assert sum(told(of_visits_alone(seed)) for seed in range(20)) <= 2
+
+
+def test_a_reduction_of_errors_by_chance_is_no_skill() -> None:
+    """Half of the sessions are predicted a little better than by their mean, the others a little worse."""
+    bare = replace(BUFFER, settings=replace(BUFFER.settings, c2=0.0, c3=0.0, c4=0.0))
+    sign = np.where(np.arange(N) % 2, 1.0, -1.02)
+    found = skill(OBSERVED - (OBSERVED - EQUAL) * (1 - 0.1 * sign), buffer=bare)
+    assert found.reasons == ("no_better_than_equal",)
+
+
+def test_outcomes_that_follow_the_dose_are_skill_where_beta_says_nothing() -> None:
+    assert skill(EQUAL).told
