@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.fqe.steps import held_amplitude
-from ml.ope.linear.dynamics import autoregression, level_model, level_sums, log_noise_weights, noise_features
+from ml.ope.linear.dynamics import autoregression, innovations_of, level_model, level_sums, log_noise_weights, split_coefficients
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedFit, MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -170,14 +170,10 @@ class ImpulseDynamics:
 
     def innovations(self, tables: Sequence[ResponseTable]) -> list[Floats]:
         """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
-        found, w = [], self.phi.size
+        found = []
         for i, table in enumerate(tables):
             eta = table.beta - self.rest(table) - self.levels[:, i : i + 1]
-            windows = np.lib.stride_tricks.sliding_window_view(eta, w, axis=1)[:, :-1]
-            innovation = eta[:, w:] - windows @ self.phi[::-1]
-            predicted = table.beta[w:] - innovation
-            scale = np.exp(noise_features(np.broadcast_to(table.amplitude, predicted.shape), predicted) @ self.noise_weights)
-            found.append(np.where(table.usable, innovation / scale, np.nan))
+            found.append(innovations_of(eta, table.beta, table.amplitude, table.usable, self.phi, self.noise_weights))
         return found
 
     def usual_lead(self) -> Floats:
@@ -292,9 +288,8 @@ def _fit(sums: Sums, own: Floats, alpha: float) -> MixedFit:
 def _split(coefficients: Floats, own: Floats, alpha: float) -> tuple[Floats, Floats]:
     """Gains [D, STRETCHES] and levels [D, n] from coefficients [D, q + 1]."""
     root = prior_root(alpha)
-    first = 1 + root.shape[1]
-    visits = coefficients[:, first : first + own.shape[1]]
-    return coefficients[:, 1:first] @ root.T, coefficients[:, :1] + visits @ own.T + coefficients[:, first + own.shape[1] :]
+    answers, levels = split_coefficients(coefficients, own, root.shape[1])
+    return answers @ root.T, levels
 
 
 def _residual(table: ResponseTable, chosen: Combination, own: Floats, i: int) -> Floats:

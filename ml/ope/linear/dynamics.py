@@ -100,10 +100,7 @@ class Dynamics:
         found = []
         for i, table in enumerate(tables):
             eta = table.beta - self.beta @ table.answers.T - self.levels[:, i : i + 1]
-            expected = self._expected(eta)
-            predicted = table.beta[self.phi.size :] - (eta[:, self.phi.size :] - expected)
-            scale = np.exp(noise_features(np.broadcast_to(table.amplitude, predicted.shape), predicted) @ self.noise_weights)
-            found.append(np.where(table.usable, (eta[:, self.phi.size :] - expected) / scale, np.nan))
+            found.append(innovations_of(eta, table.beta, table.amplitude, table.usable, self.phi, self.noise_weights))
         return found
 
     def response(self, first: Floats, steps: int) -> LinearResponse:
@@ -113,11 +110,6 @@ class Dynamics:
     def usual_lead(self) -> Floats:
         """Standardised beta of each session under the mean of the random amplitudes, [n]: where the window before it is not known."""
         return np.asarray(self.levels[0] + self.beta[0, 0] * 0.65, dtype=np.float64)
-
-    def _expected(self, eta: Floats) -> Floats:
-        """E[eta_t | its past], [D, T], from eta [D, W + T]."""
-        windows = np.lib.stride_tricks.sliding_window_view(eta, self.phi.size, axis=1)[:, :-1]
-        return np.asarray(windows @ self.phi[::-1], dtype=np.float64)
 
 
 class LinearResponse:
@@ -170,6 +162,22 @@ def fit_dynamics(
     return mean, replace(mean, beta=drawn[0], levels=drawn[1])
 
 
+def innovations_of(eta: Floats, beta: Floats, amplitude: Floats, usable: NDArray[np.bool_], phi: Floats, noise_weights: Floats) -> Floats:
+    """Standardised innovations [D, T] of one session from what levels and answers leave of it, eta [D, W + T]; NaN where not usable."""
+    windows = np.lib.stride_tricks.sliding_window_view(eta, phi.size, axis=1)[:, :-1]
+    innovation = eta[:, phi.size :] - windows @ phi[::-1]
+    predicted = beta[phi.size :] - innovation
+    scale = np.exp(noise_features(np.broadcast_to(amplitude, predicted.shape), predicted) @ noise_weights)
+    return np.asarray(np.where(usable, innovation / scale, np.nan), dtype=np.float64)
+
+
+def split_coefficients(coefficients: Floats, own: Floats, width: int) -> tuple[Floats, Floats]:
+    """Answers [D, width] and levels [D, n] from coefficients [D, q] of `level_model`."""
+    first = 1 + width
+    visits = coefficients[:, first : first + own.shape[1]]
+    return coefficients[:, 1:first], coefficients[:, :1] + visits @ own.T + coefficients[:, first + own.shape[1] :]
+
+
 def largest_root(phi: Floats) -> float:
     """Largest modulus of a root of the autoregression; 0 where there is none."""
     roots = np.roots(np.concatenate([[1.0], -phi]))
@@ -214,9 +222,7 @@ def linear_sums(tables: Sequence[SessionTable], own: Floats, phi: Floats) -> lis
 
 def _split(coefficients: Floats, own: Floats) -> tuple[Floats, Floats]:
     """Answers [D, 7] and levels [D, n] from coefficients [D, q]."""
-    first = 1 + ANSWERS
-    visits = coefficients[:, first : first + own.shape[1]]
-    return coefficients[:, 1:first], coefficients[:, :1] + visits @ own.T + coefficients[:, first + own.shape[1] :]
+    return split_coefficients(coefficients, own, ANSWERS)
 
 
 def filtered(values: Floats, phi: Floats) -> Floats:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from ml.ope.fqe.steps import held_amplitude
-from ml.ope.linear.dynamics import autoregression, level_model, level_sums, log_noise_weights, noise_features
+from ml.ope.linear.dynamics import autoregression, innovations_of, level_model, level_sums, log_noise_weights, split_coefficients
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedFit, MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -147,14 +147,10 @@ class ModeDynamics:
 
     def innovations(self, tables: Sequence[ModeTable]) -> list[Floats]:
         """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
-        found, w = [], self.phi.size
+        found = []
         for i, table in enumerate(tables):
             eta = table.beta - self.gains @ table.columns.T - self.levels[:, i : i + 1]
-            windows = np.lib.stride_tricks.sliding_window_view(eta, w, axis=1)[:, :-1]
-            innovation = eta[:, w:] - windows @ self.phi[::-1]
-            predicted = table.beta[w:] - innovation
-            scale = np.exp(noise_features(np.broadcast_to(table.amplitude, predicted.shape), predicted) @ self.noise_weights)
-            found.append(np.where(table.usable, innovation / scale, np.nan))
+            found.append(innovations_of(eta, table.beta, table.amplitude, table.usable, self.phi, self.noise_weights))
         return found
 
     def usual_lead(self) -> Floats:
@@ -249,9 +245,7 @@ def mode_sums(tables: Sequence[ModeTable], own: Floats, phi: Floats) -> list[Sum
 
 def _split(coefficients: Floats, own: Floats) -> tuple[Floats, Floats]:
     """Gains [D, COLUMNS] and levels [D, n] from coefficients [D, q]."""
-    first = 1 + COLUMNS
-    visits = coefficients[:, first : first + own.shape[1]]
-    return coefficients[:, 1:first], coefficients[:, :1] + visits @ own.T + coefficients[:, first + own.shape[1] :]
+    return split_coefficients(coefficients, own, COLUMNS)
 
 
 def _residuals(tables: Sequence[ModeTable], coefficients: Floats, own: Floats) -> list[Floats]:
