@@ -133,7 +133,7 @@ def _sessions_changed(flag: Flag) -> str:
         "included": "newly included",
         "decoded": "decoded anew",
         "cdbs": "with another cDBS amplitude",
-        "moved": "with other steps: its times, control channel or controller were corrected",
+        "moved": "whose times, control channel, controller or stop were corrected",
     }
     return f"{count(int(_value(flag)), 'session', 'sessions')} {what[flag.fact('change')]}"
 

@@ -99,7 +99,9 @@ def tests_of(ran: Sequence[DrivenSession], settings: MdpSettings, horizon_steps:
         if session.trajectory is None or (session.policy_id is not None and session.policy_id not in policy_ids):
             continue
         result = actual(session.trajectory, settings, horizon_steps)
-        values = {name: v for name, v in result.shown.items() if name != "mean_beta"}
+        # a session that was stopped is a failure here as it is in buffers, whatever was measured
+        counted = {name: v for name, v in asdict(session.trajectory.counted_qoc).items() if v is not None}
+        values = {name: v for name, v in result.shown.items() if name != "mean_beta"} | counted
         if result.value is not None:
             values["return"] = result.value
         sessions.append(TestSession(None if session.policy_id is None else str(session.policy_id), session.visit, values))

@@ -32,6 +32,9 @@ NAMED = 5
 OF_STEPS = ("controller", "policy_id", "duration_s", "control_stream", "control_channel")
 """Columns of a session that its steps in a buffer depend on, beside what a snapshot pins."""
 
+STOPPED = "stopped_reason"
+"""Column that makes the session a failure in a buffer, whatever the reason."""
+
 
 def stale_reasons(db: Session, participant: Participant, evaluation: Evaluation) -> list[Flag]:
     """Why the ranking no longer speaks about the study as it is; empty when it does."""
@@ -100,7 +103,8 @@ def _edited(db: Session, sessions: Sequence[StudySession], moment: datetime) -> 
     ids, visits = [s.id for s in sessions], {s.visit_id for s in sessions}
     moved, readmitted = set(), set()
     for before, after in _pairs(*repository.changed_since(db, "session", "id", ids, moment)):
-        if any(before[name] != after[name] for name in OF_STEPS):
+        # rows of before sessions could be marked as stopped lack that column
+        if any(before[name] != after[name] for name in OF_STEPS) or bool(before.get(STOPPED)) != bool(after.get(STOPPED)):
             moved.add(int(after["id"]))
         if before["excluded_reason"] and not after["excluded_reason"]:
             readmitted.add(int(after["id"]))

@@ -289,4 +289,6 @@ def _digest(s: SessionTrajectory) -> str:
     for values in (s.lead_beta, s.beta, s.amplitude):
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes() + b"|")
     digest.update(repr((s.random_lower_bound, s.lead_amplitude, *s.holds)).encode())
+    if s.stopped:
+        digest.update(b"|stopped")
     return digest.hexdigest()

@@ -41,6 +41,7 @@ def trajectory_of(session: StudySession, table: StepTable, arm: Arm, version: Se
         holds=by_design.holds if by_design else (),
         lead_amplitude=lead_ma / table.cdbs_ma if lead_ma is not None and table.cdbs_ma else None,
         most_imputed=min(version.most_imputed, window - 1),
+        stopped=session.stopped_reason is not None,
     )
 
 

@@ -69,7 +69,7 @@ def test_corrected_steps_make_it_stale_and_taking_the_correction_back_does_not(e
     session.duration_s = seconds - 20
     segment.start_s = start + 4
     db.commit()
-    assert stale(db) == ["1 session with other steps: its times, control channel or controller were corrected"]
+    assert stale(db) == ["1 session whose times, control channel, controller or stop were corrected"]
     again = db.get_one(StudySession, number)
     again.duration_s, again.segments[0].start_s = seconds, start
     db.commit()
@@ -80,6 +80,13 @@ def test_an_exclusion_that_is_taken_back_leaves_nothing_stale(client: TestClient
     client.patch("/api/v1/sessions/1", json={"excluded_reason": "tablet froze"})
     assert stale(db) == ["1 session newly left out"]
     client.patch("/api/v1/sessions/1", json={"excluded_reason": None})
+    assert stale(db) == []
+
+
+def test_a_session_that_is_marked_as_stopped_makes_it_stale(client: TestClient, evaluated: int, db: Session) -> None:
+    client.patch("/api/v1/sessions/1", json={"stopped_reason": "dyskinesia"})
+    assert stale(db) == ["1 session whose times, control channel, controller or stop were corrected"]
+    client.patch("/api/v1/sessions/1", json={"stopped_reason": None})
     assert stale(db) == []
 
 

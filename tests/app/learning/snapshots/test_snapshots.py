@@ -19,7 +19,7 @@ from app.platform.database import new_session
 from app.platform.errors import Invalid
 from app.study.models import Participant, Trace
 from app.study.repository import participant_by_code
-from ml.trajectories import ReplayBuffer, from_parquet
+from ml.trajectories import FAILED, ReplayBuffer, from_parquet
 
 Upload = Callable[..., int]
 
@@ -81,6 +81,17 @@ def test_an_excluded_session_stays_out_with_its_reason(upload: Upload, client: T
     snapshot, buffer = taken(db)
     assert [s.session_id for s in buffer.sessions] == [kept]
     assert reasons(snapshot) == {excluded: "excluded by a person: cable came loose"}
+
+
+def test_a_session_that_was_stopped_is_a_failure_in_the_buffer(upload: Upload, client: TestClient, db: Session) -> None:
+    upload("random")
+    upload("random")
+    before, _ = taken(db)
+    assert client.patch("/api/v1/sessions/2", json={"stopped_reason": "dyskinesia"}).status_code == 200
+    after, buffer = taken(db)
+    assert [s.stopped for s in buffer.sessions] == [False, True]
+    assert buffer.sessions[1].counted_qoc == FAILED
+    assert after.id != before.id
 
 
 def test_beta_of_another_unit_is_never_mixed_in(upload: Upload, db: Session) -> None:
