@@ -18,9 +18,10 @@ function plotly() {
 }
 
 // "token:rl" and "token:rl/0.25" become the colour of --c-rl in the theme in use
-function colours() {
+function colours(onPaper) {
   const probe = document.createElement("span");
   probe.hidden = true;
+  if (onPaper) probe.style.colorScheme = "light";
   document.body.append(probe);
   const known = new Map();
   const resolve = (token) => {
@@ -34,19 +35,19 @@ function colours() {
   };
   const walk = (value) => {
     if (typeof value === "string") return value.startsWith("token:") ? resolve(value) : value;
-    if (Array.isArray(value)) return typeof value[0] === "number" ? value : value.map(walk);
+    if (Array.isArray(value)) return typeof value.at(-1) === "number" ? value : value.map(walk);
     if (value && typeof value === "object") return Object.fromEntries(Object.entries(value).map(([k, v]) => [k, walk(v)]));
     return value;
   };
   return { walk, done: () => probe.remove() };
 }
 
-async function draw(figure) {
+async function draw(figure, onPaper = false) {
   const plot = figure.querySelector(".plot");
   const source = figure.querySelector('script[type="application/json"]');
   try {
     const Plotly = await plotly();
-    const theme = colours();
+    const theme = colours(onPaper);
     const { data, layout } = theme.walk(JSON.parse(source.textContent));
     theme.done();
     plot.querySelector(".loading")?.remove();
@@ -75,6 +76,7 @@ document.addEventListener("betaloop:swap", (event) => find(event.target));
 // a changed figure: replace the JSON in its script element, then dispatch this event on the <figure>
 document.addEventListener("betaloop:redraw", (event) => draw(event.target.closest("figure[data-chart]")));
 document.addEventListener("betaloop:theme", () => { for (const figure of document.querySelectorAll("figure[data-drawn=yes]")) draw(figure); });
-addEventListener("beforeprint", () => {
-  for (const figure of document.querySelectorAll("figure[data-drawn=yes] .plot")) window.Plotly.Plots.resize(figure);
-});
+// paper takes every chart, also those that nobody scrolled to, in the light colours
+addEventListener("beforeprint", () => { for (const figure of document.querySelectorAll("figure[data-chart]")) draw(figure, true); });
+addEventListener("afterprint", () => { for (const figure of document.querySelectorAll("figure[data-drawn=yes]")) draw(figure); });
+if (document.querySelector("figure[data-chart]")) plotly().catch(() => {});

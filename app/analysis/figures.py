@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 
-COLOURS = {"cdbs": "#4b5563", "rl": "#0b6e99", "distilled": "#7c3aed", "no_dbs": "#b91c1c", "random": "#a16207", "other": "#0f766e"}
+COLOURS = {"cdbs": "#0067a8", "rl": "#c24e00", "distilled": "#9b3f86", "no_dbs": "#5d6770", "random": "#00795a", "other": "#7a6200"}
 PANEL_W, PANEL_H, LEFT, TOP, BOTTOM, GAP = 250, 190, 52, 44, 52, 18
 
 

@@ -302,4 +302,4 @@ def _left(job: dict[str, Any]) -> str:
         return "waits for the worker"
     if job["status"] != "running":
         return ""
-    return "time left not known yet" if job["seconds_left"] is None else f"about {minutes_left(job['seconds_left'])} left"
+    return "time left not known yet" if job["seconds_left"] is None else minutes_left(job["seconds_left"])

@@ -75,6 +75,22 @@ def test_the_theme_is_chosen_kept_and_redraws_the_charts(window: Callable, studi
     assert watched.page.get_attribute("html", "data-theme") == "dark"
 
 
+def test_paper_takes_every_chart_in_the_light_colours(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+    """Also charts that nobody scrolled to, and from a page in the dark theme."""
+    watched = window(1280, 400, "dark")
+    watched.sign_in()
+    watched.open(f"/sessions/{studied[0]}")
+    charts = len(watched.page.query_selector_all("figure[data-chart]"))
+    watched.page.wait_for_function("() => window.Plotly")
+    watched.page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
+    watched.page.wait_for_function(f"() => document.querySelectorAll('figure[data-drawn=yes] .main-svg').length >= {charts}")
+    ink = "() => getComputedStyle(document.querySelector('figure[data-drawn=yes] .xtick text, figure[data-drawn=yes] .xtitle')).fill"
+    on_paper = watched.page.evaluate(ink)
+    watched.page.evaluate("() => dispatchEvent(new Event('afterprint'))")
+    watched.page.wait_for_function(f"(before) => ({ink})() !== before", arg=on_paper)
+    assert watched.errors == []
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_targets_are_large_enough_for_a_finger_on_a_tablet(window: Callable, studied: list[int], scheme: str) -> None:  # type: ignore[type-arg]
     watched = window(820, 1180, scheme)

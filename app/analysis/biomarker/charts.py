@@ -14,6 +14,9 @@ UNITS = {
     "tremor": "% of session",
 }  # fmt: skip
 
+SCALE = ((0.0, "token:cdbs"), (1.0, "token:rl"))
+"""Early visits to late ones, in colours that either theme shows on its ground."""
+
 
 def unit(name: str, beta_unit: str) -> str:
     """The unit of an axis."""
@@ -22,11 +25,12 @@ def unit(name: str, beta_unit: str) -> str:
 
 def scatter(pair: Pairing, beta_unit: str) -> Chart:
     """All sessions that have both."""
-    visits, bar = [p[1] for p in pair.points], {"title": {"text": "Visit"}, "thickness": 10}
+    visits = [p[1] for p in pair.points]
+    bar = {"title": {"text": "Visit"}, "thickness": 10, "tickvals": sorted(set(visits))}
     data = [
         {
             "type": "scatter", "mode": "markers", "x": [p[2] for p in pair.points], "y": [p[3] for p in pair.points],
-            "marker": {"size": 8, "color": visits, "colorscale": "Viridis", "showscale": len(set(visits)) > 1, "colorbar": bar},
+            "marker": {"size": 8, "color": visits, "colorscale": SCALE, "showscale": len(set(visits)) > 1, "colorbar": bar},
             "text": [f"Session {p[0]}, visit {p[1]}" for p in pair.points], "hovertemplate": "%{text}<br>%{x:.3g}, %{y:.3g}<extra></extra>",
         }
     ]  # fmt: skip

@@ -56,7 +56,11 @@ def _chart(found: BySeed, metric: str) -> Chart:
             "text": [f"seed {s}" for s, _ in points], "hovertemplate": "%{text}: %{y:.3g}<extra></extra>",
         },
     ]  # fmt: skip
-    layout = {"xaxis": {"tickvals": list(range(len(names))), "ticktext": names, "showgrid": False}, "yaxis": axis(unit), "dragmode": False}
+    layout = {
+        "xaxis": {"tickvals": list(range(len(names))), "ticktext": names, "showgrid": False, "zeroline": False},
+        "yaxis": axis(unit),
+        "dragmode": False,
+    }
     rows: list[list[Cell]] = [[r.name, r.seed, r.policies, getattr(r, metric)] for own in grouped.values() for r in own]
     subtitle = f"{unit} \u00b7 {len(found.seeds)} seeds \u00b7 {found.policies} policies"
     return Chart(

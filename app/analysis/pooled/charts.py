@@ -39,7 +39,14 @@ def _chart(found: Sequence[FiveMetrics], metric: str) -> Chart:
             rows.append([one.participant, g.label, g.n, g.median, g.q1, g.q3, test.p_value if test else None])
     unit, places = ", ".join(units), list(range(len(names)))
     layout = {
-        "xaxis": {"tickvals": places, "ticktext": names, "range": [-0.6, len(names) - 0.4], "tickangle": 0, "showgrid": False},
+        "xaxis": {
+            "tickvals": places,
+            "ticktext": names,
+            "range": [-0.6, len(names) - 0.4],
+            "tickangle": 0,
+            "showgrid": False,
+            "zeroline": False,
+        },
         "yaxis": axis(unit, rangemode="tozero", zeroline=False),
         "annotations": notes,
         "margin": {"l": 52, "r": 8, "t": 26, "b": 60},

@@ -37,7 +37,7 @@ def by_visit(tested: Tested, found: Comparison, unit: str) -> Chart:
         places, ticks = [*places, len(rows) + 0.3], [*ticks, "Average"]
     better = "higher is better" if HIGHER_IS_BETTER[found.metric] else "lower is better"
     layout = {
-        "xaxis": {"tickvals": places, "ticktext": ticks, "showgrid": False, "range": [-0.6, len(rows) + 0.9]},
+        "xaxis": {"tickvals": places, "ticktext": ticks, "showgrid": False, "zeroline": False, "range": [-0.6, len(rows) + 0.9]},
         "yaxis": axis(f"{name} less cDBS", unit),
         "shapes": [horizontal(0.0, "", MUTED)[0]],
         "showlegend": False, "dragmode": False,

@@ -106,7 +106,7 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
 
 def _seen(session: StudySession, placement: Placement) -> str:
     """Which trace of which side the controller is taken to have seen, in words."""
-    trace = f"{session.control_stream} {session.control_channel or ''}".strip()
+    trace = f"{session.control_stream.replace('_', ' ')} {session.control_channel or ''}".strip()
     others = [r for r in placement.recordings if r is not placement.control]
     side = (
         f" of the {placement.control.hemisphere} side"

@@ -66,8 +66,8 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def fixed(value: float | None, decimals: int = 1) -> str:
-    """A number with a fixed count of decimals."""
-    return "—" if value is None or math.isnan(value) else f"{value:.{decimals}f}".replace("-", "\u2212")
+    """A number with a fixed count of decimals; what rounds to nothing has no sign."""
+    return "—" if value is None or math.isnan(value) else f"{value:z.{decimals}f}".replace("-", "\u2212")
 
 
 def minutes(seconds: float | None) -> str:
@@ -80,7 +80,7 @@ def minutes(seconds: float | None) -> str:
 
 def minutes_left(seconds: float) -> str:
     """A remaining time for people, no finer than it can be known."""
-    return "less than a minute" if seconds < 60 else f"{math.ceil(seconds / 60)} min"
+    return "less than a minute left" if seconds < 60 else f"about {math.ceil(seconds / 60)} min left"
 
 
 def size(value: int) -> str:

@@ -79,11 +79,11 @@ def test_the_api_gives_the_time_left(client: TestClient, pipeline: str) -> None:
 
 def test_remaining_times_are_words() -> None:
     assert [minutes_left(s) for s in (0.0, 59.9, 60.0, 61.0, 600.0)] == [
-        "less than a minute",
-        "less than a minute",
-        "1 min",
-        "2 min",
-        "10 min",
+        "less than a minute left",
+        "less than a minute left",
+        "about 1 min left",
+        "about 2 min left",
+        "about 10 min left",
     ]
 
 
