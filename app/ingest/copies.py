@@ -1,7 +1,7 @@
 """Copies of the same minutes: a recording is what a device and side had in a stretch of time, in whatever set of files it comes.
 
 The fuller copy counts. A copy that holds no more than a stored one is not stored again; a fuller one takes the place of the stored one in
-its sessions. Where both differ, or each holds what the other lacks, both are kept and a person decides.
+its sessions, those of locked visits aside. Where both differ, or each holds what the other lacks, both are kept and a person decides.
 """
 
 from __future__ import annotations
@@ -58,9 +58,10 @@ class Rows:
     unit: str
 
     @property
-    def valid(self) -> int:
-        """Rows with a value."""
-        return int(np.sum(np.isfinite(self.values)))
+    def valid_end_s(self) -> NDArray[np.float64]:
+        """Ends of the rows that have a value."""
+        ends: NDArray[np.float64] = self.end_s[np.isfinite(self.values)]
+        return ends
 
 
 @dataclass
@@ -70,11 +71,18 @@ class Verdict:
     Attributes:
         copy_of: a stored recording that holds all of it. fuller_than: stored ones that it takes the place of.
         beside: stored ones of the same minutes that differ, or hold what it lacks.
+        locked: stored ones that it is fuller than, and that stay, for sessions of a locked visit use them.
     """
 
     copy_of: Recording | None = None
     fuller_than: list[Recording] = field(default_factory=list)
     beside: list[Recording] = field(default_factory=list)
+    locked: list[Recording] = field(default_factory=list)
+
+    @property
+    def alone(self) -> bool:
+        """Whether it is fuller than one stored recording, and no other has any of its minutes."""
+        return len(self.fuller_than) == 1 and not self.beside and not self.locked
 
 
 def of_logs(traces: Sequence[TraceLog]) -> dict[Channel, Rows]:
@@ -137,8 +145,18 @@ def _alike(a: Rows, b: Rows) -> bool | None:
 
 
 def _holds(fuller: Mapping[Channel, Rows], less: Mapping[Channel, Rows]) -> bool:
-    """Whether one recording has every channel of another with as many valid rows."""
-    return all(key in fuller and fuller[key].valid >= rows.valid - max(1.0, LOST * rows.valid) for key, rows in less.items())
+    """Whether one recording has every channel of another, and a valid row in the place of each of its valid rows."""
+    return all(key in fuller and _lacks(fuller[key], rows) <= max(1.0, LOST * rows.valid_end_s.size) for key, rows in less.items())
+
+
+def _lacks(fuller: Rows, less: Rows) -> int:
+    """How many valid rows of a trace have no valid row of another within one row of their own."""
+    wanted, there = less.valid_end_s, fuller.valid_end_s
+    if not there.size:
+        return wanted.size
+    right = np.clip(np.searchsorted(there, wanted), 1, max(1, there.size - 1))
+    off = np.minimum(np.abs(wanted - there[right - 1]), np.abs(wanted - there[np.minimum(right, there.size - 1)]))
+    return int(np.sum(off > max(fuller.dt_s, less.dt_s) + EXACT_S))
 
 
 def judge(db: Session, like: Recording, traces: Sequence[TraceLog]) -> Verdict:
@@ -159,7 +177,12 @@ def judge(db: Session, like: Recording, traces: Sequence[TraceLog]) -> Verdict:
         is_to = relation(mine, of_stored(study.traces_of_recording(db, old.id), ahead))
         if is_to is Relation.NO_MORE:
             return Verdict(copy_of=old)
-        (found.fuller_than if is_to is Relation.FULLER else found.beside).append(old)
+        if is_to is not Relation.FULLER:
+            found.beside.append(old)
+        elif any(s.visit.locked for s in sessions_of(db, old)):
+            found.locked.append(old)
+        else:
+            found.fuller_than.append(old)
     return found
 
 
@@ -168,15 +191,24 @@ def _of_a_session(recording: Recording) -> bool:
     return recording.details.get("run", 0) is not None
 
 
-def supersede(db: Session, old: Recording, new: Recording, by: str) -> list[int]:
-    """Let the sessions of a recording use its fuller copy; which ones. A session of the whole recording is one of the whole copy then."""
+def sessions_of(db: Session, recording: Recording) -> list[StudySession]:
+    """Sessions with a part of a recording."""
+    return [db.get_one(StudySession, number) for number in sorted(study.session_ids_of_recording(db, recording.id))]
+
+
+def supersede(db: Session, old: Recording, new: Recording, alone: bool, by: str) -> list[int]:
+    """Let the sessions of a recording use its fuller copy; which ones.
+
+    Args:
+        alone: the copy has no minutes of other stored recordings: a session of the whole recording is one of the whole copy then. Else
+            each session keeps its minutes.
+    """
     assert old.started_at is not None
     assert new.started_at is not None
     moved = []
-    for session_id in sorted(study.session_ids_of_recording(db, old.id)):
-        session = db.get_one(StudySession, session_id)
-        _move(db, session, old, new)
-        moved.append(session_id)
+    for session in sessions_of(db, old):
+        _move(db, session, old, new, alone)
+        moved.append(session.id)
         if session.status == "confirmed":
             conditions.renew(db, session, by, f"a fuller copy of recording {old.id} came: recording {new.id}")
         else:
@@ -186,7 +218,7 @@ def supersede(db: Session, old: Recording, new: Recording, by: str) -> list[int]
     return moved
 
 
-def _move(db: Session, session: StudySession, old: Recording, new: Recording) -> None:
+def _move(db: Session, session: StudySession, old: Recording, new: Recording, alone: bool) -> None:
     assert old.started_at is not None
     assert new.started_at is not None
     period = session.visit.participant.current_settings.period_s
@@ -194,7 +226,7 @@ def _move(db: Session, session: StudySession, old: Recording, new: Recording) ->
     mine = [s for s in session.segments if s.recording_id == old.id]
     parts = []
     for segment in mine:
-        whole = segment.start_s <= period and segment.stop_s >= old.duration_s - period
+        whole = alone and segment.start_s <= period and segment.stop_s >= old.duration_s - period
         start = 0.0 if whole else min(max(0.0, round((segment.start_s - ahead) / period) * period), max(0.0, new.duration_s - 1e-3))
         stop = new.duration_s if whole else min(max(segment.stop_s - ahead, start + 1e-3), new.duration_s)
         parts.append((segment.is_control, start, stop))

@@ -135,8 +135,20 @@ def no_more_than(stored: Recording) -> str:
 
 def fuller_than(old: Recording, sessions: Sequence[int]) -> str:
     """Of a copy that holds more than a stored recording."""
-    used = f"; session{'s' if len(sessions) > 1 else ''} {', '.join(map(str, sessions))} uses it from now on" if sessions else ""
+    several = len(sessions) > 1
+    named = f"; session{'s' if several else ''} {', '.join(map(str, sessions))}"
+    used = f"{named} use{'' if several else 's'} it from now on" if sessions else ""
     return f"A fuller copy of the minutes of recording {old.id} ({old.duration_s:.0f} s): it takes that one's place{used}."
+
+
+def locked_copy(new: Recording, old: Recording, sessions: Sequence[int]) -> str:
+    """Of a copy that holds more than a stored recording, which sessions of a locked visit use."""
+    named = f"session{'s' if len(sessions) > 1 else ''} {', '.join(map(str, sessions))}"
+    return (
+        f"A fuller copy (recording {new.id}) of the minutes of recording {old.id}, of which {named} of a locked visit is made: nothing was "
+        f"changed there. To use the copy, have the visit unlocked, exclude {named} with a reason and confirm the session "
+        "proposed of the copy."
+    )
 
 
 def beside(new: Recording, other: Recording) -> str:

@@ -49,7 +49,10 @@ def store(db: Session, participant: Participant, file: UploadFile, decoded: Sequ
         fresh = _add(db, row, one)
         stored.fresh.append(fresh)
         for old in verdict.fuller_than:
-            stored.flagged.append(wording.fuller_than(old, copies.supersede(db, old, fresh, file.upload.created_by)))
+            moved = copies.supersede(db, old, fresh, verdict.alone, file.upload.created_by)
+            stored.flagged.append(wording.fuller_than(old, moved))
+        for old in verdict.locked:
+            stored.flagged.append(wording.locked_copy(fresh, old, [s.id for s in copies.sessions_of(db, old) if s.visit.locked]))
         stored.flagged += [wording.beside(fresh, other) for other in verdict.beside]
     return stored
 

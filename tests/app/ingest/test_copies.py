@@ -51,12 +51,21 @@ def changed(change: Callable[[str, bytes], bytes]) -> bytes:
 
 def cut(name: str, content: bytes) -> bytes:
     """The first half of the packets of the streams."""
+    return _packets(name, content, lambda n: slice(n // 2))
+
+
+def cut_off(name: str, content: bytes) -> bytes:
+    """The second half of the packets of the streams."""
+    return _packets(name, content, lambda n: slice(n // 2, None))
+
+
+def _packets(name: str, content: bytes, kept: Callable[[int], slice]) -> bytes:
     if "RawData" not in name:
         return content
     body = json.loads(content)
     for key in ("TimeDomainData", "PowerDomainData"):
         if body[0].get(key):
-            body[0][key] = body[0][key][: len(body[0][key]) // 2]
+            body[0][key] = body[0][key][kept(len(body[0][key]))]
     return json.dumps(body).encode()
 
 
@@ -217,3 +226,35 @@ def test_what_two_recordings_of_the_same_minutes_are_to_each_other() -> None:
     holed = [*signal[:80], *[float("nan")] * 10]
     assert relation({beta: rows(holed), amplitude: rows([1.0] * 90)}, old) is Relation.NO_MORE
     assert relation(old, {beta: rows(holed)}) is Relation.FULLER
+
+
+def test_a_recording_that_goes_on_after_a_stored_one_ended_is_no_copy_of_it() -> None:
+    signal = [float(v) for v in 3 + np.random.default_rng(2).standard_normal(120)]
+    beta = ("beta", "a")
+    early, late = {beta: rows(signal[:80])}, {beta: rows(signal[40:], at=80.0)}
+    assert relation(late, early) is Relation.EACH_ITS_OWN, "as many rows, and half of them are of minutes that nobody else has"
+    assert relation(early, late) is Relation.EACH_ITS_OWN
+    assert relation({beta: rows(signal)}, late) is Relation.FULLER
+
+
+def test_two_parts_keep_their_minutes_in_the_whole_recording(send: Any, client: TestClient) -> None:
+    for name, part in (("first.zip", cut), ("second.zip", cut_off)):
+        assert send((name, changed(part)), **STATED).status_code == 201
+    before = sessions_of(client)
+    assert len(before) == 2
+    whole = send(("whole.zip", FOLDER), **STATED).json()
+    assert "the decoder failed" not in str(whole["report"])
+    after = sessions_of(client)
+    assert [s["id"] for s in after] == [s["id"] for s in before]
+    assert [s["duration_s"] for s in after] == pytest.approx([s["duration_s"] for s in before], abs=3)
+    assert len({r for s in after for r in s["recordings"]}) == 1
+
+
+def test_a_fuller_copy_changes_no_session_of_a_locked_visit(send: Any, client: TestClient) -> None:
+    send(("half.zip", changed(cut)), **STATED)
+    (before,) = sessions_of(client)
+    assert client.post(f"/api/v1/visits/{before['visit_id']}/lock", json={"reason": "data complete"}).status_code == 200
+    answer = send(("whole.zip", FOLDER)).json()
+    assert sessions_of(client)[0] == before
+    assert [p["session"]["id"] for p in answer["proposals"]] != [before["id"]]
+    assert f"session {before['id']} of a locked visit is made: nothing was changed there" in str(answer["report"])
