@@ -9,6 +9,7 @@ import csv
 import hashlib
 import json
 import math
+import os
 import sys
 import time
 from collections import deque
@@ -51,6 +52,10 @@ def main(arguments: list[str]) -> int:
         log = next((Path(a.removeprefix("--log=")) for a in arguments if a.startswith("--log=")), None)
         try:
             run(manifest, network, log)
+        except BrokenPipeError:
+            sys.stderr.write("nobody reads the amplitudes any more\n")
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to write at exit goes nowhere
+            return 1
         except OSError as error:
             sys.stderr.write(f"the log {log} cannot be written: {error.strerror}\n")
             return 1

@@ -101,6 +101,21 @@ def test_the_log_of_a_bundles_own_runner_gives_back_what_the_device_had(tmp_path
     assert (again.returncode, "log.csv cannot be written" in again.stderr) == (1, True)
 
 
+def test_a_runner_whose_reader_went_away_says_so_and_blames_no_log(tmp_path: Path) -> None:
+    with zipfile.ZipFile(made(tmp_path)) as archive:
+        archive.extractall(tmp_path / "bundle")
+    call = [sys.executable, "-m", "controller", "--run"]
+    with subprocess.Popen(
+        call, cwd=tmp_path / "bundle", stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as runner:
+        assert runner.stdout is not None
+        runner.stdout.close()
+        runner.stdout = None
+        _, said = runner.communicate("1\n1\n1\n", timeout=20)
+    assert runner.returncode == 1
+    assert said.splitlines()[-1] == "nobody reads the amplitudes any more"
+
+
 def test_an_uploaded_log_is_the_session_that_the_device_had(logged: tuple[Device, Path], client: TestClient, enrolled: str) -> None:
     device, log = logged
     client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"cdbs_amplitude_ma": 3.0}})
