@@ -101,13 +101,16 @@ def _program(program: dict[str, Any], side: str, rate_hz: float | None) -> dict[
 
 
 def _amplitude(program: dict[str, Any]) -> float | None:
-    """A program's amplitude in mA; of a lead whose segments have amplitudes of their own (SenSight) the sum over its cathodes."""
+    """A program's amplitude in mA; of a lead whose segments have amplitudes of their own (SenSight) the sum over its cathodes.
+
+    None where one of them does not tell its own.
+    """
     whole = finite(program.get("AmplitudeInMilliAmps"))
     if whole is not None:
         return whole
-    cathodes = (e for e in entries(program.get("ElectrodeState")) if word(e.get("ElectrodeStateResult")) == "Negative")
+    cathodes = [e for e in entries(program.get("ElectrodeState")) if word(e.get("ElectrodeStateResult")) == "Negative"]
     known = [own for e in cathodes if (own := finite(e.get("ElectrodeAmplitudeInMilliAmps"))) is not None]
-    return round(sum(known), 3) if known else None
+    return round(sum(known), 3) if known and len(known) == len(cathodes) else None
 
 
 def contacts(value: Any) -> str:

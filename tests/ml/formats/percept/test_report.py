@@ -360,5 +360,7 @@ def test_a_group_of_a_directional_lead_has_the_amplitude_of_its_cathodes():
     group = {"GroupId": "GroupIdDef.GROUP_A", "ProgramSettings": {"LeftHemisphere": {"Programs": [program]}}}
     assert groups([group])[0]["programs"][0]["amplitude_ma"] == 1.9
     assert groups([json.loads(json.dumps(group).replace("ElectrodeAmplitudeInMilliAmps", "X"))])[0]["programs"][0]["amplitude_ma"] is None
+    del states[1]["ElectrodeAmplitudeInMilliAmps"]
+    assert groups([group])[0]["programs"][0]["amplitude_ma"] is None, "a part of the current is no amplitude"
     program["AmplitudeInMilliAmps"] = 2.0
     assert groups([group])[0]["programs"][0]["amplitude_ma"] == 2.0
