@@ -95,8 +95,9 @@ def _wide(table: TextTable, columns: dict[str, int], time: int, report: FileRepo
     start = _starts(table, time, report)
     fractions = np.column_stack([table.numbers(columns[c], decimal, c) for c in TREMOR_CLASSES]) if table.rows else np.empty((0, 6))
     stated = table.numbers(columns["any_tremor"], decimal, "any_tremor") if "any_tremor" in columns else np.full(start.size, np.nan)
-    total = np.median(fractions.sum(axis=1)) if start.size else 1.0
-    if abs(total - 100.0) <= 100.0 * SUM_TOLERANCE:
+    sums = fractions.sum(axis=1)
+    whole = sums[np.isfinite(sums)]  # a minute with an empty cell does not say what the others are in
+    if whole.size and abs(float(np.median(whole)) - 100.0) <= 100.0 * SUM_TOLERANCE:
         fractions, stated = fractions / 100.0, stated / 100.0
         report.repaired.append("shares in per cent read as fractions")
     outside = np.flatnonzero(((fractions < 0) | (fractions > 1 + SUM_TOLERANCE)).any(axis=1))

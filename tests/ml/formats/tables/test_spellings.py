@@ -133,6 +133,12 @@ def test_tremor_in_another_spelling_is_the_same_minutes(write, tmp_path, text):
             np.testing.assert_allclose(getattr(one, name), getattr(plain, name), atol=1e-12)
 
 
+def test_one_minute_without_shares_does_not_hide_that_the_others_are_in_per_cent(write):
+    text = TREMOR["per cent"] + "2024-03-14T10:07:00Z,,,,,,\n"
+    (got,) = decode_strivepd(write(text)).tremor
+    np.testing.assert_allclose(got.fractions[:2].sum(axis=1), 1.0)
+
+
 def test_an_interval_of_tremor_that_ends_before_it_begins_is_refused(write):
     bad = TREMOR["Apple's names"].replace("2024-03-14T10:07:00Z", "2024-03-14T10:05:30Z")
     with pytest.raises(UndecodableFile, match="ends before it begins") as caught:
