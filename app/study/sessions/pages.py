@@ -28,6 +28,7 @@ from app.study.sessions import view as session_view
 from app.study.sessions.charts import operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.data import SessionData, session_data
+from app.study.sessions.stimulation import beside, delivered
 from app.study.traces import NO_CONTROL, session_offset_s
 from app.study.wording import drawn_words, sentences
 from ml.energy import relative_energy
@@ -286,6 +287,7 @@ def _page(
         correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},
         seen=seen,
         drawn=_drawn(db, session, data, caller),
+        beside=_beside(db, session, data),
         ran_under=dict(_conditions_revisions(session)[-1].fields)
         | {"conditions_reason": ""}
         | {k: v for k, v in (typed or {}).items() if k in _CONDITIONS_LABELS},
@@ -299,6 +301,16 @@ def _drawn(db: Session, session: StudySession, data: SessionData | None, caller:
     """How a random session's amplitudes were drawn, in words; empty for other sessions and where its steps cannot be read."""
     found = designs.of_session(db, session, data.table, caller) if data else None
     return drawn_words(found) if found else ""
+
+
+def _beside(db: Session, session: StudySession, data: SessionData | None) -> list[str]:
+    """Sides and programs that stimulated too, of which mean amplitude and energy hold nothing."""
+    if data is None:
+        return []
+    try:
+        return beside(delivered(db, session), data.table.amplitude_trace)
+    except Invalid:
+        return []  # the contradictions of the session say what cannot be read
 
 
 def _control_events(session: StudySession, recordings: list[Recording]) -> tuple[list[dict[str, Any]], float]:

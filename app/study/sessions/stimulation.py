@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Any
@@ -175,6 +176,12 @@ def contradicts(session: StudySession, controller: Controller, side: Delivered) 
 def delivered(db: Session, session: StudySession) -> list[Delivered]:
     """The stimulation of every side of a session, from all its recordings, the controlled one first; errors as in `delivered_by`."""
     return delivered_by(session, lambda recording_id: repository.traces_of_recording(db, recording_id))
+
+
+def beside(sides: Sequence[Delivered], counted: Trace | None) -> list[str]:
+    """Names of the sides and programs that stimulated, but for the one whose amplitude trace a session's step table was read from."""
+    traces = ((s, s.table.amplitude_trace) for s in sides if s.table is not None and s.stimulated)
+    return [s.name for s, trace in traces if trace is not None and (counted is None or trace.id != counted.id)]
 
 
 def delivered_by(session: StudySession, traces_of: TracesOf) -> list[Delivered]:

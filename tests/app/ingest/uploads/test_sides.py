@@ -52,6 +52,17 @@ def test_a_confirmed_no_dbs_with_a_stimulated_side_is_told_at_once_and_on_its_pa
     assert against in page(client, f"/sessions/{first['session']['id']}")
 
 
+def test_the_page_says_whose_stimulation_is_not_in_its_energy(send: Any, client: TestClient, percept: tuple[str, bytes]) -> None:
+    first, *_, last = send(percept, visit=1).json()["proposals"]
+    for one, said in ((first, "left side"), (last, None)):
+        post(client, one, "confirm", controller="no_dbs")
+        text = page(client, f"/sessions/{one['session']['id']}")
+        assert ("<dt>Stimulated too</dt>" in text) is (said is not None)
+        assert said is None or f"<dt>Stimulated too</dt><dd>{said} " in text
+    alone = send(("a.zip", device_zip()), visit=1, controller="random").json()["sessions"][0]["id"]
+    assert "<dt>Stimulated too</dt>" not in page(client, f"/sessions/{alone}"), "its own stimulation is what its energy is of"
+
+
 def test_a_stated_controller_is_held_against_every_side(send: Any, percept: tuple[str, bytes]) -> None:
     answer = send(percept, visit=1, controller="no_dbs").json()
     (line,) = [text for text in answer["report"][0]["flagged"] if "Said to be without DBS, but its mean amplitude on the left side" in text]
