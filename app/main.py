@@ -32,6 +32,7 @@ log = structlog.get_logger()
 API_MODULES = (
     "app.study.api",
     "app.study.margins.api",
+    "app.study.adverse_events.api",
     "app.ingest.uploads.api",
     "app.ingest.proposals.api",
     "app.ingest.quarantine.api",
@@ -56,6 +57,7 @@ PAGE_MODULES = (
     "app.study.pages",
     "app.study.settings.pages",
     "app.study.margins.pages",
+    "app.study.adverse_events.pages",
     "app.study.visits.pages",
     "app.study.sessions.pages",
     "app.ingest.uploads.pages",

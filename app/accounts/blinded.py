@@ -21,6 +21,7 @@ OPEN = (
     ("GET", "/api/v1/sessions/[0-9]+/(qoc|outcomes|trace)"),
     ("PUT", "/api/v1/sessions/[0-9]+/qoc"),
     ("POST", "/sessions/[0-9]+/qoc"),
+    ("POST", "/api/v1/participants/[^/]+/adverse-events"),
 )
 """Method and path, as a regular expression. What these show of a visit that is not locked goes through `app.study.blinding`."""
 

@@ -47,6 +47,8 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "visit_lock": (),
     "session": (),
     "session_conditions": (),
+    "adverse_event": (),
+    "adverse_event_revision": (),
     "recording": ("details",),
     "session_segment": (),
     "trace": ("values_f32", "valid_bits"),

@@ -13,6 +13,7 @@ TABLE_MODULES = (
     "app.platform.jobs.models",
     "app.accounts.models",
     "app.study.models",
+    "app.study.adverse_events.models",
     "app.study.outcomes.models",
     "app.study.sessions.models",
     "app.ingest.models",

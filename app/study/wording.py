@@ -5,9 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from app.study.adverse_events.models import EventKind, Severity
 from app.study.models import Controller
 from app.study.sessions.contradictions import Contradiction, Kind
 from app.study.sessions.designs import Drawn
+
+EVENT_KINDS = {
+    EventKind.DYSKINESIA: "Dyskinesia",
+    EventKind.SPEECH: "Speech",
+    EventKind.GAIT: "Gait or balance",
+    EventKind.FALL: "Fall",
+    EventKind.MUSCLE_CONTRACTION: "Muscle contraction",
+    EventKind.PARAESTHESIA: "Paraesthesia",
+    EventKind.VISION: "Vision",
+    EventKind.MOOD: "Mood",
+    EventKind.COGNITION: "Thinking or confusion",
+    EventKind.PAIN: "Pain",
+    EventKind.NAUSEA: "Nausea",
+    EventKind.DEVICE: "Device",
+    EventKind.OTHER: "Other",
+}
+EVENT_SEVERITIES = {Severity.NONE: "none", Severity.MILD: "mild", Severity.SEVERE: "severe"}
 
 _SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be without DBS"}
 

@@ -183,6 +183,20 @@ INTENDED: dict[str, str] = {
         ("components > schemas > SessionChange", "components > schemas > SessionOut"),
         "API: a session has `stopped_reason` and `medication_h`",
     ),
+    **dict.fromkeys(
+        (
+            "components > schemas > AdverseEventChange",
+            "components > schemas > AdverseEventIn",
+            "components > schemas > AdverseEventOut",
+            "components > schemas > ClearanceIn",
+            "components > schemas > EventKind",
+            "components > schemas > Severity",
+            "paths > /api/v1/adverse-events/{event_id}",
+            "paths > /api/v1/adverse-events/{event_id}/clearance",
+            "paths > /api/v1/participants/{code}/adverse-events",
+        ),
+        "API: adverse events are written down, corrected and cleared at `/participants/{code}/adverse-events` and `/adverse-events/{id}`",
+    ),
 }
 
 

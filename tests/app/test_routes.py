@@ -57,6 +57,7 @@ READABLE = (
     "/api/v1/participants/{code}/analyses/evaluations",
     "/api/v1/analyses",
     "/api/v1/participants/{code}/margins/locks",
+    "/api/v1/participants/{code}/adverse-events",
     "/api/v1/visits/{visit_id}/locks",
     "/api/v1/participants/{code}/calibration",
     "/healthz",
@@ -72,6 +73,9 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("post", "/api/v1/visits/{visit_id}/lock"): {"clinician", "admin"},
     ("post", "/api/v1/visits/{visit_id}/unlock"): {"clinician", "admin"},
     ("post", "/api/v1/participants/{code}/margins/locks"): {"clinician", "admin"},
+    ("post", "/api/v1/participants/{code}/adverse-events"): {"clinician", "engineer", "admin"},
+    ("put", "/api/v1/adverse-events/{event_id}"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/adverse-events/{event_id}/clearance"): {"clinician", "admin"},
     ("patch", "/api/v1/sessions/{session_id}"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/sessions/{session_id}/outcomes"): {"clinician", "engineer", "admin"},
     ("put", "/api/v1/sessions/{session_id}/conditions"): {"clinician", "engineer", "admin"},
@@ -110,6 +114,7 @@ BLINDED = {
     ("get", "/api/v1/sessions/{session_id}"),
     ("get", "/api/v1/sessions/{session_id}/qoc"),
     ("put", "/api/v1/sessions/{session_id}/qoc"),
+    ("post", "/api/v1/participants/{code}/adverse-events"),
     ("get", "/api/v1/sessions/{session_id}/outcomes"),
     ("get", "/api/v1/participants/{code}/analyses"),
     ("get", "/api/v1/participants/{code}/analyses/primary"),
@@ -120,6 +125,7 @@ BLINDED = {
 Json = dict[str, Any]
 TABLE = b"t_s,beta,amplitude_fraction\n" + b"".join(b"%d,1,1\n" % (2 * k) for k in range(21))
 GRASPS = b"t_s\n" + b"".join(b"%.2f\n" % (0.4 * k) for k in range(11))
+SPEECH = {"kind": "speech", "severity": "severe", "serious": True}
 PASSWORD = "a password of the test"
 
 
@@ -170,6 +176,9 @@ class World:
             ("post", "/visits/{visit_id}/unlock"): {"json": {"reason": "rating misread"}},
             ("post", "/participants/{code}/margins/locks"): {"json": {"version": 2, "reason": "protocol"}},
             ("put", "/participants/{code}/margins"): {"json": {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}},
+            ("post", "/participants/{code}/adverse-events"): {"json": SPEECH},
+            ("put", "/adverse-events/{event_id}"): {"event_id": self.event(), "json": SPEECH | {"revision": 1, "reason": "misread"}},
+            ("post", "/adverse-events/{event_id}/clearance"): {"event_id": self.event(), "json": {"revision": 1, "reason": "passed"}},
             ("post", "/participants/{code}/visits"): {"json": {"number": 77}},
             ("patch", "/visits/{visit_id}"): {"json": {"note": "tired", "reason": "forgotten"}},
             ("patch", "/sessions/{session_id}"): {"json": {"excluded_reason": "cable", "reason": "said so"}},
@@ -229,6 +238,10 @@ class World:
         given = [("file", file) for file in [(name, content), *(more or [])]]
         return dict(self.send("/uploads", data={"participant": "P4", **stated}, files=given))
 
+    def event(self) -> int:
+        """A serious adverse event of its own for one route."""
+        return int(self.send("/participants/P1/adverse-events", json=SPEECH)["id"])
+
     def proposal(self, **change: Any) -> Json:
         """A proposal of its own for one route."""
         self.made += 1
@@ -249,7 +262,7 @@ class World:
     def call(self, client: TestClient, method: str, path: str) -> int:
         """Status of a call that is right in everything but, perhaps, who makes it."""
         form = dict(self.forms.get((method, path.removeprefix("/api/v1")), {}))
-        ids = self.ids | {name: form.pop(name) for name in list(form) if name in self.ids or name == "file_id"}
+        ids = self.ids | {name: form.pop(name) for name in list(form) if name in self.ids or name in ("file_id", "event_id")}
         if method == "get":
             form.pop("json", None)
         with client.stream(method, path.format(**ids), **form) as answer:

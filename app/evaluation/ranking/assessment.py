@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -116,13 +116,19 @@ class Assessment:
 
 
 def assess(
-    evaluation: Evaluation, policies: Mapping[int, Policy], method: str, participant: Participant, version: SettingsVersion
+    evaluation: Evaluation,
+    policies: Mapping[int, Policy],
+    method: str,
+    participant: Participant,
+    version: SettingsVersion,
+    harmful: Collection[int] = (),
 ) -> Assessment:
     """What an evaluation says of its policies by one method, with the verdicts by the participant's margins of now.
 
     Args:
         evaluation: with its estimates. policies: all of them, by id. method: whose estimates rank; one of the evaluation's.
         participant: whose. version: the settings that the evaluation rests on.
+        harmful: policies under which something serious happened that no clinician has cleared.
     """
     table: dict[int, dict[str, Estimate]] = defaultdict(dict)
     for row in evaluation.estimates:
@@ -142,7 +148,10 @@ def assess(
     )
     candidates = {i: e for i, e in by_method.items() if i not in references}
     decided = {
-        i: decide(table[i], cdbs, evaluation.default_method, given, i, retired_reason=policies[i].retired_reason) for i in candidates
+        i: decide(
+            table[i], cdbs, evaluation.default_method, given, i, retired_reason=policies[i].retired_reason, adverse_event=i in harmful
+        )
+        for i in candidates
     }
     ordered = ordering_told({i: by[POSTERIOR] for i, by in table.items() if POSTERIOR in by and i not in references})
     # who is unsafe comes last, as who is not supported does

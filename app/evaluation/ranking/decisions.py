@@ -81,20 +81,23 @@ def decide(
 
     A retired policy cannot be told: it is not proposed, whatever is predicted. Nor can one of an evaluation without a posterior: a single
     method knows no chance of keeping within the margins. What rankings of before called *reject*, a whole interval of the gain over cDBS
-    below 0, is *unsafe*; their *test next* and *needs more data* are *cannot tell* until the policies are evaluated again.
+    below 0, is *unsafe*; their *test next* and *needs more data* are *cannot tell* until the policies are evaluated again. A serious
+    adverse event counts whatever else is known.
 
     Args:
         estimates: of the candidate, by method. cdbs: of the cDBS reference, by method; empty where it has none.
         method: that the evaluation ranks by.
         given: what all verdicts of the evaluation share. policy_id: whose.
         retired_reason: why a person withdrew it.
-        adverse_event: whether a serious adverse event under it has not been cleared. Nothing records such events yet: it is False for all.
+        adverse_event: whether a serious adverse event under it has not been cleared by a clinician.
     """
+    happened = (Flag("adverse_event"),) if adverse_event else ()
     if retired_reason:
-        return Decided("cannot_tell", (Flag.of("retired", text=retired_reason),))
+        return Decided("cannot_tell", (Flag.of("retired", text=retired_reason), *happened))
     own = estimates.get(POSTERIOR)
     if own is None:
-        return _without_posterior(estimates.get(method), cdbs.get(method))
+        known = _without_posterior(estimates.get(method), cdbs.get(method))
+        return Decided("unsafe", (*happened, *known.reasons)) if happened else known
     reference, levels = cdbs.get(POSTERIOR), levels_of(given.margins)
     found = verdict(own, reference, margins_of(given.margins), levels, adverse_event=adverse_event, unchecked=given.unchecked)
     more = _further(own, reference, given, levels, policy_id) if found.code == "cannot_tell" and not found.hazards else ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
-from app.accounts.permissions import Caller
+from app.accounts.permissions import SYSTEM, Caller
 from app.evaluation import repository, wording
 from app.evaluation.estimates.coverage import coverage_failed
 from app.evaluation.models import Evaluation
@@ -19,6 +19,8 @@ from app.learning.models import BufferSnapshot
 from app.platform.errors import Invalid, NotFound
 from app.study import repository as study_repository
 from app.study import service as study
+from app.study.adverse_events.repository import events_of_participant
+from app.study.adverse_events.service import blocked_policies
 from app.study.models import Participant
 from app.study.threshold import mdp_settings
 from ml.ope.compare.gain import gain_over
@@ -70,7 +72,10 @@ def assessment_of(db: Session, participant: Participant, evaluation: Evaluation,
     if chosen not in methods:
         raise Invalid(f"This ranking has no estimates by '{chosen}'.", f"Choose one of {', '.join(methods)}.")
     policies = repository.policies_by_id(db, [row.policy_id for row in evaluation.estimates])
-    return assess(evaluation, policies, chosen, participant, study_repository.settings_version(db, evaluation.settings_version_id))
+    version = study_repository.settings_version(db, evaluation.settings_version_id)
+    # a verdict does not depend on who asks for it
+    harmful = blocked_policies(events_of_participant(db, participant.id), SYSTEM)
+    return assess(evaluation, policies, chosen, participant, version, harmful)
 
 
 def ranking_of(db: Session, found: Assessment, shown: RankingFilter | None = None) -> RankingOut:

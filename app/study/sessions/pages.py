@@ -18,6 +18,7 @@ from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
 from app.study import repository, service
+from app.study.adverse_events.repository import events_of_session
 from app.study.blinding import CONTROLLER_NAMES, arm, may_know, require_known
 from app.study.deps import CurrentSession
 from app.study.form_changes import Shown, own_changes
@@ -30,7 +31,7 @@ from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.stimulation import beside, delivered
 from app.study.traces import NO_CONTROL, session_offset_s
-from app.study.wording import drawn_words, sentences
+from app.study.wording import EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
 from ml.energy import relative_energy
 
 router = APIRouter()
@@ -286,6 +287,9 @@ def _page(
         qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
         correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},
         seen=seen,
+        events=events_of_session(db, session.id),
+        event_kinds=EVENT_KINDS,
+        event_severities=EVENT_SEVERITIES,
         drawn=_drawn(db, session, data, caller),
         beside=_beside(db, session, data),
         ran_under=dict(_conditions_revisions(session)[-1].fields)

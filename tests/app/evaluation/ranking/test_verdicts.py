@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
+from app.evaluation.ranking.decisions import Circumstances, decide
+from app.study.models import MarginsVersion
 from tests.app.evaluations import judged
 from tests.ml.ope.posterior.draws import N, cdbs, share
 
@@ -142,3 +145,12 @@ def test_another_method_can_order_the_fold_and_the_verdicts_stay(client: TestCli
     body = client.get(RANKING, params={"method": "posterior"}).json()
     assert [p["decision"] for p in body["policies"]] == ["test", "unsafe"]
     assert "Weights of the structures" in client.get(PAGE).text
+
+
+def test_a_serious_event_is_unsafe_without_a_posterior_and_of_a_retired_policy_too() -> None:
+    given = Circumstances(1, datetime(2026, 1, 1, tzinfo=UTC), MarginsVersion(), None, {}, 0.3, None)
+    found = decide({}, {}, "dlsm", given, 7, adverse_event=True)
+    assert (found.decision, found.reasons[0].code) == ("unsafe", "adverse_event")
+    retired = decide({}, {}, "dlsm", given, 7, retired_reason="replaced", adverse_event=True)
+    assert retired.needs_override
+    assert not decide({}, {}, "dlsm", given, 7, retired_reason="replaced").needs_override

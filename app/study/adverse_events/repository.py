@@ -1,0 +1,54 @@
+"""Queries of adverse events, within what the caller may read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import Select, select
+from sqlalchemy.orm import Session, joinedload, selectinload
+
+from app.accounts.permissions import Caller
+from app.platform.errors import NotFound
+from app.study.adverse_events.models import AdverseEvent
+from app.study.models import Participant, StudySession, Visit
+from app.study.repository import in_scope
+
+
+def event(db: Session, event_id: int, caller: Caller) -> AdverseEvent:
+    """An event. Raises NotFound."""
+    query = _events().join(AdverseEvent.participant).join(Participant.site).where(AdverseEvent.id == event_id, in_scope(caller))
+    row = db.scalar(query)
+    if row is None:
+        raise NotFound(f"There is no adverse event {event_id}, or you have no access to it.")
+    return row
+
+
+def events_of_participant(db: Session, participant_id: int) -> Sequence[AdverseEvent]:
+    """A participant's events in the order in which they were entered."""
+    return db.scalars(_events().where(AdverseEvent.participant_id == participant_id).order_by(AdverseEvent.id)).all()
+
+
+def events_of_session(db: Session, session_id: int) -> Sequence[AdverseEvent]:
+    """The events of a session in the order in which they were entered."""
+    return db.scalars(_events().where(AdverseEvent.session_id == session_id).order_by(AdverseEvent.id)).all()
+
+
+def event_by_key(db: Session, participant_id: int, entry_key: str) -> AdverseEvent | None:
+    """A participant's event of the name that its entry had on a device."""
+    mine = (AdverseEvent.participant_id == participant_id) & (AdverseEvent.entry_key == entry_key)
+    return db.scalar(_events().where(mine))
+
+
+def lock_event(db: Session, row: AdverseEvent) -> None:
+    """Hold an event for this transaction and read its revisions again, so that two corrections at once are asked in turn."""
+    db.execute(select(AdverseEvent.id).where(AdverseEvent.id == row.id).with_for_update())
+    db.expire(row, ["revisions"])
+
+
+def _events() -> Select[AdverseEvent]:
+    return select(AdverseEvent).options(
+        selectinload(AdverseEvent.revisions),
+        joinedload(AdverseEvent.participant).joinedload(Participant.site),
+        joinedload(AdverseEvent.visit),
+        joinedload(AdverseEvent.session).joinedload(StudySession.visit).joinedload(Visit.participant).joinedload(Participant.site),
+    )

@@ -1,0 +1,170 @@
+"""Rules of adverse events. The caller commits.
+
+A locked visit takes events too: what harms a participant is written down whenever it becomes known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.platform.database import set_reason
+from app.platform.errors import Conflict, Invalid
+from app.study import blinding
+from app.study import repository as study_repository
+from app.study import service as study
+from app.study.adverse_events import repository
+from app.study.adverse_events.models import AdverseEvent, AdverseEventRevision
+from app.study.adverse_events.schemas import AdverseEventChange, AdverseEventFields, AdverseEventIn
+from app.study.models import Participant
+
+_BELONGS = ("session_id", "visit_id", "policy_id", "occurred_at")
+_KNOWN = ("kind", "severity", "serious", "note")
+
+
+def add_adverse_event(db: Session, participant: Participant, draft: AdverseEventIn, caller: Caller) -> AdverseEvent:
+    """Write down what happened. An entry that was sent before under the same key is given back and not added again.
+
+    Args:
+        db: the session. participant: to whom. draft: what happened, and in which session or at which visit under what.
+        caller: may enter outcomes; blinded assessors may.
+
+    Raises:
+        Forbidden: the caller may not enter outcomes. NotFound: the session, visit or policy is not the participant's.
+        Invalid: the session is of another visit, or has a policy of its own. Conflict: the session is a proposal, or the key belongs to
+            an entry that says something else.
+    """
+    study.require(caller, can.WRITE_QOC, participant)
+    if draft.entry_key is not None and (known := repository.event_by_key(db, participant.id, draft.entry_key)):
+        return _same(known, draft)
+    visit_id = _checked_visit(db, participant, draft, caller)
+    if draft.policy_id is not None and not study_repository.has_policy(db, participant.id, draft.policy_id):
+        raise Invalid(f"Participant {participant.code} has no policy {draft.policy_id}.", "Name one of this participant's policies.")
+    row = AdverseEvent(
+        participant_id=participant.id,
+        visit_id=visit_id,
+        session_id=draft.session_id,
+        policy_id=draft.policy_id,
+        occurred_at=draft.occurred_at,
+        entry_key=draft.entry_key,
+    )
+    row.revisions.append(_revision(1, draft, caller))
+    db.add(row)
+    try:
+        db.flush()
+    except IntegrityError as error:  # the same entry arrived twice at once
+        db.rollback()
+        raise Conflict("This entry is being saved already.", "Send it again.") from error
+    return repository.event(db, row.id, caller)
+
+
+def change_adverse_event(db: Session, event: AdverseEvent, change: AdverseEventChange, caller: Caller) -> AdverseEvent:
+    """Correct what is known of an event: a new revision, which a clinician has not cleared.
+
+    Raises:
+        Forbidden: the caller may not correct the study's data. Conflict: somebody else changed it. Invalid: no reason.
+    """
+    study.require(caller, can.WRITE_STUDY, event.participant)
+    return _follow(db, event, change.revision, change.reason, caller, change, None)
+
+
+def clear_adverse_event(db: Session, event: AdverseEvent, revision: int, reason: str, caller: Caller) -> AdverseEvent:
+    """State as a clinician that a serious event does not stand against what ran.
+
+    Args:
+        revision: the one that the caller has read.
+
+    Raises:
+        Forbidden: the caller approves no plans of this participant. Conflict: it does not block, or somebody changed it.
+        Invalid: no reason.
+    """
+    study.require(caller, can.APPROVE_PLAN, event.participant)
+    if not event.blocks:
+        raise Conflict(f"Adverse event {event.id} is {'cleared already' if event.now.serious else 'not serious'}.", "Nothing waits for it.")
+    return _follow(db, event, revision, reason, caller, event.now, reason.strip())
+
+
+def policy_of(event: AdverseEvent, caller: Caller) -> int | None:
+    """What ran when it happened: the session's policy, else the one that was stated; None where it is hidden or none did."""
+    visit = event.session.visit if event.session is not None else event.visit
+    if visit is not None and not blinding.may_know(visit, caller):
+        return None
+    if event.session is not None:
+        known = blinding.visible_arm(event.session, caller)
+        return known.policy_id if known else None
+    site = event.participant.site
+    return event.policy_id if caller.may(can.READ_ARMS, site.study_id, site.id) or visit is not None else None
+
+
+def blocked_policies(events: Iterable[AdverseEvent], caller: Caller) -> frozenset[int]:
+    """Policies under which something serious happened that no clinician has cleared."""
+    return frozenset(found for e in events if e.blocks for found in [policy_of(e, caller)] if found is not None)
+
+
+def _checked_visit(db: Session, participant: Participant, draft: AdverseEventIn, caller: Caller) -> int | None:
+    if draft.session_id is None:
+        if draft.visit_id is not None:
+            study.require_own(participant, study_repository.visit(db, draft.visit_id, caller), f"visit {draft.visit_id}")
+        return draft.visit_id
+    session = study_repository.session(db, draft.session_id, caller)
+    study.require_own(participant, session.visit, f"session {draft.session_id}")
+    if session.status == "proposed":
+        raise Conflict(f"Session {session.id} is a proposal that nobody has confirmed yet.", "Confirm it first, or name the visit alone.")
+    if draft.visit_id not in (None, session.visit_id):
+        raise Invalid(f"Session {session.id} is not of visit {draft.visit_id}.", "Leave the visit out, or correct one of them.")
+    if draft.policy_id is not None:
+        raise Invalid("A session tells itself what ran.", "Leave the policy out; correct the session if it names the wrong one.")
+    return session.visit_id
+
+
+def _same(known: AdverseEvent, draft: AdverseEventIn) -> AdverseEvent:
+    first = known.revisions[0]
+    # the visit of a session is filled in
+    told = {n: getattr(known, n) for n in _BELONGS if n != "visit_id" or draft.visit_id is not None} | {
+        n: getattr(first, n) for n in _KNOWN
+    }
+    if any(getattr(draft, name) != value for name, value in told.items()):
+        raise Conflict(
+            f"The entry key '{draft.entry_key}' belongs to adverse event {known.id}, which says something else.",
+            "Correct that event, or send a new entry under a key of its own.",
+        )
+    return known
+
+
+def _follow(
+    db: Session,
+    event: AdverseEvent,
+    revision: int,
+    reason: str,
+    caller: Caller,
+    values: AdverseEventFields | AdverseEventRevision,
+    cleared: str | None,
+) -> AdverseEvent:
+    if not reason.strip():
+        raise Invalid("A reason is missing.", "Say why; it is kept with the event.")
+    repository.lock_event(db, event)
+    if event.now.revision != revision:
+        raise Conflict(
+            f"Adverse event {event.id} was changed by {event.now.entered_by} after you opened it; nothing was saved.", "Load it again."
+        )
+    set_reason(db, reason.strip())
+    row = _revision(revision + 1, values, caller)
+    row.reason, row.cleared_reason = reason.strip(), cleared
+    event.revisions.append(row)
+    db.flush()
+    return event
+
+
+def _revision(number: int, values: AdverseEventFields | AdverseEventRevision, caller: Caller) -> AdverseEventRevision:
+    return AdverseEventRevision(
+        revision=number,
+        kind=values.kind,
+        severity=values.severity,
+        serious=values.serious,
+        note=values.note.strip(),
+        entered_by=caller.label,
+    )
