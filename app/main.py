@@ -51,6 +51,7 @@ API_MODULES = (
     "app.analysis.energy.api",
     "app.analysis.biomarker.api",
     "app.analysis.calibration.api",
+    "app.overview.samples.api",
 )
 PAGE_MODULES = (
     "app.accounts.pages",

@@ -93,6 +93,11 @@ def received_uploads(db: Session, participant_id: int) -> Sequence[int]:
     return db.scalars(select(Upload.id).where(mine).order_by(Upload.id)).all()
 
 
+def file_of_recording(db: Session, recording: Recording) -> UploadFile:
+    """The file that gave a recording, which has one."""
+    return db.get_one(UploadFile, recording.upload_file_id)
+
+
 def recordings_of_file(db: Session, upload_file_id: int) -> Sequence[Recording]:
     """Recordings that a file gave, in the order in which they were stored."""
     return db.scalars(select(Recording).where(Recording.upload_file_id == upload_file_id).order_by(Recording.id)).all()

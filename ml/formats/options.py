@@ -32,6 +32,7 @@ class DecodeOptions:
         table_lfp_unit: unit of `lfp` in a table whose header states none; such a table is refused where nobody states it.
         max_table_rows: rows a table of steps may have.
         max_lfp_rows: rows a table of raw LFP may have.
+        keep_samples: keep the samples of each recording (`RecordingLog.samples`), which changes no other number.
         archive: bounds for archives.
     """
 
@@ -44,6 +45,7 @@ class DecodeOptions:
     table_lfp_unit: str | None = None
     max_table_rows: int = 500_000
     max_lfp_rows: int = 1_500_000
+    keep_samples: bool = False
     archive: ArchiveLimits = field(default_factory=ArchiveLimits)
 
     def __post_init__(self) -> None:

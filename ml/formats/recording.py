@@ -7,8 +7,8 @@ Everything here is plain data. Times are seconds in the recording's own clock un
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any, Literal
 
@@ -117,6 +117,55 @@ class TraceLog:
         )
 
 
+Stretch = tuple[float, float, NDArray[np.float64]]
+"""A gap-free piece of signal: time of its first sample in s of the recording's clock, rate in Hz, samples."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampleLog:
+    """Samples of one channel as they were measured, gap-free stretches one after the other.
+
+    Attributes:
+        channel: as in the traces. unit: of the samples, e.g. `uV`.
+        t_s: time of each sample in the recording's clock, s, [n], increasing within a stretch.
+        values: samples, float32, [n].
+        rates_hz: rates that occur, ascending.
+        starts: index of the first sample of each stretch, [k]; before it samples are missing.
+    """
+
+    channel: str
+    unit: str
+    t_s: NDArray[np.float64]
+    values: NDArray[np.float32]
+    rates_hz: tuple[float, ...]
+    starts: NDArray[np.int64]
+
+    @staticmethod
+    def of(channel: str, unit: str, stretches: Sequence[Stretch]) -> SampleLog:
+        """The samples of stretches in their order."""
+        sizes = [x.size for _, _, x in stretches]
+        t_s = [start + np.arange(x.size) / rate for start, rate, x in stretches]
+        return SampleLog(
+            channel,
+            unit,
+            np.concatenate([np.empty(0), *t_s]),
+            np.concatenate([np.empty(0), *(x for _, _, x in stretches)]).astype(np.float32),
+            tuple(sorted({rate for _, rate, _ in stretches})),
+            np.cumsum([0, *sizes[:-1]], dtype=np.int64)[: len(sizes)],
+        )
+
+    def between(self, begin_s: float, end_s: float) -> SampleLog:
+        """The samples after `begin_s` and up to `end_s`, to the microsecond, as rows of traces take them."""
+        inside = np.flatnonzero((self.t_s > begin_s + 1e-6) & (self.t_s <= end_s + 1e-6))
+        first = np.zeros(self.t_s.size, dtype=bool)
+        first[self.starts] = True
+        first = first[inside]
+        if inside.size:
+            first[0] = True
+            first[1:] |= np.diff(inside) > 1
+        return replace(self, t_s=self.t_s[inside], values=self.values[inside], starts=np.flatnonzero(first))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SpectrumLog:
     """Power spectral density of one channel over a whole recording, gaps left out.
@@ -183,6 +232,7 @@ class RecordingLog:
     `fingerprint` is a SHA-256 over the decoded content without the device's name, so the same recording in another archive has the same.
     `run` says which recordings of one file were made together (the two sides of a Percept, the two implants of a participant) and so belong
     to one session; None for what is no session: surveys, tests, the history that a device keeps.
+    `samples` are there only where they were asked for (`DecodeOptions.keep_samples`).
     """
 
     kind: str
@@ -199,6 +249,7 @@ class RecordingLog:
     fingerprint: str
     spectra: tuple[SpectrumLog, ...] = ()
     run: int | None = 0
+    samples: tuple[SampleLog, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -119,6 +119,10 @@ INTENDED: dict[str, str] = {
         ("components > schemas > RecordedTraceOut", "paths > /api/v1/sessions/{session_id}/traces"),
         "API: `GET /sessions/{id}/traces` gives every trace of a session's recordings, not the control trace alone.",
     ),
+    **dict.fromkeys(
+        ("components > schemas > SampleFormat", "paths > /api/v1/sessions/{session_id}/samples"),
+        "API: `GET /sessions/{id}/samples` gives a session's samples with their times, and every trace, as one Parquet or NWB file",
+    ),
     "components > schemas > ProposalChange": "API: `control_stream` and `control_channel` of a proposal can be corrected.",
     "components > schemas > ProposalOut": "API: a proposal has `usable_steps`.",
     "components > schemas > UsableStepsOut": "API: a proposal has `usable_steps`.",

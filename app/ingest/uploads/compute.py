@@ -41,7 +41,7 @@ def clean(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
     Returns:
         `kind` and `redaction`; or the `problem` that keeps it from being cleaned, and what was `left_out` of its archive, if it is one.
     """
-    source, options = Path(params["source"]), _options(params["options"])
+    source, options = Path(params["source"]), options_of(params["options"])
     try:
         kind = formats.sniff(source)
         key = stored_secret(Path(params["secrets"]), "pseudonyms")
@@ -65,7 +65,7 @@ def decode(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[st
     """
     try:
         with reading_of_members(_told(report, "decoding")):
-            decoded = formats.decode(Path(params["source"]), params["kind"], _options(params["options"]), name=params["name"])
+            decoded = formats.decode(Path(params["source"]), params["kind"], options_of(params["options"]), name=params["name"])
         transfer.write(decoded, Path(params["target"]))
     except UndecodableFile as error:
         return {"problem": error.args_of()}
@@ -89,7 +89,8 @@ def prepare() -> None:
         formats.redact(table, Path(folder) / "clean.csv", formats.sniff(table), bytes(32))
 
 
-def _options(stated: dict[str, Any]) -> DecodeOptions:
+def options_of(stated: dict[str, Any]) -> DecodeOptions:
+    """The options that params hold as JSON."""
     return DecodeOptions(**{**stated, "archive": ArchiveLimits(**stated["archive"])})
 
 

@@ -14,13 +14,13 @@ import structlog
 from sqlalchemy.orm import Session
 
 from app.ingest import repository
-from app.ingest.models import Upload, UploadFile
+from app.ingest.models import UploadFile
 from app.ingest.sessions import in_milliamperes
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading, recordings
 from app.ingest.uploads.reading import ReaderFault
-from app.ingest.uploads.receiving import TABLES, BetaStated, name_beta
-from app.ingest.uploads.service import decode_options
+from app.ingest.uploads.receiving import TABLES, name_beta
+from app.ingest.uploads.service import options_of_file, stated_beta
 from app.platform import files
 from app.platform.database import transaction
 from app.platform.errors import NotFound
@@ -120,10 +120,8 @@ def _decoded(db: Session, file: UploadFile, participant: Participant) -> Decoded
     path = files.path_of(file.stored_sha256)
     if not path.exists() or files.hash_file(path)[0] != file.stored_sha256:
         raise files.MissingFile(f"The stored file {file.stored_sha256} is missing or damaged.")
-    said = db.get_one(Upload, file.upload_id).stated
-    beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
-    decoded = reading.decode(path, file.kind, decode_options(participant, beta), file.name)
-    return name_beta(decoded, beta, participant.current_settings) if file.kind in TABLES else decoded
+    decoded = reading.decode(path, file.kind, options_of_file(db, file, participant), file.name)
+    return name_beta(decoded, stated_beta(db, file), participant.current_settings) if file.kind in TABLES else decoded
 
 
 def _outcomes_again(db: Session, file: UploadFile, decoded: DecodedFile) -> list[str]:

@@ -348,6 +348,17 @@ def decode_options(participant: Participant, beta: BetaStated) -> DecodeOptions:
     )
 
 
+def options_of_file(db: Session, file: UploadFile, participant: Participant) -> DecodeOptions:
+    """The options for a stored file, with what its sender had stated of it."""
+    return decode_options(participant, stated_beta(db, file))
+
+
+def stated_beta(db: Session, file: UploadFile) -> BetaStated:
+    """What the sender of a stored file had said of its beta."""
+    said = db.get_one(Upload, file.upload_id).stated
+    return BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
+
+
 def stored_outcomes(db: Session, upload: Upload) -> list[FileOutcome]:
     """The files of an upload as they were stored, and those that had come before."""
     earlier = [db.get_one(UploadFile, i) for i in upload.stated.get("duplicates", [])]

@@ -24,7 +24,7 @@ from ml.formats.percept.enums import word
 from ml.formats.percept.history import history_recording
 from ml.formats.percept.report_json import SIDES, entries, inside, looks_like_report, moment, read_report, side_of, utc_offset_h
 from ml.formats.percept.streams import DevicePower, Side, TimeDomain, device_powers, time_domains
-from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
+from ml.formats.recording import DecodedFile, FileReport, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
 from ml.signals import row_means
 
 SAME_RUN_MS = 2_000.0
@@ -306,6 +306,7 @@ def _recording(
         fingerprint=_fingerprint(run, side, channels),
         spectra=tuple(s for c in channels for s in channel_spectrum(c.stretches(begin), c.channel)),
         run=number,
+        samples=tuple(SampleLog.of(c.channel, "uV", c.stretches(begin)) for c in channels) if options.keep_samples else (),
     )
 
 

@@ -13,7 +13,7 @@ from ml.formats.rcs.packets.streams import TimeDomain
 from ml.formats.rcs.packets.time import PacketTimes
 from ml.formats.rcs.settings import Sensing, Settings
 from ml.formats.rcs.traces import Grid
-from ml.formats.recording import SpectrumLog, TraceLog
+from ml.formats.recording import SampleLog, SpectrumLog, TraceLog
 from ml.signals import BandRows, band_rows, spectrum
 
 UV_PER_MV = 1000.0
@@ -123,6 +123,14 @@ def beta_traces(channels: dict[str, list[Stretch]], grid: Grid, notes: list[str]
         for stream, unit, measure, values in beta_streams(rows, options):
             out.append(grid.trace((stream, channel, unit), "time_domain", values, rows.covered, {**details, "measure": measure}))
     return out
+
+
+def time_domain_samples(channels: dict[str, list[Stretch]], grid: Grid) -> list[SampleLog]:
+    """The samples of each channel in uV, with the times of the recording's clock."""
+    return [
+        SampleLog.of(channel, "uV", [((start - grid.start_ms) / 1000.0, rate, UV_PER_MV * x) for start, rate, x in pieces])
+        for channel, pieces in channels.items()
+    ]
 
 
 def band_rows_in_blocks(stretches: list[Stretch], grid: Grid) -> BandRows:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
 from ml.formats.rcs.amplitude import AmplitudeSteps, amplitude_steps
-from ml.formats.rcs.beta import beta_traces, time_domain_spectra, time_domain_stretches
+from ml.formats.rcs.beta import Stretch, beta_traces, time_domain_samples, time_domain_spectra, time_domain_stretches
 from ml.formats.rcs.events import adaptive_events, note_events, stimulation_events
 from ml.formats.rcs.leads import described, hemisphere
 from ml.formats.rcs.packets.headers import PacketHeaders
@@ -76,7 +76,10 @@ def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) 
     duration_s = (end_ms - start_ms) / 1000.0
     grid = Grid(start_ms, duration_s, max(0, math.ceil(duration_s / options.period_s - 1e-6)), options)
     steps = amplitude_steps(settings, streams.adaptive if "adaptive" in times else None, times.get("adaptive"))
-    traces, spectra = _traces(streams, settings, times, steps, grid, report) if main else ([], [])
+    channels: dict[str, list[Stretch]] = {}
+    if main and streams.time_domain is not None and "time_domain" in times:
+        channels = time_domain_stretches(streams.time_domain, times["time_domain"], settings)
+    traces, spectra = _traces(streams, settings, times, steps, grid, channels, report) if main else ([], [])
     if not main:
         report("RawDataTD").flagged.append("a recording without data: no stream holds a packet that can be placed in time")
     quality = describe_quality(streams.data(), times, settings, streams.counts, report)
@@ -103,6 +106,7 @@ def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) 
         quality=quality,
         fingerprint=_fingerprint(streams),
         spectra=tuple(spectra),
+        samples=tuple(time_domain_samples(channels, grid)) if options.keep_samples else (),
     )
 
 
@@ -158,14 +162,16 @@ def _first_record_ms(settings: Settings) -> float:
 
 
 def _traces(
-    streams: Streams, settings: Settings, times: dict[str, PacketTimes], steps: AmplitudeSteps, grid: Grid, report: ReportOf
+    streams: Streams,
+    settings: Settings,
+    times: dict[str, PacketTimes],
+    steps: AmplitudeSteps,
+    grid: Grid,
+    channels: dict[str, list[Stretch]],
+    report: ReportOf,
 ) -> tuple[list[TraceLog], list[SpectrumLog]]:
-    traces: list[TraceLog] = []
-    spectra: list[SpectrumLog] = []
-    if streams.time_domain is not None and "time_domain" in times:
-        channels = time_domain_stretches(streams.time_domain, times["time_domain"], settings)
-        traces += beta_traces(channels, grid, report("RawDataTD").flagged)
-        spectra += time_domain_spectra(channels)
+    traces = beta_traces(channels, grid, report("RawDataTD").flagged)
+    spectra = list(time_domain_spectra(channels))
     if streams.power is not None and "power" in times:
         traces += power_traces(streams.power, times["power"], settings, grid, report("RawDataPower").flagged)
     if streams.fft is not None and "fft" in times:

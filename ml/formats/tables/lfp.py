@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ml.formats.beta import channel_spectrum, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
-from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
+from ml.formats.recording import DecodedFile, FileReport, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
 from ml.formats.tables.columns import LFP_SCALE, TIME_SCALE, Columns, check_reach, checked_amplitude, compare_amplitudes
 from ml.formats.tables.numbers import known_unit
 from ml.signals import BRIDGE_S, Stretch, row_means
@@ -82,6 +82,7 @@ def decode_lfp(columns: Columns, options: DecodeOptions, report: FileReport) -> 
         quality={f"{t.stream}.{t.channel}": {"valid_fraction": round(float(t.valid.mean()), 6)} for t in traces},
         fingerprint=fingerprint("lfp table", [t_s, lfp, *(t.values for t in traces if t.stream == "amplitude")]),
         spectra=tuple(channel_spectrum(stretches, "lfp")),
+        samples=(SampleLog.of("lfp", "uV", stretches),) if options.keep_samples else (),
     )
     return DecodedFile((recording,), (report,))
 
