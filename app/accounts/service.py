@@ -16,7 +16,7 @@ from app.accounts import repository
 from app.accounts.addresses import LONGEST_ADDRESS, normal_address
 from app.accounts.models import ApiToken, Membership, Role, Scope, SignIn, SignInAttempt, Study, User
 from app.accounts.permissions import MANAGE_ACCOUNTS, PERMISSIONS, READ_AUDIT, Caller, Grant
-from app.platform.database import now
+from app.platform.database import new_session, now
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 from app.settings import get_settings
 
@@ -75,12 +75,23 @@ def change_own_password(db: Session, user_id: int, present: str, new: str) -> No
         TooMany: too many wrong passwords lately. Forbidden: the present one is wrong. Invalid: a bad new one.
     """
     check_password(new)
-    user = db.get_one(User, user_id)
-    attempt = _count_attempt(db, user.email)
-    if not _hasher.verify(present, user.password_hash):
-        raise Forbidden("The present password is wrong.", "Nothing was changed; try again.")
-    repository.forget_failures(db, attempt)
-    set_password(db, user, new)
+    confirm_password(user_id, present)
+    set_password(db, db.get_one(User, user_id), new)
+
+
+def confirm_password(user_id: int, password: str) -> None:
+    """Have a user who has signed in prove to be there. Tries are counted together with sign-ins, in a transaction of their own.
+
+    Raises:
+        TooMany: too many wrong passwords lately. Forbidden: it is wrong, or the account is closed.
+    """
+    with new_session() as db:
+        user = db.get_one(User, user_id)
+        attempt = _count_attempt(db, user.email)
+        if not (_hasher.verify(password, user.password_hash) and user.active):
+            raise Forbidden("The password is wrong.", "Nothing was changed; try again.")
+        repository.forget_failures(db, attempt)
+        db.commit()
 
 
 def administers(caller: Caller, study_id: int, site_id: int | None = None) -> bool:

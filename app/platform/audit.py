@@ -69,6 +69,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "plan": (),
     "plan_item": (),
     "bundle_release": (),
+    "signature": ("content",),
     "job": ("progress", "message", "updated_at"),
 }
 """Audited tables and the columns left out of what is shown: secrets, bulk arrays and live progress. Every change makes a row, except of

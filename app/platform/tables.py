@@ -10,6 +10,7 @@ from importlib import import_module
 TABLE_MODULES = (
     "app.platform.audit",
     "app.platform.files",
+    "app.platform.signatures.models",
     "app.platform.jobs.models",
     "app.accounts.models",
     "app.study.models",

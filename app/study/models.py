@@ -272,6 +272,8 @@ class StudySession(Base):
     status: Mapped[str] = mapped_column(String(20), server_default="confirmed")
     started_at: Mapped[datetime | None]
     duration_s: Mapped[float]
+    plan_item_id: Mapped[int | None] = mapped_column(ForeignKey("plan_item.id"), unique=True)
+    """The slot of the visit's plan that this session fills; None of a session that nobody planned."""
     control_stream: Mapped[str] = mapped_column(String(40), server_default="beta")
     control_channel: Mapped[str | None] = mapped_column(String(80))
     excluded_reason: Mapped[str | None] = mapped_column(Text)

@@ -16,6 +16,7 @@ from app.learning.deps import CurrentOwnPolicy
 from app.learning.models import Policy
 from app.planning.bundles import repository
 from app.planning.bundles import service as bundles
+from app.planning.plans.limits import device_limits
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, parse
@@ -93,7 +94,7 @@ def _page(
         policy=policy,
         typed=typed,
         sides=sides,
-        device=bundles.device_limits(db, participant, None),
+        device=device_limits(db, participant, None),
         releases=repository.releases(db, policy.id),
         may_take=bundles.may_take(participant, caller),
         key=bundles.public_key(),

@@ -9,20 +9,12 @@ from sqlalchemy.orm import Session
 
 from app.planning.bundles.models import BundleRelease
 from app.planning.plans.models import Plan, PlanItem
-from app.study.models import Hemisphere, Recording, Visit
+from app.study.models import Visit
 
 
 def releases(db: Session, policy_id: int) -> Sequence[BundleRelease]:
     """The bundles of a policy that left so far, newest first."""
     return db.scalars(select(BundleRelease).where(BundleRelease.policy_id == policy_id).order_by(BundleRelease.id.desc())).all()
-
-
-def recordings_newest_first(db: Session, participant_id: int, hemisphere: Hemisphere | None) -> Sequence[Recording]:
-    """The participant's recordings; where a side is named, those of it and those that name none."""
-    query = select(Recording).where(Recording.participant_id == participant_id)
-    if hemisphere is not None:
-        query = query.where((Recording.hemisphere == hemisphere) | Recording.hemisphere.is_(None))
-    return db.scalars(query.order_by(Recording.started_at.desc().nulls_last(), Recording.id.desc())).all()
 
 
 def planned_limits(db: Session, participant_id: int, policy_id: int) -> Sequence[float]:

@@ -23,6 +23,7 @@ from app.learning.policies.service import onnx_of, probe_windows
 from app.planning import wording
 from app.planning.bundles import repository
 from app.planning.bundles.models import BundleRelease
+from app.planning.plans.limits import DeviceLimits, device_limits
 from app.platform import files
 from app.platform.database import set_reason
 from app.platform.errors import Invalid
@@ -59,14 +60,6 @@ class Limits:
     def stated(self) -> bool:
         """Whether anything was stated."""
         return any(v is not None for v in (self.min_ma, self.max_ma, self.ramp_ma_per_s))
-
-
-@dataclass(frozen=True)
-class DeviceLimits:
-    """Amplitude limits that a recording of the participant's stimulator holds: the strictest of its enabled programs, mA."""
-
-    min_ma: float
-    max_ma: float
 
 
 def signing_key() -> Ed25519PrivateKey:
@@ -158,15 +151,6 @@ def _in_child(policy: Policy, manifest: BundleManifest, windows: NDArray[np.floa
 def may_take(participant: Participant, caller: Caller) -> bool:
     """Whether somebody may take a bundle and state its limits."""
     return study.may(caller, can.TAKE_BUNDLES, participant)
-
-
-def device_limits(db: Session, participant: Participant, hemisphere: Hemisphere | None) -> DeviceLimits | None:
-    """Limits of the newest recording that holds any, of this side where one is named; None where no recording does."""
-    for recording in repository.recordings_newest_first(db, participant.id, hemisphere):
-        programs = [p for group in (recording.details.get("limits") or {}).values() for p in group.values()]
-        if programs:
-            return DeviceLimits(max(p["lower_ma"] for p in programs), min(p["upper_ma"] for p in programs))
-    return None
 
 
 def approvals(db: Session, participant_id: int, policy_id: int) -> tuple[Approval, ...]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import datetime, time
 from typing import Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, String, Text, UniqueConstraint, func
+from sqlalchemy import CheckConstraint, ForeignKey, Index, SmallInteger, String, Text, UniqueConstraint, func
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
-from app.study.models import Controller
+from app.study.models import HEMISPHERE_CHECK, Controller, Hemisphere
 
 
 class Plan(Base):
@@ -20,6 +20,8 @@ class Plan(Base):
     __table_args__ = (
         CheckConstraint("status in ('draft', 'approved', 'superseded')", name="status"),
         CheckConstraint("(status = 'draft') = (approved_at is null) or status = 'superseded'", name="approval"),
+        CheckConstraint("(key_opened_at is null) = (key_opened_by is null)", name="key_opened"),
+        CheckConstraint("key_opened_at is null or key_opened_in_emergency or key_opened_reason is not null", name="key_reason"),
         Index("uq_plan_visit_live", "visit_id", unique=True, postgresql_where="status <> 'superseded'"),
     )
 
@@ -34,11 +36,25 @@ class Plan(Base):
     created_by: Mapped[str] = mapped_column(String(254))
     approved_at: Mapped[datetime | None]
     approved_by: Mapped[str | None] = mapped_column(String(254))
+    starts_at: Mapped[time | None]
+    """Time of day of the first session, by the clinic's clock; None where only minutes from it are planned."""
+    blinded: Mapped[bool] = mapped_column(server_default="false")
+    """Whether the visit runs under labels. Which label is which policy is the sealed key, until it is opened."""
+    key_opened_at: Mapped[datetime | None]
+    key_opened_by: Mapped[str | None] = mapped_column(String(254))
+    key_opened_reason: Mapped[str | None] = mapped_column(Text)
+    """Why it was opened; in an emergency it may be given afterwards."""
+    key_opened_in_emergency: Mapped[bool] = mapped_column(server_default="false")
     items: Mapped[list[PlanItem]] = relationship(order_by="PlanItem.position", cascade="all, delete-orphan")
 
 
 class PlanItem(Base):
-    """One session of a plan."""
+    """One session of a plan: the slot of the visit that a recording fills (`StudySession.plan_item_id`).
+
+    `min_ma`, `max_ma`, `ramp_ma_per_s` are the limits within which it runs, set before the plan is signed; null in plans of earlier
+    versions, and where the cDBS amplitude is not known. `repeat` counts the sessions of one policy (or of cDBS and so on) within the visit,
+    from 1. `label` is what a blinded visit calls it.
+    """
 
     __tablename__ = "plan_item"
     __table_args__ = (
@@ -46,6 +62,10 @@ class PlanItem(Base):
         CheckConstraint("minutes > 0 and washout_minutes >= 0", name="minutes"),
         CheckConstraint("controller in ('cdbs', 'rl', 'distilled', 'no_dbs', 'random', 'other')", name="controller"),
         CheckConstraint("min_fraction > 0 and min_fraction <= 1", name="min_fraction"),
+        CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"),
+        CheckConstraint("min_ma >= 0 and min_ma <= max_ma and ramp_ma_per_s > 0 and cdbs_ma > 0", name="limits"),
+        CheckConstraint('"repeat" >= 1', name="repeat"),
+        CheckConstraint("break_minutes >= 0", name="break_minutes"),
         CheckConstraint("override_reason is null or override_reason <> ''", name="override_reason"),
     )
 
@@ -57,6 +77,19 @@ class PlanItem(Base):
     minutes: Mapped[float]
     washout_minutes: Mapped[float]
     note: Mapped[str] = mapped_column(Text, server_default="")
+    hemisphere: Mapped[Hemisphere | None] = mapped_column(String(5))
+    """Side whose amplitude the controller sets; None where the cDBS amplitude is stated without one."""
+    cdbs_ma: Mapped[float | None]
+    """The clinical amplitude that the limits were set for, and to which every fault leads back."""
+    min_ma: Mapped[float | None]
+    max_ma: Mapped[float | None]
+    ramp_ma_per_s: Mapped[float | None]
+    repeat: Mapped[int] = mapped_column(SmallInteger, server_default="1")
+    label: Mapped[str | None] = mapped_column(String(10))
+    break_minutes: Mapped[float] = mapped_column(server_default="0")
+    """Rest after the session's washout, minutes."""
+    medication: Mapped[str] = mapped_column(Text, server_default="")
+    """What is due before the session."""
     verdict: Mapped[str | None] = mapped_column(String(20))
     """What the ranking said of the policy when the plan was drafted."""
     min_fraction: Mapped[float | None]

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session, selectinload
 
 from app.evaluation.models import Evaluation
 from app.planning.plans.models import Plan, PlanItem
-from app.study.models import StudySession, Visit
+from app.study.models import Hemisphere, Recording, StudySession, Visit
 from app.study.repository import CONFIRMED, count
 
 
@@ -69,6 +69,14 @@ def visits_with_approved_plan(db: Session, participant_id: int) -> set[int]:
 def next_visit_number(db: Session, participant_id: int) -> int:
     """The number after the participant's last visit."""
     return (db.scalar(select(func.max(Visit.number)).where(Visit.participant_id == participant_id)) or 0) + 1
+
+
+def recordings_newest_first(db: Session, participant_id: int, hemisphere: Hemisphere | None) -> Sequence[Recording]:
+    """The participant's recordings; where a side is named, those of it and those that name none."""
+    query = select(Recording).where(Recording.participant_id == participant_id)
+    if hemisphere is not None:
+        query = query.where((Recording.hemisphere == hemisphere) | Recording.hemisphere.is_(None))
+    return db.scalars(query.order_by(Recording.started_at.desc().nulls_last(), Recording.id.desc())).all()
 
 
 def evaluation(db: Session, evaluation_id: int) -> Evaluation:

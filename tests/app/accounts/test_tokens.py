@@ -89,7 +89,7 @@ def test_a_new_password_ends_tokens_and_browser_sessions(db: Session, ada: str) 
 def test_the_present_password_cannot_be_guessed_without_limit(db: Session, ada: str) -> None:
     user = db.query(User).filter_by(email=ada).one()
     for _ in range(service.FAILURES_ALLOWED):
-        with pytest.raises(Forbidden, match="present password is wrong"):
+        with pytest.raises(Forbidden, match="password is wrong"):
             service.change_own_password(db, user.id, "a wrong guess", "another good password")
     with pytest.raises(TooMany):
         service.change_own_password(db, user.id, PASSWORD, "another good password")

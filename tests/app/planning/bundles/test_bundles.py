@@ -17,7 +17,8 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.learning.models import Policy
 from app.planning.bundles.repository import releases
-from app.planning.bundles.service import approvals, device_limits
+from app.planning.bundles.service import approvals
+from app.planning.plans.limits import device_limits
 from app.platform import files
 from app.platform.audit import AuditEvent
 from app.study.models import Device, Hemisphere, Recording

@@ -1,0 +1,124 @@
+"""The limits of a planned session in milliamperes: set with the plan and signed with it, not when a bundle is taken."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from sqlalchemy.orm import Session
+
+from app.planning.plans import repository
+from app.platform.errors import Invalid
+from app.study import cdbs_amplitude
+from app.study.models import Controller, Hemisphere, Participant, Visit
+
+_TOLERANCE_MA = 1e-6
+
+
+@dataclass(frozen=True)
+class DeviceLimits:
+    """Amplitude limits that a recording of the participant's stimulator holds: the strictest of its enabled programs, mA."""
+
+    min_ma: float
+    max_ma: float
+
+
+@dataclass(frozen=True)
+class StatedLimits:
+    """What a clinician states for the controllers of a plan; None takes the default.
+
+    Defaults: from the stimulator's own lower limit (0 mA where no recording holds one) to the cDBS amplitude, with a ramp that covers the
+    cDBS amplitude within one period.
+    """
+
+    min_ma: float | None = None
+    max_ma: float | None = None
+    ramp_ma_per_s: float | None = None
+
+    @property
+    def any(self) -> bool:
+        """Whether anything was stated."""
+        return any(v is not None for v in (self.min_ma, self.max_ma, self.ramp_ma_per_s))
+
+
+@dataclass(frozen=True)
+class SlotLimits:
+    """Within what one planned session runs.
+
+    Attributes:
+        cdbs_ma: the clinical amplitude, to which every fault leads back. min_ma, max_ma: no amplitude leaves them; both are the cDBS
+            amplitude in a cDBS session, and 0 without stimulation. ramp_ma_per_s: fastest change.
+    """
+
+    cdbs_ma: float
+    min_ma: float
+    max_ma: float
+    ramp_ma_per_s: float
+
+
+def device_limits(db: Session, participant: Participant, hemisphere: Hemisphere | None) -> DeviceLimits | None:
+    """Limits of the newest recording that holds any, of this side where one is named; None where no recording does."""
+    for recording in repository.recordings_newest_first(db, participant.id, hemisphere):
+        programs = [p for group in (recording.details.get("limits") or {}).values() for p in group.values()]
+        if programs:
+            return DeviceLimits(max(p["lower_ma"] for p in programs), min(p["upper_ma"] for p in programs))
+    return None
+
+
+def planned_cdbs_ma(visit: Visit, hemisphere: Hemisphere | None) -> float:
+    """The cDBS amplitude of a visit's plan, mA: what the visit states, else the participant's settings.
+
+    Raises:
+        Invalid: nobody has stated it; the visit states both sides and none is named; or the settings say otherwise than the newest visit
+            that states one, so that nobody knows which of the two is right.
+    """
+    settings = visit.participant.current_settings
+    found = cdbs_amplitude.in_force(visit, hemisphere, settings)
+    if found is None:
+        raise Invalid(
+            f"The cDBS amplitude of visit {visit.number} is not known.", "State it at the visit or in the participant's settings, in mA."
+        )
+    if cdbs_amplitude.stated_at(visit, hemisphere) is None:
+        newest = cdbs_amplitude.in_force_now(visit.participant, hemisphere)
+        if abs(newest - found) > _TOLERANCE_MA:
+            raise Invalid(
+                f"Visit {visit.number} states no cDBS amplitude; the settings say {found:g} mA, and the newest visit that states one "
+                f"{newest:g} mA.",
+                f"State the amplitude at visit {visit.number}.",
+            )
+    return found
+
+
+def slot_limits(
+    cdbs_ma: float, controller: Controller, period_s: float, stated: StatedLimits, device: DeviceLimits | None, least_fraction: float = 0.0
+) -> SlotLimits:
+    """The limits of one session.
+
+    Args:
+        cdbs_ma: as `planned_cdbs_ma`. period_s: between two decisions. stated: by the clinician. device: the stimulator's own.
+        least_fraction: of cDBS, below which the session must not go: that of a test with care, or B of a random session.
+
+    Raises:
+        Invalid: limits that contradict each other, leave the stimulator's own, or go below what the verdict allows.
+    """
+    ramp = cdbs_ma / period_s if stated.ramp_ma_per_s is None else stated.ramp_ma_per_s
+    if controller is Controller.NO_DBS:
+        return SlotLimits(cdbs_ma, 0.0, 0.0, ramp)
+    if controller is Controller.CDBS:
+        return SlotLimits(cdbs_ma, cdbs_ma, cdbs_ma, ramp)
+    # to the hundredth of a milliampere, upwards, so that rounding never goes below what is allowed
+    least = math.ceil(100 * least_fraction * cdbs_ma - _TOLERANCE_MA) / 100
+    default = max(least, device.min_ma if device else 0.0)
+    low = default if stated.min_ma is None else max(stated.min_ma, least)
+    high = cdbs_ma if stated.max_ma is None else stated.max_ma
+    if not low <= cdbs_ma <= high:
+        raise Invalid(
+            f"Limits of {low:g} to {high:g} mA leave out the cDBS amplitude of {cdbs_ma:g} mA, to which every fault leads back.",
+            "State limits that hold it.",
+        )
+    if device and (low < device.min_ma - _TOLERANCE_MA or high > device.max_ma + _TOLERANCE_MA):
+        raise Invalid(
+            f"Limits of {low:g} to {high:g} mA leave those of the stimulator, {device.min_ma:g} to {device.max_ma:g} mA.",
+            "State limits within the stimulator's own.",
+        )
+    return SlotLimits(cdbs_ma, low, high, ramp)

@@ -1,0 +1,71 @@
+"""Rules of signatures: what is hashed, and whether a signature still stands. The caller commits."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from app.platform.signatures import repository
+from app.platform.signatures.models import Signature
+
+_EXACT = 2**53
+
+
+@dataclass(frozen=True)
+class Signer:
+    """A person whose password was checked a moment ago; `app.accounts.signing` makes them, and nothing else should."""
+
+    user_id: int
+    label: str
+
+
+def content_hash(content: Mapping[str, Any]) -> str:
+    """SHA-256 of the canonical JSON of what is signed, 64 hexadecimal digits.
+
+    Canonical: members sorted by name, no spaces, UTF-8, and whole numbers without a fraction (10.0 as 10), so that what comes back from
+    the database has the hash of what went in; after RFC 8785.
+
+    Raises:
+        ValueError: a number that is not finite. TypeError: a value that JSON does not have.
+    """
+    text = json.dumps(_canonical(content), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def record(db: Session, signer: Signer, *, kind: str, subject_id: int, meaning: str, content: Mapping[str, Any]) -> Signature:
+    """Store a signature of somebody whose password was checked. Raises as `content_hash`."""
+    signature = Signature(
+        subject_kind=kind,
+        subject_id=subject_id,
+        meaning=meaning,
+        sha256=content_hash(content),
+        content=dict(content),
+        signed_by=signer.user_id,
+        signer=signer.label,
+    )
+    db.add(signature)
+    db.flush()
+    return signature
+
+
+def standing(db: Session, kind: str, subject_id: int, content: Mapping[str, Any]) -> Signature | None:
+    """The newest signature under something, if it was given for exactly this content and its own record is whole; else None."""
+    newest = next(iter(repository.signatures_of(db, kind, subject_id)), None)
+    if newest is None or newest.sha256 != content_hash(content) or newest.sha256 != content_hash(newest.content):
+        return None
+    return newest
+
+
+def _canonical(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _canonical(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_canonical(v) for v in value]
+    if isinstance(value, float) and value.is_integer() and abs(value) < _EXACT:
+        return int(value)
+    return value
