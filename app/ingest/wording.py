@@ -118,6 +118,7 @@ _SENTENCES: dict[Reason, Callable[[Mapping[str, Any]], str]] = {
     Reason.SEVERAL_VISITS: lambda f: f"{f['visits']} visits are dated {f['day']}: choose one",
     Reason.NO_VISIT_OF_DAY: lambda f: f"recorded on {f['day']}, and no visit has that date: choose the visit, or add it",
     Reason.AMPLITUDE: _amplitude,
+    Reason.LOG: lambda f: f"its log names policy {f['policy']}",
     Reason.SURVEY: _survey,
     Reason.CHANNEL: _channel,
     Reason.UNREADABLE: lambda f: f"its steps cannot be read: {f['detail']}",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import ColumnElement, Select, column, false, func, or_, select, table, true
 from sqlalchemy.dialects.postgresql import JSONB
@@ -325,6 +325,22 @@ def has_policy(db: Session, participant_id: int, policy_id: int) -> bool:
     """Whether a policy is the participant's."""
     policies = table("policy", column("id"), column("participant_id"))
     return db.scalar(select(policies.c.id).where(policies.c.id == policy_id, policies.c.participant_id == participant_id)) is not None
+
+
+class PolicyHead(NamedTuple):
+    """What sessions need of a policy."""
+
+    id: int
+    name: str
+    kind: str
+
+
+def policies_of_network(db: Session, participant_id: int, sha256: str) -> Sequence[PolicyHead]:
+    """The participant's policies whose network file has this SHA-256, the newest first."""
+    policies = table("policy", *(column(name) for name in ("id", "participant_id", "name", "kind", "onnx_sha256")))
+    query = select(policies.c.id, policies.c.name, policies.c.kind)
+    query = query.where(policies.c.participant_id == participant_id, policies.c.onnx_sha256 == sha256)
+    return [PolicyHead(*row) for row in db.execute(query.order_by(policies.c.id.desc()))]
 
 
 def released_limits(db: Session, policy_id: int, moment: datetime | None) -> tuple[float, float] | None:

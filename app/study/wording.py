@@ -96,6 +96,22 @@ def _repeated(f: Mapping[str, Any]) -> str:
     )
 
 
+def _logged_policy(f: Mapping[str, Any]) -> str:
+    if f["logged"] is None:
+        return (
+            f"The controller's log was written by a policy (number {f['number']} where its bundle was made) that is none of this "
+            "participant's. Check that this is the participant's log."
+        )
+    return f"The controller's log was written by policy {f['logged']}, which is not what is stated for this session. Correct one of them."
+
+
+def _logged_cdbs(f: Mapping[str, Any]) -> str:
+    return (
+        f"The controller ran with a cDBS amplitude of {f['logged']:g} mA, and the one in force here is {f['in_force']:g} mA: fractions are "
+        "of the latter. Correct the visit's cDBS amplitude if it is wrong."
+    )
+
+
 _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.DAY: _day,
     Kind.START: _start,
@@ -105,6 +121,8 @@ _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.AMPLITUDE: _amplitude,
     Kind.SILENT_CONTROL: _silent_control,
     Kind.REPEATED: _repeated,
+    Kind.LOGGED_POLICY: _logged_policy,
+    Kind.LOGGED_CDBS: _logged_cdbs,
     Kind.NO_POLICY: lambda f: (
         "No policy is named for this session: it cannot be compared with its estimate. Name one on the session's page."
     ),

@@ -11,7 +11,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -213,7 +213,7 @@ def drive(
     controller = opened.controller()
     writer = csv.writer(sink) if sink else None
     if sink and writer:
-        sink.write(f"{decision_log.kind_line(run.period_s)}\r\n")
+        sink.write(f"{decision_log.kind_line(asdict(opened.manifest))}\r\n")
         writer.writerow(decision_log.COLUMNS)
     window: deque[float] = deque(maxlen=opened.manifest.window)
     rows = source.rows

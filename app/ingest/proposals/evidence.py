@@ -39,6 +39,8 @@ class Reason(StrEnum):
     """`day`."""
     AMPLITUDE = "amplitude"
     """`courses`: one per side, as `Course.as_json`."""
+    LOG = "log"
+    """`policy`: name of the participant's policy that the controller's log names."""
     SURVEY = "survey"
     """`recording`; `montages`: how many sets of sensing contacts it went through."""
     CHANNEL = "channel"

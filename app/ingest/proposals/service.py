@@ -13,8 +13,8 @@ from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
 from app.ingest import repository, sessions, wording
 from app.ingest.models import SessionProposal, Upload
-from app.ingest.proposals import control_channel
-from app.ingest.proposals.evidence import BY_CUT, BY_UPLOAD, Evidence, Reason, Source, guess_controller, guess_visit
+from app.ingest.proposals import control_channel, guesses
+from app.ingest.proposals.evidence import BY_CUT, BY_UPLOAD, Evidence, Reason, Source, guess_visit
 from app.ingest.schemas import PartIn, ProposalChange
 from app.ingest.sessions import Placement, StatedSession, add_session, set_segments
 from app.ingest.uploads import outcomes as outcomes_intake
@@ -27,7 +27,6 @@ from app.study.models import Controller, Participant, Recording, StudySession
 from app.study.service import POLICY_CONTROLLERS
 from app.study.sessions import conditions
 from app.study.sessions.contradictions import contradictions, control_recording, local_day
-from app.study.sessions.stimulation import delivered
 from app.study.sessions.usable_steps import sentence, usable_steps
 from app.study.visits.service import require_unlocked
 from app.study.wording import sentences
@@ -69,6 +68,7 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     day = local_day(placement.control, placement.started_at) if placement.started_at else None
     guess = guess_visit(study.visits(db, participant.id, 1000, 0)[0], day, stated.visit)
     session = add_session(db, guess.visit, placement, stated.controller, stated.policy_id, stated.hemisphere, stated.counts)
+    guesses.policy_by_log(db, session)
     length = f"{session.duration_s / 60:.1f} min" if session.duration_s else "no data"
     seen, usable = _seen(session, placement), sentence(usable_steps(db, session))
     if stated.counts:
@@ -81,8 +81,9 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     evidence = {"visit": guess.why, "controller": BY_UPLOAD}
     controller = stated.controller
     if controller is None:
-        controller, evidence["controller"] = _guess_controller(db, session)
-        blinding.assign(session, controller, stated.policy_id if controller in POLICY_CONTROLLERS else None)
+        guess_of_controller = guesses.controller(db, session)
+        controller, evidence["controller"] = guess_of_controller.controller, guess_of_controller.why
+        guess_of_controller.assign(session, stated.policy_id)
     of_recording = Evidence(Source.RECORDING, Reason.RECORDED_SIDE if session.hemisphere else Reason.NO_SIDE)
     evidence["hemisphere"] = BY_UPLOAD if stated.hemisphere else of_recording
     evidence["control"] = control_channel.why(db, session)
@@ -117,15 +118,6 @@ def _seen(session: StudySession, placement: Placement) -> str:
     )
     beside = [f"the {r.hemisphere} side" if r.hemisphere else f"recording {r.id}" for r in others]
     return f"controlled by {trace}{side}" + (f", recorded together with {' and '.join(beside)}" if beside else "")
-
-
-def _guess_controller(db: Session, session: StudySession) -> tuple[Controller | None, Evidence]:
-    if (survey := control_channel.survey(session)) is not None:
-        return None, survey
-    try:
-        return guess_controller(delivered(db, session))
-    except Invalid as error:
-        return None, Evidence(Source.RECORDING, Reason.UNREADABLE, {"detail": error.detail})
 
 
 def _join_earlier(db: Session, participant: Participant, group: list[Recording], stated: StatedSession) -> NewSession | None:
@@ -178,11 +170,10 @@ def _renew_guess(db: Session, session: StudySession, proposal: SessionProposal, 
     if "controller" in proposal.evidence and Evidence.from_json(proposal.evidence["controller"]).stated:
         return
     arm = blinding.stated_arm(session, SYSTEM)
-    controller, why = _guess_controller(db, session)
-    proposal.evidence = {**proposal.evidence, "controller": why.as_json()}
-    if not keep and controller != (arm.controller if arm else None):
-        kept = arm.policy_id if arm and controller in POLICY_CONTROLLERS else None
-        blinding.assign(session, controller, kept)
+    guess = guesses.controller(db, session)
+    proposal.evidence = {**proposal.evidence, "controller": guess.why.as_json()}
+    if not keep and guess.controller != (arm.controller if arm else None):
+        guess.assign(session, arm.policy_id if arm else None)
 
 
 def renew(db: Session, session: StudySession) -> None:
@@ -277,9 +268,9 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
         new = add_session(db, session.visit, placement, part.controller, None, session.hemisphere, counts=False)
         why = BY_CUT
         if part.controller is None:
-            guessed, why = _guess_controller(db, new)
-            policy_id = arm.policy_id if arm and guessed == arm.controller else None
-            blinding.assign(new, guessed, policy_id)
+            guess = guesses.controller(db, new)
+            guess.assign(new, arm.policy_id if arm and guess.controller == arm.controller else None)
+            why = guess.why
         part_of = Evidence(Source.CUT, Reason.CUT_OUT, {"session": session.id})
         evidence = {**proposal.evidence, "controller": why.as_json(), "part": part_of.as_json()}
         db.add(

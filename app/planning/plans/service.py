@@ -32,6 +32,7 @@ from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import service as study
 from app.study.models import Controller, Participant, Visit
 from app.study.schemas import VisitIn
+from app.study.sessions.logged import CONTROLLER_OF_KIND
 from ml.ope.estimate import Estimate
 
 MAX_SEED = 2**31 - 1
@@ -202,7 +203,7 @@ def testable_policies(db: Session, participant: Participant, ids: Sequence[int])
 
 def controller_of(policy: Policy) -> Controller:
     """What a session of this policy counts as: students are `distilled`, reference policies `other`, all others `rl`."""
-    return {"distilled": Controller.DISTILLED, "baseline": Controller.OTHER}.get(policy.kind, Controller.RL)
+    return CONTROLLER_OF_KIND.get(policy.kind, Controller.RL)
 
 
 def visit_for_draft(

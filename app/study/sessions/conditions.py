@@ -15,7 +15,7 @@ from app.platform.errors import Conflict, Invalid
 from app.study import blinding, repository, service
 from app.study.models import Controller, Recording, SettingsVersion, StudySession
 from app.study.schemas import ConditionsChange, ConditionsFields
-from app.study.sessions import designs, programming
+from app.study.sessions import designs, logged, programming
 from app.study.sessions.models import SessionConditions
 from app.study.traces import AMPLITUDE_STREAM, StepTable, step_table
 
@@ -135,8 +135,11 @@ def _add(db: Session, session: StudySession, values: dict[str, Any], origin: str
 
 
 def _limits(db: Session, session: StudySession) -> tuple[float, float] | None:
-    """Amplitude limits in force, mA: the clinician's in the device for the controlled program, else those of the bundle that ran."""
+    """Amplitude limits in force, mA: the controller's by its log, else the device's for the controlled program, else the bundle's."""
     control = next((s.recording for s in session.segments if s.is_control), None)
+    said = logged.limits_and_policy(control) if control is not None else None
+    if said is not None:
+        return float(said["min_ma"]), float(said["max_ma"])
     found = _device_limits(db, control) if control is not None else None
     if found is not None:
         return found

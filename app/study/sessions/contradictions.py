@@ -15,8 +15,8 @@ from app.accounts.permissions import SYSTEM
 from app.platform.errors import Invalid
 from app.study import blinding
 from app.study.models import Controller, Recording, StudySession
-from app.study.sessions import repeated
-from app.study.sessions.stimulation import Delivered, contradicts, delivered
+from app.study.sessions import logged, repeated
+from app.study.sessions.stimulation import SILENT_MA, Delivered, contradicts, delivered
 from app.study.traces import step_table
 
 
@@ -38,6 +38,10 @@ class Kind(StrEnum):
     SILENT_CONTROL = "silent_control"
     """`side`: name of the controlled side; `others`: names of those that had stimulation."""
     NO_POLICY = "no_policy"
+    LOGGED_POLICY = "logged_policy"
+    """`logged`: name of the participant's policy that the log names; `number`, where the participant has none such."""
+    LOGGED_CDBS = "logged_cdbs"
+    """`logged`, `in_force`: cDBS amplitudes, mA."""
     REPEATED = "repeated"
     """`session`, `recording`: of the other one; `seconds`: that both hold; `counts`: whether the other one counts; `own`: recording."""
 
@@ -68,6 +72,9 @@ def contradictions(db: Session, session: StudySession, visit_open: bool = False,
         facts = {"above": table.above_one, "steps": int(np.sum(table.t_s > 0)), "cdbs_ma": table.cdbs_ma}
         found.append(Contradiction(Kind.ABOVE_CDBS, facts))
     arm = blinding.stated_arm(session, SYSTEM)
+    ran = logged.of_recording(db, control_recording(session))
+    if ran is not None:
+        found += _of_log(ran, arm, table.cdbs_ma)
     if arm is None:
         return found
     found += _of_controller(session, arm.controller, sides)
@@ -127,6 +134,14 @@ def _of_side(session: StudySession) -> Iterator[Contradiction]:
     if session.hemisphere and recording.hemisphere and session.hemisphere != recording.hemisphere:
         facts = {"stated": session.hemisphere, "recording": recording.id, "recorded": recording.hemisphere}
         yield Contradiction(Kind.SIDE, facts)
+
+
+def _of_log(ran: logged.Logged, arm: blinding.Arm | None, cdbs_ma: float | None) -> Iterator[Contradiction]:
+    """Another policy than the one that wrote the log, or another cDBS amplitude than it was bounded by."""
+    if ran.policy_id is None or (arm is not None and arm.policy_id != ran.policy_id):
+        yield Contradiction(Kind.LOGGED_POLICY, {"logged": ran.policy_name, "number": ran.number})
+    if cdbs_ma is not None and abs(cdbs_ma - ran.cdbs_ma) > SILENT_MA:
+        yield Contradiction(Kind.LOGGED_CDBS, {"logged": ran.cdbs_ma, "in_force": cdbs_ma})
 
 
 def _of_controller(session: StudySession, controller: Controller, sides: Sequence[Delivered]) -> Iterator[Contradiction]:

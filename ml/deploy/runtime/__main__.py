@@ -92,7 +92,7 @@ def run(manifest: dict[str, Any], network: MlpNetwork, log: Path | None = None) 
     with nullcontext() if log is None else log.open("x", newline="", encoding="utf-8") as sink:
         writer = csv.writer(sink) if sink else None
         if sink and writer:
-            sink.write(f"{decision_log.kind_line(manifest['period_s'])}\r\n")
+            sink.write(f"{decision_log.kind_line(manifest)}\r\n")
             writer.writerow(decision_log.COLUMNS)
         for k, line in enumerate(sys.stdin):
             try:

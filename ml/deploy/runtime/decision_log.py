@@ -1,4 +1,4 @@
-"""The log of a controller: a kind line, a header, and one row per decision.
+"""The log of a controller: a kind line that says what ran, a header, and one row per decision.
 
 The row of a decision holds the beta amplitude of the period that ended at `due_s`, and the amplitude decided for the time from `t_s` to the
 next decision's: beta and amplitude of one row are those of two steps. Readers know it by its first line.
@@ -6,20 +6,28 @@ next decision's: beta and amplitude of one row are those of two steps. Readers k
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from .envelope import BetaSample, Decision, reason_names
 
-VERSION = 1
+VERSION = 2
+NETWORK = "model.onnx"
+"""The file of a bundle by which a policy is known, in whatever installation."""
 COLUMNS = (
     "t_s", "due_s", "beta", "unit", "source", "valid", "window", "fraction", "requested_ma", "amplitude_ma", "action", "reasons",
     "latency_us", "signal_us", "late_ms", "missed", "detail",
 )  # fmt: skip
 
 
-def kind_line(period_s: float) -> str:
-    """The first line of a log, without its end."""
-    return f"# betaloop controller log, version {VERSION}, period {period_s:g} s"
+def kind_line(manifest: Mapping[str, Any]) -> str:
+    """The first line of a log, without its end: which policy decided, for which side, and within which limits."""
+    m = manifest
+    side = f", side {m['hemisphere']}" if m.get("hemisphere") else ""
+    return (
+        f"# betaloop controller log, version {VERSION}, period {m['period_s']:g} s, policy {m['policy_id']}, network {m['files'][NETWORK]}"
+        f"{side}, limits {m['min_ma']:.9g} to {m['max_ma']:.9g} mA, cDBS {m['cdbs_ma']:.9g} mA, ramp {m['ramp_ma_per_s']:.9g} mA/s"
+    )
 
 
 def cells(

@@ -8,26 +8,31 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import cast, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
-from ml.formats.recording import DecodedFile, TraceSource, UndecodableFile
+from ml.formats.recording import DecodedFile, Hemisphere, TraceSource, UndecodableFile
 from ml.formats.redaction_record import Redaction
-from ml.formats.tables.columns import LOG_KIND_LINE, Columns
+from ml.formats.tables.columns import LARGEST, LOG_KIND_LINE, Columns
 from ml.formats.tables.numbers import NotANumber, known_unit, parse_number, shown
 from ml.formats.tables.steps import GRID_TOLERANCE, decode_columns
 
-NEWEST = 1
+NEWEST = 2
 """Version of logs that this decoder reads at the most."""
 MARK = b"# betaloop controller log"
-_KIND = re.compile(r"# betaloop controller log, version (?P<version>\d{1,4}), period (?P<period>\d+(\.\d*)?) s")
+_KIND = re.compile(r"# betaloop controller log, version (?P<version>\d{1,4})(, period (?P<period>\d+(\.\d*)?) s(?P<ran>.*))?")
+_NUMBER = r"\d{1,3}(?:\.\d{1,9})?"
+_RAN = re.compile(
+    r", policy (?P<policy_id>\d{1,9}), network (?P<network_sha256>[0-9a-f]{64})(?:, side (?P<side>left|right))?"
+    rf", limits (?P<min_ma>{_NUMBER}) to (?P<max_ma>{_NUMBER}) mA, cDBS (?P<cdbs_ma>{_NUMBER}) mA, ramp (?P<ramp_ma_per_s>{_NUMBER}) mA/s"
+)
 NEEDED = ("t_s", "beta", "unit", "amplitude_ma")
 OPTIONAL = ("due_s", "source", "reasons")
 NO_BETA = frozenset({"no_beta", "invalid_beta", "wrong_signal", "late_sample"})
@@ -40,9 +45,36 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Log:
-    """The rows of a log: decided at `t_s`, for the period that ended at `due_s`; beta (NaN: none) in `unit` from `source`; amplitude."""
+class Ran:
+    """What the first line of a log says of the controller: its policy, by number and by the SHA-256 of its network, and its limits."""
 
+    policy_id: int
+    network_sha256: str
+    side: Hemisphere | None
+    min_ma: float
+    max_ma: float
+    cdbs_ma: float
+    ramp_ma_per_s: float
+
+    @classmethod
+    def of(cls, said: Mapping[str, Any]) -> Ran:
+        """From texts or numbers by name. Raises UndecodableFile where they do not fit together."""
+        numbers = {name: float(said[name]) for name in ("min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s")}
+        if not 0 <= numbers["min_ma"] <= numbers["cdbs_ma"] <= numbers["max_ma"] <= LARGEST["amplitude_ma"]:
+            what = f"limits of {numbers['min_ma']:g} to {numbers['max_ma']:g} mA around a cDBS amplitude of {numbers['cdbs_ma']:g} mA"
+            raise UndecodableFile(what, "line 1", MEND)
+        return cls(int(said["policy_id"]), said["network_sha256"], cast("Hemisphere | None", said["side"]), **numbers)
+
+
+@dataclass(frozen=True)
+class Log:
+    """The rows of a log: decided at `t_s`, for the period that ended at `due_s`; beta (NaN: none) in `unit` from `source`; amplitude.
+
+    `ran` is None for logs of version 1, which do not tell.
+    """
+
+    ran: Ran | None
+    kind_line: str
     period_s: float
     lines: NDArray[np.int64]
     t_s: Floats
@@ -81,7 +113,10 @@ def decode_log(path: Path, options: DecodeOptions, name: str | None = None) -> D
     )
     said = f"log of the controller: {log.lines.size} decisions, each put to the period that followed it"
     decoded.reports[0].understood.insert(0, said)
-    return replace(decoded, recordings=(replace(recording, kind="controller_log", traces=traces),))
+    settings = {**recording.settings, "controller": asdict(log.ran)} if log.ran else recording.settings
+    side = log.ran.side if log.ran else recording.hemisphere
+    made = replace(recording, kind="controller_log", hemisphere=side, traces=traces, settings=settings)
+    return replace(decoded, recordings=(made,))
 
 
 def in_force(log: Log) -> Floats:
@@ -108,7 +143,7 @@ def redact_log(source: Path, target: Path, options: DecodeOptions) -> Redaction:
     rows = zip(log.t_s.tolist(), log.due_s.tolist(), log.beta.tolist(), log.amplitude_ma.tolist(), strict=True)
     kept = log.source if log.source in get_args(TraceSource) else "table"
     with target.open("w", encoding="utf-8", newline="") as out:
-        out.write(f"# betaloop controller log, version {NEWEST}, period {log.period_s:g} s\nt_s,due_s,beta,unit,source,amplitude_ma\n")
+        out.write(f"{log.kind_line}\nt_s,due_s,beta,unit,source,amplitude_ma\n")
         for t, due, beta, amplitude in rows:
             out.write(f"{t!r},{due!r},{'' if beta != beta else repr(beta)},{log.unit},{kept},{amplitude!r}\n")
     return Redaction(removed=["what the controller noted beside beta and amplitude"])
@@ -122,7 +157,8 @@ def _opened(path: Path) -> Iterator[Iterator[str]]:
 
 def _read(path: Path, options: DecodeOptions) -> Log:
     with _opened(path) as lines:
-        period_s = _period(next(lines, "").strip(), options)
+        first = next(lines, "").strip().rstrip(", ;")
+        period_s, ran = _kind(first, options)
         reader = csv.reader(lines)
         headers = [h.strip() for h in next(reader, [])]
         missing = [name for name in NEEDED if name not in headers]
@@ -149,6 +185,8 @@ def _read(path: Path, options: DecodeOptions) -> Log:
             "decisions that are not in the order of their times", f"line {line_numbers[int(back[0]) + 1]}, column t_s", MEND
         )
     return Log(
+        ran,
+        first,
         period_s,
         np.array(line_numbers, dtype=np.int64),
         times,
@@ -160,18 +198,21 @@ def _read(path: Path, options: DecodeOptions) -> Log:
     )
 
 
-def _period(first: str, options: DecodeOptions) -> float:
-    kind = _KIND.fullmatch(first.rstrip(", ;"))
-    if kind is None:
-        raise UndecodableFile("the first line of this controller's log is not whole", "line 1", MEND)
-    if int(kind["version"]) > NEWEST:
+def _kind(first: str, options: DecodeOptions) -> tuple[float, Ran | None]:
+    """Period, s, and what ran. Raises UndecodableFile for a first line that is cut or of another version or period."""
+    kind = _KIND.match(first)
+    if kind is not None and int(kind["version"]) > NEWEST:
         what = f"a controller's log of version {kind['version']}; this service reads versions up to {NEWEST}"
         raise UndecodableFile(what, "line 1", "Bring this service up to date.")
+    said = None if kind is None or kind["ran"] is None else _RAN.fullmatch(kind["ran"])
+    whole = kind is not None and (kind["ran"] == "" if int(kind["version"]) == 1 else said is not None)
+    if kind is None or not whole:
+        raise UndecodableFile("the first line of this controller's log is not whole", "line 1", MEND)
     period_s = float(kind["period"])
     if abs(period_s - options.period_s) > GRID_TOLERANCE * options.period_s:
         what = f"a controller that decided every {period_s:g} s, where the participant's period is {options.period_s:g} s"
         raise UndecodableFile(what, "line 1", "Set the participant's period to the controller's.")
-    return options.period_s
+    return options.period_s, Ran.of(said.groupdict()) if said else None
 
 
 def _row(row: list[str], at: dict[str, int], line: int) -> tuple[int, float, float, float, float, str, str]:

@@ -36,5 +36,5 @@ def made(folder: Path, **changes: object) -> Path:
 
 def rows_of(log: Path) -> list[dict[str, str]]:
     with log.open(encoding="utf-8") as stream:
-        assert next(stream).strip() == "# betaloop controller log, version 1, period 2 s"
+        assert next(stream).startswith("# betaloop controller log, version 2, period 2 s, policy 3, ")
         return list(csv.DictReader(stream))

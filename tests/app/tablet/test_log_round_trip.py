@@ -8,7 +8,9 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from ml.deploy.runtime.envelope import BetaSample, Signal
 from ml.formats import DecodeOptions, UndecodableFile, decode, redact, sniff
 from ml.formats.recording import DecodedFile
 from ml.formats.tables.columns import LOG_COLUMNS, LOG_KIND_LINE
+from ml.formats.tables.control_log import _kind
 from tests.app.tablet.control_bundles import MANIFEST, PUBLIC, made
 
 STEPS, LEAD = 40, 10
@@ -78,8 +81,11 @@ def test_the_log_of_the_tablet_gives_back_what_the_device_had(logged: tuple[Devi
     clean = tmp_path / "clean.csv"
     redact(log, clean, "control_log", b"k" * 32)
     same_as_the_device(decode(clean), device)
+    assert decode(clean).recordings[0].settings == decoded.recordings[0].settings
     assert decode(clean).recordings[0].fingerprint == decoded.recordings[0].fingerprint
-    assert "policy" not in clean.read_text()
+    assert "policy" not in clean.read_text().split("\n", 1)[1], "of the decisions no more than beta and amplitude stays"
+    ran = decoded.recordings[0].settings["controller"]
+    assert (ran["policy_id"], ran["min_ma"], ran["max_ma"], ran["cdbs_ma"], ran["side"]) == (3, 0.5, 3.0, 3.0, None)
 
 
 def test_the_log_of_a_bundles_own_runner_gives_back_what_the_device_had(tmp_path: Path) -> None:
@@ -142,11 +148,43 @@ def test_a_log_without_its_first_line_is_refused_in_words(logged: tuple[Device, 
     assert "put '# betaloop controller log, version 1" in answer.text
 
 
+def test_a_log_names_policy_and_limits_of_its_session(
+    logged: tuple[Device, Path], client: TestClient, enrolled: str, tmp_path: Path
+) -> None:
+    with zipfile.ZipFile(tmp_path / "bundle.zip") as bundle:
+        network = bundle.read("model.onnx")
+
+    def uploaded(rows: int | None) -> dict[str, Any]:
+        sent = {"file": ("log.csv", b"".join(logged[1].read_bytes().splitlines(keepends=True)[:rows]))}
+        answer = client.post("/api/v1/uploads", data={"participant": enrolled, "visit": "1", "confirm": "false"}, files=sent)
+        assert answer.status_code == 201, answer.text
+        body = answer.json()
+        (found,) = body["proposals"]
+        return found | {"flagged": " ".join(body["report"][0]["flagged"])}
+
+    foreign = uploaded(-3)
+    assert (foreign["session"]["controller"], foreign["session"]["policy_id"]) == (None, None)
+    assert "a policy (number 3 where its bundle was made) that is none of this participant's" in foreign["flagged"]
+    home = f"/api/v1/participants/{enrolled}"
+    policy = client.post(f"{home}/policies", data={"name": "rl-01"}, files={"file": ("x.onnx", network)}).json()["id"]
+    client.put(f"{home}/settings", json={"settings": {"cdbs_amplitude_ma": 2.5}})
+    known = uploaded(None)
+    number = known["session"]["id"]
+    assert (known["session"]["controller"], known["session"]["policy_id"]) == ("rl", policy)
+    assert known["evidence"]["controller"] == "its log names policy rl-01"
+    assert "ran with a cDBS amplitude of 3 mA, and the one in force here is 2.5 mA" in known["flagged"]
+    answer = client.post(f"/api/v1/proposals/{number}/confirm", json={"version": known["version"]})
+    assert answer.status_code == 200, answer.text
+    assert answer.json()["session"]["policy_id"] == policy
+    conditions = client.get(f"/api/v1/sessions/{number}/conditions").json()
+    assert (conditions["min_ma"], conditions["max_ma"]) == (MANIFEST.min_ma, MANIFEST.max_ma)
+
+
 def test_a_log_of_0_1_0_is_read_once_its_kind_is_said(logged: tuple[Device, Path], tmp_path: Path) -> None:
     old = tmp_path / "old.csv"
     with logged[1].open() as stream, old.open("w") as out:
-        kind = next(stream)
-        out.write(kind)
+        next(stream)
+        out.write(f"{LOG_KIND_LINE}\n")
         rows = csv.DictReader(stream)
         writer = csv.DictWriter(out, [c for c in COLUMNS if c not in ("due_s", "source")], extrasaction="ignore")
         writer.writeheader()
@@ -159,7 +197,7 @@ def test_a_log_of_0_1_0_is_read_once_its_kind_is_said(logged: tuple[Device, Path
 def test_a_late_decision_counts_from_when_it_was_made(tmp_path: Path) -> None:
     log = tmp_path / "late.csv"
     rows = ["0,0,1,uV,,3", "2.5,2,1,uV,,1", "4,4,1,uV,,2", "10,10,1,uV,,2", "12,12,1,uV,invalid_beta,2"]
-    log.write_text(f"{kind_line(2.0)}\nt_s,due_s,beta,unit,reasons,amplitude_ma\n" + "\n".join(rows) + "\n")
+    log.write_text(f"{LOG_KIND_LINE}\nt_s,due_s,beta,unit,reasons,amplitude_ma\n" + "\n".join(rows) + "\n")
     (recording,) = decode(log).recordings
     beta, amplitude = (next(t for t in recording.traces if t.stream == stream) for stream in ("beta", "amplitude"))
     np.testing.assert_allclose(amplitude.values, [np.nan, 3.0, 1.5, np.nan, np.nan, np.nan, 2.0])
@@ -169,7 +207,10 @@ def test_a_late_decision_counts_from_when_it_was_made(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda text: text.replace("version 1", "version 2", 1), "log of version 2"),
+        (lambda text: text.replace("version 2", "version 3", 1), "log of version 3"),
+        (lambda text: text.replace("version 2", "version 1", 1), "first line of this controller's log is not whole"),
+        (lambda text: text.replace("0.5 to 3 mA", "0.5 mA", 1), "first line of this controller's log is not whole"),
+        (lambda text: text.replace("0.5 to 3 mA", "3.5 to 3 mA", 1), "limits of 3.5 to 3 mA"),
         (lambda text: text.replace("period 2 s", "period 5 s", 1), "decided every 5 s"),
         (lambda text: text.replace(", period 2 s", "", 1), "first line of this controller's log is not whole"),
         (lambda text: text.replace("amplitude_ma", "amplitude", 1), "without the column amplitude_ma"),
@@ -187,5 +228,13 @@ def test_what_is_wrong_with_a_log_is_said(logged: tuple[Device, Path], change: C
 
 
 def test_the_words_of_decoder_and_writer_agree() -> None:
-    assert kind_line(2.0) == LOG_KIND_LINE
+    manifest = asdict(replace(MANIFEST, hemisphere="left", files={"model.onnx": "a" * 64}))
+    first = kind_line(manifest)
+    assert first.startswith(LOG_KIND_LINE.replace("version 1", "version 2"))
+    said = _kind(first, DecodeOptions())[1]
+    assert said is not None
+    assert {name: value for name, value in asdict(said).items() if name not in ("network_sha256", "side")} == {
+        name: manifest[name] for name in ("policy_id", "min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s")
+    }
+    assert (said.network_sha256, said.side) == ("a" * 64, "left")
     assert set(COLUMNS) >= LOG_COLUMNS

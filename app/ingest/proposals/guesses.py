@@ -1,0 +1,53 @@
+"""Which controller a proposed session had, by what its recordings tell."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import SYSTEM
+from app.ingest.proposals import control_channel
+from app.ingest.proposals.evidence import Evidence, Reason, Source, guess_controller
+from app.platform.errors import Invalid
+from app.study import blinding
+from app.study.models import Controller, StudySession
+from app.study.service import POLICY_CONTROLLERS
+from app.study.sessions import logged
+from app.study.sessions.contradictions import control_recording
+from app.study.sessions.stimulation import delivered
+
+
+class Guess(NamedTuple):
+    """A controller, None where it stays open; the policy that its own log names; and why."""
+
+    controller: Controller | None
+    policy_id: int | None
+    why: Evidence
+
+    def assign(self, session: StudySession, known: int | None) -> None:
+        """Give a session this controller, with the policy of its log, else the one that is known of it."""
+        policy_id = self.policy_id or known
+        blinding.assign(session, self.controller, policy_id if self.controller in POLICY_CONTROLLERS else None)
+
+
+def controller(db: Session, session: StudySession) -> Guess:
+    """By the controller's own log where it names a policy of the participant, else by the amplitudes of all sides."""
+    ran = logged.of_recording(db, control_recording(session))
+    if ran is not None and ran.policy_id is not None:
+        return Guess(ran.controller, ran.policy_id, Evidence(Source.RECORDING, Reason.LOG, {"policy": ran.policy_name}))
+    if (survey := control_channel.survey(session)) is not None:
+        return Guess(None, None, survey)
+    try:
+        found, why = guess_controller(delivered(db, session))
+    except Invalid as error:
+        return Guess(None, None, Evidence(Source.RECORDING, Reason.UNREADABLE, {"detail": error.detail}))
+    return Guess(found, None, why)
+
+
+def policy_by_log(db: Session, session: StudySession) -> None:
+    """Name the policy of a session whose controller is stated without one, where its log names it and is of that controller."""
+    arm = blinding.stated_arm(session, SYSTEM)
+    ran = logged.of_recording(db, control_recording(session))
+    if ran is not None and ran.policy_id is not None and arm is not None and (arm.controller, arm.policy_id) == (ran.controller, None):
+        blinding.assign(session, arm.controller, ran.policy_id)
