@@ -173,7 +173,7 @@ class DualDice:
         Raises:
             ValueError: no usable step, or no session with a complete s_0.
         """
-        table, c = usable_steps(buffer, before=dose_before(buffer)), self.config
+        table, c = usable_steps(buffer, otherwise=dose_before(buffer)), self.config
         draws = resamples(table.sessions, c.refits, c.seed)
         inputs = ValueFeatures(table, 0, c.seed)
         report(1.0, "inputs of the density ratios")

@@ -2,7 +2,8 @@
 
 A session's log begins with its first step, yet stimulation acts over minutes: what was on before it is still at work while the discount is
 largest. Between sessions a participant is under clinical stimulation (cDBS), so that is what is expected; but a study may do otherwise, and
-uploaded sessions do not say. The two accounts are therefore weighed by the evidence of the linear model of beta under each.
+some sessions do not say. Where the amplitude in force before a session is on record, that is it (`ml.ope.fqe.steps.lead_dose`); of the
+others the two accounts are weighed by the evidence of the linear model of beta under each.
 """
 
 from __future__ import annotations
@@ -19,10 +20,12 @@ PRIOR_LOG_ODDS = 2.0
 
 
 def dose_before(buffer: ReplayBuffer) -> float | None:
-    """Amplitude fraction that had been on before every session; None where each session's first amplitude explains beta better.
+    """Amplitude fraction before sessions without a record of it; None where each session's first amplitude explains beta better.
 
-    cDBS where fewer than two sessions have usable steps, so that nothing can be weighed.
+    cDBS where every session has a record, or fewer than two sessions have usable steps, so that nothing can be weighed.
     """
+    if all(s.lead_amplitude is not None for s in buffer.sessions):
+        return CDBS
     scale = learn_scale(buffer)
 
     def evidence(before: float | None) -> float:

@@ -191,6 +191,7 @@ def replace_steps(table: UsableSteps, keep: NDArray[np.bool_]) -> UsableSteps:
         table.first_session,
         table.sessions,
         table.before,
+        table.otherwise,
     )
 
 
@@ -224,7 +225,7 @@ class Fqe:
         Raises:
             ValueError: no usable step, or no session with a complete s_0.
         """
-        table, c = usable_steps(buffer, before=dose_before(buffer)), self.config
+        table, c = usable_steps(buffer, otherwise=dose_before(buffer)), self.config
         folds = session_folds(buffer.sessions, c.folds, c.seed)
         members = []
         for m in range(c.members):

@@ -60,10 +60,10 @@ def fqe_value(
     member = fit_member(table, session_folds(buffer_train.sessions, 3, seed), settings.gamma, units, seed)
     target = TargetActions.of(table, policy)
     weights, _ = member.weights(member.next_products(target), np.arange(table.sessions), horizon, settings.gamma)
-    own = [s.lead_beta for s in sessions if np.isfinite(s.lead_beta).all()]
-    first = np.stack(own) if own else table.first_states
+    own = [s for s in sessions if np.isfinite(s.lead_beta).all()]
+    first = np.stack([s.lead_beta for s in own]) if own else table.first_states
     actions = np.clip(policy.act(first.copy()), 0.0, 1.0)
-    sums = member.features(first, actions, table.first_memory(actions)).mean(0) @ weights[-1]
+    sums = member.features(first, actions, table.first_memory(actions, own or None)).mean(0) @ weights[-1]
     sums = within_reach(sums, settings, horizon, (scale.beta_low, scale.beta_high), target.span)
     end_model = fit_end_model(buffer_train)
     end = float(end_model.predict(minutes_of(sums, horizon))[0]) if end_model.seen[0] else 0.0
@@ -81,7 +81,7 @@ def _residual(
     if not usable:
         return 0.0
     part = replace(buffer, sessions=usable)
-    held = usable_steps(part, member.features.scale, member.grams.table.before)
+    held = usable_steps(part, member.features.scale, member.grams.table.otherwise)
     target = TargetActions.of(held, policy)
     now = member.features(held.states, held.actions, held.memory) @ weights[-1][:, 0]
     then = member.features(held.next_states, target.then, target.memory) @ weights[-2][:, 0]

@@ -6,6 +6,7 @@ the log and under any policy, so they stand beside the window.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,6 +49,21 @@ def held_amplitude(session: SessionTrajectory) -> Floats:
     return np.asarray(a[np.where(last < 0, int(np.argmax(known)), last)], dtype=np.float64)
 
 
+def lead_dose(session: SessionTrajectory, otherwise: float | None) -> float | None:
+    """Amplitude fraction within [0, 1] that had been on before a session: the one on record, else `otherwise`; None: its first one."""
+    return otherwise if session.lead_amplitude is None else min(max(session.lead_amplitude, 0.0), 1.0)
+
+
+def lead_doses(sessions: Sequence[SessionTrajectory], otherwise: float | None) -> Floats:
+    """`lead_dose` every session, [n]; NaN where that is None."""
+    return np.array([np.nan if (dose := lead_dose(s, otherwise)) is None else dose for s in sessions], dtype=np.float64)
+
+
+def after_doses(first: Floats, before: Floats) -> Floats:
+    """The amplitudes [..., n] that had been on before sessions [n]: `lead_doses`, and their first ones [..., n] where those are NaN."""
+    return np.where(np.isnan(before), first, before)
+
+
 def memories(a: Floats, before: float | None = None) -> Floats:
     """Memories [T, 3] of a session's amplitudes [T], each row with its own step in it.
 
@@ -74,7 +90,8 @@ class UsableSteps:
         follows: row of the next step of the same session where that is usable too, else -1, [N].
         first_states: s_0 of the sessions without gaps in it, [m, W]. first_session: their indices, [m].
         sessions: n.
-        before: amplitude that had been on before every session; None: each session's first (`ml.ope.lead`).
+        before: amplitude that had been on before the sessions of `first_session`, [m]; NaN: their first one.
+        otherwise: amplitude that had been on before sessions of which no record says it; None: their first (`ml.ope.lead`).
     """
 
     scale: Scale
@@ -89,15 +106,17 @@ class UsableSteps:
     first_states: Floats
     first_session: Indices
     sessions: int
-    before: float | None = None
+    before: Floats
+    otherwise: float | None = None
 
-    def first_memory(self, a: Floats) -> Floats:
-        """Memories [m, 3] at the first step of sessions under the amplitudes [m], which the dose before them precedes."""
-        return fresh_memory(a) if self.before is None else remember(np.full((a.size, len(DECAYS)), self.before), a)
+    def first_memory(self, a: Floats, sessions: Sequence[SessionTrajectory] | None = None) -> Floats:
+        """Memories [m, 3] at the first step under the amplitudes [m] of the table's first sessions, or of other ones, after their doses."""
+        before = self.before if sessions is None else lead_doses(sessions, self.otherwise)
+        return remember(fresh_memory(after_doses(a, before)), a)
 
 
-def usable_steps(buffer: ReplayBuffer, scale: Scale | None = None, before: float | None = None) -> UsableSteps:
-    """The table of a buffer whose sessions began after the dose `before`.
+def usable_steps(buffer: ReplayBuffer, scale: Scale | None = None, otherwise: float | None = None) -> UsableSteps:
+    """The table of a buffer; `otherwise` is the dose before sessions of which no record says it.
 
     Raises:
         ValueError: no step is usable, or no session starts without gaps.
@@ -105,7 +124,7 @@ def usable_steps(buffer: ReplayBuffer, scale: Scale | None = None, before: float
     settings = buffer.settings
     scale = learn_scale(buffer) if scale is None else scale
     steps = buffer.transitions()
-    memory = np.concatenate([memories(held_amplitude(s), before)[s.usable()] for s in buffer.sessions])
+    memory = np.concatenate([memories(held_amplitude(s), lead_dose(s, otherwise))[s.usable()] for s in buffer.sessions])
     beta = steps.next_states[:, -1]
     rates = np.concatenate([steps.rewards[:, None], step_features(beta, steps.actions, settings.xi_beta)], axis=1)
     next_row = np.arange(1, len(beta) + 1)
@@ -126,7 +145,8 @@ def usable_steps(buffer: ReplayBuffer, scale: Scale | None = None, before: float
         first_states=np.stack([lead for _, lead in starts]),
         first_session=np.array([i for i, _ in starts], dtype=np.int64),
         sessions=len(buffer.sessions),
-        before=before,
+        before=lead_doses([buffer.sessions[i] for i, _ in starts], otherwise),
+        otherwise=otherwise,
     )
 
 

@@ -13,13 +13,13 @@ sessions are random effects.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.fqe.steps import held_amplitude
+from ml.ope.fqe.steps import after_doses, held_amplitude, lead_dose, lead_doses
 from ml.ope.linear.dynamics import autoregression, innovations_of, level_model, level_sums, log_noise_weights, split_coefficients
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedFit, MixedModel, Sums
@@ -114,9 +114,9 @@ class ResponseTable:
     usable: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, session: SessionTrajectory, scale: Scale, before: float | None = None) -> ResponseTable:
-        """Tables of a session after the dose `before` (`ml.ope.lead`); its own first amplitude where that is None."""
-        a, window = held_amplitude(session), session.lead_beta.size
+    def of(cls, session: SessionTrajectory, scale: Scale, otherwise: float | None = None) -> ResponseTable:
+        """Tables of a session after the dose before it, which is `otherwise` where no record says it (`ml.ope.fqe.steps.lead_dose`)."""
+        a, window, before = held_amplitude(session), session.lead_beta.size, lead_dose(session, otherwise)
         first = a[0] if before is None else before
         means = {shape: lagged_means(dose(shape, np.concatenate([np.full(window, first), a]))) for shape in SHAPES}
         return cls(scale.beta(session.padded_beta), a, means, session.usable())
@@ -144,7 +144,7 @@ class ImpulseDynamics:
         noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
         evidence: share of every (shape, alpha).
         shares: lambda / (1 + lambda) of the visits' and the sessions' levels.
-        before: dose before every session; None: each session's first amplitude.
+        before: dose before each session, [n]; NaN: its first amplitude.
         ratios: likeliest lambdas of every (shape, alpha).
     """
 
@@ -155,7 +155,7 @@ class ImpulseDynamics:
     noise_weights: Floats
     evidence: dict[tuple[str, float], float]
     shares: dict[str, float]
-    before: float | None = None
+    before: Floats
     ratios: dict[tuple[str, float], Floats] = field(default_factory=dict)
 
     @property
@@ -183,7 +183,7 @@ class ImpulseDynamics:
 
     def response(self, first: Floats, steps: int) -> Response:
         """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
-        return Response(self, first if self.before is None else np.full_like(first, self.before), steps)
+        return Response(self, after_doses(first, self.before), steps)
 
 
 class Response:
@@ -211,12 +211,12 @@ class Response:
 
 
 def fit_impulse(
-    buffer: ReplayBuffer, tables: Sequence[ResponseTable], draws: int, seed: int, before: float | None = None
+    buffer: ReplayBuffer, tables: Sequence[ResponseTable], draws: int, seed: int, otherwise: float | None = None
 ) -> ImpulseDynamics:
     """`draws` sets of coefficients from the posterior over shapes, time scales and coefficients.
 
     Args:
-        before: the dose before every session that the tables were made with.
+        otherwise: the dose before sessions of which no record says it, as the tables were made with.
 
     Raises:
         ValueError: fewer than two sessions with usable steps.
@@ -240,7 +240,7 @@ def fit_impulse(
         [_residual(t, best, own, i) for i, t in enumerate(tables)], [t.beta for t in tables], [t.amplitude for t in tables],
         [t.usable for t in tables], phi,
     )  # fmt: skip
-    return replace(_drawn(combinations, own, phi, noise, draws, seed), before=before)
+    return _drawn(combinations, own, phi, noise, lead_doses(buffer.sessions, otherwise), draws, seed)
 
 
 def _beside(best: Combination | None) -> tuple[float, ...]:
@@ -298,7 +298,9 @@ def _residual(table: ResponseTable, chosen: Combination, own: Floats, i: int) ->
     return np.asarray(table.beta - table.means[chosen.shape] @ gains[0] - levels[0, i], dtype=np.float64)
 
 
-def _drawn(combinations: Sequence[Combination], own: Floats, phi: Floats, noise: Floats, draws: int, seed: int) -> ImpulseDynamics:
+def _drawn(
+    combinations: Sequence[Combination], own: Floats, phi: Floats, noise: Floats, before: Floats, draws: int, seed: int
+) -> ImpulseDynamics:
     """Draws shared out over the combinations by their evidence (largest remainders, so that a rare one is not a matter of luck)."""
     live = [c for c in combinations if c.weight >= FEWEST_WEIGHT]
     shares = np.array([c.weight for c in live]) / sum(c.weight for c in live) * draws
@@ -316,4 +318,4 @@ def _drawn(combinations: Sequence[Combination], own: Floats, phi: Floats, noise:
     shares_of = {name: sum(c.weight * c.fit.share(name) for c in combinations) for name in ("visit", "session")}
     evidence = {(c.shape, c.alpha): c.weight for c in combinations}
     ratios = {(c.shape, c.alpha): c.fit.likeliest for c in combinations}
-    return ImpulseDynamics(phi, np.concatenate(gains), np.array(shapes), np.concatenate(levels), noise, evidence, shares_of, ratios=ratios)
+    return ImpulseDynamics(phi, np.concatenate(gains), np.array(shapes), np.concatenate(levels), noise, evidence, shares_of, before, ratios)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.fqe.steps import fresh_memory, held_amplitude, memories, remember
+from ml.ope.fqe.steps import after_doses, fresh_memory, held_amplitude, lead_dose, lead_doses, memories, remember
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedModel, Sums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -63,9 +63,9 @@ class SessionTable:
     usable: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, session: SessionTrajectory, scale: Scale, before: float | None = None) -> SessionTable:
-        """Tables of a session after the dose `before` (`ml.ope.lead`); its own first amplitude where that is None."""
-        a = held_amplitude(session)
+    def of(cls, session: SessionTrajectory, scale: Scale, otherwise: float | None = None) -> SessionTable:
+        """Tables of a session after the dose before it, which is `otherwise` where no record says it (`ml.ope.fqe.steps.lead_dose`)."""
+        a, before = held_amplitude(session), lead_dose(session, otherwise)
         own = answers(a, memories(a, before))
         first = a[:1] if before is None else np.array([before])
         lead = answers(first, fresh_memory(first))
@@ -82,7 +82,7 @@ class Dynamics:
         beta: answers to the amplitude, [D, 7]. levels: mu + visit + session, [D, n].
         noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
         shares: lambda / (1 + lambda) of the visits' and the sessions' levels; how far they stand out of one step's noise.
-        before: dose before every session; None: each session's first amplitude. log_evidence: of the fit, up to a constant of the rows.
+        before: dose before each session, [n]; NaN: its first amplitude. log_evidence: of the fit, up to a constant of the rows.
         ratios: likeliest lambdas of the fit, by group.
     """
 
@@ -91,7 +91,7 @@ class Dynamics:
     levels: Floats
     noise_weights: Floats
     shares: dict[str, float]
-    before: float | None = None
+    before: Floats
     log_evidence: float = 0.0
     ratios: Floats = field(default_factory=lambda: np.ones(4))
 
@@ -105,7 +105,7 @@ class Dynamics:
 
     def response(self, first: Floats, steps: int) -> LinearResponse:
         """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
-        return LinearResponse(self.beta, first if self.before is None else np.full_like(first, self.before))
+        return LinearResponse(self.beta, after_doses(first, self.before))
 
     def usual_lead(self) -> Floats:
         """Standardised beta of each session under the mean of the random amplitudes, [n]: where the window before it is not known."""
@@ -132,12 +132,12 @@ class LinearResponse:
 
 
 def fit_dynamics(
-    buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: int, seed: int, before: float | None = None
+    buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: int, seed: int, otherwise: float | None = None
 ) -> tuple[Dynamics, Dynamics]:
     """The model at its posterior mean (D = 1), and `draws` of its coefficients from their posterior (phi and noise as in the first).
 
     Args:
-        before: the dose before every session that the tables were made with.
+        otherwise: the dose before sessions of which no record says it, as the tables were made with.
 
     Raises:
         ValueError: fewer than two sessions with usable steps.
@@ -157,7 +157,7 @@ def fit_dynamics(
     shares = {name: fit.share(name) for name in ("visit", "session")}
     usable, amplitudes = [t.usable for t in tables], [t.amplitude for t in tables]
     noise = log_noise_weights(_residuals(tables, beta[0], levels[0]), [t.beta for t in tables], amplitudes, usable, phi)
-    mean = Dynamics(phi, beta, levels, noise, shares, before, fit.log_evidence, fit.likeliest)
+    mean = Dynamics(phi, beta, levels, noise, shares, lead_doses(buffer.sessions, otherwise), fit.log_evidence, fit.likeliest)
     drawn = _split(fit.draws(draws, np.random.default_rng([seed, 0xD7A])), own)
     return mean, replace(mean, beta=drawn[0], levels=drawn[1])
 

@@ -11,7 +11,7 @@ all in it; the dose may have another shape at every speed. Coefficients of one g
 dose at fast and at slow speeds, the bend of the dose, the difference between rising and falling, and falls. What the data leave open about
 them stays in the draws.
 
-Before its first step a session has been under the dose that was in force before it (`ml.ope.lead`).
+Before its first step a session has been under the dose that was in force before it, on record or inferred (`ml.ope.lead`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from ml.ope.fqe.steps import held_amplitude
+from ml.ope.fqe.steps import after_doses, held_amplitude, lead_dose, lead_doses
 from ml.ope.linear.dynamics import autoregression, innovations_of, level_model, level_sums, log_noise_weights, split_coefficients
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedFit, MixedModel, Sums
@@ -119,9 +119,9 @@ class ModeTable:
     usable: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, session: SessionTrajectory, scale: Scale, before: float | None) -> ModeTable:
-        """Tables of a session after the dose `before`; its own first amplitude where that is None."""
-        a, window = held_amplitude(session), session.lead_beta.size
+    def of(cls, session: SessionTrajectory, scale: Scale, otherwise: float | None) -> ModeTable:
+        """Tables of a session after the dose before it, which is `otherwise` where no record says it; its first amplitude for None."""
+        a, window, before = held_amplitude(session), session.lead_beta.size, lead_dose(session, otherwise)
         first = float(a[0]) if before is None else before
         columns = columns_of(np.concatenate([np.full(window, first), a]), first)
         return cls(scale.beta(session.padded_beta), a, columns, session.usable())
@@ -135,7 +135,7 @@ class ModeDynamics:
         phi: autoregression of eta on lags 1 ... W, [W]. gains: of the columns, [D, COLUMNS]. levels: mu + visit + session, [D, n].
         noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
         shares: lambda / (1 + lambda) of the visits' and the sessions' levels.
-        before: dose before every session; None: each session's first amplitude.
+        before: dose before each session, [n]; NaN: its first amplitude.
     """
 
     phi: Floats
@@ -143,7 +143,7 @@ class ModeDynamics:
     levels: Floats
     noise_weights: Floats
     shares: dict[str, float]
-    before: float | None
+    before: Floats
 
     def innovations(self, tables: Sequence[ModeTable]) -> list[Floats]:
         """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
@@ -155,12 +155,13 @@ class ModeDynamics:
 
     def usual_lead(self) -> Floats:
         """Standardised beta of each session, [n], where the window before it is not known."""
-        dose = columns_of(np.array([1.0 if self.before is None else self.before]), 1.0 if self.before is None else self.before)[0]
-        return np.asarray((self.levels + (self.gains @ dose)[:, None]).mean(0), dtype=np.float64)
+        doses = after_doses(np.ones(self.before.size), self.before)
+        lasting = np.stack([columns_of(np.array([dose]), float(dose))[0] for dose in doses], axis=1)
+        return np.asarray((self.levels + self.gains @ lasting).mean(0), dtype=np.float64)
 
     def response(self, first: Floats, steps: int) -> ModeResponse:
         """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
-        return ModeResponse(self.gains, first if self.before is None else np.full_like(first, self.before))
+        return ModeResponse(self.gains, after_doses(first, self.before))
 
 
 class ModeResponse:
@@ -186,7 +187,7 @@ class FittedModes:
     own: Floats
     phi: Floats
     noise_weights: Floats
-    before: float | None
+    before: Floats
 
     def drawn(self, draws: int, rng: np.random.Generator) -> ModeDynamics:
         """Draws of the coefficients."""
@@ -203,8 +204,8 @@ class FittedModes:
         return ModeDynamics(self.phi, gains, levels, self.noise_weights, shares, self.before)
 
 
-def fit_modes(buffer: ReplayBuffer, tables: Sequence[ModeTable], before: float | None) -> FittedModes:
-    """The posterior of the model.
+def fit_modes(buffer: ReplayBuffer, tables: Sequence[ModeTable], otherwise: float | None) -> FittedModes:
+    """The posterior of the model; `otherwise` as the tables were made with.
 
     Raises:
         ValueError: fewer than two sessions with usable steps.
@@ -222,7 +223,7 @@ def fit_modes(buffer: ReplayBuffer, tables: Sequence[ModeTable], before: float |
     fit = mode_model(own).fit(Sums.pooled(mode_sums(tables, own, phi)))
     betas, amplitudes = [t.beta for t in tables], [t.amplitude for t in tables]
     noise = log_noise_weights(_residuals(tables, fit.coefficients, own), betas, amplitudes, usable, phi)
-    return FittedModes(fit, own, phi, noise, before)
+    return FittedModes(fit, own, phi, noise, lead_doses(buffer.sessions, otherwise))
 
 
 def mode_model(own: Floats) -> MixedModel:

@@ -71,7 +71,7 @@ def test_all_sessions_policies_and_draws_together_are_each_replayed_alone(small_
                 for t in range(30):
                     a = policy.act(fitted.scale.raw_beta(np.array([window])))
                     if memory is None:
-                        before = a if model.before is None else np.array([model.before])
+                        before = a if np.isnan(model.before[i]) else model.before[i : i + 1]
                         memory = np.tile(before, 3)
                         lasting = float(answers(before, memory[None])[0] @ model.beta[d] + model.levels[d, i])
                         eta = [v - lasting for v in window]
