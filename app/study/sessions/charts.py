@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.platform.web.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, figure, horizontal
+from app.study.recordings.charts import trace_name
 from app.study.sessions.data import SessionData
-from app.study.sessions.recording_charts import trace_name
 from app.study.traces import amplitude_program, session_offset_s
 from ml.mdp import AMPLITUDE_TOLERANCE
 

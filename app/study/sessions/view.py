@@ -16,10 +16,8 @@ from app.study.outcomes import values as outcome_values
 from app.study.outcomes.charts import grasp_chart, tremor_chart
 from app.study.outcomes.service import Disagreement
 from app.study.outcomes.values import Derived, GraspOutcome, TremorOutcome
-from app.study.sessions.charts import control_chart
-from app.study.sessions.data import SessionData
-from app.study.sessions.recording_charts import Stretch, clock_chart, spectrum_charts, trace_charts, trace_name
-from app.study.sessions.recording_facts import (
+from app.study.recordings.charts import Stretch, clock_chart, spectrum_charts, trace_charts, trace_name
+from app.study.recordings.facts import (
     CLOCKS,
     SensingConfiguration,
     StreamQuality,
@@ -31,6 +29,8 @@ from app.study.sessions.recording_facts import (
     sensing_configurations,
     valid_shares,
 )
+from app.study.sessions.charts import control_chart
+from app.study.sessions.data import SessionData
 from app.study.traces import AMPLITUDE_STREAM, session_offset_s, shown_table
 
 

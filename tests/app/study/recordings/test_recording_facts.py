@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from app.study.models import Recording
-from app.study.sessions.recording_charts import Stretch, clock_chart, spectrum_charts, trace_charts
-from app.study.sessions.recording_facts import (
+from app.study.recordings.charts import Stretch, clock_chart, spectrum_charts, trace_charts
+from app.study.recordings.facts import (
     amplitude_limits,
     quality_remarks,
     quality_rows,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.study.models import Recording, Trace
-from app.study.sessions.recording_charts import Stretch, trace_charts
+from app.study.recordings.charts import Stretch, trace_charts
 from app.study.traces import pack
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from app.platform.web.charts import Cell, Chart, axis, figure
 from app.study.models import Recording, Trace
-from app.study.sessions.recording_facts import clock_fit
+from app.study.recordings.facts import clock_fit
 from app.study.traces import unpack
 
 _DASHES = ("solid", "dash", "dot", "dashdot", "longdash")

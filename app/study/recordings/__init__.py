@@ -1,0 +1,1 @@
+"""What recordings hold besides the traces of sessions, and their charts."""
