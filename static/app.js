@@ -29,7 +29,7 @@ function sortTable(heading) {
 
 function makeSortable(root) {
   for (const heading of root.querySelectorAll("table[data-sort] thead th")) {
-    if (heading.querySelector("button") || !heading.textContent.trim()) continue;
+    if (heading.querySelector("button") || "nosort" in heading.dataset) continue;
     const button = document.createElement("button");
     button.type = "button";
     button.append(...heading.childNodes);
@@ -91,8 +91,18 @@ async function refresh(id) {
 
 function announce(root) {
   makeSortable(root);
+  for (const scroll of root.querySelectorAll(".table-scroll")) fitting.observe(scroll);
   root.dispatchEvent(new CustomEvent("betaloop:swap", { bubbles: true }));
 }
+
+// --- a table that shows all its columns needs no stop of the Tab key for scrolling
+const fitting = new ResizeObserver((entries) => {
+  for (const { target } of entries) {
+    if (target.scrollWidth > target.clientWidth || target.scrollHeight > target.clientHeight) target.tabIndex = 0;
+    else target.removeAttribute("tabindex");
+  }
+});
+for (const scroll of document.querySelectorAll(".table-scroll")) fitting.observe(scroll);
 
 makeSortable(document);
 for (const part of document.querySelectorAll("[data-refresh][id]")) setTimeout(() => refresh(part.id), Number(part.dataset.refresh) * 1000);

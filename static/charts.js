@@ -52,6 +52,8 @@ async function draw(figure, onPaper = false) {
     theme.done();
     plot.querySelector(".loading")?.remove();
     await Plotly.react(plot, data, layout, CONFIG);
+    // the table below says it in words; the buttons above stay for everyone
+    for (const picture of plot.querySelectorAll(".main-svg")) picture.setAttribute("aria-hidden", "true");
     figure.dataset.drawn = "yes";
   } catch (error) {
     plot.textContent = `This chart could not be drawn (${error.message}). Its numbers are in the table below.`;

@@ -219,8 +219,8 @@ class Visit(Base):
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     participant: Mapped[Participant] = relationship(back_populates="visits")
     sessions: Mapped[list[StudySession]] = relationship(back_populates="visit", order_by="StudySession.ordinal")
-    cdbs_amplitudes: Mapped[list[CdbsAmplitude]] = relationship()
-    locks: Mapped[list[VisitLock]] = relationship(back_populates="visit", order_by="VisitLock.id")
+    cdbs_amplitudes: Mapped[list[CdbsAmplitude]] = relationship(lazy="selectin")
+    locks: Mapped[list[VisitLock]] = relationship(back_populates="visit", order_by="VisitLock.id", lazy="selectin")
 
     @property
     def locked(self) -> bool:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from sqlalchemy import ColumnElement, Select, column, false, func, or_, select, table, true
 from sqlalchemy.dialects.postgresql import JSONB
-from sqlalchemy.orm import Session, joinedload, selectinload
+from sqlalchemy.orm import Session, contains_eager, joinedload, selectinload
 
 from app.accounts.models import Site
 from app.accounts.permissions import Caller
@@ -47,7 +47,12 @@ def participant_by_code(db: Session, code: str, caller: Caller) -> Participant:
         select(Participant)
         .join(Participant.site)
         .where(Participant.code == code, in_scope(caller))
-        .options(joinedload(Participant.site), selectinload(Participant.settings))
+        .options(
+            joinedload(Participant.site),
+            selectinload(Participant.settings),
+            selectinload(Participant.margins),
+            selectinload(Participant.margins_locks),
+        )
     )
     if row is None:
         raise NotFound(f"There is no participant '{code}', or you have no access to it.")
@@ -66,7 +71,12 @@ def participants(db: Session, caller: Caller, limit: int, offset: int) -> tuple[
         query.order_by(Participant.code)
         .limit(limit)
         .offset(offset)
-        .options(joinedload(Participant.site), selectinload(Participant.settings))
+        .options(
+            joinedload(Participant.site),
+            selectinload(Participant.settings),
+            selectinload(Participant.margins),
+            selectinload(Participant.margins_locks),
+        )
     ).all()
     return rows, count(db, query)
 
@@ -128,6 +138,12 @@ def sessions_of_participant(db: Session, participant_id: int, with_proposals: bo
     """Confirmed sessions of a participant by visit and order, with QoCs, segments and recordings; proposals only where asked for."""
     query = _sessions().where(Visit.participant_id == participant_id, true() if with_proposals else CONFIRMED)
     return db.scalars(query.order_by(Visit.number, StudySession.ordinal)).all()
+
+
+def sessions_without_data(db: Session, participant_ids: Collection[int]) -> Sequence[StudySession]:
+    """Confirmed sessions of several participants with their visits, and nothing else of them: for counts and arms."""
+    query = select(StudySession).join(StudySession.visit).where(Visit.participant_id.in_(participant_ids), CONFIRMED)
+    return db.scalars(query.options(contains_eager(StudySession.visit)).order_by(Visit.participant_id, Visit.number)).all()
 
 
 def proposals_of_participant(db: Session, participant_id: int) -> Sequence[StudySession]:

@@ -11,7 +11,7 @@ from app.accounts.permissions import Caller
 from app.platform.errors import Invalid
 from app.study import blinding, repository
 from app.study.models import Controller, Participant, SettingsVersion
-from app.study.traces import step_table
+from app.study.traces import laid_out, traces_of
 from ml.mdp import MdpSettings
 
 MDP_FIELDS = (
@@ -44,8 +44,10 @@ def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> fl
     settings = participant.current_settings
     groups: dict[Controller, list[np.ndarray[Any, Any]]] = {}
     kinds: set[tuple[str, str]] = set()
-    for session in repository.sessions_of_participant(db, participant.id):
-        table = step_table(db, session, settings)
+    sessions = repository.sessions_of_participant(db, participant.id)
+    traces = traces_of(db, sessions)
+    for session in sessions:
+        table = laid_out(session, settings, traces)
         trace = table.beta_trace
         if session.excluded_reason or trace is None:
             continue

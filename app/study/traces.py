@@ -68,6 +68,12 @@ TracesOf = Callable[[int], Sequence[Trace]]
 """The traces of a recording, by its number, in their newest decode version."""
 
 
+def traces_of(db: Session, sessions: Sequence[StudySession]) -> TracesOf:
+    """The traces of all recordings of these sessions, read at once; read only and without details."""
+    found = repository.traces_of_recordings(db, {g.recording_id for s in sessions for g in s.segments})
+    return lambda recording_id: found.get(recording_id, [])
+
+
 def step_table(db: Session, session: StudySession, settings: SettingsVersion) -> StepTable:
     """Beta and amplitude of a session's control channel, with up to W rows before its start; errors as in `laid_out`."""
     return laid_out(session, settings, lambda recording_id: repository.traces_of_recording(db, recording_id))

@@ -69,14 +69,18 @@ def forget() -> None:
 
 def evidence(db: Session, participant: Participant, caller: Caller) -> Evidence:
     """The evidence of a participant, as the caller may know it; errors as in `app.study.blinding`."""
-    sight = blinding.sight(db, participant, caller)
-    key = ("evidence", participant.id, repository.fingerprint(db, participant.id), sight)
-    return kept(key, lambda: _read(db, participant, caller, key))
+    return of_all(db, [participant], caller)[0]
 
 
 def of_all(db: Session, participants: Sequence[Participant], caller: Caller) -> list[Evidence]:
-    """The evidence of several participants."""
-    return [evidence(db, p, caller) for p in participants]
+    """The evidence of several participants; whether it has changed is asked of all at once."""
+    versions = repository.fingerprints(db, [p.id for p in participants])
+    return [_of(db, p, caller, versions[p.id]) for p in participants]
+
+
+def _of(db: Session, participant: Participant, caller: Caller, fingerprint: str) -> Evidence:
+    key = ("evidence", participant.id, fingerprint, blinding.sight(db, participant, caller))
+    return kept(key, lambda: _read(db, participant, caller, key))
 
 
 def _read(db: Session, participant: Participant, caller: Caller, key: Hashable) -> Evidence:

@@ -83,7 +83,7 @@ def points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
     return {
         "type": "scatter", "mode": "markers", "x": [at + s for s in _spread(g.values)], "y": list(g.values), "cliponaxis": False,
         "marker": marker(g.controller, 7, opacity=0.8), "name": g.label,
-        "text": [f"{g.label}, session {i}" for i in g.session_ids], "hovertemplate": f"%{{text}}<br>%{{y:.4g}} {unit}<extra></extra>",
+        "customdata": list(g.session_ids), "hovertemplate": f"{g.label}, session %{{customdata}}<br>%{{y:.4g}} {unit}<extra></extra>",
     }  # fmt: skip
 
 

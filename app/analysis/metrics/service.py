@@ -122,9 +122,12 @@ class FiveMetrics:
     limits: list[str]
 
 
-def five_metrics(db: Session, participant: Participant, caller: Caller) -> FiveMetrics:
-    """Energy, mean beta, grasp, rating and tremor of every session, by controller and by policy, each compared with cDBS."""
-    held = evidence(db, participant, caller)
+def five_metrics(db: Session, participant: Participant, caller: Caller, held: Evidence | None = None) -> FiveMetrics:
+    """Energy, mean beta, grasp, rating and tremor of every session, by controller and by policy, each compared with cDBS.
+
+    `held`: the evidence, where it is at hand.
+    """
+    held = held or evidence(db, participant, caller)
     names = repository.policy_names(db, participant.id)
     return kept(("metrics", held.key, tuple(sorted(names.items()))), lambda: _compute(held, names))
 

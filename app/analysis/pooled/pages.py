@@ -7,6 +7,7 @@ from fastapi.responses import HTMLResponse
 
 from app.accounts.deps import CurrentCaller
 from app.analysis import wording
+from app.analysis.evidence.service import kept
 from app.analysis.metrics import export
 from app.analysis.pooled import service
 from app.analysis.pooled.charts import results
@@ -26,7 +27,7 @@ def pooled_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse
         request,
         "analysis/pooled.html",
         found=found,
-        charts=results(found.paper),
+        charts=kept(("results figure", tuple(p.evidence.key for p in found.participants)), lambda: results(found.paper)),
         trial=service.times_tested(db, participants, caller, found),
         times=service.computation_times(db, participants),
         wording=wording,

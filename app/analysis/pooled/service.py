@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.analysis.evidence.facts import METRICS
-from app.analysis.evidence.service import kept
+from app.analysis.evidence.service import kept, of_all
 from app.analysis.metrics.service import FiveMetrics, five_metrics
 from app.analysis.pooled import repository
 from app.analysis.primary.results import PLANNED
@@ -61,8 +61,9 @@ def readable(db: Session, caller: Caller) -> Sequence[Participant]:
 
 def pooled(db: Session, participants: Sequence[Participant], caller: Caller) -> Pooled:
     """Results of each participant and over all of them."""
-    found = tuple(primary(db, p, caller) for p in participants)
-    paper = tuple(five_metrics(db, p, caller) for p in participants)
+    held = list(zip(participants, of_all(db, participants, caller), strict=True))
+    found = tuple(primary(db, p, caller, evidence) for p, evidence in held)
+    paper = tuple(five_metrics(db, p, caller, evidence) for p, evidence in held)
     key = ("pooled", tuple((p.evidence.key, p.locked) for p in found))
     return Pooled(found, paper, kept(key, lambda: tuple(_controller(found, c) for c in PLANNED if _ran(found, c))))
 

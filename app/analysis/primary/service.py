@@ -48,9 +48,9 @@ class Primary:
         return tuple(r for r in self.results if r.tested.policy_id is not None)
 
 
-def primary(db: Session, participant: Participant, caller: Caller) -> Primary:
-    """Primary results, as the caller may know them; errors as in `app.study.blinding`."""
-    held = evidence(db, participant, caller)
+def primary(db: Session, participant: Participant, caller: Caller, held: Evidence | None = None) -> Primary:
+    """Primary results, as the caller may know them; errors as in `app.study.blinding`. `held`: the evidence, where it is at hand."""
+    held = held or evidence(db, participant, caller)
     locked = locked_margins(participant)
     names, picked = repository.policy_names(db, participant.id), repository.last_picked(db, participant.id)
     key = ("primary", held.key, locked, tuple(sorted(names.items())), tuple(sorted(picked.items())))

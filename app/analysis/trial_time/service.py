@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.study import repository as study
 from app.study.blinding import CONTROLLER_NAMES, visible_arm
-from app.study.models import Controller, Participant
+from app.study.models import Controller, Participant, StudySession
 
 PAPER_ORDER = (Controller.CDBS, Controller.RL, Controller.DISTILLED, Controller.NO_DBS)
 """The paper's columns; controllers that it does not list follow where some session has them."""
@@ -53,8 +53,11 @@ def trial_time(db: Session, participants: Sequence[Participant], caller: Caller)
     """The table over these participants, in their order. Proposed and excluded sessions do not count."""
     counted: list[dict[Controller, list[float]]] = []
     excluded: list[int] = []
+    by_participant: dict[int, list[StudySession]] = {p.id: [] for p in participants}
+    for session in study.sessions_without_data(db, list(by_participant)):
+        by_participant[session.visit.participant_id].append(session)
     for participant in participants:
-        held = study.sessions_of_participant(db, participant.id)
+        held = by_participant[participant.id]
         seconds: dict[Controller, list[float]] = {}
         for session in held:
             if session.excluded_reason is None and (known := visible_arm(session, caller)) is not None:

@@ -19,7 +19,7 @@ from app.study import blinding
 from app.study import repository as study_repository
 from app.study.blinding import Arm
 from app.study.models import Controller, SettingsVersion, StudySession
-from app.study.traces import step_table
+from app.study.traces import TracesOf, laid_out, traces_of
 from ml.mdp import MdpSettings
 from ml.ope.posterior.tested import TestSession, differences_to_cdbs
 from ml.trajectories import SessionTrajectory
@@ -52,12 +52,12 @@ def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller) -> li
         db: the session. snapshot: what the estimates rest on. caller: decides which arms may be known.
     """
     version = study_repository.settings_version(db, snapshot.settings_version_id)
+    arms = [(s, blinding.arm(s, caller)) for s in study_repository.sessions_of_participant(db, snapshot.participant_id)]
+    driven = [(s, arm) for s, arm in arms if arm.policy_id is not None or arm.controller is Controller.CDBS]
+    traces = traces_of(db, [s for s, _ in driven])
     found = []
-    for session in study_repository.sessions_of_participant(db, snapshot.participant_id):
-        arm = blinding.arm(session, caller)
-        if arm.policy_id is None and arm.controller is not Controller.CDBS:
-            continue
-        read = _read(db, session, arm, version, snapshot)
+    for session, arm in driven:
+        read = _read(session, traces, arm, version, snapshot)
         trajectory, reason = (None, read) if isinstance(read, str) else (read, None)
         found.append(DrivenSession(session.id, session.visit.number, arm.controller, arm.policy_id, trajectory, reason))
     return found
@@ -108,10 +108,10 @@ def tests_of(ran: Sequence[DrivenSession], settings: MdpSettings, horizon_steps:
     return [asdict(test) for test in differences_to_cdbs(sessions)]
 
 
-def _read(db: Session, session: StudySession, arm: Arm, version: SettingsVersion, snapshot: BufferSnapshot) -> SessionTrajectory | str:
+def _read(session: StudySession, traces: TracesOf, arm: Arm, version: SettingsVersion, snapshot: BufferSnapshot) -> SessionTrajectory | str:
     """The session's steps, or why they cannot be held against estimates."""
     try:
-        table = step_table(db, session, version)
+        table = laid_out(session, version, traces)
     except Invalid as error:
         return str(error)
     read, trace = trajectory_of(session, table, arm, version), table.beta_trace

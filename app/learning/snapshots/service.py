@@ -32,7 +32,7 @@ from app.study.sessions.data import session_data
 from app.study.sessions.programming import Program, differences, stored
 from app.study.sessions.repeated import counts_elsewhere
 from app.study.threshold import mdp_settings, suggest_xi_beta
-from app.study.traces import StepTable
+from app.study.traces import StepTable, TracesOf, traces_of
 from ml.mdp import MdpSettings
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
 
@@ -124,8 +124,10 @@ def collect(db: Session, participant: Participant) -> Collection:
     suggestion = suggest_xi_beta(db, participant, SYSTEM) if version.xi_beta is None else None
     settings = mdp_settings(version, suggestion)
     sessions = [s for s in study_repository.sessions_of_participant(db, participant.id) if s.status == "confirmed"]
-    twice = {s.id for s in sessions if s.id in study_repository.repeated_sessions(db, participant.id) and counts_elsewhere(db, s)}
-    read = [_read(db, session, version) if session.id not in twice else Member(session, None, None, REPEATED) for session in sessions]
+    placeless = study_repository.repeated_sessions(db, participant.id)
+    twice = {s.id for s in sessions if s.id in placeless and counts_elsewhere(db, s)}
+    traces = traces_of(db, sessions)
+    read = [_read(db, s, version, traces) if s.id not in twice else Member(s, None, None, REPEATED) for s in sessions]
     unit, source = _signal(version, read)
     barrier = gate(db, participant, sessions)
     admitted = _of_one_programming([_admit(m, unit, source) for m in read], version)
@@ -186,10 +188,10 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
     return db.get_one(BufferSnapshot, row_id)
 
 
-def _read(db: Session, session: StudySession, version: SettingsVersion) -> Member:
+def _read(db: Session, session: StudySession, version: SettingsVersion, traces: TracesOf) -> Member:
     """The session's trajectory, or the first reason of its own against it."""
     try:
-        table = session_data(db, session).table
+        table = session_data(db, session, traces).table
     except Invalid as error:
         return Member(session, None, None, str(error))
     trajectory = trajectory_of(session, table, blinding.arm(session, SYSTEM), version)

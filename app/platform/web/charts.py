@@ -106,7 +106,7 @@ def horizontal(
 
 
 def plain(value: Any) -> Any:
-    """JSON-ready copy: arrays become lists, numpy numbers Python's, what is not finite null."""
+    """JSON-ready copy: arrays become lists, numpy numbers Python's, what is not finite null; `_DIGITS` significant digits."""
     if isinstance(value, np.ndarray):
         return plain(value.tolist())
     if isinstance(value, Mapping):
@@ -115,10 +115,13 @@ def plain(value: Any) -> Any:
         return [plain(v) for v in value]
     if isinstance(value, np.generic):
         return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
+    if isinstance(value, float):
+        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
     return value
 
+
+_DIGITS = 7
+"""Of a number in a figure: as many as a 32-bit float holds, which is how traces are stored, and half the bytes of all."""
 
 _AXIS: dict[str, Any] = {
     "gridcolor": GRID,

@@ -21,6 +21,7 @@ from starlette.middleware.base import RequestResponseEndpoint
 
 from app.platform.errors import BetaloopError, DatabaseAway, Forbidden, StorageFull, Unauthorized
 from app.platform.web.body_limit import BodyLimit
+from app.platform.web.compression import Compression
 from app.platform.web.templates import render
 from app.settings import get_settings
 
@@ -39,6 +40,7 @@ def install(app: FastAPI) -> None:
     """Add middleware and error handlers to the service."""
     app.add_middleware(BodyLimit)  # inside the other: its refusals have the headers of every answer
     app.middleware("http")(_around)
+    app.add_middleware(Compression)  # outermost: what it shrinks is whole
     app.add_exception_handler(BetaloopError, _known_error)
     app.add_exception_handler(RequestValidationError, _bad_input)
     app.add_exception_handler(HTTPException, _http_error)

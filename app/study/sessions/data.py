@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from sqlalchemy.orm import Session
 
 from app.study.models import SettingsVersion, StudySession
-from app.study.traces import StepTable, step_table
+from app.study.traces import StepTable, TracesOf, laid_out, step_table
 from ml.qoc import Qoc
 
 
@@ -45,10 +45,11 @@ class SessionData:
         return None if self.threshold_mismatch else self.settings.xi_beta
 
 
-def session_data(db: Session, session: StudySession) -> SessionData:
-    """Beta and amplitude of a session."""
+def session_data(db: Session, session: StudySession, traces: TracesOf | None = None) -> SessionData:
+    """Beta and amplitude of a session, from `traces` where the caller has read those of many sessions at once."""
     settings = session.visit.participant.current_settings
-    return SessionData(session, settings, step_table(db, session, settings))
+    table = step_table(db, session, settings) if traces is None else laid_out(session, settings, traces)
+    return SessionData(session, settings, table)
 
 
 def qoc_of(session: StudySession) -> Qoc:

@@ -1,0 +1,249 @@
+"""How long the server works for every page of a large study while a training runs, how many bytes travel, how many queries are asked.
+
+    python benchmarks/pages.py --quick                     2 participants x 3 visits x 4 sessions x 8 policies, 5 requests of each page
+    python benchmarks/pages.py                             20 participants x 12 visits x 8 sessions x 40 policies, 40 requests of each page
+    python benchmarks/pages.py --only ranking,jobs         pages whose name holds one of these
+
+The study is made once and kept in --data (var/benchmarks/pages); a worker trains on one of its participants meanwhile. Each request of a
+page is of another participant, so that the first round finds nothing in the service's memory. Times are from the request to its last byte,
+in this machine's clock, beside the processor time of service and client; bytes are those sent, compressed. The charts' library and styles,
+which the browser keeps, are not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx2 as httpx
+import numpy as np
+import uvicorn
+from sqlalchemy import event, select, text
+from support.page_study import EMAIL, PASSWORD, Extent, add_account, add_participant
+
+from app.accounts.permissions import SYSTEM
+from app.main import create_app
+from app.pipeline.service import start_job
+from app.platform.database import get_engine, transaction
+from app.platform.jobs.models import Job
+from app.platform.jobs.service import cancel
+from app.platform.migrate import migrate
+from app.settings import get_settings
+from app.study.models import StudySession, Visit
+from app.study.repository import participant_by_code
+
+ROOT = Path(__file__).resolve().parents[1]
+KEPT = ROOT / "var" / "benchmarks" / "pages"
+
+PAGES = {
+    "home": "/",
+    "participant": "/participants/{code}",
+    "visits": "/participants/{code}/visits",
+    "visit": "/visits/{visit}",
+    "day": "/visits/{visit}/plan",
+    "session": "/sessions/{session}",
+    "upload": "/participants/{code}/upload",
+    "proposals": "/participants/{code}/proposals",
+    "quarantine": "/participants/{code}/quarantine",
+    "settings": "/participants/{code}/settings",
+    "margins": "/participants/{code}/margins",
+    "policies": "/participants/{code}/policies",
+    "policy": "/participants/{code}/policies/{policy}",
+    "bundle": "/participants/{code}/policies/{policy}/bundle",
+    "buffer gate": "/participants/{code}/buffer-gate",
+    "snapshot": "/snapshots/{snapshot}",
+    "sweep": "/sweeps/{sweep}",
+    "ranking": "/participants/{code}/ranking",
+    "calibration": "/participants/{code}/calibration",
+    "analyses": "/participants/{code}/analyses",
+    "paper": "/participants/{code}/analyses/paper",
+    "energy": "/participants/{code}/analyses/energy",
+    "beta": "/participants/{code}/analyses/beta",
+    "evaluations": "/participants/{code}/analyses/evaluations",
+    "plans": "/participants/{code}/plans",
+    "jobs": "/participants/{code}/jobs",
+    "job": "/jobs/{job}",
+    "all participants": "/analyses",
+    "trial time": "/trial-time",
+    "audit": "/audit",
+    "account": "/account",
+    "accounts": "/accounts",
+}
+
+
+@dataclass
+class Counter:
+    """Queries of the service since it was set back."""
+
+    queries: int = 0
+
+
+@dataclass
+class Measured:
+    """Requests of one page: milliseconds by this machine's clock and of the processor, bytes sent, queries."""
+
+    wall_ms: list[float] = field(default_factory=list)
+    cpu_ms: list[float] = field(default_factory=list)
+    size: list[int] = field(default_factory=list)
+    queries: list[int] = field(default_factory=list)
+
+
+def prepare(folder: Path, extent: Extent) -> None:
+    """The study in a data folder; what an interruption left is gone on with, participant by participant."""
+    os.environ["BETALOOP_DATA_DIR"] = str(folder)
+    get_settings.cache_clear()
+    migrate()
+    done = folder / "study.json"
+    made: list[int] = json.loads(done.read_text()) if done.exists() else []
+    for number in range(0, extent.participants + 1):
+        if number in made:
+            continue
+        started = time.monotonic()
+        with transaction("bench") as db:
+            add_participant(db, number, extent) if number else add_account(db)
+        made.append(number)
+        done.write_text(json.dumps(made))
+        print(f"made {number} of {extent.participants} in {time.monotonic() - started:.0f} s", flush=True)
+    with transaction("bench") as db:
+        db.execute(text("analyze"))
+
+
+def addresses(extent: Extent) -> list[dict[str, Any]]:
+    """What stands in the paths, for each participant: its newest visit with sessions, one of its sessions, policies, jobs."""
+    found = []
+    with transaction("bench") as db:
+        for number in range(1, extent.participants + 1):
+            participant = participant_by_code(db, f"P{number:02d}", SYSTEM)
+            visit = participant.visits[-1]
+            names = {"policy": "select max(id) from policy where kind = 'trained'", "job": "select min(id) from job where kind = 'train'"}
+            names |= {"snapshot": "select max(id) from buffer_snapshot where true", "sweep": "select max(id) from sweep where true"}
+            rows = {k: db.scalar(text(f"{q} and participant_id = {participant.id}")) for k, q in names.items()}
+            session = db.scalar(select(StudySession.id).join(Visit).where(Visit.id == visit.id).limit(1))
+            found.append({"code": participant.code, "visit": visit.id, "session": session, **rows})
+    return found
+
+
+@contextmanager
+def training() -> Iterator[None]:
+    """A worker that trains on the first participant for longer than any measurement."""
+    with transaction("bench") as db:
+        participant = participant_by_code(db, "P01", SYSTEM)
+        params = {"preset": "full", "count": 24, "updates": 1_000_000, "algorithms": ["ddpg"]}
+        job = start_job(db, participant, "train", params, SYSTEM)
+    log = get_settings().data_dir / "worker.log"
+    with log.open("ab") as out:
+        worker = subprocess.Popen([sys.executable, "-m", "app.cli", "worker"], stdout=out, stderr=out, cwd=ROOT)
+    try:
+        _wait_for_progress(job.id)
+        yield
+    finally:
+        with transaction("bench") as db:
+            cancel(db, db.get_one(Job, job.id), "bench")
+        time.sleep(3)
+        worker.terminate()
+        worker.wait(30)
+
+
+def _wait_for_progress(job_id: str) -> None:
+    for _ in range(240):
+        with transaction("bench") as db:
+            if db.get_one(Job, job_id).progress > 0:
+                return
+        time.sleep(0.5)
+    raise SystemExit("the training did not start within two minutes: see worker.log in the data folder")
+
+
+@contextmanager
+def service() -> Iterator[tuple[str, Counter]]:
+    """The web service in a thread of this process, whose queries are counted."""
+    counter = Counter()
+
+    def count(*_: object) -> None:
+        counter.queries += 1
+
+    event.listen(get_engine(), "before_cursor_execute", count)
+    server = uvicorn.Server(uvicorn.Config(create_app(), host="127.0.0.1", port=0, log_level="error"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        time.sleep(0.05)
+    try:
+        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}", counter
+    finally:
+        server.should_exit = True
+        thread.join(30)
+
+
+def measure(base: str, counter: Counter, places: list[dict[str, Any]], names: list[str], requests: int) -> dict[str, Measured]:
+    """Every page `requests` times, participant after participant."""
+    found = {name: Measured() for name in names}
+    with httpx.Client(base_url=base, headers={"Accept": "text/html", "Sec-Fetch-Site": "same-origin"}, timeout=60) as client:
+        if client.post("/sign-in", data={"email": EMAIL, "password": PASSWORD}).status_code != 303:
+            raise SystemExit("nobody could sign in")
+        client.get("/")  # templates are compiled once in the life of a service
+        for name in names:
+            client.get(PAGES[name].format(**places[0]))
+        for i in range(requests):
+            for name in names:
+                place = places[(1 + i) % len(places)]
+                counter.queries = 0
+                cpu, wall = time.process_time(), time.perf_counter()
+                with client.stream("GET", PAGES[name].format(**place)) as answer:
+                    body = b"".join(answer.iter_raw())
+                found[name].wall_ms.append(1000 * (time.perf_counter() - wall))
+                found[name].cpu_ms.append(1000 * (time.process_time() - cpu))
+                if answer.status_code != 200:
+                    raise SystemExit(f"{PAGES[name].format(**place)} answered {answer.status_code}")
+                found[name].size.append(len(body))
+                found[name].queries.append(counter.queries)
+    return found
+
+
+def report(found: dict[str, Measured]) -> dict[str, float]:
+    """The table, and the figures of the worst pages."""
+    print(f"{'page':<18}{'median ms':>10}{'p95 ms':>9}{'cpu ms':>9}{'kB':>8}{'queries':>9}")
+    rows = []
+    for name, m in found.items():
+        median, p95 = float(np.median(m.wall_ms)), float(np.percentile(m.wall_ms, 95))
+        rows.append((median, p95, max(m.size) / 1000))
+        print(f"{name:<18}{median:>10.0f}{p95:>9.0f}{np.median(m.cpu_ms):>9.0f}{max(m.size) / 1000:>8.1f}{max(m.queries):>9}")
+    medians, p95s, sizes = zip(*rows, strict=True)
+    return {"worst_median_ms": round(max(medians), 1), "worst_p95_ms": round(max(p95s), 1), "largest_kb": round(max(sizes), 1)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a small study in a folder that is removed")
+    parser.add_argument("--data", type=Path, default=KEPT, help="where the study is kept")
+    parser.add_argument("--only", default="", help="parts of names of pages, with commas")
+    parser.add_argument("--requests", type=int, help="of each page")
+    parser.add_argument("--idle", action="store_true", help="without a training")
+    options = parser.parse_args()
+    names = [n for n in PAGES if not options.only or any(part in n for part in options.only.split(","))]
+    extent = Extent(2, 3, 4, 8) if options.quick else Extent()
+    with tempfile.TemporaryDirectory(prefix="betaloop-pages-") as scratch:
+        folder = Path(scratch) if options.quick else options.data
+        prepare(folder / extent.name, extent)
+        places = addresses(extent)
+        with service() as (base, counter):
+            if options.idle:
+                found = measure(base, counter, places, names, options.requests or (5 if options.quick else 40))
+            else:
+                with training():
+                    found = measure(base, counter, places, names, options.requests or (5 if options.quick else 40))
+    print(json.dumps(report(found)))
+
+
+if __name__ == "__main__":
+    main()

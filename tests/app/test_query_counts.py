@@ -1,0 +1,59 @@
+"""Pages ask the database as often for many sessions as for few: what grows with a study is rows, not queries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import event
+
+from app.platform.database import get_engine
+
+PAGES = (
+    "/",
+    "/participants/P1",
+    "/participants/P1/visits",
+    "/participants/P1/settings",
+    "/participants/P1/upload",
+    "/participants/P1/jobs",
+    "/participants/P1/ranking",
+    "/participants/P1/buffer-gate",
+    "/participants/P1/analyses",
+    "/participants/P1/analyses/energy",
+    "/participants/P1/calibration",
+    "/analyses",
+    "/trial-time",
+)
+
+
+@pytest.fixture
+def queries(client: TestClient) -> Iterator[Callable[[str], int]]:
+    """How many queries a page asks once it has been seen."""
+    asked: list[str] = []
+
+    def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        asked.append(statement)
+
+    def count(path: str) -> int:
+        client.get(path, headers={"Accept": "text/html"})
+        asked.clear()
+        assert client.get(path, headers={"Accept": "text/html"}).status_code == 200, path
+        return len(asked)
+
+    event.listen(get_engine(), "before_cursor_execute", note)
+    yield count
+    event.remove(get_engine(), "before_cursor_execute", note)
+
+
+def test_more_visits_and_sessions_ask_no_more_queries(
+    client: TestClient, upload: Callable[..., int], queries: Callable[[str], int]
+) -> None:
+    upload("random", steps=20)
+    upload("cdbs", steps=20)
+    few = {path: queries(path) for path in PAGES}
+    client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": "2026-03-30"})
+    for visit in (1, 2):
+        for controller in ("random", "cdbs"):
+            upload(controller, steps=20, visit=visit)
+    assert {path: queries(path) for path in PAGES} == few
