@@ -39,7 +39,7 @@ def fingerprints(db: Session, participant_ids: Collection[int]) -> dict[int, str
         _versions("recording", Recording.id, recording),
         _versions("trace", Trace.id, recording, Trace.recording),
     ]
-    found = {i: "" for i in participant_ids}
+    found = dict.fromkeys(participant_ids, "")
     rows = union_all(*(part.where(owner.in_(found)) for part, owner in parts)).subquery()
     for owner, name, versions in db.execute(select(rows).order_by(rows.c.name)):
         found[owner] += f"{name} {versions} "
