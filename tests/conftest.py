@@ -15,6 +15,7 @@ import pytest
 from alembic import command
 from alembic.config import Config
 from fastapi.testclient import TestClient
+from httpx2 import Response
 from hypothesis import settings
 from pwdlib import PasswordHash
 from pwdlib.hashers.argon2 import Argon2Hasher
@@ -23,6 +24,7 @@ from sqlalchemy.orm import Session
 
 import app.platform.database as database
 from app.accounts import service as accounts
+from app.accounts.models import Role
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.files import path_of
 from app.platform.jobs import engine as jobs_engine
@@ -129,7 +131,6 @@ def db(fresh_database: str) -> Iterator[Session]:
 def make_token(fresh_database: str) -> Callable[[str], str]:
     """Make a user of a role and return an API token."""
     from app.accounts import service
-    from app.accounts.models import Role
 
     def make(role: str) -> str:
         with database.transaction("test") as db:
@@ -168,6 +169,20 @@ def client_as(service_app, make_token: Callable[[str], str]) -> Callable[[str], 
         return TestClient(service_app, headers={"Authorization": f"Bearer {make_token(role)}"})
 
     return make
+
+
+@pytest.fixture
+def sign_plan(service_app, fresh_database: str) -> Callable[..., Response]:  # type: ignore[no-untyped-def]
+    """Sign a visit's plan over REST as a clinician who drafts nothing."""
+    with database.transaction("test") as db:
+        accounts.add_user(db, "signer@clinic.example", Role.CLINICIAN, PASSWORD)
+        token = accounts.create_token(db, "signer@clinic.example", "tests")
+    signer = TestClient(service_app, headers={"Authorization": f"Bearer {token}"})
+
+    def sign(visit_id: int, **more: object) -> Response:
+        return signer.post(f"/api/v1/visits/{visit_id}/plan/approve", json={"password": PASSWORD, **more})
+
+    return sign
 
 
 @pytest.fixture

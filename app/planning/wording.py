@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from app.evaluation.wording import amplitude, chance
 from app.planning.plans.designs import Bound, Planned, delivered_ma
+from app.planning.plans.models import PlanItem
 from ml.deploy.manifest import BundleManifest
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
 from ml.ope.posterior.portfolio import Suggestion
@@ -77,6 +78,13 @@ def schedule_words(planned: Planned, bounds: tuple[Bound, ...]) -> str:
     last = planned.holds[-1]
     after = [f"{_clock((last.start + last.steps) * planned.period_s)} cDBS"]  # a ladder may end before the session does
     return "  ".join(held + after)
+
+
+def limits_ma(item: PlanItem) -> str:
+    """The limits of a planned session, mA."""
+    if item.min_ma is None or item.max_ma is None:
+        return "not set"
+    return f"{item.min_ma:g}" if item.min_ma == item.max_ma else f"{item.min_ma:g} to {item.max_ma:g}"
 
 
 def _given(fraction: float, bounds: tuple[Bound, ...]) -> str:

@@ -62,12 +62,21 @@ def refuse_foreign(participant: Participant, caller: Caller) -> None:
         )
 
 
+@dataclass(frozen=True)
+class Signer:
+    """A simulated clinician with the password that a signature asks for again."""
+
+    caller: Caller
+    password: str
+
+
 @dataclass
 class ParticipantLoop:
     """All visits of one participant.
 
     Args:
-        design: the study. remembered: its seed and its first day. caller: the simulated clinician who uploads, drafts and approves.
+        design: the study. remembered: its seed and its first day. caller: the simulated engineer and coordinator, who uploads and drafts.
+        signer: the simulated clinician who signs what the other drafted.
         progress: called with how far the loop is. check_worker: raises when nobody works on jobs any more.
     """
 
@@ -75,6 +84,7 @@ class ParticipantLoop:
     design: Design
     remembered: Remembered
     caller: Caller
+    signer: Signer
     progress: Progress
     check_worker: Callable[[], None]
 
@@ -191,7 +201,7 @@ class ParticipantLoop:
     def _approve(self, db: Session, visit: Visit) -> None:
         plan = planning.read_plan(db, visit, self.caller).plan
         if plan.status == "draft":
-            planning.approve_plan(db, visit, self.caller, plan.id)
+            planning.approve_plan(db, visit, self.signer.caller, self.signer.password, plan.id)
             db.commit()
 
     def _planned(self, db: Session, visit: Visit, day: dt.date) -> list[PlacedSession]:

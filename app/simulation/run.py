@@ -20,11 +20,13 @@ from app.platform.errors import BetaloopError, Conflict
 from app.platform.jobs.worker import run_worker
 from app.settings import get_settings
 from app.simulation.design import STATE_FILE, Design, remember
-from app.simulation.loop import ParticipantLoop, refuse_foreign
+from app.simulation.loop import ParticipantLoop, Signer, refuse_foreign
 from app.study import repository as study
 
 ACCOUNT = "simulated-clinician@simulation.example"
-"""Uploads, drafts and approves; nobody can sign in with it, for its password is thrown away."""
+"""Enrols, uploads and drafts; nobody can sign in with it, for its password is thrown away."""
+SIGNER = "simulated-second-clinician@simulation.example"
+"""Signs what the other account drafted; its password is drawn anew by every run and thrown away after it."""
 _LOCK = "betaloop simulated study"
 _JOB_UNITS = 5.0
 """A job counts on the bar as this many sessions."""
@@ -42,12 +44,12 @@ def simulate(design: Design, console: Console | None = None, slots: int | None =
     """
     settings = get_settings()
     with _alone(), _worker(settings.worker_slots if slots is None else slots) as check_worker:
-        caller = _account()
+        caller, signer = _account(), _signer()
         _refuse_foreign(design, caller)
         remembered = remember(settings.data_dir / STATE_FILE, design, now().date())
         with _Bars(design, console or Console(stderr=True)) as bars:
             for code in design.participants:
-                ParticipantLoop(code, design, remembered, caller, bars, check_worker).run()
+                ParticipantLoop(code, design, remembered, caller, signer, bars, check_worker).run()
                 bars.say(code, "all visits held")
     return caller
 
@@ -58,6 +60,18 @@ def _account() -> Caller:
         if user is None:
             user = accounts.add_user(db, ACCOUNT, Role.CLINICIAN, secrets.token_urlsafe(32), name="Simulated clinician")
         return accounts.caller_of(user)
+
+
+def _signer() -> Signer:
+    """The second person, with a new password for this run."""
+    password = secrets.token_urlsafe(32)
+    with transaction("simulated study") as db:
+        user = accounts_repository.user_by_email(db, SIGNER)
+        if user is None:
+            user = accounts.add_user(db, SIGNER, Role.CLINICIAN, password, name="Simulated second clinician")
+        else:
+            accounts.set_password(db, user, password)
+        return Signer(accounts.caller_of(user), password)
 
 
 def _refuse_foreign(design: Design, caller: Caller) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from typing import Any
 
@@ -42,7 +43,7 @@ def routes_with_two_ids(app: Any) -> set[tuple[str, str]]:
     return found
 
 
-def studied(client: TestClient, code: str, seed: int) -> Ids:
+def studied(client: TestClient, code: str, seed: int, sign_plan: Callable[..., Any]) -> Ids:
     """A participant with one object of every sort; their ids."""
     api, home = "/api/v1", f"/api/v1/participants/{code}"
     settings = {"xi_beta": 1.0, "cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"}
@@ -66,7 +67,7 @@ def studied(client: TestClient, code: str, seed: int) -> Ids:
         f"{api}/uploads", data={"participant": code}, files={"file": (f"{code}-grasps.csv", _grasps(seed))}
     ).json()["files"][0]["id"]  # fmt: skip
     plan = client.post(f"{api}/visits/{visits[1]}/plan", json={"policy_ids": [policy]})
-    assert client.post(f"{api}/visits/{visits[1]}/plan/approve", json={"plan_id": plan.json()["id"]}).status_code == 200
+    assert sign_plan(visits[1], plan_id=plan.json()["id"]).status_code == 200
     job = client.post(f"{home}/jobs", json={"kind": "evaluate", "preset": "quick"})
     assert job.status_code == 202, job.text
     return {
@@ -89,8 +90,8 @@ def _grasps(seed: int) -> str:
 
 
 @pytest.fixture
-def both(client: TestClient) -> tuple[Ids, Ids]:
-    return studied(client, "P1", 1), studied(client, "P2", 2)
+def both(client: TestClient, sign_plan: Callable[..., Any]) -> tuple[Ids, Ids]:
+    return studied(client, "P1", 1, sign_plan), studied(client, "P2", 2, sign_plan)
 
 
 def test_every_route_with_two_ids_refuses_another_participants(

@@ -98,6 +98,21 @@ INTENDED: dict[str, str] = {
     ),
     **dict.fromkeys(
         (
+            "components > schemas > Approval",
+            "components > schemas > PlanIn > properties > hemisphere",
+            "components > schemas > PlanIn > properties > max_ma",
+            "components > schemas > PlanIn > properties > min_ma",
+            "components > schemas > PlanIn > properties > ramp_ma_per_s",
+            "components > schemas > PlanOut > properties > signature",
+            "components > schemas > PlanOut > properties > signature_state",
+            "components > schemas > PlanOut > required",
+            "components > schemas > SignatureOut",
+            "paths > /api/v1/visits/{visit_id}/plan/approve",
+        ),
+        "API: a plan is approved by a signature",
+    ),
+    **dict.fromkeys(
+        (
             "components > schemas > MarginsChange",
             "components > schemas > MarginsIn",
             "components > schemas > MarginsOut",

@@ -135,11 +135,12 @@ def routes(app: Any) -> list[tuple[str, str]]:
     return [(m, p) for m, p in found if m in METHODS and p.startswith(("/api/", "/healthz", "/readyz")) and p != app.openapi_url]
 
 
-def token_of(role: str, study: str | None = None) -> str:
+def token_of(role: str, study: str | None = None, name: str | None = None) -> str:
     """A new person with a role, and their token."""
+    address = f"{name or role}@{study or 'clinic'}.example"
     with transaction("test") as db:
-        accounts.add_user(db, f"{role}@{study or 'clinic'}.example", Role(role), PASSWORD, study_code=study)
-        return accounts.create_token(db, f"{role}@{study or 'clinic'}.example", "tests")
+        accounts.add_user(db, address, Role(role), PASSWORD, study_code=study)
+        return accounts.create_token(db, address, "tests")
 
 
 class World:
@@ -151,7 +152,9 @@ class World:
         self.admin = self.calling(token_of("admin"))
         ranking = self.read("/participants/P2/ranking")
         open_visit = next(v["id"] for v in self.read("/participants/P2/visits")["items"] if v["number"] == 4)
-        self.send(f"/visits/{open_visit}/plan", json={"policy_ids": [ranking["policies"][0]["policy_id"]], "seed": 1})
+        first = {"policy_ids": [ranking["policies"][0]["policy_id"]], "seed": 1}
+        # by somebody who signs no plan of these tests
+        assert self.calling(token_of("engineer", name="drafter")).post(f"/api/v1/visits/{open_visit}/plan", json=first).status_code == 201
         jobs = self.read("/participants/P4/jobs")["items"]
         small = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "distilled")
         visit = self.read("/participants/P4/visits")["items"][0]["id"]
@@ -213,7 +216,7 @@ class World:
             ("post", "/visits/{visit_id}/plan"): {"visit_id": visit, "json": {"policy_ids": [2]}},
             ("get", "/visits/{visit_id}/plan"): {"visit_id": open_visit},
             ("get", "/visits/{visit_id}/plan.pdf"): {"visit_id": open_visit},
-            ("post", "/visits/{visit_id}/plan/approve"): {"visit_id": open_visit},
+            ("post", "/visits/{visit_id}/plan/approve"): {"visit_id": open_visit, "json": {"password": PASSWORD}},
             ("post", "/participants/{code}/buffer-gate"): {"json": {"choice": "open", "reason": "agreed in the trial meeting"}},
         }
 

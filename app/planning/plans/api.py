@@ -9,7 +9,16 @@ from fastapi import APIRouter, Response
 from app.accounts.deps import CurrentCaller
 from app.evaluation.shown import estimate_out
 from app.planning.plans import service, sheet
-from app.planning.plans.schemas import Approval, PlanEstimateOut, PlanEvaluationOut, PlanIn, PlannedDesignOut, PlannedSessionOut, PlanOut
+from app.planning.plans.schemas import (
+    Approval,
+    PlanEstimateOut,
+    PlanEvaluationOut,
+    PlanIn,
+    PlannedDesignOut,
+    PlannedSessionOut,
+    PlanOut,
+    SignatureOut,
+)
 from app.planning.plans.service import PlanLine, PlanView
 from app.platform.database import Db, now
 from app.platform.web.schemas import problems
@@ -37,10 +46,14 @@ def draft_plan(visit: CurrentVisit, draft: PlanIn, db: Db, caller: CurrentCaller
     return plan_out(view)
 
 
-@router.post("/visits/{visit_id}/plan/approve", responses=problems(409))
-def approve_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller, approval: Approval | None = None) -> PlanOut:
-    """Approve the draft; from then on the plan is fixed."""
-    view = service.approve_plan(db, visit, caller, approval.plan_id if approval else None)
+@router.post("/visits/{visit_id}/plan/approve", responses=problems(409, 429))
+def approve_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller, approval: Approval) -> PlanOut:
+    """Sign the draft as approved for use in this participant; from then on the plan is fixed.
+
+    The signer is a clinician who did not draft it, and gives the password again. What is signed: the order, and of every session its
+    policy's bytes, its limits in mA and its ramp.
+    """
+    view = service.approve_plan(db, visit, caller, approval.password, approval.plan_id)
     db.commit()
     return plan_out(view)
 
@@ -71,6 +84,8 @@ def plan_out(view: PlanView) -> PlanOut:
         created_by=plan.created_by,
         approved_at=plan.approved_at,
         approved_by=plan.approved_by,
+        signature=SignatureOut.model_validate(view.signature) if view.signature else None,
+        signature_state=view.signature_state.value,
         total_minutes=view.total_minutes,
         evaluation=PlanEvaluationOut(
             id=evaluation.id,
@@ -102,5 +117,12 @@ def _session_out(line: PlanLine) -> PlannedSessionOut:
         verdict=line.item.verdict,
         min_fraction=line.item.min_fraction,
         override_reason=line.item.override_reason,
+        repeat=line.item.repeat,
+        label=line.item.label,
+        hemisphere=line.item.hemisphere,
+        cdbs_ma=line.item.cdbs_ma,
+        min_ma=line.item.min_ma,
+        max_ma=line.item.max_ma,
+        ramp_ma_per_s=line.item.ramp_ma_per_s,
         design=PlannedDesignOut.model_validate(line.design.as_json()) if line.design else None,
     )

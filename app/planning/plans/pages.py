@@ -29,6 +29,7 @@ from app.planning.plans import repository, service
 from app.planning.plans.schedule import most_policies, total_minutes
 from app.planning.plans.schemas import Id, LimitIn, PlanIn, PlanOptions
 from app.planning.plans.service import PlanView, rules_of
+from app.planning.plans.sign_off import MEANING
 from app.planning.plans.suggested import suggested
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, NotFound
@@ -49,6 +50,10 @@ LABELS = {
     "total_minutes": "Minutes of the visit",
     "washout_minutes": "Washout",
     "random_sessions": "Random sessions",
+    "hemisphere": "Side that the controllers set",
+    "min_ma": "Lowest amplitude",
+    "max_ma": "Highest amplitude",
+    "ramp_ma_per_s": "Fastest change",
     "note": "Note on the sheet",
     "min_fraction": "Lowest amplitude, share of cDBS",
     "reason": "Why the approved plan is replaced",
@@ -86,10 +91,10 @@ def draft(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, 
 
 @router.post("/visits/{visit_id}/plan/approve")
 def approve(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
-    """Approve the draft that the page showed."""
+    """Sign the draft that the page showed."""
     try:
         shown = str(values.get("plan_id", ""))
-        service.approve_plan(db, visit, caller, int(shown) if shown.isdecimal() else None)
+        service.approve_plan(db, visit, caller, str(values.get("password", "")), int(shown) if shown.isdecimal() else None)
         db.commit()
     except BetaloopError as error:
         db.rollback()
@@ -178,6 +183,8 @@ def _page(
         bound_words=wording.bound_words,
         schedule_words=wording.schedule_words,
         leave_at_once=wording.LEAVE_AT_ONCE,
+        limits_ma=wording.limits_ma,
+        meaning=MEANING,
         plan_method=method_name(view.evaluation.default_method) if view and view.evaluation else "",
         choices=choices,
         suggestions=[(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],

@@ -10,9 +10,10 @@ from pydantic import Field
 
 from app.evaluation.schemas import EstimateSummary
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
-from app.study.models import Controller
+from app.study.models import Controller, Hemisphere
 
 Id = Annotated[Int, Field(ge=1)]
+Milliamperes = Annotated[Number, Field(ge=0, le=25.5)]
 
 
 class PlanOptions(Model):
@@ -23,6 +24,16 @@ class PlanOptions(Model):
     washout_minutes: Number = Field(5.0, ge=0, le=120, description="Pause on the clinical stimulation after each session but the last.")
     no_dbs: Bool = Field(False, description="One session without stimulation, 5 minutes, at the end.")
     random_sessions: Int = Field(0, ge=0, le=10, description="Sessions of the random controller.")
+    hemisphere: Hemisphere | None = Field(
+        None, description="Side whose amplitude the controllers set; needed where the visit states a cDBS amplitude of both."
+    )
+    min_ma: Milliamperes | None = Field(
+        None, description="Lowest amplitude of the controllers, mA; the stimulator's own limit where not given, or 0 where none is known."
+    )
+    max_ma: Milliamperes | None = Field(None, description="Highest amplitude of the controllers, mA; the cDBS amplitude where not given.")
+    ramp_ma_per_s: Number | None = Field(
+        None, gt=0, le=100, description="Fastest change, mA/s; the cDBS amplitude within one period where not given."
+    )
     seed: Int | None = Field(None, ge=0, description="Draws the order; without one it is drawn too, and recorded.")
     evaluation_id: Id | None = Field(None, description="Ranking that the choice rests on; the participant's newest where not given.")
     note: Text = Field("", max_length=4000)
@@ -62,9 +73,19 @@ class PlanIn(PlanOptions):
 
 
 class Approval(Model):
-    """Which draft is approved; a guard against approving one that somebody replaced meanwhile."""
+    """A signature under a draft."""
 
-    plan_id: Id | None = None
+    password: Text = Field(max_length=1000, description="The signer's own, asked for again.")
+    plan_id: Id | None = Field(None, description="Which draft was read; a guard against signing one that somebody replaced meanwhile.")
+
+
+class SignatureOut(Model):
+    """Who signed, when, and with which meaning."""
+
+    signer: str
+    signed_at: datetime
+    meaning: str
+    sha256: str = Field(description="Of the canonical JSON of all that was signed.")
 
 
 class PlanEstimateOut(EstimateSummary):
@@ -120,6 +141,13 @@ class PlannedSessionOut(Model):
     verdict: str | None = Field(description="What the ranking said of the policy when the plan was drafted; null for what is not ranked.")
     min_fraction: float | None = Field(description="Lowest amplitude of the session, fraction of the cDBS amplitude.")
     override_reason: str | None = Field(description="Why a clinician plans an unsafe policy all the same.")
+    repeat: int = Field(description="Which session of this policy or controller within the visit, from 1.")
+    label: str | None = Field(description="What a blinded visit calls it.")
+    hemisphere: Hemisphere | None = Field(description="Side whose amplitude the controller sets; null where none is stated.")
+    cdbs_ma: float | None = Field(description="The clinical amplitude that the limits were set for; null where it was not known.")
+    min_ma: float | None = Field(description="No amplitude is below it, mA; null in plans of before, and where no limit could be set.")
+    max_ma: float | None = Field(description="No amplitude is above it, mA.")
+    ramp_ma_per_s: float | None = Field(description="Fastest change, mA/s.")
     design: PlannedDesignOut | None = Field(description="Of a random session: what it shall try; null in plans of before.")
 
 
@@ -149,6 +177,10 @@ class PlanOut(Model):
     created_by: str
     approved_at: datetime | None
     approved_by: str | None
+    signature: SignatureOut | None = Field(description="The newest under this plan, standing or not.")
+    signature_state: Literal["none", "stands", "broken", "not_kept"] = Field(
+        description="Whether it stands; `broken` when anything that was signed has changed since, `not_kept` for plans of earlier versions."
+    )
     total_minutes: float
     evaluation: PlanEvaluationOut | None
     stale: bool = Field(description="The ranking no longer speaks about the study as it is.")

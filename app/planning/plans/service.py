@@ -23,12 +23,16 @@ from app.learning.models import Policy
 from app.planning import wording as plan_wording
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of, planned_sessions
+from app.planning.plans.limits import StatedLimits
 from app.planning.plans.models import Plan, PlanItem
 from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
 from app.planning.plans.schedule import Candidate, Rules, schedule
 from app.planning.plans.schemas import PlanIn, PlanOptions
+from app.planning.plans.sign_off import SignatureState, sign_plan, signature_of
+from app.planning.plans.slots import count_repeats, require_limits, set_limits
 from app.platform.database import now, set_reason
-from app.platform.errors import Conflict, Invalid, NotFound
+from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
+from app.platform.signatures.models import Signature
 from app.study import service as study
 from app.study.models import Controller, Participant, Visit
 from app.study.schemas import VisitIn
@@ -68,6 +72,8 @@ class PlanView:
     evaluation: Evaluation | None
     stale_reasons: list[str]
     warnings: list[str]
+    signature: Signature | None
+    signature_state: SignatureState
 
     @property
     def total_minutes(self) -> float:
@@ -117,6 +123,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
         created_by=caller.label,
     )
     to_try = iter(_random_sessions(db, visit, rules))
+    stated = StatedLimits(draft.min_ma, draft.max_ma, draft.ramp_ma_per_s)
     plan.items = [
         PlanItem(
             position=i,
@@ -130,22 +137,24 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
         )
         for i, s in enumerate(day, start=1)
     ]
+    count_repeats(plan.items)
+    set_limits(db, visit, plan.items, stated, draft.hemisphere)
     db.add(plan)
     db.flush()
     return _view(db, plan, visit, caller)
 
 
-def approve_plan(db: Session, visit: Visit, caller: Caller, plan_id: int | None = None) -> PlanView:
-    """Approve the draft of a visit; from then on it is fixed.
+def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_id: int | None = None) -> PlanView:
+    """Sign the draft of a visit as approved for use in this participant; from then on it is fixed.
 
     Args:
-        db: the session. visit: whose plan. caller: the clinician.
+        db: the session. visit: whose plan. caller: the clinician. password: the clinician's own, asked for again.
         plan_id: the draft that was looked at; None for whatever is there.
 
     Raises:
-        NotFound: no plan. Conflict: approved already, replaced meanwhile, with a policy that was retired since it was drafted, or what
-            `safeguards.refuse_approval` refuses.
-        Invalid: random sessions of held draws, and no cDBS amplitude by which their lower bound is one in milliamperes.
+        NotFound: no plan. Conflict: approved already, replaced meanwhile, with a policy that was retired since it was drafted, limits that
+            were set for another cDBS amplitude, or what `safeguards.refuse_approval` refuses.
+        Invalid: no cDBS amplitude by which limits are ones in milliamperes. Forbidden, TooMany: as `sign_off.sign_plan`.
     """
     study.require(caller, can.APPROVE_PLAN, visit.participant)
     repository.lock_visit(db, visit.id)
@@ -155,18 +164,44 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, plan_id: int | None 
         raise Conflict(f"Plan {plan_id} was replaced by plan {plan.id} of {plan.created_by}.", "Look at the new draft, then approve it.")
     if plan.status == "approved":
         raise Conflict(f"Plan {plan.id} was approved by {plan.approved_by} already.", "Draft the visit anew to change it.")
+    refuse_withdrawn(view)
+    policies = {line.policy.id: line.policy for line in view.lines if line.policy}
+    stated = [(v.policy, Safeguard(v.item.verdict, v.item.min_fraction, v.item.override_reason)) for v in view.lines if v.policy]
+    refuse_approval(assessment_of(db, visit.participant, view.evaluation) if view.evaluation else None, stated)
+    _fix_designs(visit, plan)
+    require_limits(visit, plan.items)
+    signature = sign_plan(db, visit, plan, policies, caller, password)
+    plan.status, plan.approved_at, plan.approved_by = "approved", signature.signed_at, caller.label
+    db.flush()
+    return replace(view, signature=signature, signature_state=SignatureState.STANDS)
+
+
+def refuse_withdrawn(view: PlanView) -> None:
+    """Raises Conflict for a plan with a policy that was retired after it was drafted."""
     for line in view.lines:
         if line.policy and line.policy.retired_reason:
             raise Conflict(
                 f"Policy '{line.policy.name}' was retired after this plan was drafted: {line.policy.retired_reason}.",
                 "Draft the visit anew.",
             )
-    stated = [(v.policy, Safeguard(v.item.verdict, v.item.min_fraction, v.item.override_reason)) for v in view.lines if v.policy]
-    refuse_approval(assessment_of(db, visit.participant, view.evaluation) if view.evaluation else None, stated)
-    _sign_designs(visit, plan)
-    plan.status, plan.approved_at, plan.approved_by = "approved", now(), caller.label
-    db.flush()
-    return view
+
+
+def refuse_running(view: PlanView) -> None:
+    """Hold a plan against what may run in a participant: signed, unchanged since, no policy withdrawn, the cDBS amplitude that was signed.
+
+    Raises:
+        Conflict: one of these fails; it says which. Invalid: nobody knows the cDBS amplitude any more.
+    """
+    if view.plan.status != "approved" or view.signature_state is not SignatureState.STANDS:
+        why = {
+            SignatureState.NONE: "is not signed yet",
+            SignatureState.BROKEN: "was changed after it was signed",
+            SignatureState.NOT_KEPT: "was approved by an earlier version, which kept no signature",
+            SignatureState.STANDS: "was replaced",
+        }[view.signature_state]
+        raise Conflict(f"Plan {view.plan.id} of visit {view.visit.number} {why}.", "Draft the visit anew, and have a clinician sign it.")
+    refuse_withdrawn(view)
+    require_limits(view.visit, view.plan.items)
 
 
 def rules_of(options: PlanOptions) -> Rules:
@@ -275,7 +310,8 @@ def _view(db: Session, plan: Plan, visit: Visit, caller: Caller) -> PlanView:
         lines.append(PlanLine(item, start, policy, estimate, _energy(item, estimate), _design(visit, item)))
         start += item.minutes + item.washout_minutes
     stale = _stale_reasons(db, visit.participant, evaluation)
-    return PlanView(plan, visit, lines, evaluation, stale, _warnings(db, visit, plan, lines, found, stale))
+    state, signature = signature_of(db, visit, plan, policies)
+    return PlanView(plan, visit, lines, evaluation, stale, _warnings(db, visit, plan, lines, found, stale), signature, state)
 
 
 def _random_sessions(db: Session, visit: Visit, rules: Rules) -> list[Planned]:
@@ -297,7 +333,7 @@ def _design(visit: Visit, item: PlanItem) -> Planned | None:
         return design  # a warning of the plan says what is missing, and approving it is refused
 
 
-def _sign_designs(visit: Visit, plan: Plan) -> None:
+def _fix_designs(visit: Visit, plan: Plan) -> None:
     """Fix the bounds of held draws in milliamperes."""
     for item in plan.items:
         if item.design is not None and item.design["holds"]:
@@ -345,8 +381,11 @@ def _warnings(
             warnings.append(f"Policy '{line.policy.name}': {flags}.")
         if line.policy.retired_reason:
             warnings.append(f"Policy '{line.policy.name}' was retired: {line.policy.retired_reason}.")
-    if plan.status == "draft" and any(line.design and line.design.holds and not line.design.bounds for line in lines):
-        warnings.append("The cDBS amplitude is not known: the plan cannot be approved before its lower bound is one in milliamperes.")
+    if plan.status == "draft":
+        try:
+            require_limits(visit, plan.items)
+        except BetaloopError as error:
+            warnings.append(f"The plan cannot be signed: {error}")
     held = repository.session_count(db, visit.id)
     if held:
         warnings.append(f"The visit already has {held} {'session' if held == 1 else 'sessions'}.")

@@ -15,6 +15,7 @@ from app.learning.models import Policy
 from app.planning import wording
 from app.planning.plans.latin1_text import latin
 from app.planning.plans.service import PlanLine, PlanView
+from app.planning.plans.sign_off import SignatureState
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller
 
@@ -26,11 +27,11 @@ STOP_RULES = (
 
 _WIDTH = 277.0
 _COLUMNS = (
-    ("#", 7), ("Start", 13), ("Controller", 25), ("Policy", 36), ("Length\nmin", 14), ("Washout\nmin", 16),
+    ("#", 7), ("Start", 13), ("Controller", 25), ("Policy", 36), ("Limits\nmA", 20), ("Length\nmin", 14), ("Washout\nmin", 16),
     ("Estimated return\n(interval)", 40), ("Energy\ncDBS = 1", 18),
-    ("Started\nhh:mm", 18), ("Grasp\nHz", 16), ("Rating\n1-10", 15), ("Tremor\n%", 15), ("Notes, adverse effects", 44),
+    ("Started\nhh:mm", 16), ("Grasp\nHz", 16), ("Rating\n1-10", 15), ("Tremor\n%", 15), ("Notes, adverse effects", 26),
 )  # fmt: skip
-_FIRST_BLANK = 8
+_FIRST_BLANK = 9
 _ROW_MM, _CLOSING_MM = 9.3, 35.0
 _SHADES = {
     Controller.CDBS: (210, 228, 242),
@@ -69,12 +70,7 @@ class _Sheet(FPDF):  # type: ignore[misc]
         self.cell(0, 8, day, align="R", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
         self.set_font("Helvetica", "", 9)
         self.set_text_color(*_MUTED)
-        approval = (
-            f"Approved by {plan.approved_by}, {plan.approved_at:%Y-%m-%d %H:%M} UTC"
-            if plan.approved_at
-            else "NOT APPROVED: not for use with a participant"
-        )
-        self.cell(0, 5, latin(f"Drafted by {plan.created_by}, {plan.created_at:%Y-%m-%d %H:%M} UTC.  {approval}."))
+        self.cell(0, 5, latin(f"Drafted by {plan.created_by}, {plan.created_at:%Y-%m-%d %H:%M} UTC.  {_approval(self._view)}."))
         self.ln(7)
 
     def footer(self) -> None:
@@ -88,6 +84,8 @@ class _Sheet(FPDF):  # type: ignore[misc]
         self.cell(0, 5, f"Page {self.page_no()} of {{nb}}", align="R")
         if plan.status != "approved":
             self._watermark(plan.status.upper())
+        elif self._view.signature_state is SignatureState.BROKEN:
+            self._watermark("DO NOT RUN")
 
     def _watermark(self, word: str) -> None:
         """Over everything, so that no filled cell hides it, and faint, so that it hides nothing."""
@@ -96,6 +94,17 @@ class _Sheet(FPDF):  # type: ignore[misc]
         width = self.get_string_width(word)
         with self.local_context(fill_opacity=0.09), self.rotation(25, self.w / 2, self.h / 2):
             self.text((self.w - width) / 2, self.h / 2 + 14, word)
+
+
+def _approval(view: PlanView) -> str:
+    """Who signed, or why nothing here may be run."""
+    plan = view.plan
+    if plan.approved_at is None:
+        return "NOT APPROVED: not for use with a participant"
+    if view.signature_state is SignatureState.BROKEN:
+        return "SIGNATURE BROKEN: changed after it was signed, not for use with a participant"
+    by = f"Approved by {plan.approved_by}, {plan.approved_at:%Y-%m-%d %H:%M} UTC"
+    return f"{by}, signature {view.signature.sha256[:12]}" if view.signature else by
 
 
 def render(view: PlanView, printed_by: str, printed_at: datetime) -> bytes:
@@ -174,7 +183,7 @@ def _table(pdf: _Sheet, view: PlanView) -> None:
             row = table.row()
             for i, text in enumerate(_cells(line)):
                 shade = FontFace(fill_color=_SHADES[Controller(line.item.controller)], emphasis="BOLD") if i == 2 else planned
-                row.cell(latin(text), style=shade, align="RIGHT" if i in (0, 1, 4, 5, 7) else "LEFT")
+                row.cell(latin(text), style=shade, align="RIGHT" if i in (0, 1, 4, 5, 6, 8) else "LEFT")
             for _ in _COLUMNS[_FIRST_BLANK:]:
                 row.cell("", style=FontFace(fill_color=(255, 255, 255)))
     pdf.ln(2)
@@ -210,7 +219,8 @@ def _cells(line: PlanLine) -> list[str]:
     washout = f"{item.washout_minutes:g}" if item.washout_minutes else "-"
     policy = _breakable(_printed_name(line.policy)) if line.policy else "-"
     controller = CONTROLLER_NAMES[Controller(item.controller)]
-    return [str(item.position), clock(line.start_minute), controller, policy, f"{item.minutes:g}", washout, estimate, energy]
+    limits = wording.limits_ma(item)
+    return [str(item.position), clock(line.start_minute), controller, policy, limits, f"{item.minutes:g}", washout, estimate, energy]
 
 
 def _printed_name(policy: Policy) -> str:

@@ -24,9 +24,10 @@ from app.platform.audit import AuditEvent
 from app.platform.database import new_session
 from app.platform.errors import Conflict
 from app.platform.jobs.models import Job, JobStatus
+from app.platform.signatures.repository import signatures_of
 from app.settings import get_settings
 from app.simulation.design import STATE_FILE, design
-from app.simulation.run import ACCOUNT, simulate
+from app.simulation.run import ACCOUNT, SIGNER, simulate
 from app.simulation.sessions import actual_return
 from app.study import repository as study
 from app.study.blinding import arm
@@ -101,7 +102,9 @@ def test_a_simulated_study_that_is_killed_goes_on_with_nothing_lost_and_nothing_
         assert db.scalars(select(QocRevision.revision)).all() == [1] * 8
         assert db.scalars(select(Job.status).where(Job.kind == "pipeline")).all() == [JobStatus.SUCCEEDED]
         (plan,) = db.scalars(select(Plan)).all()
-        assert (plan.status, plan.approved_by) == ("approved", ACCOUNT)
+        assert (plan.status, plan.approved_by) == ("approved", SIGNER)
+        (signature,) = signatures_of(db, "plan", plan.id)
+        assert (signature.signer, plan.created_by) == (SIGNER, ACCOUNT)
         assert plan.evaluation_id == db.scalar(select(func.max(Evaluation.id)))
         actors = set(db.scalars(select(AuditEvent.actor).where(AuditEvent.entity.in_(("participant", "visit", "session", "plan")))))
         assert ACCOUNT in actors

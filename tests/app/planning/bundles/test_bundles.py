@@ -126,17 +126,19 @@ def test_a_release_is_a_row_and_no_sentence_is_read_for_it(
         db.execute(text("update bundle_release set max_ma = 4"))
 
 
-def test_an_approved_plan_is_the_approval_of_its_policies(client: TestClient, policy: int, db: Session) -> None:
+def test_an_approved_plan_is_the_approval_of_its_policies(
+    client: TestClient, policy: int, db: Session, sign_plan: Callable[..., Any]
+) -> None:
     assert approvals(db, participant_by_code(db, "P1", SYSTEM).id, policy) == ()
     visit = client.get("/api/v1/participants/P1/visits").json()
     visit_id = (visit["items"] if isinstance(visit, dict) else visit)[0]["id"]
     drafted = client.post(f"/api/v1/visits/{visit_id}/plan", json={"policy_ids": [policy]})
     assert drafted.status_code == 201, drafted.text
     assert approvals(db, participant_by_code(db, "P1", SYSTEM).id, policy) == (), "a draft approves nothing"
-    approved = client.post(f"/api/v1/visits/{visit_id}/plan/approve", json={})
+    approved = sign_plan(visit_id)
     assert approved.status_code in (200, 201), approved.text
     (approval,) = verify_bundle(take(client, policy).content).approvals
-    assert (approval.name, approval.role) == ("admin@clinic.example", "approver of plans")
+    assert (approval.name, approval.role) == ("signer@clinic.example", "approver of plans")
     assert "visit 1" in approval.statement
 
 

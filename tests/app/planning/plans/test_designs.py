@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -116,16 +117,19 @@ def test_a_ladder_stands_once_in_each_visit_and_the_papers_design_is_named_so(cl
     assert "the paper&#39;s design: a new draw every 2 s, uniform from 0.3 to 1 of cDBS" in client.get(f"/visits/{number}/plan").text
 
 
-def test_a_plan_without_a_bound_in_milliamperes_cannot_be_signed(client: TestClient, enrolled: str) -> None:
+def test_a_plan_without_a_bound_in_milliamperes_cannot_be_signed(client: TestClient, enrolled: str, sign_plan: Callable[..., Any]) -> None:
     number = visit(client, 2)
     settle(client, cdbs_amplitude_ma=None)
     assert designed(client, number)[0]["bounds"] == []
-    assert "cannot be approved before its lower bound is one in milliamperes" in client.get(f"/visits/{number}/plan").text
-    refused = client.post(f"/api/v1/visits/{number}/plan/approve")
+    assert "The plan cannot be signed: The cDBS amplitude of visit 2 is not known." in client.get(f"/visits/{number}/plan").text
+    refused = sign_plan(number)
     assert refused.status_code == 422
     assert "State the cDBS amplitude" in refused.json()["hint"]
     settle(client, cdbs_amplitude_ma=2.5)
-    signed = client.post(f"/api/v1/visits/{number}/plan/approve").json()
+    unset = sign_plan(number)
+    assert (unset.status_code, unset.json()["hint"]) == (409, "Draft the visit anew.")
+    assert designed(client, number)[0]["bounds"] != []
+    signed = sign_plan(number).json()
     settle(client, cdbs_amplitude_ma=5.0)
     kept = client.get(f"/api/v1/visits/{number}/plan").json()
     assert kept["sessions"] == signed["sessions"]
@@ -162,11 +166,11 @@ def buffer_of(db: Session) -> Any:
 
 
 @pytest.fixture
-def approved(client: TestClient, enrolled: str) -> list[dict[str, Any]]:
+def approved(client: TestClient, enrolled: str, sign_plan: Callable[..., Any]) -> list[dict[str, Any]]:
     settle(client, cdbs_amplitude_ma=3.0, lower_bound=0.3, xi_beta=1.05)
     number = visit(client, 2)
     found = designed(client, number)
-    assert client.post(f"/api/v1/visits/{number}/plan/approve").status_code == 200
+    assert sign_plan(number).status_code == 200
     return found
 
 

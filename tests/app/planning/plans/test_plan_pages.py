@@ -28,7 +28,7 @@ def test_the_page_of_a_visit_without_a_plan_offers_the_ranked_policies(client: T
     assert page.text.count('name="policy_ids"') == 4
 
 
-def test_draft_then_approve_with_forms_alone(client: TestClient, studied: Any, db: Session) -> None:
+def test_draft_then_sign_with_forms_alone(client: TestClient, client_as: Any, studied: Any, db: Session) -> None:
     path = f"/visits/{studied.visit}/plan"
     drafted = _post(
         client, path, policy_ids=[str(i) for i in studied.policies[:2]], minutes_per_session="12,5", no_dbs="yes", seed="", note=""
@@ -36,14 +36,25 @@ def test_draft_then_approve_with_forms_alone(client: TestClient, studied: Any, d
     assert (drafted.status_code, drafted.headers["location"]) == (303, f"{path}?done=drafted")
     plan = db.scalars(select(Plan)).one()
     assert [i.minutes for i in plan.items] == [12.5, 12.5, 12.5, 5]
-    page = client.get(f"{path}?done=drafted", headers=PAGE).text
-    for words in ("Plan drafted.", "Approve plan", "plan.pdf", "not approved yet", "<svg", "95.00", "93.00 to 96.50", "DLSM"):
+    clinician = client_as("clinician")
+    page = clinician.get(f"{path}?done=drafted", headers=PAGE).text
+    for words in (
+        "Plan drafted.",
+        f"Sign plan {plan.id}",
+        "plan.pdf",
+        "not signed yet",
+        "0 to 3",
+        "<svg",
+        "95.00",
+        "93.00 to 96.50",
+        "DLSM",
+    ):
         assert words in page, words
-    approved = _post(client, f"{path}/approve", plan_id=str(plan.id))
+    approved = _post(clinician, f"{path}/approve", plan_id=str(plan.id), password="correct horse battery")
     assert (approved.status_code, approved.headers["location"]) == (303, f"{path}?done=approved")
     page = client.get(path, headers=PAGE).text
-    assert "by admin@clinic.example" in page
-    assert "Approve plan" not in page
+    assert "by clinician@clinic.example" in page
+    assert "Your password, again" not in page
     assert "Why the approved plan is replaced" in page
 
 
@@ -74,9 +85,9 @@ def test_ticked_policies_of_the_ranking_go_to_the_first_open_visit(client: TestC
     assert client.get(f"/api/v1/visits/{studied.visit}/plan").json()["evaluation"]["id"] == studied.evaluation
 
 
-def test_ticked_policies_never_replace_an_approved_plan_unasked(client: TestClient, studied: Any, db: Session) -> None:
+def test_ticked_policies_never_replace_an_approved_plan_unasked(client: TestClient, studied: Any, db: Session, sign_plan: Any) -> None:
     client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
-    client.post(f"/api/v1/visits/{studied.visit}/plan/approve")
+    assert sign_plan(studied.visit).status_code == 200
     answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[1])])
     made = db.scalars(select(Visit).where(Visit.number == 3)).one()
     assert answer.headers["location"] == f"/visits/{made.id}/plan?done=drafted"

@@ -18,6 +18,8 @@ from app.learning.models import BufferSnapshot, Policy
 from app.planning.plans.models import Plan
 from app.platform.audit import AuditEvent
 
+PASSWORD = "correct horse battery"
+
 
 def _path(visit_id: int, tail: str = "") -> str:
     return f"/api/v1/visits/{visit_id}/plan{tail}"
@@ -33,7 +35,7 @@ def test_a_visit_without_a_plan_says_how_to_get_one(client: TestClient, studied:
     assert answer.json()["detail"] == "Visit 2 of participant P1 has no plan yet."
     assert "draft one" in answer.json()["hint"]
     assert client.get(_path(studied.visit, ".pdf")).status_code == 404
-    assert client.post(_path(studied.visit, "/approve")).status_code == 404
+    assert client.post(_path(studied.visit, "/approve"), json={"password": PASSWORD}).status_code == 404
 
 
 def test_a_draft_has_a_cdbs_session_between_any_two_policies(client: TestClient, studied: Any) -> None:
@@ -149,15 +151,15 @@ def test_a_new_draft_supersedes_the_old_one(client: TestClient, studied: Any, db
 
 
 def test_an_approved_plan_is_fixed_and_superseded_only_with_a_reason_in_the_audit_trail(
-    client: TestClient, studied: Any, db: Session
+    client: TestClient, studied: Any, db: Session, sign_plan: Any
 ) -> None:
     draft = _draft(client, studied).json()
-    approved = client.post(_path(studied.visit, "/approve"), json={"plan_id": draft["id"]}).json()
-    assert (approved["status"], approved["approved_by"]) == ("approved", "admin@clinic.example")
+    approved = sign_plan(studied.visit, plan_id=draft["id"]).json()
+    assert (approved["status"], approved["approved_by"]) == ("approved", "signer@clinic.example")
     assert approved["sessions"] == draft["sessions"]
-    again = client.post(_path(studied.visit, "/approve"))
+    again = sign_plan(studied.visit)
     assert again.status_code == 409
-    assert "was approved by admin@clinic.example already" in again.json()["detail"]
+    assert "was approved by signer@clinic.example already" in again.json()["detail"]
     unexplained = _draft(client, studied, reason=" ")
     assert unexplained.status_code == 422
     assert "Say why the approved plan is replaced" in unexplained.json()["hint"]
@@ -169,22 +171,22 @@ def test_an_approved_plan_is_fixed_and_superseded_only_with_a_reason_in_the_audi
     assert [r.action for r in rows] == ["insert", "update", "update"]
     assert rows[-1].reason == f"approved plan {draft['id']} superseded by a new draft: participant came late"
     kept = db.get_one(Plan, draft["id"])
-    assert (kept.status, kept.approved_by) == ("superseded", "admin@clinic.example")
+    assert (kept.status, kept.approved_by) == ("superseded", "signer@clinic.example")
     assert len(kept.items) == len(draft["sessions"])
 
 
-def test_a_draft_that_was_replaced_meanwhile_is_not_approved(client: TestClient, studied: Any) -> None:
+def test_a_draft_that_was_replaced_meanwhile_is_not_approved(client: TestClient, studied: Any, sign_plan: Any) -> None:
     seen, _ = _draft(client, studied).json(), _draft(client, studied).json()
-    answer = client.post(_path(studied.visit, "/approve"), json={"plan_id": seen["id"]})
+    answer = sign_plan(studied.visit, plan_id=seen["id"])
     assert answer.status_code == 409
     assert "was replaced by plan" in answer.json()["detail"]
 
 
-def test_a_policy_retired_after_the_draft_blocks_approval(client: TestClient, studied: Any, db: Session) -> None:
+def test_a_policy_retired_after_the_draft_blocks_approval(client: TestClient, studied: Any, db: Session, sign_plan: Any) -> None:
     _draft(client, studied)
     db.get_one(Policy, studied.policies[0]).retired_reason = "speech"
     db.commit()
-    answer = client.post(_path(studied.visit, "/approve"))
+    answer = sign_plan(studied.visit)
     assert answer.status_code == 409
     assert "'rl-01' was retired after this plan was drafted: speech" in answer.json()["detail"]
 
@@ -195,15 +197,16 @@ def test_engineers_draft_clinicians_approve_viewers_read(client: TestClient, cli
     assert _draft(engineer, studied).status_code == 201
     assert viewer.get(_path(studied.visit)).status_code == 200
     assert viewer.get(_path(studied.visit, ".pdf")).status_code == 200
-    assert viewer.post(_path(studied.visit, "/approve")).status_code == 403
-    assert engineer.post(_path(studied.visit, "/approve")).status_code == 403
-    assert clinician.post(_path(studied.visit, "/approve")).status_code == 200
+    signature = {"password": PASSWORD}
+    assert viewer.post(_path(studied.visit, "/approve"), json=signature).status_code == 403
+    assert engineer.post(_path(studied.visit, "/approve"), json=signature).status_code == 403
+    assert clinician.post(_path(studied.visit, "/approve"), json=signature).status_code == 200
 
 
-def test_only_who_may_approve_replaces_an_approved_plan(client: TestClient, client_as, studied: Any) -> None:  # type: ignore[no-untyped-def]
+def test_only_who_may_approve_replaces_an_approved_plan(client: TestClient, client_as, studied: Any, sign_plan: Any) -> None:  # type: ignore[no-untyped-def]
     engineer, clinician = client_as("engineer"), client_as("clinician")
     approved = _draft(client, studied).json()["id"]
-    client.post(_path(studied.visit, "/approve"))
+    assert sign_plan(studied.visit).status_code == 200
     assert _draft(engineer, studied, reason="I prefer another").status_code == 403
     page = engineer.get(f"/visits/{studied.visit}/plan", headers={"Accept": "text/html"}).text
     assert "Only those who may approve plans can replace it." in page

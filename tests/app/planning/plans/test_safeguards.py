@@ -19,6 +19,7 @@ from tests.app.evaluations import policies as policies
 from tests.ml.ope.posterior.draws import N
 
 Judge = Callable[..., int]
+Approve = Callable[..., Any]
 UNSAFE = {"behaviour": {"below_cdbs_20_percent": 0.42}}
 CAREFUL: dict[str, Any] = {"supported": False, "support": {"lowest_supported": 0.5, "dose": 0.4}}
 
@@ -33,12 +34,8 @@ def draft(client: TestClient, visit: int, *chosen: int, **more: Any) -> Any:
     return client.post(f"/api/v1/visits/{visit}/plan", json={"policy_ids": list(chosen), "seed": 1, **more})
 
 
-def approve(client: TestClient, visit: int) -> Any:
-    return client.post(f"/api/v1/visits/{visit}/plan/approve")
-
-
 def test_an_unsafe_policy_is_planned_only_with_a_clinicians_reason(
-    client: TestClient, client_as: Callable[..., TestClient], policies: list[int], judge: Judge, visit: int
+    client: TestClient, client_as: Callable[..., TestClient], policies: list[int], judge: Judge, visit: int, sign_plan: Approve
 ) -> None:
     a, b, _ = policies
     judge({a: judged(50.0), b: judged(60.0, **UNSAFE)})
@@ -51,7 +48,7 @@ def test_an_unsafe_policy_is_planned_only_with_a_clinicians_reason(
     stated = {s["policy_id"]: (s["verdict"], s["override_reason"]) for s in plan.json()["sessions"] if s["policy_id"]}
     assert stated == {a: ("test", None), b: ("unsafe", "asked for by the family, 5 minutes, watched")}
     assert any("unsafe and planned all the same: asked for by the family" in w for w in plan.json()["warnings"])
-    assert approve(client, visit).status_code == 200
+    assert sign_plan(visit).status_code == 200
 
 
 def test_what_is_dangerous_whatever_the_data_say_needs_the_reason_even_where_nothing_can_be_told(
@@ -63,7 +60,7 @@ def test_what_is_dangerous_whatever_the_data_say_needs_the_reason_even_where_not
 
 
 def test_one_test_with_care_a_visit_and_its_lowest_amplitude_stands_in_the_plan(
-    client: TestClient, policies: list[int], judge: Judge, visit: int
+    client: TestClient, policies: list[int], judge: Judge, visit: int, sign_plan: Approve
 ) -> None:
     a, b, c = policies
     judge({a: judged(50.0, **CAREFUL), b: judged(60.0, **CAREFUL), c: judged(40.0)})
@@ -76,28 +73,30 @@ def test_one_test_with_care_a_visit_and_its_lowest_amplitude_stands_in_the_plan(
     assert "Policy 'p0' may not go below 1.5 mA." in plan["warnings"]
     higher = draft(client, visit, a, limits=[{"policy_id": a, "min_fraction": 0.7}]).json()
     assert [s["min_fraction"] for s in higher["sessions"] if s["policy_id"]] == [0.7]
-    assert approve(client, visit).status_code == 200
+    assert sign_plan(visit).status_code == 200
 
 
 def test_no_plan_with_a_test_with_care_is_approved_without_its_limit(
-    client: TestClient, policies: list[int], judge: Judge, visit: int, db: Session
+    client: TestClient, policies: list[int], judge: Judge, visit: int, db: Session, sign_plan: Approve
 ) -> None:
     judge({policies[0]: judged(50.0, **CAREFUL)})
     assert draft(client, visit, policies[0]).status_code == 201
     db.execute(text("update plan_item set min_fraction = null"))
     db.commit()
-    answer = approve(client, visit)
+    answer = sign_plan(visit)
     assert (answer.status_code, "states no lowest amplitude of at least 0.50" in answer.json()["detail"]) == (409, True)
     db.execute(text("update plan_item set min_fraction = 0.4 where policy_id is not null"))
     db.commit()
-    assert approve(client, visit).status_code == 409
+    assert sign_plan(visit).status_code == 409
 
 
-def test_verdicts_are_asked_again_at_approval(client: TestClient, policies: list[int], judge: Judge, visit: int) -> None:
+def test_verdicts_are_asked_again_at_approval(
+    client: TestClient, policies: list[int], judge: Judge, visit: int, sign_plan: Approve
+) -> None:
     judge({policies[0]: judged(50.0, outcome_draws={"tremor_percent": [26.0] * N})})
     assert draft(client, visit, policies[0]).status_code == 201
     client.put("/api/v1/participants/P1/margins", json={"margins": {"tremor_points": 5}, "reason": "she fears tremor most"})
-    answer = approve(client, visit)
+    answer = sign_plan(visit)
     assert (answer.status_code, "likely worse than cDBS, tremor most of all" in answer.json()["detail"]) == (409, True)
 
 
@@ -138,13 +137,13 @@ def test_the_form_asks_for_the_reason_and_the_limit_and_keeps_what_was_typed(
 
 
 def test_a_bundle_of_a_policy_tested_with_care_does_not_go_below_the_approved_limit(
-    client: TestClient, policies: list[int], judge: Judge, visit: int
+    client: TestClient, policies: list[int], judge: Judge, visit: int, sign_plan: Approve
 ) -> None:
     bundle = f"/api/v1/policies/{policies[0]}/bundle"
     judge({policies[0]: judged(50.0, **CAREFUL)})
     assert draft(client, visit, policies[0]).status_code == 201
     assert lowest_ma(client.get(bundle).content) == 0.0, "a draft limits nothing"
-    assert approve(client, visit).status_code == 200
+    assert sign_plan(visit).status_code == 200
     assert lowest_ma(client.get(bundle).content) == 1.5
     below = client.get(bundle, params={"min_ma": 1.2})
     assert (below.status_code, "below the 1.5 mA" in below.json()["detail"]) == (422, True)

@@ -55,13 +55,13 @@ def test_a_draft_says_so_and_holds_everything_that_the_clinic_needs(client: Test
     assert places == sorted(places)
 
 
-def test_an_approved_sheet_has_no_watermark_and_names_who_approved(client: TestClient, studied: Any) -> None:
+def test_an_approved_sheet_has_no_watermark_and_names_who_approved(client: TestClient, studied: Any, sign_plan: Any) -> None:
     client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
-    client.post(f"/api/v1/visits/{studied.visit}/plan/approve")
+    assert sign_plan(studied.visit).status_code == 200
     (text,) = _sheet(client, studied.visit)
     assert "DRAFT" not in text
     assert "NOT APPROVED" not in text
-    assert "Approved by admin@clinic.example" in text
+    assert "Approved by signer@clinic.example" in text
 
 
 def test_a_long_day_goes_over_pages_with_its_head_repeated(client: TestClient, studied: Any) -> None:
