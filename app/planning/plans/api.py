@@ -8,7 +8,7 @@ from fastapi import APIRouter, Response
 
 from app.accounts.deps import CurrentCaller
 from app.evaluation.shown import estimate_out
-from app.planning.plans import service, sheet
+from app.planning.plans import service
 from app.planning.plans.schemas import (
     Approval,
     PlanEstimateOut,
@@ -20,6 +20,7 @@ from app.planning.plans.schemas import (
     SignatureOut,
 )
 from app.planning.plans.service import PlanLine, PlanView
+from app.planning.sheet import pdf
 from app.platform.database import Db, now
 from app.platform.web.schemas import problems
 from app.study.deps import CurrentVisit
@@ -64,7 +65,7 @@ def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
     view = service.read_plan(db, visit, caller)
     name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
     return Response(
-        sheet.render(view, caller.label, now()), media_type="application/pdf", headers={"Content-Disposition": f'inline; filename="{name}"'}
+        pdf.render(view, caller.label, now()), media_type="application/pdf", headers={"Content-Disposition": f'inline; filename="{name}"'}
     )
 
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
 
-from app.planning.plans.latin1_text import latin
+from app.planning.sheet.latin1_text import latin
 
 
 def _sheet(client: TestClient, visit_id: int) -> list[str]:

@@ -13,9 +13,9 @@ from fpdf.enums import XPos, YPos
 from app.evaluation.wording import method_name
 from app.learning.models import Policy
 from app.planning import wording
-from app.planning.plans.latin1_text import latin
 from app.planning.plans.service import PlanLine, PlanView
 from app.planning.plans.sign_off import SignatureState
+from app.planning.sheet.latin1_text import latin
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller
 
