@@ -161,8 +161,8 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "no_posterior": lambda f: "evaluated by an earlier betaloop: evaluate again",
     "adverse_event": lambda f: "serious adverse event, not cleared by a clinician",
     "nearly_off": lambda f: f"nearly off {_percent(f.value)} of the time",
-    "beyond_margin": lambda f: f"{chance(_value(f))} likely worse than cDBS, {OUTCOME_NAMES[f.fact('outcome')]} most of all",
-    "all_below_zero": lambda f: "likely worse than cDBS",
+    "beyond_margin": lambda f: f"{chance(_value(f))} likely beyond a margin, most often that of {OUTCOME_NAMES[f.fact('outcome')]}",
+    "all_below_zero": lambda f: "its whole expected gain lies below that of cDBS",
     "few_near_sessions": lambda f: "hardly any session came near what it does",
     "few_near_visits": lambda f: "only one visit came near what it does",
     "outside_range": lambda f: "it asks for amplitudes that nobody has tried",
@@ -173,7 +173,7 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "reference_missing": lambda f: "there is no estimate of cDBS to hold it against",
     "reference_unsupported": lambda f: "too few sessions of cDBS to hold it against",
     "outcomes_unknown": lambda f: "no session has grasp, rating or tremor",
-    "undecided": lambda f: "as good as cDBS or worse: still open",
+    "undecided": lambda f: "within the margins or beyond: still open",
 }
 """For the first screen of the ranking, by code; what is not here is told further down alone."""
 
@@ -250,11 +250,11 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "outcomes_unknown": lambda f: "no session has grasp, rating or tremor: whether it is worse than cDBS cannot be told",
     "energy_unknown": lambda f: "its energy is not predicted",
     "no_ordering_skill": _no_ordering_skill,
-    "undecided": lambda f: "neither likely enough to be as good as cDBS nor likely enough to be worse",
+    "undecided": lambda f: "neither likely enough to be within the margins nor likely enough to be beyond one",
     "adverse_event": lambda f: "a serious adverse event under it has not been cleared by a clinician",
     "nearly_off": lambda f: f"nearly off, below 20 % of the cDBS amplitude, {_percent(f.value)} of the time (at most {_percent(f.limit)})",
     "beyond_margin": lambda f: (
-        f"{chance(_value(f))} likely worse than cDBS by more than a margin, {OUTCOME_NAMES[f.fact('outcome')]} most of all "
+        f"{chance(_value(f))} likely beyond a margin of grasp, rating or tremor, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
         f"(unsafe from {_percent(f.limit)})"
     ),
     "extrapolates": lambda f: (
@@ -262,7 +262,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     ),
     "acts_like_cdbs": lambda f: f"acts like cDBS: {_percent(f.value)} of its amplitude away from it on average",
     "within_margins": lambda f: (
-        f"{chance(_value(f))} likely at least as good as cDBS within the margins (a test asks for {_percent(f.limit)})"
+        f"{chance(_value(f))} likely within the margins of grasp, rating and tremor (a test asks for {_percent(f.limit)})"
     ),
     "saves_energy": lambda f: f"{chance(_value(f))} likely to use less energy (a test asks for {_percent(f.limit)})",
     "sessions_needed": lambda f: count(int(_value(f)), "session", "sessions"),

@@ -16,6 +16,7 @@ from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.posterior.further_sessions import session_noise
 from ml.ope.posterior.gaussian import TestedDifference
 from ml.ope.registry import AGGREGATE, Size, build, quick_estimators
+from ml.ope.support.behaviour_map import behaviour_map
 from ml.ope.support.diagnostics import diagnose
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.policies.policy import Policy
@@ -116,14 +117,21 @@ def check_coverage(params: dict[str, Any], workdir: Path, report: StepReport) ->
 
     Returns:
         `session_noise`, the standard deviation of each outcome from session to session, and `policies`, by policy id what
-        `ml.ope.support.diagnostics.Diagnostics` holds; or `failed` with the reason where these data cannot be checked.
+        `ml.ope.support.diagnostics.Diagnostics` holds, and `map`, what each asks for at which beta (`BehaviourMap`); or `failed` with the
+        reason where these data cannot be checked.
     """
     buffer = read_buffer(params["snapshot_sha256"])
+    policies = _policies(params["policies"], buffer)
     try:
-        found = diagnose(buffer, _policies(params["policies"], buffer), params["horizon_steps"], report.curves(1.0))
+        found = diagnose(buffer, policies, params["horizon_steps"], report.curves(1.0))
+        drawn = behaviour_map(buffer, policies)
     except ValueError as error:
         return {"failed": str(error), "session_noise": session_noise(buffer)}
-    return {"policies": {policy_id: _finite(d.to_json()) for policy_id, d in found.items()}, "session_noise": session_noise(buffer)}
+    return {
+        "policies": {policy_id: _finite(d.to_json()) for policy_id, d in found.items()},
+        "map": drawn.to_json(),
+        "session_noise": session_noise(buffer),
+    }
 
 
 def choose_method(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:

@@ -52,7 +52,7 @@ class Row:
 
     @property
     def within(self) -> float | None:
-        """Probability of being at least as good as cDBS within the margins."""
+        """Probability that grasp, rating and tremor are all no worse than cDBS by more than their margins."""
         return self.decided.verdict.within if self.decided.verdict else None
 
 

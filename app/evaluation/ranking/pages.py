@@ -18,6 +18,7 @@ from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.answer import Answer, answer
 from app.evaluation.ranking.export import csv_of
+from app.evaluation.ranking.picture import Picture, picture
 from app.evaluation.schemas import DECISION_NAMES, RANKING_KINDS, RankingFilter, RankingOut
 from app.learning.snapshots.service import not_ready
 from app.platform.database import Db
@@ -52,6 +53,7 @@ def ranking_page(
     shown = parse(RankingFilter, {"supported": supported, "kind": kind, "tested": tested})
     found: RankingOut | None = None
     answered: Answer | None = None
+    drawn: Picture | None = None
     held: dict[str, Any] = {}
     weights: Mapping[str, float] = {}
     correlation: float | None = None
@@ -59,6 +61,9 @@ def ranking_page(
     try:
         assessment = ranking.current_assessment(db, participant, caller, method or None)
         found, answered = ranking.ranking_of(db, assessment, shown), answer(assessment)
+        drawn = picture(
+            assessment, [*answered.rows, *answered.like_off], found.snapshot.beta_unit, participant.current_settings.lower_bound
+        )
         held = held_out.of_evaluation(assessment.evaluation)
         weights, correlation = assessment.weights, assessment.held_out_correlation
     except NotFound as error:
@@ -71,6 +76,7 @@ def ranking_page(
         participant=participant,
         ranking=found,
         answer=answered,
+        picture=drawn,
         held=held,
         plainly=wording.plainly,
         amplitude=wording.amplitude,
@@ -101,6 +107,12 @@ def ranking_page(
         window=participant.current_settings.window,
     )
     return HTMLResponse(page)
+
+
+@router.get("/glossary")
+def glossary(request: Request, caller: CurrentCaller) -> HTMLResponse:
+    """What the words of the pages mean."""
+    return HTMLResponse(render(request, "evaluation/glossary.html"))
 
 
 @router.get("/participants/{code}/ranking.csv")

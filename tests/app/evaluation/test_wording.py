@@ -103,10 +103,10 @@ def test_the_reasons_of_a_verdict_read_as_one_sentence_and_plainly() -> None:
     reasons = [Flag("undecided"), Flag("within_margins", 0.7, 0.8, "probability"), Flag("sessions_needed", 3.0, None, "sessions")]
     reasons.append(Flag("near_amplitude", 1.8, None, "mA"))
     assert wording.decision(reasons) == (
-        "neither likely enough to be as good as cDBS nor likely enough to be worse; 70 % likely at least as good as cDBS within the "
-        "margins (a test asks for 80 %); 3 sessions held near 1.8 mA would tell"
+        "neither likely enough to be within the margins nor likely enough to be beyond one; 70 % likely within the "
+        "margins of grasp, rating and tremor (a test asks for 80 %); 3 sessions held near 1.8 mA would tell"
     )
-    assert wording.plainly(reasons) == "as good as cDBS or worse: still open; 3 sessions held near 1.8 mA would tell"
+    assert wording.plainly(reasons) == "within the margins or beyond: still open; 3 sessions held near 1.8 mA would tell"
     assert wording.plainly([Flag("extrapolates", 0.4, 0.5)], 0.5, 1.5) == "lower than two sessions ever held: not below 1.5 mA"
     assert (
         wording.plainly([Flag("extrapolates", 0.4, 0.5)], 0.5) == "lower than two sessions ever held: not below 50 % of the cDBS amplitude"

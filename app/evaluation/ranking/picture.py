@@ -1,0 +1,233 @@
+"""The picture of the ranking: what each candidate asks for at which beta, where sessions have been, and what to expect of its dose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+
+from app.evaluation.estimates.coverage import STORED
+from app.evaluation.ranking.answer import QUANTITIES, Row
+from app.evaluation.ranking.assessment import Assessed, Assessment
+from app.platform.web.charts import Cell
+from app.platform.web.svg import Plane, apart, drawing
+from ml.ope.estimate import Estimate
+from ml.ope.posterior.verdict import outcome_draws
+from ml.ope.support.behaviour_map import DOSES, BehaviourMap
+
+MAP = "map"
+"""Member of what `check_coverage` found."""
+
+MOST = 8
+"""Candidates that are drawn; more would hide each other, and stand in the table."""
+
+TONES = {"test": "good", "test_with_care": "warn", "unsafe": "bad", "cannot_tell": "accent", "same_as_cdbs": "cdbs"}
+DASHES = ("", "8 4", "2 4", "10 3 2 3")
+"""Of candidates with one colour, so that colour is never the only sign."""
+SHAPES = ("circle", "diamond", "square")
+_PANELS = {
+    "energy": ("Energy, % of cDBS", 100.0),
+    "grasp_hz": ("Grasp, Hz", 1.0),
+    "rating": ("Rating, of 10", 1.0),
+    "tremor_percent": ("Tremor, % of the time", 1.0),
+}
+W, H = 620.0, 400.0
+PANEL_W, PANEL_H = 235.0, 120.0
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Amplitudes as the picture shows them: mA, or % of cDBS where the cDBS amplitude is not known.
+
+    Attributes:
+        factor: of a fraction of the cDBS amplitude. unit: of the product.
+    """
+
+    factor: float
+    unit: str
+
+    @classmethod
+    def of(cls, cdbs_ma: float | None) -> Scale:
+        """By the cDBS amplitude, mA."""
+        return cls(100.0, "% of cDBS") if cdbs_ma is None else cls(cdbs_ma, "mA")
+
+    def words(self, fraction: float) -> str:
+        """An amplitude with its unit."""
+        digits = 0 if self.unit.startswith("%") else 1
+        return f"{self.factor * fraction:.{digits}f} {self.unit}"
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One candidate as both figures draw it."""
+
+    name: str
+    policy_id: int
+    tone: str
+    dash: str
+    shape: str
+    estimate: Estimate | None
+    limit: float | None
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Both figures and the numbers behind them.
+
+    Attributes:
+        behaviour: amplitude against beta; None where the evaluation is of before it was stored.
+        doses: what each dose is expected to do; None without any.
+        behaviour_columns, behaviour_rows, dose_columns, dose_rows: tables. left_out: candidates that are in the tables alone.
+    """
+
+    behaviour: Markup | None
+    doses: Markup | None
+    behaviour_columns: tuple[str, ...]
+    behaviour_rows: tuple[tuple[Cell, ...], ...]
+    dose_columns: tuple[str, ...]
+    dose_rows: tuple[tuple[Cell, ...], ...]
+    left_out: int
+
+
+def picture(found: Assessment, rows: Sequence[Row], unit: str, lower_bound: float) -> Picture:
+    """The picture of some candidates.
+
+    Args:
+        found: the assessment. rows: candidates, what matters first. unit: of beta. lower_bound: B, fraction of cDBS.
+    """
+    scale = Scale.of(found.cdbs_ma)
+    everyone = _drawn(rows)
+    shown = everyone[:MOST]
+    stored = (found.evaluation.diagnostics.get(STORED) or {}).get(MAP)
+    known = BehaviourMap.from_json(stored) if stored else None
+    named = {str(d.policy_id): d.name for d in everyone}
+    references = sorted(
+        (a for a in found.references if a.reference in ("cdbs", "constant", "best_constant") and _dose(a.posterior) is not None),
+        key=lambda a: _dose(a.posterior) or 0.0,
+    )
+    return Picture(
+        behaviour=_behaviour(known, shown, scale, unit, lower_bound) if known else None,
+        doses=_doses(shown, references, scale),
+        behaviour_columns=(f"Beta from ({unit})", f"to ({unit})", "Recorded steps", *(f"{n} ({scale.unit})" for n in named.values())),
+        behaviour_rows=_behaviour_rows(known, list(named), scale) if known else (),
+        dose_columns=("Policy", f"Mean amplitude ({scale.unit})", *(t for t, _ in _PANELS.values())),
+        dose_rows=tuple(_dose_row(name, e, scale) for name, e in _listed(everyone, references)),
+        left_out=max(0, len(everyone) - MOST),
+    )
+
+
+def _drawn(rows: Sequence[Row]) -> list[Drawn]:
+    found, seen = [], dict.fromkeys(TONES.values(), 0)
+    for row in rows:
+        tone = TONES[row.decided.decision]
+        nth = seen[tone]
+        seen[tone] += 1
+        policy = row.one.policy
+        look = DASHES[nth % len(DASHES)], SHAPES[nth % len(SHAPES)]
+        found.append(Drawn(policy.name, policy.id, tone, *look, row.one.posterior, row.limit))
+    return found
+
+
+def _behaviour(known: BehaviourMap, shown: Sequence[Drawn], scale: Scale, unit: str, lower_bound: float) -> Markup:
+    plane = Plane(56, 34, W - 56 - 108, H - 34 - 46, (known.edges[0], known.edges[-1]), (0.0, 1.08 * scale.factor))
+    most = max((n for column in known.tried for n in column), default=0)
+    for k, column in enumerate(known.tried):
+        for row, n in enumerate(column):
+            if n:
+                dark = 0.10 + 0.45 * float(np.log1p(n) / np.log1p(most))
+                low, high = row / DOSES * scale.factor, (row + 1) / DOSES * scale.factor
+                plane.cell(known.edges[k], known.edges[k + 1], low, high, "muted", dark)
+    plane.axes(f"Beta, mean of the policy's window ({unit})", f"Amplitude ({scale.unit})")
+    plane.level(scale.factor, f"cDBS {scale.words(1.0)}", "cdbs")
+    plane.level(lower_bound * scale.factor, f"lowest of random sessions {scale.words(lower_bound)}", "muted", "2 3")
+    centres = [(a + b) / 2 for a, b in zip(known.edges[:-1], known.edges[1:], strict=True)]
+    ends: list[tuple[Drawn, float]] = []
+    for d in shown:
+        curve = known.policies.get(str(d.policy_id))
+        if curve is None:
+            continue
+        values = [None if v is None else v * scale.factor for v in curve.middle]
+        plane.line(list(zip(centres, values, strict=True)), d.tone, 2.5, d.dash)
+        last = next((v for v in reversed(values) if v is not None), None)
+        if last is not None:
+            ends.append((d, plane.at_y(last)))
+        if d.limit is not None:
+            plane.level(d.limit * scale.factor, f"{d.name}: not below {scale.words(d.limit)}", "warn", "6 3")
+    places = apart([y for _, y in ends], low=plane.top, high=plane.top + plane.height)
+    for (d, y), at in zip(ends, places, strict=True):
+        right = plane.left + plane.width
+        plane.parts.append(
+            f'<path d="M{right:.1f} {y:.1f}L{right + 10:.1f} {at:.1f}" fill="none" stroke="var(--c-{d.tone})" stroke-width="1"/>'
+        )
+        plane.mark(right + 16, at, d.tone, d.shape)
+        plane.text(right + 25, at + 4, d.name, colour=d.tone, weight=600)
+    told = "; ".join(d.name for d, _ in ends)
+    return drawing(W, H, "Amplitude against beta", f"Lines: {told}. Grey: where recorded sessions have been.", [plane])
+
+
+def _doses(shown: Sequence[Drawn], references: Sequence[Assessed], scale: Scale) -> Markup | None:
+    planes = []
+    present = [q for q in QUANTITIES if any(_predicted(e, q) is not None for _, e in _listed(shown, references))]
+    for k, name in enumerate(present):
+        title, factor = _PANELS[name]
+        left, top = 52 + (k % 2) * (PANEL_W + 62), 34 + (k // 2) * (PANEL_H + 78)
+        spans = [p for _, e in _listed(shown, references) for p in [_predicted(e, name)] if p is not None]
+        low, high = min(p[1] for p in spans) * factor, max(p[2] for p in spans) * factor
+        room = 0.06 * ((high - low) or 1.0)
+        plane = Plane(left, top, PANEL_W, PANEL_H, (0.0, 1.05 * scale.factor), (max(0.0, low - room), high + room))
+        plane.axes(f"Mean amplitude ({scale.unit})", title, y_ticks=4)
+        held = [(d * scale.factor, p) for a in references for d, p in [(_dose(a.posterior), _predicted(a.posterior, name))] if d and p]
+        plane.line([(x, p[0] * factor) for x, p in held], "cdbs", 1.5, "4 3")
+        for x, p in held:
+            plane.dot(x, p[0] * factor, "cdbs", "ring", f"held at {x:.3g} {scale.unit}: {p[0] * factor:.3g}")
+        for d in shown:
+            dose, span = _dose(d.estimate), _predicted(d.estimate, name)
+            if dose is not None and span is not None:
+                value, low_end, high_end = (v * factor for v in span)
+                plane.interval(dose * scale.factor, low_end, high_end, d.tone)
+                plane.dot(dose * scale.factor, value, d.tone, d.shape, f"{d.name}: {value:.3g} ({low_end:.3g} to {high_end:.3g})")
+        planes.append(plane)
+    if not planes:
+        return None
+    height = 34 + ((len(planes) + 1) // 2) * (PANEL_H + 78) - 30
+    told = "; ".join(d.name for d in shown)
+    return drawing(W, height, "What a dose is expected to do", f"Dots with intervals: {told}. Line: held amplitudes.", planes)
+
+
+def _listed(shown: Sequence[Drawn], references: Sequence[Assessed]) -> list[tuple[str, Estimate | None]]:
+    return [(d.name, d.estimate) for d in shown] + [(a.policy.name, a.posterior) for a in references]
+
+
+def _dose(estimate: Estimate | None) -> float | None:
+    """Mean amplitude that a policy asks for, fraction of cDBS."""
+    value = ((estimate.details.get("behaviour") or {}) if estimate is not None else {}).get("mean_amplitude")
+    return None if value is None else float(value)
+
+
+def _predicted(estimate: Estimate | None, name: str) -> tuple[float, float, float] | None:
+    """A predicted quantity with its 90 % interval."""
+    draws = outcome_draws(estimate, name) if estimate is not None else None
+    if draws is None:
+        return None
+    low, high = np.quantile(draws, [0.05, 0.95])
+    return float(draws.mean()), float(low), float(high)
+
+
+def _behaviour_rows(known: BehaviourMap, policies: Sequence[str], scale: Scale) -> tuple[tuple[Cell, ...], ...]:
+    curves = [known.policies.get(i) for i in policies]
+    asked = [[None if c is None or c.middle[k] is None else c.middle[k] for c in curves] for k in range(len(known.tried))]
+    return tuple(
+        (known.edges[k], known.edges[k + 1], sum(column), *(None if v is None else scale.factor * v for v in asked[k]))
+        for k, column in enumerate(known.tried)
+    )
+
+
+def _dose_row(name: str, estimate: Estimate | None, scale: Scale) -> tuple[Cell, ...]:
+    dose = _dose(estimate)
+    cells: list[Cell] = [name, None if dose is None else scale.factor * dose]
+    for quantity, (_, factor) in _PANELS.items():
+        span = _predicted(estimate, quantity)
+        cells.append(None if span is None else f"{factor * span[0]:.3g} ({factor * span[1]:.3g} to {factor * span[2]:.3g})")
+    return tuple(cells)

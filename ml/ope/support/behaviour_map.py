@@ -1,0 +1,90 @@
+"""What policies ask for at which beta, and where sessions have ever been: the numbers behind one picture, small enough to be stored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.ope.fqe.steps import usable_steps
+from ml.policies.policy import Policy
+from ml.trajectories import ReplayBuffer
+
+COLUMNS = 24
+"""Columns of beta, of equal width over the middle 98 % of the recorded windows; what lies outside counts in the outermost two."""
+
+DOSES = 20
+"""Rows of amplitude, 5 % of cDBS each."""
+
+FEWEST = 5
+"""Windows in a column below which nothing is said of it."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Amplitudes that a policy asks for, by column of beta, fractions of cDBS; None where a column has too few windows.
+
+    Attributes:
+        middle: median over the recorded windows of the column. low, high: 10th and 90th percentile.
+    """
+
+    middle: tuple[float | None, ...]
+    low: tuple[float | None, ...]
+    high: tuple[float | None, ...]
+
+
+@dataclass(frozen=True)
+class BehaviourMap:
+    """Policies over the cloud of amplitudes that sessions had.
+
+    Attributes:
+        edges: of the columns, mean beta of a window, in its unit, [COLUMNS + 1].
+        tried: recorded steps by column and row of amplitude, [COLUMNS][DOSES]; row i holds the fractions from i / DOSES on.
+        policies: by name.
+    """
+
+    edges: tuple[float, ...]
+    tried: tuple[tuple[int, ...], ...]
+    policies: dict[str, Curve]
+
+    def to_json(self) -> dict[str, Any]:
+        """As stored; `from_json` takes it back."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> BehaviourMap:
+        """A stored map."""
+        curves = {name: Curve(*(tuple(c[member]) for member in ("middle", "low", "high"))) for name, c in stored["policies"].items()}
+        return cls(tuple(stored["edges"]), tuple(tuple(column) for column in stored["tried"]), curves)
+
+
+def behaviour_map(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> BehaviourMap:
+    """What each policy asks for on the recorded windows, by their mean beta. Raises ValueError where the buffer has no usable step.
+
+    Args:
+        buffer: of the recorded sessions. policies: by name.
+    """
+    table = usable_steps(buffer)
+    levels = table.states.mean(1)
+    low, high = np.quantile(levels, [0.01, 0.99])
+    if high <= low:
+        low, high = low - 0.5, high + 0.5
+    edges = np.linspace(low, high, COLUMNS + 1)
+    column = np.clip(np.searchsorted(edges, levels, "right") - 1, 0, COLUMNS - 1)
+    dose = np.clip((table.actions * DOSES + 1e-9).astype(np.int64), 0, DOSES - 1)
+    tried = np.zeros((COLUMNS, DOSES), dtype=np.int64)
+    np.add.at(tried, (column, dose), 1)
+    curves = {name: _curve(np.clip(policy.act(table.states), 0.0, 1.0), column) for name, policy in policies.items()}
+    return BehaviourMap(tuple(map(float, edges)), tuple(tuple(map(int, row)) for row in tried), curves)
+
+
+def _curve(actions: NDArray[np.float64], column: NDArray[np.int64]) -> Curve:
+    found: list[tuple[float | None, ...]] = []
+    for k in range(COLUMNS):
+        own = actions[column == k]
+        found.append(tuple(float(q) for q in np.quantile(own, [0.5, 0.1, 0.9])) if own.size >= FEWEST else (None, None, None))
+    middle, low, high = zip(*found, strict=True)
+    return Curve(middle, low, high)

@@ -1,0 +1,40 @@
+"""What a page says before anything is unfolded, and the words of methods that it does without there."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+
+BANNED = (
+    "E[", "horizon", "logged", "saturated", "data support it", "DLSM", "DLMM", "FQE", "QoC", "ξβ", "xi_beta", "r_end", "posterior",
+    "fitted Q", "Mean Q", "critic", "temporal-difference", "extrapolation",
+)  # fmt: skip
+_UNSEEN = {"details", "script", "style", "title", "head"}
+
+
+class _Reader(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.folded, self.words = 0, []
+
+    def handle_starttag(self, tag, attrs):  # type: ignore[no-untyped-def]
+        # a fold that the page opens by itself is read
+        self.folded += tag in _UNSEEN and not (tag == "details" and "open" in dict(attrs) and not self.folded)
+
+    def handle_endtag(self, tag):  # type: ignore[no-untyped-def]
+        self.folded = max(0, self.folded - (tag in _UNSEEN))
+
+    def handle_data(self, data):  # type: ignore[no-untyped-def]
+        if not self.folded:
+            self.words.append(data)
+
+
+def above_fold(page: str) -> str:
+    """The words of a page's HTML that no fold hides, figures included."""
+    reader = _Reader()
+    reader.feed(page)
+    return " ".join(" ".join(reader.words).split())
+
+
+def methods_named(words: str) -> list[str]:
+    """The banned words among some words, whatever their capitals."""
+    return [word for word in BANNED if word.lower() in words.lower()]
