@@ -32,6 +32,7 @@ class ProposalChange(Model):
     hemisphere: Hemisphere | None = Field(None, description="Side of the controlled implant.")
     control_stream: Text | None = Field(None, max_length=40, description="Stream of the channel that the controller saw.")
     control_channel: Text | None = Field(None, max_length=80, description="The channel that the controller saw.")
+    control_program: Int | None = Field(None, ge=0, le=15, description="Program whose amplitude the controller set.")
     start_s: Number | None = Field(None, ge=0, le=1e7, description="Where the session begins in its control recording, s.")
     stop_s: Number | None = Field(None, ge=0, le=1e7, description="Where it ends in its control recording, s.")
     started_at: Moment | None = Field(None, description="Start, date and time of day; moves the begin where the recording has a clock.")

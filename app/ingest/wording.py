@@ -88,6 +88,18 @@ def _channel(facts: Mapping[str, Any]) -> str:
     return f"{said}; not {', '.join(passed)}" if passed else said
 
 
+def _program(facts: Mapping[str, Any]) -> str:
+    ran = {
+        "moved": "{low:.3g} to {high:.3g}",
+        "constant": "constant at {high:.3g}",
+        "off": "off",
+        "unknown": "not known",
+    }
+    each = ", ".join(f"program {p['number']} {ran[p['how']].format_map(p)}" for p in facts["programs"])
+    several = sum(p["how"] == "moved" for p in facts["programs"]) > 1
+    return f"{each}{': several moved, say which one the controller set' if several else ''}"
+
+
 _NO_AMPLITUDE = "the file states no amplitude"
 
 
@@ -121,6 +133,7 @@ _SENTENCES: dict[Reason, Callable[[Mapping[str, Any]], str]] = {
     Reason.LOG: lambda f: f"its log names policy {f['policy']}",
     Reason.SURVEY: _survey,
     Reason.CHANNEL: _channel,
+    Reason.PROGRAM: _program,
     Reason.UNREADABLE: lambda f: f"its steps cannot be read: {f['detail']}",
     Reason.RECORDED_SIDE: lambda f: "of the recording that a controller could have seen",
     Reason.NO_SIDE: lambda f: "the file states no side",

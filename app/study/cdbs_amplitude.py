@@ -31,19 +31,26 @@ def stated_at(visit: Visit, hemisphere: Hemisphere | None, program: int | None =
     return plausible(rows[0].amplitude_ma, f"Visit {visit.number} states") if rows else None
 
 
-def in_force(visit: Visit, hemisphere: Hemisphere | None, settings: SettingsVersion, program: int = 0) -> float | None:
+def in_force(visit: Visit, hemisphere: Hemisphere | None, settings: SettingsVersion, program: int = 0, alone: bool = True) -> float | None:
     """The cDBS amplitude of a visit's hemisphere and program, mA, else the settings' shorthand; None where nobody stated one.
+
+    Args:
+        alone: no other program of this side stimulates; else the amplitude stated for another program says nothing about this one.
 
     Raises:
         Invalid: as `stated_at`.
     """
+    if not alone:
+        of_side = [a for a in visit.cdbs_amplitudes if hemisphere in (None, a.hemisphere)]
+        if of_side and not any(a.program == program for a in of_side):
+            return None
     stated = stated_at(visit, hemisphere, program)
     return plausible(settings.cdbs_amplitude_ma, "The participant's settings state") if stated is None else stated
 
 
-def of_session(session: StudySession, settings: SettingsVersion, program: int = 0) -> float | None:
-    """The cDBS amplitude in force for a session, mA; None where nobody stated one. Raises Invalid as `stated_at`."""
-    return in_force(session.visit, session.hemisphere, settings, program)
+def of_session(session: StudySession, settings: SettingsVersion, program: int = 0, alone: bool = True) -> float | None:
+    """The cDBS amplitude in force for a session, mA, as `in_force`; None where nobody stated one. Raises Invalid as `stated_at`."""
+    return in_force(session.visit, session.hemisphere, settings, program, alone)
 
 
 def in_force_now(participant: Participant, hemisphere: Hemisphere | None) -> float:

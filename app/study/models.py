@@ -256,6 +256,7 @@ class StudySession(Base):
         CheckConstraint("status in ('proposed', 'confirmed')", name="status"),
         CheckConstraint("status = 'proposed' or controller is not null", name="controller_stated"),
         CheckConstraint("duration_s >= 0", name="duration"),
+        CheckConstraint("control_program between 0 and 15", name="control_program"),
         CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"),
         CheckConstraint("excluded_reason is null or excluded_reason <> ''", name="excluded_reason"),
         CheckConstraint("stopped_reason is null or stopped_reason <> ''", name="stopped_reason"),
@@ -276,6 +277,8 @@ class StudySession(Base):
     """The slot of the visit's plan that this session fills; None of a session that nobody planned."""
     control_stream: Mapped[str] = mapped_column(String(40), server_default="beta")
     control_channel: Mapped[str | None] = mapped_column(String(80))
+    control_program: Mapped[int | None] = mapped_column(SmallInteger)
+    """Whose amplitude the controller set; null: the first of the control recording's programs, which mostly has one."""
     excluded_reason: Mapped[str | None] = mapped_column(Text)
     stopped_reason: Mapped[str | None] = mapped_column(Text)
     """Why it was stopped for the patient's sake: a failure of its controller, never a missing value. None where it was not."""

@@ -261,6 +261,7 @@ class SessionOut(Model):
     started_at: datetime | None
     duration_s: float
     control_channel: str | None
+    control_program: int | None = Field(description="Program whose amplitude the controller set; null: the control recording's first.")
     excluded_reason: str | None
     stopped_reason: str | None = Field(description="Why it was stopped for the patient's sake; null: it was not.")
     medication_h: float | None = Field(description="Hours from the last dose to the start.")
@@ -276,10 +277,9 @@ class SessionChange(Model):
     hemisphere: Hemisphere | None = None
     control_stream: Text | None = Field(None, max_length=40)
     control_channel: Text | None = Field(None, max_length=80)
+    control_program: Int | None = Field(None, ge=0, le=15, description="Program whose amplitude the controller set.")
     excluded_reason: Text | None = Field(None, max_length=1000, description="Keeps it out of buffers and analyses; null takes that back.")
-    stopped_reason: Text | None = Field(
-        None, max_length=1000, description="Why it was stopped for the patient's sake: a failure of its controller; null: it was not."
-    )
+    stopped_reason: Text | None = Field(None, max_length=1000, description="Why it was stopped for the patient's sake; null: it was not.")
     medication_h: Number | None = Field(None, ge=0, le=72, description="Hours from the last dose to the start; null: not known.")
     reason: Text | None = Field(None, max_length=1000)
 

@@ -63,6 +63,7 @@ def session_out(s: StudySession, caller: Caller) -> SessionOut:
         started_at=s.started_at,
         duration_s=s.duration_s,
         control_channel=s.control_channel,
+        control_program=s.control_program,
         excluded_reason=s.excluded_reason,
         stopped_reason=s.stopped_reason,
         medication_h=s.medication_h,

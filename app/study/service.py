@@ -20,7 +20,7 @@ from app.study.outcomes import service as outcomes
 from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, ParticipantIn, QocIn, SessionChange, SettingsIn, VisitChange, VisitIn
 from app.study.sessions import repeated
 from app.study.threshold import MDP_FIELDS
-from app.study.traces import NO_CONTROL
+from app.study.traces import NO_CONTROL, control_programs
 from app.study.visits.service import require_unlocked
 from ml.mdp import MdpSettings
 
@@ -179,7 +179,8 @@ def _check_policy(db: Session, session: StudySession, controller: Controller, po
 
 
 def check_control(db: Session, session: StudySession, given: dict[str, Any]) -> None:
-    """A session can only be controlled by a trace that one of its recordings has."""
+    """A session can only be controlled by a trace, and through a program, that one of its recordings has."""
+    _check_program(db, session, given.get("control_program"))
     if given.get("control_stream") is None and given.get("control_channel") is None:
         return
     stream = given.get("control_stream") or session.control_stream
@@ -188,6 +189,15 @@ def check_control(db: Session, session: StudySession, given: dict[str, Any]) -> 
     if not any(t.stream == stream and channel in (None, t.channel) for t in traces):
         known = "; ".join(sorted({f"{t.stream} {t.channel}".strip() for t in traces})) or "none"
         raise Invalid(f"The session's recordings have no trace '{stream} {channel or ''}'.", f"Choose one of: {known}.")
+
+
+def _check_program(db: Session, session: StudySession, program: int | None) -> None:
+    if program is None:
+        return
+    known = control_programs(db, session)
+    if program not in known:
+        named = ", ".join(map(str, known)) or "none"
+        raise Invalid(f"The session's control recording has no amplitude of program {program}.", f"Choose one of: {named}.")
 
 
 def require(caller: Caller, permission: str, participant: Participant) -> None:

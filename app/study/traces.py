@@ -89,18 +89,20 @@ def laid_out(session: StudySession, settings: SettingsVersion, traces: TracesOf)
     period, t_s = settings.period_s, _grid(session, settings)
     beta, amount = np.full(t_s.size, np.nan), np.full(t_s.size, np.nan)
     beta_trace = amplitude_trace = None
+    beside: Sequence[Trace] = ()
     for segment in session.segments:
         if not segment.is_control:
             continue
-        found, driving = _chosen(session, traces(segment.recording_id))
+        own = traces(segment.recording_id)
+        found, given = _chosen(session, own)
         origin = session_offset_s(session, segment.recording_id)
         if found is not None:
             _place(beta, t_s, found, origin, period)
             beta_trace = found
-        if driving is not None:
-            _place(amount, t_s, driving, origin, period)
-            amplitude_trace = driving
-    cdbs = cdbs_amplitude.of_session(session, settings, amplitude_program(amplitude_trace) if amplitude_trace else 0)
+        if given is not None:
+            _place(amount, t_s, given, origin, period)
+            amplitude_trace, beside = given, own
+    cdbs = _cdbs(session, settings, amplitude_trace, beside)
     return _table(t_s, beta, amount, beta_trace, amplitude_trace, cdbs)
 
 
@@ -124,20 +126,28 @@ def sources(session: StudySession, settings: SettingsVersion, heads: Mapping[int
     """
     beta: repository.TraceHead | None = None
     amplitude: repository.TraceHead | None = None
+    beside: Sequence[repository.TraceHead] = ()
     for segment in session.segments:
         if segment.is_control:
-            found, driving = _chosen(session, heads.get(segment.recording_id, []))
-            beta, amplitude = found or beta, driving or amplitude
-    cdbs = cdbs_amplitude.of_session(session, settings, amplitude_program(amplitude) if amplitude else 0)
+            own = heads.get(segment.recording_id, [])
+            found, given = _chosen(session, own)
+            beta = found or beta
+            amplitude, beside = (given, own) if given else (amplitude, beside)
+    cdbs = _cdbs(session, settings, amplitude, beside)
     return Sources(beta.id if beta else None, amplitude.id if amplitude else None, cdbs)
 
 
 def shown_table(
-    session: StudySession, settings: SettingsVersion, trace: Trace, amplitude: Trace | None, recording: Recording | None = None
+    session: StudySession,
+    settings: SettingsVersion,
+    trace: Trace,
+    amplitude: Trace | None,
+    recording: Recording | None = None,
+    alone: bool = True,
 ) -> StepTable:
     """Any trace of a session's recordings on the session's grid, with an amplitude of the same recording; `beta` holds its values.
 
-    `recording` is the trace's own, where the caller has it at hand.
+    `recording` is the trace's own, where the caller has it at hand. `alone`: its recording has no other program's amplitude.
 
     The cDBS amplitude is that of the trace's own side and of the amplitude's program.
 
@@ -145,7 +155,7 @@ def shown_table(
         Invalid: a trace that is not on the participant's grid, or a visit that states both sides and a recording that names none.
     """
     program = amplitude_program(amplitude) if amplitude is not None else 0
-    cdbs = cdbs_amplitude.in_force(session.visit, (recording or trace.recording).hemisphere or session.hemisphere, settings, program)
+    cdbs = cdbs_amplitude.in_force(session.visit, (recording or trace.recording).hemisphere or session.hemisphere, settings, program, alone)
     t_s = _grid(session, settings)
     beta, amount = np.full(t_s.size, np.nan), np.full(t_s.size, np.nan)
     origin = session_offset_s(session, trace.recording_id)
@@ -228,8 +238,25 @@ def _chosen(session: StudySession, traces: Sequence[AnyTrace]) -> tuple[AnyTrace
     candidates = [t for t in traces if t.stream == session.control_stream]
     if session.control_channel is not None:
         candidates = [t for t in candidates if t.channel == session.control_channel]
-    driving = next((t for t in traces if t.stream == AMPLITUDE_STREAM), None)
-    return candidates[0] if candidates else None, driving
+    return candidates[0] if candidates else None, driving(session, traces)
+
+
+def driving(session: StudySession, traces: Sequence[AnyTrace]) -> AnyTrace | None:
+    """The amplitude that the session's controller set, among the traces of one recording."""
+    amplitudes = [t for t in traces if t.stream == AMPLITUDE_STREAM]
+    return next((t for t in amplitudes if session.control_program in (None, amplitude_program(t))), None)
+
+
+def control_programs(db: Session, session: StudySession) -> list[int]:
+    """Programs whose amplitude the session's control recordings hold."""
+    control = {s.recording_id for s in session.segments if s.is_control}
+    return sorted({amplitude_program(t) for i in control for t in repository.traces_of_recording(db, i) if t.stream == AMPLITUDE_STREAM})
+
+
+def _cdbs(session: StudySession, settings: SettingsVersion, amplitude: AnyTrace | None, traces: Sequence[AnyTrace]) -> float | None:
+    """What the controlled amplitude is a fraction of, mA; beside other programs only what is stated of this one. Raises Invalid."""
+    alone = sum(t.stream == AMPLITUDE_STREAM for t in traces) <= 1
+    return cdbs_amplitude.of_session(session, settings, amplitude_program(amplitude) if amplitude else 0, alone)
 
 
 def _place(into: NDArray[np.float64], t_s: NDArray[np.float64], trace: Trace, origin_s: float, period_s: float) -> None:

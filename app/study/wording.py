@@ -122,6 +122,10 @@ _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.SILENT_CONTROL: _silent_control,
     Kind.REPEATED: _repeated,
     Kind.LOGGED_POLICY: _logged_policy,
+    Kind.SEVERAL_PROGRAMS: lambda f: (
+        f"The amplitude of {' and of '.join(f['others'])} moved as well as that of {f['counted']}, which is taken for the controller's: "
+        "learning sees that one alone, energy all of them. Correct the program if the controller set another one."
+    ),
     Kind.LOGGED_CDBS: _logged_cdbs,
     Kind.NO_POLICY: lambda f: (
         "No policy is named for this session: it cannot be compared with its estimate. Name one on the session's page."

@@ -81,17 +81,21 @@ def taken(session: Facts, pulses: Mapping[tuple[int, int], Pulses], impedance_oh
 
 
 def _all_sides(sides: Sequence[Side], pulses: Mapping[tuple[int, int], Pulses]) -> float | None:
-    """Energy of all sides and programs relative to their cDBS amplitudes; with one side its mean a^2, whatever its pulses."""
+    """Energy of all sides and programs relative to their cDBS amplitudes; with one side its mean a^2, whatever its pulses.
+
+    A silent side took nothing and would have taken its share under cDBS, for which its pulses must be known; 0 where all were silent.
+    """
     if len(sides) == 1:
         return sides[0].square
+    if sides and all(side.milliamperes == 0 for side in sides):
+        return 0.0
     spent = reference = 0.0
     for side in sides:
-        complete = _complete(side, pulses)
-        if complete is None or side.square_ma2 is None or not side.square:
+        width, rate = _pulses(side, pulses)
+        if width is None or rate is None or side.square_ma2 is None or side.cdbs_ma is None:
             return None
-        weight = complete[0] * complete[1]
-        spent += weight * side.square_ma2
-        reference += weight * side.square_ma2 / side.square
+        spent += width * rate * side.square_ma2
+        reference += width * rate * side.cdbs_ma**2
     return spent / reference if reference > 0 else None
 
 
@@ -99,9 +103,13 @@ def _complete(side: Side, pulses: Mapping[tuple[int, int], Pulses]) -> tuple[flo
     """Width and rate of a side whose amplitude in mA is known too; without any current they do not matter."""
     if side.milliamperes == 0:
         return 0.0, 0.0
-    found = pulses.get((side.recording_id or 0, side.program))
-    if found is None or found.width_us is None or found.rate_hz is None or side.milliamperes is None:
-        return None
+    width, rate = _pulses(side, pulses)
+    return None if width is None or rate is None or side.milliamperes is None else (width, rate)
+
+
+def _pulses(side: Side, pulses: Mapping[tuple[int, int], Pulses]) -> tuple[float | None, float | None]:
+    """Width (us) and rate (Hz) of a side's program, None where not known."""
+    found = pulses.get((side.recording_id or 0, side.program), Pulses(None, None))
     return found.width_us, found.rate_hz
 
 

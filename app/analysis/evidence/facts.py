@@ -60,6 +60,7 @@ class Side:
     Attributes:
         name: of the side, for a table. recording_id, program: where its pulses are looked up. is_control: the side that was controlled.
         fraction, square: means of the amplitude fraction and of its square. milliamperes, square_ma2: the same in mA and mA^2.
+        cdbs_ma: the cDBS amplitude in force for it.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Side:
     square: float | None
     milliamperes: float | None
     square_ma2: float | None
+    cdbs_ma: float | None = None
 
 
 @dataclass(frozen=True)
@@ -193,6 +195,7 @@ def _side(name: str, is_control: bool, table: StepTable | None) -> Side:
         relative_energy(fraction) if of_cdbs else None,
         float(np.nanmean(milliamperes)) if in_ma else None,
         mean_square_ma(milliamperes) if in_ma else None,
+        table.cdbs_ma,
     )
 
 

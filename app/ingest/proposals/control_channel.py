@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from sqlalchemy.orm import Session
 
-from app.ingest import channels
+from app.ingest import channels, programs
 from app.ingest.proposals.evidence import Evidence, Reason, Source
 from app.study import repository as study
 from app.study import service
@@ -34,9 +37,33 @@ def why(db: Session, session: StudySession) -> Evidence:
     return Evidence(Source.RECORDING, Reason.CHANNEL, facts)
 
 
+def choose_program(db: Session, session: StudySession) -> Evidence | None:
+    """Take the program that the controller is likely to have set; why, None where the control recording has one program at most."""
+    control = next(s for s in session.segments if s.is_control)
+    traces = study.traces_of_recording(db, control.recording_id)
+    found = programs.of_part(traces, control.start_s, control.stop_s)
+    if len(found) < 2:
+        session.control_program = None
+        return None
+    session.control_program = found[0].number
+    known = [{"number": p.number, "how": p.how, "low": p.low, "high": p.high} for p in found if p.how is not programs.How.UNKNOWN]
+    unknown = [{"number": p.number, "how": p.how} for p in found if p.how is programs.How.UNKNOWN]
+    return Evidence(Source.RECORDING, Reason.PROGRAM, {"program": found[0].number, "programs": [*known, *unknown]})
+
+
+def renewed_program(db: Session, session: StudySession, evidence: Mapping[str, Any]) -> dict[str, Any]:
+    """The evidence of a proposal after its part or side changed: the program is chosen anew, unless a person stated it."""
+    if "program" in evidence and Evidence.from_json(evidence["program"]).stated:
+        return dict(evidence)
+    why = choose_program(db, session)
+    return {name: e for name, e in evidence.items() if name != "program"} | ({"program": why.as_json()} if why else {})
+
+
 def choose(db: Session, session: StudySession, given: dict[str, object]) -> None:
     """The stated channel, which a control recording of the session must have."""
     service.check_control(db, session, given)
     session.control_stream = str(given.get("control_stream") or session.control_stream)
+    if given.get("control_program") is not None:
+        session.control_program = int(str(given["control_program"]))
     if "control_channel" in given:
         session.control_channel = None if given["control_channel"] is None else str(given["control_channel"])

@@ -45,6 +45,8 @@ class Reason(StrEnum):
     """`recording`; `montages`: how many sets of sensing contacts it went through."""
     CHANNEL = "channel"
     """`stream`, `channel`; `lead`, `contacts` (text) where known; `passed`: channels that were not taken, each with `why`."""
+    PROGRAM = "program"
+    """`program`; `programs`: every one of the control recording, with `number`, `how`, `low`, `high` (mA or fraction)."""
     UNREADABLE = "unreadable"
     """`detail`."""
     RECORDED_SIDE = "recorded_side"

@@ -22,7 +22,7 @@ from app.study.sessions.usable_steps import UsableSteps
 
 LABELS = {
     "visit": "Visit", "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "from": "From", "to": "To",
-    "control": "Control channel", "started_at": "Start", "start_s": "From", "stop_s": "To",
+    "control": "Control channel", "program": "Program", "started_at": "Start", "start_s": "From", "stop_s": "To",
 }  # fmt: skip
 PARTS = 6
 """Rows of the form that cuts a recording; longer days are cut twice, or over the interface."""
@@ -39,6 +39,7 @@ class ProposalForm:
         notes: contradictions that a person should look at.
         drawn: how the amplitudes of a random session were drawn; empty for other sessions.
         usable: usable steps by channel, the control channel first.
+        programs: that the control recording has an amplitude of.
         problem: why the form was refused.
     """
 
@@ -52,6 +53,7 @@ class ProposalForm:
     notes: list[str]
     drawn: str
     usable: list[UsableSteps]
+    programs: list[int]
     reason: str = ""
     problem: dict[str, Any] | None = None
 
@@ -81,6 +83,7 @@ def texts(db: Session, session: StudySession, proposal: SessionProposal, caller:
         "policy": study.policy_name(db, arm.policy_id if arm else None) or "",
         "hemisphere": session.hemisphere or "",
         "control": f"{session.control_stream}|{session.control_channel or ''}",
+        "program": "" if session.control_program is None else str(session.control_program),
         "from": _time(session, control.start_s),
         "to": _time(session, control.stop_s),
         "started_at": _clock(session.started_at) if session.started_at else "",
@@ -117,6 +120,8 @@ def as_change(session: StudySession, version: str, stored: Mapping[str, str], ty
         del fields["visit"]  # an open visit stays open
     if own.get("control"):
         fields["control_stream"], _, fields["control_channel"] = own["control"].partition("|")
+    if own.get("program"):
+        fields["control_program"] = own["program"]
     errors = []
     for name, target in (("from", "start_s"), ("to", "stop_s")):
         if name in own:

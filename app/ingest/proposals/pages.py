@@ -33,6 +33,7 @@ from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions
 from app.study.sessions.data import session_data
 from app.study.sessions.usable_steps import usable_steps
+from app.study.traces import control_programs
 from app.study.wording import drawn_words, sentences
 
 router = APIRouter()
@@ -201,6 +202,7 @@ def _form(
         sentences(contradictions(db, session, proposal.visit_open)),
         _drawn(db, session, caller),
         usable_steps(db, session),
+        control_programs(db, session),
         sent.get(f"reason-{session.id}", "") if error else "",
         error.problem(request.url.path) if error else None,
     )

@@ -69,6 +69,7 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     guess = guess_visit(study.visits(db, participant.id, 1000, 0)[0], day, stated.visit)
     session = add_session(db, guess.visit, placement, stated.controller, stated.policy_id, stated.hemisphere, stated.counts)
     guesses.policy_by_log(db, session)
+    program = control_channel.choose_program(db, session)
     length = f"{session.duration_s / 60:.1f} min" if session.duration_s else "no data"
     seen, usable = _seen(session, placement), sentence(usable_steps(db, session))
     if stated.counts:
@@ -87,6 +88,7 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     of_recording = Evidence(Source.RECORDING, Reason.RECORDED_SIDE if session.hemisphere else Reason.NO_SIDE)
     evidence["hemisphere"] = BY_UPLOAD if stated.hemisphere else of_recording
     evidence["control"] = control_channel.why(db, session)
+    evidence |= {"program": program} if program else {}
     proposal = SessionProposal(
         session_id=session.id,
         upload_id=upload.id,
@@ -201,7 +203,7 @@ def _correct(db: Session, session: StudySession, wanted: ProposalChange, caller:
     _name_controller(db, session, given, caller)
     if "hemisphere" in given:
         _choose_side(db, session, given)
-    if {"control_stream", "control_channel"} & given.keys():
+    if {"control_stream", "control_channel", "control_program"} & given.keys():
         control_channel.choose(db, session, given)
     if {"start_s", "stop_s", "started_at"} & given.keys():
         _choose_part(session, given)
@@ -213,8 +215,11 @@ def _correct(db: Session, session: StudySession, wanted: ProposalChange, caller:
     elif "hemisphere" in given:
         stated["control"] = control_channel.why(db, session)
     proposal.evidence = {**proposal.evidence, **{name: e.as_json() for name, e in stated.items()}}
+    if given.get("control_program") is not None:
+        proposal.evidence = {**proposal.evidence, "program": _by(caller).as_json()}
     if RESTS_ON & given.keys():
         db.flush()
+        proposal.evidence = control_channel.renewed_program(db, session, proposal.evidence)
         _renew_guess(db, session, proposal, keep=confirming)
     proposal.version += 1
     proposal.changed_by = caller.label
@@ -266,6 +271,7 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
     for part in sorted(parts, key=lambda p: p.start_s):
         placement = _placement(session, *_on_grid(session, part.start_s, part.stop_s))
         new = add_session(db, session.visit, placement, part.controller, None, session.hemisphere, counts=False)
+        new.control_program = session.control_program
         why = BY_CUT
         if part.controller is None:
             guess = guesses.controller(db, new)

@@ -17,7 +17,7 @@ from app.study.models import Controller, Recording, SettingsVersion, StudySessio
 from app.study.schemas import ConditionsChange, ConditionsFields
 from app.study.sessions import designs, logged, programming
 from app.study.sessions.models import SessionConditions
-from app.study.traces import AMPLITUDE_STREAM, StepTable, step_table
+from app.study.traces import StepTable, driving, step_table
 
 OF_SETTINGS = ("lower_bound", "window", "period_s", "xi_beta")
 """What a settings version tells of the sessions that ran under it."""
@@ -140,14 +140,14 @@ def _limits(db: Session, session: StudySession) -> tuple[float, float] | None:
     said = logged.limits_and_policy(control) if control is not None else None
     if said is not None:
         return float(said["min_ma"]), float(said["max_ma"])
-    found = _device_limits(db, control) if control is not None else None
+    found = _device_limits(db, session, control) if control is not None else None
     if found is not None:
         return found
     arm = blinding.stated_arm(session, SYSTEM)
     return None if arm is None or arm.policy_id is None else repository.released_limits(db, arm.policy_id, session.started_at)
 
 
-def _device_limits(db: Session, recording: Recording) -> tuple[float, float] | None:
+def _device_limits(db: Session, session: StudySession, recording: Recording) -> tuple[float, float] | None:
     """Limits of the recording's own program, where its device says which of them that was."""
     rows: dict[str, tuple[float, float]] = {}
     for programs in (recording.details.get("limits") or {}).values():
@@ -158,5 +158,5 @@ def _device_limits(db: Session, recording: Recording) -> tuple[float, float] | N
                 rows[name] = (float(limit["lower_ma"]), float(limit["upper_ma"]))
     if len(rows) == 1:
         return next(iter(rows.values()))
-    driving = next((t for t in repository.traces_of_recording(db, recording.id) if t.stream == AMPLITUDE_STREAM), None)
-    return rows.get(driving.channel) if driving is not None else None
+    controlled = driving(session, repository.traces_of_recording(db, recording.id))
+    return rows.get(controlled.channel) if controlled is not None else None

@@ -38,6 +38,8 @@ class Kind(StrEnum):
     SILENT_CONTROL = "silent_control"
     """`side`: name of the controlled side; `others`: names of those that had stimulation."""
     NO_POLICY = "no_policy"
+    SEVERAL_PROGRAMS = "several_programs"
+    """`counted`: name of the program whose amplitude counts; `others`: of those of its side that moved too."""
     LOGGED_POLICY = "logged_policy"
     """`logged`: name of the participant's policy that the log names; `number`, where the participant has none such."""
     LOGGED_CDBS = "logged_cdbs"
@@ -75,6 +77,7 @@ def contradictions(db: Session, session: StudySession, visit_open: bool = False,
     ran = logged.of_recording(db, control_recording(session))
     if ran is not None:
         found += _of_log(ran, arm, table.cdbs_ma)
+    found += _of_programs(sides)
     if arm is None:
         return found
     found += _of_controller(session, arm.controller, sides)
@@ -142,6 +145,15 @@ def _of_log(ran: logged.Logged, arm: blinding.Arm | None, cdbs_ma: float | None)
         yield Contradiction(Kind.LOGGED_POLICY, {"logged": ran.policy_name, "number": ran.number})
     if cdbs_ma is not None and abs(cdbs_ma - ran.cdbs_ma) > SILENT_MA:
         yield Contradiction(Kind.LOGGED_CDBS, {"logged": ran.cdbs_ma, "in_force": cdbs_ma})
+
+
+def _of_programs(sides: Sequence[Delivered]) -> Iterator[Contradiction]:
+    """Several programs of the controlled side moved, of which one counts."""
+    counted = next((s for s in sides if s.is_control and s.moved), None)
+    if counted is not None:
+        others = [s.name for s in sides if s is not counted and s.hemisphere == counted.hemisphere and s.moved]
+        if others:
+            yield Contradiction(Kind.SEVERAL_PROGRAMS, {"counted": counted.name, "others": others})
 
 
 def _of_controller(session: StudySession, controller: Controller, sides: Sequence[Delivered]) -> Iterator[Contradiction]:

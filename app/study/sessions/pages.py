@@ -30,7 +30,7 @@ from app.study.sessions.charts import operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.stimulation import beside, delivered
-from app.study.traces import NO_CONTROL, session_offset_s
+from app.study.traces import NO_CONTROL, control_programs, session_offset_s
 from app.study.wording import EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
 from ml.energy import relative_energy
 
@@ -39,6 +39,7 @@ router = APIRouter()
 _QOC_LABELS = {"grasp_hz": "Grasp frequency", "rating": "Rating", "tremor_percent": "Tremor", "reason": "Reason"}
 _CORRECTION_LABELS = {
     "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "control": "Control trace", "correction_reason": "Reason",
+    "control_program": "Program",
     "stopped_reason": "Stopped for the patient's sake", "medication_h": "Time since the last dose",
 }  # fmt: skip
 _CONDITIONS_LABELS = {
@@ -47,7 +48,7 @@ _CONDITIONS_LABELS = {
 }  # fmt: skip
 
 
-_STATED = ("controller", "hemisphere", "stopped_reason", "medication_h")
+_STATED = ("controller", "hemisphere", "stopped_reason", "medication_h", "control_program")
 
 
 @dataclass(frozen=True)
@@ -211,6 +212,7 @@ def _correction(session: StudySession, caller: Caller) -> dict[str, str]:
         "policy": "" if known.policy_id is None else str(known.policy_id),
         "hemisphere": session.hemisphere or "",
         "control": f"{session.control_stream}\t{session.control_channel or ''}",
+        "control_program": "" if session.control_program is None else str(session.control_program),
         "stopped_reason": session.stopped_reason or "",
         "medication_h": "" if session.medication_h is None else f"{session.medication_h:g}",
     }
@@ -282,6 +284,7 @@ def _page(
         conflicts=operator_conflicts(events, origin),
         blocks=session_view.recording_blocks(session, recordings, traces, view.used),
         outcomes=session_view.outcomes_view(db, session),
+        programs=control_programs(db, session),
         streams=[t for r in recordings for t in traces[r.id] if t.stream not in NO_CONTROL],
         recordings=recordings,
         qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.study import repository
 from app.study.models import Controller, Hemisphere, Recording, StudySession, Trace
-from app.study.traces import AMPLITUDE_STREAM, StepTable, TracesOf, amplitude_program, shown_table
+from app.study.traces import AMPLITUDE_STREAM, StepTable, TracesOf, amplitude_program, driving, shown_table
 
 SILENT_MA = 0.005
 """Below this, an amplitude is off: devices step by 0.1 mA, tables are rounded."""
@@ -36,7 +36,7 @@ class Delivered:
 
     Attributes:
         name: of the side, for a sentence. hemisphere: where it is known.
-        is_control: whether its recording is the one that the controller saw.
+        is_control: whether its amplitude is the one that the controller set.
         table: amplitudes on the session's grid; None where the recording holds none.
     """
 
@@ -67,6 +67,13 @@ class Delivered:
         """Whether any known amplitude is not 0."""
         amount, _, _ = self.inside
         return bool(np.any(~np.isnan(amount))) and not self.silent
+
+    @property
+    def moved(self) -> bool:
+        """Whether the known amplitude was not the same throughout."""
+        amount, _, in_ma = self.inside
+        known = amount[~np.isnan(amount)]
+        return bool(known.size) and float(np.ptp(known)) > (SILENT_MA if in_ma else SILENT_FRACTION)
 
 
 class Pattern(StrEnum):
@@ -200,16 +207,18 @@ def delivered_by(session: StudySession, traces_of: TracesOf) -> list[Delivered]:
         name = f"{side} side" if side else f"recording {recording.id}"
         if side and sides[side] > 1:
             name += f", recording {recording.id}"
-        traces = [t for t in traces_of(recording.id) if t.stream == AMPLITUDE_STREAM]
+        every = traces_of(recording.id)
+        controlled = driving(session, every) if recording.id in control else None
+        traces = sorted((t for t in every if t.stream == AMPLITUDE_STREAM), key=lambda t: t is not controlled)
         if not traces:
             found.append(Delivered(name, side, recording.id in control, None))
         for i, trace in enumerate(traces):
-            table = shown_table(session, settings, trace, trace, recording)
+            table = shown_table(session, settings, trace, trace, recording, alone=len(traces) == 1)
             own = f"{name}, {trace.channel}" if len(traces) > 1 else name
             if i and not _stated(session, side, trace):
                 # the first program's cDBS amplitude says nothing about another program
                 table = replace(table, fraction=np.full(table.t_s.size, np.nan), cdbs_ma=None)
-            found.append(Delivered(own, side, recording.id in control, table))
+            found.append(Delivered(own, side, trace is controlled, table))
     return found
 
 

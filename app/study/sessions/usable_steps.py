@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from app.platform.errors import Invalid
 from app.study import repository
 from app.study.models import SettingsVersion, StudySession, Trace
-from app.study.traces import AMPLITUDE_STREAM, StepTable, shown_table
+from app.study.traces import AMPLITUDE_STREAM, StepTable, driving, shown_table
 from ml.trajectories import SessionTrajectory
 
 CONTROL_STREAMS = ("beta", "band_power")
@@ -49,11 +49,12 @@ def usable_steps(db: Session, session: StudySession) -> list[UsableSteps]:
         if not segment.is_control:
             continue
         traces = repository.traces_of_recording(db, segment.recording_id)
-        amplitude = next((t for t in traces if t.stream == AMPLITUDE_STREAM), None)
+        amplitude = driving(session, traces)
+        alone = sum(t.stream == AMPLITUDE_STREAM for t in traces) <= 1
         candidates = [t for stream in CONTROL_STREAMS for t in traces if t.stream == stream]
         for trace in candidates:
             control = trace is _control(session, candidates)
-            one = _of_channel(session, settings, trace, amplitude, control)
+            one = _of_channel(session, settings, trace, amplitude, control, alone)
             before = found.get((trace.stream, trace.channel))
             if before is None or one.usable > before.usable:
                 found[trace.stream, trace.channel] = one
@@ -84,10 +85,12 @@ def _name(u: UsableSteps) -> str:
     return f"{u.stream.replace('_', ' ')} {u.channel}".strip()
 
 
-def _of_channel(session: StudySession, settings: SettingsVersion, trace: Trace, amplitude: Trace | None, is_control: bool) -> UsableSteps:
+def _of_channel(
+    session: StudySession, settings: SettingsVersion, trace: Trace, amplitude: Trace | None, is_control: bool, alone: bool
+) -> UsableSteps:
     named = (trace.stream, trace.channel, trace.source, is_control)
     try:
-        table = shown_table(session, settings, trace, amplitude)
+        table = shown_table(session, settings, trace, amplitude, alone=alone)
     except Invalid as error:
         return UsableSteps(*named, 0, 0, 0, f"{error.detail} {error.hint}".strip().rstrip("."))
     steps = int(np.sum(table.t_s > 0))

@@ -31,7 +31,7 @@ from app.study.recordings.facts import (
 )
 from app.study.sessions.charts import control_chart
 from app.study.sessions.data import SessionData
-from app.study.traces import AMPLITUDE_STREAM, session_offset_s, shown_table
+from app.study.traces import AMPLITUDE_STREAM, driving, session_offset_s, shown_table
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def shown_trace(session: StudySession, data: SessionData | None, traces: Mapping
         has_any = data is not None and (control is not None or data.table.amplitude_trace is not None)
         chart = control_chart(data) if data is not None and has_any else None
         return TraceView(data, chart, True, options, control.id if control else None, _ids(data))
-    amplitude = next((t for t in traces[chosen.recording_id] if t.stream == AMPLITUDE_STREAM), None)
+    amplitude = driving(session, traces[chosen.recording_id])
     try:
         other = SessionData(session, settings, shown_table(session, settings, chosen, amplitude))
     except Invalid as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -65,12 +66,16 @@ def facts(*sides: Side) -> Facts:
 
 
 def test_all_sides_and_programs_count_by_their_pulses() -> None:
-    left = Side("left", 1, 0, True, 0.5, 0.25, 1.0, 1.0)  # cDBS 2 mA: 4 mA^2
-    right = Side("right", 2, 0, False, 1.0, 1.0, 3.0, 9.0)
+    left = Side("left", 1, 0, True, 0.5, 0.25, 1.0, 1.0, 2.0)
+    right = Side("right", 2, 0, False, 1.0, 1.0, 3.0, 9.0, 3.0)
     pulses = {(1, 0): Pulses(60.0, 130.0), (2, 0): Pulses(60.0, 65.0)}
     found = taken(facts(left, right), pulses, None).values
     assert found[Measure.ALL_SIDES] == pytest.approx((2 * 1 + 9) / (2 * 4 + 9))
     assert found[Measure.CHARGE] == pytest.approx((1e-3 * 130 + 3e-3 * 65) * 60)
+    silent = replace(right, fraction=0.0, square=0.0, milliamperes=0.0, square_ma2=0.0)
+    assert taken(facts(left, silent), pulses, None).values[Measure.ALL_SIDES] == pytest.approx(2 * 1 / (2 * 4 + 9))
+    assert Measure.ALL_SIDES not in taken(facts(left, silent), {(1, 0): Pulses(60.0, 130.0)}, None).values
+    assert taken(facts(replace(silent, name="left"), silent), {}, None).values[Measure.ALL_SIDES] == 0.0
     partly = taken(facts(left, right), {(1, 0): Pulses(60.0, 130.0)}, 1000.0)
     assert (partly.values, partly.unknown_sides) == ({}, 1)
 
