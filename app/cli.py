@@ -21,6 +21,7 @@ from app.accounts import service as accounts
 from app.accounts.models import Role, Scope
 from app.accounts.permissions import SYSTEM
 from app.platform import logs
+from app.platform.audit.commands import app as audit_app
 from app.platform.database import database_place, supervise_database, transaction
 from app.platform.errors import BetaloopError
 from app.platform.tables import load_tables
@@ -36,6 +37,7 @@ app.add_typer(token_app, name="token")
 study_app = typer.Typer(no_args_is_help=True, help="Whole studies.")
 app.add_typer(study_app, name="study")
 app.add_typer(ingest_app, name="ingest")
+app.add_typer(audit_app, name="audit")
 app.add_typer(upkeep_app)
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
@@ -66,6 +68,7 @@ def serve(
 
     from app.ingest.uploads.interrupted import keep_resuming
     from app.main import create_app
+    from app.platform.audit.chain import keep_sealing
     from app.platform.jobs.children import limited
     from app.platform.migrate import migrate as bring_up_to_date
 
@@ -80,6 +83,7 @@ def serve(
     limited.prepare()  # before the first upload, which would wait for it
     # beside the service, for reading what a crash left behind may take minutes
     threading.Thread(target=keep_resuming, args=("the service", threading.Event()), daemon=True).start()
+    threading.Thread(target=keep_sealing, args=(threading.Event(),), daemon=True).start()
     uvicorn.run(
         service, host=host or settings.host, port=port or settings.port, log_level=settings.log_level.lower(), access_log=False,
         timeout_graceful_shutdown=3, timeout_keep_alive=75,

@@ -10,13 +10,14 @@ from typing import Any
 
 import plotly
 import structlog
-from fastapi import APIRouter, FastAPI, Response
+from fastapi import APIRouter, Depends, FastAPI, Response
 from fastapi.openapi.utils import get_openapi
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from starlette.concurrency import run_in_threadpool
 
 from app import __version__
+from app.accounts.deps import results_viewed
 from app.platform import logs
 from app.platform.database import Db, check_connection
 from app.platform.errors import DatabaseAway
@@ -94,6 +95,11 @@ class _Static(StaticFiles):
         return response
 
 
+def _watched(module: str) -> list[Any]:
+    """What routes of a module depend on beside their own: analyses tell the audit trail who looked at results."""
+    return [Depends(results_viewed)] if module.startswith("app.analysis.") else []
+
+
 def create_app() -> FastAPI:
     """Build the service. The database is reached at the first request, not here."""
     load_tables()
@@ -104,10 +110,10 @@ def create_app() -> FastAPI:
     web.install(app)
     api = APIRouter(prefix="/api/v1")
     for name in API_MODULES:
-        api.include_router(import_module(name).router)
+        api.include_router(import_module(name).router, dependencies=_watched(name))
     app.include_router(api)
     for name in PAGE_MODULES:
-        app.include_router(import_module(name).router, include_in_schema=False)
+        app.include_router(import_module(name).router, include_in_schema=False, dependencies=_watched(name))
     app.include_router(_service_routes())
     app.mount("/static/plotly", CompressedFiles(packages=[(plotly.__name__, "package_data")]))
     app.mount("/static", _Static(directory=STATIC))

@@ -16,6 +16,7 @@ from app.accounts import repository
 from app.accounts.addresses import LONGEST_ADDRESS, normal_address
 from app.accounts.models import ApiToken, Membership, Role, Scope, SignIn, SignInAttempt, Study, User
 from app.accounts.permissions import MANAGE_ACCOUNTS, PERMISSIONS, READ_AUDIT, Caller, Grant
+from app.platform.audit import record
 from app.platform.database import new_session, now
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 from app.settings import get_settings
@@ -135,6 +136,9 @@ def sign_in(db: Session, email: str, password: str) -> str:
     # an unknown address costs the same time as a wrong password, so that addresses cannot be guessed by the clock
     ok = _hasher.verify(password, user.password_hash if user else _decoy())
     if not (ok and user and user.active and attempt):
+        # what was typed as an unknown address may be a password
+        record(db, "refuse", "sign_in", user.email if user else "unknown address")
+        db.commit()
         raise Unauthorized("The e-mail address or the password is wrong.")
     repository.forget_failures(db, attempt)
     token = secrets.token_urlsafe(32)

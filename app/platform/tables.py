@@ -8,7 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 
 TABLE_MODULES = (
-    "app.platform.audit",
+    "app.platform.audit.trail",
+    "app.platform.audit.chain",
     "app.platform.files",
     "app.platform.signatures.models",
     "app.platform.jobs.models",

@@ -23,6 +23,7 @@ from app.learning.models import Policy
 from app.overview import repository
 from app.overview.package import recompute
 from app.overview.package.dictionary import FIELDS, TITLES, Days, descriptor
+from app.platform.audit import record
 from app.platform.errors import BetaloopError
 from app.study import blinding, service
 from app.study import repository as study
@@ -39,6 +40,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
     since the participant was enrolled.
     """
     service.require(caller, can.READ, participant)
+    record(db, "export", "participant", participant.id)
     found = primary(db, participant, caller)
     day = Days(participant.created_at)
     sessions, steps = _sessions(db, participant, caller, found, day)

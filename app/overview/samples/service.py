@@ -17,6 +17,7 @@ from app.ingest.repository import file_of_recording
 from app.ingest.uploads.service import options_of_file
 from app.overview.package.dictionary import Days
 from app.platform import files
+from app.platform.audit import record
 from app.platform.errors import BetaloopError, Conflict, Invalid
 from app.platform.jobs.children.child import ChildLimits
 from app.platform.jobs.children.limited import ChildEnded, run_limited
@@ -74,6 +75,7 @@ def session_samples(db: Session, session: StudySession, form: SampleFormat, call
             run_limited(WRITE, params, limits, who=f"samples of {session.visit.participant_id}")
         except ChildEnded as ended:
             raise _not_written(session, ended) from None
+        record(db, "export", "session", session.id, {"format": form.value})
         content = (folder / "samples").open("rb")
         return SampleFile(content, name, (folder / "samples").stat().st_size)
 

@@ -21,6 +21,7 @@ from app.planning.plans.schemas import (
 )
 from app.planning.plans.service import PlanLine, PlanView
 from app.planning.sheet import pdf
+from app.platform.audit import record
 from app.platform.database import Db, now
 from app.platform.web.schemas import problems
 from app.study.deps import CurrentVisit
@@ -63,6 +64,8 @@ def approve_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller, approval: A
 def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
     """The plan as a sheet to print: sessions in order, estimates, blanks to fill in, signatures. A draft says so across every page."""
     view = service.read_plan(db, visit, caller)
+    record(db, "download", "plan", view.plan.id)
+    db.commit()
     name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
     return Response(
         pdf.render(view, caller.label, now()), media_type="application/pdf", headers={"Content-Disposition": f'inline; filename="{name}"'}

@@ -27,7 +27,8 @@ from sqlalchemy import Engine, inspect, make_url, text
 
 from app import __version__
 from app.platform import files
-from app.platform.database import database_url, get_engine, now
+from app.platform.audit.chain import seal
+from app.platform.database import database_url, get_engine, now, transaction
 from app.platform.embedded.server import wheel_binaries
 from app.platform.errors import BetaloopError
 from app.platform.migrate import migrate
@@ -102,6 +103,8 @@ def backup(folder: Path, key_file: Path) -> dict[str, Any]:
     with get_engine().connect() as connection:
         revision = connection.scalar(text("select version_num from alembic_version"))
     manifest: dict[str, Any] = {"form": FORM, "betaloop": __version__, "made_at": now().isoformat(), "revision": revision, "parts": {}}
+    with transaction("backup") as db:
+        seal(db)
     with _sealed(folder / DATABASE, key) as out:
         _dump(out)
     names = _stored()

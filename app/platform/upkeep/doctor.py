@@ -14,6 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from app.platform import files
+from app.platform.audit.chain import verify
 from app.platform.database import new_session, now
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.service import STALE_S
@@ -39,11 +40,12 @@ class Finding:
 
 
 def examine(hashes: bool = False) -> list[Finding]:
-    """Every check; `hashes` reads every stored file whole."""
+    """Every check; `hashes` reads every stored file and the audit trail whole."""
     found = [_disk(), _closed()]
     try:
         with new_session() as db:
-            return [*found, _schema(db), _clock(db), _files(db, hashes), *_jobs(db)]
+            trail = [_trail(db)] if hashes else []
+            return [*found, _schema(db), _clock(db), _files(db, hashes), *trail, *_jobs(db)]
     except (SQLAlchemyError, RuntimeError) as error:
         reason = str(getattr(error, "orig", error)).strip().splitlines()
         detail = f"it does not answer: {reason[0] if reason else type(error).__name__}"
@@ -68,6 +70,13 @@ def _schema(db: Session) -> Finding:
     has, needs = revision(db), newest_revision()
     hint = "Run `betaloop migrate`; where the database is newer than the program, install the newer betaloop."
     return Finding("database", has == needs, f"answers; schema {has or 'none'}, this betaloop needs {needs}", "" if has == needs else hint)
+
+
+def _trail(db: Session) -> Finding:
+    found = verify(db)
+    hint = "" if found.whole else "See `betaloop audit verify`; somebody changed the trail past the service."
+    detail = f"{found.links} links, sealed up to {found.sealed_to}" if found.whole else f"broken at {len(found.breaks)} places"
+    return Finding("audit trail", found.whole, detail, hint)
 
 
 def _clock(db: Session) -> Finding:

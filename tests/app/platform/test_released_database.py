@@ -23,6 +23,7 @@ from app.accounts import repository as accounts_repository
 from app.accounts import service as accounts
 from app.main import create_app
 from app.platform.database import Base
+from app.platform.files import path_of
 from app.platform.tables import load_tables
 from tests.conftest import RELEASED_DUMP
 
@@ -54,6 +55,12 @@ ABSENT = {
 }
 # a proposed session is shown by its own page: (route, rows that are sent elsewhere)
 ELSEWHERE = {"/sessions/{session_id}": "select id from session where status = 'proposed'"}
+# what is read from uploaded files, of which only small ones are kept here: the answer is 409 where a session's are not
+FROM_FILES = {"/api/v1/sessions/{session_id}/samples"}
+FILES = (
+    "select g.session_id, f.stored_sha256 from session_segment g join recording r on r.id = g.recording_id"
+    " join upload_file f on f.id = r.upload_file_id"
+)
 # pages for who is not signed in
 SIGNED_OUT = {"/sign-in"}
 
@@ -62,6 +69,12 @@ def rows(query: str) -> list[Any]:
     """The first column of a query's rows."""
     with database.new_session() as db:
         return sorted(db.scalars(text(query)))
+
+
+def without_files() -> set[int]:
+    """Sessions of which an uploaded file is not kept."""
+    with database.new_session() as db:
+        return {session for session, sha256 in db.execute(text(FILES)) if not path_of(sha256).exists()}
 
 
 def readable(app: Any) -> set[str]:
@@ -95,17 +108,20 @@ def unexpected(client: TestClient, paths: set[str]) -> dict[str, int]:
     ids = {name: rows(query) for name, query in IDS.items()}
     assert all(ids.values()), "the dump has rows of every kind"
     found = {}
+    gone = without_files()
     for path in sorted(paths):
         absent, elsewhere = (rows(table[path]) if path in table else [] for table in (ABSENT, ELSEWHERE))
         rights = set()
         for values in calls(path, ids):
             row = next(iter(values.values()), None)
             right = 404 if row in absent else 303 if row in elsewhere or path in SIGNED_OUT else 200
+            if path in FROM_FILES and row in gone:
+                right = 409
             rights.add(right)
             status = opened(client, path, values)
             if status != right:
                 found[f"{path.format(**values)} (not {right})"] = status
-        if 200 not in rights and path not in SIGNED_OUT:
+        if 200 not in rights and path not in SIGNED_OUT | FROM_FILES:
             found[f"{path}: no row of IDS can be opened"] = 404
     return found
 

@@ -17,6 +17,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import create_engine, inspect
 
 from app import main
+from app.platform.audit.chain import seal
 from app.platform.database import transaction
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.embedded.system_user import system_user
@@ -52,6 +53,8 @@ def filled(client: TestClient, enrolled: str) -> dict[str, int]:
         data={"participant": enrolled, "visit": "1", "controller": "random", "started_at": "2026-03-02T10:00:00Z"},
     )
     assert sent.status_code == 201, sent.text
+    with transaction("test") as db:
+        seal(db)  # a backup seals the trail first
     return rows()
 
 
@@ -88,6 +91,9 @@ def test_a_backup_comes_back_in_a_new_data_folder(place: Path, filled: dict[str,
     assert json.loads(done.stdout)["files"] == filled["stored_file"] > 0
     doctor = betaloop(new, "doctor", "--hashes", "--json")
     assert doctor.returncode == 0, doctor.stdout + doctor.stderr
+    trail = json.loads(betaloop(new, "audit", "verify", "--json").stdout)
+    assert trail["whole"]
+    assert 0 < trail["sealed_to"] <= trail["links"]
     again = betaloop(new, "restore", str(folder), "--key-file", str(key))
     assert again.returncode == 1
     assert "holds data already" in again.stderr

@@ -1,14 +1,17 @@
-"""The audit trail: one row for every write, made by triggers in the database, so that no code path can forget it."""
+"""Rows of the audit trail: one for every write, made by triggers in the database, so that no code path can forget it.
+
+What changes no row and must be known all the same (a refused sign-in, a record or a bundle that left) is told to `record`.
+"""
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import BigInteger, Index, String, Text, func
-from sqlalchemy.orm import Mapped, mapped_column
+from sqlalchemy import BigInteger, Index, String, Text, func, select
+from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from app.platform.database import Base
+from app.platform.database import Base, now
 
 
 class AuditEvent(Base):
@@ -74,3 +77,40 @@ AUDITED: dict[str, tuple[str, ...]] = {
 }
 """Audited tables and the columns left out of what is shown: secrets, bulk arrays and live progress. Every change makes a row, except of
 last-seen times and live progress alone."""
+
+
+VIEW_EVERY = timedelta(minutes=15)
+"""A page that is reloaded is one view."""
+
+
+def record(db: Session, action: str, entity: str, entity_id: str | int, details: dict[str, Any] | None = None) -> None:
+    """Put something into the trail that changed no row: who did it stands in the session (`set_actor`). The caller commits.
+
+    Args:
+        action: a verb of at most ten letters, e.g. `export`, `download`, `refuse`, `view`.
+        entity, entity_id: what it was done to.
+        details: what else is to be known, without identity.
+    """
+    actor = db.info.get("actor", {"label": "system"})
+    row = AuditEvent(
+        actor=actor["label"],
+        user_id=actor.get("user_id"),
+        request_id=actor.get("request_id"),
+        reason=actor.get("reason"),
+        action=action,
+        entity=entity,
+        entity_id=str(entity_id),
+        after=details,
+    )
+    db.add(row)
+    db.flush()
+
+
+def record_view(db: Session, what: str) -> bool:
+    """Record that the acting user looked at `what`, once in VIEW_EVERY; whether a row was written. The caller commits."""
+    user_id = db.info.get("actor", {}).get("user_id")
+    same = (AuditEvent.entity == "results") & (AuditEvent.entity_id == what) & (AuditEvent.user_id == user_id)
+    if db.scalar(select(AuditEvent.id).where(same, AuditEvent.at > now() - VIEW_EVERY).limit(1)) is not None:
+        return False
+    record(db, "view", "results", what)
+    return True

@@ -1,0 +1,245 @@
+"""Hashes that chain the audit trail, and seals of the chain with a key that no SQL can read.
+
+A trigger at the end of each transaction gives every row of the trail a link: its place and a SHA-256 over the digest of the link before
+and the row. An edit, a gap, a row put in or links put into another order break it. Who owns the tables could compute the whole chain
+anew, or cut off its end: seals hold the digest at a place under an HMAC whose key lies in the data folder, in the database and in a
+file of that folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+from pathlib import Path
+
+import structlog
+from sqlalchemy import BigInteger, LargeBinary, func, select, text
+from sqlalchemy.dialects.postgresql import insert
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Mapped, Session, mapped_column
+
+from app.platform.audit.trail import AUDITED
+from app.platform.database import Base, transaction
+from app.settings import get_settings, private_folder
+
+GENESIS = hashlib.sha256(b"betaloop audit trail").digest()
+SECRET = "audit-seals"
+SEAL_EVERY_S = 60.0
+MOST_BREAKS = 100
+"""After so many the rest is not looked for: the trail is broken, and one wants to know where it begins."""
+NEVER_CHANGED = ("audit_event", "audit_link", "audit_seal")
+
+
+class AuditLink(Base):
+    """The place of a row of the trail in the chain. Insert only, and by the trigger alone.
+
+    There is no foreign key: a row that somebody took out of the trail must stay seen.
+    """
+
+    __tablename__ = "audit_link"
+
+    position: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
+    event_id: Mapped[int] = mapped_column(BigInteger, unique=True)
+    digest: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class AuditSeal(Base):
+    """The digest of the chain at a place, under the key of the installation. Insert only."""
+
+    __tablename__ = "audit_seal"
+
+    position: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
+    digest: Mapped[bytes] = mapped_column(LargeBinary)
+    mac: Mapped[bytes] = mapped_column(LargeBinary)
+    made_at: Mapped[datetime] = mapped_column(server_default=func.clock_timestamp())
+
+
+class BreakKind(StrEnum):
+    """What is wrong at a place of the chain."""
+
+    EDITED = "edited"
+    REMOVED = "removed"
+    ADDED = "added"
+    GAP = "gap"
+    REWRITTEN = "rewritten"
+    FORGED_SEAL = "forged_seal"
+    CUT_OFF = "cut_off"
+    TRIGGER_OFF = "trigger_off"
+
+
+@dataclass(frozen=True)
+class Break:
+    """One break: its place in the chain, the number of the row of the trail, and the table whose trigger is off, as far as they apply."""
+
+    kind: BreakKind
+    position: int | None = None
+    event_id: int | None = None
+    table: str | None = None
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What a look at the whole trail found.
+
+    Attributes:
+        links: how long the chain is. seals: how many seals were held against it. sealed_to: the last sealed place; 0 where there is none.
+        breaks: in the order of their places, at most MOST_BREAKS.
+    """
+
+    links: int
+    seals: int
+    sealed_to: int
+    breaks: tuple[Break, ...]
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing is broken."""
+        return not self.breaks
+
+
+def digest_of(previous: bytes, fields: Sequence[str | None]) -> bytes:
+    """The digest of a link: SHA-256 over the digest before it and the row's fields, each with its length (-1 where null)."""
+    found = hashlib.sha256(previous)
+    for field in fields:
+        raw = b"" if field is None else field.encode()
+        found.update((-1 if field is None else len(raw)).to_bytes(4, "big", signed=True) + raw)
+    return found.digest()
+
+
+def seal(db: Session) -> int:
+    """Seal the chain at its end, in the database and in a file of the data folder; returns the place. The caller commits.
+
+    A chain that stands at its last seal is not sealed again.
+    """
+    last = db.scalars(select(AuditLink).order_by(AuditLink.position.desc()).limit(1)).first()
+    if last is None or db.get(AuditSeal, last.position) is not None:
+        return last.position if last else 0
+    mac = _mac(last.position, last.digest)
+    row = insert(AuditSeal).values(position=last.position, digest=last.digest, mac=mac)
+    db.execute(row.on_conflict_do_nothing())  # another process of the service may seal the same place
+    _write_line({"position": last.position, "digest": last.digest.hex(), "mac": mac.hex()})
+    return last.position
+
+
+def keep_sealing(stop: threading.Event) -> None:
+    """Seal the chain whenever it has grown, once a minute, until `stop` is set."""
+    log, told = structlog.get_logger(), False
+    while not stop.wait(SEAL_EVERY_S):
+        try:
+            with transaction("the service") as db:
+                seal(db)
+            told = False
+        except (SQLAlchemyError, OSError) as error:
+            if not told:
+                log.error("the audit trail cannot be sealed", error=type(error).__name__)
+            told = True
+
+
+def verify(db: Session) -> Verified:
+    """Compute the whole chain again and hold every seal against it."""
+    digests: dict[int, bytes] = {}
+    wanted = [*_seals_of_database(db), *_seals_of_file()]
+    places = {place for place, _, _ in wanted}
+    breaks, links, before = [], 0, GENESIS
+    for position, event_id, stored, fields in _links(db):
+        links += 1
+        if position != links:
+            breaks.append(Break(BreakKind.GAP, links))
+            links = position
+        if fields is None:
+            breaks.append(Break(BreakKind.REMOVED, position, event_id))
+        elif digest_of(before, fields) != stored:
+            breaks.append(Break(BreakKind.EDITED, position, event_id))
+        before = stored
+        if position in places:
+            digests[position] = stored
+        if len(breaks) >= MOST_BREAKS:
+            break
+    if len(breaks) < MOST_BREAKS:
+        breaks += [Break(BreakKind.ADDED, event_id=i) for i in _unlinked(db)]
+        breaks += _against_seals(wanted, digests, links)
+        breaks += [Break(BreakKind.TRIGGER_OFF, table=name) for name in _without_trigger(db)]
+    return Verified(links, len(places), max(places, default=0), tuple(breaks[:MOST_BREAKS]))
+
+
+def _against_seals(wanted: Sequence[tuple[int, bytes, bytes]], digests: dict[int, bytes], links: int) -> list[Break]:
+    found = []
+    for position, digest, mac in sorted(set(wanted)):
+        if not hmac.compare_digest(mac, _mac(position, digest)):
+            found.append(Break(BreakKind.FORGED_SEAL, position))
+        elif position > links:
+            found.append(Break(BreakKind.CUT_OFF, position))
+        elif digests.get(position) != digest:
+            found.append(Break(BreakKind.REWRITTEN, position))
+    return found
+
+
+def _links(db: Session) -> Iterator[tuple[int, int, bytes, list[str | None] | None]]:
+    """Every link in order: its place, row, digest, and the row's fields as text; None where the row is gone."""
+    rows = db.execute(
+        text(
+            "select l.position, l.event_id, l.digest, e.id::text, (extract(epoch from e.at) * 1000000)::bigint::text, e.actor,"
+            " e.user_id::text, e.request_id, e.action, e.entity, e.entity_id, e.before::text, e.after::text, e.reason"
+            " from audit_link l left join audit_event e on e.id = l.event_id order by l.position"
+        ).execution_options(yield_per=1000)
+    )
+    for position, event_id, digest, *fields in rows:
+        yield position, event_id, bytes(digest), None if fields[0] is None else list(fields)
+
+
+def _unlinked(db: Session) -> list[int]:
+    """Rows of the trail without a link: put in while the trigger was off."""
+    statement = (
+        "select e.id from audit_event e left join audit_link l on l.event_id = e.id where l.event_id is null order by e.id limit :most"
+    )
+    return list(db.scalars(text(statement), {"most": MOST_BREAKS}))
+
+
+def _without_trigger(db: Session) -> list[str]:
+    """Tables whose changes would not reach the trail, or not the chain, or that could be changed."""
+    wanted = {(table, "audit") for table in AUDITED} | {(table, "never_changed") for table in NEVER_CHANGED} | {("audit_event", "chained")}
+    statement = (
+        "select c.relname, t.tgname from pg_trigger t join pg_class c on c.oid = t.tgrelid"
+        " where t.tgenabled in ('O', 'A') and not t.tgisinternal and c.relnamespace = 'public'::regnamespace"
+    )
+    there = {(table, name) for table, name in db.execute(text(statement))}
+    return sorted({table for table, name in wanted - there})
+
+
+def _seals_of_database(db: Session) -> list[tuple[int, bytes, bytes]]:
+    return [(s.position, s.digest, s.mac) for s in db.scalars(select(AuditSeal).order_by(AuditSeal.position))]
+
+
+def _seals_of_file() -> list[tuple[int, bytes, bytes]]:
+    """Seals of the file; a line that was cut by a crash while it was written is none."""
+    found = []
+    path = _file()
+    for line in path.read_text().splitlines() if path.exists() else ():
+        try:
+            said = json.loads(line)
+            found.append((int(said["position"]), bytes.fromhex(said["digest"]), bytes.fromhex(said["mac"])))
+        except (ValueError, KeyError, TypeError):
+            continue
+    return found
+
+
+def _mac(position: int, digest: bytes) -> bytes:
+    return hmac.new(get_settings().secret(SECRET), position.to_bytes(8, "big") + digest, hashlib.sha256).digest()
+
+
+def _file() -> Path:
+    """Where seals are kept out of the reach of SQL."""
+    return private_folder(get_settings().data_dir / "audit") / "seals.jsonl"
+
+
+def _write_line(said: dict[str, object]) -> None:
+    with open(os.open(_file(), os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), "ab", buffering=0) as out:
+        out.write(json.dumps(said).encode() + b"\n")
+        os.fsync(out.fileno())

@@ -1,0 +1,60 @@
+"""Commands of the audit trail: `betaloop audit verify` and `betaloop audit seal`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from app.platform.audit.chain import Break, BreakKind, Verified, seal, verify
+from app.platform.database import new_session, transaction
+
+app = typer.Typer(no_args_is_help=True, help="The audit trail.")
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+@app.command("verify", epilog="Example: betaloop audit verify")
+def verify_(as_json: AsJson = False) -> None:
+    """Compute the hash chain of the audit trail again and hold its seals against it; exit code 1 where it is broken."""
+    with new_session() as db:
+        found = verify(db)
+    _print(json.dumps(asdict(found) | {"whole": found.whole}) if as_json else "\n".join(sentences(found)))
+    if not found.whole:
+        raise typer.Exit(1)
+
+
+@app.command("seal", epilog="Example: betaloop audit seal")
+def seal_() -> None:
+    """Seal the chain at its end now; the service does so once a minute."""
+    with transaction("command line") as db:
+        place = seal(db)
+    _print(f"The audit trail is sealed up to link {place}." if place else "The audit trail is empty.")
+
+
+def sentences(found: Verified) -> list[str]:
+    """What was found, a line each."""
+    if found.whole:
+        sealed = f"sealed up to link {found.sealed_to}" if found.sealed_to else "not sealed yet"
+        return [f"The audit trail is whole: {found.links} links, {sealed}."]
+    return [f"The audit trail is broken at {len(found.breaks)} places:", *(f"  {_sentence(b)}" for b in found.breaks)]
+
+
+def _sentence(b: Break) -> str:
+    return {
+        BreakKind.EDITED: f"link {b.position}: row {b.event_id} is not what was written",
+        BreakKind.REMOVED: f"link {b.position}: row {b.event_id} was taken out",
+        BreakKind.ADDED: f"row {b.event_id} was put in past the chain",
+        BreakKind.GAP: f"link {b.position} is missing",
+        BreakKind.REWRITTEN: f"link {b.position} is not the one that was sealed: the chain was computed anew",
+        BreakKind.FORGED_SEAL: f"the seal of link {b.position} was not made with this installation's key",
+        BreakKind.CUT_OFF: f"link {b.position} was sealed and is gone: the end of the trail was cut off",
+        BreakKind.TRIGGER_OFF: f"table {b.table}: a trigger of the trail is missing or switched off",
+    }[b.kind]
+
+
+def _print(line: str) -> None:
+    Console(soft_wrap=True, highlight=False, markup=False).print(line)
