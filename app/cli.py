@@ -62,6 +62,8 @@ def main() -> None:
 def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
     port: Annotated[int | None, typer.Option(help="Port to listen on.")] = None,
+    tls_certificate: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Serve over TLS: chain, PEM.")] = None,
+    tls_key: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Its private key, PEM.")] = None,
 ) -> None:
     """Serve the web pages and the REST interface. Jobs need a worker beside it (`betaloop worker`)."""
     import uvicorn
@@ -73,12 +75,18 @@ def serve(
     from app.platform.migrate import migrate as bring_up_to_date
 
     logs.configure()
+    if (tls_certificate is None) != (tls_key is None):
+        raise typer.BadParameter("TLS needs both --tls-certificate and --tls-key")
     bring_up_to_date()
     settings = get_settings()
+    if tls_certificate is not None:
+        settings.cookie_secure = True
     supervise_database()
     structlog.get_logger().info("database", lies_in=database_place())
     if (host or settings.host) not in LOOPBACK and not settings.cookie_secure:
-        structlog.get_logger().warning("other machines reach this service without TLS: use a TLS proxy and set BETALOOP_COOKIE_SECURE")
+        structlog.get_logger().warning(
+            "other machines reach this service without TLS: give --tls-certificate, or use a TLS proxy and set BETALOOP_COOKIE_SECURE"
+        )
     service = create_app()
     limited.prepare()  # before the first upload, which would wait for it
     # beside the service, for reading what a crash left behind may take minutes
@@ -86,7 +94,7 @@ def serve(
     threading.Thread(target=keep_sealing, args=(threading.Event(),), daemon=True).start()
     uvicorn.run(
         service, host=host or settings.host, port=port or settings.port, log_level=settings.log_level.lower(), access_log=False,
-        timeout_graceful_shutdown=3, timeout_keep_alive=75,
+        timeout_graceful_shutdown=3, timeout_keep_alive=75, ssl_certfile=tls_certificate, ssl_keyfile=tls_key,
     )  # fmt: skip
 
 

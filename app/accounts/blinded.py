@@ -23,6 +23,10 @@ OPEN = (
     ("PUT", "/api/v1/sessions/[0-9]+/qoc"),
     ("POST", "/sessions/[0-9]+/qoc"),
     ("POST", "/api/v1/participants/[^/]+/adverse-events"),
+    ("GET", "/visit-day/(key|[0-9]+)"),
+    ("POST", "/visit-day/[0-9]+"),
+    ("GET", "/api/v1/visits/[0-9]+/day(/entries)?"),
+    ("POST", "/api/v1/visits/[0-9]+/day/entries"),
 )
 """Method and path, as a regular expression. What these show of a visit that is not locked goes through `app.study.blinding`."""
 

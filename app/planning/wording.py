@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from app.evaluation.wording import amplitude, chance
 from app.planning.plans.designs import Bound, Planned, delivered_ma
 from app.planning.plans.models import PlanItem
+from app.planning.visit_day.record import Contradiction, Entry, grasp_hz, moment
+from app.planning.visit_day.schemas import SlotOut
+from app.planning.visit_day.screening import Found
 from ml.deploy.manifest import BundleManifest
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
 from ml.ope.posterior.portfolio import Suggestion
@@ -41,6 +46,35 @@ def suggestion(why: Suggestion, first: bool) -> str:
 
 TELLING = 0.2
 """Share of what is open about the other candidates from which a policy's test is said to tell about them."""
+
+
+def screened(found: Sequence[Found]) -> str:
+    """Why a note is not kept, in one sentence."""
+    what = {"date": "a date", "number": "a number of four or more digits", "address": "an address", "name": "a word that looks like a name"}
+    return "The note holds " + "; ".join(f"{what[f.kind]} ('{f.text}')" for f in found) + "."
+
+
+DAY_STATES = {"waiting": "to come", "running": "running", "asked": "to be rated", "done": "finished", "skipped": "skipped"}
+"""How far a session of the clinic day is."""
+_MATTERS = {
+    "start": "starts", "stop": "stops", "stop_cause": "causes of the early stop", "rating": "ratings", "grasp": "grasp tests",
+    "skip": "reasons for skipping it", "speech": "grades of speech", "gait": "grades of gait", "dyskinesia": "grades of dyskinesia",
+}  # fmt: skip
+
+
+def contradiction(found: Contradiction, slots: Sequence[SlotOut]) -> str:
+    """What two entries say differently, in one sentence."""
+    position = next((slot.position for slot in slots if slot.plan_item_id == found.plan_item_id), 0)
+    said = ", ".join(f"{_entered(entry)} by {entry.entered_by} at {moment(entry):%H:%M:%S} UTC" for entry in found.entries)
+    what = _MATTERS.get(found.kind, "entries")
+    return f"Session {position} has {len(found.entries)} different {what}: {said}. None counts until one is chosen."
+
+
+def _entered(entry: Entry) -> str:
+    payload = entry.payload
+    if entry.kind == "grasp":
+        return f"{grasp_hz(payload):.2f} Hz"
+    return str(payload.get("value") or payload.get("grade") or payload.get("reason") or payload.get("cause") or entry.kind)
 
 
 def design_name(planned: Planned) -> str:

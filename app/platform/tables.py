@@ -23,6 +23,7 @@ TABLE_MODULES = (
     "app.evaluation.models",
     "app.planning.plans.models",
     "app.planning.bundles.models",
+    "app.planning.visit_day.models",
 )
 
 

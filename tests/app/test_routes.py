@@ -47,6 +47,8 @@ READABLE = (
     "/api/v1/participants/{code}/jobs",
     "/api/v1/jobs/{job_id}",
     "/api/v1/jobs/{job_id}/events",
+    "/api/v1/visits/{visit_id}/day",
+    "/api/v1/visits/{visit_id}/day/entries",
     "/api/v1/visits/{visit_id}/plan",
     "/api/v1/visits/{visit_id}/plan.pdf",
     "/api/v1/bundle-key",
@@ -97,6 +99,7 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("post", "/api/v1/jobs/{job_id}/retry"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/visits/{visit_id}/plan"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/visits/{visit_id}/plan/approve"): {"clinician", "admin"},
+    ("post", "/api/v1/visits/{visit_id}/day/entries"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/participants/{code}/buffer-gate"): {"clinician", "admin"},
     ("get", "/api/v1/policies/{policy_id}/bundle"): {"clinician", "engineer", "admin"},
     **{("get", path): EVERYONE for path in READABLE},
@@ -110,6 +113,9 @@ BLINDED = {
     ("get", "/api/v1/participants/{code}/visits"),
     ("get", "/api/v1/visits/{visit_id}"),
     ("get", "/api/v1/visits/{visit_id}/locks"),
+    ("get", "/api/v1/visits/{visit_id}/day"),
+    ("get", "/api/v1/visits/{visit_id}/day/entries"),
+    ("post", "/api/v1/visits/{visit_id}/day/entries"),
     ("get", "/api/v1/visits/{visit_id}/sessions"),
     ("get", "/api/v1/sessions/{session_id}"),
     ("get", "/api/v1/sessions/{session_id}/qoc"),
@@ -126,6 +132,9 @@ Json = dict[str, Any]
 TABLE = b"t_s,beta,amplitude_fraction\n" + b"".join(b"%d,1,1\n" % (2 * k) for k in range(21))
 GRASPS = b"t_s\n" + b"".join(b"%.2f\n" % (0.4 * k) for k in range(11))
 SPEECH = {"kind": "speech", "severity": "severe", "serious": True}
+RATED = {
+    "uuid": "0b6e2a8c-6f43-4c58-9d3a-2f1a7f4f0c11", "kind": "rating", "payload": {"value": 7}, "device_time": "2026-11-22T10:00:00Z",
+}  # fmt: skip
 PASSWORD = "a password of the test"
 
 
@@ -155,6 +164,11 @@ class World:
         first = {"policy_ids": [ranking["policies"][0]["policy_id"]], "seed": 1}
         # by somebody who signs no plan of these tests
         assert self.calling(token_of("engineer", name="drafter")).post(f"/api/v1/visits/{open_visit}/plan", json=first).status_code == 201
+        held = self.send("/participants/P2/visits", json={"number": 88})["id"]
+        drafter = self.calling(token_of("engineer", name="second-drafter"))
+        assert drafter.post(f"/api/v1/visits/{held}/plan", json={"random_sessions": 1, "seed": 1}).status_code == 201
+        approved = self.send(f"/visits/{held}/plan/approve", json={"password": PASSWORD})["id"]
+        slot = self.read(f"/visits/{held}/day")["slots"][0]["plan_item_id"]
         jobs = self.read("/participants/P4/jobs")["items"]
         small = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "distilled")
         visit = self.read("/participants/P4/visits")["items"][0]["id"]
@@ -217,6 +231,12 @@ class World:
             ("get", "/visits/{visit_id}/plan"): {"visit_id": open_visit},
             ("get", "/visits/{visit_id}/plan.pdf"): {"visit_id": open_visit},
             ("post", "/visits/{visit_id}/plan/approve"): {"visit_id": open_visit, "json": {"password": PASSWORD}},
+            ("get", "/visits/{visit_id}/day"): {"visit_id": held},
+            ("get", "/visits/{visit_id}/day/entries"): {"visit_id": held},
+            ("post", "/visits/{visit_id}/day/entries"): {
+                "visit_id": held,
+                "json": {"plan_id": approved, "entries": [RATED | {"plan_item_id": slot}]},
+            },
             ("post", "/participants/{code}/buffer-gate"): {"json": {"choice": "open", "reason": "agreed in the trial meeting"}},
         }
 

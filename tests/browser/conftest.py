@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -58,12 +60,33 @@ class Watched:
         return len(charts)
 
 
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    """A running Chromium, for one module: its event loop must not outlive the browser tests. Skips where there is none."""
+def program() -> str:
+    """Path of Chromium. Skips where there is none."""
     path = os.environ.get("BETALOOP_CHROMIUM") or next(filter(None, map(shutil.which, PROGRAMS)), None)
     if path is None:
         pytest.skip("no Chromium here: install it, or name its program in BETALOOP_CHROMIUM")
+    return path
+
+
+def kill_browser(profile: str) -> None:
+    """End the browser that has this profile as an empty battery would: at once, and without a word to it."""
+    found = 0
+    for folder in Path("/proc").iterdir():
+        if not folder.name.isdecimal():
+            continue
+        try:
+            if f"--user-data-dir={profile}" in (folder / "cmdline").read_bytes().decode():
+                os.kill(int(folder.name), signal.SIGKILL)
+                found += 1
+        except (FileNotFoundError, ProcessLookupError):
+            continue  # it ended meanwhile
+    assert found, f"no browser has the profile {profile}"
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """A running Chromium, for one module: its event loop must not outlive the browser tests. Skips where there is none."""
+    path = program()
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:

@@ -73,6 +73,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "plan_item": (),
     "bundle_release": (),
     "signature": ("content",),
+    "day_entry": (),
     "job": ("progress", "message", "updated_at"),
 }
 """Audited tables and the columns left out of what is shown: secrets, bulk arrays and live progress. Every change makes a row, except of

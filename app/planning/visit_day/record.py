@@ -1,0 +1,228 @@
+"""What the entries of a clinic day amount to. `static/visit-day/record.js` does the same on the tablet.
+
+Entries are only added. Those that a later entry names in `replaces` no longer stand; where two stand that say different things of the same
+matter (two tablets, or two people), nothing is taken until somebody decides between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from ml.qoc import grasp_frequency
+
+SAME_MOMENT_S = 5.0
+"""Two starts (or stops) of one session within this time are the same event pressed twice."""
+SEVERE = "severe"
+GRADED = ("dyskinesia", "speech", "gait")
+
+
+State = Literal["waiting", "running", "asked", "done", "skipped"]
+_STATES: tuple[tuple[str, State], ...] = (("skip", "skipped"), ("session_end", "done"), ("stop", "asked"), ("start", "running"))
+
+
+class Entry(Protocol):
+    """What is read of an entry."""
+
+    uuid: Any
+    plan_item_id: Any
+    attempt: Any
+    kind: Any
+    payload: Any
+    replaces: Any
+    device_time: Any
+    clock_offset_ms: Any
+    entered_by: Any
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One run of a session. Times are the service's: the tablet's clock with its offset.
+
+    Attributes:
+        number: 1, and one more after every repeat. started_at, stopped_at: None where not entered, or where two entries contradict.
+        repeated_because: why it was run again; None for the last one.
+    """
+
+    number: int
+    started_at: datetime | None
+    stopped_at: datetime | None
+    repeated_because: str | None
+
+
+@dataclass(frozen=True)
+class SlotTimes:
+    """When a session of the plan ran.
+
+    Attributes:
+        attempts: in order, the last one counts. skipped_because: None where it was not skipped.
+        stop_cause: `participant`, `technical`, `other`; None where it was not stopped early, or nobody said why. stop_text: in words.
+    """
+
+    attempts: tuple[Attempt, ...]
+    skipped_because: str | None
+    stop_cause: str | None
+    stop_text: str
+
+    @property
+    def started_at(self) -> datetime | None:
+        """Start of the attempt that counts."""
+        return self.attempts[-1].started_at
+
+    @property
+    def stopped_at(self) -> datetime | None:
+        """Its end."""
+        return self.attempts[-1].stopped_at
+
+
+@dataclass(frozen=True)
+class SlotOutcome:
+    """What was entered about the attempt of a session that counts; None where nothing was, or where two entries contradict.
+
+    Attributes:
+        rating: 1 to 10. grasp_hz: Hz. dyskinesia, speech, gait: `none`, `mild` or `severe`. notes: in order.
+        contradictions: kinds of which two different entries stand. entered_by: of rating and grasp, by name.
+    """
+
+    rating: int | None = None
+    grasp_hz: float | None = None
+    dyskinesia: str | None = None
+    speech: str | None = None
+    gait: str | None = None
+    notes: tuple[str, ...] = ()
+    contradictions: tuple[str, ...] = ()
+    entered_by: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """Entries of one matter that say different things, and none replaces the other."""
+
+    plan_item_id: int
+    attempt: int
+    kind: str
+    entries: tuple[Entry, ...]
+
+
+def moment(entry: Entry) -> datetime:
+    """When an entry was made, by the service's clock."""
+    return entry.device_time + timedelta(milliseconds=entry.clock_offset_ms or 0)  # type: ignore[no-any-return]
+
+
+def standing(entries: Iterable[Entry]) -> list[Entry]:
+    """The entries that no other replaces, in the order of their moments."""
+    entries = list(entries)
+    replaced = {str(u) for e in entries for u in e.replaces}
+    return sorted((e for e in entries if str(e.uuid) not in replaced), key=moment)
+
+
+def last_attempt(entries: Iterable[Entry], plan_item_id: int) -> int:
+    """Number of the attempt that counts."""
+    return 1 + max((e.attempt for e in entries if e.plan_item_id == plan_item_id and e.kind == "repeat"), default=0)
+
+
+def agree(one: Entry, other: Entry) -> bool:
+    """Whether two entries of one matter say the same."""
+    if one.kind in ("start", "stop"):
+        return abs((moment(one) - moment(other)).total_seconds()) <= SAME_MOMENT_S
+    if one.kind == "grasp":
+        return grasp_hz(one.payload) == grasp_hz(other.payload)
+    return bool(one.payload == other.payload)
+
+
+def contradictions(entries: Iterable[Entry]) -> list[Contradiction]:
+    """Every matter of which two entries stand that say different things."""
+    matters: dict[tuple[int, int, str], list[Entry]] = {}
+    for entry in standing(entries):
+        if entry.plan_item_id is not None and entry.kind not in ("note", "adverse_event", "clinical_settings", "repeat"):
+            matters.setdefault((entry.plan_item_id, entry.attempt, entry.kind), []).append(entry)
+    return [Contradiction(*key, tuple(rows)) for key, rows in matters.items() if not all(agree(rows[0], row) for row in rows[1:])]
+
+
+def open_severe(entries: Iterable[Entry]) -> Entry | None:
+    """The severe side effect after which nobody has confirmed the clinical settings yet."""
+    rows = standing(entries)
+    severe = [e for e in rows if _grade(e) == SEVERE]
+    confirmed = max((moment(e) for e in rows if e.kind == "clinical_settings"), default=None)
+    return next((e for e in reversed(severe) if confirmed is None or moment(e) >= confirmed), None)
+
+
+def _grade(entry: Entry) -> str | None:
+    if entry.kind in GRADED:
+        return str(entry.payload["grade"])
+    return str(entry.payload["severity"]) if entry.kind == "adverse_event" else None
+
+
+def grasp_hz(payload: dict[str, Any]) -> float:
+    """Grasp frequency of a test, Hz (eq:grasp_speed)."""
+    if payload["method"] == "typed":
+        return float(payload["hz"])
+    return grasp_frequency(np.asarray(payload["taps_s"], dtype=np.float64))
+
+
+def state_of(entries: Sequence[Entry], plan_item_id: int) -> State:
+    """How far a session of the plan is: `asked` after its stop, until somebody says that all is entered."""
+    rows = [e for e in standing(entries) if e.plan_item_id == plan_item_id and e.attempt == last_attempt(entries, plan_item_id)]
+    kinds = {e.kind for e in rows}
+    for kind, state in _STATES:
+        if kind in kinds:
+            return state
+    return "waiting"
+
+
+def times_of(entries: Sequence[Entry]) -> dict[int, SlotTimes]:
+    """When each session ran, by its id in the plan."""
+    found = {}
+    for item in _items(entries):
+        count = last_attempt(entries, item)
+        said = {number: _said(entries, item, number) for number in range(1, count + 1)}
+        attempts = tuple(
+            Attempt(
+                number,
+                moment(about["start"]) if "start" in about else None,
+                moment(about["stop"]) if "stop" in about else None,
+                about["repeat"].payload["reason"] if "repeat" in about else None,
+            )
+            for number, about in said.items()
+        )
+        last = said[count]
+        cause = last["stop_cause"].payload if "stop_cause" in last else {}
+        skipped = last["skip"].payload["reason"] if "skip" in last else None
+        found[item] = SlotTimes(attempts, skipped, cause.get("cause"), cause.get("text", ""))
+    return found
+
+
+def outcomes_of(entries: Sequence[Entry]) -> dict[int, SlotOutcome]:
+    """What was entered about each session, by its id in the plan."""
+    found = {}
+    open_matters = contradictions(entries)
+    for item in _items(entries):
+        number = last_attempt(entries, item)
+        said = _said(entries, item, number)
+        notes = tuple(e.payload["text"] for e in standing(entries) if e.kind == "note" and (e.plan_item_id, e.attempt) == (item, number))
+        found[item] = SlotOutcome(
+            rating=said["rating"].payload["value"] if "rating" in said else None,
+            grasp_hz=grasp_hz(said["grasp"].payload) if "grasp" in said else None,
+            **{name: said[name].payload["grade"] if name in said else None for name in GRADED},
+            notes=notes,
+            contradictions=tuple(c.kind for c in open_matters if (c.plan_item_id, c.attempt) == (item, number)),
+            entered_by={name: said[name].entered_by for name in ("rating", "grasp") if name in said},
+        )
+    return found
+
+
+def _items(entries: Iterable[Entry]) -> list[int]:
+    return sorted({e.plan_item_id for e in entries if e.plan_item_id is not None})
+
+
+def _said(entries: Iterable[Entry], item: int, attempt: int) -> dict[str, Entry]:
+    """By kind, the entry that stands of one attempt; the earliest of several that agree, none where they do not."""
+    rows: dict[str, list[Entry]] = {}
+    for entry in standing(entries):
+        if (entry.plan_item_id, entry.attempt) == (item, attempt):
+            rows.setdefault(entry.kind, []).append(entry)
+    return {kind: those[0] for kind, those in rows.items() if kind == "repeat" or all(agree(those[0], e) for e in those[1:])}

@@ -1,0 +1,280 @@
+"""API types of the clinic day."""
+
+from __future__ import annotations
+
+import datetime as dt
+import itertools
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+from uuid import UUID
+
+from pydantic import AfterValidator, Field, Strict, model_validator
+
+from app.platform.web.schemas import Bool, Int, Model, Number, Text
+from app.study.adverse_events.models import EventKind
+
+MOST_TAPS = 200
+TEST_S = 10.0
+"""Length of the grasp test, s."""
+_LONGEST_OFFSET_MS = 10**13  # a tablet whose battery was empty may wake in 1970, and what it holds must be taken all the same
+
+
+def _utc(value: datetime) -> datetime:
+    value = value.replace(tzinfo=UTC) if value.tzinfo is None else value
+    if not 1970 <= value.year <= 2200:
+        raise ValueError("the year must lie between 1970 and 2200")
+    return value.astimezone(UTC)
+
+
+DeviceTime = Annotated[datetime, AfterValidator(_utc)]
+Grade = Literal["none", "mild", "severe"]
+StopCause = Literal["participant", "technical", "other"]
+NoNames = Annotated[list[Annotated[Text, Field(max_length=60)]], Field(max_length=50)]
+Reason = Annotated[Text, Field(min_length=1, max_length=500)]
+
+
+class Nothing(Model):
+    """An entry whose time says it all."""
+
+
+class StopCausePayload(Model):
+    """Why a session was stopped before its planned end."""
+
+    cause: StopCause = Field(description="`participant`: for the participant's sake.")
+    text: Annotated[Text, Field(max_length=500)] = ""
+
+
+class RatingPayload(Model):
+    """The participant's rating."""
+
+    value: Int = Field(ge=1, le=10)
+
+
+class GraspPayload(Model):
+    """A grasp test: counted by taps, or a number that was read elsewhere."""
+
+    method: Literal["taps", "typed"]
+    hz: Number | None = Field(None, ge=0, lt=20, description="As typed; of taps it is computed from them.")
+    taps_s: list[Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)]] = Field(
+        default_factory=list, max_length=MOST_TAPS, description="Time of each open fist, s after `began_at`."
+    )
+    began_at: DeviceTime | None = Field(None, description="First moment of the count, by the tablet's clock.")
+    ended_at: DeviceTime | None = Field(None, description="Its last moment.")
+
+    @model_validator(mode="after")
+    def _whole(self) -> GraspPayload:
+        if self.method == "typed":
+            if self.hz is None or self.taps_s:
+                raise ValueError("a typed grasp frequency has `hz` and no taps")
+        elif self.hz is not None or len(self.taps_s) < 2 or self.began_at is None or self.ended_at is None:
+            raise ValueError("a counted grasp test has two taps at least, `began_at`, `ended_at` and no `hz`")
+        elif any(later <= earlier for earlier, later in itertools.pairwise(self.taps_s)):
+            raise ValueError("the taps must follow one another")
+        return self
+
+
+class GradePayload(Model):
+    """How much of a side effect there was."""
+
+    grade: Grade = Field(description="`severe` is a stop rule.")
+
+
+class NotePayload(Model):
+    """A note without names, dates and long numbers."""
+
+    text: Annotated[Text, Field(min_length=1, max_length=1000)]
+    no_names: NoNames = Field(default_factory=list, description="Words that look like names and that the writer says are none.")
+
+
+class AdverseEventPayload(Model):
+    """Something that happened to the participant; it is stored among the adverse events as soon as it arrives."""
+
+    kind: EventKind
+    severity: Literal["mild", "severe"] = Field(description="`severe` is a stop rule.")
+    serious: Bool = Field(False, description="Death, danger to life, hospital, lasting harm, or what a clinician holds equal (ISO 14155).")
+    note: Annotated[Text, Field(max_length=1000)] = Field("", description="Needed for the kind `other`; screened as notes are.")
+    no_names: NoNames = Field(default_factory=list, description="As in a note.")
+
+    @model_validator(mode="after")
+    def _described(self) -> AdverseEventPayload:
+        if self.kind is EventKind.OTHER and not self.note.strip():
+            raise ValueError("say what happened: the kind is 'other'")
+        return self
+
+
+class ReasonPayload(Model):
+    """Why a session was skipped or is repeated."""
+
+    reason: Reason
+
+
+class EntryBase(Model):
+    """What every entry has."""
+
+    uuid: UUID = Field(description="Drawn by the tablet; the same one again is the same entry.")
+    plan_item_id: Annotated[Int, Field(ge=1)] | None = Field(None, description="Session of the plan; null for the day as a whole.")
+    attempt: Annotated[Int, Field(ge=1, le=20)] | None = Field(None, description="1, and one more after every repeat.")
+    replaces: list[UUID] = Field(default_factory=list, max_length=20, description="Entries that this one corrects.")
+    device_time: DeviceTime
+    clock_offset_ms: Annotated[int, Strict(), Field(ge=-_LONGEST_OFFSET_MS, le=_LONGEST_OFFSET_MS)] | None = Field(
+        None, description="Service's clock less the tablet's, as last measured."
+    )
+
+
+class SessionEntry(EntryBase):
+    """What belongs to one session of the plan."""
+
+    plan_item_id: Annotated[Int, Field(ge=1)]
+    attempt: Annotated[Int, Field(ge=1, le=20)] = 1
+
+
+class Mark(SessionEntry):
+    """A session starts, stops, or is finished with all that is asked after it."""
+
+    kind: Literal["start", "stop", "session_end"]
+    payload: Nothing = Nothing()
+
+
+class StopCauseEntry(SessionEntry):
+    """Why a session was stopped early."""
+
+    kind: Literal["stop_cause"]
+    payload: StopCausePayload
+
+
+class RatingEntry(SessionEntry):
+    """The participant's rating of a session."""
+
+    kind: Literal["rating"]
+    payload: RatingPayload
+
+
+class GraspEntry(SessionEntry):
+    """The grasp test of a session."""
+
+    kind: Literal["grasp"]
+    payload: GraspPayload
+
+
+class GradeEntry(SessionEntry):
+    """A side effect during a session."""
+
+    kind: Literal["dyskinesia", "speech", "gait"]
+    payload: GradePayload
+
+
+class ReasonEntry(SessionEntry):
+    """A session is skipped, or run again."""
+
+    kind: Literal["skip", "repeat"]
+    payload: ReasonPayload
+
+
+class NoteEntry(EntryBase):
+    """A note on a session or on the day."""
+
+    kind: Literal["note"]
+    payload: NotePayload
+
+
+class AdverseEventEntry(EntryBase):
+    """An adverse event during a session or on the day."""
+
+    kind: Literal["adverse_event"]
+    payload: AdverseEventPayload
+
+
+class ClinicalSettingsEntry(EntryBase):
+    """Somebody has looked: the stimulator is back on the clinical settings."""
+
+    kind: Literal["clinical_settings"]
+    payload: Nothing = Nothing()
+
+
+AnyEntry = (
+    Mark | StopCauseEntry | RatingEntry | GraspEntry | GradeEntry | ReasonEntry | NoteEntry | AdverseEventEntry | ClinicalSettingsEntry
+)
+EntryIn = Annotated[AnyEntry, Field(discriminator="kind")]
+
+
+class EntriesIn(Model):
+    """Entries of a tablet, in the order in which they were made."""
+
+    plan_id: Annotated[Int, Field(ge=1)] = Field(description="The plan that the tablet showed.")
+    entries: list[EntryIn] = Field(min_length=1, max_length=200)
+
+
+class EntryResult(Model):
+    """What became of one entry."""
+
+    uuid: UUID
+    outcome: Literal["stored", "known", "refused"] = Field(description="`refused`: not stored; keep it and show why.")
+    detail: str = ""
+    hint: str = ""
+
+
+class EntriesOut(Model):
+    """What became of every entry of a batch, in its order."""
+
+    server_time: datetime
+    results: list[EntryResult]
+
+
+class EntryOut(Model):
+    """An entry as it is stored."""
+
+    uuid: UUID
+    plan_id: int
+    plan_item_id: int | None
+    attempt: int | None
+    kind: str
+    payload: dict[str, Any]
+    replaces: list[UUID]
+    device_time: datetime
+    clock_offset_ms: int | None
+    received_at: datetime
+    entered_by: str
+
+
+class LimitsOut(Model):
+    """Amplitudes within which a session stays, mA, and how fast they change, mA/s."""
+
+    min_ma: float
+    max_ma: float
+    ramp_ma_per_s: float | None
+
+
+class SlotOut(Model):
+    """One session of the plan, as far as the reader may know it."""
+
+    plan_item_id: int
+    position: int
+    label: str = Field(description="What stands in large letters: the controller, or a label where it is not to be known.")
+    controller: str | None = Field(description="Null where it is not to be known.")
+    detail: str = Field(description="Policy or design; empty where it is not to be known.")
+    minutes: float
+    washout_minutes: float
+    limits: LimitsOut | None
+    note: str
+
+
+class DayOut(Model):
+    """A clinic day: the sessions of the approved plan, and what has been entered."""
+
+    visit_id: int
+    visit: int
+    date: dt.date | None
+    participant: str
+    plan_id: int
+    blinded: bool = Field(description="Labels stand in the place of controllers.")
+    locked: bool = Field(description="The visit takes no entries any more.")
+    not_runnable: str = Field(
+        description="Why nothing of the plan may be started, such as a signature that no longer stands; empty where it may."
+    )
+    note: str
+    stop_rules: list[str]
+    slots: list[SlotOut]
+    entries: list[EntryOut]
+    reader: str
+    may_enter: bool
+    server_time: datetime

@@ -1,0 +1,86 @@
+"""The clinic day as API types, with no more than the reader may know of what runs."""
+
+from __future__ import annotations
+
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.planning import wording
+from app.planning.plans.designs import Planned
+from app.planning.plans.models import Plan, PlanItem
+from app.planning.sheet.pdf import STOP_RULES
+from app.planning.visit_day.schemas import DayOut, EntryOut, LimitsOut, SlotOut
+from app.planning.visit_day.service import Day
+from app.platform.database import now
+from app.study.blinding import CONTROLLER_NAMES, may_know
+from app.study.models import Controller, Visit
+from app.study.service import may
+
+
+def day_out(day: Day, caller: Caller) -> DayOut:
+    """A clinic day for its page."""
+    visit, plan = day.visit, day.plan
+    blinded = _blinded(plan, visit, caller)
+    limits = [limits_of(item) for item in plan.items]
+    common = _common(limits) if blinded else None
+    return DayOut(
+        visit_id=visit.id,
+        visit=visit.number,
+        date=visit.date,
+        participant=visit.participant.code,
+        plan_id=plan.id,
+        blinded=blinded,
+        locked=visit.locked,
+        not_runnable=day.not_runnable,
+        note="" if blinded else plan.note,
+        stop_rules=[STOP_RULES],
+        slots=[_slot(item, day, common if blinded else own, blinded) for item, own in zip(plan.items, limits, strict=True)],
+        entries=[EntryOut.model_validate(row) for row in day.entries],
+        reader=caller.label,
+        may_enter=may(caller, can.WRITE_QOC, visit.participant) and not visit.locked,
+        server_time=now(),
+    )
+
+
+def limits_of(item: PlanItem) -> LimitsOut | None:
+    """Within which amplitudes a session of the plan stays; None where the plan does not say."""
+    if item.min_ma is None or item.max_ma is None:
+        return None
+    return LimitsOut(min_ma=item.min_ma, max_ma=item.max_ma, ramp_ma_per_s=item.ramp_ma_per_s)
+
+
+def _blinded(plan: Plan, visit: Visit, caller: Caller) -> bool:
+    """Labels alone: to a blinded assessor always, to everybody while the key of a blinded plan is sealed."""
+    return not may_know(visit, caller) or (plan.blinded and plan.key_opened_at is None)
+
+
+def _slot(item: PlanItem, day: Day, limits: LimitsOut | None, blinded: bool) -> SlotOut:
+    controller = Controller(item.controller)
+    detail = ""
+    if item.policy_id is not None:
+        detail = day.policies[item.policy_id].name
+    elif item.design is not None:
+        detail = wording.design_name(Planned.from_json(item.design))
+    return SlotOut(
+        plan_item_id=item.id,
+        position=item.position,
+        label=_label(item) if blinded else CONTROLLER_NAMES[controller],
+        controller=None if blinded else controller.value,
+        detail="" if blinded else detail,
+        minutes=item.minutes,
+        washout_minutes=item.washout_minutes,
+        limits=limits,
+        note="" if blinded else item.note,
+    )
+
+
+def _label(item: PlanItem) -> str:
+    return f"Controller {item.label}" if item.label else f"Session {item.position}"
+
+
+def _common(limits: list[LimitsOut | None]) -> LimitsOut | None:
+    """What holds for every session, so that it tells none from another; None where the plan does not say it of each."""
+    known = [v for v in limits if v is not None]
+    if not known or len(known) < len(limits):
+        return None
+    ramps = [v.ramp_ma_per_s for v in known if v.ramp_ma_per_s is not None]
+    return LimitsOut(min_ma=min(v.min_ma for v in known), max_ma=max(v.max_ma for v in known), ramp_ma_per_s=max(ramps) if ramps else None)

@@ -1,0 +1,213 @@
+"""Rules of the clinic day: what a tablet may enter, and what becomes of it. The caller commits."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.evaluation import repository as evaluations
+from app.learning.models import Policy
+from app.planning import wording
+from app.planning.plans import repository as plans
+from app.planning.plans import service as planning
+from app.planning.plans.models import Plan, PlanItem
+from app.planning.visit_day import repository
+from app.planning.visit_day.models import DayEntry
+from app.planning.visit_day.record import GRADED, SEVERE, moment
+from app.planning.visit_day.schemas import AdverseEventPayload, EntryIn, EntryResult, NotePayload
+from app.planning.visit_day.screening import screen
+from app.platform.database import now
+from app.platform.errors import BetaloopError, Conflict, Forbidden, Invalid, NotFound
+from app.settings import get_settings
+from app.study import service as study
+from app.study.adverse_events.schemas import AdverseEventIn
+from app.study.adverse_events.service import add_adverse_event
+from app.study.models import Visit
+from app.study.visits.service import require_unlocked
+
+_KEY = "visit-day"
+FIRST_YEAR = 1990
+"""Times before it are those of a tablet that has lost its clock."""
+
+
+@dataclass(frozen=True)
+class Day:
+    """The approved plan of a visit, its policies by number, why it may not run (or nothing), and everything that was entered about it."""
+
+    visit: Visit
+    plan: Plan
+    policies: dict[int, Policy]
+    not_runnable: str
+    entries: Sequence[DayEntry]
+
+
+@dataclass(frozen=True)
+class DeviceKey:
+    """With what a tablet encrypts the entries of one person until they are sent.
+
+    Attributes:
+        owner: number of the account. key: 32 bytes, base64. until: when a tablet forgets it at the latest.
+    """
+
+    owner: int
+    key: str
+    until: datetime
+
+
+def read_day(db: Session, visit: Visit, caller: Caller) -> Day:
+    """The clinic day of a visit. Raises NotFound without a plan, Conflict where it is not approved."""
+    study.require(caller, can.READ, visit.participant)
+    plan = plans.live_plan(db, visit.id)
+    if plan is None:
+        raise NotFound(f"Visit {visit.number} has no plan, and so nothing to run.", "Draft a plan and have it approved.")
+    if plan.status != "approved":
+        raise Conflict(
+            f"The plan of visit {visit.number} is not approved yet; nothing is run that is not approved.", "A clinician approves it first."
+        )
+    policies = evaluations.policies_by_id(db, [item.policy_id for item in plan.items if item.policy_id is not None])
+    return Day(visit, plan, policies, _not_runnable(db, visit, caller), repository.entries(db, plan.id))
+
+
+def add_entries(db: Session, visit: Visit, plan_id: int, entries: Sequence[EntryIn], caller: Caller) -> list[EntryResult]:
+    """Take what a tablet sends. An entry that is there already is `known`; one that cannot be taken is `refused`, the others are stored.
+
+    The plan may have been replaced since: what was done under it stays true.
+
+    Raises:
+        NotFound: the visit never had this plan approved. Forbidden: the caller may only read.
+    """
+    study.require(caller, can.WRITE_QOC, visit.participant)
+    plan = repository.plan_of_visit(db, visit.id, plan_id)
+    if plan is None:
+        raise NotFound(f"Visit {visit.number} has no approved plan {plan_id}.", "Load the page of the day again.")
+    repository.lock_plan(db, plan.id)
+    items = {item.id: item for item in plan.items}
+    known = repository.entries_named(db, [e.uuid for e in entries])
+    results = []
+    for entry in entries:
+        stored = known.get(entry.uuid)
+        try:
+            if stored is not None:
+                _require_same(stored, entry, plan)
+                results.append(EntryResult(uuid=entry.uuid, outcome="known"))
+                continue
+            if entry.kind != "adverse_event":  # what harms a participant is written down whenever it becomes known
+                require_unlocked(visit)
+            _check(entry, items)
+        except BetaloopError as error:
+            results.append(EntryResult(uuid=entry.uuid, outcome="refused", detail=error.detail, hint=error.hint))
+            continue
+        known[entry.uuid] = _store(db, plan, entry, caller)
+        _record_event(db, visit, items.get(entry.plan_item_id or 0), known[entry.uuid], caller)
+        results.append(EntryResult(uuid=entry.uuid, outcome="stored"))
+    db.flush()
+    return results
+
+
+def words_like_names(note: str) -> list[str]:
+    """The words of a note that somebody must say are no names."""
+    return [found.text for found in screen(note) if found.kind == "name"]
+
+
+def device_key(caller: Caller) -> DeviceKey:
+    """The key of the caller's own entries: the same at every sign-in, so that what waits on a tablet is read again after an expired one.
+
+    Raises:
+        Forbidden: asked for with an API token.
+    """
+    caller.require_browser()
+    if caller.user_id is None:
+        raise Forbidden("Only people have a key for a tablet.", "Sign in with a browser.")
+    derive = HKDF(SHA256(), 32, None, f"entries of account {caller.user_id}".encode())
+    key = derive.derive(get_settings().secret(_KEY))
+    return DeviceKey(caller.user_id, base64.b64encode(key).decode(), now() + timedelta(hours=get_settings().session_max_hours))
+
+
+def _not_runnable(db: Session, visit: Visit, caller: Caller) -> str:
+    """Why the approved plan may not run; what was done is entered all the same."""
+    try:
+        planning.refuse_running(planning.read_plan(db, visit, caller))
+    except (Conflict, Invalid) as error:
+        return f"{error.detail} {error.hint}".strip()
+    return ""
+
+
+def _require_same(stored: DayEntry, entry: EntryIn, plan: Plan) -> None:
+    """Raises Conflict where an identifier that is known comes with something else."""
+    same = (stored.plan_id, stored.plan_item_id, stored.kind, stored.payload) == (
+        plan.id, entry.plan_item_id, entry.kind, _payload(entry),
+    )  # fmt: skip
+    if not same:
+        raise Conflict(
+            f"An entry with this identifier is stored already and says something else ({stored.kind} by {stored.entered_by}).",
+            "Enter it again as a new one.",
+        )
+
+
+def _check(entry: EntryIn, items: dict[int, PlanItem]) -> None:
+    if entry.plan_item_id is not None and entry.plan_item_id not in items:
+        raise Invalid(f"The plan has no session {entry.plan_item_id}.", "Load the page of the day again.")
+    found = screen(*_free_text(entry))
+    if found:
+        raise Invalid(wording.screened(found), "Take it out, or say that a word is no name.")
+
+
+def _free_text(entry: EntryIn) -> tuple[str, Sequence[str]]:
+    """What somebody wrote, and which of its words they say are no names."""
+    payload = entry.payload
+    if isinstance(payload, NotePayload):
+        return payload.text, payload.no_names
+    if isinstance(payload, AdverseEventPayload):
+        return payload.note, payload.no_names
+    return getattr(payload, "reason", "") or getattr(payload, "text", ""), ()
+
+
+def _store(db: Session, plan: Plan, entry: EntryIn, caller: Caller) -> DayEntry:
+    in_session = entry.plan_item_id is not None
+    row = DayEntry(
+        uuid=entry.uuid,
+        plan_id=plan.id,
+        plan_item_id=entry.plan_item_id,
+        attempt=(entry.attempt or 1) if in_session else None,
+        kind=entry.kind,
+        payload=_payload(entry),
+        replaces=[str(u) for u in entry.replaces],
+        device_time=entry.device_time,
+        clock_offset_ms=entry.clock_offset_ms,
+        entered_by=caller.label,
+    )
+    db.add(row)
+    return row
+
+
+def _record_event(db: Session, visit: Visit, item: PlanItem | None, row: DayEntry, caller: Caller) -> None:
+    """Adverse events and severe side effects stand among the adverse events at once, with or without a recording of the session."""
+    payload = row.payload
+    if row.kind == "adverse_event":
+        about = {name: payload[name] for name in ("kind", "severity", "serious", "note")}
+    elif row.kind in GRADED and payload["grade"] == SEVERE:
+        about = {"kind": row.kind, "severity": SEVERE}
+    else:
+        return
+    draft = AdverseEventIn.model_validate(
+        about
+        | {
+            "visit_id": visit.id,
+            "policy_id": item.policy_id if item else None,
+            "occurred_at": moment(row) if moment(row).year >= FIRST_YEAR else None,
+            "entry_key": str(row.uuid),
+        }
+    )
+    add_adverse_event(db, visit.participant, draft, caller)
+
+
+def _payload(entry: EntryIn) -> dict[str, object]:
+    return entry.payload.model_dump(mode="json")
