@@ -268,9 +268,7 @@ class DayOut(Model):
     plan_id: int
     blinded: bool = Field(description="Labels stand in the place of controllers.")
     locked: bool = Field(description="The visit takes no entries any more.")
-    not_runnable: str = Field(
-        description="Why nothing of the plan may be started, such as a signature that no longer stands; empty where it may."
-    )
+    not_runnable: str = Field(description="Why nothing of the plan may be started, such as a broken signature; empty where it may.")
     note: str
     stop_rules: list[str]
     slots: list[SlotOut]

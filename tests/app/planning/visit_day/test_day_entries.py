@@ -209,7 +209,7 @@ def test_adverse_events_stand_among_the_adverse_events_at_once(clinic_day: Any) 
     ]
     assert clinic_day.outcomes(*batch) == ["stored"] * 3
     assert clinic_day.outcomes(*batch) == ["known"] * 3
-    events = clinic_day.client.get("/api/v1/participants/P1/adverse-events").json()["items"]
+    events = clinic_day.client.get("/api/v1/participants/P1/adverse-events").json()
     found = {(e["kind"], e["severity"], e["serious"], e["visit_id"]) for e in events}
     assert found == {("fall", "mild", True, clinic_day.visit), ("gait", "severe", False, clinic_day.visit)}
 
