@@ -84,6 +84,8 @@ PAGE_MODULES = (
     "app.analysis.calibration.pages",
     "app.overview.overview",
     "app.overview.participant",
+    "app.overview.search",
+    "app.overview.saved",
     "app.overview.package.pages",
 )
 

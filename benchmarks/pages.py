@@ -48,6 +48,8 @@ KEPT = ROOT / "var" / "benchmarks" / "pages"
 
 PAGES = {
     "home": "/",
+    "energy saved": "/energy-saved",
+    "search": "/search?q=P0",
     "participant": "/participants/{code}",
     "visits": "/participants/{code}/visits",
     "visit": "/visits/{visit}",
@@ -74,6 +76,7 @@ PAGES = {
     "plans": "/participants/{code}/plans",
     "jobs": "/participants/{code}/jobs",
     "job": "/jobs/{job}",
+    "all jobs": "/jobs",
     "all participants": "/analyses",
     "trial time": "/trial-time",
     "audit": "/audit",

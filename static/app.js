@@ -39,9 +39,12 @@ function makeSortable(root) {
 }
 
 // --- confirmation before what cannot be taken back
-async function confirmed(question) {
+// both buttons say what they do, so that no answer can be read backwards: data-confirm-yes, data-confirm-no
+async function confirmed(button) {
   const dialog = document.getElementById("confirm");
-  dialog.querySelector("#confirm-text").textContent = question;
+  dialog.querySelector("#confirm-text").textContent = button.dataset.confirm;
+  dialog.querySelector("[value=yes]").textContent = button.dataset.confirmYes || button.textContent.trim();
+  dialog.querySelector("[value=no]").textContent = button.dataset.confirmNo || "Leave it as it is";
   dialog.returnValue = "no";
   dialog.showModal();
   await new Promise((done) => dialog.addEventListener("close", done, { once: true }));
@@ -52,7 +55,7 @@ document.addEventListener("click", async (event) => {
   const button = event.target.closest("[data-confirm]");
   if (!button || button.dataset.confirmed) return;
   event.preventDefault();
-  if (!(await confirmed(button.dataset.confirm))) return;
+  if (!(await confirmed(button))) return;
   button.dataset.confirmed = "yes";
   button.click();
   delete button.dataset.confirmed;
@@ -69,6 +72,25 @@ addEventListener("pageshow", (event) => {
   // the back button brings the page back as it was left
   if (event.persisted) for (const button of document.querySelectorAll("form[data-once] button")) button.disabled = false;
 });
+
+// --- "/" goes to the search, unless somebody types
+document.addEventListener("keydown", (event) => {
+  if (event.key !== "/" || event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, textarea, select, [contenteditable]")) return;
+  const find = document.getElementById("find");
+  if (!find) return;
+  event.preventDefault();
+  find.select();
+});
+
+// --- what takes long comes after the page: a link to the page that holds it, within an element of the same id
+for (const late of document.querySelectorAll("[data-late][id]")) {
+  fetch(late.querySelector("a").href, { headers: { Accept: "text/html" } })
+    .then(async (answer) => {
+      const fresh = answer.ok && new DOMParser().parseFromString(await answer.text(), "text/html").getElementById(late.id);
+      if (fresh) { late.replaceChildren(...fresh.childNodes); announce(late); }
+    })
+    .catch((error) => console.info("left as a link", error));
+}
 
 // --- parts of a page that fetch themselves again
 async function refresh(id) {

@@ -38,7 +38,7 @@ function show(section, key, { status, progress, message }) {
   for (const bar of byKey(section, "step", key)) {
     if (typeof progress === "number") {
       bar.querySelector("progress").value = progress;
-      bar.querySelector("[data-progress-text]").textContent = `${Math.round(100 * progress)} %`;
+      bar.querySelector("[data-progress-text]").textContent = `${Math.floor(100 * progress)} %`;
     }
     if (typeof message === "string") bar.querySelector("[data-progress-message]").textContent = message;
   }

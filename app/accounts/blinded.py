@@ -16,6 +16,7 @@ OPEN = (
     ("GET", "(/api/v1)?/analyses(/.*)?"),
     ("GET", "/trial-time"),
     ("GET", "/glossary"),
+    ("GET", "/energy-saved"),
     ("GET", "(/api/v1)?/visits/[0-9]+"),
     ("GET", "/api/v1/visits/[0-9]+/(sessions|locks)"),
     ("GET", "(/api/v1)?/sessions/[0-9]+"),

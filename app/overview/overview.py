@@ -15,7 +15,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.accounts.repository import studies
 from app.accounts.service import reads_whole_audit
-from app.overview import repository, state
+from app.overview import repository, state, wording
 from app.platform.audit import AUDITED, AuditEvent
 from app.platform.database import Db
 from app.platform.errors import Forbidden, NotFound
@@ -33,13 +33,20 @@ _HIDDEN = "hidden from you"
 
 @router.get("/")
 def overview(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
-    """All participants as cards, those that need attention marked."""
+    """Today: the next visits with what each waits for, then all participants as cards, those that need attention marked."""
     rows, total = study.participants(db, caller, paging.limit, paging.offset)
-    states = state.states(db, rows, datetime.now(UTC).date())
+    today = datetime.now(UTC).date()
+    states = state.states(db, rows, today)
+    dated = [(p, states[p.id]) for p in rows if states[p.id].next_visit is not None]
     page = render(
         request,
         "overview/overview.html",
         participants=[(p, states[p.id]) for p in rows],
+        coming=sorted(dated, key=lambda row: (row[1].next_visit, row[0].code)),
+        today=today,
+        what=wording.what,
+        actors=wording.ACTORS,
+        in_days=wording.in_days,
         total=total,
         paging=paging,
         phases=state.PHASES,

@@ -11,7 +11,7 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.analysis.metrics import service as analysis
 from app.analysis.metrics.charts import view
-from app.overview import state
+from app.overview import state, wording
 from app.platform.database import Db
 from app.platform.web.templates import render
 from app.study import repository as study
@@ -33,6 +33,8 @@ def participant_page(request: Request, participant: CurrentParticipant, db: Db, 
         settings=participant.current_settings,
         state=state.states(db, [participant], datetime.now(UTC).date())[participant.id],
         phases=state.PHASES,
+        what=wording.what,
+        actors=wording.ACTORS,
         days=[(v, [(s, visible_arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in visits],
         minutes=sum(s.duration_s for s in sessions) / 60,
         analysis=view(analysis.five_metrics(db, participant, caller)),

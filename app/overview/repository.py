@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Iterable, Sequence
+from typing import Any
 
-from sqlalchemy import Row, Select, func, select
-from sqlalchemy.orm import Session
+from sqlalchemy import Row, Select, false, func, select
+from sqlalchemy.orm import Session, joinedload
 
+from app.accounts.permissions import Caller
 from app.evaluation.models import EstimateRow, Evaluation
 from app.evaluation.schemas import RANKING_KINDS
 from app.learning.models import BufferSnapshot, Policy
 from app.planning.plans.models import Plan
 from app.platform.audit import AuditEvent
 from app.platform.jobs.models import Job, JobStatus
-from app.study.models import QocRevision, StudySession, Visit
+from app.study.models import Participant, QocRevision, StudySession, Visit
+from app.study.repository import in_scope
 
 
 def audit_events(db: Session, entity: str, entity_id: str, actor: str, limit: int, offset: int) -> tuple[Sequence[AuditEvent], int]:
@@ -77,9 +80,9 @@ def evaluation_times(db: Session, ids: Sequence[int]) -> Iterable[Row[int, dt.da
     )
 
 
-def plan_statuses(db: Session, ids: Sequence[int]) -> Iterable[Row[int, str]]:
-    """Participant and status of each plan that counts, by visit."""
-    plans = select(Visit.participant_id, Plan.status).join(Visit, Visit.id == Plan.visit_id)
+def plan_statuses(db: Session, ids: Sequence[int]) -> Iterable[Row[int, str, dt.date | None]]:
+    """Participant, status and visit's date of each plan that counts, by visit."""
+    plans = select(Visit.participant_id, Plan.status, Visit.date).join(Visit, Visit.id == Plan.visit_id)
     return db.execute(plans.where(Visit.participant_id.in_(ids), Plan.status != "superseded").order_by(Visit.number))
 
 
@@ -116,3 +119,51 @@ def estimates(db: Session, participant_id: int) -> Iterable[Row[Evaluation, Esti
         .where(Evaluation.participant_id == participant_id)
         .order_by(Evaluation.id, EstimateRow.policy_id, EstimateRow.method)
     )
+
+
+def participant_id_of_code(db: Session, caller: Caller, code: str) -> int | None:
+    """The row number of a participant that the caller may read, whatever the code's capitals; None without one."""
+    query = select(Participant.id).join(Participant.site).where(func.lower(Participant.code) == code.lower(), in_scope(caller))
+    return db.scalar(query)
+
+
+def find_participants(db: Session, caller: Caller, words: str, most: int) -> Sequence[Participant]:
+    """Participants whose code holds the words, by code."""
+    query = select(Participant).join(Participant.site).options(joinedload(Participant.site))
+    return db.scalars(query.where(_holds(Participant.code, words), in_scope(caller)).order_by(Participant.code).limit(most)).all()
+
+
+def find_session(db: Session, caller: Caller, number: int, owner: int | None) -> Sequence[Row[int, str, int, dt.date | None]]:
+    """The session of a number, with participant, visit and day; of one participant where `owner` is given."""
+    query = select(StudySession.id, Participant.code, Visit.number, Visit.date).join(StudySession.visit).join(Visit.participant)
+    return db.execute(_within(query, caller, owner).where(StudySession.id == number)).all()
+
+
+def find_policies(db: Session, caller: Caller, words: str, owner: int | None, most: int) -> Sequence[Row[int, str, str, str]]:
+    """Policies whose name holds the words: number, name, kind, participant's code."""
+    query = select(Policy.id, Policy.name, Policy.kind, Participant.code).join(Participant, Participant.id == Policy.participant_id)
+    named = _within(query, caller, owner).where(_holds(Policy.name, words))
+    return db.execute(named.order_by(Participant.code, Policy.name).limit(most)).all()
+
+
+def find_jobs(
+    db: Session, caller: Caller, words: str, kinds: Sequence[str], owner: int | None, most: int
+) -> Sequence[Row[str, str, str, dt.datetime, str]]:
+    """Jobs of these kinds, or whose number begins with the words, newest first: number, kind, status, when asked for, participant."""
+    query = select(Job.id, Job.kind, Job.status, Job.created_at, Participant.code).join(Participant, Participant.id == Job.participant_id)
+    begins = Job.id.startswith(words.lower(), autoescape=True) if len(words) >= _FEWEST_OF_A_NUMBER else false()
+    named = _within(query, caller, owner).where(begins | Job.kind.in_(kinds))
+    return db.execute(named.order_by(Job.created_at.desc()).limit(most)).all()
+
+
+_FEWEST_OF_A_NUMBER = 4
+"""Characters of a job's number that are looked for; fewer would find many."""
+
+
+def _within(query: Select[Any], caller: Caller, owner: int | None) -> Select[Any]:
+    scoped = query.join(Participant.site).where(in_scope(caller))
+    return scoped if owner is None else scoped.where(Participant.id == owner)
+
+
+def _holds(column: Any, words: str) -> Any:
+    return column.icontains(words, autoescape=True)

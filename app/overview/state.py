@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from sqlalchemy.orm import Session
 
 from app.overview import repository
+from app.overview.next_steps import NextStep, next_steps
 from app.platform.jobs.models import Job
 from app.study.models import Participant
 
@@ -29,7 +30,8 @@ class State:
         plan: status of the plan of the latest visit that has one.
         running, failed: jobs; the latter of the last 7 days.
         ranking_job: the live job that will bring the first ranking; None where there is a ranking or no such job.
-        attention: sentences with the page where the matter is put right.
+        next_planned: whether the next visit has an approved plan or a draft.
+        steps: what is to be done, what others wait for first.
     """
 
     sessions: int = 0
@@ -47,7 +49,8 @@ class State:
     running: int = 0
     ranking_job: Job | None = None
     failed: int = 0
-    attention: list[tuple[str, str]] = field(default_factory=list)
+    next_planned: bool = False
+    steps: list[NextStep] = field(default_factory=list)
 
     @property
     def phase(self) -> int:
@@ -57,6 +60,16 @@ class State:
         if not self.policies or (self.evaluated_at and self.grown):
             return 1
         return 2 if self.evaluated_at is None else 3
+
+    @property
+    def attention(self) -> list[NextStep]:
+        """What somebody should see to, where it is not merely the next thing to do."""
+        return [s for s in self.steps if s.urgent]
+
+    @property
+    def blocked_by(self) -> NextStep | None:
+        """What the next visit waits for first; None where it can be held."""
+        return next((s for s in self.steps if s.blocks_visit), None)
 
     @property
     def grown(self) -> bool:
@@ -71,33 +84,8 @@ def states(db: Session, participants: Sequence[Participant], today: dt.date) -> 
     _study(db, ids, found, today)
     _results(db, ids, found)
     for participant in participants:
-        found[participant.id].attention = attention(participant, found[participant.id])
+        found[participant.id].steps = next_steps(participant, found[participant.id])
     return found
-
-
-def attention(participant: Participant, state: State) -> list[tuple[str, str]]:
-    """What somebody should do, as sentences with the page where it is done."""
-    home, settings = f"/participants/{participant.code}", participant.current_settings
-    todo: list[tuple[str, str]] = []
-    if settings.xi_beta is None:
-        todo.append(("Beta threshold ξβ is not set; jobs cannot start", f"{home}/settings"))
-    if settings.cdbs_amplitude_ma is None and state.sessions == 0:
-        todo.append(("No cDBS amplitude in the settings", f"{home}/settings"))
-    if not state.visits:
-        todo.append(("No visit yet", f"{home}/visits/new"))
-    elif not state.sessions:
-        todo.append(("No session yet", f"{home}/upload"))
-    if state.without_qoc:
-        todo.append((f"{_n(state.without_qoc, 'session')} without QoCs", f"{home}/visits"))
-    if state.proposed:
-        todo.append((f"{_n(state.proposed, 'session')} to confirm", f"{home}/proposals"))
-    if state.grown:
-        todo.append(("New sessions since the last ranking; it is stale", f"{home}/ranking"))
-    if state.plan == "draft":
-        todo.append(("A visit plan waits for approval", f"{home}/plans"))
-    if state.failed:
-        todo.append((f"{_n(state.failed, 'job')} failed in the last 7 days", f"{home}/jobs"))
-    return todo
 
 
 def _study(db: Session, ids: list[int], found: dict[int, State], today: dt.date) -> None:
@@ -113,15 +101,12 @@ def _results(db: Session, ids: list[int], found: dict[int, State]) -> None:
         found[key].policies = total
     for key, evaluated_at, snapshot_at in repository.evaluation_times(db, ids):
         found[key].evaluated_at, found[key].snapshot_at = evaluated_at, snapshot_at
-    for key, status in repository.plan_statuses(db, ids):
+    for key, status, day in repository.plan_statuses(db, ids):
         found[key].plan = status
+        found[key].next_planned |= day is not None and day == found[key].next_visit
     for owner, running, failed in repository.job_counts(db, ids):
         if owner is not None:
             found[owner].running, found[owner].failed = running, failed
     for job in repository.live_ranking_jobs(db, ids):
         if job.participant_id is not None and found[job.participant_id].evaluated_at is None:
             found[job.participant_id].ranking_job = job
-
-
-def _n(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"

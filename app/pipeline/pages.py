@@ -26,6 +26,7 @@ from app.platform.jobs.models import JobStatus
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
+from app.study import repository as study
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.service import may
@@ -37,6 +38,7 @@ TRAINABLE = [(name, ALGORITHM_NAMES[name]) for name in get_args(AlgorithmName)]
 SHOWN_EVENTS = 20_000
 LOG_LINES = 200
 REFRESH_S = 4
+MOST_PARTICIPANTS, MOST_LIVE = 1000, 200
 
 
 @router.get("/participants/{code}/jobs")
@@ -63,6 +65,28 @@ def start_job(request: Request, participant: CurrentParticipant, db: Db, caller:
         db.rollback()
         return _jobs(request, participant, db, caller, 50, 0, error.problem(request.url.path), given, error.status)
     return RedirectResponse(f"/jobs/{job.id}?done=started", 303)
+
+
+@router.get("/jobs")
+def all_jobs_page(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
+    """Jobs of every participant that the caller may read: those at work or waiting, then those that ended."""
+    participants, _ = study.participants(db, caller, MOST_PARTICIPANTS, 0)
+    codes = {p.id: p.code for p in participants}
+    live, _ = jobs.find(db, status=jobs.LIVE, limit=MOST_LIVE, participants=codes)
+    ended, total = jobs.find(db, status=jobs.ENDED, limit=paging.limit, offset=paging.offset, participants=codes)
+    page = render(
+        request,
+        "pipeline/all_jobs.html",
+        codes=codes,
+        live=live,
+        ended=ended,
+        total=total,
+        paging=paging,
+        titles=_titles(),
+        refresh_s=REFRESH_S,
+        workers=len(jobs.live_workers(db, job_service.STALE_S)),
+    )
+    return HTMLResponse(page)
 
 
 @router.get("/jobs/{job_id}")
@@ -125,6 +149,7 @@ def _jobs(
         offset=offset,
         kinds=list(_titles().items()),
         titles=_titles(),
+        codes=None,
         live=any(not JobStatus(j.status).ended for j in rows),
         refresh_s=REFRESH_S,
         problem=problem or (blocked.problem(request.url.path) if blocked else None),

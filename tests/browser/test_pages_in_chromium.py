@@ -21,7 +21,7 @@ SMALL_TARGETS = """() => [...document.querySelectorAll('a, button, input:not([ty
 def test_from_sign_in_to_a_participants_charts(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
     watched = window()
     watched.sign_in()
-    watched.page.click("article.participant h2 a")
+    watched.page.click("article.participant h3 a")
     assert watched.page.inner_text("h1") == "P1"
     assert watched.charts_drawn() == 5
     assert watched.errors == []
@@ -133,10 +133,11 @@ def test_what_cannot_be_taken_back_asks_first(window: Callable, enrolled: str) -
     assert watched.page.inner_text("code.secret").startswith("blp_")
     row = watched.page.locator("tr", has_text="a tablet")
     row.locator("button").click()
-    watched.page.click("dialog[open] >> text=Keep")
+    watched.page.click("dialog[open] >> text=Leave it as it is")
     assert row.locator(".badge").inner_text() == "live"
     row.locator("button").click()
-    watched.page.click("dialog[open] [data-confirm-yes]")
+    assert watched.page.inner_text("dialog[open] [value=yes]") == "Revoke"
+    watched.page.click("dialog[open] [value=yes]")
     watched.page.wait_for_selector("text=Token revoked")
     assert row.locator(".badge").inner_text() == "revoked"
 

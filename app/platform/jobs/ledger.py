@@ -125,7 +125,7 @@ class Ledger:
                 if step.status == JobStatus.SUCCEEDED and step.result is not None:
                     return step.result
                 step.result = fn(db)
-                step.status, step.progress, step.finished_at = JobStatus.SUCCEEDED, 1.0, now()
+                step.status, step.progress, step.message, step.finished_at = JobStatus.SUCCEEDED, 1.0, "", now()
                 self._step_event(db, job, step)
                 return step.result
 

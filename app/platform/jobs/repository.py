@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import timedelta
 from typing import Any
 
@@ -14,6 +14,7 @@ from app.platform.errors import NotFound
 from app.platform.jobs.models import Job, JobEvent, JobStatus, JobStep, Worker
 
 LIVE = (JobStatus.QUEUED, JobStatus.RUNNING)
+ENDED = (JobStatus.SUCCEEDED, JobStatus.FAILED, JobStatus.CANCELLED)
 
 
 def get(db: Session, job_id: str) -> Job:
@@ -47,9 +48,12 @@ def find(
     status: Sequence[JobStatus] = (),
     limit: int = 50,
     offset: int = 0,
+    participants: Collection[int] | None = None,
 ) -> tuple[list[Job], int]:
-    """Jobs, newest first, with their steps, and how many there are in all."""
+    """Jobs, newest first, with their steps, and how many there are in all; `participants`: of these alone."""
     query = select(Job)
+    if participants is not None:
+        query = query.where(Job.participant_id.in_(participants))
     if participant_id is not None:
         query = query.where(Job.participant_id == participant_id)
     if kind is not None:

@@ -1,0 +1,40 @@
+"""Sentences of the pages that join phases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from app.overview.next_steps import Actor, NextStep, Task
+
+ACTORS = {Actor.CLINICIAN: "Clinician", Actor.ENGINEER: "Engineer", Actor.SERVICE: "Nobody: the service works"}
+
+_TASKS: dict[Task, str | Callable[[int], str]] = {
+    Task.ADD_VISIT: "No visit yet",
+    Task.STATE_AMPLITUDE: "No cDBS amplitude in the settings",
+    Task.UPLOAD: "No session yet",
+    Task.CONFIRM: lambda n: f"{counted(n, 'session')} to confirm",
+    Task.ENTER_QOCS: lambda n: f"{counted(n, 'session')} without QoCs",
+    Task.SET_THRESHOLD: "Beta threshold \u03be\u03b2 is not set; jobs cannot start",
+    Task.WAIT_FOR_RANKING: "The first ranking is being made",
+    Task.RANK: "No ranking yet: start the pipeline",
+    Task.RANK_AGAIN: "New sessions since the last ranking; it is stale",
+    Task.DRAFT_PLAN: "No plan for this visit yet",
+    Task.APPROVE_PLAN: "A visit plan waits for approval",
+    Task.LOOK_AT_FAILED: lambda n: f"{counted(n, 'job')} failed in the last 7 days",
+}
+
+
+def what(step: NextStep) -> str:
+    """What is to be done."""
+    said = _TASKS[step.task]
+    return said if isinstance(said, str) else said(step.count)
+
+
+def counted(count: int, noun: str) -> str:
+    """A count with its noun."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def in_days(days: int) -> str:
+    """How far a day lies ahead."""
+    return {0: "today", 1: "tomorrow"}.get(days, f"in {days} days")

@@ -1,0 +1,98 @@
+"""The page of today, what the next visit waits for and who acts, the search, all jobs, and energy saved so far."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import SYSTEM
+from app.overview.next_steps import Actor, Task
+from app.overview.saved import Saved, overall
+from app.overview.state import states
+from app.platform.jobs import service as jobs
+from app.platform.jobs.models import Job, JobStatus
+from app.study.models import Participant
+from app.study.repository import participant_by_code
+
+
+def test_the_next_visit_waits_for_what_others_wait_for_and_says_who_acts(
+    browser: TestClient, client: TestClient, session_id: int, db: Session
+) -> None:
+    today = datetime.now(UTC).date()
+    day = today + timedelta(days=3)
+    client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": day.isoformat()})
+    page = browser.get("/").text
+    row = next(r for r in re.findall(r"<tr>.*?</tr>", page, re.S) if day.isoformat() in r)
+    assert "1 session without QoCs" in row
+    assert "in 3 days" in row
+    assert "Clinician" in row
+    client.put(f"/api/v1/sessions/{session_id}/qoc", json={"grasp_hz": 2.0, "rating": 7, "tremor_percent": 10.0})
+    state = states(db, [participant_by_code(db, "P1", SYSTEM)], today)[1]
+    assert state.blocked_by is not None
+    assert (state.blocked_by.task, state.blocked_by.actor) == (Task.RANK, Actor.ENGINEER)
+
+
+@pytest.mark.parametrize(
+    ("words", "leads_to"),
+    [
+        ("p1", "/participants/P1"),
+        ("session {session}", "/sessions/{session}"),
+        ("P1 {session}", "/sessions/{session}"),
+        ("4f00", "/jobs/{job}"),
+    ],
+)
+def test_a_search_with_one_hit_opens_it(browser: TestClient, session_id: int, db: Session, words: str, leads_to: str) -> None:
+    job = _job(db, JobStatus.SUCCEEDED)
+    found = browser.get("/search", params={"q": words.format(session=session_id)})
+    assert found.status_code == 303
+    assert found.headers["location"] == leads_to.format(session=session_id, job=job.id)
+
+
+def test_a_search_finds_nothing_beyond_the_callers_sites(sign_in: Callable[[str], TestClient], session_id: int, db: Session) -> None:
+    viewer = sign_in("viewer")
+    assert viewer.get("/search", params={"q": "P1"}).status_code == 303
+    from app.accounts.models import Membership, Site, User
+
+    site = Site(study_id=1, code="other", name="Another clinic")
+    db.add(site)
+    db.flush()
+    user = db.query(User).filter_by(email="viewer-page@clinic.example").one()
+    db.query(Membership).filter_by(user_id=user.id).update({"site_id": site.id})
+    db.commit()
+    for words in ("P1", f"session {session_id}"):
+        assert "Nothing is called" in viewer.get("/search", params={"q": words}).text
+
+
+def test_all_jobs_stand_in_one_page_with_their_participant(browser: TestClient, enrolled: str, db: Session) -> None:
+    _job(db, JobStatus.RUNNING)
+    page = browser.get("/jobs").text
+    assert "Running and waiting" in page
+    assert f'<a href="/participants/{enrolled}/jobs">' in page
+    # a running job at 99.6 % is not done
+    assert "99 %" in page
+    assert "100 %" not in page
+
+
+def test_energy_saved_is_weighted_by_minutes() -> None:
+    both = overall([Saved("P1", 0.4, 30.0, 3), Saved("P2", 0.1, 10.0, 1)])
+    assert both is not None
+    assert (both.share, both.minutes, both.sessions) == (pytest.approx(0.325), 40.0, 4)
+    assert overall([]) is None
+
+
+def _job(db: Session, status: JobStatus) -> Job:
+    participant = db.query(Participant).filter_by(code="P1").one()
+    now = datetime.now(UTC)
+    ended = now if status == JobStatus.SUCCEEDED else None
+    row = Job(
+        id="4f00aaaa-0000-4000-8000-000000000000", participant_id=participant.id, kind="train", status=status, progress=0.996, params={},
+        code_version=jobs.code_version(), created_by="test", started_at=now - timedelta(minutes=5), finished_at=ended,
+    )  # fmt: skip
+    db.add(row)
+    db.commit()
+    return row
