@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import groupby
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
@@ -16,6 +19,7 @@ from app.accounts.permissions import Caller
 from app.accounts.repository import studies
 from app.accounts.service import reads_whole_audit
 from app.overview import repository, state, wording
+from app.overview.audit_words import headline, sentence
 from app.platform.audit import AUDITED, AuditEvent
 from app.platform.database import Db
 from app.platform.errors import Forbidden, NotFound
@@ -74,13 +78,37 @@ def audit(
     page = render(
         request,
         "overview/audit.html",
-        events=[(e, changes(db, e, caller)) for e in events],
+        acts=acts(db, events, caller),
         total=total,
         paging=paging,
         entities=sorted(AUDITED),
         filters={"entity": entity, "entity_id": entity_id, "actor": actor},
     )
     return HTMLResponse(page)
+
+
+@dataclass(frozen=True)
+class Act:
+    """What one request did: in words, by its most telling change, and every row that it changed.
+
+    Attributes:
+        event: the change that names it. said: in words. rows: each change with column, value before, value after.
+    """
+
+    event: AuditEvent
+    said: str
+    rows: list[tuple[AuditEvent, list[tuple[str, str | None, str | None]]]]
+
+
+def acts(db: Session, events: Sequence[AuditEvent], caller: Caller) -> list[Act]:
+    """The events of a page, those of one request together; newest first."""
+    names = repository.audit_names(db, events)
+    found = []
+    for _, group in groupby(events, key=lambda e: (e.actor, e.request_id or e.id)):
+        rows = list(group)
+        telling = headline(rows)
+        found.append(Act(telling, sentence(telling, names), [(e, changes(db, e, caller)) for e in rows]))
+    return found
 
 
 def changes(db: Session, event: AuditEvent, caller: Caller) -> list[tuple[str, str | None, str | None]]:

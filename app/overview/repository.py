@@ -13,6 +13,7 @@ from app.accounts.permissions import Caller
 from app.evaluation.models import EstimateRow, Evaluation
 from app.evaluation.schemas import RANKING_KINDS
 from app.learning.models import BufferSnapshot, Policy
+from app.overview.audit_words import Names
 from app.planning.plans.models import Plan
 from app.platform.audit import AuditEvent
 from app.platform.jobs.models import Job, JobStatus
@@ -28,6 +29,36 @@ def audit_events(db: Session, entity: str, entity_id: str, actor: str, limit: in
             query = query.where(column == wanted)
     total = db.scalar(select(func.count()).select_from(query.subquery())) or 0
     return db.scalars(query.order_by(AuditEvent.id.desc()).limit(limit).offset(offset)).all(), total
+
+
+def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
+    """Names of the rows that these events are about, in a query per kind of row."""
+    rows = [(e.entity, row) for e in events for row in (e.before, e.after) if row]
+
+    def numbers(entity: str, column: str) -> set[int]:
+        own = {int(r["id"]) for name, r in rows if name == entity and "id" in r}
+        return own | {int(r[column]) for _, r in rows if r.get(column) is not None}
+
+    sessions = {
+        i: (ordinal, visit)
+        for i, ordinal, visit in db.execute(
+            select(StudySession.id, StudySession.ordinal, StudySession.visit_id).where(
+                StudySession.id.in_(numbers("session", "session_id"))
+            )
+        )
+    }
+    plans = dict(db.execute(select(Plan.id, Plan.visit_id).where(Plan.id.in_(numbers("plan", "plan_id")))))
+    wanted = numbers("visit", "visit_id") | {visit for _, visit in sessions.values()} | set(plans.values())
+    visits = {i: (n, p) for i, n, p in db.execute(select(Visit.id, Visit.number, Visit.participant_id).where(Visit.id.in_(wanted)))}
+    policies = {
+        i: (name, p)
+        for i, name, p in db.execute(
+            select(Policy.id, Policy.name, Policy.participant_id).where(Policy.id.in_(numbers("policy", "policy_id")))
+        )
+    }
+    whose = numbers("participant", "participant_id") | {p for _, p in (*visits.values(), *policies.values())}
+    codes = dict(db.execute(select(Participant.id, Participant.code).where(Participant.id.in_(whose))))
+    return Names(codes, visits, sessions, plans, policies)
 
 
 def visit_days(db: Session, ids: Sequence[int], today: dt.date) -> Iterable[Row[int, int, dt.date | None, dt.date | None]]:
@@ -133,22 +164,20 @@ def find_participants(db: Session, caller: Caller, words: str, most: int) -> Seq
     return db.scalars(query.where(_holds(Participant.code, words), in_scope(caller)).order_by(Participant.code).limit(most)).all()
 
 
-def find_session(db: Session, caller: Caller, number: int, owner: int | None) -> Sequence[Row[int, str, int, dt.date | None]]:
+def find_session(db: Session, caller: Caller, number: int, owner: int | None) -> Sequence[Any]:
     """The session of a number, with participant, visit and day; of one participant where `owner` is given."""
     query = select(StudySession.id, Participant.code, Visit.number, Visit.date).join(StudySession.visit).join(Visit.participant)
     return db.execute(_within(query, caller, owner).where(StudySession.id == number)).all()
 
 
-def find_policies(db: Session, caller: Caller, words: str, owner: int | None, most: int) -> Sequence[Row[int, str, str, str]]:
+def find_policies(db: Session, caller: Caller, words: str, owner: int | None, most: int) -> Sequence[Any]:
     """Policies whose name holds the words: number, name, kind, participant's code."""
     query = select(Policy.id, Policy.name, Policy.kind, Participant.code).join(Participant, Participant.id == Policy.participant_id)
     named = _within(query, caller, owner).where(_holds(Policy.name, words))
     return db.execute(named.order_by(Participant.code, Policy.name).limit(most)).all()
 
 
-def find_jobs(
-    db: Session, caller: Caller, words: str, kinds: Sequence[str], owner: int | None, most: int
-) -> Sequence[Row[str, str, str, dt.datetime, str]]:
+def find_jobs(db: Session, caller: Caller, words: str, kinds: Sequence[str], owner: int | None, most: int) -> Sequence[Any]:
     """Jobs of these kinds, or whose number begins with the words, newest first: number, kind, status, when asked for, participant."""
     query = select(Job.id, Job.kind, Job.status, Job.created_at, Participant.code).join(Participant, Participant.id == Job.participant_id)
     begins = Job.id.startswith(words.lower(), autoescape=True) if len(words) >= _FEWEST_OF_A_NUMBER else false()
@@ -160,7 +189,7 @@ _FEWEST_OF_A_NUMBER = 4
 """Characters of a job's number that are looked for; fewer would find many."""
 
 
-def _within(query: Select[Any], caller: Caller, owner: int | None) -> Select[Any]:
+def _within(query: Any, caller: Caller, owner: int | None) -> Any:
     scoped = query.join(Participant.site).where(in_scope(caller))
     return scoped if owner is None else scoped.where(Participant.id == owner)
 
