@@ -47,7 +47,7 @@ def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
             )
         )
     }
-    plans = dict(db.execute(select(Plan.id, Plan.visit_id).where(Plan.id.in_(numbers("plan", "plan_id")))))
+    plans = dict(db.execute(select(Plan.id, Plan.visit_id).where(Plan.id.in_(numbers("plan", "plan_id")))).all())
     wanted = numbers("visit", "visit_id") | {visit for _, visit in sessions.values()} | set(plans.values())
     visits = {i: (n, p) for i, n, p in db.execute(select(Visit.id, Visit.number, Visit.participant_id).where(Visit.id.in_(wanted)))}
     policies = {
@@ -57,7 +57,7 @@ def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
         )
     }
     whose = numbers("participant", "participant_id") | {p for _, p in (*visits.values(), *policies.values())}
-    codes = dict(db.execute(select(Participant.id, Participant.code).where(Participant.id.in_(whose))))
+    codes = dict(db.execute(select(Participant.id, Participant.code).where(Participant.id.in_(whose))).all())
     return Names(codes, visits, sessions, plans, policies)
 
 
