@@ -5,23 +5,28 @@ JSON and plain forms are read into memory and parsed before anybody asks who cal
 
 from __future__ import annotations
 
-import json
+from collections.abc import Awaitable, Callable
 
 from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.settings import get_settings
 
 PLAIN_LIMIT = 1 << 20
 """Bytes of a JSON document or a plain form."""
+Refusal = Callable[[Request, str, str], Awaitable[Response]]
+"""Makes the answer to a request that is too large: what is wrong, what to do about it."""
 _FORM_ALLOWANCE = 1 << 20  # the form fields and boundaries around a file of the largest size
 
 
 class BodyLimit:
     """ASGI middleware: refuses by the stated length before reading, and cuts off bodies that state none."""
 
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, refusal: Refusal) -> None:
         self.app = app
+        self.refusal = refusal
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or answer 413."""
@@ -34,7 +39,9 @@ class BodyLimit:
         said = _said(has_files)
         stated = headers.get(b"content-length", b"0")
         if stated.isdigit() and int(stated) > limit:
-            await _refuse(send, scope["path"], *said)
+            response = await self.refusal(Request(scope), *said)
+            response.headers["Connection"] = "close"
+            await response(scope, receive, send)
             return
         seen = 0
 
@@ -58,10 +65,3 @@ def _said(has_files: bool) -> tuple[str, str]:
             "Split the upload, or have BETALOOP_UPLOAD_LIMIT_MB raised.",
         )
     return "The request is larger than 1 MiB and has no file in it.", "Send recordings and policies as files (multipart/form-data)."
-
-
-async def _refuse(send: Send, path: str, detail: str, hint: str) -> None:
-    problem = {"type": "about:blank", "title": "The request is too large", "status": 413, "detail": detail, "hint": hint, "instance": path}
-    headers = [(b"content-type", b"application/problem+json"), (b"connection", b"close")]
-    await send({"type": "http.response.start", "status": 413, "headers": headers})
-    await send({"type": "http.response.body", "body": json.dumps(problem).encode()})

@@ -22,6 +22,7 @@ from starlette.middleware.base import RequestResponseEndpoint
 from app.platform.errors import BetaloopError, DatabaseAway, Forbidden, StorageFull, Unauthorized
 from app.platform.web.body_limit import BodyLimit
 from app.platform.web.compression import Compression
+from app.platform.web.error_pages import advised, kept_entries
 from app.platform.web.templates import render
 from app.settings import get_settings
 
@@ -38,7 +39,7 @@ _seconds = Histogram("betaloop_request_seconds", "Time to answer by route.", ["r
 
 def install(app: FastAPI) -> None:
     """Add middleware and error handlers to the service."""
-    app.add_middleware(BodyLimit)  # inside the other: its refusals have the headers of every answer
+    app.add_middleware(BodyLimit, refusal=_too_large)  # inside the other: its refusals have the headers of every answer
     app.middleware("http")(_around)
     app.add_middleware(Compression)  # outermost: what it shrinks is whole
     app.add_exception_handler(BetaloopError, _known_error)
@@ -54,7 +55,7 @@ async def _around(request: Request, call_next: RequestResponseEndpoint) -> Respo
     request.state.request_id = secrets.token_hex(8)
     started = time.perf_counter()
     refused = _cross_site(request)
-    response = _answer(request, refused) if refused else await call_next(request)
+    response = await _answer(request, refused) if refused else await call_next(request)
     route = getattr(request.scope.get("route"), "path", "none")
     _requests.labels(request.method, route, response.status_code).inc()
     _seconds.labels(route).observe(time.perf_counter() - started)
@@ -96,7 +97,7 @@ def wants_page(request: Request) -> bool:
     return not request.url.path.startswith("/api/") and "text/html" in request.headers.get("accept", "")
 
 
-def _answer(request: Request, error: BetaloopError) -> Response:
+async def _answer(request: Request, error: BetaloopError) -> Response:
     body = error.problem(request.url.path) | {"request_id": getattr(request.state, "request_id", None)}
     if not wants_page(request):
         headers = {"WWW-Authenticate": "Bearer"} if error.status == 401 else {}
@@ -104,12 +105,23 @@ def _answer(request: Request, error: BetaloopError) -> Response:
     if isinstance(error, Unauthorized) and request.method in _SAFE:
         target = request.url.path + (f"?{request.url.query}" if request.url.query else "")
         return RedirectResponse(f"/sign-in?next={quote(target, safe='/')}" if target != "/" else "/sign-in", 303)
-    return HTMLResponse(render(request, "error.html", problem=body), error.status)
+    entries = await kept_entries(request)
+    title, advice = advised(error.status, error.title, bool(entries))
+    return HTMLResponse(render(request, "error.html", problem=body, title=title, advice=advice, entries=entries), error.status)
+
+
+async def _too_large(request: Request, detail: str, hint: str) -> Response:
+    return await _answer(request, _TooLarge(detail, hint))
+
+
+class _TooLarge(BetaloopError):
+    status = 413
+    title = "The request is too large"
 
 
 async def _known_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, BetaloopError)
-    return _answer(request, error)
+    return await _answer(request, error)
 
 
 class _InputError(BetaloopError):
@@ -121,7 +133,7 @@ async def _bad_input(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     errors = [{"where": " > ".join(map(str, e["loc"])), "what": e["msg"]} for e in error.errors()]
     detail = "; ".join(f"{e['where']}: {e['what']}" for e in errors[:5])
-    return _answer(request, _InputError(detail, "Correct the named members and send again.", errors=errors))
+    return await _answer(request, _InputError(detail, "Correct the named members and send again.", errors=errors))
 
 
 class _PlainError(BetaloopError):
@@ -132,7 +144,7 @@ class _PlainError(BetaloopError):
 
 async def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    response = _answer(request, _PlainError(error.status_code, str(error.detail)))
+    response = await _answer(request, _PlainError(error.status_code, str(error.detail)))
     response.headers.update(error.headers or {})
     return response
 
@@ -146,7 +158,7 @@ async def _database_error(request: Request, error: Exception) -> Response:
     """503 where the database is away, restarting or out of connections, 507 where its disk is full; anything else is an error of ours."""
     state = getattr(getattr(error, "orig", None), "sqlstate", None)
     if state == _DISK_FULL:
-        return _full(request, error)
+        return await _full(request, error)
     invalidated = isinstance(error, DBAPIError) and error.connection_invalidated
     unreached = isinstance(error, PoolTimeout) or (isinstance(error, OperationalError) and state is None)
     if not (invalidated or unreached or (state or "")[:2] == "08" or (state or "")[:3] in {"57P", "533"}):
@@ -156,20 +168,20 @@ async def _database_error(request: Request, error: Exception) -> Response:
         "The database does not answer for the moment.",
         "It comes back by itself. Wait a few seconds, look at what is stored, then try again.",
     )
-    response = _answer(request, away)
+    response = await _answer(request, away)
     response.headers["Retry-After"] = str(RETRY_S)
     return response
 
 
 async def _system_error(request: Request, error: Exception) -> Response:
     if isinstance(error, OSError) and error.errno in _FULL:
-        return _full(request, error)
+        return await _full(request, error)
     return await _unknown_error(request, error)
 
 
-def _full(request: Request, error: Exception) -> Response:
+async def _full(request: Request, error: Exception) -> Response:
     log.error("the disk is full", path=request.url.path, error=type(error).__name__)
-    return _answer(
+    return await _answer(
         request,
         StorageFull(
             "There is no room left on the disk.", "Ask your administrator to make room; what was stored before is safe. Then try again."
@@ -182,4 +194,4 @@ async def _unknown_error(request: Request, error: Exception) -> Response:
     problem: Any = _PlainError(500, "Something went wrong on our side.")
     number = getattr(request.state, "request_id", "?")
     problem.hint = f"Tell your administrator the request id {number}. Look at what is stored before you send anything again."
-    return _secured(request, _answer(request, problem))
+    return _secured(request, await _answer(request, problem))

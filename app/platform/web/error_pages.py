@@ -1,0 +1,36 @@
+"""What a page of an error says beyond the error: what to do, and everything that had been typed, so that no entry is lost."""
+
+from __future__ import annotations
+
+from fastapi import Request
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+
+_PLAIN_FORM = "application/x-www-form-urlencoded"
+_SECRET = "password"
+
+_ADVICE = {
+    404: ("There is no such page", "The address may be mistyped; or what it named is gone, or lies outside your study or site."),
+    405: ("This address takes no such request", "Open the page it belongs to and use its buttons."),
+    413: ("Too large to take", "Go back and choose less at once."),
+    422: ("Something in this request cannot be used", "Correct what is named and send it again."),
+}
+
+
+def advised(status: int, title: str, has_entries: bool) -> tuple[str, str]:
+    """The heading of an error's page, and what to do where the error itself does not say."""
+    if status == 401:
+        kept = " Then send what you had entered from here." if has_entries else ""
+        return "Your sign-in has expired", f"Sign in again in a new window.{kept}"
+    return _ADVICE.get(status, (title, ""))
+
+
+async def kept_entries(request: Request) -> list[tuple[str, str]]:
+    """Names and values of a plain form that was sent, in its order; passwords are left out. Empty for other requests."""
+    if request.method != "POST" or not request.headers.get("content-type", "").startswith(_PLAIN_FORM):
+        return []
+    try:
+        form = await request.form(max_files=0, max_fields=2000)
+    except (RuntimeError, ClientDisconnect, HTTPException):
+        return []  # the body went another way, is broken, or larger than any form: there is nothing to keep
+    return [(name, value) for name, value in form.multi_items() if isinstance(value, str) and _SECRET not in name]

@@ -1,0 +1,60 @@
+"""Pages of errors say what to do and lose no entry."""
+
+from __future__ import annotations
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.accounts.deps import COOKIE
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "heading"),
+    [
+        ("GET", "/no/such/page", 404, "There is no such page"),
+        ("GET", "/participants/NOBODY", 404, "There is no such page"),
+        ("DELETE", "/accounts", 405, "This address takes no such request"),
+        ("GET", "/sessions/none", 422, "Something in this request cannot be used"),
+    ],
+)
+def test_a_page_of_an_error_says_what_to_do(browser: TestClient, method: str, path: str, status: int, heading: str) -> None:
+    answer = browser.request(method, path)
+    assert answer.status_code == status
+    assert f"<h1>{heading}</h1>" in answer.text
+    assert "Today" in answer.text
+
+
+def test_an_expired_sign_in_gives_back_every_entry_and_takes_it_after_signing_in(browser: TestClient, enrolled: str) -> None:
+    entered = {"number": "2", "date": "2026-03-30", "note": "slept <badly> & late"}
+    live = browser.cookies[COOKIE]
+    browser.cookies.set(COOKIE, "ended")
+    refused = browser.post("/participants/P1/visits", data=entered)
+    assert refused.status_code == 401
+    assert "Your sign-in has expired" in refused.text
+    assert '<input type="hidden" name="note" value="slept &lt;badly&gt; &amp; late">' in refused.text
+    assert 'action="/participants/P1/visits"' in refused.text
+    browser.cookies.clear()
+    browser.cookies.set(COOKIE, live)
+    assert browser.post("/participants/P1/visits", data=entered).status_code == 303
+
+
+def test_a_password_is_not_given_back(browser: TestClient) -> None:
+    browser.cookies.set(COOKIE, "ended")
+    refused = browser.post("/account/password", data={"present_password": "old secret 123", "new_password": "new secret 123"})
+    assert refused.status_code == 401
+    assert "secret" not in refused.text
+
+
+def test_a_form_that_is_too_large_is_refused_on_a_page(browser: TestClient, enrolled: str) -> None:
+    refused = browser.post("/participants/P1/visits", data={"note": "x" * (2 << 20)})
+    assert refused.status_code == 413
+    assert refused.headers["content-type"].startswith("text/html")
+    assert refused.headers["connection"] == "close"
+    assert "<h1>Too large to take</h1>" in refused.text
+
+
+def test_programs_get_a_problem_document_as_before(client: TestClient) -> None:
+    refused = client.post("/api/v1/participants", content=b"x" * (2 << 20), headers={"Content-Type": "application/json"})
+    assert refused.status_code == 413
+    assert refused.headers["content-type"] == "application/problem+json"
+    assert refused.json()["title"] == "The request is too large"
