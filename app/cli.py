@@ -333,7 +333,7 @@ def export_(
 @app.command("control", epilog="Example: betaloop control --bundle P1-policy-3.zip --source session.zip --speed fast --log decisions.csv")
 def control_(
     bundle: Annotated[Path, typer.Option(help="Controller bundle.")],
-    source: Annotated[str | None, typer.Option(help="Recording, cohort:P1[:SEED], or - (betas, a line each); none: verify only.")] = None,
+    source: Annotated[str | None, typer.Option(help="Device (-, tcp:PORT, tail:FILE, simulated:P1), recording or cohort:P1.")] = None,
     speed: Annotated[str, typer.Option(help="realtime or fast.")] = "realtime",
     log: Annotated[Path | None, typer.Option(help="CSV of every decision.")] = None,
     key: Annotated[str | None, typer.Option(help="Public key, or a file with it; this installation's own when left out.")] = None,
@@ -342,19 +342,24 @@ def control_(
     steps: Annotated[int, typer.Option(min=1, help="Length of a simulated session.")] = 300,
     participant: Annotated[str | None, typer.Option(help="Code of the participant that the bundle must be of.")] = None,
     battery: Annotated[Path | None, typer.Option(help="JSON with assumptions about the implant, for battery life in days.")] = None,
-    bench: Annotated[bool, typer.Option("--bench", help="Nobody is connected: a bundle without approval may run live.")] = False,
+    bench: Annotated[bool, typer.Option("--bench", help="Nobody is connected: any bundle runs, on any day.")] = False,
+    ledger: Annotated[Path | None, typer.Option(help="Folder with the sessions that this tablet has run.")] = None,
+    withdrawn: Annotated[Path | None, typer.Option(help="The study's list of withdrawn policies and plans.")] = None,
+    timed: Annotated[int, typer.Option("--time", min=0, max=100_000, help="Time so many decisions on this machine.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Verify a controller bundle and run it on a stream of beta, as the tablet does."""
-    from app.tablet.command import Task, control, lines
+    from app.tablet.command import control, lines
     from app.tablet.sources import Wish
+    from app.tablet.task import Task
 
     if speed not in ("realtime", "fast"):
         raise typer.BadParameter(f"'{speed}' is neither realtime nor fast.", param_hint="--speed")
     wish = Wish(channel=channel, beta_source=beta_source, steps=steps, realtime=speed == "realtime")
-    summary = control(bundle, source, wish, Task(log=log, key=key, participant=participant, battery=battery, bench=bench))
+    task = Task(log=log, key=key, participant=participant, battery=battery, bench=bench, ledger=ledger, withdrawn=withdrawn, timed=timed)
+    summary = control(bundle, source, wish, task)
     _print(summary, as_json, lines(summary))
-    if "wrong_signal" in summary:
+    if "wrong_signal" in summary or summary.get("failed"):
         raise typer.Exit(1)
 
 

@@ -41,6 +41,9 @@ RELEASED_DUMP = ROOT / "tests" / "data" / "released-0.1.0.sql.xz"
 RELEASED_FILES = ROOT / "tests" / "data" / "released-0.1.0-files.zip"
 
 
+pytest_plugins = ["tests.hazard_marks"]
+
+
 @pytest.fixture(scope="session")
 def recordings() -> Path:
     """Folder of real device recordings; where it is absent the test is skipped."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 import re
@@ -10,10 +9,10 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
@@ -21,23 +20,24 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from app.platform.errors import Invalid
 from app.settings import get_settings
 from app.tablet.battery import read_implant
-from app.tablet.sources import Source, Wish, open_source
+from app.tablet.live import is_live, run_live
+from app.tablet.sources import Rows, Source, Wish, open_source
+from app.tablet.task import Task
 from ml.deploy.appraisal import battery_gain
 from ml.deploy.bundle import OpenBundle, open_bundle
 from ml.deploy.manifest import BundleError, BundleManifest
-from ml.deploy.runtime import decision_log
+from ml.deploy.runtime.decision_log import LogFailed, LogFile, Row
 from ml.deploy.runtime.envelope import Decision, Reason, Signal, reason_names
+from ml.deploy.runtime.live import End, LiveSession
+from ml.deploy.runtime.session import describe, latency
 from ml.deploy.wording import battery_words, warning_sentences
 from ml.energy import Implant, relative_energy, saving_percent
 
 _KEY = "bundle-signing"
 
 
-class Sink(Protocol):
-    """What a log is written to."""
-
-    def write(self, row: str, /) -> int:
-        """Add one line."""
+Sink = Callable[[Row], None]
+"""What a log is written to."""
 
 
 @dataclass
@@ -52,6 +52,16 @@ class Run:
     signals: set[Signal] = field(default_factory=set)
     missed: int = 0
     worst_late_ms: float = 0.0
+
+    @staticmethod
+    def of(session: LiveSession) -> Run:
+        """What a session with a device side amounted to."""
+        limits = session.controller.envelope.limits
+        run = Run(limits.period_s, limits.cdbs_ma, session.decisions, [row.latency_us for row in session.rows], missed=session.missed)
+        run.signal_us = [0.0] * len(run.decisions)
+        run.signals = {row.sample.signal for row in session.rows if row.sample is not None}
+        run.worst_late_ms = 1000.0 * max((row.late_s for row in session.rows), default=0.0)
+        return run
 
     def summary(self, source: Source) -> dict[str, Any]:
         """Numbers of the session by name; None where there is nothing to count."""
@@ -80,11 +90,12 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
     """Verify a bundle and, with a source, run its controller. Returns the summary.
 
     Args:
-        bundle: the ZIP. source, wish: as `open_source` takes them; without a source the bundle is verified and no more.
-        task: what else is to be done.
+        bundle: the ZIP. source: a device side (`-` in real time, `tcp:PORT`, `tail:FILE`, `simulated:P1:SEED`), with which the session of
+            the signed plan runs, or one that `open_source` knows; without a source the bundle is verified and no more.
+        wish: as `open_source` takes it. task: what else is to be done.
 
     Raises:
-        Invalid: the bundle is not what it should be, or an argument makes no sense. NotFound: no such source.
+        Invalid: the bundle is not what it should be, may not run now, or an argument makes no sense. NotFound: no such source.
     """
     implant = None if task.battery is None else read_implant(task.battery)
     opened = verified(bundle, task.key)
@@ -95,92 +106,51 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
         )
     facts: dict[str, Any] = {"bundle": bundle.name, "participant": manifest.participant, "policy_name": manifest.policy_name}
     facts |= {"policy_id": manifest.policy_id, "approved": bool(manifest.approvals), "warnings": warning_sentences(manifest)}
+    if task.timed:
+        facts["measured_us"] = latency(opened.manifest_json, opened.controller(), task.timed)
     if source is None:
         return facts | {"verified": True, "files": len(manifest.files)}
-    if source == "-" and wish.realtime and not manifest.approvals and not task.bench:
-        raise Invalid(
-            f"{bundle.name} is not approved and must not be run live.",
-            "Have the visit plan with this policy approved and take the bundle anew, or add --bench where nobody is connected.",
-        )
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(errors="replace")  # bytes that are no text are no number either, and no reason to stop
-    stream = open_source(source, manifest, wish, sys.stdin)
-    if stream.participant not in (None, manifest.participant):
-        facts["warnings"].append(
-            f"The bundle is of participant {manifest.participant}, the source is synthetic participant {stream.participant}."
-        )
-    run = Run(manifest.period_s, manifest.cdbs_ma)
-    try:
-        with nullcontext(None) if task.log is None else DecisionLog(task.log) as sink:
-            drive(opened, stream, run, wish.realtime, sink)
-    except KeyboardInterrupt:  # ended by hand: what was done so far is summed up
-        facts["ended"] = "by hand"
+    if is_live(source, wish):
+        outcome, where = run_live(opened, bundle.name, source, task)
+        run, stream = Run.of(outcome.session), Source(_no_rows(), where)
+        facts["ended"] = outcome.end.value + (f" ({outcome.detail})" if outcome.detail else "")
+        facts["failed"] = outcome.end not in (End.COMPLETE, End.STOPPED)
+    else:
+        run, stream = Run(manifest.period_s, manifest.cdbs_ma), open_source(source, manifest, wish, sys.stdin)
+        if stream.participant not in (None, manifest.participant):
+            facts["warnings"].append(
+                f"The bundle is of participant {manifest.participant}, the source is synthetic participant {stream.participant}."
+            )
+        facts |= _replayed(opened, stream, run, wish, task)
     return facts | run.summary(stream) | _battery(run, implant) | _foreign(run, manifest)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """What is asked of a run.
-
-    Attributes:
-        log: CSV to write, one row per decision.
-        key: as `verified` takes it.
-        participant: code that the bundle must be of.
-        battery: JSON file with assumptions about the implant, as `read_implant` takes it.
-        bench: nobody is connected, so that a bundle without approval may run live.
-    """
-
-    log: Path | None = None
-    key: str | None = None
-    participant: str | None = None
-    battery: Path | None = None
-    bench: bool = False
+def _no_rows() -> Rows:
+    """Of a source that was run through already."""
+    yield from ()
 
 
-class DecisionLog:
-    """A new CSV file that gets one row per decision, each handed to the operating system at once, so that a killed process loses none.
-
-    Args:
-        path: of the file; one that holds something already is not written over.
-
-    Raises:
-        Invalid: the file is there already or cannot be written, at the start or at any row.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._rows = path, -2  # the first lines are the kind and the header
-        try:
-            if path.is_file() and path.stat().st_size:
-                raise Invalid(f"The log {path} is there already.", "Name a new file: no decision is written over.")
-            self._stream = path.open("w", newline="", encoding="utf-8")
-        except OSError as error:
-            raise self._unwritten(error) from error
-
-    def __enter__(self) -> DecisionLog:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        try:
-            self._stream.close()
-        except OSError as error:
-            raise self._unwritten(error) from error
-
-    def write(self, row: str) -> int:
-        """Add one line, whole or not at all as far as a kill is concerned."""
-        try:
-            self._stream.write(row)
-            self._stream.flush()
-        except OSError as error:
-            raise self._unwritten(error) from error
-        self._rows += 1
-        return len(row)
-
-    def _unwritten(self, error: OSError) -> Invalid:
-        done = f" The run ended after {self._rows} decisions." if self._rows >= 0 else ""
-        return Invalid(
-            f"The log {self._path} cannot be written: {error.strerror}.{done}",
-            "Name a file on a disk with free space, in a folder that may be written.",
-        )
+def _replayed(opened: OpenBundle, stream: Source, run: Run, wish: Wish, task: Task) -> dict[str, Any]:
+    """Drive the controller from what was recorded or is simulated; nobody is stimulated."""
+    log = None
+    try:
+        if task.log is not None:
+            about = describe(opened.manifest_json, opened.manifest_sha256, opened.controller(), datetime.now().astimezone(), "replay")
+            log = LogFile(task.log, run.period_s, about)
+        drive(opened, stream, run, wish.realtime, log.write if log else None)
+    except KeyboardInterrupt:  # ended by hand: what was done so far is summed up
+        return {"ended": "by hand"}
+    except LogFailed as error:
+        done = f" The run ended after {len(run.decisions) - 1} decisions." if log else ""
+        raise Invalid(
+            f"{str(error)[0].upper()}{str(error)[1:]}.{done}", "Name a new file on a disk with free space, in a folder that may be written."
+        ) from error
+    finally:
+        if log is not None:
+            log.close()
+    return {}
 
 
 def verified(path: Path, key: str | None) -> OpenBundle:
@@ -211,10 +181,6 @@ def drive(
         sink: gets the log, row by row, so that a crash loses none. wait: sleeps for so many seconds.
     """
     controller = opened.controller()
-    writer = csv.writer(sink) if sink else None
-    if sink and writer:
-        sink.write(f"{decision_log.kind_line(asdict(opened.manifest))}\r\n")
-        writer.writerow(decision_log.COLUMNS)
     window: deque[float] = deque(maxlen=opened.manifest.window)
     rows = source.rows
     row = next(rows, None)
@@ -241,9 +207,9 @@ def drive(
         run.worst_late_ms = max(run.worst_late_ms, 1000.0 * late_s)
         if row.sample is not None and not decision.reasons & Reason.LATE_SAMPLE:
             window.append(row.sample.beta)
-        if writer:
-            told = decision_log.cells(row.now_s, row.sample, decision, list(window), latency_us, row.signal_us, late_s, missed)
-            writer.writerow(told)
+        if sink:
+            drawn = None if decision.fallback else controller.drawn()
+            sink(Row(row.now_s, row.sample, decision, list(window), latency_us, row.signal_us, late_s, missed, drawn))
         try:
             row = rows.send(decision.amplitude_ma)
         except StopIteration:
@@ -253,10 +219,11 @@ def drive(
 def lines(summary: dict[str, Any]) -> str:
     """The summary for a person."""
     use = "approved" if summary["approved"] else "NOT APPROVED: not to be used on a participant"
-    who = f"participant {summary['participant']}, policy {summary['policy_name']} (no. {summary['policy_id']}), {use}"
+    who = f"participant {summary['participant']}, {_what(summary)}, {use}"
     warned = [f"warning          {text}" for text in summary["warnings"]]
     if summary.get("verified"):
-        return "\n".join([f"{summary['bundle']}: signature, {summary['files']} files and test vectors are right. {who}.", *warned])
+        said = f"{summary['bundle']}: signature, {summary['files']} files and test vectors are right. {who}."
+        return "\n".join([said, *warned, *_measured(summary)])
     latency = summary["latency_us"]
     reasons = ", ".join(f"{name} {count}" for name, count in summary["reasons"].items()) or "none"
     out = [
@@ -265,6 +232,8 @@ def lines(summary: dict[str, Any]) -> str:
         f"source           {summary['source']}",
         f"decisions        {summary['decisions']}: {summary['fallbacks']} on cDBS as fall-back",
         f"reasons          {reasons}",
+        *([f"ended            {summary['ended']}"] if "ended" in summary else []),
+        *_measured(summary),
         f"deadline misses  {summary['deadline_misses']} (worst {summary['worst_late_ms']:.3g} ms after the window's end)",
     ]
     for name, spread in (("decision", latency), ("P_beta", summary["signal_us"])):
@@ -286,6 +255,19 @@ def lines(summary: dict[str, Any]) -> str:
     if "wrong_signal" in summary:
         out.append(f"NO DECISION BY THE POLICY: {summary['wrong_signal']}")
     return "\n".join(out)
+
+
+def _what(summary: dict[str, Any]) -> str:
+    name, number = summary["policy_name"], summary["policy_id"]
+    return f"schedule {name}" if number is None else f"policy {name} (no. {number})"
+
+
+def _measured(summary: dict[str, Any]) -> list[str]:
+    """What `--time` found, as lines of the summary."""
+    found = summary.get("measured_us")
+    if not found:
+        return []
+    return [f"measured in us   mean {found['mean']:.1f}, std {found['std']:.1f}, median {found['median']:.1f} (n = {found['n']:.0f})"]
 
 
 def _public_key(key: str | None) -> Ed25519PublicKey:

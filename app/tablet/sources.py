@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Generator, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from threading import Thread
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.platform.errors import Invalid, NotFound
+from app.tablet.simulated import Brain, brain_of
 from ml.deploy.manifest import BundleManifest
 from ml.deploy.runtime.envelope import BetaSample, Signal
+from ml.deploy.runtime.protocol import number
 from ml.deploy.streaming import StreamingBeta, split_by_period
 from ml.formats import DecodeOptions, RecordingLog, TraceLog, UndecodableFile, decode, sniff
 from ml.formats.archive import FolderFiles, ZipFiles
@@ -31,8 +30,6 @@ from ml.formats.tables.numbers import column_name, unit_name
 from ml.signals import Stretch, band_rows
 
 LFP_UNITS = {"uV": 1.0, "mV": 1000.0, "V": 1e6}
-_COHORT = re.compile(r"cohort:([A-Za-z0-9]+)(?::(\d{1,9}))?")
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 class Row(NamedTuple):
@@ -74,7 +71,7 @@ class Wish:
         channel: of a recording with several; the one with most valid periods when None.
         beta_source: how the beta amplitudes of a table were made; `table` when None.
         steps: length of a simulated session.
-        realtime: standard input is timed by its arrival.
+        realtime: decisions wait until they are due.
     """
 
     channel: str | None = None
@@ -96,8 +93,7 @@ def open_source(text: str, manifest: BundleManifest, wish: Wish, stdin: Iterable
         NotFound: no such file or participant. Invalid: nothing in it can be used.
     """
     if text == "-":
-        rows = _live_lines(stdin, manifest) if wish.realtime else _lines(stdin, manifest)
-        return Source(rows, "beta amplitudes from standard input")
+        return Source(_lines(stdin, manifest), "beta amplitudes from standard input, one per period")
     if text.startswith("cohort:"):
         return _cohort(text, manifest, wish.steps)
     path = Path(text)
@@ -163,52 +159,11 @@ def _lines(lines: Iterable[str], manifest: BundleManifest) -> Rows:
         yield Row(now_s, _sample(line, now_s, manifest))
 
 
-def _live_lines(lines: Iterable[str], manifest: BundleManifest) -> Rows:
-    """Lines as they arrive, and a row in every period whether or not one did; of several the newest counts, since the others are past."""
-    inbox: SimpleQueue[str | None] = SimpleQueue()
-    Thread(target=_pump, args=(lines, inbox), daemon=True).start()
-    try:
-        line = inbox.get(timeout=manifest.period_s)  # the session starts with the first line, and without it after a period
-    except Empty:
-        line = ""
-    began, k = time.perf_counter(), 0
-    while line is not None:
-        now_s = k * manifest.period_s
-        yield Row(now_s, _sample(line, now_s, manifest))
-        k += 1
-        time.sleep(max(0.0, began + k * manifest.period_s - time.perf_counter()))
-        line = _newest(inbox)
-
-
-def _pump(lines: Iterable[str], inbox: SimpleQueue[str | None]) -> None:
-    """Hand lines on from a thread of its own, None at their end, so that the loop never waits for one."""
-    try:
-        for line in lines:
-            inbox.put(line)
-    finally:
-        inbox.put(None)
-
-
-def _newest(inbox: SimpleQueue[str | None]) -> str | None:
-    """The newest line that has come, "" where none has, None once all have been seen and there will be no more."""
-    line: str | None = ""
-    while True:
-        try:
-            came = inbox.get_nowait()
-        except Empty:
-            return line
-        if came is None:
-            inbox.put(None)
-            return line or None
-        line = came
-
-
 def _sample(line: str, now_s: float, manifest: BundleManifest) -> BetaSample | None:
     """A number, taken to be of the bundle's unit and source; NaN where there is another text, nothing where the line is empty."""
     if not line.strip():
         return None
-    beta = float(line) if _NUMBER.fullmatch(line.strip()) else math.nan  # float() alone takes "1_5" for 15
-    return BetaSample(now_s, beta, Signal(manifest.beta_unit, manifest.beta_source))
+    return BetaSample(now_s, number(line.strip()), Signal(manifest.beta_unit, manifest.beta_source))
 
 
 def _raw(stretches: list[Stretch], manifest: BundleManifest, description: str, rows: int | None = None) -> Source:
@@ -294,30 +249,12 @@ def _lfp_columns(path: Path) -> list[Stretch]:
 
 def _cohort(text: str, manifest: BundleManifest, steps: int) -> Source:
     """A synthetic participant that answers to the amplitude: the loop is closed."""
-    from ml.population import PARTICIPANTS
-
-    found = _COHORT.fullmatch(text)
-    if found is None or found[1] not in PARTICIPANTS:
-        raise NotFound(f"There is no synthetic participant '{text}'.", f"Name one of cohort:{', cohort:'.join(PARTICIPANTS)}, with :SEED.")
-    name, seed = found[1], int(found[2] or 0)
-    description = f"synthetic participant {name}, seed {seed}, closed loop of {steps} steps"
-    return Source(_simulate(name, seed, manifest, steps), description, participant=name)
+    brain = brain_of(text.removeprefix("cohort:"), manifest, steps)
+    return Source(_simulate(brain, manifest, steps), f"{brain.description}, closed loop of {steps} steps", participant=brain.participant)
 
 
-def _simulate(name: str, seed: int, manifest: BundleManifest, steps: int) -> Rows:
-    from ml.population.env import ParticipantEnv
-    from ml.population.participants import PARTICIPANTS
-
-    environment = ParticipantEnv(name, steps, PARTICIPANTS[name].mdp_settings(window=manifest.window, period_s=manifest.period_s))
-    signal = Signal("uV", manifest.beta_source)  # the simulation gives the amplitude itself, whatever the device would make it from
-    window, _ = environment.reset(seed=seed)
+def _simulate(brain: Brain, manifest: BundleManifest, steps: int) -> Rows:
     amplitude = manifest.cdbs_ma
-    for i, beta in enumerate(window.tolist()):  # the window before the session, recorded under cDBS
-        now_s = (i - len(window) + 1) * manifest.period_s
-        amplitude = yield Row(now_s, BetaSample(now_s, beta, signal))
-    for k in range(1, steps + 1):
-        _, _, done, _, info = environment.step(np.array([amplitude / manifest.cdbs_ma], dtype=np.float32))
+    for k in range(1 - manifest.window, steps + 1):  # first the window before the session, recorded under cDBS
         now_s = k * manifest.period_s
-        amplitude = yield Row(now_s, BetaSample(now_s, float(info["beta"]), signal))
-        if done:
-            return
+        amplitude = yield Row(now_s, BetaSample(now_s, brain.beta(amplitude), brain.signal))

@@ -73,6 +73,8 @@ class BundleWarning:
 def warnings(manifest: BundleManifest) -> list[BundleWarning]:
     """What stands out in a policy's answers; `wording` makes sentences of it."""
     m, out = manifest, []
+    if m.schedule is not None:
+        return []
     if m.test_windows_from is None:
         return [BundleWarning(WarningCode.UNTRIED)]
     if m.asked_below_bound is not None and m.logged_lower_bound is not None and m.asked_below_bound >= MANY:

@@ -31,12 +31,13 @@ from ml.deploy import appraisal, vectors
 from ml.deploy.c_envelope import header_tanh
 from ml.deploy.c_header import fixed_point_header, float_header, self_test
 from ml.deploy.fixed_point import CutNetwork, quantise
-from ml.deploy.manifest import BundleError, BundleManifest
+from ml.deploy.manifest import SCHEMA_VERSION, BundleError, BundleManifest
 from ml.deploy.onnx_mlp import NoPlainNetwork, mlp_of
 from ml.deploy.runtime.__main__ import check
 from ml.deploy.runtime.controller import BoundedController, WindowNetwork
 from ml.deploy.runtime.envelope import Signal
 from ml.deploy.runtime.network import MlpNetwork
+from ml.deploy.runtime.schedule import ScheduledController
 from ml.deploy.sheet import render
 from ml.deploy.windows import PolicyWindow
 from ml.policies.onnx_policy import MAX_FILE_BYTES, OnnxPolicy, PolicyFileError, PolicyOutputError
@@ -46,10 +47,10 @@ WEIGHTS, HEADER, SELF_TEST = "weights.f32", "betaloop_controller.h", "selftest.c
 HEADER_INT8, SELF_TEST_INT8 = "betaloop_controller_int8.h", "selftest_int8.c"
 _RUNTIME = Path(__file__).parent / "runtime"
 RUNNER = tuple(f"controller/{path.name}" for path in sorted(_RUNTIME.glob("*.py")))
-_LATER = {"controller/decision_log.py"}
-"""Files of the runner that bundles of version 0.1.0 do not have; these stay in use."""
-_REQUIRED = {SHEET, MODEL, VECTORS}
-_OF_NETWORKS = {WEIGHTS, HEADER, SELF_TEST, *RUNNER}
+_OLDEST_RUNNER = {f"controller/{name}.py" for name in ("__init__", "__main__", "controller", "envelope", "network")}
+"""What the runner of a bundle of version 0.1.0 consists of; later ones have more files."""
+_REQUIRED = {SHEET, VECTORS}
+_OF_NETWORKS = {WEIGHTS, HEADER, SELF_TEST}
 _OF_SMALL_NETWORKS = {HEADER_INT8, SELF_TEST_INT8}
 _ORDER = (SHEET, MANIFEST, SIGNATURE, MODEL, VECTORS, WEIGHTS, HEADER, SELF_TEST, HEADER_INT8, SELF_TEST_INT8, *RUNNER)
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a ZIP can hold
@@ -61,15 +62,22 @@ class OpenBundle:
 
     Attributes:
         manifest: what it says about itself.
-        network: keeps its own window; in numpy, or by onnxruntime for a policy made elsewhere.
+        network: keeps its own window; in numpy, or by onnxruntime for a policy made elsewhere. None where a schedule runs.
+        manifest_sha256: of its bytes, which names the bundle in logs.
     """
 
     manifest: BundleManifest
-    network: WindowNetwork
+    network: WindowNetwork | None
+    manifest_sha256: str
+
+    @property
+    def manifest_json(self) -> dict[str, Any]:
+        """The manifest as the runner on the tablet reads it."""
+        return dict(json.loads(self.manifest.to_bytes()))
 
     def controller(self) -> BoundedController:
-        """The network within the clinician's limits; one per session."""
-        return BoundedController(self.network, self.manifest.limits(), Signal(self.manifest.beta_unit, self.manifest.beta_source))
+        """The network or the schedule within the clinician's limits; one per session."""
+        return make_controller(self.manifest, self.network)
 
 
 def build_bundle(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDArray[Any]) -> bytes:
@@ -89,19 +97,54 @@ def build_bundle(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDA
     """
     manifest, network, policy, windows = _described(policy_onnx, manifest, test_windows)
     expected = policy.act(windows)
-    steps = vectors.session(manifest, network or PolicyWindow(policy, manifest.window), windows)
+    steps = vectors.session(manifest, make_controller(manifest, network or PolicyWindow(policy, manifest.window)), windows)
     files = {MODEL: policy_onnx, VECTORS: vectors.to_json(windows, expected, steps)}
     if network is not None:
-        files |= {f"controller/{path.name}": path.read_bytes() for path in _RUNTIME.glob("*.py")}
+        files |= _runner_files()
         test = self_test(manifest, HEADER, windows, expected, steps, vectors.TOLERANCE, exact=True)
         files |= {WEIGHTS: network.to_bytes(), HEADER: float_header(manifest, network).encode(), SELF_TEST: test.encode()}
         fixed = quantise(network)
         if fixed is not None:
             expected_cut = policy.act(fixed.cut(windows))  # the bound is against the real network on the window cut to the int16 inputs
-            steps = vectors.session(manifest, CutNetwork(network, fixed), windows)
+            steps = vectors.session(manifest, make_controller(manifest, CutNetwork(network, fixed)), windows)
             test = self_test(manifest, HEADER_INT8, windows, expected_cut, steps, fixed.bound, exact=False)
             files |= {HEADER_INT8: fixed_point_header(manifest, fixed).encode(), SELF_TEST_INT8: test.encode()}
-    files[SHEET] = render(manifest, hashlib.sha256(policy_onnx).hexdigest()).encode()
+    return _whole(manifest, files, render(manifest, hashlib.sha256(policy_onnx).hexdigest()))
+
+
+def build_scheduled_bundle(manifest: BundleManifest) -> bytes:
+    """Pack a session whose amplitudes are laid out beforehand: sheet, reference runner, and the session in which beta goes wrong.
+
+    Args:
+        manifest: everything but `files`; with a schedule.
+
+    Returns:
+        The ZIP's bytes, the same for the same manifest.
+    """
+    level = manifest.level_high / 2 if manifest.level_high else 1.0
+    betas = level * np.linspace(0.8, 1.2, 16)[:, None] * np.linspace(0.9, 1.1, manifest.window)[None, :]
+    steps = vectors.session(manifest, make_controller(manifest, None), betas)
+    files = {VECTORS: vectors.to_json(np.empty((0, manifest.window)), np.empty(0), steps)} | _runner_files()
+    return _whole(manifest, files, render(manifest, None))
+
+
+def make_controller(manifest: BundleManifest, network: WindowNetwork | None) -> BoundedController:
+    """A network, or the manifest's schedule, within the clinician's limits. Raises BundleError where there is neither."""
+    signal = Signal(manifest.beta_unit, manifest.beta_source)
+    if manifest.schedule is not None:
+        return ScheduledController(manifest.schedule, manifest.limits(), signal)
+    if network is None:
+        raise BundleError("the bundle has neither network nor schedule")
+    return BoundedController(network, manifest.limits(), signal)
+
+
+def _runner_files() -> dict[str, bytes]:
+    return {f"controller/{path.name}": path.read_bytes() for path in _RUNTIME.glob("*.py")}
+
+
+def _whole(manifest: BundleManifest, files: dict[str, bytes], sheet: str) -> bytes:
+    """The ZIP of all files with their manifest."""
+    files = files | {SHEET: sheet.encode()}
     full = replace(manifest, files={name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
     return _pack(files | {MANIFEST: full.to_bytes()})
 
@@ -184,9 +227,13 @@ def open_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) -> O
         found = hashlib.sha256(files[name]).hexdigest()
         if found != digest:
             raise BundleError(f"{name} is not the file that the manifest names: SHA-256 {found[:12]}... instead of {digest[:12]}...")
+    digest = hashlib.sha256(raw).hexdigest()
+    if manifest.schedule is not None:
+        _check_decisions(raw, None, files[VECTORS], "the schedule")
+        return OpenBundle(manifest, None, digest)
     policy = _check_vectors(files[MODEL], files[VECTORS], manifest.window)
     if WEIGHTS not in files:
-        return OpenBundle(manifest, PolicyWindow(policy, manifest.window))
+        return OpenBundle(manifest, PolicyWindow(policy, manifest.window), digest)
     mean, std = manifest.normalisation_mean, manifest.normalisation_std
     if mean is None or std is None:
         raise BundleError(f"the manifest must state the normalisation of {WEIGHTS}")
@@ -194,17 +241,29 @@ def open_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) -> O
         made = [
             MlpNetwork.from_bytes(files[WEIGHTS], manifest.layers, mean, std, manifest.activations, manifest.output()) for _ in range(2)
         ]
-        check(json.loads(raw), made[0], json.loads(files[VECTORS]))  # which moves its window
-        return OpenBundle(manifest, made[1])
+    except ValueError as error:
+        raise BundleError(f"{WEIGHTS} cannot be used: {error}") from error
+    _check_decisions(raw, made[0], files[VECTORS], WEIGHTS)  # which moves its window
+    return OpenBundle(manifest, made[1], digest)
+
+
+def _check_decisions(raw: bytes, network: MlpNetwork | None, stated: bytes, what: str) -> None:
+    """Raise BundleError where the reference runner's own check of the test vectors fails."""
+    try:
+        check(json.loads(raw), network, json.loads(stated))
     except (ValueError, KeyError, TypeError) as error:
-        raise BundleError(f"{WEIGHTS} does not agree with {VECTORS}: {error}") from error
+        raise BundleError(f"{what} does not agree with {VECTORS}: {error}") from error
 
 
 def _check_names(manifest: BundleManifest, present: set[str]) -> None:
-    """The files named, and those inside, are one of the three sets that a bundle can be."""
+    """The files named, and those inside, are one of the four sets that a bundle can be."""
     named = set(manifest.files)
-    wanted = _REQUIRED | (_OF_NETWORKS if manifest.layers else set()) | (_OF_SMALL_NETWORKS if manifest.int8_bound is not None else set())
-    if named not in (wanted, wanted - _LATER):
+    wanted = _REQUIRED | ({MODEL} if manifest.schedule is None else set())
+    wanted |= (_OF_NETWORKS if manifest.layers else set()) | (_OF_SMALL_NETWORKS if manifest.int8_bound is not None else set())
+    if manifest.layers or manifest.schedule:
+        older = manifest.schema_version < SCHEMA_VERSION and named >= _OLDEST_RUNNER
+        wanted |= named & set(RUNNER) if older else set(RUNNER)
+    if named != wanted:
         raise BundleError(f"the manifest must name {', '.join(sorted(wanted))}; it names {', '.join(sorted(named)) or 'nothing'}")
     for name in sorted(present ^ named):
         raise BundleError(f"the bundle lacks {name}" if name in named else f"the bundle holds {name}, which the manifest does not name")

@@ -18,7 +18,10 @@ enum {
     BETALOOP_POLICY_OUTPUT = 256,
     BETALOOP_MINIMUM = 512,
     BETALOOP_MAXIMUM = 1024,
-    BETALOOP_RAMP = 2048
+    BETALOOP_RAMP = 2048,
+    BETALOOP_SATURATED_BETA = 4096,
+    BETALOOP_FROZEN_BETA = 8192,
+    BETALOOP_BETA_LEVEL = 16384
 };
 
 /* One beta amplitude: the end of its window, its value (NaN where the device gave none), and what it says it is. */
@@ -36,6 +39,9 @@ typedef struct {
     int32_t has_sample;
     int32_t has_decision;
     int32_t streak;
+    int32_t equal;
+    float last_beta;
+    float level;
     float amplitude_ma;
     betaloop_score scores[BETALOOP_WINDOW];
 } betaloop_state;
@@ -102,6 +108,9 @@ static inline void betaloop_start(betaloop_state *s) {
     s->has_sample = 0;
     s->has_decision = 0;
     s->streak = 0;
+    s->equal = 0;
+    s->last_beta = -1.0f;
+    s->level = 0.0f;
     s->amplitude_ma = BETALOOP_CDBS_MA;
     for (i = 0; i < BETALOOP_WINDOW; ++i) s->scores[i] = 0;
 }
@@ -116,7 +125,15 @@ static inline uint32_t betaloop_admit(betaloop_state *s, int64_t now_ms, const b
     s->last_sample_ms = sample->t_ms;
     s->has_sample = 1;
     if (!betaloop_same(sample->unit, BETALOOP_UNIT) || !betaloop_same(sample->source, BETALOOP_SOURCE)) reasons = BETALOOP_WRONG_SIGNAL;
-    if (!(sample->beta >= 0.0f && sample->beta <= 3.4028234663852886e38f)) reasons |= BETALOOP_INVALID_BETA;
+    if (!(sample->beta >= 0.0f && sample->beta <= 3.4028234663852886e38f)) {
+        reasons |= BETALOOP_INVALID_BETA;
+        s->equal = 0;
+    } else {
+        s->equal = s->equal && sample->beta == s->last_beta ? s->equal + (s->equal < BETALOOP_FROZEN_AFTER) : 1;
+        s->last_beta = sample->beta;
+        if (sample->beta > BETALOOP_BETA_MAX) reasons |= BETALOOP_SATURATED_BETA;
+        if (s->equal >= BETALOOP_FROZEN_AFTER) reasons |= BETALOOP_FROZEN_BETA;
+    }
     if (reasons) {
         s->streak = 0;
         return reasons;
@@ -126,6 +143,7 @@ static inline uint32_t betaloop_admit(betaloop_state *s, int64_t now_ms, const b
         reasons = BETALOOP_WINDOW_GAP;
     }
     if (s->streak < BETALOOP_WINDOW) ++s->streak;
+    s->level = s->streak == 1 ? sample->beta : s->level + (sample->beta - s->level) / (float)s->streak;
     for (i = 0; i + 1 < BETALOOP_WINDOW; ++i) s->scores[i] = s->scores[i + 1];
     s->scores[BETALOOP_WINDOW - 1] = betaloop_score_of(sample->beta);
     return reasons;
@@ -150,6 +168,8 @@ static inline betaloop_decision betaloop_decide(betaloop_state *s, int64_t now_m
     else if ((uint64_t)now_ms - (uint64_t)s->last_sample_ms > BETALOOP_STALE_AFTER_MS)
         trouble |= BETALOOP_STALE_BETA;
     if (s->streak < BETALOOP_WINDOW) trouble |= BETALOOP_WINDOW_INCOMPLETE;
+    else if (!(s->level >= BETALOOP_LEVEL_LOW && s->level <= BETALOOP_LEVEL_HIGH))
+        trouble |= BETALOOP_BETA_LEVEL;
     if (!trouble) {
         d.fraction = betaloop_fraction(s->scores);
         if (!(d.fraction >= -1e-4f && d.fraction <= 1.0f + 1e-4f)) trouble |= BETALOOP_POLICY_OUTPUT;

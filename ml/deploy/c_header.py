@@ -21,12 +21,15 @@ from numpy.typing import NDArray
 from ml.deploy.c_envelope import ENVELOPE, SELF_TEST, TANH, TYPES
 from ml.deploy.fixed_point import SCORE_LIMIT, FixedPointNetwork
 from ml.deploy.manifest import BundleError, BundleManifest
-from ml.deploy.runtime.envelope import FLAG_MA, SPACING_TOLERANCE
+from ml.deploy.runtime.envelope import FLAG_MA, LARGEST_BETA, REASON_NAMES, SPACING_TOLERANCE, Reason
 from ml.deploy.runtime.network import MlpNetwork, Output
 from ml.deploy.vectors import Step
 
 _SAFE = set(string.ascii_letters + string.digits + " _.,:;+-()=<>@#%")
 _RENDERED_PER_LINE = 8
+LIMIT_REASONS = Reason.MINIMUM | Reason.MAXIMUM | Reason.RAMP
+INT32_MAX = 2**31 - 1
+ALL_REASONS = sum(REASON_NAMES)
 
 
 def comment(text: str) -> str:
@@ -175,7 +178,7 @@ def self_test(
             f"#define STEPS {len(steps)}",
             f"#define TOLERANCE {tolerance!r}",
             f"#define TOLERANCE_MA {tolerance * manifest.cdbs_ma + 2e-6!r}",
-            f"#define FALLBACK_REASONS {'4095u' if exact else '511u'}",
+            f"#define FALLBACK_REASONS {ALL_REASONS if exact else ALL_REASONS & ~LIMIT_REASONS}u",
             f"static const float windows[WINDOWS][BETALOOP_WINDOW] = {{\n    {{{_rows(windows)}}}}};",
             f"static const float expected[WINDOWS] = {{{_floats(expected)}}};",
             "static volatile float zero = 0.0f;",
@@ -227,6 +230,10 @@ def _preamble(manifest: BundleManifest, kind: str) -> str:
 #define BETALOOP_CDBS_MA {_float(cdbs)}
 #define BETALOOP_RAMP_MA_PER_S {_float(limits.ramp_ma_per_s)}
 #define BETALOOP_FLAG_MA {_float(FLAG_MA)}
+#define BETALOOP_BETA_MAX {_float(LARGEST_BETA if limits.beta_max is None else limits.beta_max)}
+#define BETALOOP_LEVEL_LOW {_float(limits.level_low or 0.0)}
+#define BETALOOP_LEVEL_HIGH {_float(LARGEST_BETA if limits.level_high is None else limits.level_high)}
+#define BETALOOP_FROZEN_AFTER {INT32_MAX if limits.frozen_after is None else limits.frozen_after}
 """
 
 

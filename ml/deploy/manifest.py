@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Callable
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 from ml.deploy.runtime.envelope import EnvelopeLimits
 from ml.deploy.runtime.network import OWN_OUTPUT, Output
+from ml.deploy.runtime.schedule import Schedule
+from ml.deploy.runtime.slot import Slot
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
+READABLE = (3, 4)
+"""Version 3, of betaloop 0.1.0, has neither slot nor schedule nor limits of beta: such a bundle runs on the bench alone."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -43,7 +48,7 @@ class BundleManifest:
 
     Attributes:
         participant: the participant's code.
-        policy_id, policy_name: as the study knows the policy.
+        policy_id, policy_name: as the study knows the policy; without number, and with the design's name, where a schedule runs.
         hemisphere: `left` or `right`; None where the study states one amplitude for all.
         window: W, beta amplitudes per decision, oldest first.
         period_s: m, seconds per decision.
@@ -51,7 +56,7 @@ class BundleManifest:
         beta_low_hz, beta_high_hz, min_valid_fraction: how they are made from local field potentials.
         normalisation_mean, normalisation_std: z-scoring constants inside the network; None where the file does not show them.
         min_ma, max_ma, cdbs_ma, ramp_ma_per_s: the clinician's limits, as in `EnvelopeLimits`.
-        max_beta_age_s: as in `EnvelopeLimits`.
+        max_beta_age_s, beta_max, level_low, level_high, frozen_after: as in `EnvelopeLimits`.
         limits_stated_by: who stated the limits, and when; None where nobody did and they are defaults.
         device_min_ma, device_max_ma: amplitude limits read from the participant's stimulator; None where no recording held them.
         snapshot_sha256: of the buffer snapshot that the policy was trained on; None for a policy made elsewhere.
@@ -72,6 +77,8 @@ class BundleManifest:
         int8_bound, int8_planes, int8_bytes: of the fixed-point header; None where there is none.
         taken_by: who took the bundle and when, so that no two that left are the same bytes; None for one made without a service.
         public_key: Ed25519 key that the bundle is signed with, 64 hexadecimal digits; it names the signer and proves nothing by itself.
+        slot: the session of the signed plan that the bundle is for; None for one taken without a plan, which runs on the bench alone.
+        schedule: what is delivered where no network decides; None where one does.
         approvals: sign-offs, in order.
         files: SHA-256 by file name of everything else in the bundle; filled in when the bundle is built.
         schema_version: of this manifest.
@@ -81,7 +88,7 @@ class BundleManifest:
     """
 
     participant: str
-    policy_id: int
+    policy_id: int | None
     policy_name: str
     window: int
     beta_unit: str
@@ -100,6 +107,10 @@ class BundleManifest:
     normalisation_mean: float | None = None
     normalisation_std: float | None = None
     max_beta_age_s: float | None = None
+    beta_max: float | None = None
+    level_low: float | None = None
+    level_high: float | None = None
+    frozen_after: int | None = None
     limits_stated_by: str | None = None
     device_min_ma: float | None = None
     device_max_ma: float | None = None
@@ -129,13 +140,18 @@ class BundleManifest:
     int8_bytes: int | None = None
     taken_by: str | None = None
     public_key: str | None = None
+    slot: Slot | None = None
+    schedule: Schedule | None = None
     approvals: tuple[Approval, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
     schema_version: int = SCHEMA_VERSION
 
     def __post_init__(self) -> None:
-        if self.schema_version != SCHEMA_VERSION:
-            raise BundleError(f"this bundle has manifest version {self.schema_version}; this betaloop reads {SCHEMA_VERSION}")
+        if self.schema_version not in READABLE:
+            raise BundleError(
+                f"this bundle has manifest version {self.schema_version}; this betaloop reads {READABLE[0]} to {READABLE[-1]}"
+            )
+        self._check_kind()
         for name in ("participant", "policy_name", "beta_unit", "beta_source", "code_version", "policy_code_version"):
             if not getattr(self, name).strip():
                 raise BundleError(f"the manifest needs a {name}")
@@ -155,6 +171,15 @@ class BundleManifest:
             raise BundleError(f"layers {list(self.layers)} need {max(0, len(self.layers) - 2)} activations, not {list(self.activations)}")
         self.limits()
         self._check_device_limits()
+
+    def _check_kind(self) -> None:
+        """A network or a schedule runs, and versions before 4 know neither schedule nor slot."""
+        if self.schema_version < SCHEMA_VERSION and (self.slot or self.schedule):
+            raise BundleError(f"a manifest of version {self.schema_version} has neither slot nor schedule")
+        if self.schedule is not None and (self.policy_id is not None or self.layers):
+            raise BundleError("a bundle holds a network or a schedule, not both")
+        if self.schedule is None and self.policy_id is None:
+            raise BundleError("the manifest needs a policy_id or a schedule")
 
     def _check_device_limits(self) -> None:
         """The clinician's limits lie within what the stimulator was set to allow."""
@@ -211,7 +236,22 @@ class BundleManifest:
         if not isinstance(activations, list) or not all(isinstance(name, str) for name in activations):
             raise BundleError("activations in manifest.json must be a list of names")
         signed = tuple(Approval(**item) for item in approvals)
+        values["slot"] = _nested("slot", values.get("slot"), lambda stored: Slot(**stored))
+        values["schedule"] = _nested("schedule", values.get("schedule"), Schedule.from_json)
         return BundleManifest(**values, layers=tuple(layers), activations=tuple(activations), approvals=signed)
+
+
+Made = TypeVar("Made")
+
+
+def _nested(name: str, stored: Any, make: Callable[[dict[str, Any]], Made]) -> Made | None:
+    """An object inside the manifest. Raises BundleError where it is another."""
+    if stored is None:
+        return None
+    try:
+        return make(stored)
+    except (TypeError, ValueError, KeyError) as error:
+        raise BundleError(f"{name} in manifest.json cannot be used: {error}") from error
 
 
 _TEXT, _WHOLE, _NUMBER = (str,), (int,), (int, float)
@@ -240,5 +280,5 @@ def _check_keys(where: str, kind: type[Any], values: dict[str, Any]) -> None:
         allowed = _TYPES.get(str(known[name].type))
         if allowed and (not isinstance(value, allowed) or isinstance(value, bool)):
             raise BundleError(f"{name} in {where} must be {known[name].type}, not {json.dumps(value)}")
-        if isinstance(value, dict) and not all(isinstance(text, str) for text in value.values()):
+        if str(known[name].type) == "dict[str, str]" and not all(isinstance(text, str) for text in value.values()):
             raise BundleError(f"{name} in {where} must map names to text")

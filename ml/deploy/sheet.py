@@ -7,7 +7,7 @@ from datetime import datetime
 from html import escape
 
 from ml.deploy.manifest import BundleManifest
-from ml.deploy.wording import battery_words, warning_sentences
+from ml.deploy.wording import battery_words, energy_words, warning_sentences
 
 _STYLE = """
 @page { size: A4; margin: 10mm 14mm; }
@@ -43,21 +43,24 @@ footer { margin-top: 10px; color: #51606d; font-size: 8.2pt; }
 """
 
 
-def render(manifest: BundleManifest, model_sha256: str) -> str:
+def render(manifest: BundleManifest, model_sha256: str | None) -> str:
     """The sheet.
 
     Args:
         manifest: of the bundle, all but its files.
-        model_sha256: of the ONNX file.
+        model_sha256: of the ONNX file; None where a schedule runs.
     """
+    number = "" if manifest.policy_id is None else f" · policy {manifest.policy_id}"
+    what = "Network" if manifest.schedule is None else "Schedule"
     code = escape(manifest.participant)
     side = f" · {manifest.hemisphere} hemisphere" if manifest.hemisphere else ""
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Controller bundle {code}, policy {manifest.policy_id}</title><style>{_STYLE}</style></head><body>
-<header><div><h1>{code}</h1>{escape(manifest.policy_name)} <span class="muted">· policy {manifest.policy_id}{side}</span></div>
+<title>Controller bundle {code}{escape(number.replace(" ·", ","))}</title><style>{_STYLE}</style></head><body>
+<header><div><h1>{code}</h1>{escape(manifest.policy_name)} <span class="muted">{number}{side}</span></div>
 <div class="kind">Closed-loop DBS controller<br>one-page sheet of the bundle</div></header>
 {_approval(manifest)}
+{_session(manifest)}
 {_warned(manifest)}
 <h2>Stimulation limits</h2>
 <div class="big"><div><small>Lowest</small><b>{manifest.min_ma:g} mA</b></div><div><small>Highest</small><b>{manifest.max_ma:g} mA</b></div>
@@ -68,13 +71,14 @@ def render(manifest: BundleManifest, model_sha256: str) -> str:
 <div class="columns"><div>
 <h2>Signal</h2><table>{_rows(_signal(manifest))}</table>
 </div><div>
-<h2>Network</h2><table>{_rows(_network(manifest))}</table>
+<h2>{what}</h2><table>{_rows(_network(manifest))}</table>
 </div></div>
 <h2>Amplitude, energy, battery</h2><table class="wide">{_rows(_expected(manifest))}</table>
 <h2>When the controller gives way</h2>
 <p style="margin:2px 0">Every {manifest.period_s:g} s it decides anew. In the same decision, and without a ramp, it returns to the cDBS
 amplitude of <b>{manifest.cdbs_ma:g}&nbsp;mA</b> when beta has not come when it was due (older than {manifest.limits().stale_after_s:g} s),
-is not a number, negative, or of another unit or source, when the window has a gap, or when the network fails. It takes over again after
+is not a number, negative, {_implausible(manifest)}or of another unit or source, when the window has a gap, or when the
+network fails. It takes over again after
 {manifest.window} valid beta amplitudes in a row ({manifest.window * manifest.period_s:g} s), moving at most
 {manifest.ramp_ma_per_s * manifest.period_s:.3g} mA per period.</p>
 <h2>Before use</h2>
@@ -97,6 +101,28 @@ def _approval(m: BundleManifest) -> str:
         f"Approved by {escape(a.name)} ({escape(a.role)}), {escape(_when(a.approved_at))}: {escape(a.statement)}" for a in m.approvals
     )
     return f'<div class="signed">{lines}</div>'
+
+
+def _session(m: BundleManifest) -> str:
+    """Which session of which visit, and that it runs once."""
+    slot = m.slot
+    if slot is None:
+        return '<div class="warn">For no session of a signed plan: runs on the bench alone, with nobody connected.</div>'
+    label = f" · {escape(slot.label)}" if slot.label else ""
+    repeat = f", repeat {slot.repeat}" if slot.repeat > 1 else ""
+    return (
+        f'<div class="signed">Session {slot.position} of visit {slot.visit_number}{label}{repeat} · {slot.minutes:g} min · '
+        f"<b>{escape(slot.visit_date)}</b> only, once. Plan {slot.plan_id}, signed as <code>{escape(slot.plan_sha256[:12])}</code>.</div>"
+    )
+
+
+def _implausible(m: BundleManifest) -> str:
+    """What else counts as beta that is not to be trusted, as part of a sentence."""
+    found = [] if m.beta_max is None else [f"above {m.beta_max:.3g} {escape(m.beta_unit)}"]
+    found += [] if m.frozen_after is None else [f"the same {m.frozen_after} times in a row"]
+    if m.level_low is not None and m.level_high is not None:
+        found.append(f"on average outside {m.level_low:.3g} to {m.level_high:.3g} {escape(m.beta_unit)}")
+    return "".join(f"{text}, " for text in found)
 
 
 def _made(m: BundleManifest) -> str:
@@ -165,6 +191,11 @@ def _signal(m: BundleManifest) -> list[tuple[str, str]]:
 
 
 def _network(m: BundleManifest) -> list[tuple[str, str]]:
+    if m.schedule is not None:
+        drawn = [] if m.schedule.seed is None else [("Seed", str(m.schedule.seed))]
+        level = [] if m.schedule.level is None else [("Level", f"{m.schedule.level:.2f} of cDBS")]
+        minutes = sum(hold.steps for hold in m.schedule.holds) * m.period_s / 60
+        return [("Design", m.schedule.design), *level, *drawn, ("Amplitudes", f"{len(m.schedule.holds)} held, {minutes:.1f} min in all")]
     if not m.layers:
         return [("Form", f"ONNX only, without C header: {m.no_header or 'no layers are known'}")]
     rows = [
@@ -183,7 +214,13 @@ def _network(m: BundleManifest) -> list[tuple[str, str]]:
 
 
 def _expected(m: BundleManifest) -> list[tuple[str, str]]:
-    """What the policy asks for on logged beta, and what follows for energy and battery."""
+    """What the policy asks for on logged beta, or the schedule delivers, and what follows for energy and battery."""
+    if m.schedule is not None:
+        fractions = [hold.amplitude for hold in m.schedule.holds for _ in range(hold.steps)]
+        given = [min(max(a * m.cdbs_ma, m.min_ma), m.max_ma) / m.cdbs_ma for a in fractions]
+        mean, square = sum(given) / len(given), sum(a * a for a in given) / len(given)
+        lowest = f"{min(given) * m.cdbs_ma:.2f} to {max(given) * m.cdbs_ma:.2f} mA, {mean * m.cdbs_ma:.2f} mA on average"
+        return [("Delivered", lowest), ("Energy", f"{energy_words(square)}, as scheduled")]
     if m.asked_mean is None or m.energy_of_cdbs is None or m.charge_of_cdbs is None:
         return [("Not known", "no beta of this participant was logged with this window: neither amplitude nor energy can be estimated")]
     asked = f"{m.asked_mean * m.cdbs_ma:.2f} mA on average over {m.test_windows} logged windows ({m.test_windows_from})"
@@ -196,10 +233,13 @@ def _expected(m: BundleManifest) -> list[tuple[str, str]]:
     ]
 
 
-def _origin(m: BundleManifest, model_sha256: str) -> list[tuple[str, str]]:
-    return [
-        ("Network SHA-256", model_sha256),
+def _origin(m: BundleManifest, model_sha256: str | None) -> list[tuple[str, str]]:
+    network = [
+        ("Network SHA-256", model_sha256 or ""),
         ("Snapshot SHA-256", m.snapshot_sha256 or "none: trained outside this study"),
+    ]
+    return [
+        *(network if m.schedule is None else []),
         ("Signing key", m.public_key or "not signed"),
     ]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.deploy.manifest import BundleManifest
-from ml.deploy.runtime.controller import BoundedController, WindowNetwork
+from ml.deploy.runtime.controller import BoundedController
 from ml.deploy.runtime.envelope import BetaSample, Signal, reason_names
 
 TOLERANCE = 1e-5
@@ -45,10 +45,9 @@ def edge_windows(windows: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([windows, *(np.stack([np.ones_like(ramp), ramp]) * level * scale for scale in _SCALES)])
 
 
-def session(manifest: BundleManifest, network: WindowNetwork, windows: NDArray[np.float64]) -> list[Step]:
+def session(manifest: BundleManifest, controller: BoundedController, windows: NDArray[np.float64]) -> list[Step]:
     """Run the session through the Python controller; what it decides is what others must decide."""
     signal = Signal(manifest.beta_unit, manifest.beta_source)
-    controller = BoundedController(network, manifest.limits(), signal)
     steps = []
     for now_s, sample in _script(manifest, signal, np.abs(windows).ravel()):
         decision = controller.decide(now_s, sample)
@@ -58,10 +57,11 @@ def session(manifest: BundleManifest, network: WindowNetwork, windows: NDArray[n
 
 
 def _script(manifest: BundleManifest, signal: Signal, betas: NDArray[np.float64]) -> Iterator[tuple[float, BetaSample | None]]:
-    """Times and samples: start, NaN, negative, silence, wrong unit, wrong source, late, huge, zero, early decision, gap."""
+    """Times and samples: start, NaN, negative, silence, wrong unit, wrong source, late, huge, zero, gap; then, where limits say what they
+    are, frozen, saturated and another level; an early decision."""
     period, w = manifest.period_s, manifest.window
     level = float(betas.mean()) or 1.0
-    values = iter(np.resize(betas, 40 * (w + 8)).tolist())
+    values = iter(np.resize(betas, 60 * (w + 8)).tolist())
     k = 0
 
     def take(count: int, beta: float | None = None, stated: Signal = signal) -> Iterator[tuple[float, BetaSample | None]]:
@@ -92,6 +92,16 @@ def _script(manifest: BundleManifest, signal: Signal, betas: NDArray[np.float64]
     yield from take(w + 2, 1e6 * level)
     yield from take(w + 2, 0.0)
     yield from take(w + 2)
+    if manifest.frozen_after is not None:
+        yield from take(manifest.frozen_after + 1, level)
+        yield from take(w + 1)
+    if manifest.beta_max is not None:
+        yield from take(2, 1.5 * manifest.beta_max)
+        yield from take(w + 1)
+    if manifest.level_low is not None:
+        for _ in range(w + 3):  # a unit that is too small by far, and then the right one again
+            yield from take(1, 0.1 * manifest.level_low * (1 + 0.01 * (k % 7)))
+        yield from take(w + 4)
     yield (k - 0.5) * period, None  # a decision too early: the ramp allows half
     yield from take(3)
 

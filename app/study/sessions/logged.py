@@ -37,7 +37,7 @@ class Logged:
 def of_recording(db: Session, recording: Recording) -> Logged | None:
     """What a recording says of its controller; None where it is no log, or a log that does not tell."""
     said = limits_and_policy(recording)
-    if said is None:
+    if said is None or said["network_sha256"] is None:  # a schedule has no policy
         return None
     same = repository.policies_of_network(db, recording.participant_id, said["network_sha256"])
     policy = next((p for p in same if p.id == said["policy_id"]), same[0] if same else None)
@@ -53,6 +53,6 @@ def of_recording(db: Session, recording: Recording) -> Logged | None:
 
 
 def limits_and_policy(recording: Recording) -> Mapping[str, Any] | None:
-    """What stands in a log's first line (`ml.formats.tables.control_log.Ran`); None as in `of_recording`."""
+    """What stands at the head of a log (`ml.formats.tables.log_head.Ran`); None as in `of_recording`."""
     said = recording.details.get("settings", {}).get("controller")
     return said if isinstance(said, Mapping) else None

@@ -1,72 +1,99 @@
-"""`python -m controller [FOLDER] [--run [--log=FILE]]`: check an unpacked bundle against its test vectors, and run it on standard input.
+"""`python -m controller [FOLDER] [OPTIONS]`: check an unpacked bundle, and run its session with a device side.
 
-Hashes are checked here; the signature of the manifest is not (that needs a cryptography library): `betaloop control` does.
+    --key=KEY          the study's public key, 64 hexadecimal digits or a file with them: the manifest's signature is checked
+    --run              run the session of the signed plan that the bundle is for, once, on the day of the visit; needs --key
+    --input=INPUT      where the device side is: - (standard input and output, the default), tcp:PORT on this machine, or tail:FILE
+    --log=FILE         the session's log, a new file
+    --ledger=FOLDER    which sessions this tablet has run (default: .betaloop-tablet in the home folder)
+    --withdrawn=FILE   the study's signed list of withdrawn policies and plans
+    --bench            with --run: nobody is connected; any bundle runs, and lone numbers count as beta
+    --replay           with --run and --bench: one line per period, as fast as they come, with no clock
+    --time=N           measure N decisions on this machine, microseconds
+
+The lines are those of `protocol.py`. Without --key hashes and test vectors are checked, and the signature is not.
 """
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import math
-import os
+import re
+import signal
 import sys
-import time
 from collections import deque
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from . import decision_log
 from .controller import BoundedController
+from .decision_log import LogFile, Row
 from .envelope import BetaSample, EnvelopeLimits, Signal, reason_names
+from .inputs import Event, LoopbackLink, QueueLink, from_growing_file, from_lines, give_up_standard_output
+from .ledger import Ledger
+from .live import End
 from .network import MlpNetwork, Output
+from .protocol import number
+from .schedule import Schedule, ScheduledController
+from .session import Outcome, Tablet, describe, latency, parse_manifest, run_bench, run_slot
+from .signature import verifies
+from .slot import NotAllowed, read_withdrawals
 
 _LIMITS = ("min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s", "window", "period_s", "max_beta_age_s")
+_OPTIONAL_LIMITS = ("beta_max", "level_low", "level_high", "frozen_after")
+LEDGER = Path.home() / ".betaloop-tablet"
+ENDED_WELL = (End.COMPLETE, End.STOPPED)
 
 
 def main(arguments: list[str]) -> int:
-    """Exit code 0: everything agrees; 1: something does not, said on standard error."""
+    """Exit code 0: everything agrees, and the session came to its end; 1: something did not, said on standard error."""
     folder = Path(next((a for a in arguments if not a.startswith("-")), "."))
+    options = {name: value for name, _, value in (a.partition("=") for a in arguments if a.startswith("--"))}
     try:
-        manifest = json.loads((folder / "manifest.json").read_bytes())
-        for name, digest in manifest["files"].items():
-            if hashlib.sha256((folder / name).read_bytes()).hexdigest() != digest:
-                raise ValueError(f"{name} is not the file that the manifest names")
-        network = MlpNetwork.from_bytes(
-            (folder / "weights.f32").read_bytes(),
-            manifest["layers"],
-            manifest["normalisation_mean"],
-            manifest["normalisation_std"],
-            manifest["activations"],
-            Output(*(manifest[f"output_{name}"] for name in Output._fields)),
-        )
+        key = None if "--key" not in options else public_key(options["--key"])
+        raw = (folder / "manifest.json").read_bytes()
+        manifest = parse_manifest(raw)
+        check_files(folder, manifest, raw, key)
+        network = None if manifest.get("schedule") else _network(folder, manifest)
         worst, worst_ma = check(manifest, network, json.loads((folder / "test_vectors.json").read_bytes()))
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         sys.stderr.write(f"this bundle cannot be used: {error}\n")
         return 1
-    sys.stderr.write(f"test vectors agree: worst difference {worst:.3g} of a fraction, {worst_ma:.3g} mA\n")
-    if "--run" in arguments:
-        log = next((Path(a.removeprefix("--log=")) for a in arguments if a.startswith("--log=")), None)
-        try:
-            run(manifest, network, log)
-        except BrokenPipeError:
-            sys.stderr.write("nobody reads the amplitudes any more\n")
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to write at exit goes nowhere
-            return 1
-        except OSError as error:
-            sys.stderr.write(f"the log {log} cannot be written: {error.strerror}\n")
-            return 1
-    return 0
+    said = "signature right, " if key else ""
+    sys.stderr.write(f"{said}test vectors agree: worst difference {worst:.3g} of a fraction, {worst_ma:.3g} mA\n")
+    controller = make_controller(manifest, network)
+    if "--time" in options:
+        measured = latency(manifest, controller, int(options["--time"] or 200))
+        sys.stdout.write(json.dumps({"participant": manifest["participant"], "policy": manifest["policy_name"], "us": measured}) + "\n")
+    return _run(manifest, hashlib.sha256(raw).hexdigest(), controller, options, key) if "--run" in options else 0
 
 
-def check(manifest: dict[str, Any], network: MlpNetwork, vectors: dict[str, Any]) -> tuple[float, float]:
+def public_key(text: str) -> bytes:
+    """The 32 bytes of a key given as digits or as a file with them. Raises ValueError, OSError."""
+    digits = text.strip()
+    if not re.fullmatch(r"[0-9a-fA-F]{64}", digits):
+        digits = Path(text).read_text("ascii").strip()
+    if not re.fullmatch(r"[0-9a-fA-F]{64}", digits):
+        raise ValueError("the key is not 64 hexadecimal digits")
+    return bytes.fromhex(digits)
+
+
+def check_files(folder: Path, manifest: dict[str, Any], raw: bytes, key: bytes | None) -> None:
+    """Raise ValueError where a file is another than the manifest names or, with a key, the manifest is not signed by it."""
+    for name, digest in manifest["files"].items():
+        if hashlib.sha256((folder / name).read_bytes()).hexdigest() != digest:
+            raise ValueError(f"{name} is not the file that the manifest names")
+    if key is not None and not verifies(key, raw, (folder / "manifest.sig").read_bytes()):
+        raise ValueError("the manifest is not signed with this key")
+
+
+def check(manifest: dict[str, Any], network: MlpNetwork | None, vectors: dict[str, Any]) -> tuple[float, float]:
     """Worst differences of fractions and of decisions (mA) from the test vectors. Raises ValueError where one is too large."""
-    worst = float(np.abs(network.act(np.array(vectors["windows"])) - np.array(vectors["expected"])).max())
-    controller = _controller(manifest, network)
-    worst_ma = 0.0
+    worst = worst_ma = 0.0
+    if network is not None:
+        worst = float(np.abs(network.act(np.array(vectors["windows"])) - np.array(vectors["expected"])).max())
+    controller = make_controller(manifest, network)
     for step in vectors["session"]:
         sample = None
         if step["t_s"] is not None:
@@ -81,39 +108,108 @@ def check(manifest: dict[str, Any], network: MlpNetwork, vectors: dict[str, Any]
     return worst, worst_ma
 
 
-def run(manifest: dict[str, Any], network: MlpNetwork, log: Path | None = None) -> None:
-    """One beta amplitude per line in (anything else counts as no number), one amplitude in mA and its reasons per line out.
+def make_controller(manifest: dict[str, Any], network: MlpNetwork | None) -> BoundedController:
+    """The network or schedule of a manifest within its limits. Raises ValueError, KeyError, TypeError for a manifest that is none."""
+    stated = {name: manifest[name] for name in _LIMITS} | {name: manifest.get(name) for name in _OPTIONAL_LIMITS}
+    limits, said = EnvelopeLimits(**stated), Signal(manifest["beta_unit"], manifest["beta_source"])
+    if manifest.get("schedule"):
+        return ScheduledController(Schedule.from_json(manifest["schedule"]), limits, said)
+    if network is None:
+        raise ValueError("the bundle has neither network nor schedule")
+    return BoundedController(network, limits, said)
 
-    With a log, every decision is a row of it too, handed to the operating system at once. Raises OSError where it is there already or
-    cannot be written.
+
+def _network(folder: Path, manifest: dict[str, Any]) -> MlpNetwork:
+    return MlpNetwork.from_bytes(
+        (folder / "weights.f32").read_bytes(),
+        manifest["layers"],
+        manifest["normalisation_mean"],
+        manifest["normalisation_std"],
+        manifest["activations"],
+        Output(*(manifest[f"output_{name}"] for name in Output._fields)),
+    )
+
+
+def _run(manifest: dict[str, Any], manifest_sha256: str, controller: BoundedController, options: dict[str, str], key: bytes | None) -> int:
+    log = Path(options["--log"]) if options.get("--log") else None
+    try:
+        if "--bench" in options and "--replay" in options:
+            replay(manifest, manifest_sha256, controller, log)
+            return 0
+        link = open_link(options.get("--input", "-"))
+        _stop_on_signals(link)
+        if "--bench" in options:
+            outcome = run_bench(manifest, manifest_sha256, controller, link, log, None)
+        else:
+            if key is None or log is None:
+                sys.stderr.write("a session needs --key and --log; add --bench where nobody is connected\n")
+                return 1
+            withdrawn = read_withdrawals(Path(options["--withdrawn"]), key) if "--withdrawn" in options else None
+            tablet = Tablet(ledger=Ledger(Path(options.get("--ledger", LEDGER))), withdrawn=withdrawn)
+            outcome = run_slot(manifest, manifest_sha256, controller, link, log, tablet)
+    except NotAllowed as refused:
+        sys.stderr.write(f"not run: {refused}\n")
+        return 1
+    except BrokenPipeError:
+        give_up_standard_output()
+        sys.stderr.write("nobody reads the amplitudes any more\n")
+        return 1
+    except OSError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return _report(outcome)
+
+
+def _report(outcome: Outcome) -> int:
+    if outcome.end is End.DEVICE_GONE:
+        give_up_standard_output()
+        sys.stderr.write("nobody reads the amplitudes any more\n")
+    else:
+        detail = f" ({outcome.detail})" if outcome.detail else ""
+        sys.stderr.write(f"ended after {len(outcome.session.decisions)} decisions, on clinical settings: {outcome.end.value}{detail}\n")
+    return 0 if outcome.end in ENDED_WELL else 1
+
+
+def open_link(where: str) -> QueueLink:
+    """The device side at `-`, `tcp:PORT` or `tail:FILE`. Raises ValueError for another text, OSError for a port that is taken."""
+    kind, _, rest = where.partition(":")
+    if where == "-":
+        return from_lines(sys.stdin)
+    if kind == "tcp" and rest.isdecimal() and int(rest) < 65536:
+        link = LoopbackLink(int(rest))
+        sys.stderr.write(f"waiting for a device side on port {link.port} of this machine\n")
+        return link
+    if kind == "tail" and rest:
+        return from_growing_file(Path(rest))
+    raise OSError(f"the input '{where}' is none of -, tcp:PORT and tail:FILE")
+
+
+def _stop_on_signals(link: QueueLink) -> None:
+    """Have Ctrl-C and a stop of the system end the session as the stop button does: on clinical settings, with its log whole."""
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, lambda *_: link.put(Event.STOP))
+
+
+def replay(manifest: dict[str, Any], manifest_sha256: str, controller: BoundedController, log: Path | None) -> None:
+    """One lone number per period from standard input, as fast as they come, amplitudes and reasons out: for tests of a bundle.
+
+    Raises:
+        LogFailed: the log is there already or cannot be written. BrokenPipeError: nobody reads the amplitudes.
     """
-    controller, signal = _controller(manifest, network), Signal(manifest["beta_unit"], manifest["beta_source"])
+    facts = describe(manifest, manifest_sha256, controller, Tablet(ledger=Ledger(LEDGER)).now(), "replay")
+    sink = None if log is None else LogFile(log, manifest["period_s"], facts)
     window: deque[float] = deque(maxlen=manifest["window"])
-    with nullcontext() if log is None else log.open("x", newline="", encoding="utf-8") as sink:
-        writer = csv.writer(sink) if sink else None
-        if sink and writer:
-            sink.write(f"{decision_log.kind_line(manifest)}\r\n")
-            writer.writerow(decision_log.COLUMNS)
-        for k, line in enumerate(sys.stdin):
-            try:
-                beta = math.nan if "_" in line else float(line)  # float() alone takes "1_5" for 15
-            except ValueError:
-                beta = math.nan
-            now_s = k * manifest["period_s"]
-            sample, began = BetaSample(now_s, beta, signal), time.perf_counter_ns()
-            decision = controller.decide(now_s, sample)
-            latency_us = (time.perf_counter_ns() - began) / 1000.0
-            window.append(beta)
-            sys.stdout.write(f"{decision.amplitude_ma:.6g} {' '.join(reason_names(decision.reasons))}\n")
-            sys.stdout.flush()
-            if sink and writer:
-                writer.writerow(decision_log.cells(now_s, sample, decision, list(window), latency_us))
-                sink.flush()
-
-
-def _controller(manifest: dict[str, Any], network: MlpNetwork) -> BoundedController:
-    limits = EnvelopeLimits(**{name: manifest[name] for name in _LIMITS})
-    return BoundedController(network, limits, Signal(manifest["beta_unit"], manifest["beta_source"]))
+    said = Signal(manifest["beta_unit"], manifest["beta_source"])
+    for k, line in enumerate(sys.stdin):
+        sample = BetaSample(k * manifest["period_s"], number(line.strip()), said)
+        decision = controller.decide(sample.t_s, sample)
+        window.append(sample.beta)
+        sys.stdout.write(f"{decision.amplitude_ma:.6g} {' '.join(reason_names(decision.reasons))}\n")
+        sys.stdout.flush()
+        if sink:
+            sink.write(Row(sample.t_s, sample, decision, list(window), 0.0, drawn=None if decision.fallback else controller.drawn()))
+    if sink:
+        sink.close()
 
 
 if __name__ == "__main__":

@@ -26,23 +26,38 @@ class BoundedController:
         signal: unit and source of the beta amplitudes that the network was trained on.
     """
 
-    __slots__ = ("_network", "envelope")
+    __slots__ = ("envelope", "network")
 
     def __init__(self, network: WindowNetwork, limits: EnvelopeLimits, signal: Signal) -> None:
-        self._network = network
+        self.network = network
         self.envelope = Envelope(limits, signal)
 
-    def decide(self, now_s: float, sample: BetaSample | None) -> Decision:
+    def fresh(self) -> BoundedController:
+        """The same at the start of a session; the network is shared, and its window is filled before it is asked."""
+        return BoundedController(self.network, self.envelope.limits, self.envelope.signal)
+
+    def observe(self, now_s: float, sample: BetaSample) -> int:
+        """Take a beta amplitude in without deciding on it, as one that came late. Returns the reasons against it."""
+        self.envelope.begin(now_s)
+        reasons, use = self.envelope.admit(now_s, sample)
+        if use:
+            self.network.push(sample.beta)
+        return reasons
+
+    def decide(self, now_s: float, sample: BetaSample | None, reasons: int = 0) -> Decision:
         """Decide on the amplitude of the period that starts now.
 
         Args:
             now_s: time of this decision, seconds, on the clock of the samples.
             sample: the beta amplitude that came since the last decision; None when none came.
+            reasons: what the loop itself found wrong since the last decision, as bits of `Reason`.
         """
-        self.envelope.begin(now_s)
-        reasons = 0
-        if sample is not None:
-            reasons, use = self.envelope.admit(now_s, sample)
-            if use:
-                self._network.push(sample.beta)
-        return self.envelope.decide(now_s, reasons, self._network.fraction)
+        if sample is None:
+            self.envelope.begin(now_s)
+        else:
+            reasons |= self.observe(now_s, sample)
+        return self.envelope.decide(now_s, reasons, self.network.fraction)
+
+    def drawn(self) -> tuple[int, float | None] | None:
+        """Index and log density of the drawn amplitude that the last decision delivers; None for a network, which draws nothing."""
+        return None

@@ -1,56 +1,74 @@
-"""The log of a controller: a kind line that says what ran, a header, and one row per decision.
+"""The log of a controller: a kind line, a line that says whose session it is, a header, and one row per decision.
 
 The row of a decision holds the beta amplitude of the period that ended at `due_s`, and the amplitude decided for the time from `t_s` to the
-next decision's: beta and amplitude of one row are those of two steps. Readers know it by its first line.
+next decision's: beta and amplitude of one row are those of two steps. Readers know it by its first line. The second line is JSON, so that
+an uploaded log finds the session that it is of; versions before 3 lack it.
 """
 
 from __future__ import annotations
 
+import csv
+import json
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from .envelope import BetaSample, Decision, reason_names
 
-VERSION = 2
-NETWORK = "model.onnx"
-"""The file of a bundle by which a policy is known, in whatever installation."""
+VERSION = 3
 COLUMNS = (
     "t_s", "due_s", "beta", "unit", "source", "valid", "window", "fraction", "requested_ma", "amplitude_ma", "action", "reasons",
-    "latency_us", "signal_us", "late_ms", "missed", "detail",
+    "latency_us", "signal_us", "late_ms", "missed", "hold", "log_density", "battery_percent", "ended", "detail",
 )  # fmt: skip
 
 
-def kind_line(manifest: Mapping[str, Any]) -> str:
-    """The first line of a log, without its end: which policy decided, for which side, and within which limits."""
-    m = manifest
-    side = f", side {m['hemisphere']}" if m.get("hemisphere") else ""
-    return (
-        f"# betaloop controller log, version {VERSION}, period {m['period_s']:g} s, policy {m['policy_id']}, network {m['files'][NETWORK]}"
-        f"{side}, limits {m['min_ma']:.9g} to {m['max_ma']:.9g} mA, cDBS {m['cdbs_ma']:.9g} mA, ramp {m['ramp_ma_per_s']:.9g} mA/s"
-    )
+class LogFailed(OSError):
+    """The log is there already, or cannot be written."""
 
 
-def cells(
-    due_s: float,
-    sample: BetaSample | None,
-    decision: Decision,
-    window: list[float],
-    latency_us: float,
-    signal_us: float = 0.0,
-    late_s: float = 0.0,
-    missed: bool = False,
-) -> list[Any]:
-    """The row of a decision, in the order of `COLUMNS`.
+class Row(NamedTuple):
+    """One decision for the log.
 
-    Args:
+    Attributes:
         due_s: end of the period whose beta amplitude came, seconds from the session's start. sample: that beta amplitude, if one came.
         decision: what was decided. window: beta amplitudes so far, the newest last.
         latency_us, signal_us: time that the decision, and P_beta before it, took. late_s, missed: after the period's end, and too late.
+        drawn: index and log density of the drawn amplitude that is delivered; None where none is.
+        battery_percent: charge of the tablet's own battery; None where it has none.
+        ended: how the session ended with this row; None where it goes on.
     """
-    shown = window[len(window) - decision.valid :] if decision.valid else []
+
+    due_s: float
+    sample: BetaSample | None
+    decision: Decision
+    window: list[float]
+    latency_us: float
+    signal_us: float = 0.0
+    late_s: float = 0.0
+    missed: bool = False
+    drawn: tuple[int, float | None] | None = None
+    battery_percent: float | None = None
+    ended: str | None = None
+
+
+def kind_line(period_s: float) -> str:
+    """The first line of a log, without its end."""
+    return f"# betaloop controller log, version {VERSION}, period {period_s:g} s"
+
+
+def description_line(facts: Mapping[str, Any]) -> str:
+    """The second line of a log, without its end."""
+    return "# " + json.dumps(facts, sort_keys=True, ensure_ascii=True, allow_nan=False)
+
+
+def cells(row: Row) -> list[Any]:
+    """A row, in the order of `COLUMNS`."""
+    sample, decision = row.sample, row.decision
+    shown = row.window[len(row.window) - decision.valid :] if decision.valid else []
+    hold, log_density = row.drawn or ("", None)
     return [
         f"{decision.t_s:.3f}",
-        f"{due_s:.3f}",
+        f"{row.due_s:.3f}",
         "" if sample is None else f"{sample.beta:.9g}",
         "" if sample is None else sample.signal.unit,
         "" if sample is None else sample.signal.source,
@@ -61,9 +79,69 @@ def cells(
         f"{decision.amplitude_ma:.9g}",
         "cdbs" if decision.fallback else "policy",
         " ".join(reason_names(decision.reasons)),
-        f"{latency_us:.1f}",
-        f"{signal_us:.1f}",
-        f"{1000.0 * late_s:.3f}",
-        int(missed),
+        f"{row.latency_us:.1f}",
+        f"{row.signal_us:.1f}",
+        f"{1000.0 * row.late_s:.3f}",
+        int(row.missed),
+        hold,
+        "" if log_density is None else f"{log_density:.12g}",
+        "" if row.battery_percent is None else f"{row.battery_percent:g}",
+        row.ended or "",
         decision.detail,
     ]
+
+
+class LogFile:
+    """A new file that gets one row per decision, each handed to the operating system at once, so that a killed process loses none.
+
+    Args:
+        path: of the file; one that holds something already is not written over.
+
+    Raises:
+        LogFailed: the file is there already or cannot be written, at the start or at any row.
+    """
+
+    def __init__(self, path: Path, period_s: float, facts: Mapping[str, Any]) -> None:
+        self._path = path
+        try:
+            if path.is_file() and path.stat().st_size:
+                raise LogFailed(f"the log {path} is there already: name a new file, no decision is written over")
+            self._stream = path.open("w", newline="", encoding="utf-8")
+        except OSError as error:
+            raise self._failed(error) from error
+        self._writer = csv.writer(self._stream)
+        self._lines(kind_line(period_s), description_line(facts))
+        self._row(COLUMNS)
+
+    def write(self, row: Row) -> None:
+        """Add a row. Raises LogFailed."""
+        self._row(cells(row))
+
+    def close(self) -> None:
+        """Raises LogFailed where what was written cannot be kept."""
+        try:
+            self._stream.close()
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def discard(self) -> None:
+        """Take the file away again, before any decision."""
+        self._stream.close()
+        self._path.unlink()
+
+    def _lines(self, *lines: str) -> None:
+        try:
+            self._stream.write("".join(f"{line}\r\n" for line in lines))
+            self._stream.flush()
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def _row(self, row: Any) -> None:
+        try:
+            self._writer.writerow(row)
+            self._stream.flush()
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def _failed(self, error: OSError) -> LogFailed:
+        return error if isinstance(error, LogFailed) else LogFailed(f"the log {self._path} cannot be written: {error.strerror}")

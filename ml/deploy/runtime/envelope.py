@@ -6,15 +6,17 @@ It knows nothing of how the fraction was made. Every period it decides on one am
 * from one decision to the next the amplitude moves by no more than the ramp limit times the time between them, and never by more than the
   ramp limit times one period, however late a decision comes;
 * beta that has not come when it was due, is not a number, negative, of another unit or source, or not yet a whole window without a gap,
-  and a network that fails or answers outside [0, 1], give the cDBS amplitude in the very decision in which that is found. This return to
-  the programmed therapy is *not* ramped: a ramp would leave the participant under-treated for some periods on a signal that nobody trusts.
-  It is the one exception to the ramp limit;
+  beta that is saturated, frozen or on a level that was never logged (where the limits say what that is), and a network that fails or
+  answers outside [0, 1], give the cDBS amplitude in the very decision in which that is found. This return to the programmed therapy is
+  *not* ramped: a ramp would leave the participant under-treated for some periods on a signal that nobody trusts. It is the one exception
+  to the ramp limit;
 * the network is asked again once a whole window of valid beta amplitudes has come; from cDBS the amplitude then moves at the ramp limit.
 """
 
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
@@ -48,6 +50,10 @@ class Reason:
     MINIMUM = 512  # raised to the clinician's minimum
     MAXIMUM = 1024  # lowered to the clinician's maximum
     RAMP = 2048  # held back by the ramp limit
+    SATURATED_BETA = 4096  # the beta amplitude is above what any recording of the participant makes plausible
+    FROZEN_BETA = 8192  # the same beta amplitude came again and again
+    BETA_LEVEL = 16384  # the mean of the window is far from every level that was logged: another unit, a loose contact
+    LINK = 32768  # the input repeats, skips or restarts its numbers or its clock, or was lost; found by the loop, not by the envelope
 
 
 _NOTES = Reason.LATE_SAMPLE | Reason.WINDOW_GAP  # no trouble in themselves: the window that they leave behind is judged
@@ -70,6 +76,9 @@ class EnvelopeLimits:
         window: W, beta amplitudes per decision.
         period_s: m, seconds per decision.
         max_beta_age_s: age above which a beta amplitude is stale, less than one period; None means `STALE_AFTER` of a period.
+        beta_max: beta amplitude above which the input counts as saturated; None where nobody knows.
+        level_low, level_high: range of the mean of a window, in the unit of the beta amplitudes; None where nobody knows.
+        frozen_after: so many equal beta amplitudes in a row count as frozen, 2 or more; None leaves them uncounted.
 
     Raises:
         ValueError: a value outside its range; the message names it.
@@ -82,6 +91,10 @@ class EnvelopeLimits:
     window: int = 10
     period_s: float = 2.0
     max_beta_age_s: float | None = None
+    beta_max: float | None = None
+    level_low: float | None = None
+    level_high: float | None = None
+    frozen_after: int | None = None
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
@@ -93,7 +106,7 @@ class EnvelopeLimits:
             raise ValueError(
                 f"the cDBS amplitude {self.cdbs_ma} mA must lie within the limits, {self.min_ma} to {self.max_ma} mA, and above 0"
             )
-        for name in ("ramp_ma_per_s", "period_s", "max_beta_age_s"):
+        for name in ("ramp_ma_per_s", "period_s", "max_beta_age_s", "beta_max"):
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise ValueError(f"{name} must be positive, not {value}")
@@ -101,6 +114,10 @@ class EnvelopeLimits:
             raise ValueError(f"beta is stale before one period ({self.period_s} s) has passed, not after {self.max_beta_age_s} s")
         if self.window < 1:
             raise ValueError(f"window must be at least 1 step, not {self.window}")
+        if (self.level_low is None) != (self.level_high is None) or not 0 <= (self.level_low or 0.0) <= (self.level_high or math.inf):
+            raise ValueError(f"the level of beta needs a range that rises from 0 or more, not {self.level_low} to {self.level_high}")
+        if self.frozen_after is not None and self.frozen_after < 2:
+            raise ValueError(f"beta is frozen after 2 equal amplitudes at the earliest, not after {self.frozen_after}")
 
     @property
     def stale_after_s(self) -> float:
@@ -164,7 +181,10 @@ class Envelope:
     A session starts with cDBS in force and no beta. The same inputs in the same order always give the same decisions.
     """
 
-    __slots__ = ("_age_s", "_closest_s", "_farthest_s", "_last_decision_s", "_last_sample_s", "_streak", "amplitude_ma", "limits", "signal")
+    __slots__ = (
+        "_age_s", "_beta_max", "_closest_s", "_equal", "_farthest_s", "_frozen_after", "_last_beta", "_last_decision_s", "_last_sample_s",
+        "_level", "_streak", "amplitude_ma", "limits", "signal",
+    )  # fmt: skip
 
     def __init__(self, limits: EnvelopeLimits, signal: Signal) -> None:
         self.limits = limits
@@ -176,6 +196,13 @@ class Envelope:
         self._last_sample_s: float | None = None
         self._last_decision_s: float | None = None
         self._streak = 0
+        self._beta_max = math.inf if limits.beta_max is None else _float32(limits.beta_max)
+        self._frozen_after = math.inf if limits.frozen_after is None else limits.frozen_after
+        self._last_beta, self._equal, self._level = -1.0, 0, 0.0
+
+    def forget(self) -> None:
+        """Trust nothing that came so far, as after a break of the link: cDBS until a whole window has come anew."""
+        self._last_sample_s, self._streak, self._equal = None, 0, 0
 
     def begin(self, now_s: float) -> None:
         """Start a decision: when the clock has run back, what came before it is forgotten, so that a corrected clock does not lock the
@@ -197,6 +224,9 @@ class Envelope:
             reasons = Reason.WRONG_SIGNAL
         if not 0.0 <= beta <= LARGEST_BETA:
             reasons |= Reason.INVALID_BETA
+            self._equal = 0
+        else:
+            reasons |= self._implausible(beta)
         if reasons:
             self._streak = 0
             return reasons, False
@@ -205,7 +235,15 @@ class Envelope:
             reasons = Reason.WINDOW_GAP
         if self._streak < self.limits.window:
             self._streak += 1
+        self._level = beta if self._streak == 1 else self._level + (beta - self._level) / self._streak
         return reasons, True
+
+    def _implausible(self, beta: float) -> int:
+        """Whether a beta amplitude is saturated, or one of a row of equal ones; as float32, which is what every runtime compares."""
+        beta = _float32(beta)
+        self._equal = self._equal + 1 if beta == self._last_beta and self._equal else 1
+        self._last_beta = beta
+        return (Reason.SATURATED_BETA if beta > self._beta_max else 0) | (Reason.FROZEN_BETA if self._equal >= self._frozen_after else 0)
 
     def decide(self, now_s: float, reasons: int, ask: Callable[[], float]) -> Decision:
         """Decide on the amplitude of the period that starts now.
@@ -225,6 +263,8 @@ class Envelope:
             trouble |= Reason.STALE_BETA
         if self._streak < limits.window:
             trouble |= Reason.WINDOW_INCOMPLETE
+        elif limits.level_high is not None and not (limits.level_low or 0.0) <= self._level <= limits.level_high:
+            trouble |= Reason.BETA_LEVEL
         fraction: float | None = None
         detail = ""
         if not trouble:
@@ -257,6 +297,10 @@ class Envelope:
             return 0.0
         self._last_decision_s = now_s
         return self.limits.ramp_ma_per_s * min(elapsed, period)
+
+
+def _float32(value: float) -> float:
+    return float(struct.unpack("<f", struct.pack("<f", value))[0])
 
 
 def _asked(ask: Callable[[], float]) -> tuple[float | None, int, str]:

@@ -7,74 +7,46 @@ a table of steps both belong to two rows: here each beta stands beside the ampli
 from __future__ import annotations
 
 import csv
-import re
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
-from ml.formats.recording import DecodedFile, Hemisphere, TraceSource, UndecodableFile
+from ml.formats.recording import DecodedFile, TraceSource, UndecodableFile
 from ml.formats.redaction_record import Redaction
-from ml.formats.tables.columns import LARGEST, LOG_KIND_LINE, Columns
+from ml.formats.tables.columns import Columns
+from ml.formats.tables.log_head import ENDS, MEND, Ran, read_head
 from ml.formats.tables.numbers import NotANumber, known_unit, parse_number, shown
 from ml.formats.tables.steps import GRID_TOLERANCE, decode_columns
 
-NEWEST = 2
-"""Version of logs that this decoder reads at the most."""
 MARK = b"# betaloop controller log"
-_KIND = re.compile(r"# betaloop controller log, version (?P<version>\d{1,4})(, period (?P<period>\d+(\.\d*)?) s(?P<ran>.*))?")
-_NUMBER = r"\d{1,3}(?:\.\d{1,9})?"
-_RAN = re.compile(
-    r", policy (?P<policy_id>\d{1,9}), network (?P<network_sha256>[0-9a-f]{64})(?:, side (?P<side>left|right))?"
-    rf", limits (?P<min_ma>{_NUMBER}) to (?P<max_ma>{_NUMBER}) mA, cDBS (?P<cdbs_ma>{_NUMBER}) mA, ramp (?P<ramp_ma_per_s>{_NUMBER}) mA/s"
-)
 NEEDED = ("t_s", "beta", "unit", "amplitude_ma")
-OPTIONAL = ("due_s", "source", "reasons")
+OPTIONAL = ("due_s", "source", "reasons", "action", "hold", "log_density", "ended", "battery_percent")
 NO_BETA = frozenset({"no_beta", "invalid_beta", "wrong_signal", "late_sample"})
 """Reasons of a decision whose beta amplitude is not one of the period that ended."""
 UNKNOWN_START = 0.05
 """A step's amplitude counts as known where the first decision came within this share of the period."""
-MEND = f"Upload the log as the controller wrote it, with its first line ('{LOG_KIND_LINE}')."
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Ran:
-    """What the first line of a log says of the controller: its policy, by number and by the SHA-256 of its network, and its limits."""
-
-    policy_id: int
-    network_sha256: str
-    side: Hemisphere | None
-    min_ma: float
-    max_ma: float
-    cdbs_ma: float
-    ramp_ma_per_s: float
-
-    @classmethod
-    def of(cls, said: Mapping[str, Any]) -> Ran:
-        """From texts or numbers by name. Raises UndecodableFile where they do not fit together."""
-        numbers = {name: float(said[name]) for name in ("min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s")}
-        if not 0 <= numbers["min_ma"] <= numbers["cdbs_ma"] <= numbers["max_ma"] <= LARGEST["amplitude_ma"]:
-            what = f"limits of {numbers['min_ma']:g} to {numbers['max_ma']:g} mA around a cDBS amplitude of {numbers['cdbs_ma']:g} mA"
-            raise UndecodableFile(what, "line 1", MEND)
-        return cls(int(said["policy_id"]), said["network_sha256"], cast("Hemisphere | None", said["side"]), **numbers)
 
 
 @dataclass(frozen=True)
 class Log:
     """The rows of a log: decided at `t_s`, for the period that ended at `due_s`; beta (NaN: none) in `unit` from `source`; amplitude.
 
-    `ran` is None for logs of version 1, which do not tell.
+    `ran` is None for logs of version 1, which do not tell. Of the rest, only logs from version 3 on know: `followed`, whether policy or
+    schedule was followed; `hold` and `log_density`, of the drawn amplitude (-1 and NaN: none); `battery_percent` of the tablet; `ended`.
     """
 
     ran: Ran | None
-    kind_line: str
+    head: str
     period_s: float
     lines: NDArray[np.int64]
     t_s: Floats
@@ -83,6 +55,19 @@ class Log:
     amplitude_ma: Floats
     unit: str
     source: str
+    followed: NDArray[np.bool_]
+    hold: NDArray[np.int64]
+    log_density: Floats
+    battery_percent: Floats
+    ended: str | None
+
+    @property
+    def zero_s(self) -> float:
+        """Where the session begins on the log's clock: at 0, but where a device side was connected with the first decision that followed
+        policy or schedule; what comes before is the window before the session."""
+        if self.ran is None or not self.ran.counts_from_take_over or not self.followed.any():
+            return 0.0
+        return float(self.due_s[int(np.argmax(self.followed))])
 
 
 def is_log(path: Path) -> bool:
@@ -102,7 +87,7 @@ def decode_log(path: Path, options: DecodeOptions, name: str | None = None) -> D
         names={"t_s": "due_s", "beta": "beta", "amplitude_ma": "amplitude_ma"},
         units={"t_s": None, "beta": log.unit, "amplitude_ma": "mA"},
         lines=log.lines,
-        values={"t_s": log.due_s, "beta": log.beta, "amplitude_ma": in_force(log)},
+        values={"t_s": log.due_s - log.zero_s, "beta": log.beta, "amplitude_ma": in_force(log)},
     )
     decoded = decode_columns(columns, options, name or path.name)
     (recording,) = decoded.recordings
@@ -113,10 +98,46 @@ def decode_log(path: Path, options: DecodeOptions, name: str | None = None) -> D
     )
     said = f"log of the controller: {log.lines.size} decisions, each put to the period that followed it"
     decoded.reports[0].understood.insert(0, said)
-    settings = {**recording.settings, "controller": asdict(log.ran)} if log.ran else recording.settings
-    side = log.ran.side if log.ran else recording.hemisphere
-    made = replace(recording, kind="controller_log", hemisphere=side, traces=traces, settings=settings)
+    if log.ran is None:
+        return replace(decoded, recordings=(replace(recording, kind="controller_log", traces=traces),))
+    settings = {**recording.settings, "controller": asdict(log.ran) | _of_rows(log)}
+    made = replace(recording, kind="controller_log", hemisphere=log.ran.side, traces=traces, settings=settings)
+    if log.ran.started_at is not None and log.ran.counts_from_take_over:
+        made = replace(made, clock="pc", started_at=datetime.fromisoformat(log.ran.started_at) + timedelta(seconds=log.zero_s))
     return replace(decoded, recordings=(made,))
+
+
+def _of_rows(log: Log) -> dict[str, Any]:
+    """What the rows of a log of version 3 say of the whole session: how it ended, what was drawn and delivered, the tablet's battery."""
+    known = np.flatnonzero(np.isfinite(log.battery_percent))
+    charge = log.battery_percent[known[[0, -1]]].tolist() if known.size else None
+    minutes = float(log.t_s[known[-1]] - log.t_s[known[0]]) / 60 if known.size else None
+    return {"ended": log.ended, "holds": delivered_holds(log), "tablet_battery_percent": charge, "tablet_battery_minutes": minutes}
+
+
+def delivered_holds(log: Log) -> list[dict[str, Any]]:
+    """Drawn amplitudes as they were delivered, `start`, `steps`, `amplitude` (fraction) and `log_density`, without gaps from step 0.
+
+    A stretch on which cDBS stood in for the schedule, or that is missing in the log, has no density, and cuts the hold that it interrupts.
+    Empty where nothing was drawn or held.
+    """
+    if log.ran is None or log.ran.design is None or not log.followed.any():
+        return []
+    steps = np.rint((log.due_s[:-1] - log.zero_s) / log.period_s).astype(np.int64)
+    rows = {int(k): i for i, k in enumerate(steps) if k >= 0}
+    out: list[dict[str, Any]] = []
+    before: int | None = None
+    for k in range(int(steps[-1]) + 1 if steps.size else 0):
+        i = rows.get(k)
+        hold = -1 if i is None else int(log.hold[i])
+        density = None if hold < 0 or i is None or np.isnan(log.log_density[i]) else float(log.log_density[i])
+        amplitude = 1.0 if i is None else min(float(log.amplitude_ma[i]) / log.ran.cdbs_ma, 1.0)
+        if out and hold == before:
+            out[-1] |= {"steps": out[-1]["steps"] + 1, "amplitude": round(amplitude, 6)}  # a ramp may lead up to it
+        else:
+            out.append({"start": k, "steps": 1, "amplitude": round(amplitude, 6), "log_density": density})
+        before = hold
+    return out
 
 
 def in_force(log: Log) -> Floats:
@@ -140,13 +161,22 @@ def redact_log(source: Path, target: Path, options: DecodeOptions) -> Redaction:
     """Write a log of its numbers alone, which decodes to the same recording. Raises UndecodableFile as `decode_log`, before it writes."""
     log = _read(source, options)
     decode_log(source, options, "log")
-    rows = zip(log.t_s.tolist(), log.due_s.tolist(), log.beta.tolist(), log.amplitude_ma.tolist(), strict=True)
     kept = log.source if log.source in get_args(TraceSource) else "table"
+    last = log.lines.size - 1
     with target.open("w", encoding="utf-8", newline="") as out:
-        out.write(f"{log.kind_line}\nt_s,due_s,beta,unit,source,amplitude_ma\n")
-        for t, due, beta, amplitude in rows:
-            out.write(f"{t!r},{due!r},{'' if beta != beta else repr(beta)},{log.unit},{kept},{amplitude!r}\n")
+        out.write(f"{log.head}\nt_s,due_s,beta,unit,source,amplitude_ma,action,hold,log_density,ended,battery_percent\n")
+        for i in range(log.lines.size):
+            cells: list[Any] = [log.t_s[i], log.due_s[i], log.beta[i], log.unit, kept, log.amplitude_ma[i]]
+            cells += ["policy" if log.followed[i] else "cdbs", "" if log.hold[i] < 0 else int(log.hold[i]), log.log_density[i]]
+            cells += [log.ended or "" if i == last else "", log.battery_percent[i]]
+            out.write(",".join(_cell(cell) for cell in cells) + "\n")
     return Redaction(removed=["what the controller noted beside beta and amplitude"])
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return "" if np.isnan(value) else repr(float(value))
+    return str(value)
 
 
 @contextmanager
@@ -157,18 +187,18 @@ def _opened(path: Path) -> Iterator[Iterator[str]]:
 
 def _read(path: Path, options: DecodeOptions) -> Log:
     with _opened(path) as lines:
-        first = next(lines, "").strip().rstrip(", ;")
-        period_s, ran = _kind(first, options)
+        period_s, ran, head = read_head(lines, options)
+        before = head.count("\n") + 1
         reader = csv.reader(lines)
         headers = [h.strip() for h in next(reader, [])]
         missing = [name for name in NEEDED if name not in headers]
         if missing:
             what = f"a controller's log without the column{'s' if len(missing) > 1 else ''} {', '.join(missing)}"
-            raise UndecodableFile(what, "line 2", MEND)
+            raise UndecodableFile(what, f"line {before + 1}", MEND)
         at = {name: headers.index(name) for name in (*NEEDED, *OPTIONAL) if name in headers}
-        found: list[tuple[int, float, float, float, float, str, str]] = []
+        found: list[_Cells] = []
         for row in reader:
-            line = reader.line_num + 1
+            line = reader.line_num + before
             if not any(cell.strip() for cell in row):
                 continue
             if len(row) != len(headers):
@@ -177,48 +207,55 @@ def _read(path: Path, options: DecodeOptions) -> Log:
                 raise UndecodableFile(f"more than {options.max_table_rows} rows", f"line {line}", "Upload one session per log.")
             found.append(_row(row, at, line))
     if not found:
-        raise UndecodableFile("the log has no decision", "after line 2", "Upload the log of a session.")
-    line_numbers, t_s, due_s, beta, amplitude, units, sources = (list(column) for column in zip(*found, strict=True))
-    times = np.array(t_s, dtype=np.float64)
+        raise UndecodableFile("the log has no decision", f"after line {before + 1}", "Upload the log of a session.")
+    times = np.array([row.t_s for row in found])
     if (back := np.flatnonzero(np.diff(times) < 0)).size:
         raise UndecodableFile(
-            "decisions that are not in the order of their times", f"line {line_numbers[int(back[0]) + 1]}, column t_s", MEND
+            "decisions that are not in the order of their times", f"line {found[int(back[0]) + 1].line}, column t_s", MEND
         )
     return Log(
         ran,
-        first,
+        head,
         period_s,
-        np.array(line_numbers, dtype=np.int64),
+        np.array([row.line for row in found], dtype=np.int64),
         times,
-        np.array(due_s, dtype=np.float64),
-        np.array(beta, dtype=np.float64),
-        np.array(amplitude, dtype=np.float64),
-        _one(units, "unit"),
-        _one(sources, "source"),
+        np.array([row.due_s for row in found]),
+        np.array([row.beta for row in found]),
+        np.array([row.amplitude_ma for row in found]),
+        _one([row.unit for row in found], "unit"),
+        _one([row.source for row in found], "source"),
+        np.array([row.followed for row in found], dtype=np.bool_),
+        np.array([row.hold for row in found], dtype=np.int64),
+        np.array([row.log_density for row in found]),
+        np.array([row.battery_percent for row in found]),
+        found[-1].ended if found[-1].ended in ENDS else None,
     )
 
 
-def _kind(first: str, options: DecodeOptions) -> tuple[float, Ran | None]:
-    """Period, s, and what ran. Raises UndecodableFile for a first line that is cut or of another version or period."""
-    kind = _KIND.match(first)
-    if kind is not None and int(kind["version"]) > NEWEST:
-        what = f"a controller's log of version {kind['version']}; this service reads versions up to {NEWEST}"
-        raise UndecodableFile(what, "line 1", "Bring this service up to date.")
-    said = None if kind is None or kind["ran"] is None else _RAN.fullmatch(kind["ran"])
-    whole = kind is not None and (kind["ran"] == "" if int(kind["version"]) == 1 else said is not None)
-    if kind is None or not whole:
-        raise UndecodableFile("the first line of this controller's log is not whole", "line 1", MEND)
-    period_s = float(kind["period"])
-    if abs(period_s - options.period_s) > GRID_TOLERANCE * options.period_s:
-        what = f"a controller that decided every {period_s:g} s, where the participant's period is {options.period_s:g} s"
-        raise UndecodableFile(what, "line 1", "Set the participant's period to the controller's.")
-    return options.period_s, Ran.of(said.groupdict()) if said else None
+class _Cells(NamedTuple):
+    """A row as it was read, in the order of `Log`."""
+
+    line: int
+    t_s: float
+    due_s: float
+    beta: float
+    amplitude_ma: float
+    unit: str
+    source: str
+    followed: bool
+    hold: int
+    log_density: float
+    battery_percent: float
+    ended: str
 
 
-def _row(row: list[str], at: dict[str, int], line: int) -> tuple[int, float, float, float, float, str, str]:
+def _row(row: list[str], at: dict[str, int], line: int) -> _Cells:
+    def text(name: str) -> str:
+        return row[at[name]].strip() if name in at else ""
+
     def number(name: str) -> float | None:
         try:
-            return parse_number(row[at[name]])
+            return parse_number(text(name))
         except NotANumber as error:
             known = f"line {line}, column {name}"
             raise UndecodableFile(f"{shown(row[at[name]])} is no number", known, MEND, "a cell holds text, not a number", known) from error
@@ -227,11 +264,22 @@ def _row(row: list[str], at: dict[str, int], line: int) -> tuple[int, float, flo
     due_s = number("due_s") if "due_s" in at else t_s
     if t_s is None or due_s is None or amplitude is None:
         raise UndecodableFile("a decision without its time or its amplitude", f"line {line}", MEND)
-    reasons = set(row[at["reasons"]].split()) if "reasons" in at else set()
-    beta = None if reasons & NO_BETA else number("beta")
-    unit = row[at["unit"]].strip() if beta is not None else ""
-    source = row[at["source"]].strip() if beta is not None and "source" in at else ""
-    return line, t_s, due_s, float("nan") if beta is None else beta, amplitude, unit, source
+    beta = None if set(text("reasons").split()) & NO_BETA else number("beta")
+    hold, density, battery = number("hold"), number("log_density"), number("battery_percent")
+    return _Cells(
+        line=line,
+        t_s=t_s,
+        due_s=due_s,
+        beta=math.nan if beta is None else beta,
+        amplitude_ma=amplitude,
+        unit=text("unit") if beta is not None else "",
+        source=text("source") if beta is not None else "",
+        followed=text("action") == "policy",
+        hold=-1 if hold is None else int(hold),
+        log_density=math.nan if density is None else density,
+        battery_percent=math.nan if battery is None else battery,
+        ended=text("ended"),
+    )
 
 
 def _one(texts: list[str], what: str) -> str:

@@ -41,6 +41,7 @@ def test_on_windows_that_nobody_logged_nothing_is_said_but_that(manifest):
     assert "Nobody knows" in only
 
 
+@pytest.mark.hazard("H04")
 def test_a_policy_that_often_leaves_what_was_tried_or_allowed_is_warned_of_on_the_sheet(logged, test_windows):
     def sheet(bias):
         policy = MlpPolicy(10, (4,), mean=120.0, std=35.0, seed=1)

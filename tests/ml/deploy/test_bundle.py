@@ -69,12 +69,32 @@ def test_a_bundle_holds_the_network_in_every_form_its_vectors_the_sheet_and_ever
     np.testing.assert_allclose(vectors["expected"], network.act(np.array(vectors["windows"])), atol=1e-5)
 
 
-def test_a_bundle_of_before_the_runner_kept_a_log_stays_in_use(bundle):
+def of_version_3(bundle):
+    """The files of a bundle, and its manifest, as betaloop 0.1.0 made them."""
     files = unpack(bundle)
     stated = json.loads(files["manifest.json"])
-    for folder in (files, stated["files"]):
-        del folder["controller/decision_log.py"]
-    assert open_bundle(pack(files | {"manifest.json": json.dumps(stated).encode()})).manifest.layers
+    for name in ("slot", "schedule", "beta_max", "level_low", "level_high", "frozen_after"):
+        assert stated.pop(name) is None
+    stated["schema_version"] = 3
+    for later in [name for name in files if name.startswith("controller/") and name not in RUNNER_OF_0_1_0]:
+        del files[later], stated["files"][later]
+    return files, stated
+
+
+RUNNER_OF_0_1_0 = {f"controller/{name}.py" for name in ("__init__", "__main__", "controller", "envelope", "network")}
+
+
+def test_a_bundle_of_0_1_0_is_read_and_one_without_its_network_is_not(network, manifest, test_windows):
+    plain = dataclasses.replace(manifest, beta_max=None, level_low=None, level_high=None, frozen_after=None)
+    files, stated = of_version_3(build_bundle(network.to_onnx(), plain, test_windows))
+    opened = open_bundle(pack(files | {"manifest.json": json.dumps(stated).encode()})).manifest
+    assert (opened.schema_version, opened.slot, opened.frozen_after) == (3, None, None)
+    newer = {**stated, "schema_version": 4}
+    with pytest.raises(BundleError, match=r"the manifest must name .*controller/live\.py"):
+        open_bundle(pack(files | {"manifest.json": json.dumps(newer).encode()}))
+    older = {**stated, "schema_version": 2}
+    with pytest.raises(BundleError, match="manifest version 2; this betaloop reads 3 to 4"):
+        open_bundle(pack(files | {"manifest.json": json.dumps(older).encode()}))
     del files["weights.f32"], stated["files"]["weights.f32"]
     with pytest.raises(BundleError, match="the manifest must name"):
         open_bundle(pack(files | {"manifest.json": json.dumps(stated).encode()}))
@@ -108,7 +128,7 @@ def test_a_policy_without_layers_leaves_as_onnx_alone_and_runs_within_the_same_e
     assert set(unpack(made)) == {"sheet.html", "model.onnx", "test_vectors.json", "manifest.json"}
     opened = open_bundle(made)
     controller, signal = opened.controller(), Signal("uV", "time_domain")
-    amplitudes = [controller.decide(2.0 * k, BetaSample(2.0 * k, 120.0, signal)).amplitude_ma for k in range(20)]
+    amplitudes = [controller.decide(2.0 * k, BetaSample(2.0 * k, 120.0 + k % 2, signal)).amplitude_ma for k in range(20)]
     assert amplitudes[8] == 3.0
     assert amplitudes[9:13] == pytest.approx([2.5, 2.0, 1.5, 1.5])
 
@@ -167,7 +187,10 @@ def test_no_name_can_leave_its_place_in_the_sheet(network, manifest, test_window
 
 
 def test_the_manifests_limits_are_the_envelopes(manifest):
-    assert manifest.limits() == EnvelopeLimits(min_ma=0.5, max_ma=3.2, cdbs_ma=3.0, ramp_ma_per_s=0.25, window=10, period_s=2.0)
+    assert manifest.limits() == EnvelopeLimits(
+        min_ma=0.5, max_ma=3.2, cdbs_ma=3.0, ramp_ma_per_s=0.25, window=10, period_s=2.0, beta_max=900.0, level_low=30.0, level_high=400.0,
+        frozen_after=5,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(NETWORK_FILES | SMALL_FILES))

@@ -62,6 +62,7 @@ def test_the_network_is_asked_with_the_window_oldest_first_and_its_fraction_is_o
     assert decision.beta_age_s == 0.0
 
 
+@pytest.mark.hazard("H06")
 def test_the_amplitude_never_moves_faster_than_the_ramp():
     decisions = run(constant(0.0), [100.0] * 10)
     assert [d.amplitude_ma for d in decisions] == pytest.approx([3.0, 3.0, 2.5, 2.0, 1.5, 1.0, 0.5, 0.5, 0.5, 0.5])
@@ -79,6 +80,7 @@ def test_decisions_in_quick_succession_share_one_periods_ramp():
     assert controller.decide(5.0, None).amplitude_ma == moved[-1], "a clock that runs back moves nothing"
 
 
+@pytest.mark.hazard("H12")
 def test_a_clock_that_is_set_back_does_not_lock_the_network_out():
     controller = BoundedController(constant(1.0), LIMITS, UV)
     times = [*np.arange(1e6, 1e6 + 10, 2.0), *np.arange(0.0, 10, 2.0)]
@@ -86,12 +88,14 @@ def test_a_clock_that_is_set_back_does_not_lock_the_network_out():
     assert [d.fallback for d in decisions] == [True, True, False, False, False] * 2
 
 
+@pytest.mark.hazard("H06")
 def test_a_late_decision_moves_no_farther_than_one_period():
     controller = BoundedController(constant(0.0), dataclasses.replace(LIMITS, window=1), UV)
     controller.decide(0.0, BetaSample(0.0, 1.0, UV))
     assert controller.decide(60.0, BetaSample(60.0, 1.0, UV)).amplitude_ma == pytest.approx(2.0)
 
 
+@pytest.mark.hazard("H05")
 def test_the_clinicians_limits_hold():
     assert run(constant(0.5), [1.0] * 9, dataclasses.replace(LIMITS, max_ma=3.0, min_ma=2.9))[-1].amplitude_ma == 2.9
     assert run(constant(1.0), [1.0] * 9)[-1].amplitude_ma == 3.0
@@ -118,6 +122,7 @@ def test_beta_of_another_unit_or_source_gives_cdbs_at_once(signal):
     assert (decision.amplitude_ma, names(decision)) == (3.0, {"wrong_signal", "window_incomplete"})
 
 
+@pytest.mark.hazard("H07")
 def test_beta_that_stops_coming_gives_cdbs_one_period_after_the_last_one():
     decisions = run(constant(0.2), [100.0] * 8 + [None, None, None])
     assert [d.amplitude_ma for d in decisions[8:]] == [3.0, 3.0, 3.0]
@@ -168,6 +173,7 @@ def test_a_sample_out_of_order_or_from_the_future_is_left_out_and_said(t_s):
     assert names(controller.decide(4.1, BetaSample(4.0, 1.0, UV))) == set(), "and the window is still whole"
 
 
+@pytest.mark.hazard("H08")
 @pytest.mark.parametrize(
     ("answer", "reason"),
     [(math.nan, "policy_output"), (1.2, "policy_output"), (-0.01, "policy_output"), (RuntimeError("weights lost"), "policy_failed")],
@@ -266,6 +272,7 @@ ANSWERS = st.floats(0, 1) | ANYTHING | st.just(RuntimeError("broken"))
 SAMPLES = st.none() | st.tuples(st.floats(-4, 1) | ANYTHING, st.floats(0, 1e4) | ANYTHING, st.sampled_from([UV, UV, Signal("mV", "x")]))
 
 
+@pytest.mark.hazard("H05")
 @settings(deadline=None)
 @given(limits=limits_of_any_kind(), stream=st.lists(st.tuples(st.floats(0, 5) | ANYTHING, SAMPLES, ANSWERS), max_size=25))
 def test_whatever_comes_the_limits_hold_and_no_number_is_missing(limits, stream):

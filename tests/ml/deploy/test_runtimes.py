@@ -18,7 +18,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ml.deploy.bundle import build_bundle
+from ml.deploy.bundle import build_bundle, make_controller
 from ml.deploy.c_header import comment, float_header, self_test, string_literal
 from ml.deploy.fixed_point import SCORE_LIMIT, WANTED_BOUND, CutNetwork, _quantise, quantise
 from ml.deploy.manifest import BundleError
@@ -74,6 +74,7 @@ def compiled_and_run(compiler, folder, name, *options):
     return ran.stdout
 
 
+@pytest.mark.hazard("H22")
 @pytest.mark.parametrize("hidden", [(20, 10), (400, 300), (1,), (7, 5, 3)])
 @pytest.mark.parametrize(("mean", "std"), [(120.0, 35.0), (0.8, 0.05), (2e4, 9e3)])
 def test_torch_onnxruntime_and_numpy_agree(hidden, mean, std):
@@ -218,7 +219,7 @@ def test_no_name_can_leave_its_place_in_the_c_text(compiler, tmp_path, manifest,
         manifest, participant="P" + text, policy_name="N" + text, code_version="v" + text, beta_unit="u" + text, beta_source="s" + text
     )
     windows = np.ones((1, 10))
-    steps = session(changed, network, windows)
+    steps = session(changed, make_controller(changed, network), windows)
     (tmp_path / "betaloop_controller.h").write_text(float_header(changed, network), encoding="ascii")
     test = self_test(changed, "betaloop_controller.h", windows, network.act(windows), steps, 1e-5, exact=True)
     (tmp_path / "selftest.c").write_text(test, encoding="ascii")
@@ -240,7 +241,8 @@ def test_the_runner_of_a_bundle_checks_and_runs_it_with_numpy_alone(tmp_path, ma
     policy = policy_of((20, 10))
     folder = unpacked(build_bundle(policy.to_onnx(), manifest, test_windows), tmp_path)
     barred = "import sys\nfor name in ('torch', 'onnx', 'onnxruntime', 'scipy', 'ml', 'app'): sys.modules[name] = None\n"
-    code = barred + "import runpy\nsys.argv = ['controller', '.', '--run']\nrunpy.run_module('controller', run_name='__main__')\n"
+    arguments = ["controller", ".", "--run", "--bench", "--replay"]
+    code = f"{barred}import runpy\nsys.argv = {arguments}\nrunpy.run_module('controller', run_name='__main__')\n"
     betas = [str(b) for b in test_windows.ravel()[:12]] + ["", "nan", "120"]
     ran = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, input="\n".join(betas), check=False)
     assert ran.returncode == 0, ran.stderr
@@ -332,15 +334,17 @@ def test_a_policy_window_gives_what_the_policy_gives_and_refuses_more_than_one_n
         PolicyWindow(Two(), 3).fraction()
 
 
+@pytest.mark.hazard("H22")
 def test_the_session_of_the_test_vectors_is_the_same_from_any_runtime(manifest, test_windows):
     policy = policy_of((20, 10))
-    ours = session(manifest, mlp_of(policy.to_onnx()), test_windows)
-    onnx = session(manifest, PolicyWindow(OnnxPolicy(policy.to_onnx(), 10), 10), test_windows)
+    ours = session(manifest, make_controller(manifest, mlp_of(policy.to_onnx())), test_windows)
+    onnx = session(manifest, make_controller(manifest, PolicyWindow(OnnxPolicy(policy.to_onnx(), 10), 10)), test_windows)
     assert [s.reasons for s in ours] == [s.reasons for s in onnx]
     np.testing.assert_allclose([s.amplitude_ma for s in ours], [s.amplitude_ma for s in onnx], atol=3e-5)
     assert json.dumps([s.now_s for s in ours]) == json.dumps(sorted(s.now_s for s in ours))
 
 
+@pytest.mark.hazard("H22")
 def test_the_shipped_runner_is_the_code_that_is_tested_here(manifest, test_windows, tmp_path):
     folder = unpacked(build_bundle(policy_of((3,)).to_onnx(), manifest, test_windows), tmp_path)
     import ml.deploy.runtime as runtime

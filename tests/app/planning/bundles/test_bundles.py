@@ -68,6 +68,7 @@ def test_defaults_are_zero_to_cdbs_and_say_that_nobody_stated_them(client: TestC
     assert (manifest.limits_stated_by, manifest.device_max_ma) == (None, None)
 
 
+@pytest.mark.hazard("H05")
 def test_the_stimulators_limits_are_the_default_and_cannot_be_left(client: TestClient, policy: int, db: Session) -> None:
     record_limits(
         db, {"group A": {"program 0": {"lower_ma": 0.4, "upper_ma": 3.4}}, "group B": {"program 0": {"lower_ma": 0.2, "upper_ma": 5.0}}}

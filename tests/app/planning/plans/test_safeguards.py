@@ -34,6 +34,7 @@ def draft(client: TestClient, visit: int, *chosen: int, **more: Any) -> Any:
     return client.post(f"/api/v1/visits/{visit}/plan", json={"policy_ids": list(chosen), "seed": 1, **more})
 
 
+@pytest.mark.hazard("H04")
 def test_an_unsafe_policy_is_planned_only_with_a_clinicians_reason(
     client: TestClient, client_as: Callable[..., TestClient], policies: list[int], judge: Judge, visit: int, sign_plan: Approve
 ) -> None:
@@ -136,6 +137,7 @@ def test_the_form_asks_for_the_reason_and_the_limit_and_keeps_what_was_typed(
     assert stated == {a: (None, "watched"), b: (0.6, None)}
 
 
+@pytest.mark.hazard("H04")
 def test_a_bundle_of_a_policy_tested_with_care_does_not_go_below_the_approved_limit(
     client: TestClient, policies: list[int], judge: Judge, visit: int, sign_plan: Approve
 ) -> None:

@@ -1,0 +1,256 @@
+"""The hazard log: every way in which a controller could harm, what stands against it, and the tests that show it. In the form of ISO 14971.
+
+The hazards are data, here and nowhere else; which tests show a control is read from the tests themselves, which carry the hazard's number
+(`@pytest.mark.hazard("H01")`). `python -m app.tablet.hazards` writes docs/hazards.md.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "hazards.md"
+
+
+class Harm(StrEnum):
+    """What a participant would suffer."""
+
+    UNDER = "too little stimulation: symptoms return"
+    OVER = "too much stimulation: side effects"
+    SWINGS = "amplitudes that jump: discomfort, falls"
+    WRONG_RECORD = "a wrong record: later controllers learn from it"
+
+
+class Severity(StrEnum):
+    """How bad it would be, before any control. S4 does not occur: the stimulator's own limits stand outside of betaloop."""
+
+    S1 = "S1: inconvenience, or a session to repeat"
+    S2 = "S2: passing discomfort, ends with the session or with the programmer"
+    S3 = "S3: injury is possible, such as a fall or dyskinesia that needs a clinician"
+
+
+class Likelihood(StrEnum):
+    """How often it is expected over a study, judged, not measured."""
+
+    P1 = "P1: not expected in a study"
+    P2 = "P2: once in a study"
+    P3 = "P3: at some visits"
+    P4 = "P4: at most visits"
+
+
+@dataclass(frozen=True)
+class Hazard:
+    """One entry of the log.
+
+    Attributes:
+        number: `H01`, ...; never given to another one.
+        situation: what goes wrong. harms: what it would do. severity, before: without the control; after: likelihood with it.
+        control: what stands against it, and where. residual: what is left, for the clinician to know.
+    """
+
+    number: str
+    situation: str
+    harms: tuple[Harm, ...]
+    severity: Severity
+    before: Likelihood
+    control: str
+    after: Likelihood
+    residual: str
+
+
+_U, _O, _S, _R = Harm.UNDER, Harm.OVER, Harm.SWINGS, Harm.WRONG_RECORD
+_S1, _S2, _S3 = Severity.S1, Severity.S2, Severity.S3
+_P1, _P2, _P3, _P4 = Likelihood.P1, Likelihood.P2, Likelihood.P3, Likelihood.P4
+
+HAZARDS: tuple[Hazard, ...] = (
+    Hazard(
+        "H01", "The bundle of another participant is started", (_U, _O), _S3, _P2,
+        "The manifest names the participant and is signed; the device side says who is connected, and any other name ends the "
+        "session before it begins; `--participant` checks what the clinician reads off the chart.",
+        _P1,
+        "A device side that was set up with the wrong code states it with confidence: the sheet asks to compare it with the "
+        "programmer.",
+    ),
+    Hazard(
+        "H02", "The controller is connected to the other side, or to another device", (_U, _O), _S3, _P2,
+        "Side, unit, source and period stand in the device's first line and must be the bundle's; without that line nothing but "
+        "cDBS is sent. Recordings of the other side are not used.",
+        _P1, "Leads that are swapped in the stimulator itself look right: contacts and side are on the sheet.",
+    ),
+    Hazard(
+        "H03", "Beta comes in another unit, or from another source", (_U, _O), _S3, _P3,
+        "Each value states unit and source; a window whose mean lies far from every level that was logged gives cDBS, whatever it "
+        "says of itself.",
+        _P1, "A scale error below about twice stays within the logged range.",
+    ),
+    Hazard(
+        "H04", "A policy asks for nearly nothing", (_U,), _S3, _P3,
+        "Unsafe policies need a stated override in the plan; the clinician's lowest amplitude holds whatever the network answers; "
+        "sheet and page warn of policies that ask for less than was ever tried.",
+        _P1, "The lowest amplitude itself may treat badly: stop rules and the stop button remain.",
+    ),
+    Hazard(
+        "H05", "An amplitude leaves the limits", (_O, _U), _S3, _P2,
+        "The envelope outside the network cuts every answer to the clinician's limits, which lie within the stimulator's own; the "
+        "device side has limits of its own and leaves them for no message.",
+        _P1, "Limits that were stated wrongly: they are signed with the plan, before any bundle is made.",
+    ),
+    Hazard(
+        "H06", "The amplitude changes too fast", (_S,), _S2, _P4,
+        "The change from one decision to the next is bounded by the clinician's ramp, and by one period's worth however late a "
+        "decision comes.",
+        _P1, "The return to cDBS is not ramped, so that nobody stays under-treated on a signal that is not trusted.",
+    ),
+    Hazard(
+        "H07", "Beta is stale or missing", (_U, _O), _S2, _P4,
+        "The runner keeps its own clock and decides in every period; beta that has not come a fifth of a period after it was due, "
+        "or that is older than 0.9 of a period, gives cDBS.",
+        _P1, "One lost value costs a whole window of cDBS.",
+    ),
+    Hazard(
+        "H08", "Beta is no number, or the network fails", (_U, _O), _S2, _P3,
+        "Whatever is no amplitude empties the window; an answer that is no fraction in [0, 1] and an error of the network give "
+        "cDBS.",
+        _P1, "None known.",
+    ),
+    Hazard(
+        "H09", "Beta is saturated", (_U, _O), _S2, _P3,
+        "A value above three times the highest that was logged counts as saturated, and gives cDBS.",
+        _P1, "Where nothing was logged no bound is known; the bundle's sheet says so.",
+    ),
+    Hazard(
+        "H10", "Beta is frozen: the same value comes again and again", (_U, _O), _S2, _P2,
+        "A row of equal values counts as frozen and gives cDBS.",
+        _P1, "Four values pass before the fifth shows it.",
+    ),
+    Hazard(
+        "H11", "Messages are repeated, lost or cut off, or the link breaks", (_U, _O), _S2, _P3,
+        "Numbers that repeat, skip or begin anew, lines that are no message, and a lost connection give cDBS within one period, "
+        "and the window begins anew.",
+        _P1, "None known.",
+    ),
+    Hazard(
+        "H12", "The clock of the device jumps", (_U, _O), _S2, _P2,
+        "Times of the device are held against the runner's own monotonic clock; a jump gives cDBS and a new window. In the "
+        "envelope a clock that runs back does the same.",
+        _P1, "A clock that is off by less than half a period from one value to the next goes unnoticed.",
+    ),
+    Hazard(
+        "H13", "The tablet stands still or sleeps", (_U, _O), _S2, _P3,
+        "The clock goes on while the tablet sleeps; values that waited are old when it wakes, a missed deadline gives cDBS and a "
+        "new window, and after a standstill so long that the device side's watchdog has returned to clinical settings the session "
+        "ends.",
+        _P1, "None known.",
+    ),
+    Hazard(
+        "H14", "A fault or an attacker floods the runner with lines", (_S, _U), _S2, _P1,
+        "At most one decision in half a period, a bound on lines that wait and on their length; the port is open to this machine "
+        "alone, and the first device keeps it.",
+        _P1, "Whoever has control of the tablet has control of its controller: lock it.",
+    ),
+    Hazard(
+        "H15", "The session does not end", (_U, _O), _S2, _P2,
+        "It ends by itself after its minutes, at midnight, when stopped from the tablet or the device, and then sends the return "
+        "to clinical settings as its last line.",
+        _P1, "None known.",
+    ),
+    Hazard(
+        "H16", "The runner, or the link to the device, dies", (_U, _O), _S3, _P3,
+        "The protocol carries a watchdog: after two missing messages the device side returns to clinical settings, shown with the "
+        "runner killed. Whole rows of the log are on disk. Lines that are cut off or old are no messages.",
+        _P1, "A device side without the watchdog must not be connected: the reference shows what it does.",
+    ),
+    Hazard(
+        "H17", "A session is started again after a crash", (_U, _R), _S2, _P2,
+        "A slot runs once: it is noted on disk before the first amplitude. The next start refuses, says when it was broken off "
+        "and after how many decisions, and the device stays on clinical settings.",
+        _P1, "Another tablet does not know of it; the study notices the second log.",
+    ),
+    Hazard(
+        "H18", "An outdated bundle runs: yesterday's, or of a plan that was replaced", (_U, _O), _S3, _P2,
+        "A bundle names its visit's day and runs on no other; plans that were replaced stand on the study's signed list of "
+        "withdrawals; a clock that was set back is noticed.",
+        _P1, "On the day itself the list must reach the tablet.",
+    ),
+    Hazard(
+        "H19", "A bundle runs that nobody signed, or that was changed", (_U, _O), _S3, _P2,
+        "Signature, hashes of all files and test vectors are checked at every start, and a bundle without a slot of a signed plan "
+        "runs on the bench alone. Bundles leave for the slots of signed plans.",
+        _P1, "The bundle's own runner is part of what was changed: `betaloop control` checks from outside.",
+    ),
+    Hazard(
+        "H20", "A policy is used after it was withdrawn", (_U, _O), _S3, _P2,
+        "No bundle leaves for it, and a bundle that has left is refused where the study's signed list of withdrawals names it; a "
+        "list once seen is remembered, and an older one is not taken in its place.",
+        _P1, "On the day itself the list must reach the tablet.",
+    ),
+    Hazard(
+        "H21", "A log is uploaded for another participant or session, or its steps are shifted by one", (_R,), _S2, _P3,
+        "A log says whose it is, and of which slot of which signed bundle: it fills that slot and no other. Beta stands beside "
+        "the amplitude that was in force while it was measured.",
+        _P1, "Logs of before version 2 say nothing of themselves: they are assigned by a person.",
+    ),
+    Hazard(
+        "H22", "Two forms of a controller answer differently", (_U, _O), _S3, _P2,
+        "Reference runner, ONNX file and C header must give the same decisions on the same test vectors, within 1e-5 of a "
+        "fraction, on the tablet too.",
+        _P1, "None known.",
+    ),
+    Hazard(
+        "H23", "A random session stays low for long, or its draws are lost", (_U, _R), _S2, _P2,
+        "Its amplitudes are laid out before the visit and signed with the bundle; they run within the same envelope, low ones at "
+        "the end alone, and each row of the log has its hold and density.",
+        _P1, "The session is unpleasant by design: a stop ends it on clinical settings.",
+    ),
+)  # fmt: skip
+
+
+def marked_tests(folder: Path) -> dict[str, list[str]]:
+    """Tests by the hazards that they carry, `path::name` from the project's root, as the source says; sorted."""
+    found: dict[str, list[str]] = {}
+    for path in sorted(folder.rglob("test_*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                for number in _numbers(node.decorator_list):
+                    found.setdefault(number, []).append(f"{path.relative_to(ROOT).as_posix()}::{node.name}")
+    return {number: sorted(names) for number, names in found.items()}
+
+
+def _numbers(decorators: Sequence[ast.expr]) -> Iterator[str]:
+    for one in decorators:
+        if isinstance(one, ast.Call) and ast.unparse(one.func) == "pytest.mark.hazard":
+            yield from (str(argument.value) for argument in one.args if isinstance(argument, ast.Constant))
+
+
+def page(tests: Mapping[str, Sequence[str]]) -> str:
+    """docs/hazards.md, in Markdown."""
+    lines = [
+        "# Hazard log", "",
+        "In which ways could a controller harm, what stands against each, and which tests show it? In the form of ISO 14971:",
+        "hazardous situation, harm, risk before and after its control, what remains. This page is made from",
+        "`app/tablet/hazards.py` and from the tests (`python -m app.tablet.hazards`), and a test holds it current. A hazard without",
+        "a test that passes fails `make test`.", "",
+        "Severities and likelihoods are judgements of the authors, made without data on betaloop in use: a study that uses it reviews",
+        "them, and signs them, with its own device and its own risk management.", "",
+        *[f"* **{str(one.value)[:2]}** {str(one.value)[4:]}" for kind in (Severity, Likelihood) for one in kind], "",
+        "| | situation | harm | before | control | after | what remains |", "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    lines += [
+        f"| {h.number} | {h.situation} | {'; '.join(h.harms)} | {h.severity.name} {h.before.name} | {h.control} | "
+        f"{h.severity.name} {h.after.name} | {h.residual} |"
+        for h in HAZARDS
+    ]
+    lines += ["", "## Tests", ""]
+    for hazard in HAZARDS:
+        lines += [f"**{hazard.number}** {hazard.situation}", "", *[f"* `{name}`" for name in tests.get(hazard.number, [])], ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(marked_tests(ROOT / "tests")), "utf-8")
+    sys.stdout.write(f"wrote {PAGE}\n")

@@ -1,0 +1,338 @@
+"""Sessions of signed plans on a simulated device: they run on their day, once, and whatever breaks leaves a whole record."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Iterable
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from app.platform.errors import Invalid
+from app.tablet.command import control, verified
+from app.tablet.live import run_live
+from app.tablet.simulated import Sent, SimulatedDevice, brain_of
+from app.tablet.sources import Wish
+from app.tablet.task import Task
+from ml.deploy.runtime.device import DeviceSide
+from ml.deploy.runtime.inputs import Event
+from ml.deploy.runtime.ledger import Ledger
+from ml.deploy.runtime.live import End
+from ml.deploy.runtime.session import Outcome, Tablet, run_slot
+from ml.deploy.runtime.signature import verifies
+from ml.deploy.runtime.slot import NotAllowed, Refusal, Slot, Withdrawals, withdrawals_body
+from ml.formats import decode
+from tests.app.tablet.control_bundles import HOLDS, KEY, MORNING, PUBLIC, SLOT, made, of_slot, rows_of, scheduled
+
+
+def run(bundle: Path, folder: Path, now: datetime = MORNING, log: str = "log.csv", **task: object) -> Outcome:
+    """A whole session on the simulated device, in the time that its computations take."""
+    stated = Task(log=folder / log, key=PUBLIC, ledger=folder / "ledger", **task)  # type: ignore[arg-type]
+    return run_live(verified(bundle, PUBLIC), bundle.name, "simulated:P1:3", stated, now=lambda: now)[0]
+
+
+def test_a_whole_session_runs_in_closed_loop_and_its_log_says_whose_it_is(tmp_path: Path) -> None:
+    outcome = run(of_slot(tmp_path), tmp_path)
+    assert outcome.end is End.COMPLETE
+    rows = rows_of(tmp_path / "log.csv")
+    assert [row["action"] for row in rows] == ["cdbs"] * 9 + ["policy"] * 150 + ["cdbs"]
+    assert rows[-1]["ended"] == "complete"
+    device = outcome.session.link
+    assert isinstance(device, SimulatedDevice)
+    assert len(set(np.round(device.amplitudes_ma, 3))) > 5, "the loop is closed"
+    (recording,) = decode(tmp_path / "log.csv").recordings
+    beta, amplitude = (next(t for t in recording.traces if t.stream == stream) for stream in ("beta", "amplitude"))
+    assert beta.t_end_s[0] == -18.0
+    assert beta.t_end_s[-1] == 300.0
+    np.testing.assert_allclose(amplitude.values[1:], device.amplitudes_ma[1:160], rtol=1e-4)
+    said = recording.settings["controller"]
+    assert (said["slot_id"], said["plan_id"], said["controller"], said["ended"], said["purpose"]) == (7, 1, "rl", "complete", "session")
+    assert said["manifest_sha256"] == verified(of_slot(tmp_path), PUBLIC).manifest_sha256
+    assert said["latency_us"]["n"] == 200
+    assert recording.started_at == MORNING + timedelta(seconds=20)
+
+
+@pytest.mark.hazard("H23")
+def test_a_random_session_runs_its_signed_schedule_and_the_log_has_holds_and_densities(tmp_path: Path) -> None:
+    bundle = scheduled(tmp_path)
+    assert verified(bundle, PUBLIC).manifest.schedule is not None
+    outcome = run(bundle, tmp_path)
+    assert outcome.end is End.COMPLETE
+    (recording,) = decode(tmp_path / "log.csv").recordings
+    said = recording.settings["controller"]
+    assert (said["design"], said["level"], said["seed"], said["lower_bound"]) == ("stratified", 0.71, 12, 0.3)
+    assert said["holds"] == [dataclasses.asdict(hold) for hold in HOLDS]
+    amplitude = next(t for t in recording.traces if t.stream == "amplitude")
+    delivered = amplitude.values[amplitude.t_end_s > 0] / 3.0
+    np.testing.assert_allclose(delivered, np.repeat([h.amplitude for h in HOLDS], [h.steps for h in HOLDS]), atol=2e-3)
+
+
+@pytest.mark.hazard("H23")
+def test_a_lost_link_interrupts_a_random_session_and_what_was_not_drawn_has_no_density(tmp_path: Path) -> None:
+    def lose(number: int, line: str) -> Iterable[Sent]:
+        return [] if number in (39, 40) else [(0.0, Event.LINE, line)]
+
+    opened = verified(scheduled(tmp_path), PUBLIC)
+    device = SimulatedDevice(brain_of("P1:3", opened.manifest, 400), opened.manifest, lose)
+    tablet = Tablet(ledger=Ledger(tmp_path / "ledger"), now=lambda: MORNING)
+    run_slot(opened.manifest_json, opened.manifest_sha256, opened.controller(), device, tmp_path / "log.csv", tablet)
+    (recording,) = decode(tmp_path / "log.csv").recordings
+    holds = recording.settings["controller"]["holds"]
+    assert [(h["start"], h["log_density"]) for h in holds] == [(0, -0.3), (20, 0.4), (30, None), (41, 0.4), (50, 0.2), (90, -1.1)]
+    assert holds[2]["amplitude"] == 1.0
+    assert sum(h["steps"] for h in holds) == 150
+
+
+@pytest.mark.hazard("H17")
+def test_a_slot_runs_once_whatever_bundle_of_it_is_taken(tmp_path: Path) -> None:
+    run(of_slot(tmp_path), tmp_path)
+    again = of_slot(tmp_path, taken_by="somebody, a minute later")
+    with pytest.raises(Invalid, match=r"began at 2026-03-02T09:30:00\+00:00 and ended .* \(complete\); a slot runs once"):
+        run(again, tmp_path, log="again.csv")
+    assert not (tmp_path / "again.csv").exists()
+    other = of_slot(tmp_path, slot=dataclasses.replace(SLOT, slot_id=9, position=4, repeat=2))
+    assert run(other, tmp_path, log="repeat.csv").end is End.COMPLETE
+
+
+@pytest.mark.hazard("H17")
+def test_of_two_that_start_one_slot_at_the_same_time_one_runs(tmp_path: Path) -> None:
+    ledger = Ledger(tmp_path)
+    ledger.check_unused("P1", SLOT)
+    ledger.begin("P1", SLOT, MORNING, tmp_path / "log.csv", "a" * 64)
+    with pytest.raises(NotAllowed) as refused:
+        ledger.begin("P1", SLOT, MORNING, tmp_path / "other.csv", "b" * 64)
+    assert refused.value.code is Refusal.BROKEN_OFF
+    assert not list(tmp_path.glob("*.draft"))
+
+
+@pytest.mark.hazard("H18")
+@pytest.mark.parametrize(
+    ("now", "words"),
+    [
+        ("2026-03-01T23:59:00+00:00", "the bundle was made at 2026-03-02 08:00: set the clock"),
+        ("2026-03-03T00:00:10+00:00", "expired that night"),
+        ("2026-04-02T09:00:00+00:00", "expired that night"),
+        ("2026-03-02T07:00:00+00:00", "set the clock"),
+    ],
+)
+def test_a_bundle_runs_on_the_day_of_its_visit_alone(tmp_path: Path, now: str, words: str) -> None:
+    with pytest.raises(Invalid, match=words):
+        run(of_slot(tmp_path), tmp_path, datetime.fromisoformat(now))
+    assert not (tmp_path / "log.csv").exists()
+
+
+@pytest.mark.hazard("H18")
+def test_a_bundle_of_tomorrow_waits_and_a_clock_that_is_set_back_opens_nothing(tmp_path: Path) -> None:
+    tomorrow = dataclasses.replace(SLOT, visit_date="2026-03-03", slot_id=20)
+    with pytest.raises(Invalid, match=r"for the visit of 2026-03-03; today is 2026-03-02"):
+        run(of_slot(tmp_path, slot=tomorrow), tmp_path)
+    run(of_slot(tmp_path, slot=tomorrow), tmp_path, MORNING + timedelta(days=1))
+    with pytest.raises(Invalid, match="has said 2026-03-03 09:30 before"):
+        run(of_slot(tmp_path), tmp_path, MORNING, log="back.csv")
+
+
+@pytest.mark.hazard("H15")
+@pytest.mark.hazard("H18")
+def test_a_session_that_reaches_midnight_ends_there(tmp_path: Path) -> None:
+    opened = verified(of_slot(tmp_path), PUBLIC)
+    device = SimulatedDevice(brain_of("P1:3", opened.manifest, 400), opened.manifest)
+    late = datetime.fromisoformat("2026-03-02T23:58:00+00:00")
+    tablet = Tablet(ledger=Ledger(tmp_path / "ledger"), now=lambda: late + timedelta(seconds=device.now()))
+    outcome = run_slot(opened.manifest_json, opened.manifest_sha256, opened.controller(), device, tmp_path / "log.csv", tablet)
+    assert outcome.end is End.EXPIRED
+    assert outcome.session.decisions[-1].t_s == pytest.approx(120.0, abs=2.1)
+    assert device.device.look(device.now()) == 3.0
+
+
+def withdrawals(folder: Path, key: Ed25519PrivateKey = KEY, issued: str = "2026-03-02T08:30:00+00:00", **named: frozenset[int]) -> Path:
+    body = withdrawals_body(Withdrawals(issued, named.get("policies", frozenset()), named.get("plans", frozenset())))
+    path = folder / "withdrawn.json"
+    path.write_bytes(body + b"\n" + key.sign(body).hex().encode() + b"\n")
+    return path
+
+
+@pytest.mark.hazard("H20")
+def test_a_withdrawn_policy_is_refused_and_stays_so_without_the_list(tmp_path: Path) -> None:
+    with pytest.raises(Invalid, match="policy 3 was withdrawn"):
+        run(of_slot(tmp_path), tmp_path, withdrawn=withdrawals(tmp_path, policies=frozenset({3, 9})))
+    with pytest.raises(Invalid, match="policy 3 was withdrawn"):
+        run(of_slot(tmp_path), tmp_path)
+    older = withdrawals(tmp_path, issued="2026-03-01T08:30:00+00:00")
+    with pytest.raises(Invalid, match="older than the one that is known"):
+        run(of_slot(tmp_path), tmp_path, withdrawn=older)
+    forged = withdrawals(tmp_path, Ed25519PrivateKey.from_private_bytes(b"x" * 32), issued="2026-03-02T09:00:00+00:00")
+    with pytest.raises(Invalid, match="signature does not belong to the study's key"):
+        run(of_slot(tmp_path), tmp_path, withdrawn=forged)
+
+
+@pytest.mark.hazard("H18")
+def test_a_plan_that_was_replaced_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(Invalid, match="plan 1 was replaced or withdrawn"):
+        run(of_slot(tmp_path), tmp_path, withdrawn=withdrawals(tmp_path, plans=frozenset({1})))
+
+
+@pytest.mark.hazard("H19")
+def test_what_nobody_signed_runs_on_the_bench_alone(tmp_path: Path) -> None:
+    with pytest.raises(Invalid, match=r"for no session of a signed plan .* runs on the bench alone"):
+        run(made(tmp_path), tmp_path)
+    with pytest.raises(Invalid, match="nobody signed the plan of this bundle"):
+        run(made(tmp_path, slot=SLOT), tmp_path)
+    assert not (tmp_path / "ledger").exists()
+    bench = run(made(tmp_path), tmp_path, bench=True)
+    assert bench.end is End.COMPLETE
+    assert decode(tmp_path / "log.csv").recordings[0].settings["controller"]["purpose"] == "bench"
+
+
+@pytest.mark.hazard("H01")
+def test_another_participants_bundle_is_refused_by_the_code_on_the_chart_and_by_the_device(tmp_path: Path) -> None:
+    bundle = of_slot(tmp_path)
+    with pytest.raises(Invalid, match="of participant P1, not P2"):
+        control(bundle, "simulated:P1:3", Wish(), Task(log=tmp_path / "log.csv", key=PUBLIC, participant="P2", ledger=tmp_path / "l"))
+    opened = verified(bundle, PUBLIC)
+    stranger = SimulatedDevice(brain_of("P1:3", opened.manifest, 400), dataclasses.replace(opened.manifest, participant="P2"))
+    tablet = Tablet(ledger=Ledger(tmp_path / "ledger"), now=lambda: MORNING)
+    outcome = run_slot(opened.manifest_json, opened.manifest_sha256, opened.controller(), stranger, tmp_path / "log.csv", tablet)
+    assert (outcome.end, outcome.detail) == (End.STRANGER, "participant P2 instead of P1")
+    assert set(stranger.amplitudes_ma) <= {3.0}
+
+
+def test_signatures_are_checked_in_plain_python_as_by_the_library() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(12):
+        key = Ed25519PrivateKey.from_private_bytes(rng.bytes(32))
+        public, message = key.public_key().public_bytes_raw(), rng.bytes(int(rng.integers(0, 300)))
+        signature = key.sign(message)
+        assert verifies(public, message, signature)
+        for place in (0, 31, 32, 63):
+            spoilt = signature[:place] + bytes([signature[place] ^ (1 << int(rng.integers(8)))]) + signature[place + 1 :]
+            assert not verifies(public, message, spoilt)
+        assert not verifies(public, message + b".", signature)
+        assert not verifies(Ed25519PrivateKey.from_private_bytes(rng.bytes(32)).public_key().public_bytes_raw(), message, signature)
+    assert not verifies(b"\xff" * 32, b"", b"\xff" * 64)
+    assert not verifies(b"", b"", b"")
+
+
+def unpacked(bundle: Path, folder: Path) -> Path:
+    with zipfile.ZipFile(bundle) as archive:
+        archive.extractall(folder / "bundle")
+    return folder / "bundle"
+
+
+def todays(folder: Path, **changes: object) -> Path:
+    """A bundle of a slot of today, with quick decisions."""
+    now = datetime.now().astimezone()
+    slot = dataclasses.replace(SLOT, visit_date=now.date().isoformat(), issued_at=(now - timedelta(minutes=1)).isoformat())
+    return of_slot(folder, slot=slot, period_s=0.2, window=2, ramp_ma_per_s=50.0, **changes)
+
+
+def own_runner(folder: Path, *options: str) -> subprocess.Popen[str]:
+    call = [sys.executable, "-m", "controller", f"--key={PUBLIC}", f"--ledger={folder / 'ledger'}", *options]
+    return subprocess.Popen(
+        call, cwd=folder / "bundle", stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
+    )
+
+
+@pytest.mark.hazard("H16")
+@pytest.mark.hazard("H17")
+def test_a_runner_killed_in_mid_session_leaves_whole_rows_the_device_on_cdbs_and_the_next_start_says_so(tmp_path: Path) -> None:
+    folder, log = unpacked(todays(tmp_path), tmp_path).parent, tmp_path / "log.csv"
+    runner = own_runner(folder, "--run", f"--log={log}")
+    assert runner.stdin is not None
+    assert runner.stdout is not None
+    device, began = DeviceSide("P1", "-", 3.0, 0.5, 3.0), time.monotonic()
+    runner.stdin.write("hello 1 P1 - uV time_domain 200\n")
+    os.set_blocking(runner.stdout.fileno(), False)
+    seq = 0
+    while device.amplitude_ma == 3.0 and time.monotonic() < began + 20:
+        if time.monotonic() - began >= 0.2 * (seq + 1):
+            runner.stdin.write(f"beta {seq} {1000 * (time.monotonic() - began):.0f} {1.4 + 0.1 * (seq % 3)} uV time_domain\n")
+            seq += 1
+        for line in iter(runner.stdout.readline, ""):
+            device.hear(line, time.monotonic())
+        time.sleep(0.01)
+    assert device.why == "policy"
+    runner.kill()
+    runner.communicate()
+    killed = time.monotonic()
+    while not device.over and time.monotonic() < killed + 5:
+        device.look(time.monotonic())
+        time.sleep(0.01)
+    assert (device.amplitude_ma, device.why) == (3.0, "watchdog")
+    assert time.monotonic() - killed <= 2.5 * 0.2 + 0.2
+    assert runner.returncode == -signal.SIGKILL
+    assert log.read_bytes().endswith(b"\n")
+    rows = rows_of_quick(log)
+    again = own_runner(folder, "--run", f"--log={tmp_path / 'again.csv'}")
+    out, said = again.communicate("hello 1 P1 - uV time_domain 200\n", timeout=30)
+    assert again.returncode == 1
+    assert out == "refused broken_off\n"
+    assert f"was broken off after {len(rows)} decisions" in said
+    assert "plan a repeat" in said
+    assert not (tmp_path / "again.csv").exists()
+
+
+def rows_of_quick(log: Path) -> list[str]:
+    lines = log.read_text("utf-8").splitlines()
+    assert all(line.count(",") >= 18 for line in lines[2:])
+    return lines[3:]
+
+
+@pytest.mark.hazard("H15")
+def test_the_stop_of_the_system_ends_a_session_over_loopback_on_clinical_settings(tmp_path: Path) -> None:
+    folder = unpacked(todays(tmp_path), tmp_path).parent
+    runner = own_runner(folder, "--run", "--input=tcp:0", f"--log={tmp_path / 'log.csv'}")
+    assert runner.stderr is not None
+    said = [runner.stderr.readline() for _ in range(2)]
+    port = int(said[-1].split("port ")[1].split()[0])
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as link:
+        stream = link.makefile("rw", newline="\n")
+        assert stream.readline().startswith("controller 1 P1 - 200 3 0.5 3 2")
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as second:
+            assert second.recv(100) == b"", "one device at a time"
+        stream.write("hello 1 P1 - uV time_domain 200\n")
+        stream.flush()
+        assert stream.readline().startswith("amplitude 0 ")
+        runner.send_signal(signal.SIGTERM)
+        last = [line for line in stream if line][-1]
+    assert last.split()[0::3] == ["end", "3"]
+    assert last.split()[4] == "stopped"
+    assert runner.wait(20) == 0
+    runner.communicate()
+
+
+@pytest.mark.hazard("H19")
+def test_the_bundles_own_runner_runs_nothing_that_was_changed_or_signed_by_another(tmp_path: Path) -> None:
+    folder = unpacked(todays(tmp_path), tmp_path)
+    manifest = folder / "manifest.json"
+    manifest.write_bytes(manifest.read_bytes().replace(b'"max_ma": 3.0', b'"max_ma": 3.4'))
+    changed = own_runner(tmp_path, "--run", f"--log={tmp_path / 'log.csv'}")
+    _, said = changed.communicate("", timeout=30)
+    assert (changed.returncode, "the manifest is not signed with this key" in said) == (1, True)
+    assert not (tmp_path / "log.csv").exists()
+
+
+def test_decisions_are_timed_by_both_runners(tmp_path: Path) -> None:
+    unpacked(of_slot(tmp_path), tmp_path)
+    runner = own_runner(tmp_path, "--time=50")
+    out, _ = runner.communicate("", timeout=30)
+    assert '"n": 50.0' in out
+    assert '"mean"' in out
+    summary = control(tmp_path / "bundle.zip", None, Wish(), Task(key=PUBLIC, timed=50))
+    assert summary["measured_us"]["n"] == 50
+    assert summary["measured_us"]["median"] > 0
+
+
+def test_slots_without_a_real_day_or_minutes_are_refused() -> None:
+    for change in ({"visit_date": "soon"}, {"minutes": 0}, {"issued_at": "2026-03-02T08:00:00"}):
+        with pytest.raises(ValueError, match=r"soon|minutes|offset"):
+            Slot(**dataclasses.asdict(SLOT) | change)
