@@ -90,8 +90,8 @@ def _channel(facts: Mapping[str, Any]) -> str:
 
 def _program(facts: Mapping[str, Any]) -> str:
     ran = {
-        "moved": "{low:.3g} to {high:.3g}",
-        "constant": "constant at {high:.3g}",
+        "moved": "{low:.3g} to {high:.3g} mA",
+        "constant": "constant at {high:.3g} mA",
         "off": "off",
         "unknown": "not known",
     }

@@ -139,6 +139,18 @@ INTENDED: dict[str, str] = {
         "API: `GET /sessions/{id}/samples` gives a session's samples with their times, and every trace, as one Parquet or NWB file",
     ),
     "components > schemas > ProposalChange": "API: `control_stream` and `control_channel` of a proposal can be corrected.",
+    **dict.fromkeys(
+        (
+            "components > schemas > DeviceEventOut",
+            "components > schemas > DeviceHistoryOut",
+            "components > schemas > DeviceSpectrumOut",
+            "components > schemas > TherapyGroupOut",
+            "components > schemas > TherapyProgramOut",
+            "components > schemas > TrendOut",
+            "paths > /api/v1/participants/{code}/device-history",
+        ),
+        "API: `GET /participants/{code}/device-history` gives what Percept reports tell of the device's own history",
+    ),
     "components > schemas > ProposalOut": "API: a proposal has `usable_steps`.",
     "components > schemas > UsableStepsOut": "API: a proposal has `usable_steps`.",
     "components > schemas > JobOut > properties > seconds_left": "API: a job has `seconds_left`.",

@@ -60,6 +60,7 @@ READABLE = (
     "/api/v1/analyses",
     "/api/v1/participants/{code}/margins/locks",
     "/api/v1/participants/{code}/adverse-events",
+    "/api/v1/participants/{code}/device-history",
     "/api/v1/visits/{visit_id}/locks",
     "/api/v1/participants/{code}/calibration",
     "/healthz",

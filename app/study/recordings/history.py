@@ -1,0 +1,133 @@
+"""What a device keeps beside sessions: trends, snapshots and surveys of spectra, therapy groups and events; from a recording's details.
+
+Everything in it was reduced to numbers, times and known words before it was stored (`ml.formats.percept.details`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any
+
+from app.study.models import Recording
+
+
+@dataclass(frozen=True)
+class Trend:
+    """Averages over ten minutes of one side: times (Unix s), power (device units) and amplitude (mA), all [n]; None where not told."""
+
+    side: str
+    unix_s: list[float]
+    power: list[float | None]
+    amplitude_ma: list[float | None]
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """A spectrum that the device made: of a patient's event (`at`, `label`) or of a survey (`channel`); magnitude in uVp, [n]."""
+
+    side: str | None
+    hz: list[float]
+    magnitude: list[float]
+    at: datetime | None = None
+    label: str = ""
+    channel: str = ""
+    artifact: str = ""
+
+
+@dataclass(frozen=True)
+class Program:
+    """One side's program of a therapy group; None where not told. `sensing_hz`: the frequency that the side was sensed at."""
+
+    side: str
+    amplitude_ma: float | None
+    lower_ma: float | None
+    upper_ma: float | None
+    rate_hz: float | None
+    pulse_width_us: float | None
+    contacts: str
+    sensing_hz: float | None
+
+
+@dataclass(frozen=True)
+class Group:
+    """A therapy group as it was at a moment; `at` is None for the present groups of a report without a date."""
+
+    at: datetime | None
+    name: str
+    active: bool
+    programs: list[Program]
+
+
+@dataclass(frozen=True)
+class Marked:
+    """An event: `patient` marked it, or the `device` logged it."""
+
+    at: datetime
+    kind: str
+    label: str
+
+
+@dataclass(frozen=True)
+class History:
+    """The history of one device as one report told it; what the report did not hold is empty. Battery: percent and months left."""
+
+    recording: Recording
+    trends: list[Trend]
+    snapshots: list[Spectrum]
+    surveys: list[Spectrum]
+    groups: list[Group]
+    events: list[Marked]
+    battery_percent: float | None
+    battery_months: float | None
+
+    @property
+    def patient_events(self) -> list[Marked]:
+        """Those that the patient marked."""
+        return [e for e in self.events if e.kind == "patient"]
+
+
+def history_of(recording: Recording) -> History:
+    """The history that a recording holds."""
+    kept = recording.details.get("settings", {})
+    battery = kept.get("battery") or {}
+    present = [_group(g, recording.started_at) for g in kept.get("groups") or []]
+    before = [_group(g, _moment(visit["at"])) for visit in kept.get("group_history") or [] for g in visit["groups"]]
+    return History(
+        recording=recording,
+        trends=[Trend(side, t["unix_s"], t["power_device_units"], t["amplitude_ma"]) for side, t in (kept.get("trends") or {}).items()],
+        snapshots=[
+            Spectrum(side, s["hz"], s["magnitude"], _moment(e["at"]), e["label"])
+            for e in kept.get("snapshots") or []
+            for side, s in e["spectra"].items()
+        ],
+        surveys=[
+            Spectrum(m["side"], m["hz"], m["magnitude"], channel=m["channel"] or "", artifact=m["artifact"] or "")
+            for m in kept.get("montage") or []
+        ],
+        groups=[*before, *present],
+        events=_events(recording),
+        battery_percent=battery.get("percent"),
+        battery_months=battery.get("months_left"),
+    )
+
+
+def _group(stored: Mapping[str, Any], at: datetime | None) -> Group:
+    sensed = {s["side"]: s["frequency_hz"] for s in stored.get("sensing") or []}
+    names = ("side", "amplitude_ma", "lower_ma", "upper_ma", "rate_hz", "pulse_width_us", "contacts")
+    programs = [Program(**{name: p[name] for name in names}, sensing_hz=sensed.get(p["side"])) for p in stored["programs"]]
+    return Group(at, stored["group"] or "?", bool(stored["active"]), programs)
+
+
+def _events(recording: Recording) -> list[Marked]:
+    """In time order; the stored seconds count from the recording's start, or from its first event where it has none."""
+    begin = recording.started_at
+    if begin is None:
+        return []
+    stored = recording.details.get("events") or []
+    return [Marked(begin + timedelta(seconds=float(e["t_s"])), e["kind"], e["label"]) for e in stored]
+
+
+def _moment(stored: str | None) -> datetime | None:
+    return datetime.fromisoformat(stored) if stored else None
