@@ -70,6 +70,25 @@ def contradiction(found: Contradiction, slots: Sequence[SlotOut]) -> str:
     return f"Session {position} has {len(found.entries)} different {what}: {said}. None counts until one is chosen."
 
 
+STOPPED_FOR_PARTICIPANT = "stopped for the participant's sake on the clinic day"
+
+
+def from_the_day(who: Sequence[str]) -> str:
+    """Why a session has outcomes that nobody typed beside it."""
+    return "entered on the clinic day" + (f" by {', '.join(who)}" if who else "")
+
+
+def day_differs(name: str, entered: float, known: float) -> str:
+    """A QoC that the clinic day has otherwise than the session, which keeps its own."""
+    what, unit = {"rating": ("rating", ""), "grasp_hz": ("grasp frequency", " Hz")}[name]
+    return f"The clinic day has a {what} of {entered:.3g}{unit}, the session {known:.3g}{unit}; the session keeps its own."
+
+
+def open_contradiction(kind: str) -> str:
+    """A matter of which the clinic day has two entries that say different things."""
+    return f"The clinic day has different {_MATTERS.get(kind, 'entries')}; none was taken. Choose one on the page of the day."
+
+
 def _entered(entry: Entry) -> str:
     payload = entry.payload
     if entry.kind == "grasp":

@@ -17,7 +17,7 @@ from ml.qoc import grasp_frequency
 
 SAME_MOMENT_S = 5.0
 """Two starts (or stops) of one session within this time are the same event pressed twice."""
-SEVERE = "severe"
+MILD, SEVERE = "mild", "severe"
 GRADED = ("dyskinesia", "speech", "gait")
 
 

@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.planning.plans.models import Plan
+from app.planning.plans.models import Plan, PlanItem
 from app.planning.visit_day.models import DayEntry
 from app.planning.visit_day.record import SlotOutcome, SlotTimes, outcomes_of, times_of
 from app.study.repository import count
@@ -23,6 +23,12 @@ def entries_of_visit(db: Session, visit_id: int, limit: int, offset: int) -> tup
     """A page of all entries about a visit, under whichever of its plans, in the order in which they arrived."""
     of_visit = select(DayEntry).join(Plan, Plan.id == DayEntry.plan_id).where(Plan.visit_id == visit_id)
     return db.scalars(of_visit.order_by(DayEntry.id).limit(limit).offset(offset)).all(), count(db, of_visit)
+
+
+def entries_beside(db: Session, plan_item_id: int) -> Sequence[DayEntry]:
+    """All entries of the day that a session of a plan belongs to, in the order in which they arrived."""
+    of_item = select(PlanItem.plan_id).where(PlanItem.id == plan_item_id).scalar_subquery()
+    return db.scalars(select(DayEntry).where(DayEntry.plan_id == of_item).order_by(DayEntry.id)).all()
 
 
 def entries_named(db: Session, uuids: Collection[uuid.UUID]) -> dict[uuid.UUID, DayEntry]:
