@@ -130,6 +130,8 @@ function session(app, slot) {
     const blocked = app.day.not_runnable ? "This plan may not run." : other ? `Session ${other.position} is running: stop it first.` : record.openSevere(app.entries) ? "Confirm first that the stimulator is back on clinical settings." : "";
     card.append(button("Start", "primary huge", () => app.enter("start", {}, where), { disabled: Boolean(blocked) || !mayEnter, "data-act": "start", "data-focus": "startstop" }));
     if (blocked) card.append(el("p", { class: "muted", text: blocked }));
+    const until = washoutEnd(app);
+    if (until > Date.now() + (app.link.offsetMs ?? 0)) card.append(el("p", { class: "day-washout", "data-until": until }));
   }
   if (state === "running") card.append(button("Stop", "stop huge", () => app.enter("stop", {}, where), { disabled: !mayEnter, "data-act": "stop", "data-focus": "startstop" }));
   if (["asked", "done"].includes(state) && early(slot, about)) card.append(stopCause(app, where, about));
@@ -137,6 +139,15 @@ function session(app, slot) {
   if (["running", "asked"].includes(state)) parts.push(outcomes(app, slot, where, about, state));
   if (state === "done") parts.push(summary(app, slot, where, about));
   return parts;
+}
+
+// When the washout of the session before ends, by the service's clock.
+function washoutEnd(app) {
+  const ends = app.day.slots.map((slot) => {
+    const stop = record.about(app.entries, slot.plan_item_id, record.lastAttempt(app.entries, slot.plan_item_id)).stop;
+    return stop ? record.moment(stop[0]) + slot.washout_minutes * 60_000 : -Infinity;
+  });
+  return Math.max(-Infinity, ...ends);
 }
 
 function limits(slot) {
@@ -161,6 +172,11 @@ function timer(slot, about, state) {
 
 // Four times a second: the clock alone, so that nothing that is being touched is drawn anew.
 export function tick(root, app) {
+  const washout = root.querySelector(".day-washout");
+  if (washout) {
+    const left = (Number(washout.dataset.until) - Date.now() - (app.link.offsetMs ?? 0)) / 1000;
+    washout.textContent = left > 0 ? `Washout on clinical settings: ${clock(left + 0.999)} left.` : "The washout is over.";
+  }
   const box = root.querySelector(".day-timer");
   if (!box) return;
   const began = box.dataset.began ? Number(box.dataset.began) : null;
