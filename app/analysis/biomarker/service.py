@@ -11,7 +11,8 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.analysis.evidence.facts import METRICS, Facts
 from app.analysis.evidence.measurements import comparable_beta, with_comparable_beta
-from app.analysis.evidence.service import evidence, kept
+from app.analysis.evidence.service import evidence
+from app.platform.kept import kept
 from app.study import repository as study
 from app.study.models import Controller, Participant
 from ml.statistics.association import Association, between_visits, within_visits

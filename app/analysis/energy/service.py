@@ -11,7 +11,8 @@ from app.accounts.permissions import Caller
 from app.analysis.energy.measures import Measure, Pulses, Taken, mean, pulses_of, taken
 from app.analysis.evidence import repository
 from app.analysis.evidence.facts import Facts
-from app.analysis.evidence.service import Evidence, evidence, kept
+from app.analysis.evidence.service import Evidence, evidence
+from app.platform.kept import kept
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller, Participant
 from ml.energy import Implant, Range, saving_percent

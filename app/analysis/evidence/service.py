@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from threading import Lock
-from typing import Any, TypeVar, cast
 
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.analysis.evidence import repository
 from app.analysis.evidence.facts import Excluded, Facts, LeftOut, read
 from app.platform.errors import Invalid
+from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study
 from app.study.models import Participant
-
-T = TypeVar("T")
-
-KEPT = 512
-"""Results that a process keeps; the oldest goes first."""
+from app.study.sessions.repository import fingerprints
 
 
 @dataclass(frozen=True)
@@ -43,30 +36,6 @@ class Evidence:
     beta_source: str | None
 
 
-_kept: OrderedDict[Hashable, Any] = OrderedDict()
-_lock = Lock()
-
-
-def kept(key: Hashable, compute: Callable[[], T]) -> T:
-    """A result under a key that names everything it depends on; computed where this process has not kept it."""
-    with _lock:
-        if key in _kept:
-            _kept.move_to_end(key)
-            return cast("T", _kept[key])
-    result = compute()
-    with _lock:
-        _kept[key] = result
-        while len(_kept) > KEPT:
-            _kept.popitem(last=False)
-    return result
-
-
-def forget() -> None:
-    """Drop everything that is kept: for measuring."""
-    with _lock:
-        _kept.clear()
-
-
 def evidence(db: Session, participant: Participant, caller: Caller) -> Evidence:
     """The evidence of a participant, as the caller may know it; errors as in `app.study.blinding`."""
     return of_all(db, [participant], caller)[0]
@@ -74,7 +43,7 @@ def evidence(db: Session, participant: Participant, caller: Caller) -> Evidence:
 
 def of_all(db: Session, participants: Sequence[Participant], caller: Caller) -> list[Evidence]:
     """The evidence of several participants; whether it has changed is asked of all at once."""
-    versions = repository.fingerprints(db, [p.id for p in participants])
+    versions = fingerprints(db, [p.id for p in participants])
     return [_of(db, p, caller, versions[p.id]) for p in participants]
 
 

@@ -12,9 +12,10 @@ from app.accounts.permissions import Caller
 from app.analysis import wording
 from app.analysis.evidence.facts import METRICS, BetaKind, Facts
 from app.analysis.evidence.measurements import comparable_beta, with_comparable_beta
-from app.analysis.evidence.service import Evidence, evidence, kept
+from app.analysis.evidence.service import Evidence, evidence
 from app.analysis.metrics.comparisons import Comparison, Group, adjust, compare, group
 from app.analysis.primary import repository
+from app.platform.kept import kept
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller, Participant
 from app.study.sessions.stimulation import MEAN_FRACTION, fits

@@ -7,12 +7,12 @@ from fastapi.responses import HTMLResponse
 
 from app.accounts.deps import CurrentCaller
 from app.analysis import wording
-from app.analysis.evidence.service import kept
 from app.analysis.metrics import export
 from app.analysis.pooled import service
 from app.analysis.pooled.charts import results
 from app.analysis.trial_time.service import trial_time
 from app.platform.database import Db
+from app.platform.kept import kept
 from app.platform.web.templates import render
 
 router = APIRouter()

@@ -9,12 +9,13 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.analysis.evidence.facts import METRICS
-from app.analysis.evidence.service import kept, of_all
+from app.analysis.evidence.service import of_all
 from app.analysis.metrics.service import FiveMetrics, five_metrics
 from app.analysis.pooled import repository
 from app.analysis.primary.results import PLANNED
 from app.analysis.primary.service import Primary, primary
 from app.analysis.trial_time.service import TrialTime, trial_time
+from app.platform.kept import kept
 from app.study import repository as study
 from app.study.models import Controller, Participant
 from ml.statistics.pooling import Summary, pool

@@ -11,11 +11,12 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.analysis.evidence.facts import METRICS, BetaKind, Facts
 from app.analysis.evidence.measurements import choose, comparable_beta, of_controller, with_comparable_beta
-from app.analysis.evidence.service import Evidence, evidence, kept
+from app.analysis.evidence.service import Evidence, evidence
 from app.analysis.primary import repository
 from app.analysis.primary.results import PLANNED, ControllerResult, results
 from app.analysis.primary.verdict import LockedMargins, VerdictResult, verdicts
 from app.platform.errors import NotFound
+from app.platform.kept import kept
 from app.study.margins.service import margins_of
 from app.study.models import Controller, Participant
 from ml.statistics.power import Power, Target, power

@@ -10,15 +10,19 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
+from app.evaluation.models import Evaluation
 from app.evaluation.ranking.actual import Actual, actual, mean_of
 from app.evaluation.schemas import TestedBefore
 from app.learning.models import BufferSnapshot
 from app.learning.snapshots.trajectories import trajectory_of
 from app.platform.errors import Invalid
+from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study.blinding import Arm
-from app.study.models import Controller, SettingsVersion, StudySession
+from app.study.models import Controller, Participant, SettingsVersion, StudySession
+from app.study.sessions.repository import fingerprints
+from app.study.threshold import mdp_settings
 from app.study.traces import TracesOf, laid_out, traces_of
 from ml.mdp import MdpSettings
 from ml.ope.posterior.tested import TestSession, differences_to_cdbs
@@ -85,6 +89,26 @@ def results_by_policy(ran: list[DrivenSession], settings: MdpSettings, horizon_s
         )
         for policy_id, found in results.items()
     }
+
+
+def tested_before(
+    db: Session, evaluation: Evaluation, participant: Participant, caller: Caller, cdbs: int | None
+) -> dict[int, TestedBefore]:
+    """The same of all sessions so far, kept by this process until a row of the participant's sessions changes.
+
+    Args:
+        db: the session. evaluation: whose settings, horizon and discount count. participant: whose.
+        caller: decides which arms may be known. cdbs: id of the cDBS reference.
+    """
+    rows = fingerprints(db, [participant.id])[participant.id]
+    key = ("tested before", evaluation.id, evaluation.created_at, rows, cdbs, blinding.sight(db, participant, caller))
+
+    def read() -> dict[int, TestedBefore]:
+        settings = mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
+        ran = driven_sessions(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller)
+        return results_by_policy(ran, settings, evaluation.horizon_steps, cdbs)
+
+    return kept(key, read)
 
 
 def tests_of(ran: Sequence[DrivenSession], settings: MdpSettings, horizon_steps: int, policy_ids: Collection[int]) -> list[dict[str, Any]]:

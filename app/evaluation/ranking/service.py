@@ -11,7 +11,7 @@ from app.evaluation.estimates.coverage import coverage_failed
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.assessment import Assessed, Assessment, assess
 from app.evaluation.ranking.notes import ranking_notes
-from app.evaluation.ranking.results import driven_sessions, results_by_policy
+from app.evaluation.ranking.results import tested_before
 from app.evaluation.ranking.staleness import stale_reasons
 from app.evaluation.schemas import CoverageOut, EstimateOut, FlagOut, GainOut, RankedPolicy, RankedSnapshot, RankingFilter, RankingOut
 from app.evaluation.shown import estimate_out, flag_out, reason_out
@@ -22,7 +22,6 @@ from app.study import service as study
 from app.study.adverse_events.repository import events_of_participant
 from app.study.adverse_events.service import blocked_policies
 from app.study.models import Participant
-from app.study.threshold import mdp_settings
 from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate
 from ml.ope.flags import distinct
@@ -55,9 +54,7 @@ def current_assessment(db: Session, participant: Participant, caller: Caller, me
             f"Participant {participant.code} has no ranking yet.", "Start a job of kind 'pipeline', or 'evaluate' where there are policies."
         )
     found = assessment_of(db, participant, evaluation, method)
-    settings = mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
-    ran = driven_sessions(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller)
-    return found.with_tests(results_by_policy(ran, settings, evaluation.horizon_steps, found.cdbs_id))
+    return found.with_tests(tested_before(db, evaluation, participant, caller, found.cdbs_id))
 
 
 def assessment_of(db: Session, participant: Participant, evaluation: Evaluation, method: str | None = None) -> Assessment:

@@ -11,7 +11,6 @@ from fastapi.testclient import TestClient
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
-from app.analysis.evidence import service as evidence
 from tests.app.analysis.conftest import adder
 
 CONTROLLERS = ("cdbs", "rl", "cdbs", "distilled")
@@ -52,7 +51,7 @@ def milliseconds(client: TestClient, path: str, forget: bool) -> float:
     found = []
     for _ in range(7):
         if forget:
-            evidence.forget()
+            forget()
         start = time.process_time()
         assert client.get(path).status_code == 200
         found.append(1000 * (time.process_time() - start))

@@ -1,0 +1,36 @@
+"""Results that this process keeps under a key that names everything they depend on."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from threading import Lock
+from typing import Any, TypeVar, cast
+
+T = TypeVar("T")
+
+KEPT = 512
+"""Results that a process keeps; the oldest goes first."""
+
+_kept: OrderedDict[Hashable, Any] = OrderedDict()
+_lock = Lock()
+
+
+def kept(key: Hashable, compute: Callable[[], T]) -> T:
+    """A result under a key that names everything it depends on; computed where this process has not kept it."""
+    with _lock:
+        if key in _kept:
+            _kept.move_to_end(key)
+            return cast("T", _kept[key])
+    result = compute()
+    with _lock:
+        _kept[key] = result
+        while len(_kept) > KEPT:
+            _kept.popitem(last=False)
+    return result
+
+
+def forget() -> None:
+    """Drop everything that is kept: for measuring."""
+    with _lock:
+        _kept.clear()
