@@ -216,6 +216,15 @@ INTENDED: dict[str, str] = {
     ),
     **dict.fromkeys(
         (
+            "components > schemas > AskedOut",
+            "components > schemas > DifferenceOut",
+            "components > schemas > ReplayOut",
+            "paths > /api/v1/participants/{code}/replay",
+        ),
+        "API: `GET /participants/{code}/replay?session=&policy=` tells what policies would have asked for on a recorded session's beta",
+    ),
+    **dict.fromkeys(
+        (
             "components > schemas > AdverseEventChange",
             "components > schemas > AdverseEventIn",
             "components > schemas > AdverseEventOut",

@@ -61,6 +61,7 @@ READABLE = (
     "/api/v1/participants/{code}/margins/locks",
     "/api/v1/participants/{code}/adverse-events",
     "/api/v1/participants/{code}/device-history",
+    "/api/v1/participants/{code}/replay",
     "/api/v1/visits/{visit_id}/locks",
     "/api/v1/participants/{code}/calibration",
     "/healthz",
@@ -194,6 +195,7 @@ class World:
             ("post", "/visits/{visit_id}/unlock"): {"json": {"reason": "rating misread"}},
             ("post", "/participants/{code}/margins/locks"): {"json": {"version": 2, "reason": "protocol"}},
             ("put", "/participants/{code}/margins"): {"json": {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}},
+            ("get", "/participants/{code}/replay"): {"code": "P2", "params": self.replayed(ranking["policies"][0]["policy_id"])},
             ("post", "/participants/{code}/adverse-events"): {"json": SPEECH},
             ("put", "/adverse-events/{event_id}"): {"event_id": self.event(), "json": SPEECH | {"revision": 1, "reason": "misread"}},
             ("post", "/adverse-events/{event_id}/clearance"): {"event_id": self.event(), "json": {"revision": 1, "reason": "passed"}},
@@ -261,6 +263,11 @@ class World:
         """Upload files of P4."""
         given = [("file", file) for file in [(name, content), *(more or [])]]
         return dict(self.send("/uploads", data={"participant": "P4", **stated}, files=given))
+
+    def replayed(self, policy: int) -> Json:
+        """A session of P2 and a policy to run over it."""
+        visit = self.read("/participants/P2/visits")["items"][0]["id"]
+        return {"session": self.read(f"/visits/{visit}/sessions")["items"][0]["id"], "policy": policy}
 
     def event(self) -> int:
         """A serious adverse event of its own for one route."""

@@ -48,10 +48,17 @@ IDS = {
 ABSENT = {
     "/api/v1/participants/{code}/ranking": "select code from participant where id not in (select participant_id from evaluation)",
     "/participants/{code}/ranking.csv": "select code from participant where id not in (select participant_id from evaluation)",
+    "/api/v1/participants/{code}/replay": "select code from participant where code <> 'P1'",
     "/api/v1/visits/{visit_id}/plan": "select id from visit where id not in (select visit_id from plan)",
     "/api/v1/visits/{visit_id}/plan.pdf": "select id from visit where id not in (select visit_id from plan)",
     "/api/v1/proposals/{session_id}": "select id from session where status <> 'proposed'",
     "/proposals/{session_id}": "select id from session where status <> 'proposed'",
+}
+# what a route needs to be told besides its path: a session and a policy of P1
+QUERIES = {
+    "/api/v1/participants/{code}/replay": "select 'session=' || min(s.id) || '&policy=' || min(p.id) from session s"
+    " join visit v on v.id = s.visit_id join policy p on p.participant_id = v.participant_id"
+    " where v.participant_id = 1 and s.status = 'confirmed' and p.kind = 'trained'",
 }
 # a proposed session is shown by its own page: (route, rows that are sent elsewhere)
 ELSEWHERE = {"/sessions/{session_id}": "select id from session where status = 'proposed'"}
@@ -96,7 +103,7 @@ def calls(path: str, ids: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:
 
 def opened(client: TestClient, path: str, values: dict[str, Any]) -> int:
     """Status of a GET; an event stream is read to its first bytes."""
-    url = path.format(**values)
+    url = path.format(**values) + (f"?{rows(QUERIES[path])[0]}" if path in QUERIES else "")
     with client.stream("GET", url, follow_redirects=False) as answer:
         if "text/event-stream" not in answer.headers.get("content-type", ""):
             answer.read()

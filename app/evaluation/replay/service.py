@@ -1,0 +1,162 @@
+"""Runs two or three policies over a recorded session and says how they differ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import Caller
+from app.evaluation.replay.schemas import AskedOut, DifferenceOut, ReplayOut
+from app.learning.models import BufferSnapshot, Policy
+from app.learning.policies import foreign
+from app.learning.policies.service import onnx_of
+from app.platform import files
+from app.platform.errors import Invalid
+from app.platform.kept import kept
+from app.study import repository as study_repository
+from app.study import service as study
+from app.study.blinding import require_known
+from app.study.models import Participant, StudySession, Trace
+from app.study.sessions.data import session_data
+from app.study.traces import StepTable
+from ml.energy import relative_energy
+from ml.ope.posterior.verdict import NEARLY_OFF, SAME_AMPLITUDE
+from ml.policies.onnx_policy import PolicyFileError
+
+ASK = "app.evaluation.replay.compute:ask"
+MOST = 3
+"""Policies at once: more lines hide each other."""
+
+MOST_STEPS = 5000
+"""Steps of a session that are run: at 2 s nearly three hours."""
+Floats = NDArray[np.float64]
+
+
+def sessions_to_replay(db: Session, participant: Participant) -> Sequence[StudySession]:
+    """Sessions over whose beta policies may be run, newest first."""
+    found = study_repository.sessions_of_participant(db, participant.id)
+    return [s for s in reversed(found) if s.excluded_reason is None]
+
+
+def replay(db: Session, participant: Participant, session_id: int, policies: Sequence[Policy], caller: Caller) -> ReplayOut:
+    """What policies would have asked for before every step of a session.
+
+    Args:
+        db: the session. participant: whose session and policies. session_id: of the recorded session. policies: one to three.
+        caller: must be allowed to know what ran.
+
+    Raises:
+        NotFound: no such session. Forbidden: what ran is hidden from the caller. Invalid: none or too many policies, a session without
+            beta or too long, beta of another unit or source than a policy learned from, or a file that cannot be run.
+    """
+    session = study_repository.session(db, session_id, caller)
+    study.require_own(participant, session.visit, f"session {session_id}")
+    require_known(session.visit, caller)
+    if not 1 <= len(policies) <= MOST:
+        raise Invalid(f"{len(policies)} policies cannot be compared.", f"Choose one to {MOST}.")
+    data = session_data(db, session)
+    table, window, period = data.table, data.settings.window, data.settings.period_s
+    trace = table.beta_trace
+    if trace is None or not np.isfinite(table.beta).any():
+        raise Invalid(f"Session {session_id} has no beta to run a policy over.", "Choose another session.")
+    steps = int((table.t_s > 0).sum())
+    if not 1 <= steps <= MOST_STEPS:
+        raise Invalid(f"Session {session_id} has {steps} steps; one to {MOST_STEPS} can be run.", "Choose another session.")
+    for policy in policies:
+        _require_signal(db, participant, policy, trace)
+    rows = _rows(table, window)
+    asked = _asked(policies, rows, window, period)
+    recorded = table.fraction[table.t_s > 0]
+    begins = table.t_s[table.t_s > 0] - period
+    return ReplayOut(
+        participant=participant.code,
+        session_id=session.id,
+        visit=session.visit.number,
+        period_s=period,
+        beta_unit=trace.unit,
+        cdbs_amplitude_ma=table.cdbs_ma,
+        t_s=[float(t) for t in begins],
+        beta=_list(rows[window - 1 : -1]),
+        recorded_fraction=_list(recorded),
+        asked=[_summary(p, asked[p.id]) for p in policies],
+        differences=[d for a, b in combinations(policies, 2) if (d := _difference(a, b, asked, begins)) is not None],
+    )
+
+
+def _rows(table: StepTable, window: int) -> Floats:
+    """Beta of the W rows before the session and of the session, [W + T]."""
+    during = table.beta[table.t_s > 0]
+    lead = table.beta[table.t_s <= 0][-window:]
+    return np.concatenate([np.full(window - lead.size, np.nan), lead, during])
+
+
+def _asked(policies: Sequence[Policy], rows: Floats, window: int, period_s: float) -> Mapping[int, Floats]:
+    key = ("replay", tuple((p.id, p.onnx_sha256) for p in policies), window, period_s, rows.tobytes())
+    return kept(key, lambda: _run(policies, rows, window, period_s))
+
+
+def _run(policies: Sequence[Policy], rows: Floats, window: int, period_s: float) -> dict[int, Floats]:
+    with files.draft_folder() as folder:
+        listed: list[dict[str, Any]] = []
+        for policy in policies:
+            file = folder / f"{policy.id}.onnx"
+            file.write_bytes(onnx_of(policy))
+            listed.append({"id": policy.id, "file": str(file)})
+        try:
+            found = foreign.run(ASK, {"policies": listed, "window": window, "period_s": period_s, "beta": _list(rows)})
+        except PolicyFileError as error:
+            raise Invalid(f"These policies cannot be run: {error}.", "Leave out those that were made elsewhere.") from error
+    for policy in policies:
+        if str(policy.id) in found["refused"]:
+            raise Invalid(f"Policy '{policy.name}' cannot be run: {found['refused'][str(policy.id)]}.", "Leave it out.")
+    return {int(i): np.array([np.nan if v is None else v for v in values]) for i, values in found["asked"].items()}
+
+
+def _require_signal(db: Session, participant: Participant, policy: Policy, trace: Trace) -> None:
+    snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id is not None else None
+    settings = participant.current_settings
+    unit, source = (snapshot.beta_unit, snapshot.beta_source) if snapshot else (settings.beta_unit, settings.beta_source)
+    if (unit, source) != (trace.unit, trace.source):
+        raise Invalid(
+            f"Policy '{policy.name}' takes beta in {unit or 'no stated unit'} from {source or 'no stated source'}; the session's is in "
+            f"{trace.unit} from {trace.source}.",
+            "Choose a session with that beta, or state unit and source in the participant's settings.",
+        )
+
+
+def _summary(policy: Policy, asked: Floats) -> AskedOut:
+    known = asked[np.isfinite(asked)]
+    return AskedOut(
+        policy_id=policy.id,
+        name=policy.name,
+        fraction=_list(asked),
+        mean_fraction=float(known.mean()) if known.size else None,
+        energy=relative_energy(known) if known.size else None,
+        nearly_off=float(np.mean(known < NEARLY_OFF)) if known.size else None,
+    )
+
+
+def _difference(one: Policy, other: Policy, asked: Mapping[int, Floats], begins: Floats) -> DifferenceOut | None:
+    """How far two are apart; None where no step has an answer of both."""
+    apart = asked[one.id] - asked[other.id]
+    known = np.isfinite(apart)
+    if not known.any():
+        return None
+    at = int(np.argmax(np.where(known, np.abs(apart), -1.0)))
+    return DifferenceOut(
+        policy_id=one.id,
+        other_id=other.id,
+        mean_fraction=float(apart[known].mean()),
+        apart=float(np.mean(np.abs(apart[known]) > SAME_AMPLITUDE)),
+        most_at_s=float(begins[at]),
+        most=float(apart[at]),
+    )
+
+
+def _list(values: Floats) -> list[float | None]:
+    return [float(v) if np.isfinite(v) else None for v in values]
