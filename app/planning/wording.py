@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from app.evaluation.wording import amplitude, chance
+from app.evaluation.wording import amplitude, chance, joined
+from app.planning.notices import Code, PlanWarning
 from app.planning.plans.designs import Bound, Planned, delivered_ma
-from app.planning.plans.models import PlanItem
+from app.planning.plans.models import Plan, PlanItem
+from app.planning.protocol.orders import Order
 from app.planning.visit_day.record import Contradiction, Entry, grasp_hz, moment
 from app.planning.visit_day.schemas import SlotOut
 from app.planning.visit_day.screening import Found
+from app.study.blinding import CONTROLLER_NAMES
+from app.study.models import Controller
 from ml.deploy.manifest import BundleManifest
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
 from ml.ope.posterior.portfolio import Suggestion
@@ -26,15 +30,40 @@ def release_reason(manifest: BundleManifest) -> str:
     )
 
 
-def of_item(policy: str, min_fraction: float | None, override_reason: str | None, cdbs_ma: float | None) -> list[str]:
-    """What whoever runs a session must know of its policy: its lowest amplitude, and that it is unsafe and planned all the same."""
-    found = []
-    if min_fraction is not None:
-        lowest = amplitude(min_fraction, None if cdbs_ma is None else min_fraction * cdbs_ma)
-        found.append(f"Policy '{policy}' may not go below {lowest}.")
-    if override_reason:
-        found.append(f"Policy '{policy}' is unsafe and planned all the same: {override_reason}.")
-    return found
+_ABOUT: dict[Code, str] = {
+    Code.STALE_RANKING: "The ranking is out of date: {reason}.",
+    Code.RANKING_NOTE: "{text}",
+    Code.NOT_EVALUATED: "No ranking stands behind this plan: the participant's policies have not been evaluated.",
+    Code.OVERRIDDEN: "Policy '{policy}' is unsafe and planned all the same: {reason}.",
+    Code.NOT_RANKED: "Policy '{policy}' is not in the ranking.",
+    Code.NOT_SUPPORTED: "The data do not support the estimate of policy '{policy}': {flags}.",
+    Code.FLAGS: "Policy '{policy}': {flags}.",
+    Code.RETIRED: "Policy '{policy}' was retired: {reason}.",
+    Code.CANNOT_BE_SIGNED: "The plan cannot be signed: {why}",
+    Code.DATE_PAST: "The visit's date, {date}, is past.",
+    Code.ONE_POLICY: "The visit tests a single policy; the protocol tests 2 to 4, each against the others and cDBS of the same day.",
+    Code.KEY_REASON_MISSING: "The key was opened in an emergency by {by}; the reason is still missing.",
+}
+
+
+def warning(found: PlanWarning) -> str:
+    """The sentence of a warning."""
+    values = dict(found.values) | {"policy": found.policy}
+    if found.code is Code.LOWEST_AMPLITUDE:
+        fraction, cdbs_ma = values["fraction"], values["cdbs_ma"]
+        return f"Policy '{found.policy}' may not go below {amplitude(fraction, None if cdbs_ma is None else fraction * cdbs_ma)}."
+    if found.code is Code.VISIT_HELD:
+        return f"The visit already has {values['sessions']} {'session' if values['sessions'] == 1 else 'sessions'}."
+    if "flags" in values:
+        values["flags"] = joined(values["flags"]) or "no reason given"
+    return _ABOUT[found.code].format(**values)
+
+
+STOP_RULES = (
+    "Stop the session and return to the clinical stimulation (cDBS) at once when the participant asks for it; on a fall or its risk; "
+    "on troublesome tremor, dyskinesia, dystonia, or change of speech, mood or sight; when sensing or the link to the device is lost; or "
+    "when the amplitude leaves the clinician's limits. The study protocol's stop rules prevail over this sheet."
+)
 
 
 def suggestion(why: Suggestion, first: bool) -> str:
@@ -131,6 +160,29 @@ def schedule_words(planned: Planned, bounds: tuple[Bound, ...]) -> str:
     last = planned.holds[-1]
     after = [f"{_clock((last.start + last.steps) * planned.period_s)} cDBS"]  # a ladder may end before the session does
     return "  ".join(held + after)
+
+
+def session_name(item: PlanItem) -> str:
+    """What a session of a plan is called: its controller, and its letter in a blinded plan; the letter alone while the key is sealed."""
+    if not item.controller:
+        return f"Session {item.label}"
+    name = CONTROLLER_NAMES[Controller(item.controller)] + (f" {item.repeat}" if item.repeat > 1 else "")
+    return f"{name} ({item.label})" if item.label else name
+
+
+ORDER_NAMES = {
+    Order.DRAWN: "drawn from the seed",
+    Order.WILLIAMS: "Williams' design, balanced over visits",
+    Order.LATIN_SQUARE: "Latin square, balanced over visits",
+    Order.STATED: "as stated",
+}
+
+
+def order_words(plan: Plan) -> str:
+    """How the order of a plan's policies was found."""
+    order = Order(plan.rules.get("order", Order.DRAWN))
+    block = f", block {plan.rules.get('block', 0) + 1}" if order in (Order.WILLIAMS, Order.LATIN_SQUARE) else ""
+    return ORDER_NAMES[order] + block
 
 
 def limits_ma(item: PlanItem) -> str:

@@ -17,9 +17,10 @@ from app.learning.models import Policy
 from app.pipeline.service import start_job
 from app.planning.plans import repository as plans
 from app.planning.plans import service as planning
+from app.planning.plans import view as plan_view
 from app.planning.plans.designs import planned_sessions
-from app.planning.plans.schedule import total_minutes
 from app.planning.plans.schemas import OverrideIn, PlanIn
+from app.planning.protocol.schedule import total_minutes
 from app.platform.database import new_session, set_actor
 from app.platform.errors import BetaloopError, Conflict, NotFound
 from app.platform.jobs import repository as jobs
@@ -199,14 +200,14 @@ class ParticipantLoop:
         db.commit()
 
     def _approve(self, db: Session, visit: Visit) -> None:
-        plan = planning.read_plan(db, visit, self.caller).plan
+        plan = plan_view.read_plan(db, visit, self.caller).plan
         if plan.status == "draft":
             planning.approve_plan(db, visit, self.signer.caller, self.signer.password, plan.id)
             db.commit()
 
     def _planned(self, db: Session, visit: Visit, day: dt.date) -> list[PlacedSession]:
         """The sessions of the approved plan."""
-        lines = planning.read_plan(db, visit, self.caller).lines
+        lines = plan_view.read_plan(db, visit, self.caller).lines
         policies: dict[int, Policy] = {
             p.id: p for p in learning.policies_named(db, visit.participant_id, [i.item.policy_id for i in lines if i.item.policy_id])
         }

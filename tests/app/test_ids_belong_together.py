@@ -152,7 +152,7 @@ def _bodies(own: Ids, other: Ids) -> list[tuple[str, str, dict[str, Any]]]:
         ("POST", f"{api}{plan}/approve", {"json": {"plan_id": other["plan_id"]}}),
         ("POST", plan, {"data": {"policy_ids": str(policy), "reason": "x"}}),
         ("POST", f"{plan}/approve", {"data": {"plan_id": str(other["plan_id"])}}),
-        ("POST", f"{page}/plan/draft", {"data": {"policy_ids": str(policy), "visit_number": "9"}}),
+        ("POST", f"{page}/plan/draft", {"data": {"policy_ids": str(policy), "visit_number": "9", "visit_date": "2199-01-01"}}),
         ("POST", f"{page}/plan/draft", {"data": {"policy_ids": str(own["policy_id"]), "visit_id": str(other["open_visit"])}}),
         *(("POST", f"{api}{page}/jobs", {"json": body}) for body in jobs),
         ("PATCH", f"{api}{session}", {"json": {"controller": "rl", "policy_id": policy, "reason": "x"}}),

@@ -102,6 +102,9 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("post", "/api/v1/visits/{visit_id}/plan"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/visits/{visit_id}/plan/approve"): {"clinician", "admin"},
     ("post", "/api/v1/visits/{visit_id}/day/entries"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/visits/{visit_id}/plan/moves"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/visits/{visit_id}/plan/key"): {"clinician", "admin"},
+    ("post", "/api/v1/visits/{visit_id}/removal"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/participants/{code}/buffer-gate"): {"clinician", "admin"},
     ("get", "/api/v1/policies/{policy_id}/bundle"): {"clinician", "engineer", "admin"},
     **{("get", path): EVERYONE for path in READABLE},
@@ -171,6 +174,12 @@ class World:
         assert drafter.post(f"/api/v1/visits/{held}/plan", json={"random_sessions": 1, "seed": 1}).status_code == 201
         approved = self.send(f"/visits/{held}/plan/approve", json={"password": PASSWORD})["id"]
         slot = self.read(f"/visits/{held}/day")["slots"][0]["plan_item_id"]
+        two = {"policy_ids": [p["policy_id"] for p in ranking["policies"][:2]], "order": "stated", "seed": 1}
+        moved, blinded, empty = (self.send("/participants/P2/visits", json={"number": n})["id"] for n in (91, 92, 93))
+        self.send(f"/visits/{moved}/plan", json=two)
+        self.send(f"/visits/{blinded}/plan", json=two | {"blinded": True})
+        signing = self.calling(token_of("clinician", name="signer"))
+        assert signing.post(f"/api/v1/visits/{blinded}/plan/approve", json={"password": PASSWORD}).status_code == 200
         jobs = self.read("/participants/P4/jobs")["items"]
         small = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "distilled")
         visit = self.read("/participants/P4/visits")["items"][0]["id"]
@@ -240,6 +249,9 @@ class World:
                 "visit_id": held,
                 "json": {"plan_id": approved, "entries": [RATED | {"plan_item_id": slot}]},
             },
+            ("post", "/visits/{visit_id}/plan/moves"): {"visit_id": moved, "json": {"position": 1, "earlier": False}},
+            ("post", "/visits/{visit_id}/plan/key"): {"visit_id": blinded, "json": {"reason": "end of the visit"}},
+            ("post", "/visits/{visit_id}/removal"): {"visit_id": empty, "json": {"reason": "nobody came"}},
             ("post", "/participants/{code}/buffer-gate"): {"json": {"choice": "open", "reason": "agreed in the trial meeting"}},
         }
 

@@ -8,18 +8,26 @@ from fastapi import APIRouter, Response
 
 from app.accounts.deps import CurrentCaller
 from app.evaluation.shown import estimate_out
-from app.planning.plans import service
+from app.planning import wording
+from app.planning.plans import key, service, visits
+from app.planning.plans.models import Plan
 from app.planning.plans.schemas import (
     Approval,
+    KeyOpening,
+    KeyOut,
+    Move,
     PlanEstimateOut,
     PlanEvaluationOut,
     PlanIn,
     PlannedDesignOut,
     PlannedSessionOut,
     PlanOut,
+    PlanWarningOut,
+    Removal,
     SignatureOut,
 )
-from app.planning.plans.service import PlanLine, PlanView
+from app.planning.plans.view import PlanLine, PlanView, read_plan, shown
+from app.planning.protocol.orders import Order
 from app.planning.sheet import pdf
 from app.platform.audit import record
 from app.platform.database import Db, now
@@ -32,9 +40,9 @@ _PDF: dict[int | str, dict[str, Any]] = {200: {"content": {"application/pdf": {}
 
 
 @router.get("/visits/{visit_id}/plan")
-def read_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> PlanOut:
+def get_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> PlanOut:
     """The plan of a visit."""
-    return plan_out(service.read_plan(db, visit, caller))
+    return plan_out(read_plan(db, visit, caller))
 
 
 @router.post("/visits/{visit_id}/plan", status_code=201)
@@ -63,7 +71,7 @@ def approve_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller, approval: A
 @router.get("/visits/{visit_id}/plan.pdf", response_class=Response, responses=_PDF)
 def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
     """The plan as a sheet to print: sessions in order, estimates, blanks to fill in, signatures. A draft says so across every page."""
-    view = service.read_plan(db, visit, caller)
+    view = read_plan(db, visit, caller)
     record(db, "download", "plan", view.plan.id)
     db.commit()
     name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
@@ -72,8 +80,37 @@ def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
     )
 
 
+@router.post("/visits/{visit_id}/plan/moves", responses=problems(409))
+def move_session(visit: CurrentVisit, move: Move, db: Db, caller: CurrentCaller) -> PlanOut:
+    """Let a tested session of a draft change places with the tested one before or after it."""
+    found = service.reorder(db, visit, move.position, move.earlier, caller)
+    db.commit()
+    return plan_out(found)
+
+
+@router.post("/visits/{visit_id}/plan/key", responses=problems(409))
+def open_key(visit: CurrentVisit, opening: KeyOpening, db: Db, caller: CurrentCaller) -> PlanOut:
+    """Open the key of a blinded plan, with a reason; in an emergency at once, and the reason by a second call."""
+    found = read_plan(db, visit, caller)
+    waits = found.plan.key_opened_at is not None and found.plan.key_opened_reason is None
+    if waits:
+        key.give_reason(db, visit, found.plan, caller, opening.reason)
+    else:
+        key.open_key(db, visit, found.plan, caller, opening.reason, emergency=opening.emergency)
+    db.commit()
+    return plan_out(read_plan(db, visit, caller))
+
+
+@router.post("/visits/{visit_id}/removal", status_code=204, responses=problems(409))
+def remove_visit(visit: CurrentVisit, removal: Removal, db: Db, caller: CurrentCaller) -> None:
+    """Remove a visit in which nothing was done, with its drafts."""
+    visits.remove_visit(db, visit, removal.reason, caller)
+    db.commit()
+
+
 def plan_out(view: PlanView) -> PlanOut:
-    """A plan for the API."""
+    """A plan for the API: of a sealed one what may be shown."""
+    view = shown(view)
     plan, visit, evaluation = view.plan, view.visit, view.evaluation
     return PlanOut(
         id=plan.id,
@@ -102,8 +139,22 @@ def plan_out(view: PlanView) -> PlanOut:
         if evaluation
         else None,
         stale=bool(view.stale_reasons),
-        warnings=view.warnings,
+        starts_at=plan.starts_at,
+        order=Order(plan.rules.get("order", Order.DRAWN)),
+        block=plan.rules.get("block", 0),
+        key=_key_out(plan) if plan.blinded else None,
+        warnings=[PlanWarningOut(code=w.code, policy_id=w.policy_id, text=wording.warning(w)) for w in view.warnings],
         sessions=[_session_out(line) for line in view.lines],
+    )
+
+
+def _key_out(plan: Plan) -> KeyOut:
+    return KeyOut(
+        sealed=key.sealed(plan),
+        opened_at=plan.key_opened_at,
+        opened_by=plan.key_opened_by,
+        reason=plan.key_opened_reason,
+        emergency=plan.key_opened_in_emergency,
     )
 
 
@@ -112,10 +163,12 @@ def _session_out(line: PlanLine) -> PlannedSessionOut:
         position=line.item.position,
         start_minute=line.start_minute,
         controller=line.item.controller,
-        policy_id=line.item.policy_id,
+        policy_id=line.policy.id if line.policy else None,
         policy=line.policy.name if line.policy else None,
         minutes=line.item.minutes,
         washout_minutes=line.item.washout_minutes,
+        break_minutes=line.item.break_minutes,
+        medication=line.item.medication,
         estimate=estimate_out(line.estimate, PlanEstimateOut) if line.estimate else None,
         predicted_energy=line.predicted_energy,
         verdict=line.item.verdict,

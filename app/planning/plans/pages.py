@@ -25,20 +25,22 @@ from app.evaluation.wording import method_name, sentence
 from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning import wording
-from app.planning.plans import repository, service
-from app.planning.plans.schedule import most_policies, total_minutes
-from app.planning.plans.schemas import Id, LimitIn, PlanIn, PlanOptions
-from app.planning.plans.service import PlanView, rules_of
+from app.planning.plans import key, repository, service
+from app.planning.plans.schemas import Id, LimitIn, Move, PlanIn, PlanOptions
+from app.planning.plans.service import rules_of
 from app.planning.plans.sign_off import MEANING
 from app.planning.plans.suggested import suggested
+from app.planning.plans.view import PlanView, read_plan, shown
+from app.planning.plans.visits import remove_visit, today, visit_for_draft
+from app.planning.protocol.schedule import most_policies, total_minutes
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, NotFound
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.schemas import Int, Model, PagingQuery
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant, CurrentVisit
-from app.study.models import Participant, Visit
-from app.study.service import may
+from app.study.models import Controller, Participant, Visit
+from app.study.service import may, require
 
 router = APIRouter()
 
@@ -50,6 +52,11 @@ LABELS = {
     "total_minutes": "Minutes of the visit",
     "washout_minutes": "Washout",
     "random_sessions": "Random sessions",
+    "no_dbs_minutes": "No-DBS session",
+    "repeats": "Sessions of each policy",
+    "order": "Order",
+    "break_minutes": "Break",
+    "starts_at": "First session at",
     "hemisphere": "Side that the controllers set",
     "min_ma": "Lowest amplitude",
     "max_ma": "Highest amplitude",
@@ -113,20 +120,81 @@ def plans(request: Request, participant: CurrentParticipant, db: Db, paging: Pag
         rows=rows,
         total=total,
         paging=paging,
-        open_visits=repository.open_visits(db, participant.id, service.today()),
+        open_visits=repository.open_visits(db, participant.id, today()),
         next_number=repository.next_visit_number(db, participant.id),
     )
     return HTMLResponse(page)
 
 
 @router.post("/participants/{code}/plan/draft")
-def draft_from_ranking(participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
-    """Draft a visit from the policies ticked in the ranking; the visit is an open one or a new one."""
+def draft_from_ranking(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Draft a visit from the policies ticked in the ranking; where no visit is chosen, ask which."""
     wanted, plan_in = parse(VisitChoice, {k: "" if v == "new" else v for k, v in values.items()}, LABELS), _draft(values)
-    visit = service.visit_for_draft(db, participant, wanted.visit_id, wanted.visit_number, wanted.visit_date, caller)
+    if wanted.visit_id is None and wanted.visit_number is None:
+        return _choose_visit(request, db, participant, caller, values)
+    visit = visit_for_draft(db, participant, wanted.visit_id, wanted.visit_number, wanted.visit_date, caller)
     service.draft_plan(db, visit, plan_in, caller)
     db.commit()
     return RedirectResponse(f"/visits/{visit.id}/plan?done=drafted", 303)
+
+
+@router.post("/visits/{visit_id}/plan/move")
+def move(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Move a tested session of the draft up or down."""
+    try:
+        asked = parse(Move, values, LABELS)
+        service.reorder(db, visit, asked.position, asked.earlier, caller)
+        db.commit()
+    except BetaloopError as error:
+        db.rollback()
+        return HTMLResponse(_page(request, db, visit, caller, error), error.status)
+    return RedirectResponse(f"/visits/{visit.id}/plan?done=moved#order", 303)
+
+
+@router.post("/visits/{visit_id}/plan/key")
+def open_key(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Open the key of a blinded plan, or give the reason afterwards."""
+    reason = str(values.get("reason", ""))
+    try:
+        found = read_plan(db, visit, caller).plan
+        if found.key_opened_at is not None:
+            key.give_reason(db, visit, found, caller, reason)
+        else:
+            key.open_key(db, visit, found, caller, reason, emergency="emergency" in values)
+        db.commit()
+    except BetaloopError as error:
+        db.rollback()
+        return HTMLResponse(_page(request, db, visit, caller, error), error.status)
+    return RedirectResponse(f"/visits/{visit.id}/plan?done=opened", 303)
+
+
+@router.post("/visits/{visit_id}/remove")
+def remove(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Remove a visit in which nothing was done."""
+    code = visit.participant.code
+    try:
+        remove_visit(db, visit, str(values.get("reason", "")), caller)
+        db.commit()
+    except BetaloopError as error:
+        db.rollback()
+        return HTMLResponse(_page(request, db, visit, caller, error), error.status)
+    return RedirectResponse(f"/participants/{code}/plans?done=removed", 303)
+
+
+def _choose_visit(request: Request, db: Session, participant: Participant, caller: Caller, values: FormData) -> HTMLResponse:
+    """Ask which visit the ticked policies are for; what was sent goes on with the answer."""
+    require(caller, can.DRAFT_PLAN, participant)
+    sent = [(name, str(value)) for name, value in values.multi_items() if name not in VisitChoice.model_fields]
+    page = render(
+        request,
+        "planning/choose_visit.html",
+        participant=participant,
+        sent=sent,
+        open_visits=repository.open_visits(db, participant.id, today()),
+        plans={plan.visit_id: plan for plan, _ in repository.plans(db, participant.id, 500, 0)[0] if plan.status != "superseded"},
+        next_number=repository.next_visit_number(db, participant.id),
+    )
+    return HTMLResponse(page)
 
 
 def _draft(values: FormData) -> PlanIn:
@@ -151,16 +219,17 @@ def _page(
 ) -> str:
     participant = visit.participant
     try:
-        view: PlanView | None = service.read_plan(db, visit, caller)
+        full: PlanView | None = read_plan(db, visit, caller)
     except NotFound:
-        view = None
+        full = None
+    view = shown(full) if full else None
     try:
         found: Assessment | None = current_assessment(db, participant, caller)
     except NotFound:
         found = None
     defaults = rules_of(PlanOptions())
     choices = _choices(db, participant, found)
-    form = _form_values(view, values, choices)
+    form = _form_values(full, values, choices)
     suggestions = suggested(found, most_policies(defaults))
     return render(
         request,
@@ -189,7 +258,12 @@ def _page(
         choices=choices,
         suggestions=[(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],
         form_values=form,
-        chosen=_chosen(view, values),
+        chosen=_chosen(full if view is full else None, values),
+        movable=_movable(view),
+        order_words=wording.order_words,
+        session_name=wording.session_name,
+        orders=wording.ORDER_NAMES,
+        warning_words=wording.warning,
         problem=error.problem(request.url.path) if error else None,
         fit=[(n, total_minutes(n, defaults)) for n in range(1, most_policies(defaults) + 1)],
         defaults=defaults,
@@ -219,6 +293,13 @@ def _chosen(view: PlanView | None, values: FormData | None) -> Sequence[int]:
     return [line.item.policy_id for line in view.lines if line.item.policy_id] if view else []
 
 
+def _movable(view: PlanView | None) -> list[int]:
+    """Positions of the tested sessions of a draft, in order."""
+    if view is None or view.plan.status != "draft":
+        return []
+    return [i.item.position for i in view.lines if i.item.controller not in (Controller.CDBS, Controller.NO_DBS)]
+
+
 def _form_values(view: PlanView | None, values: FormData | None, choices: Sequence[Any]) -> dict[str, Any]:
     """What the form shows: what was sent, else the present plan's note, else the defaults."""
     shown: dict[str, Any] = {k: f"{v:g}" if isinstance(v, float) else v for k, v in PlanOptions().model_dump().items()}
@@ -227,5 +308,8 @@ def _form_values(view: PlanView | None, values: FormData | None, choices: Sequen
     elif not choices:
         shown["random_sessions"] = EARLY_RANDOM_SESSIONS
     if values is not None:
-        shown |= {name: str(values[name]) for name in shown if name in values} | {"no_dbs": "no_dbs" in values}
+        shown |= {name: str(values[name]) for name in shown if name in values} | {
+            "no_dbs": "no_dbs" in values,
+            "blinded": "blinded" in values,
+        }
     return shown

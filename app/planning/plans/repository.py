@@ -10,7 +10,8 @@ from sqlalchemy.orm import Session, selectinload
 
 from app.evaluation.models import Evaluation
 from app.planning.plans.models import Plan, PlanItem
-from app.study.models import Hemisphere, Recording, StudySession, Visit
+from app.study.adverse_events.models import AdverseEvent
+from app.study.models import Hemisphere, Recording, StudySession, Visit, VisitLock
 from app.study.repository import CONFIRMED, count
 
 
@@ -60,12 +61,6 @@ def open_visits(db: Session, participant_id: int, today: date) -> Sequence[Visit
     ).all()
 
 
-def visits_with_approved_plan(db: Session, participant_id: int) -> set[int]:
-    """Ids of the visits whose plan is approved."""
-    query = select(Plan.visit_id).join(Visit, Visit.id == Plan.visit_id)
-    return set(db.scalars(query.where(Visit.participant_id == participant_id, Plan.status == "approved")))
-
-
 def next_visit_number(db: Session, participant_id: int) -> int:
     """The number after the participant's last visit."""
     return (db.scalar(select(func.max(Visit.number)).where(Visit.participant_id == participant_id)) or 0) + 1
@@ -77,6 +72,49 @@ def recordings_newest_first(db: Session, participant_id: int, hemisphere: Hemisp
     if hemisphere is not None:
         query = query.where((Recording.hemisphere == hemisphere) | Recording.hemisphere.is_(None))
     return db.scalars(query.order_by(Recording.started_at.desc().nulls_last(), Recording.id.desc())).all()
+
+
+def earlier_planned_visits(db: Session, visit: Visit) -> int:
+    """Visits of the participant before this one whose live plan tests policies."""
+    query = (
+        select(func.count(distinct(Plan.visit_id)))
+        .join(PlanItem, PlanItem.plan_id == Plan.id)
+        .join(Visit, Visit.id == Plan.visit_id)
+        .where(Visit.participant_id == visit.participant_id, Visit.number < visit.number, Plan.status != "superseded")
+        .where(PlanItem.policy_id.is_not(None))
+    )
+    return db.scalar(query) or 0
+
+
+def what_holds(db: Session, visit_id: int) -> list[str]:
+    """What of a visit keeps it from being removed, in words."""
+    sessions = db.scalar(select(func.count()).select_from(StudySession).where(StudySession.visit_id == visit_id)) or 0
+    signed = db.scalar(select(func.count()).select_from(Plan).where(Plan.visit_id == visit_id, Plan.approved_at.is_not(None))) or 0
+    events = db.scalar(select(func.count()).select_from(AdverseEvent).where(AdverseEvent.visit_id == visit_id)) or 0
+    locks = db.scalar(select(func.count()).select_from(VisitLock).where(VisitLock.visit_id == visit_id)) or 0
+    counted = {"sessions or proposals": sessions, "a plan that was signed": signed, "adverse events": events, "locks": locks}
+    return [what for what, count in counted.items() if count]
+
+
+def swap(db: Session, one: PlanItem, other: PlanItem) -> None:
+    """Let two sessions of a plan change places; each place keeps its washout and its break."""
+    places = (one.position, one.washout_minutes, one.break_minutes), (other.position, other.washout_minutes, other.break_minutes)
+    one.position = -1
+    db.flush()
+    other.position, other.washout_minutes, other.break_minutes = places[0]
+    db.flush()
+    one.position, one.washout_minutes, one.break_minutes = places[1]
+    db.flush()
+
+
+def delete_visit(db: Session, visit: Visit) -> None:
+    """Remove a visit with its plans and its cDBS amplitudes."""
+    for plan in db.scalars(select(Plan).where(Plan.visit_id == visit.id)):
+        db.delete(plan)
+    for amplitude in visit.cdbs_amplitudes:
+        db.delete(amplitude)
+    db.flush()
+    db.delete(visit)
 
 
 def evaluation(db: Session, evaluation_id: int) -> Evaluation:

@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from app.evaluation.schemas import EstimateSummary
+from app.planning.notices import Code
+from app.planning.protocol.orders import Order
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
 
@@ -22,7 +24,17 @@ class PlanOptions(Model):
     minutes_per_session: Number = Field(10.0, ge=5, le=20, description="Length of every session but no-DBS, minutes.")
     total_minutes: Number = Field(120.0, gt=0, le=1440, description="From the first session's start to the last one's end, at most.")
     washout_minutes: Number = Field(5.0, ge=0, le=120, description="Pause on the clinical stimulation after each session but the last.")
-    no_dbs: Bool = Field(False, description="One session without stimulation, 5 minutes, at the end.")
+    no_dbs: Bool = Field(False, description="One session without stimulation, at the end.")
+    no_dbs_minutes: Number = Field(5.0, ge=5, le=20, description="Length of the session without stimulation; no longer than another.")
+    repeats: Int = Field(1, ge=1, le=4, description="Sessions of each policy within the visit.")
+    order: Order = Field(
+        Order.DRAWN,
+        description="Of the policies: drawn from the seed, a Latin square or Williams' design that goes on "
+        "from visit to visit, or as `policy_ids` names them.",
+    )
+    break_minutes: Number = Field(0.0, ge=0, le=240, description="One rest in the middle of the visit; 0 for none.")
+    starts_at: dt.time | None = Field(None, description="Time of day of the first session, by the clinic's clock.")
+    blinded: Bool = Field(False, description="Run the visit under letters; which is which stays sealed from the signature on.")
     random_sessions: Int = Field(0, ge=0, le=10, description="Sessions of the random controller.")
     hemisphere: Hemisphere | None = Field(
         None, description="Side whose amplitude the controllers set; needed where the visit states a cDBS amplitude of both."
@@ -60,7 +72,9 @@ class PlanIn(PlanOptions):
     """A plan to draft."""
 
     policy_ids: list[Id] = Field(
-        default_factory=list, max_length=20, description="Policies to test, each in one session; none for a visit of random sessions alone."
+        default_factory=list,
+        max_length=20,
+        description="Policies to test, in `repeats` sessions each; none for a visit of random sessions alone.",
     )
     overrides: list[OverrideIn] = Field(
         default_factory=list, max_length=20, description="For each unsafe policy the reason of a clinician who may approve plans."
@@ -131,11 +145,13 @@ class PlannedSessionOut(Model):
 
     position: int
     start_minute: float = Field(description="From the first session's start.")
-    controller: Controller
+    controller: Controller | None = Field(description="Null while the key of a blinded plan is sealed, with all that would tell it.")
     policy_id: int | None
     policy: str | None
     minutes: float
     washout_minutes: float
+    break_minutes: float
+    medication: str
     estimate: PlanEstimateOut | None
     predicted_energy: float | None = Field(description="Mean squared amplitude fraction; cDBS = 1.")
     verdict: str | None = Field(description="What the ranking said of the policy when the plan was drafted; null for what is not ranked.")
@@ -162,6 +178,44 @@ class PlanEvaluationOut(Model):
     snapshot_id: int
 
 
+class PlanWarningOut(Model):
+    """What whoever signs or runs a plan must know. Programs read the code; the text may be worded anew."""
+
+    code: Code
+    policy_id: int | None = Field(description="Whom it is about; null for the whole plan.")
+    text: str
+
+
+class KeyOut(Model):
+    """The key of a blinded plan: which letter is which controller."""
+
+    sealed: bool = Field(description="Until it is opened, sessions tell their letters and the limits that hold for all alike.")
+    opened_at: datetime | None
+    opened_by: str | None
+    reason: str | None = Field(description="Null after an emergency for which nobody has given it yet.")
+    emergency: bool
+
+
+class KeyOpening(Model):
+    """Why the key of a blinded plan is opened."""
+
+    reason: Text = Field("", max_length=1000, description="Needed but in an emergency, after which it is given by a second call.")
+    emergency: Bool = False
+
+
+class Move(Model):
+    """A tested session changes places with the tested one before or after it."""
+
+    position: Id
+    earlier: Bool
+
+
+class Removal(Model):
+    """Why a visit in which nothing was done is removed."""
+
+    reason: Text = Field(max_length=1000)
+
+
 class PlanOut(Model):
     """The plan of a visit."""
 
@@ -181,8 +235,12 @@ class PlanOut(Model):
     signature_state: Literal["none", "stands", "broken", "not_kept"] = Field(
         description="Whether it stands; `broken` when anything that was signed has changed since, `not_kept` for plans of earlier versions."
     )
+    starts_at: dt.time | None
+    order: Order
+    block: int = Field(description="Visits before this one that followed the same square.")
+    key: KeyOut | None = Field(description="Of a blinded plan; null for others.")
     total_minutes: float
     evaluation: PlanEvaluationOut | None
     stale: bool = Field(description="The ranking no longer speaks about the study as it is.")
-    warnings: list[str]
+    warnings: list[PlanWarningOut]
     sessions: list[PlannedSessionOut]

@@ -13,17 +13,10 @@ from fpdf.enums import XPos, YPos
 from app.evaluation.wording import method_name
 from app.learning.models import Policy
 from app.planning import wording
-from app.planning.plans.service import PlanLine, PlanView
 from app.planning.plans.sign_off import SignatureState
+from app.planning.plans.view import PlanLine, PlanView, shown
 from app.planning.sheet.latin1_text import latin
-from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller
-
-STOP_RULES = (
-    "Stop the session and return to the clinical stimulation (cDBS) at once when the participant asks for it; on a fall or its risk; "
-    "on troublesome tremor, dyskinesia, dystonia, or change of speech, mood or sight; when sensing or the link to the device is lost; or "
-    "when the amplitude leaves the clinician's limits. The study protocol's stop rules prevail over this sheet."
-)
 
 _WIDTH = 277.0
 _COLUMNS = (
@@ -113,6 +106,7 @@ def render(view: PlanView, printed_by: str, printed_at: datetime) -> bytes:
     Args:
         view: the plan. printed_by: who printed it. printed_at: when; stands on the page and in the document's metadata.
     """
+    view = shown(view)
     pdf = _Sheet(view, printed_by, printed_at)
     pdf.add_page()
     _timeline(pdf, view)
@@ -139,9 +133,9 @@ def _timeline(pdf: _Sheet, view: PlanView) -> None:
     pdf.set_font("Helvetica", "", 8)
     for line in view.lines:
         x, width = pdf.l_margin + line.start_minute * scale, line.item.minutes * scale
-        pdf.set_fill_color(*_SHADES[Controller(line.item.controller)])
+        pdf.set_fill_color(*_shade(line))
         pdf.rect(x, top, width, height, style="DF")
-        label = f"{line.item.position}  {CONTROLLER_NAMES[Controller(line.item.controller)]}"
+        label = f"{line.item.position}  {wording.session_name(line.item)}"
         if pdf.get_string_width(label) > width - 2:
             label = str(line.item.position)
         pdf.set_xy(x, top)
@@ -182,7 +176,7 @@ def _table(pdf: _Sheet, view: PlanView) -> None:
         for line in view.lines:
             row = table.row()
             for i, text in enumerate(_cells(line)):
-                shade = FontFace(fill_color=_SHADES[Controller(line.item.controller)], emphasis="BOLD") if i == 2 else planned
+                shade = FontFace(fill_color=_shade(line), emphasis="BOLD") if i == 2 else planned
                 row.cell(latin(text), style=shade, align="RIGHT" if i in (0, 1, 4, 5, 6, 8) else "LEFT")
             for _ in _COLUMNS[_FIRST_BLANK:]:
                 row.cell("", style=FontFace(fill_color=(255, 255, 255)))
@@ -218,9 +212,13 @@ def _cells(line: PlanLine) -> list[str]:
     energy = "-" if line.predicted_energy is None else f"{line.predicted_energy:.2f}"
     washout = f"{item.washout_minutes:g}" if item.washout_minutes else "-"
     policy = _breakable(_printed_name(line.policy)) if line.policy else "-"
-    controller = CONTROLLER_NAMES[Controller(item.controller)]
+    controller = wording.session_name(item)
     limits = wording.limits_ma(item)
     return [str(item.position), clock(line.start_minute), controller, policy, limits, f"{item.minutes:g}", washout, estimate, energy]
+
+
+def _shade(line: PlanLine) -> tuple[int, int, int]:
+    return _SHADES[Controller(line.item.controller)] if line.item.controller else _PLANNED
 
 
 def _printed_name(policy: Policy) -> str:
@@ -257,7 +255,7 @@ def _reading(pdf: _Sheet, view: PlanView) -> None:
     if view.warnings:
         pdf.set_text_color(*_INK)
         pdf.set_font("Helvetica", "B", 9)
-        text = "   ".join(f"! {warning}" for warning in view.warnings)
+        text = "   ".join(f"! {wording.warning(found)}" for found in view.warnings)
         for policy in (line.policy for line in view.lines if line.policy):
             text = text.replace(f"'{policy.name}'", f"'{_printed_name(policy)}'")
         pdf.multi_cell(_WIDTH, 4.2, latin(text), align="L", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
@@ -279,7 +277,7 @@ def _closing(pdf: _Sheet, view: PlanView) -> None:
     pdf.set_font("Helvetica", "B", 9)
     pdf.cell(0, 5, "Stop rules", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
     pdf.set_font("Helvetica", "", 9)
-    pdf.multi_cell(_WIDTH, 4.4, STOP_RULES, align="L", border=1, padding=1.5, new_x=XPos.LMARGIN, new_y=YPos.NEXT)
+    pdf.multi_cell(_WIDTH, 4.4, wording.STOP_RULES, align="L", border=1, padding=1.5, new_x=XPos.LMARGIN, new_y=YPos.NEXT)
     line_y, width = pdf.get_y() + 12, 86.0
     who = "name, signature, date"
     signers = (f"Clinician in charge: {who}", f"Study engineer: {who}", "Back on clinical settings: time, initials")

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from app.planning.plans.schedule import SESSION_MINUTES
+from app.planning.protocol.schedule import SESSION_MINUTES
 from app.platform.errors import Conflict, Invalid
 from app.simulation.demo_study import demo_visits
 from app.simulation.design import PRESETS, collecting_day, design, remember, visit_day

@@ -79,8 +79,13 @@ def test_a_refused_form_comes_back_as_it_was_filled_in(client: TestClient, studi
     assert "no number" in spelled.text
 
 
-def test_ticked_policies_of_the_ranking_go_to_the_first_open_visit(client: TestClient, studied: Any) -> None:
-    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[0])], evaluation_id=str(studied.evaluation))
+def test_ticked_policies_of_the_ranking_go_to_the_visit_that_is_chosen(client: TestClient, studied: Any, db: Session) -> None:
+    ticked = {"policy_ids": [str(studied.policies[0])], "evaluation_id": str(studied.evaluation)}
+    asked = _post(client, "/participants/P1/plan/draft", **ticked)
+    assert (asked.status_code, "Which visit is planned?" in asked.text) == (200, True)
+    assert f'name="policy_ids" value="{studied.policies[0]}"' in asked.text
+    assert db.scalars(select(Plan)).all() == []
+    answer = _post(client, "/participants/P1/plan/draft", **ticked, visit_id=str(studied.visit))
     assert (answer.status_code, answer.headers["location"]) == (303, f"/visits/{studied.visit}/plan?done=drafted")
     assert client.get(f"/api/v1/visits/{studied.visit}/plan").json()["evaluation"]["id"] == studied.evaluation
 
@@ -88,9 +93,11 @@ def test_ticked_policies_of_the_ranking_go_to_the_first_open_visit(client: TestC
 def test_ticked_policies_never_replace_an_approved_plan_unasked(client: TestClient, studied: Any, db: Session, sign_plan: Any) -> None:
     client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
     assert sign_plan(studied.visit).status_code == 200
-    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[1])])
-    made = db.scalars(select(Visit).where(Visit.number == 3)).one()
-    assert answer.headers["location"] == f"/visits/{made.id}/plan?done=drafted"
+    asked = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[1])])
+    assert "its plan is signed" in asked.text
+    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[1])], visit_id=str(studied.visit))
+    assert (answer.status_code, "no reason is given why it is replaced" in answer.text) == (422, True)
+    assert db.scalars(select(Visit.number).order_by(Visit.number)).all() == [1, 2], "no visit is made unasked"
     assert client.get(f"/api/v1/visits/{studied.visit}/plan").json()["status"] == "approved"
 
 
@@ -102,13 +109,13 @@ def test_a_draft_can_make_its_visit(client: TestClient, studied: Any, db: Sessio
     assert answer.headers["location"] == f"/visits/{visit.id}/plan?done=drafted"
     assert visit.date is not None
     assert visit.date.isoformat() == day
-    following = _post(client, "/participants/P1/plan/draft", policy_ids=[policy], visit_id="new", visit_number="", visit_date=day)
-    assert following.status_code == 303
-    assert db.scalars(select(Visit.number).order_by(Visit.number)).all() == [1, 2, 7, 8]
+    undated = _post(client, "/participants/P1/plan/draft", policy_ids=[policy], visit_id="new", visit_number="8", visit_date="")
+    assert (undated.status_code, "The new visit 8 has no date." in undated.text) == (422, True)
+    assert db.scalars(select(Visit.number).order_by(Visit.number)).all() == [1, 2, 7]
 
 
 def test_a_draft_that_fails_makes_no_visit(client: TestClient, studied: Any, db: Session) -> None:
-    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.retired)], visit_number="9")
+    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.retired)], visit_number="9", visit_date="2199-01-01")
     assert answer.status_code == 422
     assert "was retired" in answer.text
     assert db.scalars(select(Visit).where(Visit.number == 9)).all() == []

@@ -95,14 +95,14 @@ def test_new_data_make_the_ranking_behind_a_plan_stale(client: TestClient, studi
     client.put(f"/api/v1/sessions/{session}/qoc", json={"rating": 3, "reason": "misread"})
     plan = client.get(_path(studied.visit)).json()
     assert plan["stale"] is True
-    assert plan["warnings"] == ["The ranking is out of date: 1 session with corrected QoCs."]
+    assert [w["text"] for w in plan["warnings"]] == ["The ranking is out of date: 1 session with corrected QoCs."]
     assert next(s for s in plan["sessions"] if s["policy_id"] == studied.policies[0])["estimate"]["value"] == 95.0
 
 
 def test_warnings_name_unsupported_unranked_and_held(client: TestClient, studied: Any, external: int) -> None:
     answer = client.post(_path(studied.held_visit), json={"policy_ids": [studied.unsupported, external]})
     assert answer.status_code == 201
-    warnings = " ".join(answer.json()["warnings"])
+    warnings = " ".join(w["text"] for w in answer.json()["warnings"])
     for words in (
         "The data do not support the estimate of policy 'rl-02-small': far from the data.",
         "Policy 'β-Regler „Łódź“' is not in the ranking.",
@@ -230,7 +230,7 @@ def test_a_plan_repeats_what_its_ranking_says_of_unsupported_policies(client: Te
         config={},
     )
     db.commit()
-    assert _draft(client, studied).json()["warnings"] == [
+    assert [w["text"] for w in _draft(client, studied).json()["warnings"]] == [
         "Policies that the data do not support stand below all supported ones, whatever their estimated value: rl-02-small (99.0)."
     ]
 

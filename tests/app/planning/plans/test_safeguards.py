@@ -48,7 +48,7 @@ def test_an_unsafe_policy_is_planned_only_with_a_clinicians_reason(
     assert plan.status_code == 201
     stated = {s["policy_id"]: (s["verdict"], s["override_reason"]) for s in plan.json()["sessions"] if s["policy_id"]}
     assert stated == {a: ("test", None), b: ("unsafe", "asked for by the family, 5 minutes, watched")}
-    assert any("unsafe and planned all the same: asked for by the family" in w for w in plan.json()["warnings"])
+    assert any("unsafe and planned all the same: asked for by the family" in w["text"] for w in plan.json()["warnings"])
     assert sign_plan(visit).status_code == 200
 
 
@@ -71,7 +71,7 @@ def test_one_test_with_care_a_visit_and_its_lowest_amplitude_stands_in_the_plan(
     assert (low.status_code, "not to 0.30" in low.json()["detail"]) == (422, True)
     plan = draft(client, visit, a, c).json()
     assert {s["policy_id"]: s["min_fraction"] for s in plan["sessions"] if s["policy_id"]} == {a: 0.5, c: None}
-    assert "Policy 'p0' may not go below 1.5 mA." in plan["warnings"]
+    assert ("lowest_amplitude", "Policy 'p0' may not go below 1.5 mA.") in [(w["code"], w["text"]) for w in plan["warnings"]]
     higher = draft(client, visit, a, limits=[{"policy_id": a, "min_fraction": 0.7}]).json()
     assert [s["min_fraction"] for s in higher["sessions"] if s["policy_id"]] == [0.7]
     assert sign_plan(visit).status_code == 200

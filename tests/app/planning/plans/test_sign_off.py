@@ -14,8 +14,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.learning.models import Policy
-from app.planning.plans import service
 from app.planning.plans.models import Plan
+from app.planning.plans.view import PlanView, read_plan, refuse_running
 from app.platform.errors import Conflict
 from app.platform.signatures.models import Signature
 from app.study import repository as study
@@ -36,9 +36,9 @@ def drafted(client: TestClient, studied: Any) -> dict[str, Any]:
     return plan
 
 
-def view(db: Session, studied: Any) -> service.PlanView:
+def seen(db: Session, studied: Any) -> PlanView:
     db.expire_all()
-    return service.read_plan(db, study.visit(db, studied.visit, SYSTEM), SYSTEM)
+    return read_plan(db, study.visit(db, studied.visit, SYSTEM), SYSTEM)
 
 
 def test_limits_are_set_with_the_draft_and_signed(
@@ -56,7 +56,7 @@ def test_limits_are_set_with_the_draft_and_signed(
     files = {p.id: p.onnx_sha256 for p in db.scalars(select(Policy))}
     assert all(s["policy_sha256"] == files[s["policy"]] for s in sessions if s["policy"])
     assert all(s["max_ma"] == (3.5 if s["policy"] else 3.0) for s in sessions)
-    service.refuse_running(view(db, studied))
+    refuse_running(seen(db, studied))
 
 
 def test_nobody_signs_what_they_drafted(client: TestClient, studied: Any, drafted: dict[str, Any]) -> None:
@@ -103,23 +103,23 @@ def test_any_change_breaks_the_signature_visibly(
     sheet = PdfReader(BytesIO(client.get(path(studied, ".pdf")).content)).pages[0].extract_text()
     assert "SIGNATURE BROKEN" in sheet
     with pytest.raises(Conflict, match="was changed after it was signed"):
-        service.refuse_running(view(db, studied))
+        refuse_running(seen(db, studied))
 
 
 def test_what_is_signed_runs_only_while_its_policies_and_its_amplitude_are_those_of_today(
     client: TestClient, db: Session, studied: Any, drafted: dict[str, Any], sign_plan: Callable[..., Any]
 ) -> None:
     with pytest.raises(Conflict, match="is not signed yet"):
-        service.refuse_running(view(db, studied))
+        refuse_running(seen(db, studied))
     assert sign_plan(studied.visit).status_code == 200
     db.get_one(Policy, studied.policies[0]).retired_reason = "speech"
     db.flush()
     with pytest.raises(Conflict, match="was retired after this plan was drafted: speech"):
-        service.refuse_running(view(db, studied))
+        refuse_running(seen(db, studied))
     db.rollback()
     client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 2.5}})
     with pytest.raises(Conflict, match=r"set for a cDBS amplitude of 3 mA; it is 2\.5 mA now"):
-        service.refuse_running(view(db, studied))
+        refuse_running(seen(db, studied))
 
 
 def test_limits_of_another_amplitude_are_not_signed(
@@ -128,7 +128,7 @@ def test_limits_of_another_amplitude_are_not_signed(
     client.patch(
         f"/api/v1/visits/{studied.visit}", json={"cdbs_amplitudes": [{"hemisphere": "left", "amplitude_ma": 2.0}], "reason": "new"}
     )
-    assert "The plan cannot be signed" in " ".join(client.get(path(studied)).json()["warnings"])
+    assert "The plan cannot be signed" in " ".join(w["text"] for w in client.get(path(studied)).json()["warnings"])
     refused = sign_plan(studied.visit)
     assert (refused.status_code, "it is 2 mA now" in refused.json()["detail"]) == (409, True)
 
@@ -139,4 +139,4 @@ def test_plans_approved_before_signatures_say_so(client: TestClient, db: Session
     db.commit()
     assert client.get(path(studied)).json()["signature_state"] == "not_kept"
     with pytest.raises(Conflict, match="kept no signature"):
-        service.refuse_running(view(db, studied))
+        refuse_running(seen(db, studied))

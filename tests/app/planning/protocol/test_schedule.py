@@ -8,13 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.planning.plans.schedule import Candidate, Rules, most_policies, schedule, total_minutes
+from app.planning.protocol.orders import Order
+from app.planning.protocol.schedule import Candidate, Rule, Rules, most_policies, schedule, total_minutes
 from app.platform.errors import Invalid
 from app.study.models import Controller
 
 LEARNED = {Controller.RL, Controller.DISTILLED}
 
-candidates = st.lists(st.sampled_from(sorted(LEARNED)), min_size=1, max_size=8).map(
+candidates = st.lists(st.sampled_from(sorted(LEARNED)), min_size=1, max_size=4).map(
     lambda kinds: [Candidate(100 + i, kind) for i, kind in enumerate(kinds)]
 )
 rules = st.builds(
@@ -23,7 +24,11 @@ rules = st.builds(
     washout_minutes=st.floats(0, 30),
     total_minutes=st.floats(10, 600),
     no_dbs=st.booleans(),
-    no_dbs_minutes=st.floats(5, 20),
+    no_dbs_minutes=st.just(5.0),
+    repeats=st.integers(1, 3),
+    order=st.sampled_from(list(Order)),
+    block=st.integers(0, 20),
+    break_minutes=st.sampled_from([0.0, 20.0]),
     random_sessions=st.integers(0, 4),
 )
 
@@ -37,17 +42,19 @@ def test_every_day_that_is_laid_out_keeps_every_rule(chosen: list[Candidate], ru
         return
     day = schedule(chosen, rules, seed)
     learned = [i for i, s in enumerate(day) if s.controller in LEARNED]
-    assert sorted(day[i].policy_id or 0 for i in learned) == [c.policy_id for c in chosen]
+    assert sorted(day[i].policy_id or 0 for i in learned) == sorted([c.policy_id for c in chosen] * rules.repeats)
     assert {day[i].policy_id: day[i].controller for i in learned} == {c.policy_id: c.controller for c in chosen}
     for i, j in pairwise(learned):
         assert Controller.CDBS in [s.controller for s in day[i:j]]
-    assert sum(s.controller is Controller.CDBS for s in day) == max(1, len(chosen) - 1)
+    assert sum(s.controller is Controller.CDBS for s in day) == max(1, len(chosen) * rules.repeats - 1)
     assert sum(s.controller is Controller.RANDOM for s in day) == rules.random_sessions
     assert [s.controller for s in day].count(Controller.NO_DBS) == rules.no_dbs
     assert not rules.no_dbs or day[-1].controller is Controller.NO_DBS
     assert day[0].start_minute == 0
     for one, two in pairwise(day):
-        assert two.start_minute == pytest.approx(one.end_minute + rules.washout_minutes)
+        assert two.start_minute == pytest.approx(one.end_minute + rules.washout_minutes + one.break_minutes)
+    assert sum(s.break_minutes for s in day) == (rules.break_minutes if len(day) > 1 else 0)
+    assert day[-1].break_minutes == 0
     assert all(5 <= s.minutes <= 20 for s in day)
     assert day[-1].washout_minutes == 0
     assert day[-1].end_minute <= rules.total_minutes + 1e-6
@@ -109,3 +116,25 @@ def test_sessions_outside_the_papers_five_to_twenty_minutes_are_refused(minutes:
         Rules(session_minutes=minutes)
     with pytest.raises(Invalid, match="5 to 20 minutes"):
         Rules(no_dbs_minutes=minutes)
+
+
+def test_five_policies_are_refused_and_the_rule_is_named() -> None:
+    with pytest.raises(Invalid, match="the protocol tests 2 to 4") as refusal:
+        schedule([Candidate(i, Controller.RL) for i in range(5)], Rules(total_minutes=900), seed=0)
+    assert refusal.value.extra["rule"] == Rule.POLICIES
+
+
+def test_a_session_without_stimulation_is_no_longer_than_another() -> None:
+    with pytest.raises(Invalid, match="Make it short: 5 to 8 minutes") as refusal:
+        Rules(session_minutes=8, no_dbs=True, no_dbs_minutes=10)
+    assert refusal.value.extra["rule"] == Rule.NO_DBS_SHORT
+
+
+def test_policies_are_repeated_within_a_visit_in_whole_rounds() -> None:
+    day = schedule([Candidate(i, Controller.RL) for i in (1, 2)], Rules(repeats=2, order=Order.WILLIAMS, break_minutes=15), seed=1)
+    tested = [s.policy_id for s in day if s.policy_id]
+    assert [s.controller for s in day] == ["rl", "cdbs"] * 3 + ["rl"]
+    assert sorted(tested[:2]) == sorted(tested[2:]) == [1, 2]
+    assert tested[:2] != tested[2:], "the second round takes the square's next row"
+    assert [s.break_minutes for s in day] == [0, 0, 0, 15, 0, 0, 0]
+    assert day[-1].end_minute == total_minutes(2, Rules(repeats=2, break_minutes=15)) == 7 * 10 + 6 * 5 + 15

@@ -1,21 +1,38 @@
 """The rules of a visit day, pure: which controller runs when. Source: Gao et al. 2023, section 6.1.
 
 From the paper: 2-4 policies a visit, a cDBS session between any two of them as control, sessions of 5-20 minutes, a short session without
-stimulation. Ours: the washout, the minutes of a visit, the drawn order, and where no-DBS and random sessions stand.
+stimulation. Ours: the washout, the minutes of a visit, the order, repeats, the break, and where no-DBS and random sessions stand.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 
+from app.planning.protocol.orders import Order, rounds
 from app.platform.errors import Invalid
 from app.study.models import Controller
 
 SESSION_MINUTES = (5.0, 20.0)
 """Shortest and longest session of the paper, minutes."""
+POLICIES = (2, 4)
+"""Fewest and most policies of a visit in the paper; a single one, or random sessions alone, is possible and said."""
+MOST_REPEATS = 4
+"""Sessions of one policy within a visit, at most."""
+
+
+class Rule(StrEnum):
+    """The protocol's rules, by which a refusal and a warning name what they rest on."""
+
+    POLICIES = "policies_per_visit"
+    CDBS_BETWEEN = "cdbs_between_policies"
+    SESSION_MINUTES = "session_minutes"
+    NO_DBS_SHORT = "no_dbs_short"
+    VISIT_MINUTES = "visit_minutes"
+    REPEATS = "repeats"
 
 
 @dataclass(frozen=True)
@@ -27,8 +44,11 @@ class Rules:
         washout_minutes: pause on the clinical stimulation after every session but the last, so that one does not colour the next.
         total_minutes: from the first session's start to the last one's end, at most.
         no_dbs: one session without stimulation, at the end of the day: what it does to the symptoms then reaches no other session.
-        no_dbs_minutes: its length; short, to spare the participant.
+        no_dbs_minutes: its length; no longer than another session, to spare the participant.
         random_sessions: sessions of the random controller, which widen what the replay buffer covers.
+        repeats: sessions of each policy; each round has all of them.
+        order: how the order of the policies is found. block: visits before this one that followed the same square.
+        break_minutes: one rest in the middle of the visit; 0 for none.
 
     Raises:
         Invalid: a length outside its range.
@@ -40,14 +60,30 @@ class Rules:
     no_dbs: bool = False
     no_dbs_minutes: float = 5.0
     random_sessions: int = 0
+    repeats: int = 1
+    order: Order = Order.DRAWN
+    block: int = 0
+    break_minutes: float = 0.0
 
     def __post_init__(self) -> None:
         shortest, longest = SESSION_MINUTES
         for name, minutes in (("A session", self.session_minutes), ("A no-DBS session", self.no_dbs_minutes)):
             if not shortest <= minutes <= longest:
-                raise Invalid(f"{name} of {minutes:g} minutes is not possible.", f"Choose {shortest:g} to {longest:g} minutes.")
-        if self.washout_minutes < 0 or self.total_minutes <= 0 or self.random_sessions < 0:
-            raise Invalid("The washout, the visit's minutes and the number of random sessions cannot be negative.", "Correct them.")
+                raise Invalid(
+                    f"{name} of {minutes:g} minutes is not possible.",
+                    f"Choose {shortest:g} to {longest:g} minutes.",
+                    rule=Rule.SESSION_MINUTES,
+                )
+        if self.no_dbs and self.no_dbs_minutes > self.session_minutes:
+            raise Invalid(
+                f"The session without stimulation would take {self.no_dbs_minutes:g} minutes, longer than another session.",
+                f"Make it short: {shortest:g} to {self.session_minutes:g} minutes.",
+                rule=Rule.NO_DBS_SHORT,
+            )
+        if not 1 <= self.repeats <= MOST_REPEATS:
+            raise Invalid(f"{self.repeats} sessions of each policy are not possible.", f"Choose 1 to {MOST_REPEATS}.", rule=Rule.REPEATS)
+        if min(self.washout_minutes, self.random_sessions, self.break_minutes) < 0 or self.total_minutes <= 0:
+            raise Invalid("The washout, the break, the visit's minutes and the random sessions cannot be negative.", "Correct them.")
 
 
 @dataclass(frozen=True)
@@ -67,6 +103,7 @@ class PlannedSession:
     start_minute: float
     minutes: float
     washout_minutes: float
+    break_minutes: float = 0.0
 
     @property
     def end_minute(self) -> float:
@@ -75,22 +112,22 @@ class PlannedSession:
 
 
 def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[PlannedSession]:
-    """Lay out a visit day: the policies in an order drawn from the seed, a cDBS session between any two of them.
+    """Lay out a visit day: the policies in the order that the rules ask for, a cDBS session between any two of their sessions.
 
     A single policy gets its cDBS session first, so that it too has a control, and so does a day of random sessions alone: an early visit
     that only fills the replay buffer. Random-controller sessions stand at drawn places, the no-DBS session at the end. The same arguments
     give the same day.
 
     Raises:
-        Invalid: neither a policy nor a random session, a policy twice, or a day longer than `rules.total_minutes`; the message says how
-            many policies would fit.
+        Invalid: neither a policy nor a random session, a policy twice, more than four, or a day longer than `rules.total_minutes`; the
+            message says how many policies would fit. The member `rule` names the rule of the protocol.
     """
     _check_candidates(candidates, rules)
     needed = total_minutes(len(candidates), rules)
     if needed > rules.total_minutes + 1e-9:
         raise _too_long(len(candidates), needed, rules)
     rng = np.random.default_rng(seed)
-    order = [candidates[i] for i in rng.permutation(len(candidates))]
+    order = [candidates[i] for turn in rounds(len(candidates), rules.repeats, rules.order, seed, rules.block) for i in turn]
     day: list[tuple[Controller, int | None]] = [(Controller.CDBS, None)] if len(order) <= 1 else []
     for i, candidate in enumerate(order):
         if i:
@@ -106,16 +143,18 @@ def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[P
 
 def total_minutes(policies: int, rules: Rules) -> float:
     """Minutes from the first session's start to the last one's end of a day with this many policies."""
-    controls = max(policies - 1, 1) if policies or rules.random_sessions else 0
-    full = policies + controls + rules.random_sessions
+    tested = policies * rules.repeats
+    controls = max(tested - 1, 1) if tested or rules.random_sessions else 0
+    full = tested + controls + rules.random_sessions
     sessions = full + rules.no_dbs
-    return full * rules.session_minutes + rules.no_dbs * rules.no_dbs_minutes + max(sessions - 1, 0) * rules.washout_minutes
+    rest = rules.break_minutes if sessions > 1 else 0.0
+    return full * rules.session_minutes + rules.no_dbs * rules.no_dbs_minutes + max(sessions - 1, 0) * rules.washout_minutes + rest
 
 
 def most_policies(rules: Rules) -> int:
     """How many policies fit into the day."""
     count = 0
-    while total_minutes(count + 1, rules) <= rules.total_minutes + 1e-9:
+    while count < POLICIES[1] and total_minutes(count + 1, rules) <= rules.total_minutes + 1e-9:
         count += 1
     return count
 
@@ -126,7 +165,13 @@ def _check_candidates(candidates: Sequence[Candidate], rules: Rules) -> None:
     ids = [c.policy_id for c in candidates]
     twice = sorted({i for i in ids if ids.count(i) > 1})
     if twice:
-        raise Invalid(f"Policy {twice[0]} is named twice.", "Name each policy once; a visit tests each in one session.")
+        raise Invalid(f"Policy {twice[0]} is named twice.", "Name each policy once; `repeats` says how many sessions each has.")
+    if len(candidates) > POLICIES[1]:
+        raise Invalid(
+            f"{len(candidates)} policies are chosen; the protocol tests {POLICIES[0]} to {POLICIES[1]} in a visit.",
+            "Leave some for another visit.",
+            rule=Rule.POLICIES,
+        )
 
 
 def _too_long(policies: int, needed: float, rules: Rules) -> Invalid:
@@ -136,13 +181,20 @@ def _too_long(policies: int, needed: float, rules: Rules) -> Invalid:
     tested = _policies(policies) if policies else "The random sessions"
     detail = f"{tested} with the sessions around them take {needed:g} minutes; the visit has {rules.total_minutes:g}."
     if not policies:
-        return Invalid(detail, f"Plan fewer random sessions, or {', or '.join(ways[:2])}.", minutes_needed=needed, policies_that_fit=0)
+        return Invalid(
+            detail,
+            f"Plan fewer random sessions, or {', or '.join(ways[:2])}.",
+            minutes_needed=needed,
+            policies_that_fit=0,
+            rule=Rule.VISIT_MINUTES,
+        )
     return Invalid(
         detail,
         f"{'Choose ' + ('at most ' if most > 1 else '') + _policies(most) if most else 'Not even one policy fits'}, "
         f"or {', or '.join(ways)}.",
         minutes_needed=needed,
         policies_that_fit=most,
+        rule=Rule.VISIT_MINUTES,
     )
 
 
@@ -153,9 +205,11 @@ def _policies(count: int) -> str:
 def _timed(day: Sequence[tuple[Controller, int | None]], rules: Rules) -> list[PlannedSession]:
     sessions: list[PlannedSession] = []
     start = 0.0
-    for controller, policy_id in day:
+    middle = (len(day) - 1) // 2 if len(day) > 1 else None
+    for place, (controller, policy_id) in enumerate(day):
+        rest = rules.break_minutes if place == middle else 0.0
         minutes = rules.no_dbs_minutes if controller is Controller.NO_DBS else rules.session_minutes
-        sessions.append(PlannedSession(controller, policy_id, start, minutes, rules.washout_minutes))
-        start += minutes + rules.washout_minutes
+        sessions.append(PlannedSession(controller, policy_id, start, minutes, rules.washout_minutes, rest))
+        start += minutes + rules.washout_minutes + rest
     sessions[-1] = replace(sessions[-1], washout_minutes=0.0)
     return sessions

@@ -1,0 +1,47 @@
+"""What speaks against a plan, as typed records; their sentences are made in `app.planning.wording`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+
+class Code(StrEnum):
+    """Kinds of warnings."""
+
+    STALE_RANKING = "stale_ranking"
+    RANKING_NOTE = "ranking_note"
+    NOT_EVALUATED = "not_evaluated"
+    LOWEST_AMPLITUDE = "lowest_amplitude"
+    OVERRIDDEN = "overridden"
+    NOT_RANKED = "not_ranked"
+    NOT_SUPPORTED = "not_supported"
+    FLAGS = "flags"
+    RETIRED = "retired"
+    CANNOT_BE_SIGNED = "cannot_be_signed"
+    VISIT_HELD = "visit_held"
+    DATE_PAST = "date_past"
+    ONE_POLICY = "one_policy"
+    KEY_REASON_MISSING = "key_reason_missing"
+
+
+@dataclass(frozen=True)
+class PlanWarning:
+    """One warning.
+
+    Attributes:
+        code: its kind, for programs. policy_id, policy: whom it is about; None for the whole plan.
+        values: what its sentence is made of.
+    """
+
+    code: Code
+    policy_id: int | None = None
+    policy: str | None = None
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+
+def without_policies(warnings: Sequence[PlanWarning]) -> list[PlanWarning]:
+    """Those that name no policy: what a blinded reader may see."""
+    return [w for w in warnings if w.policy_id is None and w.code is not Code.RANKING_NOTE]

@@ -1,0 +1,241 @@
+"""A plan as it is read: its sessions with what is predicted of them, what speaks against it, whether its signature stands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.evaluation import repository as evaluations
+from app.evaluation import wording
+from app.evaluation.estimates.rows import estimate_of
+from app.evaluation.models import Evaluation
+from app.evaluation.ranking.assessment import Assessment
+from app.evaluation.ranking.service import assessment_of, evaluation_notes
+from app.evaluation.ranking.staleness import stale_reasons
+from app.learning.models import Policy
+from app.planning.notices import Code, PlanWarning, without_policies
+from app.planning.plans import repository
+from app.planning.plans.designs import Planned, bounds_of
+from app.planning.plans.key import CommonLimits, common_limits, sealed
+from app.planning.plans.limits import require_limits
+from app.planning.plans.models import Plan, PlanItem
+from app.planning.plans.sign_off import SignatureState, signature_of
+from app.planning.plans.visits import today
+from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
+from app.platform.signatures.models import Signature
+from app.study import service as study
+from app.study.models import Controller, Participant, Visit
+from ml.ope.estimate import Estimate
+
+
+@dataclass(frozen=True)
+class PlanLine:
+    """One session of a plan with what is known about it.
+
+    Attributes:
+        start_minute: from the first session's start.
+        estimate: of the pinned evaluation's method, as it was; None for what was not ranked.
+        predicted_energy: mean squared amplitude fraction; 1 for cDBS and 0 for no-DBS by definition, else as the estimate predicts.
+        design: what a random session shall try, in a draft with the bounds of today; None for other sessions.
+    """
+
+    item: PlanItem
+    start_minute: float
+    policy: Policy | None
+    estimate: Estimate | None
+    predicted_energy: float | None
+
+    design: Planned | None
+
+
+@dataclass(frozen=True)
+class PlanView:
+    """A plan with its visit, its sessions, the ranking it rests on, and what speaks against it today."""
+
+    plan: Plan
+    visit: Visit
+    lines: list[PlanLine]
+    evaluation: Evaluation | None
+    stale_reasons: list[str]
+    warnings: list[PlanWarning]
+    signature: Signature | None
+    signature_state: SignatureState
+
+    @property
+    def sealed(self) -> bool:
+        """Whether nobody is shown which session is which (`app.planning.plans.key`)."""
+        return sealed(self.plan)
+
+    @property
+    def total_minutes(self) -> float:
+        """From the first session's start to the last one's end."""
+        return self.lines[-1].start_minute + self.lines[-1].item.minutes
+
+
+def read_plan(db: Session, visit: Visit, caller: Caller) -> PlanView:
+    """The plan of a visit. Raises NotFound when there is none."""
+    study.require(caller, can.READ, visit.participant)
+    plan = repository.live_plan(db, visit.id)
+    if plan is None:
+        raise NotFound(
+            f"Visit {visit.number} of participant {visit.participant.code} has no plan yet.",
+            "Choose policies in the ranking and draft one, or post their ids here.",
+        )
+    return view_of(db, plan, visit)
+
+
+def refuse_withdrawn(view: PlanView) -> None:
+    """Raises Conflict for a plan with a policy that was retired after it was drafted."""
+    for line in view.lines:
+        if line.policy and line.policy.retired_reason:
+            raise Conflict(
+                f"Policy '{line.policy.name}' was retired after this plan was drafted: {line.policy.retired_reason}.",
+                "Draft the visit anew.",
+            )
+
+
+def refuse_running(view: PlanView) -> None:
+    """Hold a plan against what may run in a participant: signed, unchanged since, no policy withdrawn, the cDBS amplitude that was signed.
+
+    Raises:
+        Conflict: one of these fails; it says which. Invalid: nobody knows the cDBS amplitude any more.
+    """
+    if view.plan.status != "approved" or view.signature_state is not SignatureState.STANDS:
+        why = {
+            SignatureState.NONE: "is not signed yet",
+            SignatureState.BROKEN: "was changed after it was signed",
+            SignatureState.NOT_KEPT: "was approved by an earlier version, which kept no signature",
+            SignatureState.STANDS: "was replaced",
+        }[view.signature_state]
+        raise Conflict(f"Plan {view.plan.id} of visit {view.visit.number} {why}.", "Draft the visit anew, and have a clinician sign it.")
+    refuse_withdrawn(view)
+    require_limits(view.visit, view.plan.items)
+
+
+def shown(view: PlanView) -> PlanView:
+    """The plan as pages, routes and the sheet show it: of a sealed one letters and common limits, and nothing that tells a controller."""
+    if not view.sealed:
+        return view
+    limits = common_limits(view.plan.items)
+    lines = [
+        PlanLine(_masked(line.item, limits), line.start_minute, policy=None, estimate=None, predicted_energy=None, design=None)
+        for line in view.lines
+    ]
+    return replace(view, lines=lines, warnings=without_policies(view.warnings))
+
+
+def _masked(item: PlanItem, limits: CommonLimits | None) -> PlanItem:
+    """A session without its controller: an object of no database session."""
+    masked = PlanItem(
+        position=item.position,
+        minutes=item.minutes,
+        washout_minutes=item.washout_minutes,
+        break_minutes=item.break_minutes,
+        medication=item.medication,
+        note=item.note,
+        label=item.label,
+        hemisphere=item.hemisphere,
+        repeat=1,
+    )
+    if limits is not None:
+        masked.min_ma, masked.max_ma, masked.ramp_ma_per_s = limits.min_ma, limits.max_ma, limits.ramp_ma_per_s
+    return masked
+
+
+def view_of(db: Session, plan: Plan, visit: Visit) -> PlanView:
+    """A plan with all that is known about it."""
+    evaluation = repository.evaluation(db, plan.evaluation_id) if plan.evaluation_id else None
+    found = assessment_of(db, visit.participant, evaluation) if evaluation else None
+    estimates = {e.policy_id: estimate_of(e) for e in evaluation.estimates if e.method == evaluation.default_method} if evaluation else {}
+    policies = evaluations.policies_by_id(db, [i.policy_id for i in plan.items if i.policy_id is not None])
+    lines, start = [], 0.0
+    for item in plan.items:
+        estimate = estimates.get(item.policy_id) if item.policy_id else None
+        policy = policies.get(item.policy_id) if item.policy_id else None
+        lines.append(PlanLine(item, start, policy, estimate, _energy(item, estimate), _design(visit, item)))
+        start += item.minutes + item.washout_minutes + item.break_minutes
+    stale = _stale_reasons(db, visit.participant, evaluation)
+    state, signature = signature_of(db, visit, plan, policies)
+    return PlanView(plan, visit, lines, evaluation, stale, _warnings(db, visit, plan, lines, found, stale), signature, state)
+
+
+def _design(visit: Visit, item: PlanItem) -> Planned | None:
+    if item.design is None:
+        return None
+    design = Planned.from_json(item.design)
+    if design.bounds or not design.holds:
+        return design
+    try:
+        return replace(design, bounds=bounds_of(visit, visit.participant.current_settings, design.lower_bound))
+    except Invalid:
+        return design  # a warning of the plan says what is missing, and approving it is refused
+
+
+def _energy(item: PlanItem, estimate: Estimate | None) -> float | None:
+    fixed = {Controller.CDBS: 1.0, Controller.NO_DBS: 0.0}.get(Controller(item.controller))
+    if fixed is not None or estimate is None:
+        return fixed
+    predicted = estimate.predicted.get("energy")
+    return None if predicted is None else float(predicted)
+
+
+def _stale_reasons(db: Session, participant: Participant, evaluation: Evaluation | None) -> list[str]:
+    newest = evaluations.newest_evaluation(db, participant.id)
+    if evaluation is None or newest is None:
+        return []
+    if newest.id != evaluation.id:
+        return [f"there is a newer ranking (evaluation {newest.id}); this plan rests on evaluation {evaluation.id}"]
+    return [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation)]
+
+
+def _warnings(
+    db: Session, visit: Visit, plan: Plan, lines: Sequence[PlanLine], found: Assessment | None, stale: Sequence[str]
+) -> list[PlanWarning]:
+    warnings = [PlanWarning(Code.STALE_RANKING, values={"reason": reason}) for reason in stale]
+    if found:
+        warnings += [PlanWarning(Code.RANKING_NOTE, values={"text": text}) for text in evaluation_notes(found)]
+    elif any(line.policy for line in lines):
+        warnings.append(PlanWarning(Code.NOT_EVALUATED))
+    for line in {line.policy.id: line for line in lines if line.policy}.values():
+        warnings += _of_policy(line, found)
+    if len({line.policy.id for line in lines if line.policy}) == 1:
+        warnings.append(PlanWarning(Code.ONE_POLICY))
+    if plan.status == "draft":
+        try:
+            require_limits(visit, plan.items)
+        except BetaloopError as error:
+            warnings.append(PlanWarning(Code.CANNOT_BE_SIGNED, values={"why": str(error)}))
+    held = repository.session_count(db, visit.id)
+    if held:
+        warnings.append(PlanWarning(Code.VISIT_HELD, values={"sessions": held}))
+    if plan.status == "draft" and visit.date and visit.date < today():
+        warnings.append(PlanWarning(Code.DATE_PAST, values={"date": visit.date.isoformat()}))
+    if plan.key_opened_at is not None and plan.key_opened_reason is None:
+        warnings.append(PlanWarning(Code.KEY_REASON_MISSING, values={"by": plan.key_opened_by}))
+    return warnings
+
+
+def _of_policy(line: PlanLine, found: Assessment | None) -> list[PlanWarning]:
+    """What speaks against one policy of a plan."""
+    policy, item, estimate = line.policy, line.item, line.estimate
+    if policy is None:
+        return []
+    said: list[tuple[Code, dict[str, Any]]] = []
+    if item.min_fraction is not None:
+        said.append((Code.LOWEST_AMPLITUDE, {"fraction": item.min_fraction, "cdbs_ma": found.cdbs_ma if found else None}))
+    if item.override_reason:
+        said.append((Code.OVERRIDDEN, {"reason": item.override_reason}))
+    if found and estimate is None:
+        said.append((Code.NOT_RANKED, {}))
+    if estimate and not estimate.supported:
+        said.append((Code.NOT_SUPPORTED, {"flags": estimate.flags}))
+    elif estimate and estimate.flags:
+        said.append((Code.FLAGS, {"flags": estimate.flags}))
+    if policy.retired_reason:
+        said.append((Code.RETIRED, {"reason": policy.retired_reason}))
+    return [PlanWarning(code, policy.id, policy.name, values) for code, values in said]

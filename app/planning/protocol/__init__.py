@@ -1,0 +1,1 @@
+"""The protocol of a visit: its rules by name, the order of its sessions."""
