@@ -26,7 +26,8 @@ from app.planning.plans.schemas import (
     Removal,
     SignatureOut,
 )
-from app.planning.plans.view import PlanLine, PlanView, read_plan, shown
+from app.planning.plans.view import PlanLine, PlanView, shown
+from app.planning.plans.view import read_plan as plan_of
 from app.planning.protocol.orders import Order
 from app.planning.sheet import pdf
 from app.platform.audit import record
@@ -40,9 +41,9 @@ _PDF: dict[int | str, dict[str, Any]] = {200: {"content": {"application/pdf": {}
 
 
 @router.get("/visits/{visit_id}/plan")
-def get_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> PlanOut:
+def read_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> PlanOut:
     """The plan of a visit."""
-    return plan_out(read_plan(db, visit, caller))
+    return plan_out(plan_of(db, visit, caller))
 
 
 @router.post("/visits/{visit_id}/plan", status_code=201)
@@ -71,7 +72,7 @@ def approve_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller, approval: A
 @router.get("/visits/{visit_id}/plan.pdf", response_class=Response, responses=_PDF)
 def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
     """The plan as a sheet to print: sessions in order, estimates, blanks to fill in, signatures. A draft says so across every page."""
-    view = read_plan(db, visit, caller)
+    view = plan_of(db, visit, caller)
     record(db, "download", "plan", view.plan.id)
     db.commit()
     name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
@@ -91,14 +92,14 @@ def move_session(visit: CurrentVisit, move: Move, db: Db, caller: CurrentCaller)
 @router.post("/visits/{visit_id}/plan/key", responses=problems(409))
 def open_key(visit: CurrentVisit, opening: KeyOpening, db: Db, caller: CurrentCaller) -> PlanOut:
     """Open the key of a blinded plan, with a reason; in an emergency at once, and the reason by a second call."""
-    found = read_plan(db, visit, caller)
+    found = plan_of(db, visit, caller)
     waits = found.plan.key_opened_at is not None and found.plan.key_opened_reason is None
     if waits:
         key.give_reason(db, visit, found.plan, caller, opening.reason)
     else:
         key.open_key(db, visit, found.plan, caller, opening.reason, emergency=opening.emergency)
     db.commit()
-    return plan_out(read_plan(db, visit, caller))
+    return plan_out(plan_of(db, visit, caller))
 
 
 @router.post("/visits/{visit_id}/removal", status_code=204, responses=problems(409))

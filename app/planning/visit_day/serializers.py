@@ -7,7 +7,6 @@ from app.accounts.permissions import Caller
 from app.planning import wording
 from app.planning.plans.designs import Planned
 from app.planning.plans.models import Plan, PlanItem
-from app.planning.sheet.pdf import STOP_RULES
 from app.planning.visit_day.schemas import DayOut, EntryOut, LimitsOut, SlotOut
 from app.planning.visit_day.service import Day
 from app.platform.database import now
@@ -32,7 +31,7 @@ def day_out(day: Day, caller: Caller) -> DayOut:
         locked=visit.locked,
         not_runnable=day.not_runnable,
         note="" if blinded else plan.note,
-        stop_rules=[STOP_RULES],
+        stop_rules=[wording.STOP_RULES],
         slots=[_slot(item, day, common if blinded else own, blinded) for item, own in zip(plan.items, limits, strict=True)],
         entries=[EntryOut.model_validate(row) for row in day.entries],
         reader=caller.label,
