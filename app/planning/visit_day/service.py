@@ -17,8 +17,8 @@ from app.evaluation import repository as evaluations
 from app.learning.models import Policy
 from app.planning import wording
 from app.planning.plans import repository as plans
-from app.planning.plans import service as planning
 from app.planning.plans.models import Plan, PlanItem
+from app.planning.plans.view import read_plan, refuse_running
 from app.planning.visit_day import repository
 from app.planning.visit_day.models import DayEntry
 from app.planning.visit_day.record import GRADED, SEVERE, moment
@@ -134,7 +134,7 @@ def device_key(caller: Caller) -> DeviceKey:
 def _not_runnable(db: Session, visit: Visit, caller: Caller) -> str:
     """Why the approved plan may not run; what was done is entered all the same."""
     try:
-        planning.refuse_running(planning.read_plan(db, visit, caller))
+        refuse_running(read_plan(db, visit, caller))
     except (Conflict, Invalid) as error:
         return f"{error.detail} {error.hint}".strip()
     return ""
