@@ -62,9 +62,9 @@ def returns(world: CohortWorld, buffer: ReplayBuffer, updates: int, seeds: int, 
 def main() -> None:
     """Print a table and, as the last line, one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--updates", type=int, default=2000, help="gradient steps per policy")
-    parser.add_argument("--seeds", type=int, default=3, help="policies per participant and column")
-    parser.add_argument("--sessions", type=int, default=100, help="sessions of each true return")
+    parser.add_argument("--updates", type=int, default=600, help="gradient steps per policy")
+    parser.add_argument("--seeds", type=int, default=2, help="policies per participant and column")
+    parser.add_argument("--sessions", type=int, default=60, help="sessions of each true return")
     parser.add_argument("--quick", action="store_true", help="one participant, two seeds, few updates")
     chosen = parser.parse_args()
     if chosen.quick:

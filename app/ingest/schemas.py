@@ -97,6 +97,7 @@ class ProposalOut(Model):
     changed_by: str
     parts: list[PartOut]
     usable_steps: list[UsableStepsOut] = Field(description="By channel of the control recording, the control channel first.")
+    usable_on_any: int = Field(description="Steps that are usable on one time-domain channel or another, each counted once.")
 
 
 class ConfirmedOut(Model):

@@ -17,7 +17,7 @@ from app.ingest.schemas import (
 from app.study import repository as study
 from app.study.models import StudySession
 from app.study.serializers import session_out
-from app.study.sessions.usable_steps import usable_steps
+from app.study.sessions.usable_steps import on_any, usable_steps
 
 
 def proposals_out(db: Session, participant_id: int, caller: Caller) -> list[ProposalOut]:
@@ -29,6 +29,7 @@ def proposals_out(db: Session, participant_id: int, caller: Caller) -> list[Prop
 
 def proposal_out(db: Session, session: StudySession, row: SessionProposal, caller: Caller) -> ProposalOut:
     """A proposal for the API."""
+    usable = usable_steps(db, session)
     return ProposalOut(
         session=session_out(session, caller),
         version=row.version,
@@ -48,5 +49,6 @@ def proposal_out(db: Session, session: StudySession, row: SessionProposal, calle
             )
             for s in session.segments
         ],
-        usable_steps=[UsableStepsOut(**asdict(u)) for u in usable_steps(db, session)],
+        usable_steps=[UsableStepsOut(**{name: value for name, value in asdict(u).items() if name != "at"}) for u in usable],
+        usable_on_any=on_any(usable),
     )

@@ -26,6 +26,7 @@ class UsableSteps:
         stream, channel, source: of the trace. is_control: whether the controller is taken to have seen it.
         steps: of the session. valid: with a valid beta. usable: that may enter a replay buffer.
         reason: why there are none; None where there are some.
+        at: which steps are usable, numbers from 0.
     """
 
     stream: str
@@ -36,6 +37,16 @@ class UsableSteps:
     valid: int
     usable: int
     reason: str | None
+    at: frozenset[int] = frozenset()
+
+
+def on_any(found: Sequence[UsableSteps], source: str = "time_domain") -> int:
+    """Steps of a session that are usable on one channel of a source or another, each counted once.
+
+    More than on any single channel where the device sensed other contacts from one part of the recording to the next. A controller sees one
+    channel, so that no buffer holds them together.
+    """
+    return len(frozenset[int]().union(*(u.at for u in found if u.source == source)))
 
 
 def usable_steps(db: Session, session: StudySession) -> list[UsableSteps]:
@@ -73,6 +84,9 @@ def sentence(found: Sequence[UsableSteps]) -> str:
     first, rest = found[0], found[1:]
     said = f"Usable steps: {first.usable} of {first.steps} on {_name(first)}"
     said += f", because {first.reason}" if first.reason else ""
+    every = on_any(found)
+    if every > max(u.usable for u in found):
+        said += f"; {every} on one time-domain channel or another, which were sensed one after another"
     others = [f"{u.usable} on {_name(u)}" for u in rest if u.usable]
     if others:
         said += f"; {', '.join(others)}"
@@ -105,9 +119,9 @@ def _of_channel(
         amplitude=table.fraction[settings.window :],
         most_imputed=min(settings.most_imputed, settings.window - 1),
     )
-    usable = int(trajectory.usable().sum())
+    at = frozenset(np.flatnonzero(trajectory.usable()).tolist())
     valid = int(np.sum(~np.isnan(trajectory.beta)))
-    return UsableSteps(*named, steps, valid, usable, None if usable else _reason(trajectory, table, settings, valid))
+    return UsableSteps(*named, steps, valid, len(at), None if at else _reason(trajectory, table, settings, valid), at)
 
 
 def _reason(s: SessionTrajectory, table: StepTable, settings: SettingsVersion, valid: int) -> str:

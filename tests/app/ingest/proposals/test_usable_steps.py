@@ -27,6 +27,9 @@ def test_a_recording_with_packet_loss_has_20_usable_time_domain_steps(send: Any,
     found = {u["channel"]: u["usable"] for u in proposal["usable_steps"]}
     assert [found["key 0 +2-0"], found["key 2 +9-8"], found["key 2 +11-9"]] == [4, 18, 3]
     assert first["reason"] is None
+    # five configurations of 20 steps, of which the first ten are a state's window: no channel that was sensed in one alone can have more
+    assert proposal["usable_on_any"] == 25
+    assert "; 25 on one time-domain channel or another, which were sensed one after another; " in told(answer)
     assert len(rest) == 12
     assert all((u["reason"] is None) == (u["usable"] > 0) for u in rest)
     assert f"Usable steps: {first['usable']} of 103 on beta key 1 +3-1" in told(answer)
