@@ -75,6 +75,7 @@ PAGE_MODULES = (
     "app.learning.sweeps.pages",
     "app.evaluation.ranking.pages",
     "app.evaluation.replay.pages",
+    "app.evaluation.policies.pages",
     "app.pipeline.pages",
     "app.planning.plans.pages",
     "app.planning.bundles.pages",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 from fastapi import APIRouter, File, Form, Request, UploadFile
@@ -14,36 +13,22 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning import repository
 from app.learning.deps import CurrentOwnPolicy, CurrentSnapshot
-from app.learning.models import Policy
 from app.learning.policies import service
 from app.learning.policies.uploads import read_limited
 from app.learning.schemas import ALGORITHM_NAMES, PolicyChange, PolicyLabel
 from app.learning.snapshots.coverage import describe
-from app.learning.sweeps.comparison import below_bound
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.web.charts import ACCENT, Chart, axis, figure
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
-from app.study import repository as study_repository
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.service import may
-from ml.policies.logged_range import LARGEST_SHARE_BELOW
 
 router = APIRouter()
 
 LABELS = {"name": "Name", "retired_reason": "Reason"}
-
-CURVES = {
-    "mean_q": ("Mean Q of the policy", "reward; an unbounded climb is over-estimation"),
-    "action_distance": ("Distance from the logged amplitudes", "mean absolute difference, fraction"),
-    "saturated": ("States answered with next to 0 or 1", "share; at 1 the policy is cDBS or no DBS by another name"),
-    "critic_loss": ("Critic loss", "mean squared temporal-difference error, reward squared"),
-    "loss": ("Distillation loss", "mean squared difference from the teacher, fraction squared"),
-}
-"""Learning curves by the name that the learners give them: title and unit."""
 
 
 @router.get("/participants/{code}/policies")
@@ -74,27 +59,6 @@ def add_policy(
     return RedirectResponse(f"/participants/{participant.code}/policies/{row.id}?done=added", 303)
 
 
-@router.get("/participants/{code}/policies/{policy_id}")
-def policy_page(request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """One policy: where it comes from, its learning curves, its bundle."""
-    related = {p.id: p for p in (db.get(Policy, i) for i in (policy.teacher_id, policy.parent_id) if i) if p}
-    version = study_repository.settings_version(db, policy.settings_version_id)
-    page = render(
-        request,
-        "learning/policy.html",
-        participant=participant,
-        policy=policy,
-        teacher=related.get(policy.teacher_id or 0),
-        parent=related.get(policy.parent_id or 0),
-        settings=version,
-        below=below if (below := below_bound(policy)) and below[1] > LARGEST_SHARE_BELOW else None,
-        curves=curve_charts(policy.metrics.get("curve", {}), f"policy {policy.name}"),
-        config={k: v for k, v in policy.config.items() if not k.endswith("_every")},
-        may_write=may(caller, can.WRITE_POLICIES, participant),
-    )
-    return HTMLResponse(page)
-
-
 @router.post("/participants/{code}/policies/{policy_id}/retire")
 def retire_policy(participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Retire a policy with a reason, or take it back."""
@@ -109,30 +73,6 @@ def snapshot_page(request: Request, snapshot: CurrentSnapshot, db: Db, caller: C
     """What a snapshot's buffer covers."""
     participant = db.get_one(Participant, snapshot.participant_id)
     return HTMLResponse(render(request, "learning/snapshot.html", participant=participant, view=describe(db, snapshot, caller)))
-
-
-def curve_charts(curve: Mapping[str, Sequence[float]], of: str) -> list[Chart]:
-    """A chart for each learning curve of a policy."""
-    updates = curve.get("update", [])
-    charts = []
-    for name, (title, unit) in CURVES.items():
-        values = curve.get(name)
-        if not values:
-            continue
-        data = [{"type": "scatter", "mode": "lines", "x": updates, "y": values, "line": {"color": ACCENT, "width": 2}}]
-        log = "loss" in name and min(values) > 0
-        charts.append(
-            Chart(
-                id=f"curve-{name}",
-                title=title,
-                subtitle=f"{unit} · {of} · n = {len(values)} points",
-                figure=figure(data, xaxis=axis("Update"), yaxis=axis("", type="log" if log else "linear")),
-                columns=["Update", title],
-                rows=[[int(u), float(v)] for u, v in zip(updates, values, strict=True)],
-                height=240,
-            )
-        )
-    return charts
 
 
 def _policies(

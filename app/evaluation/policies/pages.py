@@ -1,0 +1,86 @@
+"""HTML page of one policy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.deps import CurrentCaller
+from app.evaluation import wording
+from app.evaluation.ranking.answer import Row, answer
+from app.evaluation.ranking.assessment import Assessment
+from app.evaluation.ranking.picture import Picture, picture
+from app.evaluation.ranking.service import current_assessment
+from app.evaluation.schemas import DECISION_NAMES
+from app.learning.deps import CurrentOwnPolicy
+from app.learning.models import BufferSnapshot, Policy
+from app.learning.policies.curves import curve_charts
+from app.learning.sweeps.comparison import below_bound
+from app.platform.database import Db
+from app.platform.errors import NotFound
+from app.platform.web.templates import render
+from app.study import repository as study_repository
+from app.study.deps import CurrentParticipant
+from app.study.service import may
+from ml.policies.logged_range import LARGEST_SHARE_BELOW
+
+router = APIRouter()
+
+
+@router.get("/participants/{code}/policies/{policy_id}")
+def policy_page(request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """One policy: its verdict and picture, where it comes from, its learning curves, its bundle."""
+    try:
+        assessment = current_assessment(db, participant, caller)
+    except NotFound:
+        assessment = None
+    row = _row(assessment, policy) if assessment else None
+    below = below_bound(policy)
+    page = render(
+        request,
+        "learning/policy.html",
+        participant=participant,
+        policy=policy,
+        lineage=_lineage(db, policy),
+        settings=study_repository.settings_version(db, policy.settings_version_id),
+        below=below if below and below[1] > LARGEST_SHARE_BELOW else None,
+        curves=curve_charts(policy.metrics.get("curve", {}), f"policy {policy.name}"),
+        config={k: v for k, v in policy.config.items() if not k.endswith("_every")},
+        row=row,
+        picture=_picture(db, assessment, row, participant.current_settings.lower_bound) if assessment and row else None,
+        plainly=wording.plainly,
+        decision_names=DECISION_NAMES,
+        may_write=may(caller, can.WRITE_POLICIES, participant),
+    )
+    return HTMLResponse(page)
+
+
+def _row(assessment: Assessment, policy: Policy) -> Row | None:
+    """The policy in the ranking, under its own name; None where it is no candidate of the newest one."""
+    found, own = answer(assessment).everyone().get(policy.id), assessment.of(policy.id)
+    if found is None or own is None or own.decided is None:
+        return None
+    return found if found.one is own else replace(found, one=own, decided=own.decided)
+
+
+def _picture(db: Session, assessment: Assessment, row: Row, lower_bound: float) -> Picture:
+    snapshot = db.get_one(BufferSnapshot, assessment.evaluation.snapshot_id)
+    return picture(assessment, [row], snapshot.beta_unit, lower_bound)
+
+
+def _lineage(db: Session, policy: Policy) -> list[tuple[str, Policy]]:
+    """What a policy was made from, the nearest first: how, and from which one."""
+    found: list[tuple[str, Policy]] = []
+    seen = {policy.id}
+    at: Policy | None = policy
+    while at is not None:
+        how, before = ("distilled from", at.teacher_id) if at.teacher_id is not None else ("fine-tuned from", at.parent_id)
+        at = db.get(Policy, before) if before is not None and before not in seen else None
+        if at is not None:
+            seen.add(at.id)
+            found.append((how, at))
+    return found
