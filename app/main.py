@@ -90,6 +90,7 @@ PAGE_MODULES = (
     "app.overview.overview",
     "app.overview.participant",
     "app.overview.search",
+    "app.overview.reference",
     "app.overview.saved",
     "app.overview.package.pages",
 )

@@ -34,6 +34,7 @@ class Settings(BaseSettings):
     decode_memory_mb: int = Field(2048, ge=512, description="Memory limit of reading one uploaded file, MiB.")
     decode_seconds: int = Field(180, ge=5, description="Processor time that reading one uploaded file may take, s.")
     log_level: str = Field("INFO", description="DEBUG, INFO, WARNING or ERROR.")
+    development: bool = Field(False, description="Show pages for those who build on betaloop, such as /styleguide.")
     log_json: bool = Field(False, description="Log lines as JSON.")
 
     @property

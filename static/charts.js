@@ -54,11 +54,22 @@ async function draw(figure, onPaper = false) {
     await Plotly.react(plot, data, layout, CONFIG);
     // the table below says it in words; the buttons above stay for everyone
     for (const picture of plot.querySelectorAll(".main-svg")) picture.setAttribute("aria-hidden", "true");
+    follow(plot);
     figure.dataset.drawn = "yes";
   } catch (error) {
     plot.textContent = `This chart could not be drawn (${error.message}). Its numbers are in the table below.`;
     figure.dataset.drawn = "failed";
   }
+}
+
+// a point that names a page of ours opens it
+function follow(plot) {
+  if (plot.dataset.follows) return;
+  plot.dataset.follows = "yes";
+  plot.on("plotly_click", ({ points }) => {
+    const place = points[0]?.customdata;
+    if (typeof place === "string" && /^\/[a-z]/.test(place)) location.assign(place);
+  });
 }
 
 // charts are drawn when they come near the window: a page with many stays quick

@@ -17,6 +17,7 @@ OPEN = (
     ("GET", "/trial-time"),
     ("GET", "/glossary"),
     ("GET", "/energy-saved"),
+    ("GET", "/api-reference"),
     ("GET", "(/api/v1)?/visits/[0-9]+"),
     ("GET", "/api/v1/visits/[0-9]+/(sessions|locks)"),
     ("GET", "(/api/v1)?/sessions/[0-9]+"),

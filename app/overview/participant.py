@@ -9,9 +9,11 @@ from fastapi.responses import HTMLResponse
 
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
+from app.analysis.evidence.service import evidence
 from app.analysis.metrics import service as analysis
 from app.analysis.metrics.charts import view
 from app.overview import state, wording
+from app.overview.story import story_chart
 from app.platform.database import Db
 from app.platform.web.templates import render
 from app.study import repository as study
@@ -26,6 +28,7 @@ def participant_page(request: Request, participant: CurrentParticipant, db: Db, 
     """One participant."""
     visits, _ = study.visits(db, participant.id, 1000, 0)
     sessions = study.sessions_of_participant(db, participant.id)
+    held = evidence(db, participant, caller)
     page = render(
         request,
         "overview/participant.html",
@@ -37,7 +40,8 @@ def participant_page(request: Request, participant: CurrentParticipant, db: Db, 
         actors=wording.ACTORS,
         days=[(v, [(s, visible_arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in visits],
         minutes=sum(s.duration_s for s in sessions) / 60,
-        analysis=view(analysis.five_metrics(db, participant, caller)),
+        story=story_chart(held, visits, participant.settings),
+        analysis=view(analysis.five_metrics(db, participant, caller, held)),
         may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
     )
     return HTMLResponse(page)

@@ -48,7 +48,7 @@ def test_the_session_chart_breaks_its_line_at_missing_beta(window: Callable, stu
     first = watched.page.query_selector("#control .scatterlayer .trace")
     assert len(first.query_selector_all("path.js-line")) == 2
     text = watched.page.text_content("#control .infolayer")
-    assert "threshold 1 uV" in text
+    assert "threshold 1 µV" in text
     assert "Amplitude (mA)" in text
 
 

@@ -19,7 +19,7 @@ COLUMNS = (
     "Controller", "n", "Median", "Quartile 1", "Quartile 3", "Difference from cDBS", "95 % low", "95 % high", "p", "p (Holm)", "Test",
 )  # fmt: skip
 
-_SPREAD = 0.16
+_SPREAD, _GOLDEN = 0.18, 0.618034
 
 
 @dataclass(frozen=True)
@@ -88,11 +88,11 @@ def points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
 
 
 def _spread(values: Sequence[float]) -> list[float]:
-    """Sideways places of points so that equal values stay apart: by rank, left and right of the middle in turn."""
+    """Sideways places of points so that equal values stay apart: by rank, in steps of the golden ratio, of which none falls on another."""
     order = sorted(range(len(values)), key=lambda i: (values[i], i))
     places = [0.0] * len(values)
     for rank, i in enumerate(order):
-        places[i] = _SPREAD * ((rank % 3) - 1) if len(values) > 1 else 0.0
+        places[i] = _SPREAD * (2 * ((0.5 + rank * _GOLDEN) % 1) - 1)
     return places
 
 

@@ -6,6 +6,7 @@ Colours are tokens (`token:rl`, `token:rl/0.25`); the browser replaces them by t
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -105,6 +106,11 @@ def horizontal(
     return line, label
 
 
+def written(text: str) -> str:
+    """A text with its units as people write them: device formats have `uV2` where a reader expects \u00b5V\u00b2."""
+    return _SQUARED.sub("\u00b5V\u00b2", _MICRO.sub("\u00b5\\1", text)) if "u" in text else text
+
+
 def plain(value: Any) -> Any:
     """JSON-ready copy: arrays become lists, numpy numbers Python's, what is not finite null; `_DIGITS` significant digits."""
     if isinstance(value, np.ndarray):
@@ -115,10 +121,15 @@ def plain(value: Any) -> Any:
         return [plain(v) for v in value]
     if isinstance(value, np.generic):
         return plain(value.item())
+    if isinstance(value, str):
+        return written(value)
     if isinstance(value, float):
         return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
     return value
 
+
+_MICRO = re.compile(r"\bu([VAs]2?)\b")
+_SQUARED = re.compile("\u00b5V2\\b")
 
 _DIGITS = 7
 """Of a number in a figure: as many as a 32-bit float holds, which is how traces are stored, and half the bytes of all."""

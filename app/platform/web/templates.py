@@ -14,6 +14,7 @@ from fastapi import Request
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
 from app.platform.database import now
+from app.platform.web.charts import written
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -99,5 +100,5 @@ def when(value: datetime | date | None) -> str:
     return value.strftime("%Y-%m-%d %H:%M UTC") if isinstance(value, datetime) else value.isoformat()
 
 
-_environment.filters.update(number=number, fixed=fixed, minutes=minutes, minutes_left=minutes_left, size=size, when=when)
+_environment.filters.update(written=written, number=number, fixed=fixed, minutes=minutes, minutes_left=minutes_left, size=size, when=when)
 _environment.globals.update(static_url=static_url, plotly_url=plotly_url, now=now)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from app.analysis.biomarker.charts import SCALE
 from app.analysis.figures import COLOURS
+from app.platform.web.charts import figure, written
 from app.platform.web.templates import fixed
 
 STATIC = Path(__file__).parents[4] / "static"
@@ -24,3 +25,21 @@ def test_figures_for_papers_have_the_colours_of_the_pages() -> None:
 def test_visits_in_a_scatter_take_colours_of_the_theme() -> None:
     tokens = re.findall(r"--c-(\w+): light-dark", (STATIC / "app.css").read_text())
     assert all(colour.removeprefix("token:") in tokens for _, colour in SCALE)
+
+
+def test_units_are_written_as_people_write_them() -> None:
+    given = ("uV over 2 s", "uV2/Hz \u00b7 n = 3", "60 us, 130 Hz", "(uA)", "plus 2", "Neu")
+    assert [written(t) for t in given] == [
+        "\u00b5V over 2 s",
+        "\u00b5V\u00b2/Hz \u00b7 n = 3",
+        "60 \u00b5s, 130 Hz",
+        "(\u00b5A)",
+        "plus 2",
+        "Neu",
+    ]
+
+
+def test_figures_hold_as_many_digits_as_a_trace_and_their_units_in_writing() -> None:
+    made = figure([{"y": [1 / 3, float("nan"), 2]}], yaxis={"title": "beta (uV2)"})
+    assert made["data"][0]["y"] == [0.3333333, None, 2]
+    assert made["layout"]["yaxis"]["title"] == "beta (\u00b5V\u00b2)"

@@ -114,7 +114,7 @@ def test_the_page_shows_the_conditions_and_corrects_them(client: TestClient, con
     session = confirmed(device_zip())["session"]
     page = client.get(f"/sessions/{session}", headers={"Accept": "text/html"}).text
     card = page[page.index('id="conditions"') :]
-    assert "60 us, 130 Hz" in card
+    assert "60 \u00b5s, 130 Hz" in card
     assert "assumed" in card
     form = {"revision": "1", "lower_bound": "0.45", "conditions_reason": "protocol sheet"}
     assert client.post(f"/sessions/{session}/conditions", data=form, follow_redirects=False).status_code == 303

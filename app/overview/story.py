@@ -1,0 +1,150 @@
+"""A participant's months on one axis: what every session brought, the visits, and when settings changed."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+from app.analysis.evidence.facts import Facts
+from app.analysis.evidence.service import Evidence
+from app.platform.web.charts import GRID, MUTED, SYMBOLS, WARN, Cell, Chart, colour, figure, marker
+from app.study.blinding import CONTROLLER_NAMES
+from app.study.models import SettingsVersion, Visit
+
+_GAP = 0.022
+_SHARE = 0.7
+"""Of the shortest time between two visits that the sessions of a visit may take on the axis."""
+_APART = dt.timedelta(minutes=20)
+"""Between sessions of a visit whose times nobody stated, so that they stand beside each other in their order."""
+
+
+def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsVersion]) -> Chart | None:
+    """Every session that counts and that the reader may know of, as a dot in a panel per quantity; None without any on a known day.
+
+    Args:
+        held: sessions as the caller may know them. visits: with their dates. versions: of the settings, by number.
+    """
+    days = {v.id: v.date for v in visits}
+    dated = [(moment, s) for s in held.sessions if (moment := _moment(s, days)) is not None]
+    if not dated:
+        return None
+    panels = [(name, unit, values) for name, unit, values in _quantities(held, [s for _, s in dated]) if any(v is not None for v in values)]
+    places = _places(dated)
+    data, layout = _panels(dated, places, panels)
+    for controller in dict.fromkeys(s.controller for _, s in dated):
+        shown = marker(controller.value, 8)
+        data.append({"type": "scatter", "mode": "markers", "name": CONTROLLER_NAMES[controller], "x": [None], "y": [None], "marker": shown})
+    layout["shapes"], layout["annotations"] = _marks(dated, places, versions)
+    columns = ("Start", "Visit", "Session", "Controller", *(f"{name} ({unit})" for name, unit, _ in panels))
+    rows: list[list[Cell]] = [
+        [f"{moment:%Y-%m-%d %H:%M}", s.visit, s.session_id, CONTROLLER_NAMES[s.controller], *(values[i] for _, _, values in panels)]
+        for i, (moment, s) in enumerate(dated)
+    ]
+    visits_seen = len({s.visit_id for _, s in dated})
+    subtitle = f"n = {len(dated)} sessions in {visits_seen} visits, those of a day side by side \u00b7 press a dot for its session"
+    return Chart("story", "All months", subtitle, figure(data, **layout), columns, rows, height=70 + 82 * len(panels))
+
+
+def _moment(session: Facts, days: Mapping[int, dt.date | None]) -> dt.datetime | None:
+    """When a session began; its place within the visit's day where nobody stated the time."""
+    if session.started_at is not None:
+        return session.started_at
+    day = days.get(session.visit_id)
+    return dt.datetime.combine(day, dt.time(9), dt.UTC) + session.ordinal * _APART if day is not None else None
+
+
+def _places(dated: Sequence[tuple[dt.datetime, Facts]]) -> list[dt.datetime]:
+    """Where sessions stand on the axis: those of a visit side by side in their order about the visit's day, for months hide hours."""
+    by_visit: dict[int, list[int]] = {}
+    for i, (_, s) in sorted(enumerate(dated), key=lambda row: (row[1][0], row[1][1].ordinal)):
+        by_visit.setdefault(s.visit_id, []).append(i)
+    days = {visit: min(dated[i][0] for i in members) for visit, members in by_visit.items()}
+    ordered = sorted(days.values())
+    least = min((b - a for a, b in pairwise(ordered) if b > a), default=dt.timedelta(days=1))
+    step = _SHARE * least / max(len(members) for members in by_visit.values())
+    found = [moment for moment, _ in dated]
+    for visit, members in by_visit.items():
+        for k, i in enumerate(members):
+            found[i] = days[visit] + (k - (len(members) - 1) / 2) * step
+    return found
+
+
+def _quantities(held: Evidence, sessions: Sequence[Facts]) -> list[tuple[str, str, list[float | None]]]:
+    def of(metric: str) -> list[float | None]:
+        return [s.values.get(metric) for s in sessions]
+
+    own = [next((side.milliamperes for side in s.sides if side.is_control), None) for s in sessions]
+    beta = [s.values.get("mean_beta") if s.beta_kind and s.beta_kind.unit == held.beta_unit else None for s in sessions]
+    return [
+        ("Beta", held.beta_unit or "", beta),
+        ("Amplitude", "mA", own),
+        ("Energy", "cDBS = 1", of("energy")),
+        ("Grasp", "Hz", of("grasp")),
+        ("Rating", "1–10", of("rating")),
+        ("Tremor", "%", of("tremor")),
+        ("Last dose", "h before", [s.medication_h for s in sessions]),
+    ]
+
+
+def _panels(
+    dated: Sequence[tuple[dt.datetime, Facts]], places: Sequence[dt.datetime], panels: Sequence[tuple[str, str, list[float | None]]]
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """A trace and an axis per quantity, the first one on top."""
+    x, began = [place.isoformat() for place in places], [f"{moment:%Y-%m-%d %H:%M}" for moment, _ in dated]
+    colours, shapes = [colour(s.controller.value) for _, s in dated], [SYMBOLS[s.controller.value] for _, s in dated]
+    pages = [f"/sessions/{s.session_id}" for _, s in dated]
+    height = 1 / len(panels)
+    data: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {
+        "xaxis": {"type": "date", "anchor": "free", "position": 0, "zeroline": False},
+        "margin": {"l": 78, "r": 16, "t": 30, "b": 36},
+        "legend": {"orientation": "h", "y": 1.01, "yanchor": "bottom", "x": 0},
+        "showlegend": True,
+    }
+    for i, (name, unit, values) in enumerate(panels):
+        suffix = "" if i == 0 else str(i + 1)
+        top = 1 - i * height
+        layout[f"yaxis{suffix}"] = {
+            "domain": [max(0.0, top - height + _GAP), top],
+            "zeroline": False,
+            "nticks": 4,
+            "title": _title(name, unit),
+        }
+        data.append(
+            {
+                "type": "scatter", "mode": "markers", "x": x, "y": values, "yaxis": f"y{suffix}", "showlegend": False, "name": name,
+                "marker": {"size": 7, "color": colours, "symbol": shapes, "opacity": 0.85}, "customdata": pages, "text": began,
+                "hovertemplate": f"%{{text}}<br>{name} %{{y:.3g}} {unit}<extra></extra>",
+            }
+        )  # fmt: skip
+    return data, layout
+
+
+def _title(name: str, unit: str) -> dict[str, Any]:
+    return {"text": f"{name}<br>{unit}", "font": {"size": 12}, "standoff": 10}
+
+
+def _marks(
+    dated: Sequence[tuple[dt.datetime, Facts]], places: Sequence[dt.datetime], versions: Sequence[SettingsVersion]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """A line per visit with its number, and a dashed one where settings were changed."""
+    first: dict[int, dt.datetime] = {}
+    for place, (_, s) in zip(places, dated, strict=True):
+        first[s.visit] = min(place, first.get(s.visit, place))
+    lines, labels = [], []
+    for text, at, ink, dash in (
+        *((f"visit {n}", moment, GRID, "solid") for n, moment in sorted(first.items())),
+        *((f"settings {v.version}", v.created_at, WARN, "dash") for v in versions if v.version > 1),
+    ):
+        where = {"xref": "x", "yref": "paper"}
+        line = {"color": ink, "width": 1, "dash": dash}
+        lines.append(
+            {"type": "line", **where, "x0": at.isoformat(), "x1": at.isoformat(), "y0": 0, "y1": 1, "line": line, "layer": "below"}
+        )
+        labels.append(
+            {"text": text, **where, "x": at.isoformat(), "y": 0, "yanchor": "bottom", "xanchor": "left", "showarrow": False,
+             "textangle": -90, "font": {"size": 11, "color": MUTED}}
+        )  # fmt: skip
+    return lines, labels
