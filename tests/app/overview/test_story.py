@@ -18,6 +18,7 @@ def test_every_session_is_a_dot_of_its_own_that_leads_to_it(client: TestClient, 
     ids = [add(name, grasp=2.0, visit=visit, medication_h=1.5) for visit in (1, 2) for name in ("cdbs", "rl", "cdbs")]
     add("cdbs", visit=2, excluded="fell asleep")
     assert client.put("/api/v1/participants/P1/settings", json={"settings": {"xi_beta": 1.2}, "reason": "lower"}).status_code == 200
+    db.expire_all()
     participant = participant_by_code(db, enrolled, SYSTEM)
     visits, _ = repository.visits(db, participant.id, 100, 0)
     chart = story_chart(evidence(db, participant, SYSTEM), visits, participant.settings)
