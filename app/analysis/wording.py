@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from app.analysis.evidence.facts import Excluded, LeftOut, Missing
 from app.analysis.primary.results import Basis, Comparison, Disagreement, Tested
-from app.analysis.primary.verdict import LockedMargins, VerdictResult
+from app.analysis.primary.verdict import LockedMargins, NoVerdict, VerdictResult
 from app.study.blinding import CONTROLLER_NAMES
 from ml.statistics.noninferiority import (
     ENERGY,
@@ -103,6 +103,8 @@ def verdict(result: VerdictResult) -> str:
     """The verdict in one sentence that a clinician can quote."""
     name = CONTROLLER_NAMES[result.controller]
     if result.assessment is None:
+        if result.no_verdict is NoVerdict.NO_VISIT_AFTER_LOCK:
+            return f"No verdict on {name} yet: no visit was recorded after the margins were locked."
         return f"No verdict on {name}: no cDBS session has a grasp frequency of which the margin would be a share."
     return verdict_sentence(name, result.assessment.verdict, len(result.visits))
 

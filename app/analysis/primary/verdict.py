@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from enum import StrEnum
 
 import numpy as np
 
@@ -21,6 +22,13 @@ from ml.statistics.noninferiority import LEAST_VISITS, Assessment, Outcome, asse
 
 FAILURE = {"grasp": None, "rating": 1.0, "tremor": 100.0}
 """What a stopped session counts as; of grasp, the worst frequency measured."""
+
+
+class NoVerdict(StrEnum):
+    """Why nothing was assessed."""
+
+    NO_VISIT_AFTER_LOCK = "no_visit_after_lock"
+    NO_GRASP_REFERENCE = "no_grasp_reference"
 
 
 @dataclass(frozen=True)
@@ -39,7 +47,7 @@ class VerdictResult:
 
     Attributes:
         confirmatory: every session that it rests on began, and was recorded, after the lock.
-        assessment: of those sessions; None where no outcome was ever measured.
+        assessment: of those sessions; None for the reason in `no_verdict`.
         visits: with both arms, among the sessions that it rests on. drawn_from: all visits of these sessions.
         left_to_exploration: visits of before the lock.
         margin: by outcome, in its unit. stopped: sessions of the controller that were stopped for the patient's sake.
@@ -48,6 +56,7 @@ class VerdictResult:
     controller: Controller
     confirmatory: bool
     assessment: Assessment | None
+    no_verdict: NoVerdict | None
     visits: tuple[int, ...]
     drawn_from: tuple[int, ...]
     left_to_exploration: tuple[int, ...]
@@ -88,13 +97,14 @@ def _judge(
     outcomes = [_outcome(choose(sessions, name, tested), name, margins) for name in FAILURE]
     used = {s.visit for s in sessions}
     seen = {s.visit for s in sessions if tested(s)} & {s.visit for s in sessions if s.controller is Controller.CDBS}
-    result = None
-    if all(o is not None for o in outcomes) and len(energy.sessions):
+    result, lacking = None, NoVerdict.NO_GRASP_REFERENCE if used else NoVerdict.NO_VISIT_AFTER_LOCK
+    if all(o is not None for o in outcomes):
         result = assess([o for o in outcomes if o is not None], energy.data, energy.stopped)
     return VerdictResult(
         controller,
         confirmatory,
         result,
+        lacking if result is None else None,
         tuple(sorted(seen)),
         tuple(sorted(used)),
         tuple(sorted({s.visit for s in everything if tested(s)} - used)),

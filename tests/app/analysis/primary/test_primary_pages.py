@@ -82,6 +82,23 @@ def test_a_verdict_confirms_only_what_was_recorded_after_the_lock(client: TestCl
     assert "protocol 3.2" in trail
 
 
+def test_after_the_lock_and_before_the_next_visit_the_reason_is_the_lock(client: TestClient, add_visits: AddVisits) -> None:
+    add_visits(3)
+    lock(client)
+    confirming, exploring = client.get(PRIMARY).json()["verdicts"]
+    assert (confirming["confirmatory"], confirming["verdict"], confirming["visits"]) == (True, "not_available", [])
+    assert confirming["sentence"] == "No verdict on RL yet: no visit was recorded after the margins were locked."
+    assert (exploring["confirmatory"], exploring["visits"]) == (False, [1, 2, 3])
+    assert confirming["sentence"] in client.get(PAGE).text
+
+
+def test_sessions_after_the_lock_without_grasp_under_cdbs_say_so(client: TestClient, add_session: AddSession) -> None:
+    lock(client)
+    for controller in ("cdbs", "rl"):
+        add_session(controller, rating=7)
+    assert "no cDBS session has a grasp frequency" in client.get(PRIMARY).json()["verdicts"][0]["sentence"]
+
+
 def test_the_lock_holds_what_was_locked_and_new_margins_need_a_new_one(client: TestClient, add_visits: AddVisits) -> None:
     lock(client)
     again = client.post("/api/v1/participants/P1/margins/locks", json={"version": 1, "reason": "again"})
