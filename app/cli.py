@@ -69,7 +69,7 @@ def serve(
     import uvicorn
 
     from app.ingest.uploads.interrupted import keep_resuming
-    from app.main import create_app
+    from app.main import create_app, leave_to_itself
     from app.platform.audit.chain import keep_sealing
     from app.platform.jobs.children import limited
     from app.platform.migrate import migrate as bring_up_to_date
@@ -92,6 +92,7 @@ def serve(
     # beside the service, for reading what a crash left behind may take minutes
     threading.Thread(target=keep_resuming, args=("the service", threading.Event()), daemon=True).start()
     threading.Thread(target=keep_sealing, args=(threading.Event(),), daemon=True).start()
+    leave_to_itself()
     uvicorn.run(
         service, host=host or settings.host, port=port or settings.port, log_level=settings.log_level.lower(), access_log=False,
         timeout_graceful_shutdown=3, timeout_keep_alive=75, ssl_certfile=tls_certificate, ssl_keyfile=tls_key,

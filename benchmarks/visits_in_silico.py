@@ -1,12 +1,14 @@
 """Six visits of the synthetic participants, margins locked before: how many questions are concluded, and how many conclusions are true?
 
     python benchmarks/visits_in_silico.py --quick
-    python benchmarks/visits_in_silico.py [--seeds 40] [--json FILE]
+    python benchmarks/visits_in_silico.py [--seeds 40] [--visits 6] [--minutes 120] [--json FILE]
 
 A question is one controller of one participant in one study: is it non-inferior to cDBS on grasp, rating and tremor, and does it save
-energy? Each visit has three sessions of the controller and three of cDBS in turn, 5 minutes each. The verdict is the service's own
-(`app.analysis.primary.verdict`); the truth is a large sample over other days at the same hours. The participants are synthetic and not
-fitted to patients. CPU seconds of one thread.
+energy? A visit is the day that the service plans (`app.planning.plans.schedule`) with as many policies of the controller as fit into its
+minutes, by default four sessions of the controller with three of cDBS between them, 10 minutes each. The verdict is the service's own
+(`app.analysis.primary.verdict`); the truth is a large sample over other days at the same hours. Beside it stands what a judge would conclude
+of the same sessions who knows the standard deviation of every outcome's contrast (`known`): no test of these averages can do better. The
+participants are synthetic and not fitted to patients. CPU seconds of one thread.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from ml.qoc import Margins
 from ml.statistics.noninferiority import Inferior, NonInferiorAndSaving
 
 out = sys.stdout.write
-STEPS, EACH, HOURS_APART = 150, 3, 0.3
+STEPS_PER_MINUTE = 30
 LEVELS = (0.75, 0.5, 0.3)
 """Constant fractions of the cDBS amplitude: from what hardly differs to what surely harms."""
 
@@ -45,13 +47,37 @@ Means = dict[str, float]
 
 
 @dataclass(frozen=True)
+class Day:
+    """The planned day: places in it and hours since its start by arm, steps of a session."""
+
+    places: dict[bool, tuple[int, ...]]
+    hours: dict[bool, tuple[float, ...]]
+    steps: int
+
+    @classmethod
+    def planned(cls, minutes: float) -> Day:
+        """The service's plan with as many policies as fit."""
+        rules = Rules(total_minutes=minutes)
+        sessions = schedule([Candidate(i, Controller.RL) for i in range(most_policies(rules))], rules, seed=0)
+        arms = {tested: [i for i, s in enumerate(sessions) if (s.controller is Controller.RL) == tested] for tested in (True, False)}
+        hours = {tested: tuple(sessions[i].start_minute / 60 for i in places) for tested, places in arms.items()}
+        return cls({tested: tuple(places) for tested, places in arms.items()}, hours, round(rules.session_minutes * STEPS_PER_MINUTE))
+
+
+@dataclass(frozen=True)
 class Question:
-    """One question: what was concluded (`good`, `bad` or nothing), and whether that is true."""
+    """One question: what was concluded (`good`, `bad` or nothing), whether that is true, and the average loss of every outcome.
+
+    Attributes:
+        losses: average over visits by outcome, in margins. spread: variance of one visit's contrast as estimated, in squared margins.
+    """
 
     participant: str
     level: float
     concluded: str
     true: bool | None
+    losses: dict[str, float]
+    spread: dict[str, float]
 
 
 def metrics(batch: SessionBatch) -> list[dict[str, float]]:

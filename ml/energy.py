@@ -234,11 +234,13 @@ def saving_percent(energy: float, reference: float) -> float:
 
 def _mean_square(values: ArrayLike, name: str) -> float:
     array = np.asarray(values, dtype=np.float64)
-    _check(array, name)
     known = array[~np.isnan(array)]
-    return float(np.mean(known**2)) if known.size else math.nan
+    if not known.size:
+        return math.nan
+    _check(known, name)
+    return float(np.square(known).mean())
 
 
 def _check(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]], name: str) -> None:
-    if np.any(values < 0) or np.any(np.isinf(values)):
+    if (values < 0).any() or np.isinf(values).any():
         raise ValueError(f"{name} must be 0 or more and finite")

@@ -18,16 +18,25 @@ _lock = Lock()
 
 def kept(key: Hashable, compute: Callable[[], T]) -> T:
     """A result under a key that names everything it depends on; computed where this process has not kept it."""
-    with _lock:
-        if key in _kept:
-            _kept.move_to_end(key)
-            return cast("T", _kept[key])
-    result = compute()
+    known = recalled(key)
+    return keep(key, compute()) if known is None else cast("T", known)
+
+
+def keep(key: Hashable, result: T) -> T:
+    """Keep a result under a key that names everything it depends on; returns it."""
     with _lock:
         _kept[key] = result
         while len(_kept) > KEPT:
             _kept.popitem(last=False)
     return result
+
+
+def recalled(key: Hashable) -> Any:
+    """The result that this process has kept under a key, or None."""
+    with _lock:
+        if key in _kept:
+            _kept.move_to_end(key)
+        return _kept.get(key)
 
 
 def forget() -> None:

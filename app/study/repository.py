@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, NamedTuple
 
-from sqlalchemy import ColumnElement, Select, column, false, func, or_, select, table, true
+from sqlalchemy import ARRAY, ColumnElement, Integer, Select, any_, cast, column, false, func, or_, select, table, true
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session, contains_eager, joinedload, selectinload
 
@@ -168,7 +168,8 @@ def traces_of_recording(db: Session, recording_id: int) -> Sequence[Trace]:
 def traces_of_recordings(db: Session, recording_ids: Collection[int]) -> dict[int, list[Trace]]:
     """The same of many recordings at once, by recording; read only, and not the session's own rows."""
     columns = [c for c in Trace.__table__.columns if c.name != "details"]
-    query = select(*columns).where(Trace.recording_id.in_(recording_ids)).order_by(Trace.stream, Trace.channel)
+    wanted = any_(cast(list(recording_ids), ARRAY(Integer)))  # one parameter, where `in` has one for each
+    query = select(*columns).where(Trace.recording_id == wanted).order_by(Trace.stream, Trace.channel)
     found: dict[int, list[Any]] = {}
     for row in db.execute(query):
         found.setdefault(row.recording_id, []).append(row)
@@ -190,7 +191,8 @@ class TraceHead:
 def trace_heads(db: Session, recording_ids: Collection[int]) -> dict[int, list[TraceHead]]:
     """The traces of recordings in their newest decode version, by recording, in the order of `traces_of_recording`; no values are read."""
     columns = (Trace.id, Trace.recording_id, Trace.stream, Trace.channel, Trace.decode_version)
-    query = select(*columns).where(Trace.recording_id.in_(recording_ids)).order_by(Trace.stream, Trace.channel)
+    wanted = any_(cast(list(recording_ids), ARRAY(Integer)))  # one parameter, where `in` has one for each
+    query = select(*columns).where(Trace.recording_id == wanted).order_by(Trace.stream, Trace.channel)
     found: dict[int, list[TraceHead]] = {}
     for row in db.execute(query):
         found.setdefault(row.recording_id, []).append(TraceHead(*row))

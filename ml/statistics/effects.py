@@ -78,7 +78,7 @@ def saving_contrasts(energy: Measurements) -> VisitContrasts | Unavailable:
     plain = visit_contrasts(energy)
     if isinstance(plain, Unavailable):
         return plain
-    means = np.array([energy.value[two].mean() for _, _, two in energy.arms])
+    means = energy.cells.means(energy.value[energy.cells.rows])[:, 1]
     if not (means > 0).all():
         return Unavailable(Reason.NOT_IDENTIFIED)
     return replace(plain, contrast=-plain.contrast / means, floor=plain.floor / means**2)

@@ -204,7 +204,11 @@ def assess(
     if plan and isinstance(verdict, Inconclusive):
         verdict = replace(verdict, more_visits=_more_visits(outcomes, spent, alpha, sessions_per_arm, seed))
     others = []
+    failed = bool(stopped.any()) or any(o.stopped.any() for o in outcomes)
     for other in (FailureRule.BOTH_ARMS, FailureRule.AS_MEASURED):
+        if not failed:  # without failures the rules are one
+            others.append((other, _verdict(results, saving, alpha)))
+            continue
         found = tuple(_outcome(o, other, level) for o in outcomes)
         others.append((other, _verdict(found, energy_saving(counted_energy(energy, stopped, other), level, seed=seed), alpha)))
     p_values = [r.p_non_inferior for r in results if r.p_non_inferior is not None]

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from ml.statistics.within_visits.contrasts import Measurements, Unavailable
 
@@ -201,7 +201,7 @@ def _tail(x: NDArray[np.float64], y: NDArray[np.float64], u: float, exact: bool)
     sd = _standard_deviation(x, y)
     if sd == 0:
         return 1.0
-    return float(norm.sf((u - x.size * y.size / 2 - 0.5) / sd))
+    return float(ndtr(-(u - x.size * y.size / 2 - 0.5) / sd))
 
 
 def _shift_interval(
@@ -212,6 +212,6 @@ def _shift_interval(
     if exact:
         k = int(np.searchsorted(np.cumsum(_null(x, y))[::2], tail, side="right"))
     else:
-        k = int(np.floor(x.size * y.size / 2 - float(norm.ppf(1 - tail)) * _standard_deviation(x, y)))
+        k = int(np.floor(x.size * y.size / 2 + float(ndtri(tail)) * _standard_deviation(x, y)))
     k = min(max(k, 1), (differences.size + 1) // 2)
     return float(differences[k - 1]), float(differences[-k])

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from app.platform.errors import Invalid
 from app.study.blinding import Arm
@@ -125,11 +125,11 @@ def read(session: StudySession, arm: Arm, traces: TracesOf) -> Facts:
     """
     settings = session.visit.participant.current_settings
     table = laid_out(session, settings, traces)
-    during, qoc = table.t_s > 0, qoc_of(session)
-    fraction, beta = table.fraction[during], table.beta[during]
+    first, qoc = int(np.searchsorted(table.t_s, 0.0, side="right")), qoc_of(session)
+    fraction, beta = _means(table.fraction[first:], relative_energy), table.beta[first:]
     found = {
-        "energy": relative_energy(fraction) if _known(fraction) else None,
-        "mean_beta": float(np.nanmean(beta)) if _known(beta) else None,
+        "energy": fraction.square,
+        "mean_beta": _means(beta).mean,
         "grasp": qoc.grasp_hz,
         "rating": qoc.rating,
         "tremor": qoc.tremor_percent,
@@ -148,8 +148,8 @@ def read(session: StudySession, arm: Arm, traces: TracesOf) -> Facts:
         values=values,
         missing={name: _why(name, table) for name in METRICS if name not in values},
         beta_kind=BetaKind(table.beta_trace.unit, table.beta_trace.source) if table.beta_trace else None,
-        mean_fraction=float(np.nanmean(fraction)) if _known(fraction) else None,
-        sides=_sides(session, table, traces),
+        mean_fraction=fraction.mean,
+        sides=_sides(session, table, fraction, traces),
         stopped=session.stopped_reason,
         medication_h=session.medication_h,
     )
@@ -165,7 +165,7 @@ def _why(metric: str, table: StepTable) -> Missing:
     return Missing.MOSTLY_UNKNOWN
 
 
-def _sides(session: StudySession, table: StepTable, traces: TracesOf) -> tuple[Side, ...]:
+def _sides(session: StudySession, table: StepTable, fraction: _Means, traces: TracesOf) -> tuple[Side, ...]:
     """Every side and program that was recorded; a session of one amplitude trace has it already in its step table.
 
     Where another side cannot be read, it is there without numbers, so that no sum over sides passes for the whole.
@@ -173,31 +173,35 @@ def _sides(session: StudySession, table: StepTable, traces: TracesOf) -> tuple[S
     recordings = {s.recording_id for s in session.segments}
     amplitudes = [t for i in recordings for t in traces(i) if t.stream == AMPLITUDE_STREAM]
     if len(recordings) == 1 and len(amplitudes) <= 1:
-        return (_side("controlled side", True, table),) if amplitudes and any(s.is_control for s in session.segments) else ()
+        return (_side("controlled side", True, table, fraction),) if amplitudes and any(s.is_control for s in session.segments) else ()
     try:
         return tuple(_side(d.name, d.is_control, d.table) for d in delivered_by(session, traces) if d.table is not None)
     except Invalid:
-        return (_side("controlled side", True, table), _side("other side", False, None))
+        return (_side("controlled side", True, table, fraction), _side("other side", False, None))
 
 
-def _side(name: str, is_control: bool, table: StepTable | None) -> Side:
+def _side(name: str, is_control: bool, table: StepTable | None, fraction: _Means | None = None) -> Side:
     if table is None or table.amplitude_trace is None:
         return Side(name, None, 0, is_control, None, None, None, None)
-    rows = table.t_s > 0
-    fraction, milliamperes = table.fraction[rows], table.amplitude_ma[rows]
-    of_cdbs, in_ma = _known(fraction), _known(milliamperes)
-    return Side(
-        name,
-        table.amplitude_trace.recording_id,
-        amplitude_program(table.amplitude_trace),
-        is_control,
-        float(np.nanmean(fraction)) if of_cdbs else None,
-        relative_energy(fraction) if of_cdbs else None,
-        float(np.nanmean(milliamperes)) if in_ma else None,
-        mean_square_ma(milliamperes) if in_ma else None,
-        table.cdbs_ma,
-    )
+    first = int(np.searchsorted(table.t_s, 0.0, side="right"))
+    of_cdbs = _means(table.fraction[first:], relative_energy) if fraction is None else fraction
+    in_ma = _means(table.amplitude_ma[first:], mean_square_ma)
+    of_trace = table.amplitude_trace
+    amounts = of_cdbs.mean, of_cdbs.square, in_ma.mean, in_ma.square
+    return Side(name, of_trace.recording_id, amplitude_program(of_trace), is_control, *amounts, table.cdbs_ma)
 
 
-def _known(values: NDArray[np.float64]) -> bool:
-    return bool(values.size) and float(np.mean(~np.isnan(values))) >= KNOWN_SHARE
+@dataclass(frozen=True)
+class _Means:
+    """Mean and mean square over the known steps; None where too few are known or nobody asked."""
+
+    mean: float | None
+    square: float | None
+
+
+def _means(values: NDArray[np.float64], square: Callable[[ArrayLike], float] | None = None) -> _Means:
+    """Of a session's steps, shape [n], NaN where unknown; `square` takes the mean square of the known ones."""
+    known = values[~np.isnan(values)]
+    if not known.size or known.size < KNOWN_SHARE * values.size:
+        return _Means(None, None)
+    return _Means(float(known.mean()), square(known) if square else None)

@@ -35,18 +35,27 @@ class Chosen:
 
 def choose(sessions: Sequence[Facts], metric: str, is_tested: Callable[[Facts], bool]) -> Chosen:
     """One metric of the sessions that `is_tested` names and of all cDBS sessions."""
+    return choose_each(sessions, (metric,), is_tested)[metric]
+
+
+def choose_each(sessions: Sequence[Facts], metrics: Sequence[str], is_tested: Callable[[Facts], bool]) -> dict[str, Chosen]:
+    """Several metrics of the same sessions."""
     taken = tuple(s for s in sessions if s.controller is Controller.CDBS or is_tested(s))
-    hours = [float("nan") if s.medication_h is None else s.medication_h for s in taken]
-    data = Measurements.of(
-        [s.values.get(metric, float("nan")) for s in taken],
+    nothing = float("nan")
+    plain = Measurements.of(
+        np.full(len(taken), nothing),
         [s.visit for s in taken],
         [s.controller is not Controller.CDBS for s in taken],
         order=[float(s.ordinal) for s in taken],
-        medication_h=hours,
-        resolution=RESOLUTION.get(metric, 0.0),
+        medication_h=[nothing if s.medication_h is None else s.medication_h for s in taken],
     )
     stopped = np.array([s.stopped is not None for s in taken], dtype=np.bool_)
-    return Chosen(data, taken, stopped, np.array([s.arm.policy_id or 0 for s in taken], dtype=np.int64))
+    policy = np.array([s.arm.policy_id or 0 for s in taken], dtype=np.int64)
+    found = {}
+    for metric in metrics:
+        value = np.array([s.values.get(metric, nothing) for s in taken], dtype=np.float64)
+        found[metric] = Chosen(replace(plain, value=value, resolution=RESOLUTION.get(metric, 0.0)), taken, stopped, policy)
+    return found
 
 
 def of_controller(controller: Controller) -> Callable[[Facts], bool]:

@@ -7,14 +7,39 @@ from typing import Any
 
 from sqlalchemy import cast, func, literal, select
 from sqlalchemy.dialects.postgresql import JSONPATH
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, contains_eager, joinedload, selectinload
 
 from app.study.models import (
+    Participant,
     Recording,
     SessionSegment,
+    StudySession,
+    Visit,
 )
 
 STIMULATION_EVENTS = '$.events[*] ? (@.kind == "stimulation")'
+
+
+def sessions_of(db: Session, participant_ids: Collection[int]) -> dict[int, list[StudySession]]:
+    """Sessions and proposals by participant, visit and order, to read many at once: without their conditions and what recordings tell."""
+    visit = contains_eager(StudySession.visit).options(
+        joinedload(Visit.participant).joinedload(Participant.site), selectinload(Visit.locks), selectinload(Visit.cdbs_amplitudes)
+    )
+    query = (
+        select(StudySession)
+        .join(StudySession.visit)
+        .where(Visit.participant_id.in_(participant_ids))
+        .options(
+            visit,
+            selectinload(StudySession.qocs),
+            selectinload(StudySession.segments).joinedload(SessionSegment.recording).defer(Recording.details),
+        )
+        .order_by(Visit.number, StudySession.ordinal)
+    )
+    found: dict[int, list[StudySession]] = {}
+    for session in db.scalars(query):
+        found.setdefault(session.visit.participant_id, []).append(session)
+    return found
 
 
 def stimulation_events(db: Session, recording_ids: Collection[int]) -> dict[int, list[dict[str, Any]]]:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
+from app.analysis.evidence import repository
 from app.analysis.evidence.facts import Excluded, Facts, LeftOut, read
 from app.platform.errors import Invalid
-from app.platform.kept import kept
+from app.platform.kept import keep, recalled
 from app.study import blinding
 from app.study import repository as study
-from app.study.models import Participant
+from app.study.models import Participant, StudySession, Trace
 from app.study.sessions.repository import fingerprints
+
+READ_AT_ONCE = 8
+"""Participants whose traces are in memory together."""
 
 
 @dataclass(frozen=True)
@@ -42,19 +46,25 @@ def evidence(db: Session, participant: Participant, caller: Caller) -> Evidence:
 
 
 def of_all(db: Session, participants: Sequence[Participant], caller: Caller) -> list[Evidence]:
-    """The evidence of several participants; whether it has changed is asked of all at once."""
+    """The evidence of several participants; what is not kept is read for some of them at once."""
     versions = fingerprints(db, [p.id for p in participants])
-    return [_of(db, p, caller, versions[p.id]) for p in participants]
+    keys = [("evidence", p.id, versions[p.id], blinding.sight(db, p, caller)) for p in participants]
+    found: list[Evidence | None] = [recalled(key) for key in keys]
+    lacking = [i for i, known in enumerate(found) if known is None]
+    for start in range(0, len(lacking), READ_AT_ONCE):
+        some = lacking[start : start + READ_AT_ONCE]
+        sessions = repository.sessions_of(db, [participants[i].id for i in some])
+        recordings = {s.recording_id for held in sessions.values() for session in held for s in session.segments}
+        traces = study.traces_of_recordings(db, recordings)
+        for i in some:
+            result = _read(participants[i], sessions.get(participants[i].id, []), traces, caller, keys[i])
+            found[i] = keep(keys[i], result)
+    return [known for known in found if known is not None]
 
 
-def _of(db: Session, participant: Participant, caller: Caller, fingerprint: str) -> Evidence:
-    key = ("evidence", participant.id, fingerprint, blinding.sight(db, participant, caller))
-    return kept(key, lambda: _read(db, participant, caller, key))
-
-
-def _read(db: Session, participant: Participant, caller: Caller, key: Hashable) -> Evidence:
-    held = study.sessions_of_participant(db, participant.id, with_proposals=True)
-    traces = study.traces_of_recordings(db, {s.recording_id for session in held for s in session.segments})
+def _read(
+    participant: Participant, held: Sequence[StudySession], traces: Mapping[int, Sequence[Trace]], caller: Caller, key: Hashable
+) -> Evidence:
     counted: list[Facts] = []
     excluded: list[Excluded] = []
     for session in held:

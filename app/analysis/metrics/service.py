@@ -123,13 +123,18 @@ class FiveMetrics:
     limits: list[str]
 
 
-def five_metrics(db: Session, participant: Participant, caller: Caller, held: Evidence | None = None) -> FiveMetrics:
-    """Energy, mean beta, grasp, rating and tremor of every session, by controller and by policy, each compared with cDBS.
+def five_metrics(db: Session, participant: Participant, caller: Caller) -> FiveMetrics:
+    """Energy, mean beta, grasp, rating and tremor of every session, by controller and by policy, each compared with cDBS."""
+    return of_all(db, [participant], [evidence(db, participant, caller)])[0]
 
-    `held`: the evidence, where it is at hand.
-    """
-    held = held or evidence(db, participant, caller)
-    names = repository.policy_names(db, participant.id)
+
+def of_all(db: Session, participants: Sequence[Participant], held: Sequence[Evidence]) -> list[FiveMetrics]:
+    """The same of several participants, whose evidence is `held`."""
+    names = repository.policy_names(db, [p.id for p in participants])
+    return [_of(h, names[p.id]) for p, h in zip(participants, held, strict=True)]
+
+
+def _of(held: Evidence, names: Mapping[int, str]) -> FiveMetrics:
     return kept(("metrics", held.key, tuple(sorted(names.items()))), lambda: _compute(held, names))
 
 

@@ -10,10 +10,12 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.analysis.evidence.facts import METRICS
 from app.analysis.evidence.service import of_all
-from app.analysis.metrics.service import FiveMetrics, five_metrics
+from app.analysis.metrics import service as metrics
+from app.analysis.metrics.service import FiveMetrics
 from app.analysis.pooled import repository
+from app.analysis.primary import service as primary
 from app.analysis.primary.results import PLANNED
-from app.analysis.primary.service import Primary, primary
+from app.analysis.primary.service import Primary
 from app.analysis.trial_time.service import TrialTime, trial_time
 from app.platform.kept import kept
 from app.study import repository as study
@@ -62,9 +64,8 @@ def readable(db: Session, caller: Caller) -> Sequence[Participant]:
 
 def pooled(db: Session, participants: Sequence[Participant], caller: Caller) -> Pooled:
     """Results of each participant and over all of them."""
-    held = list(zip(participants, of_all(db, participants, caller), strict=True))
-    found = tuple(primary(db, p, caller, evidence) for p, evidence in held)
-    paper = tuple(five_metrics(db, p, caller, evidence) for p, evidence in held)
+    held = of_all(db, participants, caller)
+    found, paper = tuple(primary.of_all(db, participants, held)), tuple(metrics.of_all(db, participants, held))
     key = ("pooled", tuple((p.evidence.key, p.locked) for p in found))
     return Pooled(found, paper, kept(key, lambda: tuple(_controller(found, c) for c in PLANNED if _ran(found, c))))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from datetime import datetime
 
 from sqlalchemy import func, select
@@ -11,19 +12,25 @@ from app.learning.models import Policy
 from app.planning.plans.models import Plan, PlanItem
 
 
-def policy_names(db: Session, participant_id: int) -> dict[int, str]:
-    """Names of a participant's policies."""
-    rows = db.execute(select(Policy.id, Policy.name).where(Policy.participant_id == participant_id))
-    return {row[0]: row[1] for row in rows}
+def policy_names(db: Session, participant_ids: Collection[int]) -> dict[int, dict[int, str]]:
+    """Names of the participants' policies: by participant, then by policy."""
+    found: dict[int, dict[int, str]] = {i: {} for i in participant_ids}
+    for mine, policy, name in db.execute(select(Policy.participant_id, Policy.id, Policy.name).where(Policy.participant_id.in_(found))):
+        found[mine][policy] = name
+    return found
 
 
-def last_picked(db: Session, participant_id: int) -> dict[int, datetime]:
-    """When each policy of a participant was last put on a plan that was approved: what was known then may have picked it."""
+def last_picked(db: Session, participant_ids: Collection[int]) -> dict[int, dict[int, datetime]]:
+    """When each policy was last put on a plan that was approved, by participant: what was known then may have picked it."""
+    found: dict[int, dict[int, datetime]] = {i: {} for i in participant_ids}
     rows = db.execute(
-        select(PlanItem.policy_id, func.max(Plan.created_at))
+        select(Policy.participant_id, PlanItem.policy_id, func.max(Plan.created_at))
         .join(Plan, Plan.id == PlanItem.plan_id)
         .join(Policy, Policy.id == PlanItem.policy_id)
-        .where(Policy.participant_id == participant_id, Plan.approved_at.is_not(None))
-        .group_by(PlanItem.policy_id)
+        .where(Policy.participant_id.in_(found), Plan.approved_at.is_not(None))
+        .group_by(Policy.participant_id, PlanItem.policy_id)
     )
-    return {row[0]: row[1] for row in rows if row[0] is not None}
+    for mine, policy, moment in rows:
+        if policy is not None:
+            found[mine][policy] = moment
+    return found

@@ -13,7 +13,7 @@ from enum import StrEnum
 from functools import cached_property
 
 from app.analysis.evidence.facts import METRICS, Facts
-from app.analysis.evidence.measurements import Chosen, choose, of_controller
+from app.analysis.evidence.measurements import Chosen, choose_each, of_controller
 from app.study.models import Controller
 from ml.statistics.effects import Saving, cliffs_delta, energy_saving
 from ml.statistics.multiplicity import benjamini_hochberg, holm
@@ -186,7 +186,7 @@ def _of_policy(
 
 
 def _compared(sessions: Sequence[Facts], tested: Tested, is_tested: Callable[[Facts], bool]) -> ControllerResult:
-    return ControllerResult(tested, tuple(_comparison(choose(sessions, m, is_tested), m) for m in METRICS))
+    return ControllerResult(tested, tuple(_comparison(chosen, m) for m, chosen in choose_each(sessions, METRICS, is_tested).items()))
 
 
 def _comparison(chosen: Chosen, metric: str) -> Comparison:
@@ -206,13 +206,14 @@ def _comparison(chosen: Chosen, metric: str) -> Comparison:
 
 def _rows(chosen: Chosen, contrasts: VisitContrasts | Unavailable) -> tuple[VisitRow, ...]:
     known = {} if isinstance(contrasts, Unavailable) else dict(zip(contrasts.visit.tolist(), contrasts.contrast.tolist(), strict=True))
-    measured = [(s, t) for s, t, v in zip(chosen.sessions, chosen.data.tested, chosen.data.value, strict=True) if v == v]
-    found = []
-    for visit in sorted({s.visit for s in chosen.sessions}):
-        arms = [tuple(s.session_id for s, tested in measured if s.visit == visit and bool(tested) is arm) for arm in (True, False)]
-        ran = tuple(s.session_id for s in chosen.sessions if s.visit == visit and s.controller is not Controller.CDBS)
-        found.append(VisitRow(visit, known.get(visit), arms[0] or ran, arms[1]))
-    return tuple(found)
+    visits: dict[int, tuple[list[int], list[int], list[int]]] = {}
+    for s, tested, value in zip(chosen.sessions, chosen.data.tested.tolist(), chosen.data.value.tolist(), strict=True):
+        measured, cdbs, ran = visits.setdefault(s.visit, ([], [], []))
+        if tested:
+            ran.append(s.session_id)
+        if value == value:
+            (measured if tested else cdbs).append(s.session_id)
+    return tuple(VisitRow(v, known.get(v), tuple(one or ran), tuple(two)) for v, (one, two, ran) in sorted(visits.items()))
 
 
 def _disagreement(found: Average | Unavailable, paper: RankSum | Unavailable) -> Disagreement | None:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 
 import numpy as np
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
+from app.analysis.evidence import service as evidence
 from app.analysis.evidence.facts import METRICS, BetaKind, Facts
 from app.analysis.evidence.measurements import choose, comparable_beta, of_controller, with_comparable_beta
-from app.analysis.evidence.service import Evidence, evidence
+from app.analysis.evidence.service import Evidence
 from app.analysis.primary import repository
 from app.analysis.primary.results import PLANNED, ControllerResult, results
 from app.analysis.primary.verdict import LockedMargins, VerdictResult, verdicts
@@ -49,11 +51,19 @@ class Primary:
         return tuple(r for r in self.results if r.tested.policy_id is not None)
 
 
-def primary(db: Session, participant: Participant, caller: Caller, held: Evidence | None = None) -> Primary:
-    """Primary results, as the caller may know them; errors as in `app.study.blinding`. `held`: the evidence, where it is at hand."""
-    held = held or evidence(db, participant, caller)
-    locked = locked_margins(participant)
-    names, picked = repository.policy_names(db, participant.id), repository.last_picked(db, participant.id)
+def primary(db: Session, participant: Participant, caller: Caller) -> Primary:
+    """Primary results, as the caller may know them; errors as in `app.study.blinding`."""
+    return of_all(db, [participant], evidence.of_all(db, [participant], caller))[0]
+
+
+def of_all(db: Session, participants: Sequence[Participant], held: Sequence[Evidence]) -> list[Primary]:
+    """Primary results of several participants, whose evidence is `held`."""
+    ids = [p.id for p in participants]
+    names, picked = repository.policy_names(db, ids), repository.last_picked(db, ids)
+    return [_of(h, locked_margins(p), names[p.id], picked[p.id]) for p, h in zip(participants, held, strict=True)]
+
+
+def _of(held: Evidence, locked: LockedMargins, names: Mapping[int, str], picked: Mapping[int, datetime]) -> Primary:
     key = ("primary", held.key, locked, tuple(sorted(names.items())), tuple(sorted(picked.items())))
 
     def compute() -> Primary:
@@ -92,7 +102,7 @@ def mixed_models(found: Primary, controller: Controller) -> MixedFits:
 
 def policy_names(db: Session, participant: Participant) -> dict[int, str]:
     """Names of a participant's policies."""
-    return repository.policy_names(db, participant.id)
+    return repository.policy_names(db, [participant.id])[participant.id]
 
 
 def _fit(sessions: Sequence[Facts], metric: str, controller: Controller) -> MixedComparison | Unavailable:

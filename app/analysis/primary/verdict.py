@@ -15,7 +15,7 @@ from enum import StrEnum
 import numpy as np
 
 from app.analysis.evidence.facts import Facts
-from app.analysis.evidence.measurements import HIGHER_IS_BETTER, Chosen, choose, of_controller
+from app.analysis.evidence.measurements import HIGHER_IS_BETTER, Chosen, choose_each, of_controller
 from app.study.models import Controller
 from ml.qoc import Margins
 from ml.statistics.noninferiority import LEAST_VISITS, Assessment, Outcome, assess
@@ -93,8 +93,8 @@ def _judge(
     everything: Sequence[Facts], sessions: Sequence[Facts], controller: Controller, margins: Margins, confirmatory: bool
 ) -> VerdictResult:
     tested = of_controller(controller)
-    energy = choose(sessions, "energy", tested)
-    outcomes = [_outcome(choose(sessions, name, tested), name, margins) for name in FAILURE]
+    chosen = choose_each(sessions, ("energy", *FAILURE), tested)
+    energy, outcomes = chosen["energy"], [_outcome(chosen[name], name, margins) for name in FAILURE]
     used = {s.visit for s in sessions}
     seen = {s.visit for s in sessions if tested(s)} & {s.visit for s in sessions if s.controller is Controller.CDBS}
     result, lacking = None, NoVerdict.NO_GRASP_REFERENCE if used else NoVerdict.NO_VISIT_AFTER_LOCK
@@ -117,9 +117,10 @@ def _outcome(chosen: Chosen, name: str, margins: Margins) -> Outcome | None:
     """An outcome with its margin; None where no cDBS session tells what a share of the grasp frequency is."""
     data, margin = chosen.data, {"rating": margins.rating_points, "tremor": margins.tremor_points}.get(name)
     if margin is None:
-        by_visit = [float(data.value[two].mean()) for _, _, two in data.arms]
+        cells = data.cells
+        by_visit = cells.means(data.value[cells.rows])[:, 1]
         cdbs = data.value[~data.tested & np.isfinite(data.value)]
-        reference = float(np.mean(by_visit)) if by_visit else float(cdbs.mean()) if cdbs.size else 0.0
+        reference = float(by_visit.mean()) if by_visit.size else float(cdbs.mean()) if cdbs.size else 0.0
         if not reference > 0:
             return None
         margin = margins.grasp_share * reference

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtr, stdtrit
 
+from ml.statistics.within_visits.cells import Cells, cells_of
+
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Scale = Literal["difference", "win_probability"]
@@ -142,6 +144,11 @@ class Measurements:
                 found.append((int(self.visit[rows[0]]), rows[tested], rows[~tested]))
         return tuple(found)
 
+    @cached_property
+    def cells(self) -> Cells:
+        """The measured sessions of visits with both arms, counted by visit and arm."""
+        return cells_of(np.isfinite(self.value), self.visit, self.tested)
+
     def no_evidence(self) -> Unavailable:
         """Why no visit has both arms."""
         tested = self.tested[np.isfinite(self.value)]
@@ -222,21 +229,20 @@ def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitCon
     Returns:
         The contrasts, or why there is none: no session of an arm, or no visit with both.
     """
-    if not data.arms:
+    cells = data.cells
+    if not cells.visit.size:
         return data.no_evidence()
-    pairs = [(data.value[one], data.value[two]) for _, one, two in data.arms]
-    n_tested = np.array([x.size for x, _ in pairs], dtype=np.int64)
-    n_cdbs = np.array([y.size for _, y in pairs], dtype=np.int64)
+    n_tested, n_cdbs = cells.counts.T
     if scale == "difference":
-        contrast = np.array([x.mean() - y.mean() for x, y in pairs])
+        means = cells.means(data.value[cells.rows])
+        contrast = means[:, 0] - means[:, 1]
         # Rounding to steps of r adds a variance of r^2 / 12 to every session (Sheppard 1898).
         floor = data.resolution**2 / 12 * (1 / n_tested + 1 / n_cdbs)
     else:
-        contrast = np.array([win_probability(x, y) for x, y in pairs])
+        contrast = np.array([win_probability(data.value[one], data.value[two]) for _, one, two in data.arms])
         # A visit resolves the probability no finer than by half a pair.
         floor = (0.5 / (n_tested * n_cdbs)) ** 2
-    visits = np.array([v for v, _, _ in data.arms], dtype=np.int64)
-    return VisitContrasts(visits, contrast, n_tested, n_cdbs, floor, 0.0 if scale == "difference" else 0.5)
+    return VisitContrasts(cells.visit, contrast, n_tested, n_cdbs, floor, 0.0 if scale == "difference" else 0.5)
 
 
 def win_probability(x: Floats, y: Floats) -> float:
@@ -280,16 +286,18 @@ def order_imbalance(data: Measurements) -> float | None:
 
     None where no order is known or no visit has both arms.
     """
-    if data.order is None:
+    cells = data.cells
+    if data.order is None or not cells.visit.size:
         return None
-    found = []
-    for _, one, two in data.arms:
-        first, second = data.order[one], data.order[two]
-        spread = float(np.concatenate([first, second]).std())
-        if not np.isfinite(spread):
-            return None
-        found.append((first.mean() - second.mean()) / spread if spread > 0 else 0.0)
-    return float(np.mean(found)) if found else None
+    order = data.order[cells.rows]
+    if not np.isfinite(order).all():
+        return None
+    sums, of_visit = cells.sums(order), cells.cell // 2
+    n = cells.counts.sum(1)
+    away = order - (sums.sum(1) / n)[of_visit]
+    spread = np.sqrt(np.bincount(of_visit, weights=away**2, minlength=n.size) / n)
+    later = sums[:, 0] / cells.counts[:, 0] - sums[:, 1] / cells.counts[:, 1]
+    return float(np.mean(np.divide(later, spread, out=np.zeros_like(later), where=spread > 0)))
 
 
 def primary(data: Measurements, level: float = 0.95, scale: Scale = "difference") -> Average | Unavailable:
