@@ -3,9 +3,9 @@
     python benchmarks/analyses.py --quick
     python benchmarks/analyses.py [--repeats 7] [--json FILE]
 
-Makes the study once (twenty visits of ten sessions of 10 minutes, in a database of its own) and asks for every page, first with nothing kept
-in memory, then with everything kept. Medians in milliseconds of `cpu`, processor time of the web process, and `wall`, from the request to the
-answer, which contains the database's work and waits for whatever else the machine does.
+Makes the study once (twenty visits of ten sessions of 10 minutes, in a database of its own) and asks for every page, first with
+nothing kept in memory, then with everything kept. Medians in milliseconds of `cpu`, processor time of the web process, and `wall`, from
+the request to the answer, which contains the database's work and waits for whatever else the machine does.
 """
 
 from __future__ import annotations

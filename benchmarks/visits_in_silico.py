@@ -1,14 +1,14 @@
 """Six visits of the synthetic participants, margins locked before: how many questions are concluded, and how many conclusions are true?
 
     python benchmarks/visits_in_silico.py --quick
-    python benchmarks/visits_in_silico.py [--seeds 40] [--visits 6] [--minutes 120] [--json FILE]
+    python benchmarks/visits_in_silico.py [--seeds 40] [--visits 6] [--minutes 120] [--session-minutes 5] [--json FILE]
 
 A question is one controller of one participant in one study: is it non-inferior to cDBS on grasp, rating and tremor, and does it save
-energy? A visit is the day that the service plans (`app.planning.plans.schedule`) with as many policies of the controller as fit into its
-minutes, by default four sessions of the controller with three of cDBS between them, 10 minutes each. The verdict is the service's own
-(`app.analysis.primary.verdict`); the truth is a large sample over other days at the same hours. Beside it stands what a judge would conclude
-of the same sessions who knows the standard deviation of every outcome's contrast (`known`): no test of these averages can do better. The
-participants are synthetic and not fitted to patients. CPU seconds of one thread.
+energy? A visit is the day that the service plans (`app.planning.plans.schedule`) with as many sessions of the controller as fit into its
+minutes, a cDBS session between any two of them: of 5 minutes six against five, of 10 minutes four against three. The verdict is the
+service's own (`app.analysis.primary.verdict`); the truth is a large sample over other days at the same hours. Beside it, `bound` is what
+would be concluded from the same averages by somebody who knows the standard deviation of every outcome: no test of these averages at
+these levels can conclude much more. The participants are synthetic and not fitted to patients. CPU seconds of one thread.
 """
 
 from __future__ import annotations
@@ -24,16 +24,19 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
+from scipy.special import ndtr
 
 from app.analysis.evidence.facts import Facts
 from app.analysis.primary.verdict import LockedMargins, verdicts
+from app.planning.plans.schedule import Candidate, Rules, most_policies, schedule
 from app.study.blinding import Arm
 from app.study.models import Controller
 from ml.policies.policy import ConstantPolicy
 from ml.population import PARTICIPANTS, run_sessions
-from ml.population.sessions import SessionBatch
 from ml.qoc import Margins
-from ml.statistics.noninferiority import Inferior, NonInferiorAndSaving
+from ml.statistics.multiplicity import holm
+from ml.statistics.noninferiority import Assessment, Inferior, NonInferiorAndSaving
+from ml.statistics.within_visits.contrasts import Average, Unavailable
 
 out = sys.stdout.write
 STEPS_PER_MINUTE = 30
@@ -43,45 +46,49 @@ LEVELS = (0.75, 0.5, 0.3)
 MARGINS = Margins()
 LOCKED_AT = datetime(2026, 1, 1, tzinfo=UTC)
 TRUTH_SESSIONS = 200
+GOOD, BAD, OPEN = "good", "bad", ""
 Means = dict[str, float]
 
 
 @dataclass(frozen=True)
 class Day:
-    """The planned day: places in it and hours since its start by arm, steps of a session."""
+    """The planned day: places in it and hours since its start, of the controller (True) and of cDBS, and steps of a session."""
 
-    places: dict[bool, tuple[int, ...]]
-    hours: dict[bool, tuple[float, ...]]
+    places: dict[bool, list[int]]
+    hours: list[float]
     steps: int
 
     @classmethod
-    def planned(cls, minutes: float) -> Day:
-        """The service's plan with as many policies as fit."""
-        rules = Rules(total_minutes=minutes)
+    def planned(cls, rules: Rules) -> Day:
+        """The service's plan with as many sessions of the controller as fit."""
         sessions = schedule([Candidate(i, Controller.RL) for i in range(most_policies(rules))], rules, seed=0)
-        arms = {tested: [i for i, s in enumerate(sessions) if (s.controller is Controller.RL) == tested] for tested in (True, False)}
-        hours = {tested: tuple(sessions[i].start_minute / 60 for i in places) for tested, places in arms.items()}
-        return cls({tested: tuple(places) for tested, places in arms.items()}, hours, round(rules.session_minutes * STEPS_PER_MINUTE))
+        places = {tested: [i for i, s in enumerate(sessions) if (s.controller is Controller.RL) == tested] for tested in (True, False)}
+        return cls(places, [s.start_minute / 60 for s in sessions], round(rules.session_minutes * STEPS_PER_MINUTE))
+
+    def of(self, level: float) -> list[int]:
+        """Places of a level; 1 is cDBS."""
+        return self.places[level != 1]
 
 
 @dataclass(frozen=True)
 class Question:
-    """One question: what was concluded (`good`, `bad` or nothing), whether that is true, and the average loss of every outcome.
-
-    Attributes:
-        losses: average over visits by outcome, in margins. spread: variance of one visit's contrast as estimated, in squared margins.
-    """
+    """One question: what was concluded, by the service and with known standard deviations, and what the conclusion may be."""
 
     participant: str
     level: float
     concluded: str
+    bound: str
     true: bool | None
-    losses: dict[str, float]
-    spread: dict[str, float]
 
 
-def metrics(batch: SessionBatch) -> list[dict[str, float]]:
-    """The metrics of every session."""
+def simulate(
+    code: str, level: float, visits: Sequence[int], hours: Sequence[float], studies: Sequence[int], steps: int, seed: int
+) -> list[Means]:
+    """The metrics of sessions at a constant level."""
+    rng = np.random.default_rng([seed, round(100 * level)])
+    controller = "cdbs" if level == 1 else ConstantPolicy(level)
+    seeds = rng.integers(0, 2**63, len(visits), dtype=np.uint64)
+    batch = run_sessions(code, controller, visits=visits, hours=hours, seeds=seeds, study_seed=studies, steps=steps)
     found = []
     for amplitude, outcome in zip(batch.amplitude, batch.outcomes, strict=True):
         qoc = outcome.qoc
@@ -90,22 +97,11 @@ def metrics(batch: SessionBatch) -> list[dict[str, float]]:
     return found
 
 
-def simulate(code: str, level: float, visits: Sequence[int], hours: Sequence[float], studies: Sequence[int], seed: int) -> SessionBatch:
-    """Sessions at a constant level (1 is cDBS)."""
-    rng = np.random.default_rng([seed, round(100 * level)])
-    controller = "cdbs" if level == 1 else ConstantPolicy(level)
-    seeds = rng.integers(0, 2**63, len(visits), dtype=np.uint64)
-    return run_sessions(code, controller, visits=visits, hours=hours, seeds=seeds, study_seed=studies, steps=STEPS)
-
-
-def truth(code: str, level: float, seed: int) -> Means:
+def truth(code: str, level: float, day: Day, seed: int) -> Means:
     """True means of a level over days, at the hours of its sessions."""
-    places = 2 * np.arange(EACH) + (level != 1)
-    n = TRUTH_SESSIONS
-    rng = np.random.default_rng(seed)
-    hours = HOURS_APART * rng.choice(places, n)
-    batch = simulate(code, level, rng.integers(1, 7, n).tolist(), hours.tolist(), rng.integers(1, 2**62, n).tolist(), seed + 1)
-    rows = metrics(batch)
+    rng, n = np.random.default_rng(seed), TRUTH_SESSIONS
+    hours = rng.choice([day.hours[i] for i in day.of(level)], n)
+    rows = simulate(code, level, rng.integers(1, 7, n).tolist(), hours.tolist(), rng.integers(1, 2**62, n).tolist(), day.steps, seed + 1)
     return {name: float(np.mean([r[name] for r in rows if name in r])) for name in ("energy", "grasp", "rating", "tremor")}
 
 
@@ -116,45 +112,72 @@ def beyond(level: Means, cdbs: Means) -> set[str]:
     return {name for name, loss in losses.items() if loss > margins[name]}
 
 
-def day(visit: int) -> datetime:
+def recorded(visit: int) -> datetime:
     """When a visit's sessions were recorded: after the lock."""
     return LOCKED_AT + timedelta(days=28 * visit)
 
 
-def study(code: str, seed: int, visits: int) -> dict[float, list[Facts]]:
-    """Sessions of one study by level, cDBS among them under 1."""
-    found = {}
-    for level in (1.0, *LEVELS):
-        days = np.repeat(np.arange(1, visits + 1), EACH)
-        place = np.tile(2 * np.arange(EACH) + (level != 1), visits)
-        batch = simulate(code, level, days.tolist(), (HOURS_APART * place).tolist(), [seed + 1] * days.size, 7919 * (seed + 1))
-        arm = Arm(Controller.CDBS if level == 1 else Controller.RL, None)
-        found[level] = [
-            Facts(i, int(v), int(v), int(p), arm, None, None, day(int(v)), 300.0, row, {}, None, None, (), None, None)
-            for i, (v, p, row) in enumerate(zip(days, place, metrics(batch), strict=True))
-        ]
-    return found
+def studies(code: str, level: float, day: Day, seeds: int, visits: int) -> list[list[Facts]]:
+    """The sessions of a level in every study."""
+    mine = day.of(level)
+    of_visit = np.tile(np.repeat(np.arange(1, visits + 1), len(mine)), seeds).tolist()
+    hours = np.tile([day.hours[i] for i in mine], visits * seeds).tolist()
+    rows = simulate(code, level, of_visit, hours, np.repeat(np.arange(seeds) + 1, visits * len(mine)).tolist(), day.steps, 7919)
+    arm = Arm(Controller.CDBS if level == 1 else Controller.RL, None)
+    facts = [
+        Facts(i, v, v, mine[i % len(mine)], arm, None, None, recorded(v), 60.0 * day.steps / STEPS_PER_MINUTE, row, {}, None, None, (),
+              None, None)
+        for i, (v, row) in enumerate(zip(of_visit, rows, strict=True))
+    ]  # fmt: skip
+    each = visits * len(mine)
+    return [facts[k * each : (k + 1) * each] for k in range(seeds)]
 
 
-def questions(code: str, seeds: Sequence[int], visits: int) -> list[Question]:
+def known_spread(found: Sequence[Assessment]) -> dict[str, float]:
+    """Standard deviation of the average of every outcome, from all studies together."""
+    spread: dict[str, list[float]] = {}
+    for one in found:
+        for o in one.outcomes:
+            if isinstance(o.average, Average):
+                spread.setdefault(o.name, []).append(o.average.standard_error**2)
+    return {name: max(float(np.sqrt(np.mean(squares))), 1e-9) for name, squares in spread.items()}
+
+
+def bound(found: Assessment, spread: dict[str, float]) -> str:
+    """What is concluded where the standard deviations are known."""
+    averages = [(o, o.average) for o in found.outcomes if isinstance(o.average, Average)]
+    lost = [float(ndtr((a.estimate + o.margin) / spread[o.name])) for o, a in averages]
+    if min(holm(lost), default=1.0) < found.alpha:
+        return BAD
+    shown = len(averages) == len(found.outcomes) and all(1 - p < found.alpha for p in lost)
+    saves = not isinstance(found.saving, Unavailable) and found.saving.p_value < found.alpha
+    return GOOD if shown and saves else OPEN
+
+
+def questions(code: str, day: Day, seeds: int, visits: int) -> list[Question]:
     """Every question of one participant."""
-    cdbs = truth(code, 1.0, 101)
-    means = {level: truth(code, level, 101) for level in LEVELS}
+    cdbs, reference = truth(code, 1.0, day, 101), studies(code, 1.0, day, seeds, visits)
     locked = LockedMargins(MARGINS, 1, LOCKED_AT, "benchmark")
-    found = []
-    for seed in seeds:
-        sessions = study(code, seed, visits)
-        for level in LEVELS:
-            (result,) = verdicts([*sessions[1.0], *sessions[level]], [Controller.RL], locked)
-            verdict = result.assessment.verdict if result.assessment else None
-            harmed = beyond(means[level], cdbs)
+    asked = []
+    for level in LEVELS:
+        mean = truth(code, level, day, 101)
+        harmed, saves = beyond(mean, cdbs), mean["energy"] < cdbs["energy"]
+        results = []
+        for theirs, ours in zip(reference, studies(code, level, day, seeds, visits), strict=True):
+            (result,) = verdicts([*theirs, *ours], [Controller.RL], locked)
+            if result.assessment is None:
+                raise SystemExit(f"{code} at {level}: no verdict, {result.no_verdict}")
+            results.append(result.assessment)
+        spread = known_spread(results)
+        for found in results:
+            verdict, known = found.verdict, bound(found, spread)
             if isinstance(verdict, NonInferiorAndSaving):
-                found.append(Question(code, level, "good", not harmed and means[level]["energy"] < cdbs["energy"]))
+                asked.append(Question(code, level, GOOD, known, not harmed and saves))
             elif isinstance(verdict, Inferior):
-                found.append(Question(code, level, "bad", set(verdict.outcomes) <= harmed))
+                asked.append(Question(code, level, BAD, known, set(verdict.outcomes) <= harmed))
             else:
-                found.append(Question(code, level, "", None))
-    return found
+                asked.append(Question(code, level, OPEN, known, None))
+    return asked
 
 
 def main() -> None:
@@ -162,23 +185,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=40)
     parser.add_argument("--visits", type=int, default=6)
+    parser.add_argument("--minutes", type=float, default=Rules().total_minutes, help="of a visit")
+    parser.add_argument("--session-minutes", type=float, default=5.0)
     parser.add_argument("--quick", action="store_true", help="four seeds")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
-    seeds, started = range(4 if asked.quick else asked.seeds), time.process_time()
-    asks = [q for code in PARTICIPANTS for q in questions(code, seeds, asked.visits)]
+    day = Day.planned(Rules(session_minutes=asked.session_minutes, total_minutes=asked.minutes))
+    seeds, started = 4 if asked.quick else asked.seeds, time.process_time()
+    asks = [q for code in PARTICIPANTS for q in questions(code, day, seeds, asked.visits)]
     concluded = [q for q in asks if q.concluded]
-    out("participant  level  non-inferior and saving  inferior  inconclusive  false\n")
+    out(f"{asked.visits} visits of {len(day.places[True])} sessions of the controller and {len(day.places[False])} of cDBS, ")
+    out(f"{asked.session_minutes:g} minutes each\nparticipant  level  non-inferior and saving  inferior  inconclusive  false  bound\n")
     for code in PARTICIPANTS:
         for level in LEVELS:
             mine = [q for q in asks if (q.participant, q.level) == (code, level)]
-            count = Counter(q.concluded for q in mine)
-            out(f"{code:11}  {level:5.2f}  {count['good']:23}  {count['bad']:8}  {count['']:12}  {sum(q.true is False for q in mine):5}\n")
+            count, known = Counter(q.concluded for q in mine), sum(bool(q.bound) for q in mine)
+            out(f"{code:11}  {level:5.2f}  {count[GOOD]:23}  {count[BAD]:8}  {count[OPEN]:12}  ")
+            out(f"{sum(q.true is False for q in mine):5}  {known:5}\n")
     figures = {
         "questions": len(asks),
         "concluded": len(concluded) / len(asks),
         "true": sum(bool(q.true) for q in concluded) / len(concluded) if concluded else None,
-        "false_non_inferior": sum(q.concluded == "good" and not q.true for q in asks),
+        "false_non_inferior": sum(q.concluded == GOOD and not q.true for q in asks),
+        "bound": sum(bool(q.bound) for q in asks) / len(asks),
         "cpu_s": round(time.process_time() - started, 1),
     }
     out(json.dumps(figures) + "\n")

@@ -85,7 +85,8 @@ def saving_contrasts(energy: Measurements) -> VisitContrasts | Unavailable:
 
 
 def energy_saving(energy: Measurements, level: float = 0.95, *, draws: int = 1999, seed: int = 0) -> Saving | Unavailable:
-    """Energy saved on average over visits: by bootstrap of visits from five visits on, by t below.
+    """Energy saved on average over visits: by bootstrap of visits from five visits on, by t below and where they differ by less than the
+    energy's resolution.
 
     The bootstrap is the one of Student's ratio (Efron and Tibshirani 1993, chapter 12.5): the percentile and BCa intervals of five visits
     cover far less than they state.
@@ -105,7 +106,8 @@ def energy_saving(energy: Measurements, level: float = 0.95, *, draws: int = 199
         return whole
     visits, by_visit = tuple(shares.visit.tolist()), tuple((100 * shares.contrast).tolist())
     low, high, p, method = whole.low, whole.high, whole.p_above(0.0), SavingMethod.STUDENT
-    if shares.visits >= BOOTSTRAP_FROM:
+    # what varies less than its resolution tells nothing of its spread by resampling
+    if shares.visits >= BOOTSTRAP_FROM and float(shares.contrast.var(ddof=1)) > float(shares.floor.mean()):
         ratios = student_ratios(shares.contrast, draws, seed)
         top, bottom = np.quantile(ratios, [(1 + level) / 2, (1 - level) / 2])
         low = whole.estimate - float(top) * whole.standard_error

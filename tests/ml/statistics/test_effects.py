@@ -72,3 +72,13 @@ def test_a_stated_resolution_gives_equal_savings_an_interval():
     found = energy_saving(coarse)
     assert found.low < 30 < found.high
     assert found.p_value < 0.01
+
+
+def test_a_saving_that_never_varies_is_held_against_the_resolution():
+    exact = energies([0.4] * 6)
+    assert energy_saving(exact) == Unavailable(Reason.NO_VARIANCE)
+    found = energy_saving(Measurements.of(exact.value, exact.visit, exact.tested, resolution=0.05))
+    # floor of one visit: 0.05^2 / 12 * (1/2 + 1/2); t with 5 degrees of freedom
+    half = 2.570582 * 0.05 / 12**0.5 / 6**0.5
+    assert (found.percent, found.method) == (pytest.approx(40.0), SavingMethod.STUDENT)
+    assert (found.low, found.high) == pytest.approx((40 - 100 * half, 40 + 100 * half), abs=1e-4)

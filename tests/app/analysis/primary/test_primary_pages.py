@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
@@ -109,6 +110,18 @@ def test_the_lock_holds_what_was_locked_and_new_margins_need_a_new_one(client: T
     assert client.get(PRIMARY).json()["margins"] | {"locked_at": 0} == {
         "version": 1, "grasp_share": 0.1, "rating_points": 1.0, "tremor_points": 10.0, "locked_at": 0, "locked_by": "admin@clinic.example",
     }  # fmt: skip
+
+
+def test_a_constant_amplitude_saves_though_its_energy_never_varies(client: TestClient, add_session: AddSession) -> None:
+    lock(client)
+    rng = np.random.default_rng(3)
+    for visit in range(1, 7):
+        for fraction in (1.0, 0.8, 0.8, 1.0, 1.0, 0.8):
+            outcomes = {"grasp": 2.4 + 0.05 * rng.normal(), "rating": 7, "tremor": float(rng.uniform(5, 8))}
+            add_session("cdbs" if fraction == 1 else "rl", fraction=fraction, visit=visit, **outcomes)
+    (found,) = client.get(PRIMARY).json()["verdicts"]
+    assert found["verdict"] == "non_inferior_and_saving"
+    assert found["energy_saving_percent"]["estimate"] == pytest.approx(36.0, abs=1e-4)
 
 
 def test_a_controller_that_loses_grasp_is_inferior_in_one_sentence(client: TestClient, add_visits: AddVisits) -> None:
