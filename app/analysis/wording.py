@@ -137,6 +137,22 @@ def _more(found: Inconclusive) -> str:
     return f"by what was seen so far, even {MOST_VISITS} more visits would not settle it"
 
 
+def outlook(result: VerdictResult, sessions_per_arm: int) -> str:
+    """What further visits would settle of a controller, for the plan of the next one."""
+    name, a = CONTROLLER_NAMES[result.controller], result.assessment
+    if a is None or not isinstance(a.verdict, Inconclusive):
+        return verdict(result)
+    found = a.verdict
+    if found.more_visits is None:
+        return f"{name}: {_more(found)}."
+    visits, arms = _n(found.more_visits, "more visit"), _n(sessions_per_arm, "session")
+    settled = f"{name}: {visits}, each with {arms} of it and as many of cDBS, would show with a probability of 80 % that it saves energy"
+    settled += " without loss, if what was seen holds"
+    if found.fewest_visits is not None and found.fewest_visits < found.more_visits:
+        return f"{settled}. With more sessions at each it is {_n(found.fewest_visits, 'visit')} at the least."
+    return f"{settled}. More sessions at a visit would not replace one."
+
+
 def verdict_kind(result: VerdictResult, locked: LockedMargins) -> str:
     """Whether a verdict confirms, and why not."""
     if result.confirmatory:

@@ -34,6 +34,8 @@ Floats = NDArray[np.float64]
 
 LEAST_VISITS = 3
 WANTED_POWER = 0.8
+PLANNED_SESSIONS = 3
+"""Sessions of either arm in a further visit, where nobody states another number."""
 ENERGY = "energy"
 
 
@@ -140,12 +142,14 @@ class Inconclusive:
     Attributes:
         open: outcomes (or `energy`) that are not shown yet.
         more_visits: further visits after which a conclusion has a probability of `WANTED_POWER`; None where `MOST_VISITS` are not enough.
+        fewest_visits: the same with any number of sessions in each of them: what sessions cannot replace.
         reason: why nothing could be tested; None where the tests were made.
     """
 
     open: tuple[str, ...]
     more_visits: int | None
     reason: Reason | None = None
+    fewest_visits: int | None = None
 
 
 Verdict = NonInferiorAndSaving | Inferior | Inconclusive
@@ -176,7 +180,7 @@ def assess(
     *,
     alpha: float = 0.05,
     level: float = 0.95,
-    sessions_per_arm: int = 3,
+    sessions_per_arm: int = PLANNED_SESSIONS,
     seed: int = 0,
     plan: bool = True,
 ) -> Assessment:
@@ -202,7 +206,8 @@ def assess(
     saving = energy_saving(spent, level, seed=seed)
     verdict = _verdict(results, saving, alpha)
     if plan and isinstance(verdict, Inconclusive):
-        verdict = replace(verdict, more_visits=_more_visits(outcomes, spent, alpha, sessions_per_arm, seed))
+        more, fewest = _more_visits(outcomes, spent, alpha, sessions_per_arm, seed)
+        verdict = replace(verdict, more_visits=more, fewest_visits=fewest)
     others = []
     failed = bool(stopped.any()) or any(o.stopped.any() for o in outcomes)
     for other in (FailureRule.BOTH_ARMS, FailureRule.AS_MEASURED):
@@ -275,19 +280,24 @@ def _verdict(results: Sequence[OutcomeResult], saving: Saving | Unavailable, alp
     return NonInferiorAndSaving(saving.percent, saving.low, saving.high)
 
 
-def _more_visits(outcomes: Sequence[Outcome], energy: Measurements, alpha: float, sessions: int, seed: int) -> int | None:
-    """Fewest further visits after which all is shown with the wanted probability, outcomes taken as independent."""
-    chances = np.ones(MOST_VISITS)
-    for i, outcome in enumerate(outcomes):
-        found = posterior(outcome.counted(FailureRule.WORST_CASE), outcome.scale, seed=seed + i)
-        if isinstance(found, Unavailable):
-            return None
-        chances *= success(found, Target(outcome.loss, "greater", alpha, LEAST_VISITS), sessions, seed=seed + 100 + i).mean(0)
+def _more_visits(
+    outcomes: Sequence[Outcome], energy: Measurements, alpha: float, sessions: int, seed: int
+) -> tuple[int | None, int | None]:
+    """Fewest further visits after which all is shown with the wanted probability, outcomes taken as independent.
+
+    Returns:
+        With so many sessions of either arm at each, and with any number of them.
+    """
+    chances, limit = np.ones(MOST_VISITS), np.ones(MOST_VISITS)
     shares = _energy_posterior(energy, seed)
-    if isinstance(shares, Unavailable):
-        return None
-    chances *= success(shares, Target(0.0, "greater", alpha, LEAST_VISITS), sessions, seed=seed + 99).mean(0)
-    return first_reaching(chances, WANTED_POWER)
+    posteriors = [(posterior(o.counted(FailureRule.WORST_CASE), o.scale, seed=seed + i), o.loss) for i, o in enumerate(outcomes)]
+    for i, (found, value) in enumerate([*posteriors, (shares, 0.0)]):
+        if isinstance(found, Unavailable):
+            return None, None
+        target = Target(value, "greater", alpha, LEAST_VISITS)
+        chances *= success(found, target, sessions, seed=seed + 100 + i).mean(0)
+        limit *= success(found, target, np.inf, seed=seed + 100 + i).mean(0)
+    return first_reaching(chances, WANTED_POWER), first_reaching(limit, WANTED_POWER)
 
 
 def _energy_posterior(energy: Measurements, seed: int) -> Posterior | Unavailable:

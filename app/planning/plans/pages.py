@@ -257,6 +257,7 @@ def _page(
         plan_method=method_name(view.evaluation.default_method) if view and view.evaluation else "",
         choices=choices,
         suggestions=[(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],
+        outlook=request.app.state.outlook(db, participant, caller),
         form_values=form,
         chosen=_chosen(full if view is full else None, values),
         movable=_movable(view),

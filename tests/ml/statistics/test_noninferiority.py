@@ -78,6 +78,7 @@ def test_one_outcome_not_shown_leaves_all_open_and_names_the_visits_it_takes():
     easy = assess(*study(visits=2, seed=3)).verdict
     assert isinstance(easy, Inconclusive)
     assert easy.more_visits is not None
+    assert 1 <= easy.fewest_visits <= easy.more_visits  # sessions can replace some visits, never all
 
 
 def test_energy_is_tested_only_behind_the_gate_and_is_open_where_nothing_is_saved():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import permutation_test, rankdata
 
 from ml.statistics.ranksum import rank_sum, u_distribution_given_ties
 
@@ -31,6 +32,22 @@ def test_the_exact_p_is_that_of_enumeration_ties_or_not(x: list[int], y: list[in
     result = rank_sum(x, y)
     assert result.method == "exact"
     assert result.p_value == pytest.approx(enumerated_p([float(v) for v in x], [float(v) for v in y]), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("x", "y"),
+    [([7, 7, 8, 6], [6, 6, 7, 5, 8]), ([1, 1, 1], [1, 2, 2, 3]), ([5, 5, 5, 9], [5, 5, 5, 5, 1]), ([0, 0, 0, 4, 4], [0, 0, 4, 4, 4])],
+)
+def test_the_exact_p_of_ratings_is_that_of_scipys_permutation_test(x: list[int], y: list[int]) -> None:
+    ranks = rankdata([*x, *y])
+    found = permutation_test(
+        (ranks[: len(x)], ranks[len(x) :]),
+        lambda first, _: first.sum(),
+        permutation_type="independent",
+        n_resamples=np.inf,
+        vectorized=False,
+    )
+    assert rank_sum(x, y).p_value == pytest.approx(found.pvalue, abs=1e-12)
 
 
 def test_all_values_equal_says_nothing() -> None:

@@ -153,6 +153,18 @@ def test_a_session_stopped_for_the_patients_sake_is_a_failure(client: TestClient
     assert "counts as a failure" in client.get(PAGE).text
 
 
+def test_the_plan_of_the_next_visit_says_how_many_would_settle_it(client: TestClient, add_visits: AddVisits) -> None:
+    lock(client)
+    visit = client.get("/api/v1/participants/P1/visits").json()["items"][0]["id"]
+    assert 'id="outlook"' not in client.get(f"/visits/{visit}/plan").text
+    add_visits(2)
+    more = client.get(PRIMARY).json()["verdicts"][0]["more_visits"]
+    assert more >= 1
+    page = client.get(f"/visits/{visit}/plan").text
+    assert f"RL: {more} more visit" in page
+    assert "each with 3 sessions of it and as many of cDBS, would show with a probability of 80 %" in page
+
+
 def test_holm_covers_the_planned_family(client: TestClient, add_visits: AddVisits, add_session: AddSession) -> None:
     add_visits(4)
     for visit in (1, 2, 3, 4):
