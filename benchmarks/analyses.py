@@ -29,7 +29,7 @@ from app.accounts import service as accounts
 from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM
 from app.main import create_app, leave_to_itself
-from app.platform import kept as evidence
+from app.platform import kept
 from app.platform.database import new_session, set_actor, transaction
 from app.platform.migrate import migrate
 from app.settings import get_settings
@@ -104,7 +104,7 @@ def milliseconds(client: TestClient, path: str, repeats: int, *, keep: bool) -> 
     cpu, wall = [], []
     for _ in range(repeats + 1):
         if not keep:
-            evidence.forget()
+            kept.forget()
         started, began = time.perf_counter(), time.process_time()
         client.get(path).raise_for_status()
         cpu.append(1000 * (time.process_time() - began))

@@ -24,11 +24,11 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
+from app.planning.plans.schedule import Candidate, Rules, most_policies, schedule
 from scipy.special import ndtr
 
 from app.analysis.evidence.facts import Facts
 from app.analysis.primary.verdict import LockedMargins, verdicts
-from app.planning.plans.schedule import Candidate, Rules, most_policies, schedule
 from app.study.blinding import Arm
 from app.study.models import Controller
 from ml.policies.policy import ConstantPolicy
