@@ -123,9 +123,12 @@ class FiveMetrics:
     limits: list[str]
 
 
-def five_metrics(db: Session, participant: Participant, caller: Caller) -> FiveMetrics:
-    """Energy, mean beta, grasp, rating and tremor of every session, by controller and by policy, each compared with cDBS."""
-    return of_all(db, [participant], [evidence(db, participant, caller)])[0]
+def five_metrics(db: Session, participant: Participant, caller: Caller, held: Evidence | None = None) -> FiveMetrics:
+    """Energy, mean beta, grasp, rating and tremor of every session, by controller and by policy, each compared with cDBS.
+
+    `held`: the evidence, where it is at hand.
+    """
+    return of_all(db, [participant], [held or evidence(db, participant, caller)])[0]
 
 
 def of_all(db: Session, participants: Sequence[Participant], held: Sequence[Evidence]) -> list[FiveMetrics]:
