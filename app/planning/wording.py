@@ -99,6 +99,7 @@ def contradiction(found: Contradiction, slots: Sequence[SlotOut]) -> str:
     return f"Session {position} has {len(found.entries)} different {what}: {said}. None counts until one is chosen."
 
 
+MAY_NOT_RUN = "This plan may not run any more. A clinician who may open its key sees why on the page of the plan."
 STOPPED_FOR_PARTICIPANT = "stopped for the participant's sake on the clinic day"
 
 

@@ -55,8 +55,19 @@ class App {
     await (over ? this.store.dropDay(visit) : this.store.keepDay(this.day));
   }
 
+  // Nothing is drawn anew between finger down and finger up: the button under the finger would be another, and the tap lost.
   draw() {
-    if (this.day) draw(root, this);
+    if (this.pressed) this.late = true;
+    else if (this.day) draw(root, this);
+  }
+
+  watchFingers() {
+    const released = () => setTimeout(() => {
+      this.pressed = false;
+      if (this.late) { this.late = false; this.draw(); }
+    });
+    root.addEventListener("pointerdown", () => { this.pressed = true; });
+    for (const kind of ["pointerup", "pointercancel"]) addEventListener(kind, released);
   }
 }
 
@@ -104,6 +115,7 @@ async function boot() {
   await app.keep();
   if (plain) plain.remove();
   root.hidden = false;
+  app.watchFingers();
   app.draw();
   app.link.send();
   setInterval(() => tick(root, app), 250);

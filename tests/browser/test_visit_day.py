@@ -228,6 +228,20 @@ def test_a_severe_side_effect_tells_to_return_to_clinical_settings(window: Calla
     assert stored(clinic_day) == ["start", "dyskinesia", "stop", "stop_cause", "rating", "session_end", "clinical_settings"]
 
 
+def test_a_tap_is_not_lost_when_something_arrives_under_the_finger(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
+    watched = window(768, 1024)
+    watched.sign_in()
+    open_day(watched, clinic_day)
+    tap(watched, "start")
+    box = watched.page.locator("[data-act=stop]").bounding_box()
+    watched.page.mouse.move(box["x"] + 20, box["y"] + 20)
+    watched.page.mouse.down()
+    watched.page.evaluate("() => { dispatchEvent(new Event('online')); }")  # sends, and draws the page when it has sent
+    watched.page.wait_for_timeout(1500)
+    watched.page.mouse.up()
+    watched.page.wait_for_selector("section[data-state=asked]")
+
+
 def test_grasps_are_counted_for_ten_seconds(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     watched = window(768, 1024)
     watched.sign_in()

@@ -1,6 +1,6 @@
 """A whole visit as the clinic walks it: engineer, clinician, coordinator and the tablet, from the signed plan to the next generation.
 
-With `BETALOOP_SCREENSHOTS` set to a folder the pictures of docs/visit.md are taken on the way.
+With `BETALOOP_SCREENSHOTS` set to a folder (docs/visit, for those of docs/visit.md) pictures are taken on the way.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SHOTS = Path(os.environ["BETALOOP_SCREENSHOTS"]) if "BETALOOP_SCREENSHOTS" in os
 def shot(watched: Watched, name: str) -> None:
     if SHOTS:
         SHOTS.mkdir(parents=True, exist_ok=True)
-        watched.page.screenshot(path=SHOTS / f"{name}.png")
+        watched.page.screenshot(path=SHOTS / f"{name}.jpg", type="jpeg", quality=30)
 
 
 def sign_in_as(watched: Watched, who: str, path: str) -> None:
@@ -147,7 +147,8 @@ def test_a_visit_from_the_signed_plan_to_the_next_generation(
             run_on_the_tablet(client, policies[slot["detail"]], number, logs[-1])
         else:
             conventional(logs[-1])
-        shot(tablet, f"2-running-{number}")
+        if number == 1:
+            shot(tablet, "2-running")
         if number == 2:
             context.set_offline(True)
         rate(tablet, 6 + number, f"2.{number}")
@@ -156,6 +157,7 @@ def test_a_visit_from_the_signed_plan_to_the_next_generation(
             shot(tablet, "3-no-connection")
             tablet.page.reload()
             tablet.page.wait_for_selector("section[data-state=running]")
+        tablet.page.wait_for_selector("[data-act='gait-none'][aria-pressed=true]")  # what is shown as entered is on the disk
         if number == 3:
             kill_browser(profile)
             context = launch(profile, executable_path=program(), args=FLAGS, viewport={"width": 768, "height": 1024})
@@ -166,7 +168,8 @@ def test_a_visit_from_the_signed_plan_to_the_next_generation(
         tap(tablet, "stop")
         tap(tablet, "cause-other")
         context.set_offline(False)
-        shot(tablet, f"4-asked-{number}")
+        if number == 3:
+            shot(tablet, "4-asked")
         tap(tablet, "finish")
     tap(tablet, "back")
     tablet.page.wait_for_selector("text=All entries are sent; none is left on this tablet.")
@@ -185,3 +188,18 @@ def test_a_visit_from_the_signed_plan_to_the_next_generation(
     coordinator.page.wait_for_function("() => document.querySelectorAll('[data-upload-list] li .badge').length >= 3", timeout=60_000)
     coordinator.open(f"/participants/{enrolled}/proposals")
     shot(coordinator, "6-proposals")
+    coordinator.page.click("button[value='confirm:all']")
+    coordinator.page.wait_for_selector("text=Just confirmed")
+    coordinator.open(f"/visits/{visit}")
+    shot(coordinator, "7-visit")
+    sessions = client.get(f"/api/v1/visits/{visit}/sessions").json()["items"]
+    ran = sorted((s["controller"], s["policy_id"] or 0) for s in sessions)
+    assert ran == [("cdbs", 0), *sorted(("rl", policy) for policy in policies.values())]
+
+    # the engineer starts the next generation
+    engineer.open(f"/participants/{enrolled}/jobs")
+    engineer.page.select_option("[name=preset]", "quick")
+    engineer.page.click("button:has-text('Start job')")
+    engineer.page.wait_for_url("**/jobs/*")
+    shot(engineer, "8-next-generation")
+    assert engineer.errors + coordinator.errors == []

@@ -6,21 +6,22 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.planning import wording
 from app.planning.plans.designs import Planned
-from app.planning.plans.models import Plan, PlanItem
+from app.planning.plans.key import common_limits, sealed
+from app.planning.plans.models import PlanItem
 from app.planning.visit_day.schemas import DayOut, EntryOut, LimitsOut, SlotOut
 from app.planning.visit_day.service import Day
 from app.platform.database import now
 from app.study.blinding import CONTROLLER_NAMES, may_know
-from app.study.models import Controller, Visit
+from app.study.models import Controller
 from app.study.service import may
 
 
 def day_out(day: Day, caller: Caller) -> DayOut:
     """A clinic day for its page."""
     visit, plan = day.visit, day.plan
-    blinded = _blinded(plan, visit, caller)
-    limits = [limits_of(item) for item in plan.items]
-    common = _common(limits) if blinded else None
+    blinded = not may_know(visit, caller) or sealed(plan)
+    shared = common_limits(plan.items)
+    common = LimitsOut.model_validate(shared) if shared else None
     return DayOut(
         visit_id=visit.id,
         visit=visit.number,
@@ -29,10 +30,10 @@ def day_out(day: Day, caller: Caller) -> DayOut:
         plan_id=plan.id,
         blinded=blinded,
         locked=visit.locked,
-        not_runnable=day.not_runnable,
+        not_runnable=wording.MAY_NOT_RUN if blinded and day.not_runnable else day.not_runnable,
         note="" if blinded else plan.note,
         stop_rules=[wording.STOP_RULES],
-        slots=[_slot(item, day, common if blinded else own, blinded) for item, own in zip(plan.items, limits, strict=True)],
+        slots=[_slot(item, day, common if blinded else limits_of(item), blinded) for item in plan.items],
         entries=[EntryOut.model_validate(row) for row in day.entries],
         reader=caller.label,
         may_enter=may(caller, can.WRITE_QOC, visit.participant) and not visit.locked,
@@ -45,11 +46,6 @@ def limits_of(item: PlanItem) -> LimitsOut | None:
     if item.min_ma is None or item.max_ma is None:
         return None
     return LimitsOut(min_ma=item.min_ma, max_ma=item.max_ma, ramp_ma_per_s=item.ramp_ma_per_s)
-
-
-def _blinded(plan: Plan, visit: Visit, caller: Caller) -> bool:
-    """Labels alone: to a blinded assessor always, to everybody while the key of a blinded plan is sealed."""
-    return not may_know(visit, caller) or (plan.blinded and plan.key_opened_at is None)
 
 
 def _slot(item: PlanItem, day: Day, limits: LimitsOut | None, blinded: bool) -> SlotOut:
@@ -74,12 +70,3 @@ def _slot(item: PlanItem, day: Day, limits: LimitsOut | None, blinded: bool) -> 
 
 def _label(item: PlanItem) -> str:
     return f"Controller {item.label}" if item.label else f"Session {item.position}"
-
-
-def _common(limits: list[LimitsOut | None]) -> LimitsOut | None:
-    """What holds for every session, so that it tells none from another; None where the plan does not say it of each."""
-    known = [v for v in limits if v is not None]
-    if not known or len(known) < len(limits):
-        return None
-    ramps = [v.ramp_ma_per_s for v in known if v.ramp_ma_per_s is not None]
-    return LimitsOut(min_ma=min(v.min_ma for v in known), max_ma=max(v.max_ma for v in known), ramp_ma_per_s=max(ramps) if ramps else None)

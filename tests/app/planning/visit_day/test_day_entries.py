@@ -218,3 +218,18 @@ def test_a_locked_visit_still_takes_adverse_events(clinic_day: Any) -> None:
     clinic_day.client.post(f"/api/v1/visits/{clinic_day.visit}/lock", json={"reason": "complete"})
     fall = {"kind": "fall", "severity": "severe", "serious": False, "note": "", "no_names": []}
     assert clinic_day.outcomes(clinic_day.entry("adverse_event", fall)) == ["stored"]
+
+
+def test_a_sealed_plan_shows_its_letters_and_common_limits_to_everybody(client: TestClient, enrolled: str, sign_plan: Any) -> None:
+    visit = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 2, "date": "2099-11-22"}).json()["id"]
+    draft = {"policy_ids": [], "random_sessions": 2, "seed": 1, "blinded": True}
+    assert client.post(f"/api/v1/visits/{visit}/plan", json=draft).status_code == 201
+    assert sign_plan(visit).status_code == 200
+    day = client.get(f"/api/v1/visits/{visit}/day").json()
+    assert day["blinded"] is True
+    assert sorted(s["label"] for s in day["slots"]) == ["Controller A", "Controller B", "Controller C"]
+    assert {(s["controller"], s["detail"], str(s["limits"])) for s in day["slots"]} == {(None, "", str(day["slots"][0]["limits"]))}
+    assert day["slots"][0]["limits"]["min_ma"] < day["slots"][0]["limits"]["max_ma"]
+    page = client.get(f"/visit-day/{visit}", headers={"Accept": "text/html"}).text
+    assert "Random" not in page.split('<div id="plain"')[1]
+    assert "cDBS" not in page.split('<div id="plain"')[1].split("Stop rules")[0]
