@@ -9,6 +9,7 @@ from app.planning.notices import Code, PlanWarning
 from app.planning.plans.designs import Bound, Planned, delivered_ma
 from app.planning.plans.models import Plan, PlanItem
 from app.planning.protocol.orders import Order
+from app.planning.slots.matching import Deviation
 from app.planning.visit_day.record import Contradiction, Entry, grasp_hz, moment
 from app.planning.visit_day.schemas import SlotOut
 from app.planning.visit_day.screening import Found
@@ -177,6 +178,22 @@ ORDER_NAMES = {
     Order.LATIN_SQUARE: "Latin square, balanced over visits",
     Order.STATED: "as stated",
 }
+
+
+DEVIATIONS: dict[Deviation, str] = {
+    Deviation.MISSING: "not found",
+    Deviation.UNPLANNED: "not planned",
+    Deviation.OUT_OF_ORDER: "in another order than planned",
+    Deviation.SHORTER: "shorter than planned",
+    Deviation.LONGER: "longer than planned",
+    Deviation.OTHER_DAY: "held on another day than the visit's",
+}
+
+
+def slots_summary(planned: int, missing: Sequence[str]) -> str:
+    """How many of the planned sessions were found, and which are missing."""
+    found = f"{planned - len(missing)} of {planned} planned sessions found"
+    return found if not missing else f"{found}; {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
 
 
 def order_words(plan: Plan) -> str:

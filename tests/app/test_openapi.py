@@ -98,6 +98,18 @@ INTENDED: dict[str, str] = {
     ),
     **dict.fromkeys(
         (
+            "components > schemas > Deviation",
+            "components > schemas > SlotConfirmation",
+            "components > schemas > SlotRowOut",
+            "components > schemas > SlotsConfirmed",
+            "components > schemas > VisitComparisonOut",
+            "paths > /api/v1/visits/{visit_id}/slots",
+            "paths > /api/v1/visits/{visit_id}/slots/confirm",
+        ),
+        "API: `GET /visits/{id}/slots` holds a visit's sessions against its signed plan",
+    ),
+    **dict.fromkeys(
+        (
             "components > schemas > Code",
             "components > schemas > KeyOpening",
             "components > schemas > KeyOut",

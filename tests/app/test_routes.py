@@ -29,6 +29,7 @@ READABLE = (
     "/api/v1/sessions/{session_id}",
     "/api/v1/sessions/{session_id}/trace",
     "/api/v1/sessions/{session_id}/traces",
+    "/api/v1/sessions/{session_id}/samples",
     "/api/v1/sessions/{session_id}/conditions",
     "/api/v1/sessions/{session_id}/qoc",
     "/api/v1/sessions/{session_id}/outcomes",
@@ -50,6 +51,7 @@ READABLE = (
     "/api/v1/visits/{visit_id}/day",
     "/api/v1/visits/{visit_id}/day/entries",
     "/api/v1/visits/{visit_id}/plan",
+    "/api/v1/visits/{visit_id}/slots",
     "/api/v1/visits/{visit_id}/plan.pdf",
     "/api/v1/bundle-key",
     "/api/v1/participants/{code}/analyses",
@@ -102,6 +104,7 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("post", "/api/v1/visits/{visit_id}/plan"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/visits/{visit_id}/plan/approve"): {"clinician", "admin"},
     ("post", "/api/v1/visits/{visit_id}/day/entries"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/visits/{visit_id}/slots/confirm"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/visits/{visit_id}/plan/moves"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/visits/{visit_id}/plan/key"): {"clinician", "admin"},
     ("post", "/api/v1/visits/{visit_id}/removal"): {"clinician", "engineer", "admin"},
@@ -174,6 +177,8 @@ class World:
         assert drafter.post(f"/api/v1/visits/{held}/plan", json={"random_sessions": 1, "seed": 1}).status_code == 201
         approved = self.send(f"/visits/{held}/plan/approve", json={"password": PASSWORD})["id"]
         slot = self.read(f"/visits/{held}/day")["slots"][0]["plan_item_id"]
+        of_slot = {"participant": "P2", "visit": "88", "controller": "cdbs"}
+        self.send("/uploads", data=of_slot, files={"file": ("day.csv", TABLE.replace(b"2,1,1", b"2,1.88,1", 1))})
         two = {"policy_ids": [p["policy_id"] for p in ranking["policies"][:2]], "order": "stated", "seed": 1}
         moved, blinded, empty = (self.send("/participants/P2/visits", json={"number": n})["id"] for n in (91, 92, 93))
         self.send(f"/visits/{moved}/plan", json=two)
@@ -249,6 +254,8 @@ class World:
                 "visit_id": held,
                 "json": {"plan_id": approved, "entries": [RATED | {"plan_item_id": slot}]},
             },
+            ("get", "/visits/{visit_id}/slots"): {"visit_id": held},
+            ("post", "/visits/{visit_id}/slots/confirm"): {"visit_id": held},
             ("post", "/visits/{visit_id}/plan/moves"): {"visit_id": moved, "json": {"position": 1, "earlier": False}},
             ("post", "/visits/{visit_id}/plan/key"): {"visit_id": blinded, "json": {"reason": "end of the visit"}},
             ("post", "/visits/{visit_id}/removal"): {"visit_id": empty, "json": {"reason": "nobody came"}},

@@ -1,0 +1,146 @@
+"""Which session filled which slot of a plan, pure.
+
+Sessions are aligned with slots in their order, as one aligns two sequences: the assignment that explains most, with no session and no slot
+used twice and none passing another. What is left over is matched out of order where controller and policy say clearly what it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date, datetime, timedelta
+from enum import StrEnum
+
+import numpy as np
+
+from app.study.models import Controller
+
+FAR = timedelta(minutes=60)
+"""A session that began further than this from what the clinic day entered for a slot is another one."""
+NEAR = timedelta(minutes=10)
+_SHARE = 0.2
+"""A session whose length differs from the plan by more than this share is named."""
+
+
+class Deviation(StrEnum):
+    """How what was done departs from the plan."""
+
+    MISSING = "missing"
+    UNPLANNED = "unplanned"
+    OUT_OF_ORDER = "out_of_order"
+    SHORTER = "shorter"
+    LONGER = "longer"
+    OTHER_DAY = "other_day"
+
+
+@dataclass(frozen=True)
+class Planned:
+    """One slot. began: as the clinic day entered it; None where it did not."""
+
+    item_id: int
+    controller: Controller
+    policy_id: int | None
+    minutes: float
+    began: datetime | None = None
+
+
+@dataclass(frozen=True)
+class Done:
+    """One session of the visit; controller and policy None where they are open."""
+
+    session_id: int
+    controller: Controller | None
+    policy_id: int | None
+    duration_s: float
+    began: datetime | None
+    filled: int | None = None
+    """The slot that somebody confirmed it into."""
+
+
+@dataclass(frozen=True)
+class Match:
+    """A slot with the session that fills it, and how it departs; session_id is None for a slot that nothing fills."""
+
+    item_id: int | None
+    session_id: int | None
+    deviations: tuple[Deviation, ...]
+
+
+def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) -> list[Match]:
+    """The slots in their order, each with its session, then sessions that nobody planned.
+
+    Args:
+        slots: in the plan's order. sessions: in the order in which they were held. day: of the visit; None where it has no date.
+    """
+    pairs: dict[int, Done] = {s.filled: s for s in sessions if s.filled is not None}
+    taken = {s.session_id for s in pairs.values()}
+    open_slots = [p for p in slots if p.item_id not in pairs]
+    free = [s for s in sessions if s.session_id not in taken]
+    in_order = _aligned(open_slots, free)
+    pairs |= in_order
+    taken |= {s.session_id for s in in_order.values()}
+    crossed = set()
+    for slot in slots:
+        if slot.item_id in pairs:
+            continue
+        found = next((s for s in free if s.session_id not in taken and _score(slot, s) >= _CLEAR), None)
+        if found is not None:
+            pairs[slot.item_id] = found
+            taken.add(found.session_id)
+            crossed.add(slot.item_id)
+    made = [_judged(slot, pairs.get(slot.item_id), slot.item_id in crossed, day) for slot in slots]
+    return made + [Match(None, s.session_id, (Deviation.UNPLANNED,)) for s in free if s.session_id not in taken]
+
+
+_CLEAR = 3.0
+
+
+def _score(slot: Planned, session: Done) -> float:
+    """How well a session explains a slot; 0 where it cannot be this one."""
+    if session.controller is not None and session.controller is not slot.controller:
+        return 0.0
+    if session.policy_id is not None and session.policy_id != slot.policy_id:
+        return 0.0
+    known = 1.0 if session.controller is None else 2.0 if slot.policy_id is not None and session.policy_id is None else _CLEAR
+    if slot.began is None or session.began is None:
+        return known
+    apart = abs(slot.began - session.began)
+    return 0.0 if apart > FAR else known + (2.0 if apart <= NEAR else 0.0)
+
+
+def _aligned(slots: Sequence[Planned], sessions: Sequence[Done]) -> dict[int, Done]:
+    """The best assignment that keeps the order of both."""
+    best = np.zeros((len(slots) + 1, len(sessions) + 1))
+    for i, slot in enumerate(slots):
+        for j, session in enumerate(sessions):
+            score = _score(slot, session)
+            both = best[i, j] + score if score > 0 else -np.inf
+            best[i + 1, j + 1] = max(best[i, j + 1], best[i + 1, j], both)
+    found: dict[int, Done] = {}
+    i, j = len(slots), len(sessions)
+    while i and j:
+        score = _score(slots[i - 1], sessions[j - 1])
+        # a session goes to the earliest slot that explains as much
+        if best[i, j] == best[i - 1, j]:
+            i -= 1
+        elif best[i, j] == best[i, j - 1]:
+            j -= 1
+        else:
+            assert score > 0
+            found[slots[i - 1].item_id] = sessions[j - 1]
+            i, j = i - 1, j - 1
+    return found
+
+
+def _judged(slot: Planned, session: Done | None, crossed: bool, day: date | None) -> Match:
+    if session is None:
+        return Match(slot.item_id, None, (Deviation.MISSING,))
+    said = [Deviation.OUT_OF_ORDER] if crossed else []
+    planned_s = 60 * slot.minutes
+    if session.duration_s < (1 - _SHARE) * planned_s:
+        said.append(Deviation.SHORTER)
+    elif session.duration_s > (1 + _SHARE) * planned_s:
+        said.append(Deviation.LONGER)
+    if day is not None and session.began is not None and abs((session.began.date() - day).days) > 1:
+        said.append(Deviation.OTHER_DAY)
+    return Match(slot.item_id, session.session_id, tuple(said))

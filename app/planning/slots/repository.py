@@ -1,0 +1,32 @@
+"""Queries of slots and the sessions that fill them. Visits come already scoped to what the caller may see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from app.planning.plans.models import Plan, PlanItem
+from app.study.models import StudySession, Visit
+
+
+def sessions_of_day(db: Session, visit_id: int) -> Sequence[StudySession]:
+    """Sessions of a visit, proposed ones too, in the order in which they were held; those without a start by their place in the visit."""
+    query = select(StudySession).where(StudySession.visit_id == visit_id)
+    return db.scalars(query.order_by(StudySession.started_at.nulls_last(), StudySession.ordinal)).all()
+
+
+def slots_filled(db: Session, participant_ids: Sequence[int]) -> list[tuple[int, int, int, int]]:
+    """(participant, visit, slots of its approved plan, how many of them a confirmed session fills), by visit number."""
+    filled = func.count(StudySession.id).filter(StudySession.status == "confirmed")
+    query = (
+        select(Visit.participant_id, Visit.id, func.count(PlanItem.id), filled)
+        .join(Plan, Plan.visit_id == Visit.id)
+        .join(PlanItem, PlanItem.plan_id == Plan.id)
+        .outerjoin(StudySession, StudySession.plan_item_id == PlanItem.id)
+        .where(Visit.participant_id.in_(participant_ids), Plan.status == "approved")
+        .group_by(Visit.participant_id, Visit.id, Visit.number)
+        .order_by(Visit.participant_id, Visit.number)
+    )
+    return [(int(p), int(v), int(slots), int(done)) for p, v, slots, done in db.execute(query)]

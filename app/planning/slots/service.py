@@ -1,0 +1,199 @@
+"""Planned against done: sessions proposed into the slots of a signed plan, confirmed in one step. The caller commits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.ingest import repository as ingest
+from app.ingest.models import SessionProposal
+from app.ingest.proposals import service as proposals
+from app.ingest.schemas import ProposalChange
+from app.planning.plans import view as plans
+from app.planning.plans.view import PlanLine, PlanView
+from app.planning.slots import repository
+from app.planning.slots.matching import Deviation, Done, Match, Planned, match
+from app.planning.visit_day import repository as clinic_day
+from app.planning.visit_day.record import SlotTimes
+from app.planning.visit_day.session_outcomes import take_outcomes
+from app.platform.errors import BetaloopError, Conflict
+from app.study import service as study
+from app.study.blinding import require_known, stated_arm
+from app.study.models import Controller, StudySession, Visit
+from app.study.sessions.data import session_data
+from app.study.visits.service import require_unlocked
+
+QUANTITIES = ("energy", "grasp_hz", "rating", "tremor_percent")
+"""What is predicted of a session and seen in it: mean squared fraction of cDBS, grasp in Hz, rating 1-10, % of time with tremor."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One slot, or one session that nobody planned.
+
+    Attributes:
+        line: of the plan; None for a session beside it. session: that fills it; None where none was found.
+        confirmed: whether a person has put it there. proposed: whether the session itself waits for confirmation.
+        predicted, done: `QUANTITIES` that are known, by name.
+    """
+
+    line: PlanLine | None
+    session: StudySession | None
+    deviations: tuple[Deviation, ...]
+    confirmed: bool
+    proposed: bool
+    predicted: dict[str, float]
+    done: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A visit as it was planned and as it was held."""
+
+    view: PlanView
+    rows: list[Row]
+
+    @property
+    def planned(self) -> int:
+        """Slots of the plan."""
+        return sum(r.line is not None for r in self.rows)
+
+    @property
+    def found(self) -> int:
+        """Slots that a session fills, confirmed or proposed."""
+        return sum(r.line is not None and r.session is not None for r in self.rows)
+
+    @property
+    def missing(self) -> list[PlanLine]:
+        """Slots that nothing fills."""
+        return [r.line for r in self.rows if r.line is not None and r.session is None]
+
+    @property
+    def waiting(self) -> list[Row]:
+        """Rows that are put into their slot when the visit is confirmed."""
+        return [r for r in self.rows if r.line is not None and r.session is not None and not r.confirmed]
+
+    @property
+    def asks_about_day(self) -> list[Row]:
+        """Those of them that were held on another day than the visit's."""
+        return [r for r in self.waiting if Deviation.OTHER_DAY in r.deviations]
+
+
+def compare(db: Session, visit: Visit, caller: Caller) -> Comparison:
+    """The slots of a visit's signed plan with the sessions that fill them.
+
+    Raises:
+        NotFound: the visit has no plan. Conflict: the plan was never signed. Forbidden: the caller may not know what ran.
+    """
+    require_known(visit, caller)
+    view = plans.read_plan(db, visit, caller)
+    if view.plan.status != "approved":
+        raise Conflict(f"Plan {view.plan.id} of visit {visit.number} is not signed.", "Sessions are held against signed plans alone.")
+    sessions = {s.id: s for s in repository.sessions_of_day(db, visit.id)}
+    times = clinic_day.slot_times(db, view.plan.id)
+    slots = [_planned(line, times) for line in view.lines]
+    lines = {line.item.id: line for line in view.lines}
+    found = match(slots, [_done(s, caller) for s in sessions.values()], visit.date)
+    return Comparison(view, [_row(db, one, lines, sessions) for one in found])
+
+
+def confirm(db: Session, visit: Visit, caller: Caller, *, other_day: bool = False) -> list[str]:
+    """Put every found session into its slot, and confirm those that wait for it, all or none.
+
+    Args:
+        other_day: whether sessions that were held on another day than the visit's are meant all the same.
+
+    Returns:
+        Sentences: what speaks against a session, and what the clinic day says otherwise.
+
+    Raises:
+        Conflict: nothing is found to confirm, the visit is locked, or sessions of another day and nobody said that they are meant.
+        Invalid, Conflict: as confirming a proposal does, with the session's number.
+    """
+    study.require(caller, can.WRITE_STUDY, visit.participant)
+    require_unlocked(visit)
+    found = compare(db, visit, caller)
+    if not found.waiting:
+        raise Conflict(
+            f"Visit {visit.number} has nothing to confirm: no session waits for one of its {found.planned} slots.",
+            "Upload the recordings of the day, or look at the sessions that nobody planned.",
+        )
+    if found.asks_about_day and not other_day:
+        held = [r.session for r in found.asks_about_day if r.session is not None]
+        days = ", ".join(f"session {s.id} of {s.started_at:%Y-%m-%d}" for s in held)
+        raise Conflict(
+            f"Held on another day than visit {visit.number} ({visit.date}): {days}. Are they meant?",
+            "Say so and confirm again, or give these sessions to their own visit.",
+            asks="other_day",
+        )
+    said: list[str] = []
+    waiting = ingest.proposals(db, [r.session.id for r in found.waiting if r.session is not None])
+    for row in found.waiting:
+        said += _fill(db, row, waiting, caller)
+    return said
+
+
+def _fill(db: Session, row: Row, waiting: dict[int, SessionProposal], caller: Caller) -> list[str]:
+    line, session = row.line, row.session
+    assert line is not None
+    assert session is not None
+    said: list[str] = []
+    if row.proposed:
+        stated = {"controller": line.item.controller} | ({"policy": line.policy.name} if line.policy else {})
+        wanted = ProposalChange.model_validate({"version": waiting[session.id].version, **stated, "reason": "as planned"})
+        try:
+            said += proposals.confirm(db, session, wanted, caller)
+        except BetaloopError as error:
+            error.detail = f"Session {session.id}, slot {line.item.position}: {error.detail}"
+            raise
+    session.plan_item_id = line.item.id
+    db.flush()
+    return said + take_outcomes(db, session, caller)
+
+
+def _planned(line: PlanLine, times: dict[int, SlotTimes]) -> Planned:
+    entered = times.get(line.item.id)
+    began = entered.attempts[-1].started_at if entered is not None and entered.attempts else None
+    return Planned(line.item.id, Controller(line.item.controller), line.item.policy_id, line.item.minutes, began)
+
+
+def _done(session: StudySession, caller: Caller) -> Done:
+    arm = stated_arm(session, caller)
+    controller, policy = (arm.controller, arm.policy_id) if arm is not None else (None, None)
+    return Done(session.id, controller, policy, session.duration_s, session.started_at, session.plan_item_id)
+
+
+def _row(db: Session, found: Match, lines: dict[int, PlanLine], sessions: dict[int, StudySession]) -> Row:
+    line = None if found.item_id is None else lines[found.item_id]
+    session = None if found.session_id is None else sessions[found.session_id]
+    return Row(
+        line,
+        session,
+        found.deviations,
+        confirmed=session is not None and line is not None and session.plan_item_id == line.item.id,
+        proposed=session is not None and session.status == "proposed",
+        predicted=_predicted(line),
+        done=_shown(db, session) if session is not None else {},
+    )
+
+
+def _predicted(line: PlanLine | None) -> dict[str, float]:
+    if line is None:
+        return {}
+    named = dict(line.estimate.predicted) if line.estimate else {}
+    if line.predicted_energy is not None:
+        named["energy"] = line.predicted_energy
+    return {name: float(named[name]) for name in QUANTITIES if named.get(name) is not None}
+
+
+def _shown(db: Session, session: StudySession) -> dict[str, float]:
+    """What a session brought; its energy over the steps of known amplitude."""
+    table = session_data(db, session).table
+    fraction = table.fraction[(table.t_s > 0) & ~np.isnan(table.fraction)]
+    found = {"energy": float(np.mean(fraction**2)) if fraction.size else None}
+    found |= {name: getattr(session.qoc, name, None) for name in QUANTITIES[1:]}
+    return {name: float(value) for name, value in found.items() if value is not None}

@@ -1,0 +1,94 @@
+"""A held visit comes back into its plan: found, missing, confirmed in one step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.study.models import StudySession
+
+DAY = "2026-04-06"
+PAGE = {"Accept": "text/html"}
+
+
+def recording(seed: int, controlled: bool) -> str:
+    rows = "".join(f"{2 * k},{1.5 + 0.001 * seed + 0.001 * k},{0.6 if controlled and k % 2 else 1}\n" for k in range(-9, 301))
+    return f"t_s,beta,amplitude_fraction\n{rows}"
+
+
+@pytest.fixture
+def planned(client: TestClient, studied: Any, sign_plan: Callable[..., Any]) -> list[dict[str, Any]]:
+    assert client.patch(f"/api/v1/visits/{studied.visit}", json={"date": DAY, "reason": "agreed"}).status_code == 200
+    body = {"policy_ids": list(studied.policies[:2]), "order": "stated", "repeats": 2, "seed": 1}
+    assert client.post(f"/api/v1/visits/{studied.visit}/plan", json=body).status_code == 201
+    plan = sign_plan(studied.visit).json()
+    sessions: list[dict[str, Any]] = plan["sessions"]
+    assert [s["policy_id"] for s in sessions] == [1, None, 2, None, 1, None, 2]
+    return sessions
+
+
+def send(client: TestClient, number: int, minute: int, *, day: str = DAY, controlled: bool = True, **stated: str) -> dict[str, Any]:
+    data = {"participant": "P1", "visit": "2", "started_at": f"{day}T09:{minute:02d}:00Z", **stated}
+    answer = client.post("/api/v1/uploads", data=data, files={"file": (f"{number}.csv", recording(number, controlled))})
+    assert answer.status_code == 201, answer.text
+    return dict(answer.json())
+
+
+def test_uploads_of_the_day_are_found_in_their_slots_and_confirmed_in_one_step(
+    client: TestClient, studied: Any, planned: list[dict[str, Any]], db: Session
+) -> None:
+    path = f"/api/v1/visits/{studied.visit}/slots"
+    for i, slot in enumerate(planned):
+        if i == 3:
+            continue  # the second cDBS session was not uploaded
+        known = {"controller": slot["controller"]} | ({"policy": slot["policy"]} if slot["policy"] else {})
+        send(
+            client, i, 8 * i, controlled=slot["controller"] == "rl", **(known if i < 5 else {})
+        )  # of the last ones nobody stated the controller
+    found = client.get(path).json()
+    assert (found["planned"], found["found"], found["missing"]) == (7, 6, ["cDBS 2"])
+    assert [r["confirmed"] for r in found["rows"]] == [False] * 7
+    page = client.get(f"/visits/{studied.visit}/slots", headers=PAGE).text
+    assert "6 of 7 planned sessions found; cDBS 2 is missing" in page
+    done = client.post(f"{path}/confirm", json={})
+    assert done.status_code == 200, done.text
+    rows = done.json()["comparison"]["rows"]
+    assert [r["confirmed"] for r in rows] == [True, True, True, False, True, True, True]
+    assert rows[3]["deviations"] == ["missing"]
+    assert rows[0]["predicted"]["energy"] == pytest.approx(0.4)
+    assert rows[0]["done"]["energy"] == pytest.approx((0.36 + 1) / 2)
+    db.expire_all()
+    held = db.scalars(select(StudySession).where(StudySession.visit_id == studied.visit)).all()
+    assert {s.status for s in held} == {"confirmed"}
+    assert len({s.plan_item_id for s in held} - {None}) == 6
+    again = client.post(f"{path}/confirm", json={})
+    assert (again.status_code, "has nothing to confirm" in again.json()["detail"]) == (409, True)
+
+
+def test_sessions_of_another_year_are_asked_about(client: TestClient, studied: Any, planned: list[dict[str, Any]]) -> None:
+    send(client, 1, 0, day="2024-04-06", controller="rl", policy="rl-01")
+    path = f"/visits/{studied.visit}/slots"
+    asked = client.post(f"/api/v1{path}/confirm", json={})
+    assert (asked.status_code, asked.json()["asks"]) == (409, "other_day")
+    assert "2024-04-06" in asked.json()["detail"]
+    assert client.get(f"/api/v1{path}").json()["rows"][0]["deviations"] == ["other_day"]
+    assert "Sessions of another day belong to this visit all the same" in client.get(path, headers=PAGE).text
+    meant = client.post(f"{path}/confirm", data={"other_day": "yes"}, headers=PAGE)
+    assert (meant.status_code, "Confirmed" in meant.text) == (200, True)
+
+
+def test_a_visit_without_recordings_or_a_signature_has_nothing_to_confirm(
+    client: TestClient, studied: Any, sign_plan: Callable[..., Any]
+) -> None:
+    path = f"/api/v1/visits/{studied.visit}/slots"
+    client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
+    unsigned = client.get(path)
+    assert (unsigned.status_code, "is not signed" in unsigned.json()["detail"]) == (409, True)
+    assert sign_plan(studied.visit).status_code == 200
+    assert client.get(path).json()["found"] == 0
+    assert client.post(f"{path}/confirm", json={}).status_code == 409
