@@ -40,6 +40,13 @@ ALGORITHM_NAMES: dict[str, str] = {name: algorithm.title for name, algorithm in 
 """What pages call the algorithm of a policy: those that train, by the table of the learners, and where the others come from."""
 
 
+Aim = Literal["steps", "return", "both"]
+Anchor = Literal["logged", "cdbs", "both"]
+DEFAULT_SWEEP: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "both"}
+"""What the pipeline trains where nothing else is asked for: the paper's algorithm, and one held near what was logged or near cDBS, each
+with and without a share of r_end. DDPG alone went below cDBS in all participants of the demo."""
+
+
 class SweepParams(Model):
     """What a sweep takes: several policies trained in one action. What is left out comes from the preset."""
 
@@ -48,11 +55,11 @@ class SweepParams(Model):
     algorithms: Annotated[list[AlgorithmName], Field(min_length=1, max_length=5)] = Field(
         ["ddpg"], description="The policies are dealt to these in turn; from scratch only."
     )
-    aim: Literal["steps", "return", "both"] = Field(
+    aim: Aim = Field(
         "steps",
         description="What the critics sum: step rewards, as in the paper; each step's share of r_end besides; or one and the other.",
     )
-    anchor: Literal["logged", "cdbs", "both"] = Field(
+    anchor: Anchor = Field(
         "logged",
         description="What TD3+BC and ReBRAC hold the policy near: the logged amplitudes, as published; the cDBS amplitude, so that it "
         "leaves the standard of care only where the values speak for it; or by turns one and the other. The others have no such bond.",

@@ -13,7 +13,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.evaluation.estimates.methods import names as method_names
 from app.learning import repository as learning
-from app.learning.schemas import ALGORITHM_NAMES, AlgorithmName
+from app.learning.schemas import ALGORITHM_NAMES, DEFAULT_SWEEP, AlgorithmName
 from app.learning.snapshots.service import not_ready
 from app.pipeline import charts, service
 from app.pipeline.deps import CurrentJob
@@ -51,7 +51,8 @@ def jobs_page(request: Request, participant: CurrentParticipant, db: Db, caller:
 def start_job(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Start a job from the form; empty fields take the preset's value."""
     given: dict[str, Any] = {name: str(v) for name, v in values.items() if str(v).strip()}
-    given["algorithms"] = [str(v) for v in values.getlist("algorithms")] or ["ddpg"]
+    if algorithms := [str(v) for v in values.getlist("algorithms")]:
+        given["algorithms"] = algorithms
     if methods := [str(v) for v in values.getlist("methods")]:
         given["methods"] = methods
     try:
@@ -154,8 +155,9 @@ def _jobs(
         refresh_s=REFRESH_S,
         problem=problem or (blocked.problem(request.url.path) if blocked else None),
         given=given or {},
+        default_sweep=DEFAULT_SWEEP,
         algorithms=TRAINABLE,
-        given_algorithms=(given or {}).get("algorithms", ["ddpg"]),
+        given_algorithms=(given or {}).get("algorithms", DEFAULT_SWEEP["algorithms"]),
         methods=estimators.methods(),
         given_methods=(given or {}).get("methods", []),
         workers=len(jobs.live_workers(db, job_service.STALE_S)),

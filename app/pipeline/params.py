@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from pydantic import Field
 
 from app.evaluation.estimates.methods import Methods
 from app.evaluation.schemas import EvaluateParams
-from app.learning.schemas import DistilParams, SweepParams, TrainParams
+from app.learning.schemas import DEFAULT_SWEEP, Aim, AlgorithmName, Anchor, DistilParams, SweepParams, TrainParams
 from app.platform.web.schemas import Int, Number
 
 
 class PipelineParams(SweepParams):
-    """What `pipeline` takes: everything between two visits in one job."""
+    """What `pipeline` takes: everything between two visits in one job. The sweep is `DEFAULT_SWEEP` where nothing else is asked for."""
 
+    algorithms: Annotated[list[AlgorithmName], Field(min_length=1, max_length=5)] = Field(
+        DEFAULT_SWEEP["algorithms"], description="The policies are dealt to these in turn; from scratch only."
+    )
+    aim: Aim = Field(DEFAULT_SWEEP["aim"], description="What the critics sum; see `train`.")
+    anchor: Anchor = Field(DEFAULT_SWEEP["anchor"], description="What TD3+BC and ReBRAC hold the policy near; see `train`.")
     updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each policy.")
     actor_lr_low: Number | None = Field(None, gt=0, le=1, description="Lowest learning rate of the policies.")
     actor_lr_high: Number | None = Field(None, gt=0, le=1, description="Highest; in between they are spread evenly in the logarithm.")

@@ -214,7 +214,7 @@ class _Loader:
 
     def submit(self, code: str) -> None:
         """Ask for the between-visit pipeline."""
-        asked = {"kind": "pipeline", "preset": "quick", "algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "both"}
+        asked = {"kind": "pipeline", "preset": "quick"}
         self.state["jobs"][code] = self._post(f"/participants/{code}/jobs", asked)["id"]
         _save(self.path, self.state)
 

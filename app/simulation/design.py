@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from app.learning.schemas import DEFAULT_SWEEP
 from app.platform.errors import Conflict, Invalid
 from ml.population import PARTICIPANTS
 from ml.population.clinic import PlannedSession, plan_day
@@ -40,9 +41,6 @@ class Preset:
     pipeline: dict[str, Any]
 
 
-LEARNING: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "both"}
-"""The paper's algorithm, and one held near what was logged or near cDBS, each with and without a share of r_end: sweeps that differ."""
-
 PRESETS: Final = {
     "quick": Preset(
         visits=3,
@@ -50,11 +48,11 @@ PRESETS: Final = {
         random_sessions=4,
         session_minutes=5,
         policies_per_kind=1,
-        pipeline={"preset": "quick", "count": 4, "updates": 1_000, "distil_updates": 500} | LEARNING,
+        pipeline={"preset": "quick", "count": 4, "updates": 1_000, "distil_updates": 500} | DEFAULT_SWEEP,
     ),
     # about the minutes of the paper's Table 1: 100 of RL, 100 of distilled RL, 35 without stimulation, and cDBS between any two
     "full": Preset(
-        visits=7, random_visits=2, random_sessions=4, session_minutes=10, policies_per_kind=2, pipeline={"preset": "full"} | LEARNING
+        visits=7, random_visits=2, random_sessions=4, session_minutes=10, policies_per_kind=2, pipeline={"preset": "full"} | DEFAULT_SWEEP
     ),
 }
 

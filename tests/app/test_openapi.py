@@ -253,6 +253,10 @@ INTENDED: dict[str, str] = {
         "API: a session has `stopped_reason` and `medication_h`",
     ),
     **dict.fromkeys(
+        tuple(f"components > schemas > PipelineJob > properties > {name} > default" for name in ("aim", "algorithms", "anchor")),
+        "The pipeline trains one default sweep from the page's button, the form, the API and the command line",
+    ),
+    **dict.fromkeys(
         (
             "components > schemas > AskedOut",
             "components > schemas > DifferenceOut",

@@ -15,6 +15,7 @@ from app.evaluation.schemas import EvaluateParams
 from app.evaluation.service import policies_to_rank
 from app.learning.models import Policy
 from app.learning.policies.baselines import constant_onnx
+from app.learning.schemas import DEFAULT_SWEEP
 from app.platform import files
 from app.study.repository import participant_by_code
 from ml.ope.registry import method_keys
@@ -42,6 +43,7 @@ def test_the_quick_preset_runs_its_own_methods_and_named_ones_are_run_once(clien
     upload("random")
     quick = client.post(JOBS, json={"kind": "pipeline", "preset": "quick"}).json()
     assert quick["params"]["methods"] == quick_methods()
+    assert {name: quick["params"][name] for name in DEFAULT_SWEEP} == DEFAULT_SWEEP, "the sweep of the demo, whoever starts it"
     assert set(quick_methods()) < set(method_keys())
     named = client.post(JOBS, json={"kind": "pipeline", "preset": "quick", "methods": ["dual_dice", "wis", "dual_dice"]}).json()
     assert named["params"]["methods"] == ["dual_dice", "wis"]
