@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
@@ -17,16 +19,28 @@ def sessions_of_day(db: Session, visit_id: int) -> Sequence[StudySession]:
     return db.scalars(query.order_by(StudySession.started_at.nulls_last(), StudySession.ordinal)).all()
 
 
-def slots_filled(db: Session, participant_ids: Sequence[int]) -> list[tuple[int, int, int, int]]:
-    """(participant, visit, slots of its approved plan, how many of them a confirmed session fills), by visit number."""
+@dataclass(frozen=True)
+class Filled:
+    """How many slots of a visit's approved plan a confirmed session fills."""
+
+    participant_id: int
+    visit_id: int
+    number: int
+    date: date | None
+    slots: int
+    filled: int
+
+
+def slots_filled(db: Session, participant_ids: Sequence[int]) -> list[Filled]:
+    """Of every visit whose approved plan has limits in mA, by participant and visit number; plans of earlier versions have none."""
     filled = func.count(StudySession.id).filter(StudySession.status == "confirmed")
     query = (
-        select(Visit.participant_id, Visit.id, func.count(PlanItem.id), filled)
+        select(Visit.participant_id, Visit.id, Visit.number, Visit.date, func.count(PlanItem.id), filled)
         .join(Plan, Plan.visit_id == Visit.id)
         .join(PlanItem, PlanItem.plan_id == Plan.id)
         .outerjoin(StudySession, StudySession.plan_item_id == PlanItem.id)
-        .where(Visit.participant_id.in_(participant_ids), Plan.status == "approved")
-        .group_by(Visit.participant_id, Visit.id, Visit.number)
+        .where(Visit.participant_id.in_(participant_ids), Plan.status == "approved", PlanItem.max_ma.is_not(None))
+        .group_by(Visit.participant_id, Visit.id, Visit.number, Visit.date)
         .order_by(Visit.participant_id, Visit.number)
     )
-    return [(int(p), int(v), int(slots), int(done)) for p, v, slots, done in db.execute(query)]
+    return [Filled(*row) for row in db.execute(query)]
