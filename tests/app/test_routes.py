@@ -255,7 +255,7 @@ class World:
                 "json": {"plan_id": approved, "entries": [RATED | {"plan_item_id": slot}]},
             },
             ("get", "/visits/{visit_id}/slots"): {"visit_id": held},
-            ("post", "/visits/{visit_id}/slots/confirm"): {"visit_id": held},
+            ("post", "/visits/{visit_id}/slots/confirm"): {"visit_id": held, "json": {}},
             ("post", "/visits/{visit_id}/plan/moves"): {"visit_id": moved, "json": {"position": 1, "earlier": False}},
             ("post", "/visits/{visit_id}/plan/key"): {"visit_id": blinded, "json": {"reason": "end of the visit"}},
             ("post", "/visits/{visit_id}/removal"): {"visit_id": empty, "json": {"reason": "nobody came"}},
