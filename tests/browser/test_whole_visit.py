@@ -32,6 +32,7 @@ SHOTS = Path(os.environ["BETALOOP_SCREENSHOTS"]) if "BETALOOP_SCREENSHOTS" in os
 def shot(watched: Watched, name: str) -> None:
     if SHOTS:
         SHOTS.mkdir(parents=True, exist_ok=True)
+        watched.page.evaluate("() => scrollTo(0, 0)")
         watched.page.screenshot(path=SHOTS / f"{name}.jpg", type="jpeg", quality=30)
 
 
@@ -123,7 +124,7 @@ def test_a_visit_from_the_signed_plan_to_the_next_generation(
     engineer.page.fill("[name=washout_minutes]", "0")
     engineer.page.click("form:has([name=policy_ids]) button.primary")
     engineer.page.wait_for_selector("text=Plan drafted.")
-    clinician = window(1280, 900)
+    clinician = window(1280, 760)
     sign_in_as(clinician, "clinician", f"/visits/{visit}/plan")
     clinician.page.fill("[name=password]", PASSWORD)
     clinician.page.click("form:has([name=password]) button.primary")
@@ -149,6 +150,7 @@ def test_a_visit_from_the_signed_plan_to_the_next_generation(
             conventional(logs[-1])
         if number == 1:
             shot(tablet, "2-running")
+        sent(tablet)
         if number == 2:
             context.set_offline(True)
         rate(tablet, 6 + number, f"2.{number}")
@@ -186,15 +188,17 @@ def test_a_visit_from_the_signed_plan_to_the_next_generation(
     coordinator.page.set_input_files("input[type=file]", [str(log) for log in logs])
     coordinator.page.click("form[data-upload] button.primary")
     coordinator.page.wait_for_function("() => document.querySelectorAll('[data-upload-list] li .badge').length >= 3", timeout=60_000)
-    coordinator.open(f"/participants/{enrolled}/proposals")
-    shot(coordinator, "6-proposals")
-    coordinator.page.click("button[value='confirm:all']")
-    coordinator.page.wait_for_selector("text=Just confirmed")
-    coordinator.open(f"/visits/{visit}")
-    shot(coordinator, "7-visit")
+    coordinator.open(f"/visits/{visit}/slots")
+    if coordinator.page.is_visible("[name=other_day]"):
+        coordinator.page.check("[name=other_day]")
+    coordinator.page.click("form[action$='/slots/confirm'] button.primary")
+    coordinator.page.wait_for_selector(".note:has-text('Confirmed')")
+    shot(coordinator, "6-planned-and-done")
     sessions = client.get(f"/api/v1/visits/{visit}/sessions").json()["items"]
     ran = sorted((s["controller"], s["policy_id"] or 0) for s in sessions)
     assert ran == [("cdbs", 0), *sorted(("rl", policy) for policy in policies.values())]
+    qocs = [client.get(f"/api/v1/sessions/{s['id']}/qoc").json() for s in sessions]
+    assert sorted((q["rating"], q["grasp_hz"]) for q in qocs) == [(7, 2.1), (8, 2.2), (9, 2.3)]
 
     # the engineer starts the next generation
     engineer.open(f"/participants/{enrolled}/jobs")
