@@ -14,6 +14,7 @@ from ml.population.virtual.world import (
     World,
     is_responder,
     simple_policies,
+    training_world,
     within_margins,
     world,
 )
@@ -42,6 +43,7 @@ __all__ = [
     "new_days",
     "simple_policies",
     "simulate",
+    "training_world",
     "visit_days",
     "with_trait",
     "within_margins",
