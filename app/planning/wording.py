@@ -25,8 +25,10 @@ LEAVE_AT_ONCE = "A stop, an adverse event or a lost link: back to cDBS at once; 
 def release_reason(manifest: BundleManifest) -> str:
     """Why a bundle's bytes were stored, for the audit trail."""
     side = f", {manifest.hemisphere}" if manifest.hemisphere else ""
+    what = f"policy {manifest.policy_id}" if manifest.schedule is None else manifest.policy_name
+    slot = f", session {manifest.slot.position} of plan {manifest.slot.plan_id}" if manifest.slot else ""
     return (
-        f"controller bundle of {manifest.participant}, policy {manifest.policy_id}{side}: {manifest.min_ma:g} to {manifest.max_ma:g} mA, "
+        f"controller bundle of {manifest.participant}, {what}{side}{slot}: {manifest.min_ma:g} to {manifest.max_ma:g} mA, "
         f"cDBS {manifest.cdbs_ma:g} mA, ramp {manifest.ramp_ma_per_s:g} mA/s"
     )
 

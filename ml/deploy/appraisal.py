@@ -48,6 +48,31 @@ def of(fractions: NDArray[np.float64], manifest: BundleManifest) -> dict[str, An
     }
 
 
+FROZEN_AFTER = 5
+"""So many equal beta amplitudes in a row are none: a measured one never comes twice to the last digit of a float32."""
+SATURATED_AT = 3.0
+"""Times the highest beta amplitude that was logged."""
+LEVEL_SPREAD = 2.5
+"""A window's mean may lie this factor outside the range of those logged; a unit ten times off lies farther."""
+
+
+def plausible_beta(windows: NDArray[np.float64] | None) -> dict[str, Any]:
+    """Limits of beta for the safety envelope, as entries of the manifest.
+
+    Args:
+        windows: logged, [N, W]; None where nothing was, so that no level is known.
+    """
+    if windows is None or not windows.size or float(windows.min()) < 0:
+        return {"frozen_after": FROZEN_AFTER}
+    means = windows.mean(axis=1)
+    return {
+        "frozen_after": FROZEN_AFTER,
+        "beta_max": SATURATED_AT * float(windows.max()),
+        "level_low": float(means.min()) / LEVEL_SPREAD,
+        "level_high": float(means.max()) * LEVEL_SPREAD,
+    }
+
+
 class WarningCode(StrEnum):
     """What a clinician must know of a policy before it is used."""
 

@@ -150,6 +150,10 @@ INTENDED: dict[str, str] = {
         "API: a plan is approved by a signature",
     ),
     **dict.fromkeys(
+        ("paths > /api/v1/bundle-withdrawals", "paths > /api/v1/visits/{visit_id}/plan/sessions/{position}/bundle"),
+        "API: bundles for the sessions of a signed plan",
+    ),
+    **dict.fromkeys(
         (
             "components > schemas > MarginsChange",
             "components > schemas > MarginsIn",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
@@ -54,6 +55,7 @@ READABLE = (
     "/api/v1/visits/{visit_id}/slots",
     "/api/v1/visits/{visit_id}/plan.pdf",
     "/api/v1/bundle-key",
+    "/api/v1/bundle-withdrawals",
     "/api/v1/participants/{code}/analyses",
     "/api/v1/participants/{code}/analyses/primary",
     "/api/v1/participants/{code}/analyses/energy",
@@ -110,6 +112,7 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("post", "/api/v1/visits/{visit_id}/removal"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/participants/{code}/buffer-gate"): {"clinician", "admin"},
     ("get", "/api/v1/policies/{policy_id}/bundle"): {"clinician", "engineer", "admin"},
+    ("get", "/api/v1/visits/{visit_id}/plan/sessions/{position}/bundle"): {"clinician", "engineer", "admin"},
     **{("get", path): EVERYONE for path in READABLE},
 }
 BLINDED = {
@@ -172,7 +175,7 @@ class World:
         first = {"policy_ids": [ranking["policies"][0]["policy_id"]], "seed": 1}
         # by somebody who signs no plan of these tests
         assert self.calling(token_of("engineer", name="drafter")).post(f"/api/v1/visits/{open_visit}/plan", json=first).status_code == 201
-        held = self.send("/participants/P2/visits", json={"number": 88})["id"]
+        held = self.send("/participants/P2/visits", json={"number": 88, "date": f"{datetime.now(UTC):%Y-%m-%d}"})["id"]
         drafter = self.calling(token_of("engineer", name="second-drafter"))
         assert drafter.post(f"/api/v1/visits/{held}/plan", json={"random_sessions": 1, "seed": 1}).status_code == 201
         approved = self.send(f"/visits/{held}/plan/approve", json={"password": PASSWORD})["id"]
@@ -197,6 +200,7 @@ class World:
             "session_id": session,
             "upload_id": 1,
             "policy_id": small,
+            "position": 1,
             "snapshot_id": 1,
             "sweep_id": self.read("/participants/P1/sweeps")["items"][0]["id"],
             "job_id": next(j["id"] for j in jobs if j["status"] == "cancelled"),
@@ -248,6 +252,7 @@ class World:
             ("get", "/visits/{visit_id}/plan"): {"visit_id": open_visit},
             ("get", "/visits/{visit_id}/plan.pdf"): {"visit_id": open_visit},
             ("post", "/visits/{visit_id}/plan/approve"): {"visit_id": open_visit, "json": {"password": PASSWORD}},
+            ("get", "/visits/{visit_id}/plan/sessions/{position}/bundle"): {"visit_id": held, "position": 1},
             ("get", "/visits/{visit_id}/day"): {"visit_id": held},
             ("get", "/visits/{visit_id}/day/entries"): {"visit_id": held},
             ("post", "/visits/{visit_id}/day/entries"): {

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Path, Query, Response
 from fastapi.responses import PlainTextResponse
 
 from app.accounts.deps import CurrentCaller
 from app.learning.deps import CurrentPolicy
 from app.planning.bundles import service as bundles
+from app.planning.bundles import slots
 from app.platform.database import Db
 from app.platform.web.schemas import problems
+from app.study.deps import CurrentVisit
 from app.study.models import Hemisphere, Participant
 
 router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
@@ -42,6 +44,30 @@ def read_bundle(
     db.commit()
     name = f"{participant.code}-policy-{policy.id}.zip"
     return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+@router.get(
+    "/visits/{visit_id}/plan/sessions/{position}/bundle",
+    response_class=Response,
+    responses=problems(409) | {200: {"content": {"application/zip": {}}, "description": "The session's bundle."}},
+)
+def read_session_bundle(
+    visit: CurrentVisit, db: Db, caller: CurrentCaller, position: Annotated[int, Path(ge=1, le=1000, description="Of the session.")]
+) -> Response:
+    """The signed bundle of one session of the visit's signed plan: it runs on the day of the visit, once.
+
+    Sessions of policies hold the network, random and cDBS sessions their schedule. A plan that is not signed, was changed since, or holds
+    a withdrawn policy has none.
+    """
+    name, content = slots.bundle(db, visit, position, caller)
+    db.commit()
+    return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+@router.get("/bundle-withdrawals", response_class=PlainTextResponse)
+def read_withdrawals(db: Db, caller: CurrentCaller) -> PlainTextResponse:
+    """Policies and plans that were withdrawn, signed: bring it to the tablet, which then refuses their bundles."""
+    return PlainTextResponse(slots.withdrawals(db))
 
 
 @router.get("/bundle-key", response_class=PlainTextResponse)

@@ -16,18 +16,21 @@ from app.study.models import Hemisphere
 class BundleRelease(Base):
     """A controller bundle that left the service: who took which policy within which limits, and with whose approval. Insert only.
 
+    `policy_id` is null where the session's amplitudes were laid out beforehand, `plan_item_id` where the bundle is for no planned session.
     `approvals` holds the sign-offs that stood in the manifest; null for bundles taken before they were recorded here.
     """
 
     __tablename__ = "bundle_release"
     __table_args__ = (
         CheckConstraint("hemisphere in ('left', 'right')", name="hemisphere"),
+        CheckConstraint("policy_id is not null or plan_item_id is not null", name="what"),
         CheckConstraint("min_ma >= 0 and min_ma <= cdbs_ma and cdbs_ma <= max_ma and ramp_ma_per_s > 0", name="limits"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
     participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
-    policy_id: Mapped[int] = mapped_column(ForeignKey("policy.id"), index=True)
+    policy_id: Mapped[int | None] = mapped_column(ForeignKey("policy.id"), index=True)
+    plan_item_id: Mapped[int | None] = mapped_column(ForeignKey("plan_item.id"), index=True)
     sha256: Mapped[str] = mapped_column(ForeignKey("stored_file.sha256"))
     hemisphere: Mapped[Hemisphere | None] = mapped_column(String(10))
     min_ma: Mapped[float]

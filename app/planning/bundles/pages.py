@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,14 +15,15 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning.deps import CurrentOwnPolicy
 from app.learning.models import Policy
-from app.planning.bundles import repository
+from app.planning.bundles import repository, slots
 from app.planning.bundles import service as bundles
 from app.planning.plans.limits import device_limits
+from app.planning.plans.view import read_plan
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, CurrentVisit
 from app.study.models import Hemisphere, Participant
 from ml.deploy.wording import battery_life_words, energy_words, warning_sentences
 
@@ -63,6 +65,28 @@ def take_bundle(
         return _page(request, participant, policy, db, caller, error, typed)
     name = f"{participant.code}-policy-{policy.id}.zip"
     return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+@router.get("/visits/{visit_id}/bundles")
+def session_bundles(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """The bundles of a signed plan, one per session, and how they come to the tablet."""
+    view = read_plan(db, visit, caller)
+    problem = None
+    try:
+        slots.runnable(view)
+    except BetaloopError as error:
+        problem = error.problem(request.url.path)
+    page = render(
+        request,
+        "planning/session_bundles.html",
+        visit=visit,
+        view=view,
+        problem=problem,
+        taken=Counter(r.plan_item_id for r in repository.releases_of_slots(db, [line.item.id for line in view.lines])),
+        may_take=bundles.may_take(visit.participant, caller),
+        key=bundles.public_key(),
+    )
+    return HTMLResponse(page)
 
 
 def _page(

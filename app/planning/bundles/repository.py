@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from app.learning.models import Policy
 from app.planning.bundles.models import BundleRelease
 from app.planning.plans.models import Plan, PlanItem
 from app.study.models import Visit
@@ -15,6 +16,21 @@ from app.study.models import Visit
 def releases(db: Session, policy_id: int) -> Sequence[BundleRelease]:
     """The bundles of a policy that left so far, newest first."""
     return db.scalars(select(BundleRelease).where(BundleRelease.policy_id == policy_id).order_by(BundleRelease.id.desc())).all()
+
+
+def releases_of_slots(db: Session, item_ids: Sequence[int]) -> Sequence[BundleRelease]:
+    """Bundles that left for sessions of plans, newest first."""
+    return db.scalars(select(BundleRelease).where(BundleRelease.plan_item_id.in_(item_ids)).order_by(BundleRelease.id.desc())).all()
+
+
+def withdrawn_policies(db: Session) -> Sequence[int]:
+    """Policies of this installation that were retired."""
+    return db.scalars(select(Policy.id).where(Policy.retired_reason.is_not(None)).order_by(Policy.id)).all()
+
+
+def withdrawn_plans(db: Session) -> Sequence[int]:
+    """Plans of this installation that were signed and then replaced."""
+    return db.scalars(select(Plan.id).where(Plan.status == "superseded", Plan.approved_at.is_not(None)).order_by(Plan.id)).all()
 
 
 def planned_limits(db: Session, participant_id: int, policy_id: int) -> Sequence[float]:

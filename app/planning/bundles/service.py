@@ -20,6 +20,7 @@ from app.learning import repository as learning
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies import foreign
 from app.learning.policies.service import onnx_of, probe_windows
+from app.learning.snapshots.buffers import read_buffer
 from app.planning import wording
 from app.planning.bundles import repository
 from app.planning.bundles.models import BundleRelease
@@ -32,6 +33,7 @@ from app.study import cdbs_amplitude
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.models import Hemisphere, Participant
+from ml.deploy.appraisal import plausible_beta
 from ml.deploy.bundle import build_bundle, describe, sign
 from ml.deploy.manifest import Approval, BundleError, BundleManifest
 from ml.policies.onnx_policy import PolicyFileError
@@ -81,17 +83,29 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
         Forbidden: the caller may only read.
     """
     study.require(caller, can.TAKE_BUNDLES, participant)
-    manifest, windows = _manifest(db, participant, policy, limits, hemisphere, caller)
+    manifest, windows = manifest_of(db, participant, policy, limits, hemisphere, caller)
+    return store(db, participant, policy_bundle(policy, manifest, windows), manifest, caller)
+
+
+def policy_bundle(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64]) -> bytes:
+    """The signed bundle of a policy. Raises Invalid where it cannot be made."""
     try:
-        signed = _signed(policy, manifest, windows)
+        return _signed(policy, manifest, windows)
     except (BundleError, PolicyFileError) as error:
         raise _unmade(policy, error) from error
+
+
+def store(
+    db: Session, participant: Participant, signed: bytes, manifest: BundleManifest, caller: Caller, plan_item_id: int | None = None
+) -> bytes:
+    """Keep a signed bundle as it leaves, and record its release. Returns it."""
     set_reason(db, wording.release_reason(manifest))
     release = BundleRelease(
         participant_id=participant.id,
-        policy_id=policy.id,
+        policy_id=manifest.policy_id,
+        plan_item_id=plan_item_id,
         sha256=files.store(db, signed, _ZIP).sha256,
-        hemisphere=hemisphere,
+        hemisphere=Hemisphere(manifest.hemisphere) if manifest.hemisphere else None,
         min_ma=manifest.min_ma,
         max_ma=manifest.max_ma,
         cdbs_ma=manifest.cdbs_ma,
@@ -108,7 +122,7 @@ def preview(
     db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
 ) -> BundleManifest:
     """What the bundle would say of itself, all but its files; nothing is stored. Raises as `bundle` does, but whoever reads may look."""
-    manifest, windows = _manifest(db, participant, policy, limits, hemisphere, caller)
+    manifest, windows = manifest_of(db, participant, policy, limits, hemisphere, caller)
     try:
         return _described(policy, manifest, windows)
     except (BundleError, PolicyFileError) as error:
@@ -167,7 +181,7 @@ def approvals(db: Session, participant_id: int, policy_id: int) -> tuple[Approva
     )
 
 
-def _manifest(
+def manifest_of(
     db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
 ) -> tuple[BundleManifest, NDArray[np.float64]]:
     """What the bundle says about itself, and beta windows for its test vectors: logged ones, where there are any of its length."""
@@ -213,6 +227,7 @@ def _manifest(
             agreement_p99=agreement.get("p99"),
             agreement_worst=agreement.get("worst"),
             logged_lower_bound=version.lower_bound,
+            **beta_limits(data),
             test_windows_from=f"snapshot {usable.id}" if usable else None,
             taken_by=f"{caller.label}, {datetime.now(UTC):%Y-%m-%d %H:%M:%S.%f} UTC",
             public_key=public_key(),
@@ -221,6 +236,11 @@ def _manifest(
     except BundleError as error:
         raise _unmade(policy, error) from error
     return manifest, probe_windows(usable, version)
+
+
+def beta_limits(snapshot: BufferSnapshot | None) -> dict[str, Any]:
+    """Which beta is plausible in this participant, as entries of the manifest; only that it is not frozen where nothing was logged."""
+    return plausible_beta(read_buffer(snapshot.file_sha256).transitions().states if snapshot is not None else None)
 
 
 def _lowest(db: Session, participant: Participant, policy: Policy, limits: Limits, device: DeviceLimits | None, cdbs_ma: float) -> float:

@@ -57,7 +57,7 @@ def test_a_bundle_is_signed_with_the_key_that_the_service_tells(client: TestClie
     opened = open_bundle(take(client, policy).content, key)
     assert opened.manifest.public_key == key.public_bytes_raw().hex()
     controller, signal = opened.controller(), Signal("uV", "table")
-    decisions = [controller.decide(2.0 * k, BetaSample(2.0 * k, 1.0, signal)) for k in range(12)]
+    decisions = [controller.decide(2.0 * k, BetaSample(2.0 * k, 1.0 + 0.1 * (k % 2), signal)) for k in range(12)]
     assert [d.fallback for d in decisions] == [True] * 9 + [False] * 3
     assert all(np.isfinite(d.amplitude_ma) for d in decisions)
 

@@ -1,0 +1,176 @@
+"""Bundles for the sessions of a signed plan: what runs on a participant, on that day, once. The caller commits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+
+from sqlalchemy.orm import Session
+
+from app import __version__
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.learning import repository as learning
+from app.planning.bundles import repository, service
+from app.planning.plans.designs import Planned, seed_of
+from app.planning.plans.limits import device_limits
+from app.planning.plans.models import PlanItem
+from app.planning.plans.view import PlanLine, PlanView, read_plan, refuse_running
+from app.planning.plans.visits import today
+from app.platform.errors import Conflict, Invalid, NotFound
+from app.platform.signatures.models import Signature
+from app.study import service as study
+from app.study.models import Controller, Hemisphere, Visit
+from ml.deploy.bundle import build_scheduled_bundle, sign
+from ml.deploy.manifest import Approval, BundleError, BundleManifest
+from ml.deploy.runtime.schedule import Schedule, ScheduledHold
+from ml.deploy.runtime.slot import Slot, Withdrawals, withdrawals_body
+from ml.designs import Decision, DesignSettings, lay_out
+
+
+def bundle(db: Session, visit: Visit, position: int, caller: Caller) -> tuple[str, bytes]:
+    """The signed bundle of one session of a visit's signed plan, and its file name. It is stored, and its release is recorded.
+
+    Raises:
+        NotFound: no plan, or no such session. Conflict: the plan may not run, the visit has no date or is past, or the session has no
+            bundle, as one without stimulation. Invalid: it cannot be made. Forbidden: the caller may only read.
+    """
+    study.require(caller, can.TAKE_BUNDLES, visit.participant)
+    view = read_plan(db, visit, caller)
+    signature = runnable(view)
+    line = next((line for line in view.lines if line.item.position == position), None)
+    if line is None:
+        raise NotFound(f"Plan {view.plan.id} has no session {position}.", f"Name one from 1 to {len(view.lines)}.")
+    code = visit.participant.code
+    slot = _slot(view, line.item, signature)
+    if line.policy is not None:
+        limits = service.Limits(line.item.min_ma, line.item.max_ma, line.item.ramp_ma_per_s)
+        side = Hemisphere(line.item.hemisphere) if line.item.hemisphere else None
+        manifest, windows = service.manifest_of(db, visit.participant, line.policy, limits, side, caller)
+        manifest = replace(manifest, slot=slot, approvals=_approvals(view, signature), limits_stated_by=_stated_by(signature))
+        content = service.policy_bundle(line.policy, manifest, windows)
+    else:
+        manifest = _scheduled(db, view, line, slot, signature, caller)
+        content = sign(build_scheduled_bundle(manifest), service.signing_key())
+    service.store(db, visit.participant, content, manifest, caller, line.item.id)
+    return f"{code}-visit-{visit.number}-session-{position}.zip", content
+
+
+def runnable(view: PlanView) -> Signature:
+    """The signature under which a plan may run. Raises Conflict, Invalid where it may not."""
+    refuse_running(view)
+    if view.visit.date is None:
+        raise Conflict(f"Visit {view.visit.number} has no date, and a bundle runs on the day of its visit alone.", "Date the visit.")
+    if view.visit.date < today():
+        raise Conflict(f"Visit {view.visit.number} was on {view.visit.date}; its bundles have expired.", "Plan another visit.")
+    if view.signature is None:
+        raise Conflict(f"Plan {view.plan.id} is not signed.", "Have a clinician sign it.")
+    return view.signature
+
+
+def withdrawals(db: Session) -> bytes:
+    """What was withdrawn, as a tablet takes it: a line of JSON, and its signature in a second one."""
+    now = datetime.now(UTC).isoformat(timespec="milliseconds")
+    gone = Withdrawals(now, frozenset(repository.withdrawn_policies(db)), frozenset(repository.withdrawn_plans(db)))
+    body = withdrawals_body(gone)
+    return body + b"\n" + service.signing_key().sign(body).hex().encode() + b"\n"
+
+
+def _slot(view: PlanView, item: PlanItem, signature: Signature) -> Slot:
+    return Slot(
+        plan_id=view.plan.id,
+        slot_id=item.id,
+        position=item.position,
+        visit_number=view.visit.number,
+        visit_date=str(view.visit.date),
+        controller=str(item.controller),
+        minutes=item.minutes,
+        plan_sha256=signature.sha256,
+        issued_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        label=item.label,
+        repeat=item.repeat,
+    )
+
+
+def _approvals(view: PlanView, signature: Signature) -> tuple[Approval, ...]:
+    what = f"plan {view.plan.id} of visit {view.visit.number}: {signature.meaning}"
+    return (Approval(name=signature.signer, role="signer", approved_at=signature.signed_at.isoformat(timespec="seconds"), statement=what),)
+
+
+def _stated_by(signature: Signature) -> str:
+    return f"{signature.signer}, {signature.signed_at.astimezone(UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def _scheduled(db: Session, view: PlanView, line: PlanLine, slot: Slot, signature: Signature, caller: Caller) -> BundleManifest:
+    """The manifest of a session whose amplitudes are laid out beforehand."""
+    item, participant = line.item, view.visit.participant
+    settings = participant.current_settings
+    data = learning.newest_snapshot(db, participant.id)
+    unit, source = (data.beta_unit, data.beta_source) if data else (settings.beta_unit, settings.beta_source)
+    if unit is None or source is None:
+        raise Invalid("The unit and source of beta are not known.", "Set beta_unit and beta_source in the participant's settings.")
+    if item.cdbs_ma is None or item.min_ma is None or item.max_ma is None or item.ramp_ma_per_s is None:
+        raise Conflict(f"Session {item.position} has no limits in mA.", "Draft the visit anew.")
+    schedule = _schedule(view, item, settings.period_s)
+    side = Hemisphere(item.hemisphere) if item.hemisphere else None
+    device = device_limits(db, participant, side)
+    try:
+        return BundleManifest(
+            participant=participant.code,
+            policy_id=None,
+            policy_name="cDBS" if schedule.design == "constant" else f"random session, {schedule.design} design",
+            hemisphere=side.value if side else None,
+            window=settings.window,
+            period_s=settings.period_s,
+            beta_unit=unit,
+            beta_source=source,
+            beta_low_hz=settings.beta_low_hz,
+            beta_high_hz=settings.beta_high_hz,
+            min_valid_fraction=settings.min_valid_fraction,
+            min_ma=item.min_ma,
+            max_ma=item.max_ma,
+            cdbs_ma=item.cdbs_ma,
+            ramp_ma_per_s=item.ramp_ma_per_s,
+            limits_stated_by=_stated_by(signature),
+            device_min_ma=device.min_ma if device else None,
+            device_max_ma=device.max_ma if device else None,
+            code_version=__version__,
+            taken_by=f"{caller.label}, {datetime.now(UTC):%Y-%m-%d %H:%M:%S.%f} UTC",
+            public_key=service.public_key(),
+            approvals=_approvals(view, signature),
+            slot=slot,
+            schedule=schedule,
+            **service.beta_limits(data),
+        )
+    except BundleError as error:
+        raise Invalid(f"The bundle of session {item.position} cannot be made: {error}.", "Correct what is named.") from error
+
+
+def _schedule(view: PlanView, item: PlanItem, period_s: float) -> Schedule:
+    """What the session delivers: cDBS throughout, or the holds of its design; the paper's draws are made here, from a seed of the slot."""
+    steps = max(1, round(60 * item.minutes / period_s))
+    if item.controller == Controller.CDBS:
+        return Schedule("constant", None, None, None, (ScheduledHold(0, steps, 1.0, None),))
+    if item.controller == Controller.NO_DBS:
+        raise Conflict(
+            f"Session {item.position} runs without stimulation, which no bundle does: the tablet's fall-back is cDBS.",
+            "Switch the stimulation off, and on again, with the programmer.",
+        )
+    if item.design is None:
+        raise Conflict(f"Session {item.position} has neither policy nor design.", "Draft the visit anew.")
+    planned = Planned.from_json(item.design)
+    if planned.period_s != period_s:
+        raise Conflict(
+            f"Session {item.position} was laid out in steps of {planned.period_s:g} s, and the period is {period_s:g} s now.",
+            "Draft the visit anew.",
+        )
+    if planned.holds:
+        return Schedule(planned.design, planned.level, planned.seed, planned.lower_bound, _holds(planned.holds))
+    seed = seed_of(f"{view.visit.participant.code}/{item.id}", view.plan.id)
+    wanted = DesignSettings(name="paper", visits=1, sessions=1, steps=steps, period_s=period_s, lower_bound=planned.lower_bound, seed=seed)
+    (session,) = lay_out(wanted)
+    return Schedule("paper", None, seed, planned.lower_bound, _holds(session.decisions))
+
+
+def _holds(decisions: tuple[Decision, ...]) -> tuple[ScheduledHold, ...]:
+    return tuple(ScheduledHold(d.start, d.steps, d.amplitude, d.log_density) for d in decisions)
