@@ -20,6 +20,7 @@ from rich.table import Table
 from app.accounts import service as accounts
 from app.accounts.models import Role, Scope
 from app.accounts.permissions import SYSTEM
+from app.accounts.studies import commands as studies
 from app.platform import logs
 from app.platform.audit.commands import app as audit_app
 from app.platform.database import database_place, supervise_database, transaction
@@ -31,12 +32,13 @@ from app.settings import get_settings
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="betaloop: the study system for closed-loop deep brain stimulation.")
 user_app = typer.Typer(no_args_is_help=True, help="Users.")
 token_app = typer.Typer(no_args_is_help=True, help="API tokens.")
+study_app = typer.Typer(no_args_is_help=True, help="Whole studies.")
 ingest_app = typer.Typer(no_args_is_help=True, help="Stored uploads.")
 app.add_typer(user_app, name="user")
 app.add_typer(token_app, name="token")
-study_app = typer.Typer(no_args_is_help=True, help="Whole studies.")
 app.add_typer(study_app, name="study")
 app.add_typer(ingest_app, name="ingest")
+studies.register(study_app, user_app)
 app.add_typer(audit_app, name="audit")
 app.add_typer(upkeep_app)
 
@@ -128,11 +130,9 @@ def demo(
 @user_app.command("add", epilog="Example: betaloop user add ada@clinic.example --role clinician")
 def user_add(
     email: Annotated[str, typer.Argument(help="E-mail address to sign in with.")],
-    role: Annotated[Role, typer.Option(help="blinded_assessor, viewer, clinician, engineer or admin.")],
+    role: Annotated[Role, typer.Option(help=", ".join(Role))],
     study: Annotated[str | None, typer.Option(help="Code of the study, where there are several.")] = None,
-    password_file: Annotated[
-        Path | None, typer.Option(help="File with the password; asked for when left out ('-': standard input).")
-    ] = None,
+    password_file: Annotated[Path | None, typer.Option(help="File with the password; asked for when left out ('-': stdin).")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Add a user with a role in a study."""

@@ -33,7 +33,9 @@ from app.platform.web.templates import STATIC
 log = structlog.get_logger()
 
 API_MODULES = (
+    "app.accounts.studies.api",
     "app.study.api",
+    "app.study.participation.api",
     "app.study.margins.api",
     "app.study.adverse_events.api",
     "app.study.recordings.api",
@@ -62,9 +64,11 @@ API_MODULES = (
 )
 PAGE_MODULES = (
     "app.accounts.pages",
+    "app.accounts.studies.pages",
     "app.study.pages",
     "app.study.settings.pages",
     "app.study.margins.pages",
+    "app.study.participation.pages",
     "app.study.adverse_events.pages",
     "app.study.recordings.pages",
     "app.study.visits.pages",

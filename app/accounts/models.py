@@ -16,6 +16,8 @@ class Role(StrEnum):
 
     BLINDED_ASSESSOR = "blinded_assessor"
     VIEWER = "viewer"
+    MONITOR = "monitor"
+    COORDINATOR = "coordinator"
     CLINICIAN = "clinician"
     ENGINEER = "engineer"
     ADMIN = "admin"
@@ -75,7 +77,7 @@ class Membership(Base):
     __tablename__ = "membership"
     __table_args__ = (
         UniqueConstraint("user_id", "study_id", "site_id", postgresql_nulls_not_distinct=True),
-        CheckConstraint("role in ('blinded_assessor', 'viewer', 'clinician', 'engineer', 'admin')", name="role"),
+        CheckConstraint("role in ('blinded_assessor', 'viewer', 'monitor', 'coordinator', 'clinician', 'engineer', 'admin')", name="role"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)

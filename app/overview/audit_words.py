@@ -50,6 +50,8 @@ class Names:
 def sentence(event: AuditEvent, names: Names) -> str:
     """What a change of a row means, without its subject: the actor stands beside it."""
     before, after = event.before or {}, event.after or {}
+    if event.action not in ("insert", "update", "delete"):
+        return _recorded(event, names)
     said = _SAID.get(event.entity)
     return said(before, after, names) if said else _plainly(event)
 
@@ -59,9 +61,33 @@ def headline(events: Sequence[AuditEvent]) -> AuditEvent:
     return min(events, key=lambda e: (_ORDER.index(e.entity) if e.entity in _ORDER else len(_ORDER), e.id))
 
 
+def _recorded(event: AuditEvent, names: Names) -> str:
+    """What changed no row: looks, exports, refusals."""
+    number = int(event.entity_id) if event.entity_id.isdecimal() else 0
+    plan = names.plans.get(number)
+    said = {
+        ("view", "results"): f"looked at the results of {event.entity_id}",
+        ("export", "participant"): f"exported the record of {names.participant(number)}",
+        ("export", "session"): f"exported the samples of {names.session(number)}",
+        ("download", "plan"): f"printed plan {number}" + (f" for {names.visit(plan)}" if plan is not None else ""),
+        ("refuse", "sign_in"): f"refused a sign-in of {event.entity_id}",
+    }
+    return said.get((event.action, event.entity), f"{event.action}: {event.entity.replace('_', ' ')} {event.entity_id}")
+
+
 def _plainly(event: AuditEvent) -> str:
     verb = {"insert": "added", "update": "changed", "delete": "removed"}.get(event.action, event.action)
     return f"{verb} a row of {event.entity.replace('_', ' ')}"
+
+
+def _participant(before: Row, after: Row, _: Names) -> str:
+    row = after or before
+    if not before:
+        return f"enrolled {row['code']}"
+    said = {"withdrawn": "recorded that {} has withdrawn", "completed": "recorded that {} has completed the study"}
+    if before.get("status") != row.get("status"):
+        return said.get(str(row.get("status")), "recorded that {} takes part again").format(row["code"])
+    return f"changed {row['code']}"
 
 
 def _visit(before: Row, after: Row, names: Names) -> str:
@@ -168,7 +194,7 @@ _SAID: dict[str, Callable[[Row, Row, Names], str]] = {
     "margins_lock": lambda b, a, n: f"locked the margins of {n.participant(a['participant_id'])}",
     "bundle_release": lambda b, a, n: f"took the bundle of {n.policy(a['policy_id'])}",
     "buffer_gate_decision": _decided,
-    "participant": lambda b, a, n: f"{'changed' if b else 'enrolled'} {(a or b)['code']}",
+    "participant": _participant,
     "settings_version": _version("settings"),
     "margins_version": _version("margins"),
     "visit": _visit,

@@ -36,9 +36,11 @@ _HIDDEN = "hidden from you"
 
 
 @router.get("/")
-def overview(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
+def overview(
+    request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery, withdrawn: Annotated[str, Query(max_length=3)] = "no"
+) -> HTMLResponse:
     """Today: the next visits with what each waits for, then all participants as cards, those that need attention marked."""
-    rows, total = study.participants(db, caller, paging.limit, paging.offset)
+    rows, total = study.participants(db, caller, paging.limit, paging.offset, withdrawn=withdrawn == "yes")
     today = datetime.now(UTC).date()
     states = state.states(db, rows, today)
     dated = [(p, states[p.id]) for p in rows if states[p.id].next_visit is not None]
@@ -52,6 +54,7 @@ def overview(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuer
         actors=wording.ACTORS,
         in_days=wording.in_days,
         total=total,
+        withdrawn=withdrawn == "yes",
         paging=paging,
         phases=state.PHASES,
         refresh_s=REFRESH_S,

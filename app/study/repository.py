@@ -64,9 +64,11 @@ def sites(db: Session, caller: Caller) -> Sequence[Site]:
     return db.scalars(select(Site).where(in_scope(caller)).order_by(Site.code)).all()
 
 
-def participants(db: Session, caller: Caller, limit: int, offset: int) -> tuple[Sequence[Participant], int]:
-    """A page of participants by code, and how many there are."""
+def participants(db: Session, caller: Caller, limit: int, offset: int, withdrawn: bool = True) -> tuple[Sequence[Participant], int]:
+    """A page of participants by code, and how many there are; without those who have withdrawn where `withdrawn` is false."""
     query = select(Participant).join(Participant.site).where(in_scope(caller))
+    if not withdrawn:
+        query = query.where(Participant.status != "withdrawn")
     rows = db.scalars(
         query.order_by(Participant.code)
         .limit(limit)

@@ -25,6 +25,11 @@ from app.study.visits.service import require_unlocked
 from ml.mdp import MdpSettings
 
 RESERVED_CODES = {"new"}
+WITHDRAWN = "withdrawn"
+NOT_AFTER_WITHDRAWAL = frozenset(
+    {can.UPLOAD, can.RUN_JOBS, can.WRITE_POLICIES, can.DRAFT_PLAN, can.APPROVE_PLAN, can.TAKE_BUNDLES, can.WRITE_SETTINGS}
+)
+"""What needs a participant who takes part; records that exist may still be corrected."""
 SIGNED_UNITS = {"dB", "z"}
 """Units in which a beta may be negative: logarithms and standard scores."""
 POLICY_CONTROLLERS = {Controller.RL, Controller.DISTILLED, Controller.OTHER}
@@ -201,8 +206,16 @@ def _check_program(db: Session, session: StudySession, program: int | None) -> N
 
 
 def require(caller: Caller, permission: str, participant: Participant) -> None:
-    """Raises NotFound or Forbidden unless the caller holds the permission for this participant."""
+    """Raises NotFound or Forbidden unless the caller holds the permission for this participant.
+
+    Raises Conflict where it would be new work for a participant who has withdrawn.
+    """
     caller.require(permission, participant.site.study_id, participant.site_id)
+    if participant.status == WITHDRAWN and permission in NOT_AFTER_WITHDRAWAL:
+        raise Conflict(
+            f"Participant {participant.code} has withdrawn from the study: nothing new is recorded, computed or planned.",
+            "What is there can be read and exported. A mistake is taken back on the participant's page.",
+        )
 
 
 def may(caller: Caller, permission: str, participant: Participant) -> bool:

@@ -180,6 +180,24 @@ INTENDED: dict[str, str] = {
         ("components > schemas > SampleFormat", "paths > /api/v1/sessions/{session_id}/samples"),
         "API: `GET /sessions/{id}/samples` gives a session's samples with their times, and every trace, as one Parquet or NWB file",
     ),
+    **dict.fromkeys(
+        (
+            "components > schemas > NameChange",
+            "components > schemas > SiteIn",
+            "components > schemas > SiteOut",
+            "components > schemas > StudyIn",
+            "components > schemas > StudyOut",
+            "paths > /api/v1/studies",
+            "paths > /api/v1/studies/{study_code}",
+            "paths > /api/v1/studies/{study_code}/sites",
+            "paths > /api/v1/studies/{study_code}/sites/{site_code}",
+        ),
+        "API: studies and their sites are read, added and renamed at `/studies`; a page and `betaloop study add`, `study site` and `user role` do so too",
+    ),
+    **dict.fromkeys(
+        ("components > schemas > StatusChange", "paths > /api/v1/participants/{code} > patch"),
+        "API: `PATCH /participants/{code}` says that a participant has completed the study, has withdrawn, or takes part again, with a reason.",
+    ),
     "components > schemas > ProposalChange": "API: `control_stream` and `control_channel` of a proposal can be corrected.",
     **dict.fromkeys(
         (

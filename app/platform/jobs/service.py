@@ -67,6 +67,12 @@ def submit(db: Session, kind: str, participant_id: int | None, params: dict[str,
     return job
 
 
+def live_of(db: Session, participant_id: int) -> list[Job]:
+    """A participant's jobs that have not ended."""
+    found, _ = repository.find(db, participant_id, None, repository.LIVE, limit=_MANY)
+    return [job for job in found if job.participant_id == participant_id]
+
+
 def cancel(db: Session, job: Job, by: str) -> Job:
     """Cancel a job: at once when it waits, or when no worker lives that could run it; else its worker kills it within 2 s.
 

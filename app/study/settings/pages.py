@@ -73,6 +73,7 @@ def _settings_page(
         history=form.history(participant.settings),
         suggestion=_suggestion(db, participant, caller),
         may_write=may(caller, can.WRITE_SETTINGS, participant),
+        may_change_status=may(caller, can.WRITE_STUDY, participant),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

@@ -17,6 +17,10 @@ def event(entity: str, before: dict[str, Any] | None, after: dict[str, Any] | No
     return AuditEvent(id=number, entity=entity, entity_id="1", action=action, before=before, after=after, actor="ada")
 
 
+def recorded(action: str, entity: str, entity_id: str) -> AuditEvent:
+    return AuditEvent(id=1, entity=entity, entity_id=entity_id, action=action, actor="ada")
+
+
 DRAFT = {"id": 9, "visit_id": 4, "status": "draft"}
 SESSION = {"id": 7, "visit_id": 4, "ordinal": 3, "status": "confirmed", "excluded_reason": None}
 
@@ -34,6 +38,13 @@ SESSION = {"id": 7, "visit_id": 4, "ordinal": 3, "status": "confirmed", "exclude
         (event("bundle_release", None, {"policy_id": 5}), "took the bundle of policy rl-01 of P1"),
         (event("settings_version", None, {"participant_id": 1, "version": 2}), "changed the settings of P1 (version 2)"),
         (event("sign_in", {"ended_at": None}, {"ended_at": "2026-03-02"}), "signed out"),
+        (event("participant", {"code": "P1", "status": "active"}, {"code": "P1", "status": "withdrawn"}), "recorded that P1 has withdrawn"),
+        (recorded("view", "results", "/participants/P1/analyses"), "looked at the results of /participants/P1/analyses"),
+        (recorded("export", "participant", "1"), "exported the record of P1"),
+        (recorded("export", "session", "7"), "exported the samples of session 3 of visit 2 of P1"),
+        (recorded("download", "plan", "9"), "printed plan 9 for visit 2 of P1"),
+        (recorded("refuse", "sign_in", "ada@clinic.example"), "refused a sign-in of ada@clinic.example"),
+        (recorded("seize", "thing", "3"), "seize: thing 3"),
         (event("session_segment", None, {"session_id": 7}), "added a row of session segment"),
     ],
 )

@@ -1,0 +1,1 @@
+"""Studies, their sites, and who works in them in which role."""

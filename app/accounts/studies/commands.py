@@ -1,0 +1,87 @@
+"""Commands of studies, sites and roles: `betaloop study add`, `study site` and `user role`."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any, TypeVar
+
+import typer
+from pydantic import BaseModel, ValidationError
+
+from app.accounts import service as accounts
+from app.accounts.models import Role
+from app.accounts.permissions import SYSTEM
+from app.accounts.studies import service
+from app.accounts.studies.schemas import HINT, SiteIn, StudyIn
+from app.platform.database import transaction
+from app.platform.errors import Invalid
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+ACTOR = "command line"
+Draft = TypeVar("Draft", bound=BaseModel)
+
+
+def study_add(
+    code: Annotated[str, typer.Argument(help="Code of the new study.")],
+    name: Annotated[str, typer.Option(help="Its name.")],
+    site: Annotated[str | None, typer.Option(help="Code of its first site; the study's when left out.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Add a study with its first site."""
+    draft = _checked(StudyIn, code=code, name=name, site={"code": site or code, "name": name})
+    with transaction(ACTOR) as db:
+        service.add_study(db, draft, SYSTEM)
+    _print({"code": code, "site": site or code}, as_json, f"Added study {code}.")
+
+
+def study_site(
+    code: Annotated[str, typer.Argument(help="Code of the study.")],
+    site: Annotated[str, typer.Argument(help="Code of the new site.")],
+    name: Annotated[str, typer.Option(help="Its name.")],
+    as_json: AsJson = False,
+) -> None:
+    """Add a site to a study."""
+    draft = _checked(SiteIn, code=site, name=name)
+    with transaction(ACTOR) as db:
+        service.add_site(db, service.study_to_manage(db, code, SYSTEM), draft)
+    _print({"study": code, "site": site}, as_json, f"Added site {site} to study {code}.")
+
+
+def user_role(
+    email: Annotated[str, typer.Argument(help="E-mail address of the user.")],
+    role: Annotated[str, typer.Argument(help="A role, or 'none' to end the one that the user has there.")],
+    study: Annotated[str | None, typer.Option(help="Code of the study, where there are several.")] = None,
+    site: Annotated[str | None, typer.Option(help="Code of the site; all sites when left out.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Give a user a role in a study, or end it."""
+    if role not in {*Role, "none"}:
+        raise Invalid(f"{role!r} is no role.", f"Known: {', '.join(Role)}, none.")
+    with transaction(ACTOR) as db:
+        where = accounts.study_of(db, study)
+        if role == "none":
+            service.end_membership(db, where, email, site, SYSTEM)
+        else:
+            service.grant(db, where, email, Role(role), site, SYSTEM)
+        result = {"email": email, "role": role, "study": where.code, "site": site}
+    _print(result, as_json, f"The role of {email} has ended." if role == "none" else f"{email} is now {role} in {result['study']}.")
+
+
+def register(study: typer.Typer, user: typer.Typer) -> None:
+    """Put the commands where people look for them."""
+    study.command("add", epilog="Example: betaloop study add ADAPT --name 'Adaptive DBS' --site north")(study_add)
+    study.command("site", epilog="Example: betaloop study site ADAPT south --name 'Clinic South'")(study_site)
+    user.command("role", epilog="Example: betaloop user role ada@clinic.example coordinator --study ADAPT --site north")(user_role)
+
+
+def _checked(kind: type[Draft], **values: Any) -> Draft:
+    try:
+        return kind(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = " ".join(map(str, first["loc"]))
+        raise Invalid(f"The {where}: {first['msg']}.", HINT) from error
+
+
+def _print(result: dict[str, Any], as_json: bool, said: str) -> None:
+    print(json.dumps(result) if as_json else said)  # noqa: T201

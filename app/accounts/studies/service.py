@@ -1,0 +1,125 @@
+"""Rules of studies, sites and memberships. The caller commits."""
+
+from __future__ import annotations
+
+from sqlalchemy.orm import Session
+
+from app.accounts import repository as accounts
+from app.accounts.models import Membership, Role, Site, Study, User
+from app.accounts.permissions import Caller
+from app.accounts.service import administers
+from app.accounts.studies import repository
+from app.accounts.studies.schemas import SiteIn, StudyIn
+from app.platform.database import set_reason
+from app.platform.errors import Conflict, Forbidden, Invalid, NotFound
+
+
+def add_study(db: Session, draft: StudyIn, caller: Caller) -> Study:
+    """Add a study with its first site; who adds it administers it.
+
+    Raises:
+        Forbidden: the caller does not administer every study that there is. Conflict: the code is taken.
+    """
+    if not all(administers(caller, study.id) for study in accounts.studies(db)):
+        raise Forbidden("A study is added by an administrator of all studies.", "Ask one.")
+    if repository.study_by_code(db, draft.code):
+        raise Conflict(f"There is already a study '{draft.code}'.", "Choose another code.")
+    study = Study(code=draft.code, name=draft.name)
+    db.add(study)
+    db.flush()
+    first = draft.site or SiteIn(code=draft.code, name=draft.name)
+    db.add(Site(study_id=study.id, code=first.code, name=first.name))
+    if caller.user_id is not None:
+        db.add(Membership(user_id=caller.user_id, study_id=study.id, role=Role.ADMIN))
+    db.flush()
+    return study
+
+
+def study_to_manage(db: Session, code: str, caller: Caller) -> Study:
+    """A study that the caller administers at all of its sites. Raises NotFound for every other."""
+    study = repository.study_by_code(db, code)
+    if study is None or not administers(caller, study.id):
+        raise NotFound(f"There is no study '{code}', or you do not administer it.")
+    return study
+
+
+def rename_study(db: Session, study: Study, name: str, reason: str) -> None:
+    """Give a study another name; its code stays."""
+    set_reason(db, reason)
+    study.name = name
+    db.flush()
+
+
+def add_site(db: Session, study: Study, draft: SiteIn) -> Site:
+    """Add a site. Raises Conflict where its code is taken."""
+    if repository.site_by_code(db, study.id, draft.code):
+        raise Conflict(f"Study '{study.code}' has a site '{draft.code}' already.", "Choose another code.")
+    site = Site(study_id=study.id, code=draft.code, name=draft.name)
+    db.add(site)
+    db.flush()
+    return site
+
+
+def rename_site(db: Session, study: Study, code: str, name: str, reason: str) -> Site:
+    """Give a site another name. Raises NotFound."""
+    site = site_of(db, study, code)
+    set_reason(db, reason)
+    site.name = name
+    db.flush()
+    return site
+
+
+def site_of(db: Session, study: Study, code: str) -> Site:
+    """A study's site. Raises NotFound."""
+    site = repository.site_by_code(db, study.id, code)
+    if site is None:
+        raise NotFound(f"Study '{study.code}' has no site '{code}'.")
+    return site
+
+
+def grant(db: Session, study: Study, email: str, role: Role, site_code: str | None, caller: Caller) -> Membership:
+    """Give a user a role in a study, at one site or at all; a role that the user has there is replaced.
+
+    Raises:
+        NotFound: no such user or site. Invalid: one's own role, or a blinded assessor with another role in the study.
+    """
+    user, site_id = _user(db, email), site_of(db, study, site_code).id if site_code else None
+    _require_other(user, caller)
+    others = [m.role for m in user.memberships if m.study_id == study.id and m.site_id != site_id]
+    if others and Role.BLINDED_ASSESSOR in (role, *others) and {role, *others} != {Role.BLINDED_ASSESSOR}:
+        raise Invalid("A blinded assessor has no other role in the study.", "End the other role first.")
+    found = repository.membership(db, user.id, study.id, site_id)
+    if found is None:
+        found = Membership(user_id=user.id, study_id=study.id, site_id=site_id, role=role)
+        db.add(found)
+    found.role = role
+    db.flush()
+    return found
+
+
+def end_membership(db: Session, study: Study, email: str, site_code: str | None, caller: Caller) -> None:
+    """End a user's role in a study; at once, for whatever the user has open.
+
+    Raises:
+        NotFound: the user has no role there. Invalid: one's own.
+    """
+    user, site_id = _user(db, email), site_of(db, study, site_code).id if site_code else None
+    _require_other(user, caller)
+    found = repository.membership(db, user.id, study.id, site_id)
+    if found is None:
+        where = f"at site '{site_code}'" if site_code else "at all sites"
+        raise NotFound(f"{user.email} has no role {where} of study '{study.code}'.")
+    db.delete(found)
+    db.flush()
+
+
+def _user(db: Session, email: str) -> User:
+    user = accounts.user_by_email(db, email)
+    if user is None:
+        raise NotFound(f"There is no user {email.strip()[:254]}.", "Add the user first.")
+    return user
+
+
+def _require_other(user: User, caller: Caller) -> None:
+    if user.id == caller.user_id:
+        raise Invalid("You cannot change your own role.", "Ask another administrator.")

@@ -1,0 +1,1 @@
+"""Whether a participant takes part: active, completed, withdrawn."""
