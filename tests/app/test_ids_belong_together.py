@@ -30,15 +30,16 @@ PAIRS: dict[tuple[str, str], dict[str, Any]] = {
     ("POST", "/participants/{code}/policies/{policy_id}/retire"): {"data": {"reason": "worn out"}},
     ("GET", "/participants/{code}/policies/{policy_id}/bundle"): {},
     ("POST", "/participants/{code}/policies/{policy_id}/bundle"): BUNDLE_FORM,
+    ("PATCH", "/api/v1/studies/{study_code}/sites/{site_code}"): {"json": {"name": "Moved", "reason": "new house"}},
 }
 Ids = dict[str, Any]
 
 
 def routes_with_two_ids(app: Any) -> set[tuple[str, str]]:
-    """(method, path) of every page and route whose path names two objects; `key` is a word for a comparison, no object."""
+    """(method, path) of every page and route whose path names two objects; `key` is a word, `position` a place in a plan."""
     found = set()
     for context in iter_route_contexts(app.routes):
-        if context.path and context.path.replace("{key}", "").count("{") >= 2:
+        if context.path and context.path.replace("{key}", "").replace("{position}", "").count("{") >= 2:
             found |= {(method, context.path) for method in (context.methods or set()) - {"HEAD", "OPTIONS"}}
     return found
 
@@ -47,7 +48,9 @@ def studied(client: TestClient, code: str, seed: int, sign_plan: Callable[..., A
     """A participant with one object of every sort; their ids."""
     api, home = "/api/v1", f"/api/v1/participants/{code}"
     settings = {"xi_beta": 1.0, "cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"}
-    assert client.post(f"{api}/participants", json={"code": code, "settings": settings}).status_code == 201
+    assert client.post(f"{api}/participants", json={"code": code, "site": "main", "settings": settings}).status_code == 201
+    own = {"code": f"study-{code}", "name": "x", "site": {"code": f"site-{code}", "name": "x"}}
+    assert client.post(f"{api}/studies", json=own).status_code == 201
     visits = [client.post(f"{home}/visits", json={"number": n}).json()["id"] for n in (1, 2)]
     rng = np.random.default_rng(seed)
 
@@ -72,6 +75,8 @@ def studied(client: TestClient, code: str, seed: int, sign_plan: Callable[..., A
     assert job.status_code == 202, job.text
     return {
         "code": code,
+        "study_code": f"study-{code}",
+        "site_code": f"site-{code}",
         "visit_id": visits[0],
         "open_visit": visits[1],
         "session_id": session,

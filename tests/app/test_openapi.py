@@ -192,11 +192,11 @@ INTENDED: dict[str, str] = {
             "paths > /api/v1/studies/{study_code}/sites",
             "paths > /api/v1/studies/{study_code}/sites/{site_code}",
         ),
-        "API: studies and their sites are read, added and renamed at `/studies`; a page and `betaloop study add`, `study site` and `user role` do so too",
+        "API: studies and their sites are read, added and renamed at `/studies`;",
     ),
     **dict.fromkeys(
         ("components > schemas > StatusChange", "paths > /api/v1/participants/{code} > patch"),
-        "API: `PATCH /participants/{code}` says that a participant has completed the study, has withdrawn, or takes part again, with a reason.",
+        "API: `PATCH /participants/{code}` says that a participant has completed the study, has withdrawn, or takes part again",
     ),
     "components > schemas > ProposalChange": "API: `control_stream` and `control_channel` of a proposal can be corrected.",
     **dict.fromkeys(

@@ -18,7 +18,8 @@ from app.main import create_app
 from app.platform.database import transaction
 
 METHODS = ("get", "post", "put", "patch", "delete")
-EVERYONE = {"viewer", "clinician", "engineer", "admin"}
+EVERYONE = {"viewer", "monitor", "coordinator", "clinician", "engineer", "admin"}
+RECORDERS = {"coordinator", "clinician", "engineer", "admin"}
 READABLE = (
     "/api/v1/participants",
     "/api/v1/participants/{code}",
@@ -68,32 +69,33 @@ READABLE = (
     "/api/v1/participants/{code}/replay",
     "/api/v1/visits/{visit_id}/locks",
     "/api/v1/participants/{code}/calibration",
+    "/api/v1/studies",
     "/healthz",
     "/readyz",
 )
 ROLES: dict[tuple[str, str], set[str]] = {
     # method and path: roles that may
-    ("post", "/api/v1/participants"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/participants"): RECORDERS,
     ("put", "/api/v1/participants/{code}/settings"): {"clinician", "engineer", "admin"},
     ("put", "/api/v1/participants/{code}/margins"): {"clinician", "admin"},
-    ("post", "/api/v1/participants/{code}/visits"): {"clinician", "engineer", "admin"},
-    ("patch", "/api/v1/visits/{visit_id}"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/participants/{code}/visits"): RECORDERS,
+    ("patch", "/api/v1/visits/{visit_id}"): RECORDERS,
     ("post", "/api/v1/visits/{visit_id}/lock"): {"clinician", "admin"},
     ("post", "/api/v1/visits/{visit_id}/unlock"): {"clinician", "admin"},
     ("post", "/api/v1/participants/{code}/margins/locks"): {"clinician", "admin"},
-    ("post", "/api/v1/participants/{code}/adverse-events"): {"clinician", "engineer", "admin"},
-    ("put", "/api/v1/adverse-events/{event_id}"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/participants/{code}/adverse-events"): RECORDERS,
+    ("put", "/api/v1/adverse-events/{event_id}"): RECORDERS,
     ("post", "/api/v1/adverse-events/{event_id}/clearance"): {"clinician", "admin"},
-    ("patch", "/api/v1/sessions/{session_id}"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/sessions/{session_id}/outcomes"): {"clinician", "engineer", "admin"},
-    ("put", "/api/v1/sessions/{session_id}/conditions"): {"clinician", "engineer", "admin"},
-    ("put", "/api/v1/sessions/{session_id}/qoc"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/uploads"): {"clinician", "engineer", "admin"},
-    ("patch", "/api/v1/proposals/{session_id}"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/proposals/{session_id}/confirm"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/proposals/{session_id}/split"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/proposals/{session_id}/discard"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/uploaded-files/{file_id}/session"): {"clinician", "engineer", "admin"},
+    ("patch", "/api/v1/sessions/{session_id}"): RECORDERS,
+    ("post", "/api/v1/sessions/{session_id}/outcomes"): RECORDERS,
+    ("put", "/api/v1/sessions/{session_id}/conditions"): RECORDERS,
+    ("put", "/api/v1/sessions/{session_id}/qoc"): RECORDERS,
+    ("post", "/api/v1/uploads"): RECORDERS,
+    ("patch", "/api/v1/proposals/{session_id}"): RECORDERS,
+    ("post", "/api/v1/proposals/{session_id}/confirm"): RECORDERS,
+    ("post", "/api/v1/proposals/{session_id}/split"): RECORDERS,
+    ("post", "/api/v1/proposals/{session_id}/discard"): RECORDERS,
+    ("post", "/api/v1/uploaded-files/{file_id}/session"): RECORDERS,
     ("post", "/api/v1/uploaded-files/{file_id}/review"): {"clinician", "admin"},
     ("post", "/api/v1/uploaded-files/{file_id}/release"): {"clinician", "admin"},
     ("post", "/api/v1/uploaded-files/{file_id}/discard"): {"clinician", "admin"},
@@ -105,14 +107,19 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("post", "/api/v1/jobs/{job_id}/retry"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/visits/{visit_id}/plan"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/visits/{visit_id}/plan/approve"): {"clinician", "admin"},
-    ("post", "/api/v1/visits/{visit_id}/day/entries"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/visits/{visit_id}/slots/confirm"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/visits/{visit_id}/day/entries"): RECORDERS,
+    ("post", "/api/v1/visits/{visit_id}/slots/confirm"): RECORDERS,
     ("post", "/api/v1/visits/{visit_id}/plan/moves"): {"clinician", "engineer", "admin"},
     ("post", "/api/v1/visits/{visit_id}/plan/key"): {"clinician", "admin"},
-    ("post", "/api/v1/visits/{visit_id}/removal"): {"clinician", "engineer", "admin"},
+    ("post", "/api/v1/visits/{visit_id}/removal"): RECORDERS,
     ("post", "/api/v1/participants/{code}/buffer-gate"): {"clinician", "admin"},
     ("get", "/api/v1/policies/{policy_id}/bundle"): {"clinician", "engineer", "admin"},
     ("get", "/api/v1/visits/{visit_id}/plan/sessions/{position}/bundle"): {"clinician", "engineer", "admin"},
+    ("patch", "/api/v1/participants/{code}"): RECORDERS,
+    ("post", "/api/v1/studies"): {"admin"},
+    ("patch", "/api/v1/studies/{study_code}"): {"admin"},
+    ("post", "/api/v1/studies/{study_code}/sites"): {"admin"},
+    ("patch", "/api/v1/studies/{study_code}/sites/{site_code}"): {"admin"},
     **{("get", path): EVERYONE for path in READABLE},
 }
 BLINDED = {
@@ -194,6 +201,7 @@ class World:
         session, graspless = (s["id"] for s in self.read(f"/visits/{visit}/sessions")["items"][:2])
         derived = self.upload("d.csv", TABLE, visit="2", controller="other", more=[("g.csv", GRASPS)])["sessions"][0]["id"]
         self.send(f"/sessions/{derived}/qoc", method="put", json={"grasp_hz": 3.0, "reason": "counted by hand"})
+        sampled = self.upload("s.csv", TABLE.replace(b"6,1,1", b"6,1.77,1", 1), visit="2", controller="other")["sessions"][0]["id"]
         self.ids: Json = {
             "code": "P1",
             "visit_id": visit,
@@ -201,19 +209,27 @@ class World:
             "upload_id": 1,
             "policy_id": small,
             "position": 1,
+            "study_code": "main",
+            "site_code": "main",
             "snapshot_id": 1,
             "sweep_id": self.read("/participants/P1/sweeps")["items"][0]["id"],
             "job_id": next(j["id"] for j in jobs if j["status"] == "cancelled"),
         }
         self.forms: dict[tuple[str, str], Json] = {
             # members of `ids` that differ, and what is sent
-            ("post", "/participants"): {"json": {"code": "Q1"}},
+            ("post", "/participants"): {"json": {"code": "Q1", "site": "main"}},
+            ("patch", "/participants/{code}"): {"code": "P3", "json": {"status": "completed", "reason": "last visit held"}},
+            ("get", "/sessions/{session_id}/samples"): {"session_id": sampled},
+            ("post", "/studies"): {"json": {"code": "ADAPT", "name": "Adaptive"}},
+            ("patch", "/studies/{study_code}"): {"json": {"name": "Main", "reason": "protocol 2"}},
+            ("post", "/studies/{study_code}/sites"): {"json": {"code": "south", "name": "South"}},
+            ("patch", "/studies/{study_code}/sites/{site_code}"): {"json": {"name": "Main clinic", "reason": "moved"}},
             ("put", "/participants/{code}/settings"): {"code": "P3", "json": {"settings": {"gamma": 0.9}}},
             ("post", "/visits/{visit_id}/lock"): {"json": {"reason": "complete"}},
             ("post", "/visits/{visit_id}/unlock"): {"json": {"reason": "rating misread"}},
             ("post", "/participants/{code}/margins/locks"): {"json": {"version": 2, "reason": "protocol"}},
             ("put", "/participants/{code}/margins"): {"json": {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}},
-            ("get", "/participants/{code}/replay"): {"code": "P2", "params": self.replayed(ranking["policies"][0]["policy_id"])},
+            ("get", "/participants/{code}/replay"): {"params": self.replayed(small)},
             ("post", "/participants/{code}/adverse-events"): {"json": SPEECH},
             ("put", "/adverse-events/{event_id}"): {"event_id": self.event(), "json": SPEECH | {"revision": 1, "reason": "misread"}},
             ("post", "/adverse-events/{event_id}/clearance"): {"event_id": self.event(), "json": {"revision": 1, "reason": "passed"}},
@@ -289,8 +305,8 @@ class World:
         return dict(self.send("/uploads", data={"participant": "P4", **stated}, files=given))
 
     def replayed(self, policy: int) -> Json:
-        """A session of P2 and a policy to run over it."""
-        visit = self.read("/participants/P2/visits")["items"][0]["id"]
+        """A session of P1 and a policy to run over it."""
+        visit = self.read("/participants/P1/visits")["items"][0]["id"]
         return {"session": self.read(f"/visits/{visit}/sessions")["items"][0]["id"], "policy": policy}
 
     def event(self) -> int:
@@ -358,7 +374,7 @@ def test_without_a_token_no_route_answers(world: World) -> None:
     assert {route: status for route, status in answers.items() if status != 401} == {}
 
 
-@pytest.mark.parametrize("role", ["viewer", "clinician", "engineer", "admin", "blinded_assessor"])
+@pytest.mark.parametrize("role", ["viewer", "monitor", "coordinator", "clinician", "engineer", "admin", "blinded_assessor"])
 def test_every_route_against_every_role(world: World, role: str) -> None:
     """Who may call a route gets what it promises; who may not is refused, with rows that exist in both cases."""
     caller = world.admin if role == "admin" else world.calling(token_of(role))
@@ -380,8 +396,16 @@ def test_a_caller_of_another_study_sees_nothing(world: World) -> None:
         db.add(Site(study_id=study.id, code="other", name="Other site"))
     stranger = world.calling(token_of("admin", "other"))
     assert stranger.get("/api/v1/participants").json()["total"] == 0
-    # the key that every bundle is verified with is public; of all participants it sees none
-    own = {"/api/v1/participants", "/api/v1/analyses", "/healthz", "/readyz", "/api/v1/bundle-key"}
+    # the key that bundles are verified with and the list of withdrawals, which names no participant, are for every tablet
+    own = {
+        "/api/v1/participants",
+        "/api/v1/studies",
+        "/api/v1/analyses",
+        "/healthz",
+        "/readyz",
+        "/api/v1/bundle-key",
+        "/api/v1/bundle-withdrawals",
+    }
     answers = {(m, p): world.call(stranger, m, p) for m, p in routes(world.app) if p not in own}
     assert {route: status for route, status in answers.items() if status != 404} == {}
 

@@ -6,7 +6,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import repository as accounts
 from app.accounts.models import Membership, Role, Site, Study, User
-from app.accounts.permissions import Caller
+from app.accounts.permissions import READ, Caller
 from app.accounts.service import administers
 from app.accounts.studies import repository
 from app.accounts.studies.schemas import SiteIn, StudyIn
@@ -36,10 +36,16 @@ def add_study(db: Session, draft: StudyIn, caller: Caller) -> Study:
 
 
 def study_to_manage(db: Session, code: str, caller: Caller) -> Study:
-    """A study that the caller administers at all of its sites. Raises NotFound for every other."""
+    """A study that the caller administers at all of its sites.
+
+    Raises:
+        NotFound: a study that the caller may not read. Forbidden: one that the caller reads and does not administer.
+    """
     study = repository.study_by_code(db, code)
-    if study is None or not administers(caller, study.id):
-        raise NotFound(f"There is no study '{code}', or you do not administer it.")
+    if study is None or not caller.may(READ, study.id):
+        raise NotFound(f"There is no study '{code}', or you have no access to it.")
+    if not administers(caller, study.id):
+        raise Forbidden(f"You do not administer study '{code}' at all of its sites.", "Ask somebody who does.")
     return study
 
 

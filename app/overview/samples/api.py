@@ -14,7 +14,7 @@ from app.platform.database import Db
 from app.platform.web.schemas import problems
 from app.study.deps import CurrentSession
 
-router = APIRouter()
+router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 CHUNK = 1 << 18
 
 ANSWERS: dict[int | str, dict[str, Any]] = {

@@ -59,7 +59,7 @@ def test_who_administers_one_study_makes_none_and_sees_no_other(client: TestClie
     assert [s["code"] for s in clinician.get("/api/v1/studies").json()] == ["main"]
     assert clinician.post("/api/v1/studies", json={"code": "mine", "name": "x"}).status_code == 403
     assert clinician.patch("/api/v1/studies/ADAPT", json={"name": "x", "reason": "x"}).status_code == 404
-    assert clinician.patch("/api/v1/studies/main", json={"name": "x", "reason": "x"}).status_code == 404
+    assert clinician.patch("/api/v1/studies/main", json={"name": "x", "reason": "x"}).status_code == 403
 
 
 def test_a_role_holds_at_its_site_alone_and_ends_at_once(client: TestClient, client_as: Clients) -> None:
