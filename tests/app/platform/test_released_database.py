@@ -61,6 +61,7 @@ ABSENT = {
             "/api/v1/visits/{visit_id}/slots",
             "/api/v1/visits/{visit_id}/plan/sessions/{position}/bundle",
             "/visits/{visit_id}/slots",
+            "/visits/{visit_id}/bundles",
             "/visit-day/{visit_id}",
         ),
         "select id from visit where id not in (select visit_id from plan)",
