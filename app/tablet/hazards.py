@@ -191,7 +191,7 @@ HAZARDS: tuple[Hazard, ...] = (
     ),
     Hazard(
         "H21", "A log is uploaded for another participant or session, or its steps are shifted by one", (_R,), _S2, _P3,
-        "A log says whose it is, and of which slot of which signed bundle: it fills that slot and no other. Beta stands beside "
+        "A log says whose it is, and of which slot of which signed bundle; uploaded for anybody else it is refused. Beta stands beside "
         "the amplitude that was in force while it was measured.",
         _P1, "Logs of before version 2 say nothing of themselves: they are assigned by a person.",
     ),

@@ -176,6 +176,14 @@ class Receiver:
     def _content(row: UploadFile) -> StoredContent:
         return StoredContent(row.kind, row.stored_sha256, row.quarantine_sha256, Redaction(), None)
 
+    def _refuse_another_participants(self, decoded: DecodedFile) -> None:
+        """Raise UndecodableFile for a controller's log that says it is of another participant: nothing of it may count here."""
+        for recording in decoded.recordings:
+            whose = (recording.settings.get("controller") or {}).get("participant")
+            if whose and whose != self.participant.code:
+                what = f"this log of a controller is of a session of participant {whose}, not of {self.participant.code}"
+                raise UndecodableFile(what, "first line", f"Upload it for {whose}; if that is wrong, ask which tablet it came from.")
+
     def _put_aside(self, row: UploadFile, content: StoredContent, problem: UndecodableFile) -> FileOutcome:
         """Into quarantine with a file that ends the processes which read it; a person decides on it there."""
         assert content.stored_sha256 is not None
@@ -231,6 +239,7 @@ class Receiver:
             if (known := self._known_meanwhile(name, row)) is not None:
                 return known
             decoded = self._decoded(row, content)
+            self._refuse_another_participants(decoded)
             repository.lock_participant(self.db, self.participant.id)
             # asked again under the lock: somebody may have sent the same bytes meanwhile
             if (known := self._known_meanwhile(name, row)) is not None:

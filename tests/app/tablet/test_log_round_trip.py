@@ -156,6 +156,18 @@ def test_a_log_without_its_first_line_is_refused_in_words(logged: tuple[Device, 
     assert "put '# betaloop controller log, version 1" in answer.text
 
 
+@pytest.mark.hazard("H21")
+def test_a_log_of_another_participant_is_refused(logged: tuple[Device, Path], client: TestClient, enrolled: str) -> None:
+    enrol = client.post("/api/v1/participants", json={"code": "P2"})
+    assert enrol.status_code == 201
+    assert client.post("/api/v1/participants/P2/visits", json={"number": 1}).status_code == 201
+    data = {"participant": "P2", "visit": "1", "confirm": "false"}
+    answer = client.post("/api/v1/uploads", data=data, files={"file": ("log.csv", logged[1].read_bytes())})
+    assert answer.status_code == 422
+    assert "of a session of participant P1, not of P2" in answer.text
+    assert client.get("/api/v1/participants/P2/proposals").json() == []
+
+
 def test_a_log_names_policy_and_limits_of_its_session(
     logged: tuple[Device, Path], client: TestClient, enrolled: str, tmp_path: Path
 ) -> None:
