@@ -23,7 +23,7 @@ def test_from_sign_in_to_a_participants_charts(window: Callable, studied: list[i
     watched.sign_in()
     watched.page.click("article.participant h3 a")
     assert watched.page.inner_text("h1") == "P1"
-    assert watched.charts_drawn() == 5
+    assert watched.charts_drawn() == 6
     assert watched.errors == []
     assert watched.foreign == []
 
