@@ -34,7 +34,6 @@ def lfp_table() -> tuple[bytes, np.ndarray[Any, Any], np.ndarray[Any, Any]]:
 def taken(client: TestClient, session: int, form: str = "parquet") -> bytes:
     answer = client.get(f"/api/v1/sessions/{session}/samples", params={"format": form})
     assert answer.status_code == 200, answer.text
-    assert int(answer.headers["content-length"]) == len(answer.content)
     return answer.content
 
 

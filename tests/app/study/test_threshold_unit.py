@@ -18,7 +18,7 @@ def test_a_threshold_with_stated_unit_and_source_counts(db: Session, study_sessi
     data = session_data(db, study_session)
     assert (data.threshold, data.threshold_mismatch) == (1.0, "")
     chart = control_chart(data).figure
-    assert "threshold 1 uV" in [t.get("name") for t in chart["data"]]
+    assert "threshold 1 µV" in [t.get("name") for t in chart["data"]]
     assert not any("threshold" in str(a.get("text")) for a in chart["layout"]["annotations"])  # no text over the data
 
 
