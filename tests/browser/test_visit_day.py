@@ -238,8 +238,11 @@ def test_a_tap_is_not_lost_when_something_arrives_under_the_finger(window: Calla
     watched.page.mouse.down()
     watched.page.evaluate("() => { dispatchEvent(new Event('online')); }")  # sends, and draws the page when it has sent
     watched.page.wait_for_timeout(1500)
+    assert stored(clinic_day) == ["start"], "sent while the finger was down"
     watched.page.mouse.up()
     watched.page.wait_for_selector("section[data-state=asked]")
+    wait_for(watched, 0)
+    assert stored(clinic_day) == ["start", "stop"]
 
 
 def test_grasps_are_counted_for_ten_seconds(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
