@@ -10,8 +10,10 @@ from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from fastapi import Depends
+from psycopg.errors import UndefinedColumn, UndefinedTable
 from sqlalchemy import Connection, DateTime, Engine, MetaData, create_engine, event, make_url, text
 from sqlalchemy.dialects.postgresql import JSONB
+from sqlalchemy.exc import ProgrammingError
 from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 
 from app.platform.embedded import place
@@ -118,11 +120,19 @@ def new_session() -> Session:
 
 @contextmanager
 def transaction(actor: str = "system") -> Iterator[Session]:
-    """A session that commits at the end and rolls back on an error; `actor` stands in the audit trail."""
+    """A session that commits at the end and rolls back on an error; `actor` stands in the audit trail.
+
+    Raises RuntimeError, in the words of a command line, where the database does not have the tables of this version.
+    """
     with new_session() as db:
         set_actor(db, actor)
-        yield db
-        db.commit()
+        try:
+            yield db
+            db.commit()
+        except ProgrammingError as error:
+            if isinstance(error.orig, UndefinedTable | UndefinedColumn):
+                raise RuntimeError("the database does not have the tables of this version: run `betaloop migrate` first") from error
+            raise
 
 
 def get_db() -> Iterator[Session]:

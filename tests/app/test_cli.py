@@ -11,6 +11,7 @@ import sys
 import zipfile
 from pathlib import Path
 
+import psycopg
 import pytest
 
 from app.accounts.permissions import SYSTEM
@@ -22,6 +23,7 @@ from app.study.repository import participant_by_code
 COMMANDS = (
     "serve", "worker", "demo", "migrate", "user add", "token create", "import", "pipeline", "rank", "export", "control",
     "ingest redecode", "ingest resume", "study simulate", "where", "backup-key", "backup", "restore", "doctor",
+    "audit verify", "audit seal", "study add", "study site", "user role",
 )  # fmt: skip
 TABLE = "t_s,beta,amplitude_fraction\n0,1,1\n2,1,0.5\n4,2,0.5\n"
 
@@ -111,6 +113,14 @@ def test_a_file_of_no_use_is_exit_code_1_with_the_hint(study: str, tmp_path: Pat
     assert result.returncode == 1
     assert "wrong.csv" in result.stderr
     assert "amplitude_fraction" in result.stderr
+
+
+def test_a_database_without_tables_is_said_in_a_line(fresh_database: str) -> None:
+    with psycopg.connect(fresh_database.replace("+psycopg", ""), autocommit=True) as connection:
+        connection.execute("drop owned by current_user cascade")
+    done = betaloop("user", "add", "ada@clinic.example", "--role", "admin", "--password-file", "-", stdin="correct horse battery")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.strip() == "betaloop: the database does not have the tables of this version: run `betaloop migrate` first"
 
 
 def test_migrating_twice_is_harmless(fresh_database: str) -> None:
