@@ -31,7 +31,11 @@ def study_add(
     draft = _checked(StudyIn, code=code, name=name, site={"code": site or code, "name": name})
     with transaction(ACTOR) as db:
         service.add_study(db, draft, SYSTEM)
-    _print({"code": code, "site": site or code}, as_json, f"Added study {code}.")
+    said = (
+        f"Added study {code}. Nobody works in it yet: give somebody a role with `betaloop user role EMAIL admin --study {code}`. "
+        "The audit trail, which covers all studies, is read by who has a role with that right in each of them."
+    )
+    _print({"code": code, "site": site or code}, as_json, said)
 
 
 def study_site(
