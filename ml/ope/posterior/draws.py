@@ -11,17 +11,33 @@ from ml.ope.estimate import OUTCOMES
 from ml.ope.flags import Flag
 from ml.ope.observed import mean_over_days
 from ml.ope.outcomes.model import EndModel
-from ml.ope.posterior.constants import COMMON_SHARE
-from ml.ope.posterior.gaussian import JITTER, correlated
-from ml.ope.posterior.learned.evidence import UNITS
-from ml.ope.posterior.learned.networks import Differences, Learned
-from ml.ope.posterior.replays import Replays
+from ml.ope.posterior.constants import COMMON_SHARE, MODEL_ERRORS
+from ml.ope.posterior.gaussian import correlated
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
 
 KEPT = 400
 """Draws that are kept, aligned over policies and quantities."""
+
+
+@dataclass(frozen=True)
+class Replays:
+    """Sessions under policies in all structures: P policies, D draws, n sessions.
+
+    Attributes:
+        step_return, energy, amplitude, beta: [P, D, n]. outcomes: [P, D, n, 4]. weights: of the draws, [D], summing to 1.
+        summaries: `support.SUMMARIES` of each policy, [P, 4]. behaviour: see `FittedPosterior`, by policy.
+    """
+
+    step_return: Floats
+    energy: Floats
+    amplitude: Floats
+    beta: Floats
+    outcomes: Floats
+    weights: Floats
+    summaries: Floats
+    behaviour: tuple[dict[str, float], ...]
 
 
 @dataclass(frozen=True)
@@ -38,79 +54,42 @@ class Draws:
     unknown: Flag | None
 
 
-def joint_draws(
-    buffer: ReplayBuffer,
-    replays: Replays,
-    ends: EndModel,
-    differences: Differences,
-    constants: Learned,
-    alike: Floats,
-    seed: int,
-    reach: float,
-) -> Draws:
-    """Draws of the level under cDBS on days that were not seen, of energies, and of differences to cDBS.
+def joint_draws(buffer: ReplayBuffer, replays: Replays, ends: EndModel, alike: Floats, leverage: Floats, horizon: int, seed: int) -> Draws:
+    """Draws of coefficients and structures, of the days that were not seen, and of what the structures get wrong.
 
     Args:
-        replays: P policies, cDBS last. ends: model of r_end. differences: of the policies. constants: what errors have in common.
-        alike: correlation of errors of the policies, [P, P]. seed: of the draws. reach: return that is lost above the threshold throughout.
+        replays: P policies, cDBS last. ends: model of r_end. alike: correlation of what structures get wrong, [P, P]. leverage: [P].
+        horizon: steps. seed: of the draws.
     """
+    settings = buffer.settings
     visits = np.array([s.visit for s in buffer.sessions])
-    parts = {"steps": replays.step_return}
+    parts = {"steps": replays.step_return, "energy": replays.energy}
     parts |= {name: replays.outcomes[..., j] for j, name in enumerate(OUTCOMES) if j and ends.seen[j]}
-    weighed = {name: np.einsum("pdn,d->pn", values, replays.weights) for name, values in parts.items()}
-    ended = np.einsum("pdn,d->pn", replays.outcomes[..., 0], replays.weights) if ends.seen[0] else 0.0
-    total = weighed["steps"] + ended
-    days = mean_over_days(total, visits, KEPT, seed)
+    constants = ends.constants if ends.seen[0] else None
+    total = replays.step_return + (replays.outcomes[..., 0] if ends.seen[0] else 0.0)
+    days = mean_over_days(np.einsum("pdn,d->pn", total, replays.weights), visits, KEPT, seed)
     rng = np.random.default_rng([seed, 0x9057])
-    drawn = {"energy": _energies(replays, days.weights, visits, seed, rng)}
-    between = {}
-    noise = _noises(alike, constants.together, rng)
-    for name, over_draws in weighed.items():
-        q, unit = list(UNITS).index(name), reach if name == "steps" else UNITS[name]
-        size = level_sd(over_draws[-1], visits, unit, q, constants, seed)
-        level = over_draws[-1] @ days.weights + size * _level_noise(noise[:-1, q], constants.level_against[q], rng)
-        gaps = unit * (differences.mean[:, q, None] + differences.sd[:, q, None] * noise[:, q])
-        drawn[name] = level + gaps
+    picked = systematic(replays.weights, KEPT, rng)
+    reach = float(np.sum(settings.gamma ** np.arange(horizon))) * abs(settings.r_a - settings.r_b)
+    drawn, between = {}, {}
+    for name, values in parts.items():
+        base, over_draws = values @ days.weights, np.einsum("pdn,d->pn", values, replays.weights)
+        own = mean_over_days(over_draws, visits, KEPT, seed)
+        rows = base[:, picked] + COMMON_SHARE * own.common + own.own
+        # what was picked has a mean of its own: the draws keep that of all
+        rows += (base @ replays.weights - rows.mean(1))[:, None]
+        if name in MODEL_ERRORS:
+            unit = reach if name == "steps" else 1.0
+            rows += correlated(alike, np.array([unit * MODEL_ERRORS[name].sd(v) for v in leverage]), KEPT, rng)
+        drawn[name] = rows
         between[name] = _between_visits(over_draws - over_draws[-1], visits)
-    if ends.seen[0]:
+    if constants is not None:
         qoc = [drawn.get(name, np.zeros_like(drawn["steps"])) for name in OUTCOMES[1:]]
-        drawn["r_end"] = np.einsum("k,kpd->pd", ends.constants, np.stack(qoc))
+        drawn["r_end"] = np.einsum("k,kpd->pd", constants, np.stack(qoc))
     drawn.setdefault("r_end", np.zeros_like(drawn["steps"]))
     drawn["return"] = drawn["steps"] + drawn["r_end"]
-    between["return"] = _between_visits(total - total[-1], visits)
-    energies = np.einsum("pdn,d->pn", replays.energy, replays.weights)
-    between["energy"] = _between_visits(energies - energies[-1], visits)
+    between["return"] = _between_visits(np.einsum("pdn,d->pn", total - total[-1], replays.weights), visits)
     return Draws(drawn, between, days.unknown)
-
-
-def level_sd(under_cdbs: Floats, visits: NDArray[np.int64], unit: float, quantity: int, constants: Learned, seed: int) -> float:
-    """Standard deviation of the level of new days under cDBS: that of a mean over few days, and one of its own in units."""
-    common = float(mean_over_days(under_cdbs[None], visits, KEPT, seed).common.std())
-    return float(np.hypot(constants.level_common[quantity] * common, unit * constants.level_own[quantity]))
-
-
-def _level_noise(noise: Floats, against: float, rng: np.random.Generator) -> Floats:
-    """Standard normal draws [KEPT] with a correlation to what the policies' noises [P, KEPT] have in common."""
-    shared, own = noise.mean(0), rng.standard_normal(KEPT)
-    both = against * shared / max(float(shared.std()), 1e-9) + np.sqrt(1 - against**2) * (own - own.mean()) / own.std()
-    return np.asarray(both - both.mean(), dtype=np.float64)
-
-
-def _energies(replays: Replays, weights: Floats, visits: NDArray[np.int64], seed: int, rng: np.random.Generator) -> Floats:
-    """Mean squared amplitudes [P, KEPT]: draws of coefficients and of days."""
-    base, over_draws = replays.energy @ weights, np.einsum("pdn,d->pn", replays.energy, replays.weights)
-    own = mean_over_days(over_draws, visits, KEPT, seed)
-    rows = base[:, systematic(replays.weights, KEPT, rng)] + COMMON_SHARE * own.common + own.own
-    # what was picked has a mean of its own: the draws keep that of all
-    return np.asarray(rows + (base @ replays.weights - rows.mean(1))[:, None], dtype=np.float64)
-
-
-def _noises(alike: Floats, together: Floats, rng: np.random.Generator) -> Floats:
-    """Standard normal draws [P, 4, KEPT], correlated over policies and over quantities."""
-    rows = np.stack([correlated(alike, np.ones(len(alike)), KEPT, rng) for _ in range(len(together))], axis=1)
-    lower = np.linalg.cholesky(together + JITTER * np.eye(len(together)))
-    rows = np.einsum("qr,prd->pqd", lower, rows)
-    return np.asarray(rows / rows.std(-1, keepdims=True), dtype=np.float64)
 
 
 def systematic(weights: Floats, number: int, rng: np.random.Generator) -> NDArray[np.int64]:

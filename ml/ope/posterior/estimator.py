@@ -20,12 +20,9 @@ from ml.ope.lead import dose_before
 from ml.ope.linear.estimator import FittedLinear, LinearConfig, Replayed
 from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.posterior.constants import VERSION
-from ml.ope.posterior.draws import Draws, joint_draws
+from ml.ope.posterior.draws import Draws, Replays, joint_draws
 from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference, similarity, updated
 from ml.ope.posterior.held_out import HeldOut, held_out
-from ml.ope.posterior.learned.evidence import Evidence, evidence, reach_of
-from ml.ope.posterior.learned.networks import differences_of, learned
-from ml.ope.posterior.replays import Replays
 from ml.ope.posterior.skill import Skill, ordering_skill
 from ml.ope.posterior.structures import STRUCTURES, Fit, no_answer
 from ml.ope.posterior.support import LATE_STEPS, SessionSupport, Support
@@ -136,7 +133,7 @@ class FittedPosterior:
             return {}
         everyone = {**policies, CDBS: ConstantPolicy(1.0)}
         names, chosen = list(everyone), list(everyone.values())
-        replays = self.replays(chosen, horizon, report)
+        replays = self._replays(chosen, horizon, report)
         support = SessionSupport(self.buffer)
         supports = [support.of(s) for s in replays.summaries]
         draws = self._draws(replays, everyone, supports, horizon)
@@ -152,7 +149,7 @@ class FittedPosterior:
         """Level of every session, [n], over structures."""
         return np.sum([self.predictions.weights[f.key] * f.drawn.levels.mean(0) for f in self.fits], axis=0)
 
-    def replays(self, policies: list[Policy], horizon: int, report: Report = silent) -> Replays:
+    def _replays(self, policies: list[Policy], horizon: int, report: Report) -> Replays:
         """Every structure's replays side by side; the draws of r_end are dealt out over the structures."""
         found: list[Replayed] = []
         weights: list[Floats] = []
@@ -190,16 +187,10 @@ class FittedPosterior:
             each.append(np.stack([v.mean(-1) for v in (r.amplitude, late, r.above, switching)], axis=-1))  # [P, D, 4]
         return np.asarray(np.einsum("pds,d->ps", np.concatenate(each, axis=1), weights), dtype=np.float64)
 
-    def evidence(self, replays: Replays, leverage: Floats, horizon: int) -> Evidence:
-        """What the record and the structures say of the replayed policies, cDBS last; leverage [P]."""
-        return evidence(self.buffer, replays, leverage, self.shares, self.predictions, self.equal, self.ends, horizon)
-
     def _draws(self, replays: Replays, policies: Mapping[str, Policy], supports: Sequence[Support], horizon: int) -> Draws:
         alike = similarity(list(policies.values()), self.buffer.transitions().states)
         leverage = np.array([s.leverage for s in supports])
-        constants = learned()
-        gaps = differences_of(self.evidence(replays, leverage, horizon), leverage, constants)
-        found = joint_draws(self.buffer, replays, self.ends, gaps, constants, alike, self.config.seed, reach_of(self.buffer, horizon))
+        found = joint_draws(self.buffer, replays, self.ends, alike, leverage, horizon, self.config.seed)
         if not self.tests:
             return found
         names, rng = list(policies), np.random.default_rng([self.config.seed, 0x7E57])

@@ -14,7 +14,6 @@ from ml.population.virtual.world import (
     World,
     is_responder,
     simple_policies,
-    training_world,
     within_margins,
     world,
 )
@@ -43,7 +42,6 @@ __all__ = [
     "new_days",
     "simple_policies",
     "simulate",
-    "training_world",
     "visit_days",
     "with_trait",
     "within_margins",

@@ -31,9 +31,6 @@ Part = Literal["A", "B", "C"]
 DataDesign = Literal["paper", "stratified", "ladder"]
 
 PARTS: Final[dict[str, int]] = {"A": 11, "B": 23, "C": 37}
-TRAINING: Final = "training"
-TRAINING_SEED: Final = 5501
-"""Worlds that constants are learned from (`training_world`). Far above `PARTS`, so that no stream of numbers is shared with them."""
 WORLDS_PER_PART: Final = 60
 PER_OTHER_MECHANISM: Final = 4
 """Worlds of a part with each mechanism but the graded one: one ordinary, the others with traits in rotation."""
@@ -221,27 +218,11 @@ def world(part: Part, index: int) -> World:
     if part not in PARTS or not 0 <= index < WORLDS_PER_PART:
         raise ValueError(f"there is no world {index} in part {part!r}: parts are A, B and C, indices 0 to {WORLDS_PER_PART - 1}")
     kind, trait = make_up(part)[index]
-    return _drawn_world(part, PARTS[part], index, kind, trait)
-
-
-def training_world(index: int) -> World:
-    """A world to learn constants from: of the same distribution as the parts and of none of them; every 60 have a part's mixture.
-
-    Raises:
-        ValueError: a negative index.
-    """
-    if index < 0:
-        raise ValueError(f"training worlds are numbered from 0, not {index}")
-    kind, trait = make_up(TRAINING)[index % WORLDS_PER_PART]
-    return _drawn_world(TRAINING, TRAINING_SEED, index, kind, trait)
-
-
-def _drawn_world(part: str, seed: int, index: int, kind: int, trait: str | None) -> World:
-    rng = np.random.default_rng([seed, index, 0x776F])
+    rng = np.random.default_rng([PARTS[part], index, 0x776F])
     patient = with_trait(draw_patient(kind, rng), trait, rng)
     lower_bound = float(rng.choice((0.3, 0.3, 0.3, 0.4)))
     weight = 0.0 if rng.random() < WITHOUT_END else 10.0
-    key = seed * 1000 + index
+    key = PARTS[part] * 1000 + index
     days = new_days(key, _CALIBRATION, 100)
     full, low = (simulate(patient, 1.0, ConstantPolicy(a), days=days, key=key, first=_CALIBRATION).beta for a in (1.0, 0.3))
     settings = MdpSettings(xi_beta=float(full.mean() + low.mean()) / 2, c2=weight, c3=weight, c4=weight, lower_bound=lower_bound)
@@ -259,8 +240,7 @@ def make_up(part: str) -> list[tuple[int, str | None]]:
     difficult: list[tuple[int, str | None]] = [(0, t) for t in repeated]
     ordinary: list[tuple[int, str | None]] = [(0, None)] * (WORLDS_PER_PART - len(others) - len(difficult))
     both = others + difficult + ordinary
-    seed = TRAINING_SEED if part == TRAINING else PARTS[part]
-    return [both[i] for i in np.random.default_rng([seed, 0x6D65]).permutation(len(both))]
+    return [both[i] for i in np.random.default_rng([PARTS[part], 0x6D65]).permutation(len(both))]
 
 
 def _truth(settings: MdpSettings, run: Sessions) -> Truth:

@@ -21,7 +21,6 @@ from ml.population.virtual import (
     is_responder,
     new_days,
     simulate,
-    training_world,
     visit_days,
     with_trait,
     world,
@@ -322,14 +321,3 @@ def test_controllers_that_answer_wrongly_are_refused():
         simulate(patient, 1.0, FOLLOWING, days=days, key=1, steps=10, window=31)
     with pytest.raises(ValueError, match="mechanisms"):
         draw_patient(99, np.random.default_rng(0))
-
-
-def test_worlds_to_learn_from_are_of_the_same_mixture_and_in_no_part() -> None:
-    worlds = [training_world(i) for i in range(WORLDS_PER_PART)]
-    assert Counter((w.patient.kind, w.trait) for w in worlds) == Counter(make_up("A"))
-    ours = {w.key for w in worlds} | {training_world(1000).key}
-    assert not ours & {world(part, i).key for part in ("A",) for i in range(WORLDS_PER_PART)}
-    assert training_world(7).patient == training_world(7).patient != training_world(67).patient
-    assert training_world(67).trait == training_world(7).trait
-    with pytest.raises(ValueError, match="numbered from 0"):
-        training_world(-1)
