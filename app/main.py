@@ -65,7 +65,7 @@ API_MODULES = (
 PAGE_MODULES = (
     "app.accounts.pages",
     "app.accounts.studies.pages",
-    "app.study.pages",
+    "app.study.enrolment.pages",
     "app.study.settings.pages",
     "app.study.margins.pages",
     "app.study.participation.pages",

@@ -33,8 +33,10 @@ from app.simulation.sessions import PlacedSession
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.blinding import CONTROLLER_NAMES, arm
+from app.study.enrolment import service as enrolment
+from app.study.enrolment.schemas import ParticipantIn
 from app.study.models import Controller, Participant, Visit
-from app.study.schemas import ParticipantIn, VisitIn
+from app.study.schemas import VisitIn
 
 LEARNED_KINDS = ("trained", "distilled")
 _WASHOUT_MINUTES = 5.0
@@ -110,7 +112,7 @@ class ParticipantLoop:
         try:
             found = study_repository.participant_by_code(db, self.code, self.caller)
         except NotFound:
-            return study.enrol(db, ParticipantIn.model_validate(participant_body(self.code)), self.caller)
+            return enrolment.enrol(db, ParticipantIn.model_validate(participant_body(self.code)), self.caller)
         refuse_foreign(found, self.caller)
         return found
 

@@ -10,13 +10,14 @@ from app.platform.web.schemas import Page, PagingQuery, problems
 from app.study import repository, service
 from app.study.blinding import require_known
 from app.study.deps import CurrentParticipant, CurrentSession, CurrentVisit
+from app.study.enrolment import service as enrolment
+from app.study.enrolment.schemas import ParticipantIn
 from app.study.outcomes import values as outcome_values
 from app.study.schemas import (
     ConditionsChange,
     ConditionsOut,
     DerivedChoice,
     OutcomeOut,
-    ParticipantIn,
     ParticipantOut,
     QocIn,
     QocOut,
@@ -51,7 +52,7 @@ def list_participants(db: Db, caller: CurrentCaller, paging: PagingQuery) -> Pag
 @router.post("/participants", status_code=201, responses=problems(409))
 def enrol(draft: ParticipantIn, db: Db, caller: CurrentCaller) -> ParticipantOut:
     """Enrol a participant."""
-    participant = service.enrol(db, draft, caller)
+    participant = enrolment.enrol(db, draft, caller)
     db.commit()
     return participant_out(participant)
 

@@ -143,14 +143,6 @@ class SettingsChange(Model):
     reason: Text | None = Field(None, max_length=1000)
 
 
-class ParticipantIn(Model):
-    """A participant to enrol."""
-
-    code: Code
-    site: Text | None = Field(None, max_length=40, description="Code of the site; needed when there are several.")
-    settings: SettingsIn = Field(default_factory=SettingsIn)
-
-
 class ParticipantOut(Model):
     """A participant."""
 

@@ -9,22 +9,19 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
-from app.accounts.models import Site
 from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import blinding, repository
-from app.study.margins.schemas import MarginsFields
-from app.study.models import CdbsAmplitude, Controller, MarginsVersion, Participant, QocRevision, SettingsVersion, StudySession, Visit
+from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision, SettingsVersion, StudySession, Visit
 from app.study.outcomes import service as outcomes
-from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, ParticipantIn, QocIn, SessionChange, SettingsIn, VisitChange, VisitIn
+from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, QocIn, SessionChange, SettingsIn, VisitChange, VisitIn
 from app.study.sessions import repeated
 from app.study.threshold import MDP_FIELDS
 from app.study.traces import NO_CONTROL, control_programs
 from app.study.visits.service import require_unlocked
 from ml.mdp import MdpSettings
 
-RESERVED_CODES = {"new"}
 WITHDRAWN = "withdrawn"
 NOT_AFTER_WITHDRAWAL = frozenset(
     {can.UPLOAD, can.RUN_JOBS, can.WRITE_POLICIES, can.DRAFT_PLAN, can.APPROVE_PLAN, can.TAKE_BUNDLES, can.WRITE_SETTINGS}
@@ -36,27 +33,6 @@ POLICY_CONTROLLERS = {Controller.RL, Controller.DISTILLED, Controller.OTHER}
 """Controllers that a policy can stand behind."""
 
 
-def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
-    """Add a participant with its first settings version and the default margins. Raises Conflict when the code is taken."""
-    if draft.code.lower() in RESERVED_CODES:
-        raise Invalid(f"'{draft.code}' cannot be a participant's code: it is the address of a page.", "Choose another code.")
-    site = _site(db, draft.site, caller)
-    caller.require(can.WRITE_STUDY, site.study_id, site.id)
-    participant = Participant(site_id=site.id, code=draft.code)
-    db.add(participant)
-    try:
-        db.flush()
-    except IntegrityError as error:
-        db.rollback()
-        raise Conflict(
-            f"There is already a participant '{draft.code}' (capitals and small letters count as the same).", "Choose another code."
-        ) from error
-    _add_settings(db, participant, draft.settings.model_dump(), caller, reason=None)
-    participant.margins.append(MarginsVersion(version=1, created_by=caller.label, **MarginsFields().model_dump()))
-    db.flush()
-    return participant
-
-
 def change_settings(db: Session, participant: Participant, change: SettingsIn, reason: str | None, caller: Caller) -> SettingsVersion:
     """Make a new settings version of what the change names; old results keep theirs. No change, no version."""
     require(caller, can.WRITE_SETTINGS, participant)
@@ -64,7 +40,7 @@ def change_settings(db: Session, participant: Participant, change: SettingsIn, r
     values = {name: getattr(current, name) for name in SettingsIn.model_fields} | change.model_dump(exclude_unset=True)
     if all(getattr(current, name) == value for name, value in values.items()):
         return current
-    return _add_settings(db, participant, values, caller, reason)
+    return add_settings(db, participant, values, caller, reason)
 
 
 def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Caller) -> Visit:
@@ -244,7 +220,8 @@ def require_own(participant: Participant, row: Owned, name: str) -> None:
         raise NotFound(f"Participant {participant.code} has no {name}.", "Choose one from the participant's own list.")
 
 
-def _add_settings(db: Session, participant: Participant, values: dict[str, Any], caller: Caller, reason: str | None) -> SettingsVersion:
+def add_settings(db: Session, participant: Participant, values: dict[str, Any], caller: Caller, reason: str | None) -> SettingsVersion:
+    """Store the next settings version. Raises Invalid for settings that contradict each other, Conflict where somebody was faster."""
     try:
         MdpSettings(xi_beta=values["xi_beta"] if values["xi_beta"] is not None else 0.0, **{n: values[n] for n in MDP_FIELDS})
     except ValueError as error:
@@ -270,12 +247,3 @@ def _add_settings(db: Session, participant: Participant, values: dict[str, Any],
         db.rollback()
         raise Conflict("Somebody else changed these settings at the same time.", "Load them again and repeat your change.") from error
     return row
-
-
-def _site(db: Session, code: str | None, caller: Caller) -> Site:
-    sites = [s for s in repository.sites(db, caller) if code in (None, s.code)]
-    if len(sites) == 1:
-        return sites[0]
-    if not sites:
-        raise NotFound(f"There is no site '{code}', or you have no access to it.")
-    raise Invalid("There are several sites.", f"Name one: {', '.join(s.code for s in sites)}.")

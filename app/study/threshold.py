@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,23 +20,32 @@ MDP_FIELDS = (
 )  # fmt: skip
 
 
-def mdp_settings(settings: SettingsVersion, suggestion: float | None = None) -> MdpSettings:
+@dataclass(frozen=True)
+class SuggestedThreshold:
+    """A threshold from the data, in the unit and from the source of the beta that it was taken from."""
+
+    value: float
+    unit: str
+    source: str
+
+
+def mdp_settings(settings: SettingsVersion, suggestion: SuggestedThreshold | None = None) -> MdpSettings:
     """The MDP of a settings version.
 
     Raises:
         Invalid: xi_beta is not set; names the suggestion from the data where there is one.
     """
     if settings.xi_beta is None:
-        hint = f" A suggestion from the data: {suggestion:.4g} {settings.beta_unit or ''}".rstrip() + "." if suggestion is not None else ""
+        hint = f" A suggestion from the data: {suggestion.value:.4g} {suggestion.unit}." if suggestion is not None else ""
         raise Invalid(
             f"Participant {settings.participant.code} has no beta threshold xi_beta yet; the paper gives no default.",
             f"Set xi_beta in the participant's settings.{hint}",
-            suggested_xi_beta=suggestion,
+            suggested_xi_beta=suggestion.value if suggestion else None,
         )
     return MdpSettings(xi_beta=settings.xi_beta, **{name: getattr(settings, name) for name in MDP_FIELDS})
 
 
-def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> float | None:
+def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> SuggestedThreshold | None:
     """A threshold from the data: midway between the median beta of cDBS sessions and that of no-DBS sessions, else the median of all.
 
     Of confirmed sessions that are not excluded, with beta in the settings' unit and from their source; None where these leave it open and
@@ -55,10 +65,10 @@ def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> fl
             continue
         kinds.add((trace.unit, trace.source))
         groups.setdefault(blinding.arm(session, caller).controller, []).append(table.beta[~np.isnan(table.beta)])
-    if len(kinds) > 1:
-        return None
     medians = {c: float(np.median(np.concatenate(b))) for c, b in groups.items() if sum(x.size for x in b)}
+    if len(kinds) != 1 or not medians:
+        return None
+    unit, source = kinds.pop()
     if Controller.CDBS in medians and Controller.NO_DBS in medians:
-        return (medians[Controller.CDBS] + medians[Controller.NO_DBS]) / 2
-    everything = [x for parts in groups.values() for x in parts if x.size]
-    return float(np.median(np.concatenate(everything))) if everything else None
+        return SuggestedThreshold((medians[Controller.CDBS] + medians[Controller.NO_DBS]) / 2, unit, source)
+    return SuggestedThreshold(float(np.median(np.concatenate([x for parts in groups.values() for x in parts if x.size]))), unit, source)

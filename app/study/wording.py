@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from app.study.adverse_events.models import EventKind, Severity
+from app.study.enrolment.codes import CodeQuestion
 from app.study.models import Controller
 from app.study.sessions.contradictions import Contradiction, Kind
 from app.study.sessions.designs import Drawn
@@ -27,7 +28,20 @@ EVENT_KINDS = {
 }
 EVENT_SEVERITIES = {Severity.NONE: "none", Severity.MILD: "mild", Severity.SEVERE: "severe"}
 
+CODE_QUESTIONS = {
+    CodeQuestion.NAME: "it holds a word that may be a name",
+    CodeQuestion.BIRTH_YEAR: "it holds a year in which a participant may have been born",
+    CodeQuestion.BIRTH_DATE: "it holds a date on which a participant may have been born",
+}
+CODE_HINT = "Choose a code that tells nothing about the person, or confirm that this is a study code."
+CODE_CONFIRMED = "looked at by a person: a study code"
+
 _SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be without DBS"}
+
+
+def code_questions(code: str, found: Iterable[CodeQuestion]) -> str:
+    """What a study code looks like."""
+    return f"The code '{code}' may tell who the participant is: {' and '.join(CODE_QUESTIONS[q] for q in found)}."
 
 
 def sentences(contradictions: Iterable[Contradiction]) -> list[str]:

@@ -41,6 +41,9 @@ INTENDED: dict[str, str] = {
         ),
         "API: sweeps call their scores of controllers without learning `baselines` (was `yardsticks`).",
     ),
+    "components > schemas > ParticipantIn > properties > is_study_code": (
+        "API: a study code that may be a name or holds a year or date of birth is questioned (422, `questions`)"
+    ),
     "paths > /readyz": "`GET /readyz` says whether requests can be served (the database answers and has this version's schema).",
     **dict.fromkeys(
         ("components > schemas > Problem", "components > schemas > ProblemOut"),

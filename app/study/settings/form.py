@@ -130,6 +130,11 @@ GROUPS = (
     ),
 )  # fmt: skip
 
+_AT_ENROLMENT = ("cdbs_amplitude_ma",)
+AT_ENROLMENT = tuple(f for group in GROUPS for f in group.fields if f.name in _AT_ENROLMENT)
+"""What whoever enrols a participant knows of the settings."""
+LATER = tuple(SettingGroup(group.title, tuple(f for f in group.fields if f.name not in _AT_ENROLMENT)) for group in GROUPS)
+"""What has a default, or comes from the data."""
 LABELS = {f.name: f.label for group in GROUPS for f in group.fields}
 
 

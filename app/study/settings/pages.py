@@ -21,7 +21,7 @@ from app.study.models import Participant
 from app.study.schemas import SettingsIn
 from app.study.service import may
 from app.study.settings import form
-from app.study.threshold import suggest_xi_beta
+from app.study.threshold import SuggestedThreshold, suggest_xi_beta
 
 log = structlog.get_logger()
 
@@ -79,7 +79,7 @@ def _settings_page(
     return HTMLResponse(page, error.status if error else 200)
 
 
-def _suggestion(db: Session, participant: Participant, caller: Caller) -> float | None:
+def _suggestion(db: Session, participant: Participant, caller: Caller) -> SuggestedThreshold | None:
     try:
         return suggest_xi_beta(db, participant, caller)
     except Invalid as error:

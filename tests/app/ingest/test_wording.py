@@ -44,14 +44,14 @@ def test_other_words_change_no_decision(client: TestClient, monkeypatch: pytest.
         assert answer.status_code == 201, answer.text
         return code
 
-    plain = run(client, enrol("PLAIN"))
+    plain = run(client, enrol("P8"))
     assert plain[0] == ("no_dbs", "no_dbs", "cdbs")
     assert plain[4] == ("random", "random", "cdbs")
     monkeypatch.setattr(ingest_wording, "reason", lambda evidence: "reworded")
     monkeypatch.setattr(ingest_wording, "unreadable", lambda members: ["reworded" for _ in members])
     for kind in Kind:
         monkeypatch.setitem(study_wording._SENTENCES, kind, lambda facts: "reworded")
-    assert run(client, enrol("OTHER")) == plain
+    assert run(client, enrol("P9")) == plain
 
 
 def test_every_contradiction_has_words() -> None:

@@ -12,8 +12,10 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.ingest.models import Upload, UploadFile
 from app.study import blinding, repository, service
+from app.study.enrolment import service as enrolment
+from app.study.enrolment.schemas import ParticipantIn
 from app.study.models import Controller, Device, Hemisphere, Recording, SessionSegment, StudySession, Trace
-from app.study.schemas import ParticipantIn, SettingsIn, VisitIn
+from app.study.schemas import SettingsIn, VisitIn
 from app.study.traces import pack
 
 START = datetime(2026, 3, 2, 9, 0, tzinfo=UTC)
@@ -24,7 +26,7 @@ CLASSES = ("unknown", "none", "slight", "mild", "moderate", "strong")
 def study_session(db: Session) -> StudySession:
     """A confirmed session of 10 minutes from 09:00 UTC on, of the left hemisphere, at half of a cDBS amplitude of 3 mA."""
     settings = SettingsIn(xi_beta=1.0, cdbs_amplitude_ma=3.0, beta_unit="uV", beta_source="table")
-    participant = service.enrol(db, ParticipantIn(code="P1", settings=settings), SYSTEM)
+    participant = enrolment.enrol(db, ParticipantIn(code="P1", settings=settings), SYSTEM)
     visit = service.add_visit(db, participant, VisitIn(number=1, date=START.date()), SYSTEM)
     device = Device(participant_id=participant.id, pseudonym="d", kind="rcs")
     db.add(device)

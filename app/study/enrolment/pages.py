@@ -1,4 +1,4 @@
-"""HTML page of enrolment. Settings, visits and sessions have their own."""
+"""HTML page of enrolment."""
 
 from __future__ import annotations
 
@@ -14,26 +14,30 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
-from app.study import repository, service
-from app.study.schemas import ParticipantIn, SettingsIn
+from app.study import repository
+from app.study.enrolment import service
+from app.study.enrolment.schemas import ParticipantIn
+from app.study.schemas import SettingsIn
 from app.study.settings import form
 
 router = APIRouter()
+
+_LABELS = {"code": "Code (letters, digits, - and _)", "site": "Site", "is_study_code": "This is a study code"}
 
 
 @router.get("/participants/new")
 def new_participant(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """The enrolment form."""
     caller.require(can.WRITE_STUDY)
-    return _enrolment(request, db, caller, {"code": "", "site": ""}, form.texts(SettingsIn()))
+    return _enrolment(request, db, caller, dict.fromkeys(_LABELS, ""), form.texts(SettingsIn()))
 
 
 @router.post("/participants")
 def enrol(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Enrol a participant."""
-    known = {name: str(values.get(name, "")).strip() for name in ("code", "site")}
+    known = {name: str(values.get(name, "")).strip() for name in _LABELS}
     try:
-        draft = parse(ParticipantIn, {k: v for k, v in known.items() if v}, {"code": "Code (letters, digits, - and _)", "site": "Site"})
+        draft = parse(ParticipantIn, {k: v for k, v in known.items() if v}, _LABELS)
         draft.settings = parse(SettingsIn, values, form.LABELS)
         participant = service.enrol(db, draft, caller)
     except BetaloopError as error:
@@ -47,8 +51,17 @@ def _enrolment(
     request: Request, db: Session, caller: Caller, known: dict[str, str], values: dict[str, str], error: BetaloopError | None = None
 ) -> HTMLResponse:
     sites = [s for s in repository.sites(db, caller) if caller.may(can.WRITE_STUDY, s.study_id, s.id)]
-    problem = error.problem(request.url.path) if error else None
-    page = render(request, "study/participant_new.html", known=known, values=values, groups=form.GROUPS, sites=sites, problem=problem)
+    page = render(
+        request,
+        "study/participant_new.html",
+        known=known,
+        values=values,
+        stated=form.AT_ENROLMENT,
+        constants=form.LATER,
+        sites=sites,
+        questioned=bool(error and error.extra.get("questions")),
+        problem=error.problem(request.url.path) if error else None,
+    )
     return HTMLResponse(page, error.status if error else 200)
 
 

@@ -1,0 +1,19 @@
+"""API type of an enrolment."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from app.platform.web.schemas import Bool, Model, Text
+from app.study.schemas import Code, SettingsIn
+
+
+class ParticipantIn(Model):
+    """A participant to enrol."""
+
+    code: Code
+    is_study_code: Bool = Field(
+        False, description="A person has looked at a code that resembles a name or holds a birth year or date: it is a study code."
+    )
+    site: Text | None = Field(None, max_length=40, description="Code of the site; needed when there are several.")
+    settings: SettingsIn = Field(default_factory=SettingsIn)

@@ -1,0 +1,61 @@
+"""Enrolment. The caller commits."""
+
+from __future__ import annotations
+
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.models import Site
+from app.accounts.permissions import Caller
+from app.platform.database import now, set_reason
+from app.platform.errors import Conflict, Invalid, NotFound
+from app.study import repository, wording
+from app.study.enrolment import codes
+from app.study.enrolment.schemas import ParticipantIn
+from app.study.margins.schemas import MarginsFields
+from app.study.models import MarginsVersion, Participant
+from app.study.service import add_settings
+
+RESERVED_CODES = {"new"}
+
+
+def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
+    """Add a participant with its first settings version and the default margins.
+
+    Raises:
+        Invalid: the code is a page's address, or looks like somebody's identity and nobody said that it is a study code (the problem's
+            `questions` say what it looks like). Conflict: the code is taken. NotFound: no such site. Forbidden: not the caller's to enrol.
+    """
+    if draft.code.lower() in RESERVED_CODES:
+        raise Invalid(f"'{draft.code}' cannot be a participant's code: it is the address of a page.", "Choose another code.")
+    site = _site(db, draft.site, caller)
+    caller.require(can.WRITE_STUDY, site.study_id, site.id)
+    asked = codes.questions(draft.code, now().date())
+    if asked and not draft.is_study_code:
+        told = wording.code_questions(draft.code, asked)
+        raise Invalid(told, wording.CODE_HINT, questions=[{"code": q.value, "text": wording.CODE_QUESTIONS[q]} for q in asked])
+    if asked:
+        set_reason(db, wording.CODE_CONFIRMED)
+    participant = Participant(site_id=site.id, code=draft.code)
+    db.add(participant)
+    try:
+        db.flush()
+    except IntegrityError as error:
+        db.rollback()
+        raise Conflict(
+            f"There is already a participant '{draft.code}' (capitals and small letters count as the same).", "Choose another code."
+        ) from error
+    add_settings(db, participant, draft.settings.model_dump(), caller, reason=None)
+    participant.margins.append(MarginsVersion(version=1, created_by=caller.label, **MarginsFields().model_dump()))
+    db.flush()
+    return participant
+
+
+def _site(db: Session, code: str | None, caller: Caller) -> Site:
+    sites = [s for s in repository.sites(db, caller) if code in (None, s.code)]
+    if len(sites) == 1:
+        return sites[0]
+    if not sites:
+        raise NotFound(f"There is no site '{code}', or you have no access to it.")
+    raise Invalid("There are several sites.", f"Name one: {', '.join(s.code for s in sites)}.")
