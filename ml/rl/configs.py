@@ -47,7 +47,7 @@ class TrainConfig:
         default="steps",
         metadata={
             "doc": "What the critics sum: `steps`, the step rewards (the paper's remark 1), or `return`, each step's share of r_end "
-            "besides, where enough sessions have one and a regression predicts it (`ml.rl.end_reward`)."
+            "besides, where enough sessions have one and the model of outcomes predicts it (`ml.rl.end_reward`)."
         },
     )
     device: str = field(default="cpu", metadata={"doc": "`cpu`, `cuda`, or `auto`: CUDA where there is one."})

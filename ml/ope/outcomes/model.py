@@ -62,7 +62,7 @@ class EndModel:
         burden = burden_of(minutes, self.centre, self.spread)
         result = self._unseen(minutes.share.shape[:-1])
         tremor: Floats | None = None
-        for outcome, r in self._ordered():
+        for outcome, r in self.ordered():
             mean = np.zeros(minutes.share.shape[:-1])
             for weight, member in zip(r.weights, r.members, strict=True):
                 mean += weight * r.mean(member, minutes, burden, tremor, own)
@@ -85,7 +85,7 @@ class EndModel:
             one = Minutes(minutes.features[..., k, :, :, :], minutes.share[..., k, :, :], minutes.late[..., k, :, :])
             burden = burden_of(one, self.centre, self.spread)
             tremor: Floats | None = None
-            for outcome, r in self._ordered():
+            for outcome, r in self.ordered():
                 mean = r.mean(r.drawn[d], one, burden, tremor, own)
                 tremor = mean if outcome == "tremor" else tremor
                 result[..., d, :, COLUMN[outcome]] = 100 * mean if outcome == "tremor" else mean
@@ -121,7 +121,8 @@ class EndModel:
         outcomes[..., 0] = outcomes[..., 1:] @ self.constants if self.seen[0] else self.unseen[0]
         return outcomes
 
-    def _ordered(self) -> list[tuple[Outcome, Regression]]:
+    def ordered(self) -> list[tuple[Outcome, Regression]]:
+        """The regressions in the order in which they are predicted."""
         return [(outcome, self.regressions[outcome]) for outcome in ORDER if outcome in self.regressions]
 
     def _unseen(self, shape: tuple[int, ...]) -> Floats:

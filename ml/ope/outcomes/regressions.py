@@ -97,7 +97,15 @@ class Regression:
     day_share: float
 
     def mean(self, member: Member, minutes: Minutes, burden: Floats, tremor: Floats | None, own: Sessions | None) -> Floats:
-        """Expected outcome [...] of sessions, by one member.
+        """Expected outcome [...] of sessions, by one member; arguments as of `predictor`."""
+        eta, parts = self.predictor(member, minutes, burden, tremor, own)
+        extra = 0.0 if own is not None else member.day_variance
+        return mean_of(KINDS[self.outcome], eta, parts, member.dispersion, extra)
+
+    def predictor(
+        self, member: Member, minutes: Minutes, burden: Floats, tremor: Floats | None, own: Sessions | None
+    ) -> tuple[Floats, Floats]:
+        """Predictor of the parts of sessions and the weights of these, [..., M'] each, by one member.
 
         Args:
             burden: [..., M]. tremor: predicted share of minutes, [...], where the rating follows it.
@@ -106,10 +114,9 @@ class Regression:
         severity = own.severity if own is not None else None
         columns, parts = design(self.outcome, member.shape, minutes, burden, tremor, severity)
         eta = sum((columns[name] * w for name, w in zip(self.columns, member.fixed, strict=True) if name in columns), np.zeros(1))
-        extra = 0.0 if own is not None else member.day_variance
         if own is not None:
             eta = eta + member.levels[own.visit][:, None]
-        return mean_of(KINDS[self.outcome], np.broadcast_to(eta, parts.shape), parts, member.dispersion, extra)
+        return np.broadcast_to(eta, parts.shape), parts
 
 
 def design(
