@@ -205,9 +205,13 @@ class SweepCandidateOut(Model):
     saturated: float | None = Field(description="Share of states answered with next to 0 or 1.")
     mean_amplitude: float | None
     gain_over_cdbs: float | None = Field(
-        description="Estimated return less that of cDBS, by fitted Q evaluation of the whole buffer; null where it was not estimated."
+        description="Estimated return less that of cDBS over the whole buffer, by `gain_method`; null where it was not estimated."
     )
-    gain_low: float | None = Field(description="Its one-sided lower 95 % bound over resampled sessions.")
+    gain_low: float | None = Field(description="Its one-sided lower 95 % bound.")
+    gain_method: Literal["posterior", "fqe"] | None = Field(
+        description="What estimated the gain: `fqe` in older sweeps, whose order rests on the scores; null without a gain."
+    )
+    supported: bool | None = Field(description="Whether sessions lie near what the policy does; null where that was not asked.")
     below_bound: float | None = Field(
         description="Share of the buffer's states answered with less than the lower bound of its random sessions; null without those."
     )
@@ -219,10 +223,12 @@ class BaselineScoreOut(Model):
     controller: str
     score: float
     mean_amplitude: float
+    gain_over_cdbs: float | None = Field(default=None, description="Estimated return less that of cDBS, by the posterior.")
+    gain_low: float | None = Field(default=None, description="Its one-sided lower 95 % bound.")
 
 
 class SweepOut(Model):
-    """Policies trained in one action, the best score on held-out sessions first."""
+    """Policies trained in one action, the largest gain by the posterior first (in older sweeps the best score on held-out sessions)."""
 
     id: int
     participant: str

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from sqlalchemy.orm import Session
 
 from app.learning import wording
@@ -89,6 +91,17 @@ def gate_out(found: gates.Gate) -> GateOut:
     )
 
 
+def _baseline(row: dict[str, Any]) -> BaselineScoreOut:
+    gain = row.get("gain_over_cdbs") or {}
+    return BaselineScoreOut(
+        controller=row["controller"],
+        score=row["score"],
+        mean_amplitude=row["mean_amplitude"],
+        gain_over_cdbs=gain.get("value"),
+        gain_low=gain.get("low"),
+    )
+
+
 def sweep_out(db: Session, sweep: Sweep) -> SweepOut:
     """A sweep for the API."""
     return SweepOut(
@@ -114,11 +127,13 @@ def sweep_out(db: Session, sweep: Sweep) -> SweepOut:
                 mean_amplitude=c.mean_amplitude,
                 gain_over_cdbs=c.gain.value if c.gain else None,
                 gain_low=c.gain.low if c.gain else None,
+                gain_method=None if c.gain is None else "posterior" if c.by_posterior else "fqe",
+                supported=c.supported if c.by_posterior else None,
                 below_bound=c.below[1] if c.below else None,
             )
             for c in comparison.candidates(sweep)
         ],
-        baselines=[BaselineScoreOut(**row) for row in sweep.baselines["rows"]],
+        baselines=[_baseline(row) for row in sweep.baselines["rows"]],
         code_version=sweep.code_version,
         created_at=sweep.created_at,
         created_by=sweep.created_by,

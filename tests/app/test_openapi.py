@@ -44,6 +44,16 @@ INTENDED: dict[str, str] = {
     "components > schemas > ParticipantIn > properties > is_study_code": (
         "API: a study code that may be a name or holds a year or date of birth is questioned (422, `questions`)"
     ),
+    **dict.fromkeys(
+        (
+            "components > schemas > SweepCandidateOut > properties > gain_low",
+            "components > schemas > SweepCandidateOut > properties > gain_method",
+            "components > schemas > SweepCandidateOut > properties > gain_over_cdbs",
+            "components > schemas > SweepCandidateOut > properties > supported",
+            "components > schemas > SweepCandidateOut > required",
+        ),
+        "API: `gain_method` and `supported` of a sweep's policies",
+    ),
     "paths > /readyz": "`GET /readyz` says whether requests can be served (the database answers and has this version's schema).",
     **dict.fromkeys(
         ("components > schemas > Problem", "components > schemas > ProblemOut"),

@@ -36,6 +36,8 @@ class Candidate:
         best_update: the update whose state was chosen; None: the last.
         rate: the policy's learning rate. seed: of its training.
         gain: estimated return less that of cDBS, with its lower bound; None where it was not estimated.
+        by_posterior: whether the posterior estimated it; sweeps of before have gains by fitted Q evaluation, which decide nothing.
+        supported, told: whether sessions lie near what the policy does, and whether they can order policies at all.
         below: the lower bound B of the buffer's random sessions, and the share of its states answered with less; None where unknown.
     """
 
@@ -50,6 +52,14 @@ class Candidate:
     seed: int | None
     gain: Gain | None
     below: tuple[float, float] | None
+    by_posterior: bool = False
+    supported: bool = True
+    told: bool = True
+
+    @property
+    def standing(self) -> tuple[bool, float] | None:
+        """Larger is better, unsupported ones are last; None where the posterior has not spoken, or the data cannot order policies."""
+        return (self.supported, self.gain.value) if self.by_posterior and self.told and self.gain is not None else None
 
     @property
     def leaves_the_logged_range(self) -> bool:
@@ -58,21 +68,43 @@ class Candidate:
 
 
 def candidates(sweep: Sweep) -> list[Candidate]:
-    """The sweep's policies, the best score first; in the order of training where nothing was held out."""
+    """The sweep's policies, the largest gain over cDBS by the posterior first and those without supporting sessions last.
+
+    Where the posterior has not spoken of all of them, or the data cannot order policies: by their score on held-out sessions, and in the
+    order of training where nothing was held out.
+    """
     found = [_candidate(p) for p in sweep.policies]
+    if ordered_by_posterior(found):
+        return sorted(found, key=lambda c: c.standing or (False, 0.0), reverse=True)
     return sorted(found, key=lambda c: -c.score if c.score is not None else float("inf"))
 
 
+def ordered_by_posterior(found: Sequence[Candidate]) -> bool:
+    """Whether the posterior orders all of them."""
+    return bool(found) and all(c.standing is not None for c in found)
+
+
 def better_without_learning(found: Sequence[Candidate], baselines: Sequence[dict[str, Any]]) -> str | None:
-    """The best controller without learning where it scores above every policy of the sweep, else None; None too where nothing scored."""
+    """The best controller without learning where it is above every policy of the sweep, else None; None too where nothing was estimated.
+
+    By the gain over cDBS where the posterior orders all of them, else by the scores on held-out sessions.
+    """
+    stored = {str(row["controller"]): row.get("gain_over_cdbs") for row in baselines}
+    told = {name: (bool(g["supported"]), float(g["value"])) for name, g in stored.items() if g is not None and g["told"]}
+    if ordered_by_posterior(found) and told:
+        name = max(told, key=told.__getitem__)
+        return name if told[name] > max(c.standing for c in found if c.standing is not None) else None
     scores = [c.score for c in found if c.score is not None]
     best = max(baselines, key=lambda row: row["score"], default=None)
     return str(best["controller"]) if best is not None and scores and best["score"] > max(scores) else None
 
 
 def surely_above_cdbs(found: Sequence[Candidate]) -> Candidate | None:
-    """The policy with the largest lower bound of its gain over cDBS; None where no bound lies above 0."""
-    name = surest({str(k): c.gain for k, c in enumerate(found) if c.gain is not None})
+    """The policy with the largest lower bound of its gain over cDBS by the posterior; None where no bound lies above 0.
+
+    Policies that no session supports, and all where the data cannot order policies, are left out.
+    """
+    name = surest({str(k): c.gain for k, c in enumerate(found) if c.gain is not None and c.by_posterior and c.supported and c.told})
     return None if name is None else found[int(name)]
 
 
@@ -87,6 +119,8 @@ def _candidate(policy: Policy) -> Candidate:
     # Policies stored before the chosen state was measured have the figures of their last state.
     measured = policy.metrics.get("kept") or policy.metrics.get("last", {})
     at = _chosen(held, policy.metrics.get("best_update"))
+    stored = dict(policy.metrics.get("gain_over_cdbs") or {})
+    by, supported, told = stored.pop("by", None), stored.pop("supported", True), stored.pop("told", True)
     return Candidate(
         policy=policy,
         score=_at(held, "score", at),
@@ -97,8 +131,11 @@ def _candidate(policy: Policy) -> Candidate:
         best_update=policy.metrics.get("best_update"),
         rate=policy.config.get("actor_lr"),
         seed=policy.seed,
-        gain=Gain(**gained) if (gained := policy.metrics.get("gain_over_cdbs")) else None,
+        gain=Gain(**stored) if stored else None,
         below=below_bound(policy),
+        by_posterior=by == "posterior",
+        supported=supported,
+        told=told,
     )
 
 

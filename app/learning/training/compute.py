@@ -6,7 +6,7 @@ Loaded by those children alone: everything heavy is imported here, and nothing t
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -17,10 +17,9 @@ from app.learning.training.results import CLONE, POLICY, policy_file, training_f
 from app.platform import files
 from app.platform.jobs import JobError, StepReport, write_atomically
 from ml import rl
-from ml.ope.compare.selection import gains_over
-from ml.ope.fqe.estimator import Fqe
 from ml.ope.fqe.score import fqe_value
-from ml.policies.from_buffer import behaviour_mean, best_constant, proportional_from_buffer
+from ml.ope.posterior.gains import PosteriorGain, gains_over_cdbs
+from ml.policies.from_buffer import behaviour_mean, proportional_from_buffer
 from ml.policies.logged_range import random_bound, share_below_bound, stays_in_range
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.policies.policy import ConstantPolicy, Policy
@@ -29,7 +28,7 @@ from ml.trajectories import ReplayBuffer
 FEWEST_TO_HOLD_OUT = 5
 """Sessions below which none is held out of a training."""
 
-CONSTANT_GRID = tuple(round(0.05 * k, 2) for k in range(21))
+CONSTANT_GRID = tuple(round(0.1 * k, 2) for k in range(1, 11))
 CLONE_UPDATES = 2000
 _CURVE_POINTS = 200
 
@@ -56,12 +55,12 @@ def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
         results = rl.train_many(learnt, configs, report.curves(updates), workdir / "checkpoint.pt", initial, held_out)
     except (rl.TrainingDiverged, rl.CheckpointError, ValueError) as error:
         raise JobError(f"The policies cannot be trained: {error}.") from error
-    gains = gains_over_cdbs(buffer, [result.policy for result in results])
+    gains = stored_gains(buffer, {str(k): result.policy for k, result in enumerate(results)})
     members = []
-    for k, (result, gain) in enumerate(zip(results, gains, strict=True)):
+    for k, result in enumerate(results):
         write_atomically(workdir / policy_file(k), result.policy.to_onnx())
         write_atomically(workdir / training_file(k), result.to_bytes())
-        metrics = _metrics(result, buffer) | _share_of_end(learnt, result.config) | {"gain_over_cdbs": gain}
+        metrics = _metrics(result, buffer) | _share_of_end(learnt, result.config) | {"gain_over_cdbs": gains[str(k)]}
         members.append({"config": result.config.to_json(), "metrics": metrics})
     return {"members": members, "held_out_sessions": [s.session_id for s in held_out.sessions.sessions] if held_out else []}
 
@@ -75,7 +74,8 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
         report: progress.
 
     Returns:
-        `rows` with `controller`, `score` and `mean_amplitude`; `best_constant`, the amplitude that scores best; `held_out_sessions`.
+        `rows` with `controller`, `score` on held-out sessions, `mean_amplitude` and `gain_over_cdbs`; `best_constant`, the amplitude with
+        the largest gain by the posterior among those that sessions support, None without one; `held_out_sessions`.
     """
     buffer = read_buffer(params["snapshot_sha256"])
     learnt, held_out = _hold_out(buffer, params["held_out"], every=1)
@@ -87,10 +87,11 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
         raise JobError(f"The logged behaviour cannot be cloned: {error}.") from error
     write_atomically(workdir / CLONE, clone.to_onnx())
     report.progress(0.3, "scoring constant amplitudes")
-    best = best_constant(lambda policy: fqe_value(learnt, policy, watched).value, CONSTANT_GRID).policy.amplitude
+    constants = _gains(buffer, {f"{a:.2f}": ConstantPolicy(a) for a in CONSTANT_GRID})
+    best = best_supported(constants)
     named: dict[str, Policy] = {
         "cDBS": ConstantPolicy(1.0),
-        f"best constant, {best:.2f}": ConstantPolicy(best),
+        **({} if best is None else {f"best constant, {best:.2f}": ConstantPolicy(best)}),
         "mean logged amplitude, held": behaviour_mean(learnt),
         "behaviour clone": clone,
         "no DBS": ConstantPolicy(0.0),
@@ -98,11 +99,24 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
     with contextlib.suppress(ValueError):  # beta without spread has no proportional control
         named["proportional to beta"] = proportional_from_buffer(learnt)
     states = buffer.transitions().states
+    report.progress(0.6, "estimating gains over cDBS")
+    gains = stored_gains(buffer, named)
     rows = [
-        {"controller": name, "score": fqe_value(learnt, p, watched).value, "mean_amplitude": float(p.act(states).mean())}
+        {
+            "controller": name,
+            "score": fqe_value(learnt, p, watched).value,
+            "mean_amplitude": float(p.act(states).mean()),
+            "gain_over_cdbs": gains[name],
+        }
         for name, p in named.items()
     ]
     return {"rows": rows, "best_constant": best, "held_out_sessions": [s.session_id for s in watched]}
+
+
+def best_supported(constants: Mapping[str, PosteriorGain]) -> float | None:
+    """The amplitude with the largest gain among those that sessions support, by names such as `0.70`; None without one."""
+    supported = {name: one.gain.value for name, one in constants.items() if one.supported}
+    return float(max(supported, key=supported.__getitem__)) if supported else None
 
 
 def _hold_out(buffer: ReplayBuffer, wanted: bool, every: int) -> tuple[ReplayBuffer, rl.HeldOutSessions | None]:
@@ -132,18 +146,25 @@ def _share_of_end(learnt: ReplayBuffer, config: rl.TrainConfig) -> dict[str, Any
     return {"end_reward": {"skill": share.skill, "sessions": share.sessions} if share else None}
 
 
-def gains_over_cdbs(buffer: ReplayBuffer, policies: Sequence[Policy]) -> list[dict[str, float] | None]:
-    """Gain of each policy over cDBS by fitted Q evaluation of the whole buffer, with its lower bound over resampled sessions.
+def stored_gains(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> dict[str, dict[str, Any] | None]:
+    """Gain of each policy over cDBS by the posterior over the whole buffer, as it is stored; None where it cannot be estimated.
 
-    The policies have seen most of these sessions, which flatters them; the resamples are the same for all. None where the sessions allow
-    no such estimate.
+    The policies have seen most of these sessions, which flatters them.
     """
-    named = {str(k): policy for k, policy in enumerate(policies)}
+    gains = _gains(buffer, policies)
+    return {name: _stored(gains[name]) if name in gains else None for name in policies}
+
+
+def _stored(one: PosteriorGain) -> dict[str, Any]:
+    return asdict(one.gain) | {"by": "posterior", "supported": one.supported, "told": one.told}
+
+
+def _gains(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> dict[str, PosteriorGain]:
+    """Gains over cDBS; none where the sessions are too few for the posterior."""
     try:
-        gains = gains_over(Fqe().fit(buffer), named, ConstantPolicy(1.0))
-    except ValueError:  # what the method says of sessions that it cannot start from
-        return [None] * len(policies)
-    return [asdict(gains[name]) for name in named]
+        return gains_over_cdbs(buffer, policies)
+    except ValueError:  # what the method says of sessions that it cannot fit
+        return {}
 
 
 def _below_bound(policy: Policy, buffer: ReplayBuffer) -> dict[str, Any]:

@@ -14,26 +14,32 @@ from app.learning.models import Policy, Sweep
 from app.learning.policies.baselines import ONNX, constant_onnx
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.snapshots.service import take_snapshot
-from app.learning.training.compute import gains_over_cdbs
+from app.learning.training.compute import best_supported, stored_gains
 from app.platform import files
 from app.platform.jobs import service as jobs
 from app.study.repository import participant_by_code
+from ml.ope.posterior.gains import PosteriorGain
 from ml.policies.policy import ConstantPolicy
+from ml.returns import Gain
 from ml.trajectories import ReplayBuffer
 
 Upload = Callable[..., int]
 Store = Callable[..., Sweep]
 BELOW = "Below what the random controller tried"
 NOT_ABOVE = "No policy of this sweep is estimated above cDBS with confidence"
-NOT_BETTER = "No policy of this sweep scores above a controller that learns nothing"
+NOT_BETTER = "No policy of this sweep is estimated above a controller that learns nothing"
 
 
-def metrics(score: float, gain: float, low: float, below: float | None) -> dict[str, Any]:
+def estimated(gain: float, low: float, **told: Any) -> dict[str, Any]:
+    return {"value": gain, "low": low, "standard_error": 1.0, "by": "posterior", "supported": True, "told": True} | told
+
+
+def metrics(score: float, gain: float, low: float, below: float | None, **told: Any) -> dict[str, Any]:
     return {
         "held_out": {"update": [10], "score": [score]},
         "last": {},
         "best_update": 10,
-        "gain_over_cdbs": {"value": gain, "low": low, "standard_error": 1.0},
+        "gain_over_cdbs": estimated(gain, low, **told),
         "below_bound": None if below is None else {"bound": 0.3, "share": below},
     }
 
@@ -48,7 +54,8 @@ def store(upload: Upload, db: Session) -> Store:
         participant = participant_by_code(db, "P1", SYSTEM)
         snapshot = take_snapshot(db, participant, SYSTEM)
         job = jobs.submit(db, "train", participant.id, {}, "ada")
-        rows = [{"controller": "cDBS", "score": 5.0, "mean_amplitude": 1.0}]
+        half = {"controller": "constant 0.50", "score": 5.0, "mean_amplitude": 0.5, "gain_over_cdbs": estimated(2.5, 1.0)}
+        rows = [{"controller": "cDBS", "score": 4.5, "mean_amplitude": 1.0, "gain_over_cdbs": estimated(0.0, 0.0)}, half]
         sweep = Sweep(
             participant_id=participant.id, name="s", snapshot_id=snapshot.id, job_id=job.id, config={}, code_version="0", created_by="ada",
             baselines={"rows": rows, "best_constant": 1.0, "held_out_sessions": [1]},
@@ -83,7 +90,7 @@ def test_policies_that_score_below_cdbs_and_whose_gains_may_be_losses_are_told_s
     sweep = store(metrics(4.0, 2.0, -1.0, 0.0), metrics(3.0, 1.0, 0.0, None))
     page = client.get(f"/sweeps/{sweep.id}").text
     assert NOT_BETTER in page
-    assert "The best of those is cDBS" in page
+    assert "The best of those is constant 0.50" in page
     assert NOT_ABOVE in page
     assert BELOW not in page
 
@@ -129,8 +136,49 @@ def buffer(upload: Upload, db: Session) -> ReplayBuffer:
     return read_buffer(snapshot.file_sha256)
 
 
-def test_cdbs_gains_nothing_over_itself_and_no_stimulation_loses_surely(buffer: ReplayBuffer) -> None:
-    same, off = gains_over_cdbs(buffer, [ConstantPolicy(1.0), ConstantPolicy(0.0)])
-    assert same == {"value": 0.0, "low": 0.0, "high": 0.0, "standard_error": 0.0, "level": 0.9}
+def test_cdbs_gains_nothing_over_itself_and_no_stimulation_is_not_supported_by_one_visit(buffer: ReplayBuffer) -> None:
+    found = stored_gains(buffer, {"cDBS": ConstantPolicy(1.0), "off": ConstantPolicy(0.0)})
+    same, off = found["cDBS"], found["off"]
+    assert same is not None
     assert off is not None
+    assert same["value"] == pytest.approx(0.0, abs=0.01)
+    assert same["standard_error"] < 0.1 * off["standard_error"]
     assert off["low"] < off["value"] < 0
+    assert (off["by"], off["supported"]) == ("posterior", False)
+
+
+def test_the_best_constant_is_one_that_sessions_support() -> None:
+    def one(value: float, supported: bool) -> PosteriorGain:
+        return PosteriorGain(Gain(value, value, 1.0), supported, True)
+
+    assert best_supported({"0.10": one(50.0, False), "0.70": one(3.0, True), "1.00": one(0.0, True)}) == 0.7
+    assert best_supported({"0.10": one(50.0, False)}) is None
+
+
+def test_policies_are_ordered_by_the_posterior_and_not_by_the_held_out_score(store: Store, client: TestClient) -> None:
+    sweep = store(metrics(9.0, 1.0, -1.0, 0.0), metrics(2.0, 6.0, 1.0, 0.0), metrics(8.0, 99.0, 50.0, 0.0, supported=False))
+    told = client.get(f"/api/v1/sweeps/{sweep.id}").json()
+    assert [c["name"] for c in told["candidates"]] == ["rl-1", "rl-0", "rl-2"]
+    assert {c["gain_method"] for c in told["candidates"]} == {"posterior"}
+    assert [b["gain_over_cdbs"] for b in told["baselines"]] == [0.0, 2.5]
+    page = client.get(f"/sweeps/{sweep.id}").text
+    assert "rl-1 has the largest lower bound" in page, "the larger bound of rl-2 is extrapolation"
+    assert "no session near" in page
+
+
+def test_where_sessions_cannot_order_policies_nothing_is_preferred(store: Store, client: TestClient) -> None:
+    sweep = store(metrics(9.0, 1.0, 0.5, 0.0, told=False), metrics(2.0, 6.0, 1.0, 0.0, told=False))
+    assert [c["name"] for c in client.get(f"/api/v1/sweeps/{sweep.id}").json()["candidates"]] == ["rl-0", "rl-1"]
+    page = client.get(f"/sweeps/{sweep.id}").text
+    assert "These sessions cannot order policies" in page
+    assert "largest lower bound" not in page
+
+
+def test_gains_by_fitted_q_evaluation_of_older_sweeps_decide_nothing(store: Store, client: TestClient) -> None:
+    old = {"value": 3.0, "low": 2.0, "standard_error": 1.0}
+    sweep = store(
+        metrics(1.0, 0.0, 0.0, 0.0) | {"gain_over_cdbs": old}, metrics(9.0, 0.0, 0.0, 0.0) | {"gain_over_cdbs": old | {"low": -1.0}}
+    )
+    told = client.get(f"/api/v1/sweeps/{sweep.id}").json()["candidates"]
+    assert [(c["name"], c["gain_method"], c["gain_over_cdbs"]) for c in told] == [("rl-1", "fqe", 3.0), ("rl-0", "fqe", 3.0)]
+    assert "largest lower bound" not in client.get(f"/sweeps/{sweep.id}").text
