@@ -46,9 +46,7 @@ INTENDED: dict[str, str] = {
     ),
     **dict.fromkeys(
         (
-            "components > schemas > SweepCandidateOut > properties > gain_low",
             "components > schemas > SweepCandidateOut > properties > gain_method",
-            "components > schemas > SweepCandidateOut > properties > gain_over_cdbs",
             "components > schemas > SweepCandidateOut > properties > supported",
             "components > schemas > SweepCandidateOut > required",
         ),
