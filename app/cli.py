@@ -21,6 +21,7 @@ from app.accounts import service as accounts
 from app.accounts.models import Role, Scope
 from app.accounts.permissions import SYSTEM
 from app.accounts.studies import commands as studies
+from app.pipeline.next_generation import commands as next_generation
 from app.platform import logs
 from app.platform.audit.commands import app as audit_app
 from app.platform.database import database_place, supervise_database, transaction
@@ -39,6 +40,7 @@ app.add_typer(token_app, name="token")
 app.add_typer(study_app, name="study")
 app.add_typer(ingest_app, name="ingest")
 studies.register(study_app, user_app)
+next_generation.register(app)
 app.add_typer(audit_app, name="audit")
 app.add_typer(upkeep_app)
 
@@ -241,18 +243,14 @@ def pipeline(
 ) -> None:
     """Train, distil, evaluate and rank: the work between two visits. A worker must be running."""
     from app.pipeline.service import start_job
-    from app.platform.jobs.models import JobStatus
-    from app.platform.jobs.watch import show_progress
+    from app.platform.jobs.watch import follow
     from app.study import repository as study
 
     params: dict[str, Any] = {} if preset is None else {"preset": preset}
     with transaction(ACTOR) as db:
         person = study.participant_by_code(db, code, SYSTEM)
         job_id = start_job(db, person, "pipeline", params, SYSTEM).id
-    status = show_progress(job_id, Console(stderr=True)).status if wait else JobStatus.QUEUED
-    _print({"id": job_id, "status": status.value}, as_json, f"Job {job_id}: {status}.")
-    if status in {"failed", "cancelled"}:
-        raise typer.Exit(1)
+    follow(job_id, wait, as_json)
 
 
 @app.command(epilog="Example: betaloop rank P1")

@@ -83,6 +83,7 @@ PAGE_MODULES = (
     "app.evaluation.replay.pages",
     "app.evaluation.policies.pages",
     "app.pipeline.pages",
+    "app.pipeline.next_generation.pages",
     "app.planning.plans.pages",
     "app.planning.bundles.pages",
     "app.planning.visit_day.pages",

@@ -23,7 +23,7 @@ class EvaluateParams(Model):
     seed: Int = Field(0, ge=0, le=10**6)
 
 
-RANKING_KINDS = ("pipeline", "evaluate")
+RANKING_KINDS = ("pipeline", "next_generation", "evaluate")
 """Kinds of job that end with a ranking."""
 
 

@@ -9,8 +9,10 @@ from app.evaluation.service import policies_to_rank
 from app.learning.schemas import DistilParams, TrainParams
 from app.learning.snapshots.service import collect
 from app.pipeline.distillation import teachers
-from app.pipeline.params import PipelineParams
+from app.pipeline.next_generation.parents import tested_policies
+from app.pipeline.params import NEXT_GENERATION, NextGenerationParams, PipelineParams
 from app.pipeline.training import training_starts
+from app.platform.errors import Invalid
 from app.platform.jobs import JobKind, register
 from app.study.models import Participant
 
@@ -34,6 +36,16 @@ def starts_of_the_training(db: Session, participant_id: int, params: PipelinePar
     training_starts(db, participant_id, params.training())
 
 
+def something_tested(db: Session, participant_id: int, params: object) -> None:
+    """Raise where no policy that could be trained further has run in a session."""
+    participant = db.get_one(Participant, participant_id)
+    if not tested_policies(db, participant):
+        raise Invalid(
+            f"No policy of participant {participant.code} that could be trained further has been tested in a session yet.",
+            "Confirm the sessions of the visit first; before the first visit with policies start a job of kind 'pipeline'.",
+        )
+
+
 register(
     JobKind(
         name="pipeline",
@@ -42,6 +54,17 @@ register(
         orchestration="app.pipeline.between_visits:run_pipeline",
         compute=_TRAINING | _DISTILLATION | _EVALUATION,
         requires=(usable_sessions, starts_of_the_training),
+    )
+)
+register(
+    JobKind(
+        name=NEXT_GENERATION,
+        title="Next generation from what did best",
+        params=NextGenerationParams,
+        orchestration="app.pipeline.next_generation.job:run_next_generation",
+        compute=_TRAINING | _DISTILLATION | _EVALUATION,
+        requires=(usable_sessions, something_tested),
+        one_at_a_time=True,
     )
 )
 register(

@@ -1,4 +1,4 @@
-"""What a job of the kind `pipeline` takes; the other kinds take what their phases say."""
+"""What jobs of the kinds `pipeline` and `next_generation` take; the other kinds take what their phases say."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from pydantic import Field
 
 from app.evaluation.estimates.methods import Methods
 from app.evaluation.schemas import EvaluateParams
-from app.learning.schemas import DEFAULT_SWEEP, Aim, AlgorithmName, Anchor, DistilParams, SweepParams, TrainParams
+from app.learning.schemas import DEFAULT_SWEEP, Aim, AlgorithmName, Anchor, DistilParams, PolicyIds, SweepParams, TrainParams
 from app.platform.web.schemas import Int, Number
+
+NEXT_GENERATION = "next_generation"
+"""The kind that goes on from what did best."""
 
 
 class PipelineParams(SweepParams):
@@ -43,3 +46,16 @@ class PipelineParams(SweepParams):
     def evaluation(self) -> EvaluateParams:
         """The evaluation stage: every policy that is not retired, the new ones among them."""
         return EvaluateParams(preset=self.preset, methods=self.methods, horizon_steps=self.horizon_steps, seed=self.seed)
+
+
+class NextGenerationParams(PipelineParams):
+    """What `next_generation` takes: the pipeline that goes on from what did best, with fresh policies beside it."""
+
+    policies: Annotated[PolicyIds, Field(max_length=0)] = Field(
+        default_factory=list, description="Always empty: the job chooses the best tested policies; name policies in a `pipeline` instead."
+    )
+    parents: Int = Field(2, ge=1, le=6, description="Tested policies to go on from, the best by the posterior.")
+    tuned: Int = Field(2, ge=1, le=6, description="Policies to fine-tune from each, at the paper's learning rates from 1e-7 to 1e-5.")
+    count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch beside them.")
+    actor_lr_low: Number | None = Field(None, gt=0, le=1, description="Lowest learning rate of the policies from scratch.")
+    actor_lr_high: Number | None = Field(None, gt=0, le=1, description="Highest; in between they are spread evenly in the logarithm.")

@@ -9,7 +9,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.platform.jobs import registry
+from app.learning import repository as learning
+from app.platform.jobs import registry, repository
 from app.platform.jobs import service as jobs
 from app.platform.jobs.models import Job
 from app.study import service as study
@@ -17,15 +18,21 @@ from app.study.models import Participant
 
 
 def start_job(db: Session, participant: Participant, kind: str, params: Mapping[str, Any], caller: Caller) -> Job:
-    """Put a job of this participant on the queue.
+    """Put a job of this participant on the queue; of a kind of which there is one at a time, the one that has not ended is given instead.
 
     Raises:
         UnknownKind: there is no such kind. Invalid: params that break its schema, or something that it requires is not there.
         Forbidden: the caller may not run jobs.
     """
     study.require(caller, can.RUN_JOBS, participant)
-    job = jobs.submit(db, kind, participant.id, dict(params), caller.label)
     wanted = registry.kind(kind)
+    if wanted.one_at_a_time:
+        # two requests at once: the second waits here and finds the job of the first
+        learning.lock_participant(db, participant.id)
+        live, _ = repository.find(db, participant.id, kind, repository.LIVE, limit=1)
+        if live:
+            return live[0]
+    job = jobs.submit(db, kind, participant.id, dict(params), caller.label)
     checked = wanted.params.model_validate(job.params)
     for requirement in wanted.requires:
         requirement(db, participant.id, checked)

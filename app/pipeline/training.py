@@ -68,9 +68,11 @@ def training_calls(params: TrainParams, sha256: str, groups: Sequence[Group]) ->
     return [*calls, (BASELINES, "baselines", {"snapshot_sha256": sha256, "held_out": params.held_out, "seed": params.seed})]
 
 
-def declare_training(job: JobContext, params: TrainParams) -> None:
-    """Show the training stage from the start; what is fine-tuned is known once the plan is made."""
-    if not params.policies:
+def declare_training(job: JobContext, params: TrainParams, groups: Sequence[Group] | None = None) -> None:
+    """Show the training stage; without `groups` from the start, where what is fine-tuned is known once the plan is made."""
+    if groups is not None:
+        _declare_groups(job, groups)
+    elif not params.policies:
         _declare_groups(job, training_groups(params, [None] * params.count))
     job.step(BASELINES, "Score controllers without learning", weight=BASELINES_WEIGHT)
     job.step("store-policies", "Store the policies", weight=STORE_WEIGHT)
@@ -81,7 +83,8 @@ def _declare_groups(job: JobContext, groups: Sequence[Group]) -> None:
     for group in groups:
         count = len(group["configs"])
         numbers = f"policy {first}" if count == 1 else f"policies {first} to {first + count - 1}"
-        job.step(group["key"], f"Train {numbers} ({ALGORITHM_NAMES[group['algorithm']]})", weight=TRAIN_WEIGHT * count)
+        how = "Train" if group["start"] is None else "Fine-tune"
+        job.step(group["key"], f"{how} {numbers} ({ALGORITHM_NAMES[group['algorithm']]})", weight=TRAIN_WEIGHT * count)
         first += count
 
 

@@ -23,7 +23,7 @@ from app.study.repository import participant_by_code
 COMMANDS = (
     "serve", "worker", "demo", "migrate", "user add", "token create", "import", "pipeline", "rank", "export", "control",
     "ingest redecode", "ingest resume", "study simulate", "where", "backup-key", "backup", "restore", "doctor",
-    "audit verify", "audit seal", "study add", "study site", "user role",
+    "next-generation", "audit verify", "audit seal", "study add", "study site", "user role",
 )  # fmt: skip
 TABLE = "t_s,beta,amplitude_fraction\n0,1,1\n2,1,0.5\n4,2,0.5\n"
 

@@ -291,6 +291,13 @@ INTENDED: dict[str, str] = {
     ),
     **dict.fromkeys(
         (
+            "components > schemas > NextGenerationJob",
+            "paths > /api/v1/participants/{code}/jobs > post",
+        ),
+        "API: a job of kind `next_generation` goes on from the policies that did best in their sessions",
+    ),
+    **dict.fromkeys(
+        (
             "components > schemas > AskedOut",
             "components > schemas > DifferenceOut",
             "components > schemas > ReplayOut",

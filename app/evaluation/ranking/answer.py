@@ -78,6 +78,12 @@ class Answer:
         """What is not to be run without a clinician's word, whatever its verdict."""
         return [r for r in (*self.rows, *self.like_off) if r.decided.needs_override and not r.one.policy.retired_reason]
 
+    @property
+    def tested(self) -> bool:
+        """Whether some candidate that was trained here ran in a session, so that a next generation can go on from it."""
+        everyone = (a for row in (*self.rows, *self.like_cdbs, *self.like_off) for a in (row.one, *row.twins))
+        return any(a.tested is not None and a.policy.kind in ("trained", "distilled") for a in everyone)
+
     def everyone(self) -> dict[int, Row]:
         """Every candidate's row by the id of its policy, what to test first; twins have the row of what they do the same as."""
         rows = (*self.rows, *self.like_cdbs, *self.like_off)

@@ -57,6 +57,27 @@ def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]
     return [{"key": f"train/{k}"} | group for k, group in enumerate(groups)]
 
 
+def generation_groups(params: TrainParams, parents: Sequence[dict[str, Any]], each: int) -> list[dict[str, Any]]:
+    """The groups of a next generation: `each` policies fine-tuned from every parent, then `params.count` from scratch.
+
+    The rates of fine-tuning are dealt to the parents in turn, so that no parent has the slow ones alone. Seeds count up over all.
+
+    Args:
+        params: of those from scratch. parents: as `starts` of `training_groups`. each: at least 1.
+    """
+    starts = [*parents] * each
+    own_rates = {"actor_lr_low": None, "actor_lr_high": None}
+    tuned = training_groups(params.model_copy(update={"policies": [s["policy_id"] for s in starts]} | own_rates), starts)
+    fresh = training_groups(params.model_copy(update={"policies": [], "seed": params.seed + len(starts)}), [None] * params.count)
+    return [group | {"key": f"train/{k}"} for k, group in enumerate([*tuned, *fresh])]
+
+
+def fresh_rates(params: TrainParams) -> tuple[float, float]:
+    """Lowest and highest learning rate of the policies that are trained from scratch, over all algorithms."""
+    each = [_rates(params, algorithm) for algorithm in params.algorithms]
+    return min(low for low, _ in each), max(high for _, high in each)
+
+
 def _kinds(params: TrainParams) -> list[tuple[str, dict[str, Any]]]:
     """Kinds of policies in the order of dealing: every algorithm once before any has a second aim or anchor."""
     aims = ("steps", "return") if params.aim == "both" else (params.aim,)

@@ -56,6 +56,7 @@ def _page(
         summary=wording.slots_summary(found.planned, comparison_out(found).missing),
         deviation_words=wording.DEVIATIONS,
         notes=notes,
+        may_run=may(caller, can.RUN_JOBS, visit.participant) and any(r.confirmed for r in found.rows),
         may_confirm=may(caller, can.WRITE_STUDY, visit.participant),
         problem=error.problem(request.url.path) if error else None,
     )

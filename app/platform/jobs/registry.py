@@ -56,6 +56,7 @@ class JobKind:
             whichever kinds use it.
         requires: what must exist before such a job may start.
         priority: in the queue.
+        one_at_a_time: whether a participant has one such job at once: who asks again before it has ended is given that one.
 
     Raises:
         ValueError: a malformed name or reference.
@@ -68,6 +69,7 @@ class JobKind:
     compute: Mapping[str, str] = field(default_factory=dict)
     requires: tuple[Requirement, ...] = ()
     priority: Priority = Priority.NORMAL
+    one_at_a_time: bool = False
 
     def __post_init__(self) -> None:
         for name in (self.name, *self.compute):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
@@ -95,3 +97,15 @@ def show_progress(job_id: str, console: Console | None = None) -> JobView:
                 if step.status.ended:
                     progress.stop_task(bars[step.key])
     return view
+
+
+def follow(job_id: str, wait: bool, as_json: bool) -> None:
+    """End of a command that starts a job: show its progress where `wait`, and print how it stands.
+
+    Raises:
+        typer.Exit: 1 where it failed or was cancelled.
+    """
+    status = show_progress(job_id, Console(stderr=True)).status if wait else look(job_id).status
+    print(json.dumps({"id": job_id, "status": status.value}) if as_json else f"Job {job_id}: {status}.")  # noqa: T201
+    if status in {JobStatus.FAILED, JobStatus.CANCELLED}:
+        raise typer.Exit(1)

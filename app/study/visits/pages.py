@@ -128,6 +128,7 @@ def _visit_page(
         draft=seen | {"reason": ""} | (typed or {}),
         labels=form.labels(seen),
         may_write=may(caller, can.WRITE_STUDY, visit.participant),
+        may_run=may(caller, can.RUN_JOBS, visit.participant),
         may_lock=may(caller, can.LOCK_VISIT, visit.participant),
         problem=error.problem(request.url.path) if error else None,
     )

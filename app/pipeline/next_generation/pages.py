@@ -1,0 +1,67 @@
+"""The page that starts the next generation: what it goes on from, and one button."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.orm import Session
+
+from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
+from app.learning.schemas import ALGORITHM_NAMES
+from app.learning.training.configs import FINE_TUNING, fresh_rates
+from app.pipeline.next_generation import service
+from app.pipeline.params import NextGenerationParams
+from app.platform.database import Db
+from app.platform.errors import BetaloopError
+from app.platform.jobs import repository as jobs
+from app.platform.jobs import service as job_service
+from app.platform.web.forms import FormValues, parse
+from app.platform.web.templates import render
+from app.study.deps import CurrentParticipant
+from app.study.models import Participant
+
+router = APIRouter()
+
+REFRESH_S = 4
+_LABELS = {"preset": "Size", "parents": "Policies to go on from", "tuned": "Fine-tuned from each", "count": "Trained from scratch"}
+
+
+@router.get("/participants/{code}/next-generation")
+def next_generation(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """What the next generation would go on from, and the button that starts it."""
+    return _page(request, db, participant, caller, {})
+
+
+@router.post("/participants/{code}/next-generation")
+def start(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Start it; where a job does so already, or has done so from the same data, go to that one."""
+    given = {name: str(values[name]) for name in _LABELS if str(values.get(name, "")).strip()}
+    try:
+        job = service.start(db, participant, parse(NextGenerationParams, given, _LABELS), caller)
+        db.commit()
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, db, participant, caller, given, error)
+    return RedirectResponse(f"/jobs/{job.id}?done=started", 303)
+
+
+def _page(
+    request: Request, db: Session, participant: Participant, caller: Caller, given: dict[str, str], error: BetaloopError | None = None
+) -> HTMLResponse:
+    found, params = service.outlook(db, participant, caller), NextGenerationParams.model_validate({})
+    page = render(
+        request,
+        "pipeline/next_generation.html",
+        participant=participant,
+        found=found,
+        parents=found.parents(params.parents),
+        draft={name: getattr(params, name) for name in _LABELS} | given,
+        algorithms=", ".join(ALGORITHM_NAMES[name] for name in params.algorithms),
+        tuning=FINE_TUNING,
+        fresh=fresh_rates(params.training()),
+        refresh_s=REFRESH_S,
+        workers=len(jobs.live_workers(db, job_service.STALE_S)),
+        problem=error.problem(request.url.path) if error else None,
+    )
+    return HTMLResponse(page, error.status if error else 200)

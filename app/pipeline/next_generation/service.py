@@ -1,0 +1,67 @@
+"""Rules of the next generation: what it would go on from, and that it is trained once from the same data. The caller commits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.evaluation import repository as evaluation
+from app.evaluation.models import Evaluation
+from app.evaluation.ranking.staleness import stale_reasons
+from app.learning import repository as learning
+from app.pipeline import service as pipeline
+from app.pipeline.next_generation.parents import Tested, best, posterior_of, tested_policies
+from app.pipeline.params import NEXT_GENERATION, NextGenerationParams
+from app.platform.jobs import repository as jobs
+from app.platform.jobs.models import Job
+from app.study import service as study
+from app.study.models import Participant
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """Where a participant's next generation stands.
+
+    Attributes:
+        tested: what it may go on from. posterior: estimated returns by policy, from the newest ranking.
+        ranking: the newest one; None without. current: whether it knows everything that was recorded.
+        live: the job at work. done: the job that trained the generation of the data as they are now; None where something came since.
+    """
+
+    tested: list[Tested]
+    posterior: dict[int, float]
+    ranking: Evaluation | None
+    current: bool
+    live: Job | None
+    done: Job | None
+
+    def parents(self, most: int) -> list[int]:
+        """Policies that it goes on from, the best first; empty where the job judges the tested ones with the new sessions first."""
+        return [p.id for p in best([t.policy for t in self.tested], self.posterior, most)] if self.current else []
+
+
+def outlook(db: Session, participant: Participant, caller: Caller) -> Outlook:
+    """What the page tells before somebody starts a generation. Raises Forbidden for who may not run jobs."""
+    study.require(caller, can.RUN_JOBS, participant)
+    newest = evaluation.newest_evaluation(db, participant.id)
+    current = newest is not None and not stale_reasons(db, participant, newest)
+    rows, _ = jobs.find(db, participant.id, NEXT_GENERATION, jobs.LIVE, limit=1)
+    maker = db.get(Job, newest.job_id) if newest is not None and newest.job_id is not None else None
+    done = maker if current and maker is not None and maker.kind == NEXT_GENERATION else None
+    return Outlook(tested_policies(db, participant), posterior_of(newest), newest, current, rows[0] if rows else None, done)
+
+
+def start(db: Session, participant: Participant, params: NextGenerationParams, caller: Caller) -> Job:
+    """Train the next generation; the job that does, or that has done so from the same data, is given instead of a second one.
+
+    Raises:
+        Forbidden: the caller may not run jobs. Invalid: no policy that could be trained further was tested, or no usable session.
+    """
+    study.require(caller, can.RUN_JOBS, participant)
+    # two clicks at once: the second waits here and finds the job of the first
+    learning.lock_participant(db, participant.id)
+    found = outlook(db, participant, caller)
+    return found.live or found.done or pipeline.start_job(db, participant, NEXT_GENERATION, params.model_dump(mode="json"), caller)
