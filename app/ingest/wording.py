@@ -131,6 +131,10 @@ _SENTENCES: dict[Reason, Callable[[Mapping[str, Any]], str]] = {
     Reason.NO_VISIT_OF_DAY: lambda f: f"recorded on {f['day']}, and no visit has that date: choose the visit, or add it",
     Reason.AMPLITUDE: _amplitude,
     Reason.LOG: lambda f: f"its log names policy {f['policy']}",
+    Reason.SLOT: lambda f: f"its log is of session {f['position']} of the plan of visit {f['visit']}",
+    Reason.OTHER_VISIT: lambda f: (
+        f"the upload says visit {f['stated']}, and its log is of session {f['position']} of the plan of visit {f['visit']}: choose one"
+    ),
     Reason.SURVEY: _survey,
     Reason.CHANNEL: _channel,
     Reason.PROGRAM: _program,

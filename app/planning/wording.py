@@ -189,6 +189,7 @@ DEVIATIONS: dict[Deviation, str] = {
     Deviation.SHORTER: "shorter than planned",
     Deviation.LONGER: "longer than planned",
     Deviation.OTHER_DAY: "held on another day than the visit's",
+    Deviation.OTHER_PLAN: "its log is of a session of another plan",
 }
 
 

@@ -126,11 +126,30 @@ def _logged_cdbs(f: Mapping[str, Any]) -> str:
     )
 
 
+def _logged_slot(f: Mapping[str, Any]) -> str:
+    return (
+        f"The controller's log is of session {f['position']} of the plan of visit {f['visit']} ({f['visit_date']}), and this session "
+        f"stands in visit {f['other_visit']}. Correct the visit if it is wrong."
+    )
+
+
+def _no_slot(f: Mapping[str, Any]) -> str:
+    return (
+        f"The controller's log names session {f['position']} of plan {f['plan']}, visit {f['visit']} ({f['visit_date']}), which is no "
+        "signed plan of this participant here any more. Check that this is the participant's log of that day."
+    )
+
+
 _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.DAY: _day,
     Kind.START: _start,
     Kind.SIDE: _side,
     Kind.UNREADABLE: lambda f: f"{f['detail']} {f['hint']}".strip(),
+    Kind.LOGGED_SLOT: _logged_slot,
+    Kind.NO_SLOT: _no_slot,
+    Kind.BENCH: lambda f: (
+        "The controller's log is of a trial on a bench, at which no participant was connected: it is no session. Drop it."
+    ),
     Kind.ABOVE_CDBS: _above_cdbs,
     Kind.AMPLITUDE: _amplitude,
     Kind.SILENT_CONTROL: _silent_control,

@@ -32,7 +32,11 @@ class Guess(NamedTuple):
 
 
 def controller(db: Session, session: StudySession) -> Guess:
-    """By the controller's own log where it names a policy of the participant, else by the amplitudes of all sides."""
+    """By the controller's own log where it names a session of a signed plan or a policy, else by the amplitudes of all sides."""
+    slot = logged.slot_of_recording(db, control_recording(session))
+    if slot is not None and slot.planned is not None:
+        facts = {"visit": slot.visit_number, "position": slot.planned.position}
+        return Guess(Controller(slot.planned.controller), slot.planned.policy_id, Evidence(Source.RECORDING, Reason.SLOT, facts))
     ran = logged.of_recording(db, control_recording(session))
     if ran is not None and ran.policy_id is not None:
         return Guess(ran.controller, ran.policy_id, Evidence(Source.RECORDING, Reason.LOG, {"policy": ran.policy_name}))

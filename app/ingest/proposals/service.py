@@ -15,6 +15,7 @@ from app.ingest import repository, sessions, wording
 from app.ingest.models import SessionProposal, Upload
 from app.ingest.proposals import control_channel, guesses
 from app.ingest.proposals.evidence import BY_CUT, BY_UPLOAD, Evidence, Reason, Source, guess_visit
+from app.ingest.proposals.slots import differs_from_slot, visit_of_slot
 from app.ingest.schemas import PartIn, ProposalChange
 from app.ingest.sessions import Placement, StatedSession, add_session, set_segments
 from app.ingest.uploads import outcomes as outcomes_intake
@@ -25,7 +26,7 @@ from app.study import repository as study
 from app.study import service as study_service
 from app.study.models import Controller, Participant, Recording, StudySession
 from app.study.service import POLICY_CONTROLLERS
-from app.study.sessions import conditions
+from app.study.sessions import conditions, logged
 from app.study.sessions.contradictions import contradictions, control_recording, local_day
 from app.study.sessions.usable_steps import sentence, usable_steps
 from app.study.visits.service import require_unlocked
@@ -66,7 +67,12 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
         # what differs from a session that counts is for a person to look at
         stated = replace(stated, confirm=False)
     day = local_day(placement.control, placement.started_at) if placement.started_at else None
-    guess = guess_visit(study.visits(db, participant.id, 1000, 0)[0], day, stated.visit)
+    visits = study.visits(db, participant.id, 1000, 0)[0]
+    slot = logged.slot_of_recording(db, placement.control)
+    if logged.rehearsed(placement.control) or differs_from_slot(slot, stated):
+        # a log of a bench, or of another session than the sender says, is for a person to look at
+        stated = replace(stated, confirm=False)
+    guess = visit_of_slot(visits, slot, stated.visit) or guess_visit(visits, day, stated.visit)
     session = add_session(db, guess.visit, placement, stated.controller, stated.policy_id, stated.hemisphere, stated.counts)
     guesses.policy_by_log(db, session)
     program = control_channel.choose_program(db, session)

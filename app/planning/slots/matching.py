@@ -1,12 +1,13 @@
 """Which session filled which slot of a plan, pure.
 
-Sessions are aligned with slots in their order, as one aligns two sequences: the assignment that explains most, with no session and no slot
-used twice and none passing another. What is left over is matched out of order where controller and policy say clearly what it was.
+A controller's log names its slot, and fills that one or none. Other sessions are aligned with slots in their order, as one aligns two
+sequences: the assignment that explains most, with no session and no slot used twice and none passing another. What is left over is matched
+out of order where controller and policy say clearly what it was.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime, timedelta
 from enum import StrEnum
@@ -31,6 +32,8 @@ class Deviation(StrEnum):
     SHORTER = "shorter"
     LONGER = "longer"
     OTHER_DAY = "other_day"
+    OTHER_PLAN = "other_plan"
+    """A controller's log of a session of another plan."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,8 @@ class Done:
     began: datetime | None
     filled: int | None = None
     """The slot that somebody confirmed it into."""
+    logged: int | None = None
+    """The slot of which its controller's log says it is."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +78,14 @@ def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) 
         slots: in the plan's order. sessions: in the order in which they were held. day: of the visit; None where it has no date.
     """
     pairs: dict[int, Done] = {s.filled: s for s in sessions if s.filled is not None}
+    known = {p.item_id for p in slots}
+    for session in sessions:
+        if session.filled is None and session.logged in known:
+            pairs.setdefault(session.logged, session)
     taken = {s.session_id for s in pairs.values()}
     open_slots = [p for p in slots if p.item_id not in pairs]
-    free = [s for s in sessions if s.session_id not in taken]
+    # a log that names its slot fills that one or none
+    free = [s for s in sessions if s.session_id not in taken and s.logged is None]
     in_order = _aligned(open_slots, free)
     pairs |= in_order
     taken |= {s.session_id for s in in_order.values()}
@@ -88,8 +98,30 @@ def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) 
             pairs[slot.item_id] = found
             taken.add(found.session_id)
             crossed.add(slot.item_id)
+    crossed |= _passed(slots, sessions, pairs)
     made = [_judged(slot, pairs.get(slot.item_id), slot.item_id in crossed, day) for slot in slots]
-    return made + [Match(None, s.session_id, (Deviation.UNPLANNED,)) for s in free if s.session_id not in taken]
+    beside = [s for s in sessions if s.session_id not in taken]
+    return made + [Match(None, s.session_id, (_beside(s, known),)) for s in beside]
+
+
+def _beside(session: Done, known: Collection[int]) -> Deviation:
+    """Why a session stands beside the plan."""
+    return Deviation.OTHER_PLAN if session.logged is not None and session.logged not in known else Deviation.UNPLANNED
+
+
+def _passed(slots: Sequence[Planned], sessions: Sequence[Done], pairs: Mapping[int, Done]) -> set[int]:
+    """Slots whose log says that a session ran before one of an earlier slot."""
+    order = {s.session_id: i for i, s in enumerate(sessions)}
+    found: set[int] = set()
+    latest = -1
+    for slot in slots:
+        session = pairs.get(slot.item_id)
+        if session is None:
+            continue
+        if session.logged is not None and order[session.session_id] < latest:
+            found.add(slot.item_id)
+        latest = max(latest, order[session.session_id])
+    return found
 
 
 _CLEAR = 3.0

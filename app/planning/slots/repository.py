@@ -21,7 +21,7 @@ def sessions_of_day(db: Session, visit_id: int) -> Sequence[StudySession]:
 
 @dataclass(frozen=True)
 class Filled:
-    """How many slots of a visit's approved plan a confirmed session fills."""
+    """How many slots of a visit's approved plan a confirmed session fills; `tested`: of those that run a policy."""
 
     participant_id: int
     visit_id: int
@@ -29,13 +29,16 @@ class Filled:
     date: date | None
     slots: int
     filled: int
+    tested: int
 
 
 def slots_filled(db: Session, participant_ids: Sequence[int]) -> list[Filled]:
     """Of every visit whose approved plan has limits in mA, by participant and visit number; plans of earlier versions have none."""
-    filled = func.count(StudySession.id).filter(StudySession.status == "confirmed")
+    confirmed = StudySession.status == "confirmed"
+    filled = func.count(StudySession.id).filter(confirmed)
+    tested = func.count(StudySession.id).filter(confirmed & PlanItem.policy_id.is_not(None))
     query = (
-        select(Visit.participant_id, Visit.id, Visit.number, Visit.date, func.count(PlanItem.id), filled)
+        select(Visit.participant_id, Visit.id, Visit.number, Visit.date, func.count(PlanItem.id), filled, tested)
         .join(Plan, Plan.visit_id == Visit.id)
         .join(PlanItem, PlanItem.plan_id == Plan.id)
         .outerjoin(StudySession, StudySession.plan_item_id == PlanItem.id)

@@ -24,6 +24,8 @@ from app.platform.errors import BetaloopError, Conflict
 from app.study import service as study
 from app.study.blinding import require_known, stated_arm
 from app.study.models import Controller, StudySession, Visit
+from app.study.sessions import logged
+from app.study.sessions.contradictions import control_recording
 from app.study.sessions.data import session_data
 from app.study.visits.service import require_unlocked
 
@@ -97,7 +99,7 @@ def compare(db: Session, visit: Visit, caller: Caller) -> Comparison:
     times = clinic_day.slot_times(db, view.plan.id)
     slots = [_planned(line, times) for line in view.lines]
     lines = {line.item.id: line for line in view.lines}
-    found = match(slots, [_done(s, caller) for s in sessions.values()], visit.date)
+    found = match(slots, [_done(db, s, caller) for s in sessions.values()], visit.date)
     return Comparison(view, [_row(db, one, lines, sessions) for one in found])
 
 
@@ -161,10 +163,13 @@ def _planned(line: PlanLine, times: dict[int, SlotTimes]) -> Planned:
     return Planned(line.item.id, Controller(line.item.controller), line.item.policy_id, line.item.minutes, began)
 
 
-def _done(session: StudySession, caller: Caller) -> Done:
+def _done(db: Session, session: StudySession, caller: Caller) -> Done:
+    slot = logged.slot_of_recording(db, control_recording(session))
     arm = stated_arm(session, caller)
     controller, policy = (arm.controller, arm.policy_id) if arm is not None else (None, None)
-    return Done(session.id, controller, policy, session.duration_s, session.started_at, session.plan_item_id)
+    return Done(
+        session.id, controller, policy, session.duration_s, session.started_at, session.plan_item_id, slot.slot_id if slot else None
+    )
 
 
 def _row(db: Session, found: Match, lines: dict[int, PlanLine], sessions: dict[int, StudySession]) -> Row:

@@ -44,6 +44,11 @@ class Kind(StrEnum):
     """`logged`: name of the participant's policy that the log names; `number`, where the participant has none such."""
     LOGGED_CDBS = "logged_cdbs"
     """`logged`, `in_force`: cDBS amplitudes, mA."""
+    LOGGED_SLOT = "logged_slot"
+    """`position`, `visit`, `visit_date` (as it was): of the planned session that the log names; `other_visit`: of the session."""
+    NO_SLOT = "no_slot"
+    """`plan`, `position`, `visit`, `visit_date`: of a session of a plan that this participant does not have, or not any more."""
+    BENCH = "bench"
     REPEATED = "repeated"
     """`session`, `recording`: of the other one; `seconds`: that both hold; `counts`: whether the other one counts; `own`: recording."""
 
@@ -63,7 +68,7 @@ def contradictions(db: Session, session: StudySession, visit_open: bool = False,
         visit_open: nobody has said the visit yet, so that its date contradicts nothing.
         steps_shown: the reader sees elsewhere why steps cannot be read, and which lie above the cDBS amplitude.
     """
-    found = [*_of_minutes(db, session), *_of_day(session, visit_open), *_of_start(session), *_of_side(session)]
+    found = [*_of_minutes(db, session), *_of_day(session, visit_open), *_of_start(session), *_of_side(session), *_of_slot(db, session)]
     try:
         table = step_table(db, session, session.visit.participant.current_settings)
         sides = delivered(db, session)
@@ -145,6 +150,22 @@ def _of_log(ran: logged.Logged, arm: blinding.Arm | None, cdbs_ma: float | None)
         yield Contradiction(Kind.LOGGED_POLICY, {"logged": ran.policy_name, "number": ran.number})
     if cdbs_ma is not None and abs(cdbs_ma - ran.cdbs_ma) > SILENT_MA:
         yield Contradiction(Kind.LOGGED_CDBS, {"logged": ran.cdbs_ma, "in_force": cdbs_ma})
+
+
+def _of_slot(db: Session, session: StudySession) -> Iterator[Contradiction]:
+    """A log of a session that is planned at another visit, or nowhere any more; or of no session at all."""
+    recording = control_recording(session)
+    if logged.rehearsed(recording):
+        yield Contradiction(Kind.BENCH)
+    slot = logged.slot_of_recording(db, recording)
+    if slot is None:
+        return
+    if slot.planned is None or slot.planned.plan_status != "approved":
+        facts = {"plan": slot.plan_id, "position": slot.position, "visit": slot.visit_number, "visit_date": slot.visit_date}
+        yield Contradiction(Kind.NO_SLOT, facts)
+    elif slot.planned.visit_id != session.visit_id:
+        facts = {"position": slot.position, "visit": slot.visit_number, "visit_date": slot.visit_date}
+        yield Contradiction(Kind.LOGGED_SLOT, facts | {"other_visit": session.visit.number})
 
 
 def _of_programs(sides: Sequence[Delivered]) -> Iterator[Contradiction]:

@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.study import blinding, repository
 from app.study.models import Controller, StudySession
+from app.study.sessions import logged
 from app.study.sessions.models import SessionConditions
 from app.study.traces import StepTable
 from ml.designs import recognise, unstated_holds
@@ -78,20 +79,22 @@ def of_session(db: Session, session: StudySession, table: StepTable, caller: Cal
     if session.conditions is None and (plan := planned(db, session, table, session.visit.participant.current_settings.period_s)):
         parameters = plan["design_parameters"]
         holds = tuple(Hold(h["start"], h["steps"], h["log_density"]) for h in parameters["holds"])
-        return Drawn(plan["design"], parameters["level"], plan["seed"], holds)
+        return Drawn(plan["design"], parameters["level"], plan["seed"], () if plan["design"] == "paper" else holds)
     found = drawn(session.conditions, table)
     return None if arm is None and len(found.holds) < 2 else found
 
 
 def planned(db: Session, session: StudySession, table: StepTable, period_s: float) -> dict[str, Any] | None:
-    """What the visit's approved plan says of how this random session was drawn, as members of its conditions.
+    """What its controller's log, else the visit's approved plan, says of how this random session was drawn, as members of its conditions.
 
-    A session is held against every designed session of the plan, and belongs to the one whose amplitudes it followed longest; decisions
-    after it left the design, such as a return to cDBS, are cut off. None where it followed none.
+    Without a log a session is held against every designed session of the plan, and belongs to the one whose amplitudes it followed longest;
+    decisions after it left the design, such as a return to cDBS, are cut off. None where it followed none.
 
     Args:
         db: the session. session: whose visit. table: its steps. period_s: of these steps; designs of other steps are left out.
     """
+    if (drawn_by_log := logged.design_of_session(session)) is not None:
+        return drawn_by_log
     fraction = table.fraction[table.t_s > 0]
     best: dict[str, Any] | None = None
     longest = FEWEST_STEPS - 1

@@ -1,4 +1,4 @@
-"""What the log of a controller says of its session: which policy decided, and within which limits."""
+"""What the log of a controller says of its session: which policy decided, within which limits, and for which slot of a signed plan."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.study import repository
-from app.study.models import Controller, Recording
+from app.study.models import Controller, Recording, StudySession
+from app.study.sessions.repository import SlotHead, slot_head
 
 CONTROLLER_OF_KIND = {"distilled": Controller.DISTILLED, "baseline": Controller.OTHER}
 """Controllers of policies by their kind; those of every other kind are RL."""
@@ -56,3 +57,53 @@ def limits_and_policy(recording: Recording) -> Mapping[str, Any] | None:
     """What stands at the head of a log (`ml.formats.tables.log_head.Ran`); None as in `of_recording`."""
     said = recording.details.get("settings", {}).get("controller")
     return said if isinstance(said, Mapping) else None
+
+
+@dataclass(frozen=True)
+class LoggedSlot:
+    """The session of a signed plan that a log says it is of.
+
+    Attributes:
+        slot_id, plan_id, position, visit_number, visit_date (ISO 8601): as they stood when the bundle was made.
+        planned: the session of the plan as it stands; None where this participant has none such.
+    """
+
+    slot_id: int
+    plan_id: int
+    position: int
+    visit_number: int
+    visit_date: str
+    planned: SlotHead | None
+
+
+def slot_of_recording(db: Session, recording: Recording) -> LoggedSlot | None:
+    """The slot that a recording ran in; None where it is no log, and of trials on a bench and replays, at which nobody was connected."""
+    said = limits_and_policy(recording)
+    if said is None or said.get("purpose") != "session" or said.get("slot_id") is None:
+        return None
+    head = slot_head(db, recording.participant_id, int(said["slot_id"]))
+    # numbers of another installation may be anything: plan and slot must belong together
+    planned = head if head is not None and head.plan_id == said["plan_id"] else None
+    return LoggedSlot(
+        int(said["slot_id"]), int(said["plan_id"]), int(said["position"]), int(said["visit_number"]), str(said["visit_date"]), planned
+    )
+
+
+def rehearsed(recording: Recording) -> bool:
+    """Whether a log is of a trial on a bench: a controller ran, and no participant was connected."""
+    said = limits_and_policy(recording)
+    return said is not None and said.get("purpose") == "bench"
+
+
+def design_of_session(session: StudySession) -> dict[str, Any] | None:
+    """How a random session's amplitudes were drawn, by the log of the schedule that ran, as members of its conditions.
+
+    None where no such log is its control recording, or where the session does not begin where the schedule took over.
+    """
+    control = next((s for s in session.segments if s.is_control), None)
+    said = limits_and_policy(control.recording) if control is not None else None
+    if control is None or said is None or said.get("design") is None or not said.get("holds") or control.start_s > 1e-3:
+        return None
+    parameters = {"level": said.get("level"), "holds": said["holds"]}
+    known = {"design": said["design"], "seed": said.get("seed"), "design_parameters": parameters}
+    return known | ({"lower_bound": said["lower_bound"]} if said.get("lower_bound") is not None else {})

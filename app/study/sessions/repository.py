@@ -1,11 +1,11 @@
-"""Queries of sessions: which rows what they hold is made of, in which version."""
+"""Queries of sessions: which rows what they hold is made of, in which version; and which session of a plan they are."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
+from typing import Any, NamedTuple
 
-from sqlalchemy import Select, String, cast, func, literal, literal_column, select, union_all
+from sqlalchemy import Select, String, cast, column, func, literal, literal_column, select, table, union_all
 from sqlalchemy.dialects.postgresql import aggregate_order_by
 from sqlalchemy.orm import Session
 
@@ -51,3 +51,28 @@ def _versions(name: str, key: Any, owner: Any, *joins: Any) -> tuple[Select[Any]
     for join in joins:
         query = query.join(*join) if isinstance(join, tuple) else query.join(join)
     return query, owner
+
+
+class SlotHead(NamedTuple):
+    """One session of a plan as it stands: where it is, what it runs, and whether its plan is still signed (`plan_status` approved)."""
+
+    slot_id: int
+    plan_id: int
+    plan_status: str
+    visit_id: int
+    position: int
+    controller: str
+    policy_id: int | None
+
+
+def slot_head(db: Session, participant_id: int, slot_id: int) -> SlotHead | None:
+    """A session of one of the participant's plans.
+
+    Plans belong to a later phase; of their tables only these columns are needed here.
+    """
+    plans = table("plan", *(column(name) for name in ("id", "visit_id", "status")))
+    items = table("plan_item", *(column(name) for name in ("id", "plan_id", "position", "controller", "policy_id")))
+    wanted = (items.c.id, plans.c.id, plans.c.status, plans.c.visit_id, items.c.position, items.c.controller, items.c.policy_id)
+    query = select(*wanted).join_from(items, plans, items.c.plan_id == plans.c.id).join(Visit, Visit.id == plans.c.visit_id)
+    row = db.execute(query.where(items.c.id == slot_id, Visit.participant_id == participant_id)).first()
+    return None if row is None else SlotHead(*row)

@@ -1,0 +1,34 @@
+"""What the slot that a controller's log names says of where its session belongs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from app.ingest.proposals.evidence import Evidence, Reason, Source, VisitGuess
+from app.ingest.sessions import StatedSession
+from app.study.models import Visit
+from app.study.sessions.logged import LoggedSlot
+
+
+def differs_from_slot(slot: LoggedSlot | None, stated: StatedSession) -> bool:
+    """Whether a log is of another session of a plan than its sender says; False where it names none of this participant's."""
+    if slot is None or slot.planned is None:
+        return False
+    planned = slot.planned
+    return (
+        (stated.visit is not None and stated.visit.id != planned.visit_id)
+        or (stated.controller is not None and stated.controller != planned.controller)
+        or (stated.policy_id is not None and stated.policy_id != planned.policy_id)
+    )
+
+
+def visit_of_slot(visits: Sequence[Visit], slot: LoggedSlot | None, stated: Visit | None) -> VisitGuess | None:
+    """The visit of the planned session that a log names; open where the sender says another one. None where it names none."""
+    planned = slot.planned if slot is not None else None
+    own = next((v for v in visits if planned is not None and v.id == planned.visit_id), None)
+    if planned is None or own is None:
+        return None
+    facts = {"visit": own.number, "position": planned.position}
+    if stated is not None and stated.id != own.id:
+        return VisitGuess(stated, True, Evidence(Source.RECORDING, Reason.OTHER_VISIT, facts | {"stated": stated.number}))
+    return VisitGuess(own, False, Evidence(Source.RECORDING, Reason.SLOT, facts))

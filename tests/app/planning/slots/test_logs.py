@@ -1,0 +1,132 @@
+"""A controller's log names the session of the signed plan that it ran: it fills that slot by itself, with what it knows of the draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import date, datetime, timedelta
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy.orm import Session
+
+from app.planning.plans.models import Plan
+from ml.deploy.runtime.decision_log import description_line, kind_line
+
+DAY = date(2026, 4, 6)
+BOUNDS = {"min_ma": 0.5, "max_ma": 3.0, "cdbs_ma": 3.0, "ramp_ma_per_s": 1.5}
+COLUMNS = "t_s,due_s,beta,unit,source,amplitude_ma,action,hold,log_density,ended,battery_percent"
+
+
+@pytest.fixture
+def planned(client: TestClient, studied: Any, sign_plan: Callable[..., Any], db: Session) -> Plan:
+    """A signed plan: a policy, cDBS, a random session, cDBS, the policy again."""
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "design": "stratified"}})
+    assert client.patch(f"/api/v1/visits/{studied.visit}", json={"date": str(DAY), "reason": "agreed"}).status_code == 200
+    body = {"policy_ids": [studied.policies[0]], "repeats": 2, "random_sessions": 1, "order": "stated", "seed": 1, "minutes_per_session": 5}
+    drafted = client.post(f"/api/v1/visits/{studied.visit}/plan", json=body)
+    assert drafted.status_code == 201, drafted.text
+    assert sign_plan(studied.visit).status_code == 200
+    return db.get_one(Plan, drafted.json()["id"])
+
+
+def log_of(
+    plan: Plan, position: int, minute: int, *, number: int = 0, holds: list[tuple[int, int, float, float]] | None = None, **said: Any
+) -> str:
+    """The log of the runner for a session of the plan; held draws as (start, steps, fraction, log density)."""
+    item = plan.items[position - 1]
+    facts = BOUNDS | {
+        "policy_id": item.policy_id, "purpose": "session", "participant": "P1", "manifest_sha256": "e" * 64,
+        "started_at": (datetime(2026, 4, 6, 9) + timedelta(minutes=minute)).isoformat() + "+00:00",
+        "plan_id": plan.id, "slot_id": item.id, "position": position, "repeat": 1, "controller": item.controller,
+        "visit_number": 2, "visit_date": str(DAY),
+    }  # fmt: skip
+    rows = []
+    for k in range(-9, 151):
+        hold = next((i for i, (start, steps, _, _) in enumerate(holds or []) if start <= k < start + steps), None)
+        drawn = "" if hold is None else f"{hold},{holds[hold][3]}" if holds else ""  # type: ignore[index]
+        fraction = 1.0 if hold is None or not holds else holds[hold][2]
+        action = "policy" if k >= 0 and (not holds or hold is not None) else "cdbs"
+        rows.append(f"{2 * k + 20},{2 * k + 20},{1 + 0.01 * (k % 7) + number},uV,table,{3 * fraction:.6g},{action},{drawn or ','},,")
+    return "\n".join([kind_line(2.0), description_line(facts | said), COLUMNS, *rows]) + "\n"
+
+
+def send(client: TestClient, log: str, code: str = "P1", **stated: str) -> dict[str, Any]:
+    answer = client.post("/api/v1/uploads", data={"participant": code, **stated}, files={"file": ("log.csv", log)})
+    assert answer.status_code == 201, answer.text
+    return dict(answer.json())
+
+
+def test_logs_fill_the_slots_that_they_name_whatever_else_would_explain_them(client: TestClient, studied: Any, planned: Plan) -> None:
+    path = f"/api/v1/visits/{studied.visit}/slots"
+    first, last = [s.position for s in planned.items if s.policy_id]
+    send(client, log_of(planned, last, 5, number=1))  # the only log of the policy: by its order it could be the first session of it
+    between = next(s.position for s in planned.items if s.controller == "cdbs")
+    body = send(client, log_of(planned, between, 40, number=2))
+    (found,) = body["proposals"]
+    assert (found["session"]["controller"], found["session"]["visit_id"]) == ("cdbs", studied.visit)
+    assert f"its log is of session {between} of the plan of visit 2" in str(found["evidence"])
+    rows = {r["position"]: r for r in client.get(path).json()["rows"]}
+    assert rows[first]["session_id"] is None
+    assert rows[last]["session_id"] is not None
+    assert rows[last]["deviations"] == ["out_of_order"], "it ran before cDBS"
+    assert between < last
+    done = client.post(f"{path}/confirm", json={})
+    assert done.status_code == 200, done.text
+    held = {r["position"]: r["confirmed"] for r in done.json()["comparison"]["rows"]}
+    assert [p for p, confirmed in held.items() if confirmed] == [between, last]
+
+
+def test_the_draws_of_a_random_session_are_those_of_its_log(client: TestClient, studied: Any, planned: Plan) -> None:
+    position = next(i.position for i in planned.items if i.controller == "random")
+    holds = [(0, 60, 0.9, -0.25), (60, 90, 0.7, 0.5)]
+    send(client, log_of(planned, position, 20, holds=holds, design="stratified", level=0.8, seed=99, lower_bound=0.45))
+    done = client.post(f"/api/v1/visits/{studied.visit}/slots/confirm", json={})
+    assert done.status_code == 200, done.text
+    session = next(r["session_id"] for r in done.json()["comparison"]["rows"] if r["position"] == position)
+    found = client.get(f"/api/v1/sessions/{session}/conditions").json()
+    assert (found["design"], found["seed"], found["lower_bound"], found["origin"]) == ("stratified", 99, 0.45, "stated")
+    kept = found["design_parameters"]
+    assert kept["level"] == 0.8
+    assert [(h["start"], h["steps"], h["amplitude"], h["log_density"]) for h in kept["holds"]][:2] == [tuple(h) for h in holds]
+
+
+def test_a_log_of_another_visit_is_asked_about_and_fills_no_slot_there(client: TestClient, studied: Any, planned: Plan) -> None:
+    other = client.post("/api/v1/participants/P1/visits", json={"number": 9, "date": "2026-05-04"}).json()["id"]
+    policy = str(planned.items[0].policy_id)
+    body = send(client, log_of(planned, 1, 0), visit="9", controller="rl", policy=policy)
+    (found,) = body["proposals"]
+    assert found["visit_open"] is True
+    assert "the upload says visit 9, and its log is of session 1 of the plan of visit 2" in str(found["evidence"])
+    assert client.get(f"/api/v1/visits/{other}/sessions").json()["total"] == 0, "it counts nowhere"
+    refused = client.post(f"/api/v1/proposals/{found['session']['id']}/confirm", json={"version": found["version"]})
+    assert (refused.status_code, "its visit is open" in refused.json()["detail"]) == (422, True)
+    right = client.post(f"/api/v1/proposals/{found['session']['id']}/confirm", json={"version": found["version"], "visit": 2})
+    assert right.status_code == 200, right.text
+    assert client.get(f"/api/v1/visits/{studied.visit}/slots").json()["rows"][0]["session_id"] == found["session"]["id"]
+
+
+def test_a_log_of_a_plan_that_is_not_signed_any_more_is_said_and_stands_beside_the_plan(
+    client: TestClient, studied: Any, planned: Plan, sign_plan: Callable[..., Any]
+) -> None:
+    again = client.post(
+        f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[1]], "seed": 4, "reason": "another policy"}
+    )
+    assert again.status_code == 201, again.text
+    assert sign_plan(studied.visit, plan_id=again.json()["id"]).status_code == 200
+    body = send(client, log_of(planned, 2, 0))
+    assert f"names session 2 of plan {planned.id}, visit 2 (2026-04-06), which is no signed plan" in " ".join(body["report"][0]["flagged"])
+    rows = client.get(f"/api/v1/visits/{studied.visit}/slots").json()["rows"]
+    assert [r["deviations"] for r in rows if r["session_id"]] == [["other_plan"]]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"), [({"slot_id": 4711}, "which is no signed plan"), ({"purpose": "bench"}, "of a trial on a bench")]
+)
+def test_a_log_that_names_no_session_here_fills_none_by_its_name(
+    client: TestClient, studied: Any, planned: Plan, change: dict[str, Any], words: str
+) -> None:
+    stated = {"visit": "2", "controller": "rl", "policy": str(planned.items[0].policy_id)}
+    body = send(client, log_of(planned, 1, 0, **change), **stated)
+    assert words in " ".join(body["report"][0]["flagged"])
+    assert len(body["proposals"]) == (1 if "purpose" in change else 0), "a trial on a bench never counts at once"
