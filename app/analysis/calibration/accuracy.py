@@ -1,8 +1,10 @@
-"""The paper's metrics of estimates against actual returns, with session-bootstrap intervals.
+"""The paper's metrics of estimates against actual returns, with intervals over visits.
 
-A pair is a policy at a visit: an estimate made before, and the mean return of its sessions there. Sessions are what is resampled, so that
-a policy of one session, whose resampled mean never varies, still drops out of some resamples. `ml.ope.compare.metrics` gives the values,
-the arrays here the same metrics of every resample at once. Source: Gao et al. 2023, appendix on the metrics of off-policy evaluation.
+A pair is a policy at a visit: what the visit's plan had predicted of it, and the mean return of its sessions there; a policy tested at two
+visits is two pairs. Visits are what is resampled, whole: sessions of one day share medication, sleep and the state of the participant.
+`ml.ope.compare.metrics` gives the values, the arrays here the same metrics of every resample at once. Nothing is divided by a range, or a
+best return, that is no larger than what tells two returns apart (`least_range`). Source: Gao et al. 2023, appendix on the metrics of
+off-policy evaluation.
 """
 
 from __future__ import annotations
@@ -22,10 +24,15 @@ Floats = NDArray[np.float64]
 
 DRAWS = 500
 FEWEST_SESSIONS = 3
-"""Sessions below which no interval is given."""
+"""Sessions of a policy at a visit below which no interval of their mean is given."""
+FEWEST_VISITS = 3
+"""Visits below which no interval of a metric is given."""
 
 DEFINED_SHARE = 0.5
 """Least share of resamples in which a metric must be defined for its interval to be given."""
+SMALL_SHARE = 0.05
+"""Where no policy has two sessions at a visit, returns closer than this share of the largest one are not told apart."""
+WITHIN_NOISE = "the actual returns lie closer together than sessions of one policy do"
 
 
 @dataclass(frozen=True)
@@ -57,79 +64,83 @@ def mean_interval(returns: Sequence[float], level: float = LEVEL) -> tuple[float
     return interval.low, interval.high
 
 
+def least_range(pairs: Sequence[Pair]) -> float:
+    """The range of actual returns that must be exceeded for a share of it to mean something, in units of the return.
+
+    The pooled standard deviation between sessions of one policy at one visit; where no policy has two, a small share of the largest return.
+    """
+    repeated = [np.asarray(p.returns) for p in pairs if len(p.returns) > 1]
+    if repeated:
+        return float(np.sqrt(sum(((r - r.mean()) ** 2).sum() for r in repeated) / sum(r.size - 1 for r in repeated)))
+    return SMALL_SHARE * max(abs(p.actual) for p in pairs)
+
+
 def accuracies(method: str, pairs: Sequence[Pair]) -> list[AccuracyOut]:
-    """Metrics of one method: over all visits, then of each visit."""
+    """Metrics of one method: over all visits, then of each visit, which alone has no interval."""
     visits = sorted({p.visit for p in pairs})
-    return [_over_visits(method, pairs)] + [_of_visit(method, [p for p in pairs if p.visit == v], v) for v in visits]
+    floor = least_range(pairs)
+    return [_over_visits(method, pairs, floor)] + [_of_visit(method, [p for p in pairs if p.visit == v], v, floor) for v in visits]
 
 
-def _of_visit(method: str, pairs: Sequence[Pair], visit: int) -> AccuracyOut:
-    estimated, means = np.array([p.predicted for p in pairs]), _resampled(pairs)
-    found = accuracy([p.actual for p in pairs], estimated)
-    metric = _metric(means, sum(len(p.returns) for p in pairs))
+def _of_visit(method: str, pairs: Sequence[Pair], visit: int, floor: float) -> AccuracyOut:
+    found = accuracy([p.actual for p in pairs], [p.predicted for p in pairs], least_range=floor)
     alone = "" if len(pairs) > 1 else "a ranking needs at least 2 policies at the visit; there is 1"
-    again = _repeated(pairs)
-    ties = alone or "all actual returns, or all estimates, are equal"
     return AccuracyOut(
         method=method,
         visit=visit,
         policies=len(pairs),
         sessions=sum(len(p.returns) for p in pairs),
-        mae=metric(found.mae, lambda m: _mae(m, estimated)),
-        mae_of_range=metric(None if alone else found.mae_of_range, lambda m: _mae(m, estimated) / _range(m), ties),
-        rank_correlation=metric(found.rank_correlation, lambda m: rank_correlations(m, estimated), ties),
+        mae=_plain(found.mae),
+        mae_of_range=_plain(None if alone else found.mae_of_range, alone or WITHIN_NOISE),
+        rank_correlation=_plain(found.rank_correlation, alone or "all actual returns, or all estimates, are equal"),
         rank_p=found.rank_p,
-        regret=metric(None if alone else found.regret, lambda m: regrets(m, estimated), alone, again),
-        regret_of_range=metric(None if alone else found.regret_of_range, lambda m: regrets(m, estimated) / _range(m), ties, again),
-        regret_as_paper=metric(
-            None if alone else found.regret_as_paper, lambda m: regrets(m, estimated) / _best(m), alone or "max V is 0", again
-        ),
+        regret=_plain(None if alone else found.regret, alone),
+        regret_of_range=_plain(None if alone else found.regret_of_range, alone or WITHIN_NOISE),
+        regret_as_paper=_plain(None if alone else found.regret_as_paper, alone or "the best actual return is next to 0"),
         coverage=_covered(pairs),
     )
 
 
-def _over_visits(method: str, pairs: Sequence[Pair]) -> AccuracyOut:
+def _over_visits(method: str, pairs: Sequence[Pair], floor: float) -> AccuracyOut:
     """MAE and rank correlation over all pairs; regret, which chooses among the policies of one visit, as the mean over visits."""
-    estimated, means = np.array([p.predicted for p in pairs]), _resampled(pairs)
-    visits = np.array([p.visit for p in pairs])
-    sessions = sum(len(p.returns) for p in pairs)
-    found = accuracy([p.actual for p in pairs], estimated)
-    metric = _metric(means, sessions)
-    several = [visits == v for v in np.unique(visits) if (visits == v).sum() > 1]
-    none = "" if several else "a ranking needs at least 2 policies at one visit; no visit has them"
+    found = accuracy([p.actual for p in pairs], [p.predicted for p in pairs], least_range=floor)
+    by_visit = [[p for p in pairs if p.visit == v] for v in sorted({p.visit for p in pairs})]
+    means, estimated, drawn = _resampled(by_visit)
+    metric = _metric(len(by_visit))
     alone = "" if len(pairs) > 1 else "at least 2 policies are needed; there is 1"
-    now = means[:1]
 
-    def mean_regret(over: Callable[[Floats], Floats] | None) -> Callable[[Floats], Floats]:
-        def of(m: Floats) -> Floats:
-            values = [regrets(m[:, own], estimated[own]) / (1.0 if over is None else over(m[:, own])) for own in several]
-            return _nan_mean(np.stack(values, axis=1))
-
-        return of
-
-    def regret(over: Callable[[Floats], Floats] | None, reason: str = "") -> MethodMetricOut:
-        if none:
-            return MethodMetricOut(value=None, low=None, high=None, missing=none)
-        return metric(_finite(mean_regret(over)(now)[0]), mean_regret(over), reason, _repeated(pairs))
+    def regret(name: str, reason: str) -> MethodMetricOut:
+        each = np.array([_regret_of(own, floor, name) for own in by_visit])
+        if not any(len(own) > 1 for own in by_visit):
+            reason = "a ranking needs at least 2 policies at one visit; no visit has them"
+        return metric(_finite(_nan_mean(each[None])[0]), _nan_mean(each[drawn]), reason)
 
     return AccuracyOut(
         method=method,
         visit=None,
         policies=len(pairs),
-        sessions=sessions,
-        mae=metric(found.mae, lambda m: _mae(m, estimated)),
-        mae_of_range=metric(None if alone else found.mae_of_range, lambda m: _mae(m, estimated) / _range(m), alone or "all are equal"),
-        rank_correlation=metric(found.rank_correlation, lambda m: rank_correlations(m, estimated), alone or "all are equal"),
+        sessions=sum(len(p.returns) for p in pairs),
+        mae=metric(found.mae, _mae(means, estimated)),
+        mae_of_range=metric(None if alone else found.mae_of_range, _mae(means, estimated) / _range(means, floor), alone or WITHIN_NOISE),
+        rank_correlation=metric(found.rank_correlation, rank_correlations(means, estimated), alone or "all are equal"),
         rank_p=found.rank_p,
-        regret=regret(None),
-        regret_of_range=regret(_range, "all actual returns of every visit are equal"),
-        regret_as_paper=regret(_best, "max V is 0 at every visit"),
+        regret=regret("regret", ""),
+        regret_of_range=regret("regret_of_range", f"at every visit {WITHIN_NOISE}"),
+        regret_as_paper=regret("regret_as_paper", "the best actual return of every visit is next to 0"),
         coverage=_covered(pairs),
     )
 
 
+def _regret_of(pairs: Sequence[Pair], floor: float, name: str) -> float:
+    """One form of regret@1 among the policies of a visit; NaN where it has none."""
+    if len(pairs) < 2:
+        return float("nan")
+    value = getattr(accuracy([p.actual for p in pairs], [p.predicted for p in pairs], least_range=floor), name)
+    return float("nan") if value is None else float(value)
+
+
 def rank_correlations(means: Floats, estimated: Floats) -> Floats:
-    """Spearman's correlation of every row of means [D, C] with the estimates [C]; NaN cells are left out; NaN where one side is flat."""
+    """Spearman's correlation of every row of means [D, C] with its estimates; NaN cells are left out; NaN where one side is flat."""
     there = np.isfinite(means)
     ours, theirs = _ranks(means, there), _ranks(np.where(there, estimated, np.nan), there)
     top = np.nansum(ours * theirs, axis=1)
@@ -137,46 +148,37 @@ def rank_correlations(means: Floats, estimated: Floats) -> Floats:
     return np.asarray(np.divide(top, scale, out=np.full(len(means), np.nan), where=scale > 1e-12), dtype=np.float64)
 
 
-def regrets(means: Floats, estimated: Floats) -> Floats:
-    """Raw regret@1 of every row of means [D, C]: the best mean less that of the highest estimate among the cells there; NaN below two."""
-    there = np.isfinite(means)
-    best = np.where(there, means, -np.inf).max(1)
-    chosen = np.argmax(np.where(there, estimated, -np.inf), axis=1)
-    return np.asarray(np.where(there.sum(1) > 1, best - means[np.arange(len(means)), chosen], np.nan), dtype=np.float64)
+def _resampled(by_visit: Sequence[Sequence[Pair]]) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Visits drawn with replacement: actual means and estimates of their pairs, [DRAWS, most pairs], NaN where a row has fewer, and the
+    drawn visits, [DRAWS, visits]."""
+    drawn = resamples(len(by_visit), DRAWS, 0)
+    most = len(by_visit) * max(len(own) for own in by_visit)
+    filled = np.full((2, len(by_visit), most // len(by_visit)), np.nan)
+    for v, own in enumerate(by_visit):
+        filled[0, v, : len(own)] = [p.actual for p in own]
+        filled[1, v, : len(own)] = [p.predicted for p in own]
+    means, estimated = filled[:, drawn].reshape(2, DRAWS, most)
+    return means, estimated, drawn
 
 
-def _resampled(pairs: Sequence[Pair]) -> Floats:
-    """Means of the pairs, [1 + DRAWS, C]: first of all sessions, then of sessions drawn with replacement; NaN where none was drawn."""
-    returns = np.concatenate([np.asarray(p.returns, dtype=np.float64) for p in pairs])
-    member = np.repeat(np.arange(len(pairs)), [len(p.returns) for p in pairs])[:, None] == np.arange(len(pairs))
-    counts = np.stack([np.bincount(pick, minlength=returns.size) for pick in resamples(returns.size, DRAWS, 0)])
-    counts = np.concatenate([np.ones((1, returns.size)), counts])
-    drawn = counts @ member
-    return np.asarray(np.divide((counts * returns) @ member, drawn, out=np.full(drawn.shape, np.nan), where=drawn > 0), dtype=np.float64)
+def _metric(visits: int) -> Callable[..., MethodMetricOut]:
+    """Makes a metric of its value and of that of every resample."""
 
-
-def _metric(means: Floats, sessions: int) -> Callable[..., MethodMetricOut]:
-    """Makes a metric of its value and of the function that gives it for every resample."""
-
-    def make(value: float | None, of: Callable[[Floats], Floats], missing: str = "", spread_known: bool = True) -> MethodMetricOut:
+    def make(value: float | None, draws: Floats, missing: str = "") -> MethodMetricOut:
         if value is None:
-            return MethodMetricOut(value=None, low=None, high=None, missing=missing)
-        if not spread_known:
-            return MethodMetricOut(value=value, low=None, high=None)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            draws = of(means[1:])
-        draws = draws[np.isfinite(draws)]
-        if sessions < FEWEST_SESSIONS or draws.size < DEFINED_SHARE * (len(means) - 1):
-            return MethodMetricOut(value=value, low=None, high=None)
-        interval = percentile_interval(draws, LEVEL)
+            return _plain(None, missing)
+        known = draws[np.isfinite(draws)]
+        if visits < FEWEST_VISITS or known.size < DEFINED_SHARE * draws.size:
+            return _plain(value)
+        interval = percentile_interval(known, LEVEL)
         return MethodMetricOut(value=value, low=interval.low, high=interval.high)
 
     return make
 
 
-def _repeated(pairs: Sequence[Pair]) -> bool:
-    """Whether most policies have several sessions: else resamples never change which of two is better, and a regret seems sure."""
-    return sum(len(p.returns) > 1 for p in pairs) > 0.5 * len(pairs)
+def _plain(value: float | None, missing: str = "") -> MethodMetricOut:
+    """A metric without an interval, or the reason why there is none."""
+    return MethodMetricOut(value=value, low=None, high=None, missing=missing if value is None else "")
 
 
 def _covered(pairs: Sequence[Pair]) -> MethodMetricOut:
@@ -195,15 +197,11 @@ def _mae(means: Floats, estimated: Floats) -> Floats:
     return _nan_mean(np.abs(means - estimated))
 
 
-def _range(means: Floats) -> Floats:
+def _range(means: Floats, floor: float) -> Floats:
+    """Range of every row; NaN where it is no larger than the floor."""
     there = np.isfinite(means)
     spread = np.where(there, means, -np.inf).max(1) - np.where(there, means, np.inf).min(1)
-    return np.asarray(np.where(spread > 0, spread, np.nan), dtype=np.float64)
-
-
-def _best(means: Floats) -> Floats:
-    best = np.where(np.isfinite(means), means, -np.inf).max(1)
-    return np.asarray(np.where(best != 0, best, np.nan), dtype=np.float64)
+    return np.asarray(np.where(spread > floor, spread, np.nan), dtype=np.float64)
 
 
 def _nan_mean(values: Floats) -> Floats:

@@ -70,7 +70,7 @@ def returns(found: CalibrationOut, method: str) -> Chart:
 
 
 def metrics(found: CalibrationOut) -> Chart:
-    """MAE, rank correlation and regret of every method over all visits, side by side, with session-bootstrap intervals."""
+    """MAE, rank correlation and regret of every method over all visits, side by side, with intervals over resampled visits."""
     rows = [m for m in found.metrics if m.visit is None]
     names = [method_of(m.method).short for m in rows]
     data: list[dict[str, Any]] = []
@@ -103,7 +103,7 @@ def metrics(found: CalibrationOut) -> Chart:
     return Chart(
         id="metrics",
         title="Metrics of every method",
-        subtitle=f"over all visits, {level} session bootstrap \u00b7 n = {max((m.sessions for m in rows), default=0)} sessions",
+        subtitle=f"over all visits, {level} over resampled visits \u00b7 n = {max((m.sessions for m in rows), default=0)} sessions",
         figure=figure(
             data,
             yaxis=axis("", categoryorder="array", categoryarray=names[::-1]),
@@ -164,7 +164,7 @@ def over_visits(found: CalibrationOut, method: str) -> Chart | None:
     return Chart(
         id="over-visits",
         title="Metrics visit by visit",
-        subtitle=f"strong: {method_of(method).name}, {level} session bootstrap \u00b7 n = {len(visits)} visits, "
+        subtitle=f"strong: {method_of(method).name}, points: one visit each \u00b7 n = {len(visits)} visits, "
         f"{sum(m.sessions for m in rows if m.method == method)} sessions \u00b7 a gap: too few policies at that visit",
         figure=figure(
             data,

@@ -60,7 +60,7 @@ class TestedPolicyOut(Model):
 
 
 class MethodMetricOut(Model):
-    """One metric with the ends of its session bootstrap; null with the reason in `missing`."""
+    """One metric with its interval over resampled visits (null below three); null with the reason in `missing`."""
 
     value: float | None
     low: float | None

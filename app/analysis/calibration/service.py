@@ -1,8 +1,9 @@
 """The calibration: estimates made before a visit against what the visit brought, policy by policy and method by method.
 
-Nothing peeks: of a visit counts only an evaluation that was stored before the service knew of any of the visit's sessions. Its own
-settings version, horizon H and discount are applied to the sessions; sessions longer than H count to H, shorter ones by the mean of the
-steps that they have (`actual.actual`).
+The prediction of a visit is that of its signed plan: the evaluation which that pins; of a visit without one the newest. Nothing peeks:
+only an evaluation counts that was stored before the service knew of any of the visit's sessions. Its own settings version, horizon H and
+discount are applied to the sessions; sessions longer than H count to H, shorter ones by the mean of the steps that they have
+(`actual.actual`).
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from app.evaluation.ranking.actual import QUANTITIES, Actual, actual
 from app.evaluation.ranking.assessment import is_cdbs
 from app.evaluation.ranking.results import DrivenSession, driven_sessions
 from app.learning.models import BufferSnapshot, Policy
+from app.planning.plans import repository as plans
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
@@ -64,6 +66,7 @@ def calibration(db: Session, participant: Participant, caller: Caller) -> Calibr
     """Predicted against actual, of every policy that ran at a visit after an evaluation of it."""
     study.require(caller, can.READ, participant)
     made = repository.evaluation_times(db, participant.id)
+    planned = plans.pinned_evaluations(db, participant.id)
     by_visit: dict[Visit, list[StudySession]] = defaultdict(list)
     for session in study_repository.sessions_of_participant(db, participant.id):
         by_visit[session.visit].append(session)
@@ -71,7 +74,9 @@ def calibration(db: Session, participant: Participant, caller: Caller) -> Calibr
     policies: list[TestedPolicyOut] = []
     left_out: list[str] = []
     for visit, sessions in by_visit.items():
-        before = newest_before(made, min(s.created_at for s in sessions))
+        known_from = min(s.created_at for s in sessions)
+        own = planned.get(visit.id)
+        before = own if own is not None and made[own] < known_from else newest_before(made, known_from)
         if before is None:
             if any(blinding.arm(s, caller).policy_id is not None for s in sessions):
                 left_out.append(f"visit {visit.number}: no evaluation had been made before its sessions")

@@ -120,3 +120,10 @@ def delete_visit(db: Session, visit: Visit) -> None:
 def evaluation(db: Session, evaluation_id: int) -> Evaluation:
     """An evaluation that a plan pins, with its estimates."""
     return db.get_one(Evaluation, evaluation_id, options=[selectinload(Evaluation.estimates)])
+
+
+def pinned_evaluations(db: Session, participant_id: int) -> dict[int, int]:
+    """By visit: the evaluation whose predictions its signed plan rests on; plans without one are left out."""
+    query = select(Plan.visit_id, Plan.evaluation_id).join(Visit, Visit.id == Plan.visit_id)
+    query = query.where(Visit.participant_id == participant_id, Plan.status == "approved", Plan.evaluation_id.is_not(None))
+    return {visit_id: evaluation_id for visit_id, evaluation_id in db.execute(query) if evaluation_id is not None}

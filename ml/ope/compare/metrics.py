@@ -19,13 +19,13 @@ class Accuracy:
 
     Attributes:
         mae: mean absolute error.
-        mae_of_range: mae divided by max V - min V; None where all actual returns are equal.
+        mae_of_range: mae divided by max V - min V; None where that is no larger than the least range that counts.
         rank_correlation: Spearman's rho; None where one side has no spread.
         rank_p: two-sided permutation p-value of rho; None with rho.
         regret: raw regret@1, V of the best policy less V of the policy with the best estimate.
-        regret_of_range: regret / (max V - min V); None where all actual returns are equal.
-        regret_as_paper: regret / max V, as the paper writes it. Its sign turns when max V < 0 and it explodes near 0: use the other two.
-            None where max V is 0.
+        regret_of_range: regret / (max V - min V); None as mae_of_range.
+        regret_as_paper: regret / max V, as the paper writes it. Its sign turns when max V < 0: use the other two. None where |max V| is no
+            larger than the least range that counts, for it explodes near 0.
         n: policies.
     """
 
@@ -39,13 +39,14 @@ class Accuracy:
     n: int
 
 
-def accuracy(actual: ArrayLike, estimated: ArrayLike, seed: int = 0) -> Accuracy:
+def accuracy(actual: ArrayLike, estimated: ArrayLike, seed: int = 0, least_range: float = 0.0) -> Accuracy:
     """All metrics of one method.
 
     Args:
         actual: actual return of each policy, shape [P].
         estimated: estimated return of each policy, shape [P].
         seed: of the sampled permutations, used when P > 8.
+        least_range: what actual returns must differ by for a share of their range to be given, such as the noise of a session.
 
     Raises:
         ValueError: shapes differ, no policy, or a value that is not finite.
@@ -62,12 +63,12 @@ def accuracy(actual: ArrayLike, estimated: ArrayLike, seed: int = 0) -> Accuracy
     rho = spearman(v, e)
     return Accuracy(
         mae=mae,
-        mae_of_range=mae / spread if spread > 0 else None,
+        mae_of_range=mae / spread if spread > least_range else None,
         rank_correlation=rho,
         rank_p=None if rho is None else spearman_p(v, e, seed=seed),
         regret=regret,
-        regret_of_range=regret / spread if spread > 0 else None,
-        regret_as_paper=regret / float(v.max()) if v.max() != 0 else None,
+        regret_of_range=regret / spread if spread > least_range else None,
+        regret_as_paper=regret / float(v.max()) if abs(v.max()) > least_range else None,
         n=v.size,
     )
 

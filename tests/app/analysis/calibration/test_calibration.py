@@ -13,6 +13,7 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from app.evaluation.models import Evaluation
+from app.planning.plans.models import Plan
 from app.study.models import StudySession, Visit
 from tests.app.evaluations import estimate
 
@@ -88,6 +89,30 @@ def test_numbers_are_those_computed_by_hand(client: TestClient, upload: Upload, 
         assert text in page.text
     assert client.get("/participants/P1/calibration", params={"method": "fqe"}).status_code == 200
     assert client.get("/participants/P1/calibration", params={"method": "wis"}).status_code == 422
+
+
+def test_the_prediction_of_a_visit_is_that_of_its_signed_plan(
+    client: TestClient, upload: Upload, policies: list[int], evaluate: Callable[..., int], db: Session
+) -> None:
+    a = policies[0]
+    planned = evaluate({a: estimate("dlsm", 50.0)})
+    newer = evaluate({a: estimate("dlsm", 90.0)})
+    for visit, pinned in ((2, planned), (3, None)):
+        if visit == 3:
+            client.post("/api/v1/participants/P1/visits", json={"number": 3, "date": "2026-04-02"})
+        row = db.scalars(select(Visit).where(Visit.number == visit)).one()
+        if pinned is not None:
+            db.add(
+                Plan(
+                    visit_id=row.id, evaluation_id=pinned, status="approved", seed=1, rules={}, created_by="a", approved_by="b",
+                    approved_at=row.created_at,
+                )
+            )  # fmt: skip
+        db.commit()
+        upload("rl", level=0.8, policy=a, visit=visit, qoc=QOC)
+    found = {p["visit"]: p for p in calibration(client)["policies"]}
+    assert {v: p["evaluation_id"] for v, p in found.items()} == {2: planned, 3: newer}
+    assert [found[v]["predictions"][0]["predicted"] for v in (2, 3)] == [50.0, 90.0], "tested twice, the policy is two facts"
 
 
 def test_an_evaluation_made_after_a_session_arrived_counts_for_nothing(
