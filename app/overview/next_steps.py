@@ -17,6 +17,7 @@ class Actor(StrEnum):
     """Whose turn it is."""
 
     CLINICIAN = "clinician"
+    COORDINATOR = "coordinator"
     ENGINEER = "engineer"
     SERVICE = "service"
 
@@ -27,12 +28,14 @@ class Task(StrEnum):
     ADD_VISIT = "add_visit"
     STATE_AMPLITUDE = "state_amplitude"
     UPLOAD = "upload"
+    SEND_LOGS = "send_logs"
     CONFIRM = "confirm"
     ENTER_QOCS = "enter_qocs"
     SET_THRESHOLD = "set_threshold"
     WAIT_FOR_RANKING = "wait_for_ranking"
     RANK = "rank"
     RANK_AGAIN = "rank_again"
+    TRAIN_NEXT = "train_next"
     DRAFT_PLAN = "draft_plan"
     APPROVE_PLAN = "approve_plan"
     LOOK_AT_FAILED = "look_at_failed"
@@ -70,6 +73,9 @@ def _steps(participant: Participant, state: State) -> Iterator[NextStep]:
         yield NextStep(Task.STATE_AMPLITUDE, clinician, f"{home}/settings")
     if state.visits and not state.sessions:
         yield NextStep(Task.UPLOAD, clinician, f"{home}/upload", blocks_visit=False)
+    for visit in state.planned_visits:
+        if visit.logs_missing:
+            yield NextStep(Task.SEND_LOGS, Actor.COORDINATOR, f"/visits/{visit.visit_id}/slots", visit.logs_missing, blocks_visit=False)
     if state.proposed:
         yield NextStep(Task.CONFIRM, clinician, f"{home}/proposals", state.proposed)
     if state.without_qoc:
@@ -80,7 +86,9 @@ def _steps(participant: Participant, state: State) -> Iterator[NextStep]:
         yield NextStep(Task.WAIT_FOR_RANKING, Actor.SERVICE, f"/jobs/{state.ranking_job.id}", urgent=False)
     elif state.sessions and state.evaluated_at is None:
         yield NextStep(Task.RANK, engineer, f"{home}/jobs", urgent=False)
-    if state.grown:
+    if state.grown and any(visit.tested for visit in state.planned_visits):
+        yield NextStep(Task.TRAIN_NEXT, engineer, f"{home}/next-generation")
+    elif state.grown:
         yield NextStep(Task.RANK_AGAIN, engineer, f"{home}/jobs")
     if state.plan == "draft":
         yield NextStep(Task.APPROVE_PLAN, clinician, f"{home}/plans")

@@ -52,6 +52,7 @@ def overview(
         today=today,
         what=wording.what,
         actors=wording.ACTORS,
+        progress=wording.progress,
         in_days=wording.in_days,
         total=total,
         withdrawn=withdrawn == "yes",

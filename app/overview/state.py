@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.overview import repository
 from app.overview.next_steps import NextStep, next_steps
+from app.overview.visit_progress import VisitProgress, visit_progress
 from app.platform.jobs.models import Job
 from app.study.models import Participant
 
@@ -31,6 +32,7 @@ class State:
         running, failed: jobs; the latter of the last 7 days.
         ranking_job: the live job that will bring the first ranking; None where there is a ranking or no such job.
         next_planned: whether the next visit has an approved plan or a draft.
+        planned_visits: how far the visits with a signed plan are, by number.
         steps: what is to be done, what others wait for first.
     """
 
@@ -50,6 +52,7 @@ class State:
     ranking_job: Job | None = None
     failed: int = 0
     next_planned: bool = False
+    planned_visits: list[VisitProgress] = field(default_factory=list)
     steps: list[NextStep] = field(default_factory=list)
 
     @property
@@ -72,6 +75,12 @@ class State:
         return next((s for s in self.steps if s.blocks_visit), None)
 
     @property
+    def last_planned(self) -> VisitProgress | None:
+        """The last visit with a signed plan up to today, else the next one; None without any."""
+        begun = [v for v in self.planned_visits if v.held or v.logs_missing]
+        return begun[-1] if begun else next(iter(self.planned_visits), None)
+
+    @property
     def grown(self) -> bool:
         """Whether sessions came after the last evaluation's snapshot."""
         return bool(self.snapshot_at and self.newest_session and self.newest_session > self.snapshot_at)
@@ -83,6 +92,8 @@ def states(db: Session, participants: Sequence[Participant], today: dt.date) -> 
     found = {i: State() for i in ids}
     _study(db, ids, found, today)
     _results(db, ids, found)
+    for key, visits in visit_progress(db, ids, today).items():
+        found[key].planned_visits = visits
     for participant in participants:
         found[participant.id].steps = next_steps(participant, found[participant.id])
     return found

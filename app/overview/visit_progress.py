@@ -18,6 +18,7 @@ class VisitProgress:
     Attributes:
         planned: sessions of the plan. held: those that a confirmed session fills.
         logs_missing: those that none fills although the day is past; 0 before it, and of a visit without a date.
+        tested: those held that ran a policy.
     """
 
     visit_id: int
@@ -26,6 +27,7 @@ class VisitProgress:
     planned: int
     held: int
     logs_missing: int
+    tested: int
 
 
 def visit_progress(db: Session, participant_ids: Sequence[int], today: dt.date) -> dict[int, list[VisitProgress]]:
@@ -37,5 +39,5 @@ def visit_progress(db: Session, participant_ids: Sequence[int], today: dt.date) 
     for row in slots.slots_filled(db, participant_ids):
         past = row.date is not None and row.date < today
         missing = row.slots - row.filled if past else 0
-        found[row.participant_id].append(VisitProgress(row.visit_id, row.number, row.date, row.slots, row.filled, missing))
+        found[row.participant_id].append(VisitProgress(row.visit_id, row.number, row.date, row.slots, row.filled, missing, row.tested))
     return found

@@ -5,19 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from app.overview.next_steps import Actor, NextStep, Task
+from app.overview.visit_progress import VisitProgress
 
-ACTORS = {Actor.CLINICIAN: "Clinician", Actor.ENGINEER: "Engineer", Actor.SERVICE: "Nobody: the service works"}
+ACTORS = {
+    Actor.CLINICIAN: "Clinician",
+    Actor.COORDINATOR: "Coordinator",
+    Actor.ENGINEER: "Engineer",
+    Actor.SERVICE: "Nobody: the service works",
+}
 
 _TASKS: dict[Task, str | Callable[[int], str]] = {
     Task.ADD_VISIT: "No visit yet",
     Task.STATE_AMPLITUDE: "No cDBS amplitude in the settings",
     Task.UPLOAD: "No session yet",
+    Task.SEND_LOGS: lambda n: f"{counted(n, 'planned session')} without a log",
     Task.CONFIRM: lambda n: f"{counted(n, 'session')} to confirm",
     Task.ENTER_QOCS: lambda n: f"{counted(n, 'session')} without QoCs",
     Task.SET_THRESHOLD: "Beta threshold \u03be\u03b2 is not set; jobs cannot start",
     Task.WAIT_FOR_RANKING: "The first ranking is being made",
     Task.RANK: "No ranking yet: start the pipeline",
     Task.RANK_AGAIN: "New sessions since the last ranking; it is stale",
+    Task.TRAIN_NEXT: "New sessions since the last ranking, of policies too: train the next generation",
     Task.DRAFT_PLAN: "No plan for this visit yet",
     Task.APPROVE_PLAN: "A visit plan waits for approval",
     Task.LOOK_AT_FAILED: lambda n: f"{counted(n, 'job')} failed in the last 7 days",
@@ -28,6 +36,12 @@ def what(step: NextStep) -> str:
     """What is to be done."""
     said = _TASKS[step.task]
     return said if isinstance(said, str) else said(step.count)
+
+
+def progress(visit: VisitProgress) -> str:
+    """How far a visit with a signed plan is."""
+    missing = f", {counted(visit.logs_missing, 'log')} missing" if visit.logs_missing else ""
+    return f"Visit {visit.number}: {visit.held} of {counted(visit.planned, 'planned session')} held{missing}"
 
 
 def counted(count: int, noun: str) -> str:
