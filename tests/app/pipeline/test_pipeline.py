@@ -95,6 +95,34 @@ def test_an_evaluation_gives_the_numbers_that_the_estimators_give(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("worker", "sessions")
+def test_sessions_of_any_design_a_foreign_policy_and_no_end_reward_go_through_the_same_door(
+    client: TestClient, upload: Upload, ended: Ended
+) -> None:
+    weights = {"c2": 0.0, "c3": 0.0, "c4": 0.0}
+    assert client.put("/api/v1/participants/P1/settings", json={"settings": weights}).status_code == 200
+    for k, design in enumerate(("stratified", "paper", "ladder")):
+        designed = upload("random", steps=60, visit=1)
+        stated = client.put(f"/api/v1/sessions/{designed}/conditions", json={"design": design, "seed": k, "reason": "as planned"})
+        assert stated.status_code == 200, stated.text
+    added = client.post("/api/v1/participants/P1/policies", data={"name": "ext"}, files={"file": ("e.onnx", constant_onnx(0.6, 10))}).json()
+    methods = [*CHEAP, "impulse", "dlmm", "dual_dice", "aggregate"]
+    done = ended(
+        client.post(JOBS, json={"kind": "evaluate", "preset": "quick", "methods": methods, "policies": [added["id"]]}).json()["id"], 400
+    )
+    assert done["status"] == "succeeded", done
+    ranking = client.get("/api/v1/participants/P1/ranking").json()
+    (policy,) = ranking["policies"]
+    assert set(policy["estimates"]) == {*methods, "posterior"}
+    for method, told in policy["estimates"].items():
+        assert np.isfinite([told["value"], told["low"], told["high"]]).all(), method
+        assert told["low"] <= told["value"] <= told["high"], method
+        assert told["end_reward"] == pytest.approx(0.0, abs=1e-9), method
+        assert all(abs(flag["value"]) < 1e4 for flag in told["flags"] if flag["value"] is not None), (method, told["flags"])
+    assert policy["predicted"]["grasp_hz"] == pytest.approx(2.0, abs=1.0), "outcomes are predicted where they earn nothing"
+
+
+@pytest.mark.slow
 @pytest.mark.usefixtures("worker")
 def test_the_pipeline_walks_from_sessions_to_a_ranking(client: TestClient, sessions: list[int], ended: Ended, db: Session) -> None:
     body = {

@@ -85,7 +85,7 @@ def test_the_choice_names_its_table_or_why_there_is_none(db: Session, tmp_path: 
     assert "none of the methods asked for" in choose_method(one, tmp_path, StepReport(lambda _: None))["failed"]
 
 
-@pytest.mark.parametrize("method", ["linear", "fqe", "wdr", "dual_dice", "dlmm"])
+@pytest.mark.parametrize("method", ["posterior", "impulse", "linear", "fqe", "wdr", "dual_dice", "dlmm"])
 def test_a_study_without_end_of_session_rewards_still_sees_the_outcomes_predicted(method: str, db: Session, tmp_path: Path) -> None:
     without = MdpSettings(xi_beta=1.0, c2=0.0, c3=0.0, c4=0.0)
     buffer = ReplayBuffer(without, sessions(), "uV", "table")

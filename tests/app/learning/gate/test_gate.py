@@ -59,6 +59,16 @@ def test_they_enter_once_a_qoc_is_significantly_better_and_none_is_worse(upload:
     assert left_out(db) == {}
 
 
+def test_designed_sessions_are_the_random_arm(upload: Upload, client: TestClient) -> None:
+    learned, random = sessions(upload, [qoc(2.0, 9, 10.0)] * 4, [qoc(2.0, 4, 10.0)] * 4)
+    for session, design in zip(random, ("stratified", "stratified", "ladder", "paper"), strict=True):
+        stated = client.put(f"/api/v1/sessions/{session}/conditions", json={"design": design, "seed": 1, "reason": "as planned"})
+        assert stated.status_code == 200, stated.text
+    gate = client.get(GATE).json()
+    assert {(t["n_learned"], t["n_random"]) for t in gate["tests"]} == {(len(learned), 4)}
+    assert gate["open"] is True
+
+
 def test_a_qoc_that_is_significantly_worse_keeps_the_gate_shut(upload: Upload, client: TestClient, db: Session) -> None:
     learned, _ = sessions(upload, [qoc(2.0, 9, 60.0 + k) for k in range(4)], [qoc(2.0, 4, 5.0 + k) for k in range(4)])
     gate = client.get(GATE).json()

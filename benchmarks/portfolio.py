@@ -1,0 +1,209 @@
+"""Which policies three visits find: the portfolio of the posterior against rankings by single methods and against chance.
+
+    python benchmarks/portfolio.py --quick                    two worlds of part A
+    python benchmarks/portfolio.py --worlds 40 --out FOLDER   40 worlds; resumable
+    python benchmarks/portfolio.py --dlsm ...                 the order of the DLSM too, which costs a minute per world
+
+Every virtual patient has three visits of data by the stratified design. Three more visits test up to four policies each: 60 minutes, two
+cDBS sessions and four others of ten minutes. `portfolio` is what the plan's page suggests: verdicts are respected, and tested sessions move
+the posterior before the next visit. `any verdict` is the same choice among all candidates without a hazard. `linear`, `dlsm` and `random`
+test the next four of their order. Told after each visit: the true gain over cDBS of the best policy tested so far, as a share of what the
+best candidate gains (`tested`), and of the policy that would be kept by what was seen (`kept`). Nothing is chosen by true returns.
+Patients whose best candidate gains less than two standard errors of the truth are left out. CPU seconds of one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from support.cells import Cells
+from support.looks import look
+from support.ope_cases import CDBS, STEPS, virtual_case
+
+from ml.mdp import step_reward
+from ml.ope.estimate import Estimate
+from ml.ope.posterior.estimator import FittedPosterior, build
+from ml.ope.posterior.portfolio import portfolio
+from ml.ope.posterior.tested import TestSession, differences_to_cdbs
+from ml.ope.posterior.verdict import Levels, verdict
+from ml.ope.registry import estimators
+from ml.policies.policy import Policy
+from ml.population.virtual import WORLDS_PER_PART, World, visit_days, world
+from ml.qoc import Margins
+from ml.statistics.bootstrap import percentile_interval
+
+SLOTS, TEST_VISITS, EARLY_VISITS = 4, 3, 3
+HOURS = (0.0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6)
+"""Beginnings of the six sessions of an hour; the first and the fourth are of cDBS."""
+CDBS_PLACES, TEST_PLACES = (0, 3), (1, 2, 4, 5)
+TESTED = 1 << 43
+"""First session number of the tests, which no other data of a world have."""
+SHARE = 0.9
+QUICK_WORLDS, TRUTH, QUICK_TRUTH = 2, 200, 80
+RESAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Clinic:
+    """The visits after the early ones: what sessions of policies show there."""
+
+    world: World
+    policies: Mapping[str, Policy]
+
+    def visit(self, number: int, names: tuple[str, ...]) -> list[TestSession]:
+        """The visit's cDBS sessions and one session of each named policy. A policy meets the same noise whoever chose it."""
+        placed = [*((CDBS, place) for place in CDBS_PLACES), *zip(names, TEST_PLACES, strict=False)]
+        return [self._session(number, name, place) for name, place in placed]
+
+    def _session(self, number: int, name: str, place: int) -> TestSession:
+        w, s = self.world, self.world.settings
+        days = visit_days(w.key, np.array([EARLY_VISITS + number]), np.array([HOURS[place]]))
+        which = list(self.policies).index(name)
+        run = w.run(self.policies[name], days, TESTED + 1000 * number + 10 * which + (place if name == CDBS else 0))
+        tremor = run.tremor_percent[0] / (100.0 if s.tremor_as_fraction else 1.0)
+        end = s.c2 * run.grasp_hz[0] + s.c3 * run.rating[0] - s.c4 * tremor
+        steps = step_reward(s, run.beta[0], run.amplitude[0]) @ s.gamma ** np.arange(STEPS)
+        values = {
+            "return": float(steps + end),
+            "energy": float((run.amplitude**2).mean()),
+            "grasp_hz": float(run.grasp_hz[0]),
+            "rating": float(run.rating[0]),
+            "tremor_percent": float(run.tremor_percent[0]),
+        }
+        return TestSession(None if name == CDBS else name, number, values)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Policies tested at each visit, and the one to be kept after it (cDBS where none is better)."""
+
+    tested: list[tuple[str, ...]]
+    kept: list[str]
+
+
+def by_posterior(clinic: Clinic, fitted: FittedPosterior, *, respecting: bool) -> Found:
+    """Three visits of portfolios; each visit's sessions move the posterior."""
+    sessions: list[TestSession] = []
+    tested, kept = [], []
+    estimates = fitted.evaluate(clinic.policies, STEPS)
+    for number in range(1, TEST_VISITS + 1):
+        names = suggested(estimates, respecting)
+        sessions += clinic.visit(number, names)
+        estimates = replace(fitted, tests=tuple(differences_to_cdbs(sessions))).evaluate(clinic.policies, STEPS)
+        tested.append(names)
+        had = [CDBS, *(name for names in tested for name in names)]
+        kept.append(max(had, key=lambda name: estimates[name].value))
+    return Found(tested, kept)
+
+
+def suggested(estimates: Mapping[str, Estimate], respecting: bool) -> tuple[str, ...]:
+    """The portfolio of a visit among what may be proposed, or among all without a hazard."""
+    cdbs = estimates[CDBS]
+    verdicts = {n: verdict(e, cdbs, Margins(), Levels()) for n, e in estimates.items() if n != CDBS}
+    able = {n for n, v in verdicts.items() if (v.proposed if respecting else not v.hazards)}
+    careful = {n for n in able if verdicts[n].code == "test_with_care"} if respecting else set()
+    draws = {n: np.asarray(e.details["draws"]) for n, e in estimates.items()}
+    return tuple(s.name for s in portfolio({n: draws[n] - draws[CDBS] for n in able}, SLOTS, careful))
+
+
+def in_order(clinic: Clinic, order: list[str]) -> Found:
+    """The next four of an order at each visit; kept is what showed the largest mean difference to cDBS above 0."""
+    seen: dict[str, float] = {CDBS: 0.0}
+    tested, kept = [], []
+    for number in range(1, TEST_VISITS + 1):
+        names = tuple(order[SLOTS * (number - 1) : SLOTS * number])
+        sessions = clinic.visit(number, names)
+        reference = float(np.mean([s.values["return"] for s in sessions if s.policy is None]))
+        seen |= {s.policy: s.values["return"] - reference for s in sessions if s.policy is not None}
+        tested.append(names)
+        kept.append(max(seen, key=seen.__getitem__))
+    return Found(tested, kept)
+
+
+def arms(index: int, truth_sessions: int, dlsm: bool) -> dict[str, Any] | None:
+    """Shares of the best gain by arm and visit; None where no candidate gains more than two standard errors."""
+    case, w = virtual_case("A", index, truth_sessions), world("A", index)
+    clinic, buffer = Clinic(w, {**case.candidates, CDBS: case.probes[CDBS]}), case.data("stratified")
+    true = {n: case.truth["policies"][n]["total"] for n in clinic.policies}
+    gains = {n: true[n][0] - true[CDBS][0] for n in clinic.policies}
+    best = max(gains, key=gains.__getitem__)
+    if gains[best] < 2 * true[best][1]:
+        return None
+    fitted = build("posterior", 0, "demo").fit(buffer)
+    found = {name: by_posterior(clinic, fitted, respecting=name == "portfolio") for name in ("portfolio", "any verdict")}
+    orders = {"random": list(np.random.default_rng([index, 0x90F]).permutation(list(case.candidates)))}
+    for method in ("linear", *(("dlsm",) if dlsm else ())):
+        said = estimators(0, demo=True)[method].fit(buffer).evaluate(case.candidates, STEPS)
+        orders[method] = sorted(said, key=lambda n: -said[n].value)
+    found |= {name: in_order(clinic, order) for name, order in orders.items()}
+    return {name: _shares(one, gains, gains[best]) for name, one in found.items()}
+
+
+def _shares(found: Found, gains: Mapping[str, float], best: float) -> dict[str, list[float]]:
+    tested = [max([0.0, *(gains[n] for names in found.tested[: k + 1] for n in names)]) / best for k in range(TEST_VISITS)]
+    return {"tested": tested, "kept": [gains[n] / best for n in found.kept], "sessions": [float(len(n)) for n in found.tested]}
+
+
+def lines(shares: Mapping[str, list[dict[str, list[float]]]]) -> Iterator[str]:
+    """A table of means with 90 % intervals over patients, one row for each arm and figure."""
+    rng = np.random.default_rng(0)
+    yield f"{'':12} {'':8} {'after visit 1':>24} {'2':>24} {'3':>24} {f'>= {SHARE:g} after 3':>16}\n"
+    for arm, rows in shares.items():
+        for figure in ("tested", "kept"):
+            table = np.array([row[figure] for row in rows])
+            told = []
+            for column in table.T:
+                means = rng.choice(column, (RESAMPLES, column.size)).mean(1)
+                interval = percentile_interval(means, 0.9)
+                told.append(f"{column.mean():.2f} ({interval.low:.2f} to {interval.high:.2f})")
+            yield f"{arm:12} {figure:8} {told[0]:>24} {told[1]:>24} {told[2]:>24} {float(np.mean(table[:, -1] >= SHARE)):16.2f}\n"
+
+
+def main() -> None:
+    """Print the curve as a table and, as the last line, one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK_WORLDS} worlds, few simulated sessions")
+    parser.add_argument("--worlds", type=int, default=WORLDS_PER_PART)
+    parser.add_argument("--dlsm", action="store_true", help="the order of the DLSM as well")
+    parser.add_argument("--minutes", type=float, default=1e9, help="start no further world after so many minutes")
+    parser.add_argument("--out", type=Path, help="folder of the finished worlds; a temporary one by default")
+    chosen = parser.parse_args()
+    torch.set_num_threads(1)
+    look("A", " ".join(["portfolio.py", *sys.argv[1:]]), None)
+    out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-portfolio-"))
+    out.mkdir(parents=True, exist_ok=True)
+    cells = Cells(out / f"portfolio{'-quick' if chosen.quick else ''}{'-dlsm' if chosen.dlsm else ''}.jsonl")
+    begun = time.monotonic()
+    for index in range(min(chosen.worlds, QUICK_WORLDS) if chosen.quick else chosen.worlds):
+        if time.monotonic() - begun > 60 * chosen.minutes:
+            break
+        if cells.get(f"A{index:02d}") is None:
+            start = time.process_time()
+            found = arms(index, QUICK_TRUTH if chosen.quick else TRUTH, chosen.dlsm)
+            cells.add(f"A{index:02d}", arms=found, seconds=time.process_time() - start)
+    rows = [cell["arms"] for cell in cells.all("A") if cell["arms"] is not None]
+    shares = {arm: [row[arm] for row in rows] for arm in (rows[0] if rows else ())}
+    sys.stdout.writelines(
+        [f"{len(rows)} virtual patients, share of the best candidate's true gain over cDBS, 90 % intervals\n", *lines(shares)]
+    )
+    figures = {
+        f"{arm}_{figure}".replace(" ", "_"): float(np.mean([r[figure][-1] for r in of]))
+        for arm, of in shares.items()
+        for figure in ("tested", "kept")
+    }
+    figures |= {"n_worlds": len(rows), "cpu_seconds_per_world": float(np.mean([c["seconds"] for c in cells.all("A")]))}
+    sys.stdout.write(json.dumps({"name": "portfolio", "figures": figures, "ratios": {}, "baseline": "linear model alone"}) + "\n")
+
+
+if __name__ == "__main__":
+    main()
