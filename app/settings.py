@@ -19,6 +19,9 @@ class Settings(BaseSettings):
 
     data_dir: Path = Field(Path("var"), description="Folder of the embedded database, stored files and job folders.")
     database_url: str | None = Field(None, description="PostgreSQL URL; without one an embedded PostgreSQL runs in the data folder.")
+    owner_url: str | None = Field(
+        None, description="PostgreSQL URL of the role that owns the tables, for migrate, backup and restore; database_url's when left out."
+    )
     server_user: str = Field(
         "pgserver", description="System user of the embedded PostgreSQL where root starts betaloop; made at the first start."
     )

@@ -25,6 +25,7 @@ from sqlalchemy.orm import Session
 import app.platform.database as database
 from app.accounts import service as accounts
 from app.accounts.models import Role
+from app.platform import rights
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.files import path_of
 from app.platform.jobs import engine as jobs_engine
@@ -58,14 +59,16 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedPostgre
     """A PostgreSQL of this test run with a migrated template database."""
     server = EmbeddedPostgres(tmp_path_factory.mktemp("database") / "postgres", durable=False, server_user=get_settings().server_user)
     server.start()
-    engine = create_engine(server.url("betaloop"))
+    engine = create_engine(server.owner_url("betaloop"))
     with engine.begin() as connection:
         config = Config(str(ROOT / "alembic.ini"))
         config.set_main_option("script_location", str(ROOT / "migrations"))
         config.attributes["connection"] = connection
         command.upgrade(config, "head")
+    jobs_engine.prepare(server.owner_url("betaloop"))
+    with engine.begin() as connection:
+        rights.grant(connection, "betaloop_service", None)
     engine.dispose()
-    jobs_engine.prepare(server.url("betaloop"))
     yield server
     server.remove()
 
@@ -82,6 +85,7 @@ def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.Monke
         connection.execute(f"create database {name} template {template} owner betaloop strategy file_copy")
     url = server.url(name)
     monkeypatch.setenv("BETALOOP_DATABASE_URL", url)
+    monkeypatch.setenv("BETALOOP_OWNER_URL", server.owner_url(name))
     monkeypatch.setenv("BETALOOP_DATA_DIR", str(data))
     get_settings.cache_clear()
     yield url
@@ -105,7 +109,7 @@ def fresh_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest
 def released_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """The database that release 0.1.0 filled (see test_released_database.py), with its small files, migrated to the newest schema."""
     with own_database(server, tmp_path / "data", monkeypatch, "template0") as url:
-        with psycopg.connect(url.replace("+psycopg", ""), autocommit=True) as connection:
+        with psycopg.connect(database.owner_url().replace("+psycopg", ""), autocommit=True) as connection:
             connection.execute(lzma.decompress(RELEASED_DUMP.read_bytes()).decode())
         with zipfile.ZipFile(RELEASED_FILES) as archive:
             for sha256 in archive.namelist():
@@ -128,6 +132,16 @@ def db(fresh_database: str) -> Iterator[Session]:
     with database.new_session() as session:
         database.set_actor(session, "test")
         yield session
+
+
+@pytest.fixture
+def owner_db(fresh_database: str) -> Iterator[Session]:
+    """A session of the role that owns the tables, for what no service may do; acts as 'owner'."""
+    engine = create_engine(database.owner_url())
+    with Session(engine, expire_on_commit=False) as session:
+        database.set_actor(session, "owner")
+        yield session
+    engine.dispose()
 
 
 @pytest.fixture

@@ -52,17 +52,33 @@ def database_url(settings: Settings | None = None) -> str:
     """The SQLAlchemy URL; starts the embedded PostgreSQL when the settings name none."""
     settings = settings or get_settings()
     if settings.database_url:
-        scheme, _, rest = settings.database_url.partition("://")
-        if scheme not in {"postgres", "postgresql", "postgresql+psycopg"}:
-            raise RuntimeError(f"BETALOOP_DATABASE_URL must start with postgresql://, not {scheme}://: betaloop runs on PostgreSQL alone")
-        return f"postgresql+psycopg://{rest}"
+        return _external("BETALOOP_DATABASE_URL", settings.database_url)
+    return _embedded_server(settings).url("betaloop")
+
+
+def owner_url(settings: Settings | None = None) -> str:
+    """The same for the role that owns the tables: migrations, backup, restore. The service's where the settings name none."""
+    settings = settings or get_settings()
+    if settings.database_url and settings.owner_url:
+        return _external("BETALOOP_OWNER_URL", settings.owner_url)
+    return database_url(settings) if settings.database_url else _embedded_server(settings).owner_url("betaloop")
+
+
+def _external(setting: str, url: str) -> str:
+    scheme, _, rest = url.partition("://")
+    if scheme not in {"postgres", "postgresql", "postgresql+psycopg"}:
+        raise RuntimeError(f"{setting} must start with postgresql://, not {scheme}://: betaloop runs on PostgreSQL alone")
+    return f"postgresql+psycopg://{rest}"
+
+
+def _embedded_server(settings: Settings) -> EmbeddedPostgres:
     key = str(settings.data_dir.resolve())
     with _lock:
         if key not in _embedded:
             server = EmbeddedPostgres(settings.data_dir / "postgres", server_user=settings.server_user)
             server.start()
             _embedded[key] = server
-        return _embedded[key].url("betaloop")
+        return _embedded[key]
 
 
 HEAL_POLL_S = 1.0

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
-from sqlalchemy import text
+from psycopg.errors import InsufficientPrivilege
+from sqlalchemy import Connection, Engine, NullPool, create_engine, make_url, text
+from sqlalchemy.exc import ProgrammingError
 
-from app.platform.database import database_url, get_engine
+from app.platform import rights
+from app.platform.database import database_url, get_engine, owner_url
 from app.platform.files import close_to_others
 from app.platform.jobs import engine as jobs_engine
 
@@ -17,15 +22,41 @@ _LOCK = 0x62657461  # any number that only this project uses
 
 
 def migrate() -> None:
-    """Run every migration that is missing; processes that start at once wait for each other.
+    """Run every migration that is missing, as the owner of the tables, and give the service's role its rights.
 
-    What an earlier version left open to other users of the machine is closed on the way.
+    Processes that start at once wait for each other. What an earlier version left open to other users of the machine is closed on the way.
+
+    Raises:
+        RuntimeError: migrations are missing, and the role may not run them.
     """
     close_to_others()
+    owner, service = owner_url(), database_url()
+    engine = get_engine() if owner == service else create_engine(owner, poolclass=NullPool, hide_parameters=True)
+    try:
+        _upgrade(engine)
+        jobs_engine.prepare(owner)
+        if owner != service:
+            with _one_at_a_time(engine) as connection:
+                rights.grant(connection, rights.role_of(service), make_url(service).password)
+    except ProgrammingError as error:
+        if isinstance(error.orig, InsufficientPrivilege):
+            raise RuntimeError(
+                f"the database role {rights.role_of(owner)} may not change the tables: run `betaloop migrate` with BETALOOP_OWNER_URL, the"
+                " address with the role that owns them"
+            ) from error
+        raise
+
+
+def _upgrade(engine: Engine) -> None:
     config = Config(str(ROOT / "alembic.ini"))
     config.set_main_option("script_location", str(ROOT / "migrations"))
-    with get_engine().begin() as connection:
-        connection.execute(text("select pg_advisory_xact_lock(:key)"), {"key": _LOCK})
+    with _one_at_a_time(engine) as connection:
         config.attributes["connection"] = connection
         command.upgrade(config, "head")
-    jobs_engine.prepare(database_url())
+
+
+@contextmanager
+def _one_at_a_time(engine: Engine) -> Iterator[Connection]:
+    with engine.begin() as connection:
+        connection.execute(text("select pg_advisory_xact_lock(:key)"), {"key": _LOCK})
+        yield connection

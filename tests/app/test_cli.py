@@ -16,7 +16,7 @@ import pytest
 
 from app.accounts.permissions import SYSTEM
 from app.overview.package.export import export_participant
-from app.platform.database import transaction
+from app.platform.database import owner_url, transaction
 from app.study.models import CdbsAmplitude, Hemisphere, StudySession
 from app.study.repository import participant_by_code
 
@@ -116,7 +116,7 @@ def test_a_file_of_no_use_is_exit_code_1_with_the_hint(study: str, tmp_path: Pat
 
 
 def test_a_database_without_tables_is_said_in_a_line(fresh_database: str) -> None:
-    with psycopg.connect(fresh_database.replace("+psycopg", ""), autocommit=True) as connection:
+    with psycopg.connect(owner_url().replace("+psycopg", ""), autocommit=True) as connection:
         connection.execute("drop owned by current_user cascade")
     done = betaloop("user", "add", "ada@clinic.example", "--role", "admin", "--password-file", "-", stdin="correct horse battery")
     assert (done.returncode, done.stdout) == (1, "")

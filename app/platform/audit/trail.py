@@ -1,17 +1,19 @@
 """Rows of the audit trail: one for every write, made by triggers in the database, so that no code path can forget it.
 
-What changes no row and must be known all the same (a refused sign-in, a record or a bundle that left) is told to `record`.
+What changes no row and must be known all the same (a refused sign-in, a record or a bundle that left) is told to `record`. Both write as
+the owner of the tables (migration 0023): the service's own role may read the trail, and nothing else.
 """
 
 from __future__ import annotations
 
+import json
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import BigInteger, Index, String, Text, func, select
+from sqlalchemy import BigInteger, Index, String, Text, func, select, text
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from app.platform.database import Base, now
+from app.platform.database import Base, now, set_actor
 
 
 class AuditEvent(Base):
@@ -92,19 +94,12 @@ def record(db: Session, action: str, entity: str, entity_id: str | int, details:
         entity, entity_id: what it was done to.
         details: what else is to be known, without identity.
     """
-    actor = db.info.get("actor", {"label": "system"})
-    row = AuditEvent(
-        actor=actor["label"],
-        user_id=actor.get("user_id"),
-        request_id=actor.get("request_id"),
-        reason=actor.get("reason"),
-        action=action,
-        entity=entity,
-        entity_id=str(entity_id),
-        after=details,
-    )
-    db.add(row)
+    if not db.info.get("actor"):
+        set_actor(db, "system")
     db.flush()
+    note = text("select audit_note(:action, :entity, :entity_id, cast(:details as jsonb))")
+    said = None if details is None else json.dumps(details, allow_nan=False)
+    db.execute(note, {"action": action, "entity": entity, "entity_id": str(entity_id), "details": said})
 
 
 def record_view(db: Session, what: str) -> bool:

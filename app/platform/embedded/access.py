@@ -1,7 +1,8 @@
-"""Who may use the embedded database: two roles with generated passwords, and no one else.
+"""Who may use the embedded database: three roles with generated passwords, and no one else.
 
-`postgres` is the superuser of the server's own upkeep; `betaloop` owns the database, and with it the service and the migrations work. A
-data folder of version 0.1.0 (no passwords, everything owned by the superuser) is converted at its next start.
+`postgres` is the superuser of the server's own upkeep; `betaloop` owns the database, and migrations run as it; `betaloop_service`, as which
+the service connects, owns nothing and has the rights of `app.platform.rights`. A data folder of version 0.1.0 (no passwords, everything
+owned by the superuser) is converted at its next start, and one without the third role gets it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 import psycopg
 from psycopg import sql
 
-ADMIN, OWNER, DATABASE = "postgres", "betaloop", "betaloop"
+ADMIN, OWNER, SERVICE, DATABASE = "postgres", "betaloop", "betaloop_service", "betaloop"
 _RULES = "# Written by betaloop: passwords only, see the data folder's secrets.\nlocal all all scram-sha-256\n"
 _SETTING_UP = (
     "# Written by betaloop: for the moment in which passwords are set; the socket's folder is closed to others.\nlocal all postgres trust\n"
@@ -49,17 +50,22 @@ end $$
 
 @dataclass(frozen=True)
 class Passwords:
-    """Of the two roles."""
+    """Of the three roles."""
 
     admin: str
     owner: str
+    service: str
+
+    def of(self, role: str) -> str:
+        """The password of one role."""
+        return {ADMIN: self.admin, OWNER: self.owner, SERVICE: self.service}[role]
 
 
 class Access:
     """The rules and roles of one running server.
 
     Args:
-        data: its data folder. sockets: where it listens. passwords: of both roles. reload: has the server read its rules again.
+        data: its data folder. sockets: where it listens. passwords: of the roles. reload: has the server read its rules again.
     """
 
     def __init__(self, data: Path, sockets: Path, passwords: Passwords, reload: Callable[[], object]) -> None:
@@ -67,11 +73,10 @@ class Access:
 
     def conninfo(self, database: str, role: str = ADMIN) -> str:
         """What libpq connects with."""
-        password = self._passwords.admin if role == ADMIN else self._passwords.owner
-        return f"host='{self._sockets}' user={role} password={password} dbname={database} connect_timeout=5"
+        return f"host='{self._sockets}' user={role} password={self._passwords.of(role)} dbname={database} connect_timeout=5"
 
     def ensure(self) -> None:
-        """Have passwords asked for, both roles and the database; what is there already is left as it is.
+        """Have passwords asked for, the roles and the database; what is there already is left as it is.
 
         Raises:
             RuntimeError: the server does not take the new rules.
@@ -82,7 +87,7 @@ class Access:
             self._set_passwords()
             self._apply(_RULES, lambda: self._may("postgres", ADMIN) and not self._may("postgres", ADMIN, password="wrong"))
         self._ensure_database()
-        if not self._may(DATABASE, OWNER):
+        if not (self._may(DATABASE, OWNER) and self._may(DATABASE, SERVICE)):
             self._set_passwords()
 
     def _may(self, database: str, role: str, **other: str) -> bool:
@@ -114,11 +119,13 @@ class Access:
             # the passwords are random and 256 bits long: hashing them many times protects nothing and costs at every connection
             connection.execute("set scram_iterations = 1")
             connection.execute("set log_statement = 'none'")
-            if connection.execute("select 1 from pg_roles where rolname = %s", (OWNER,)).fetchone() is None:
-                connection.execute(sql.SQL("create role {}").format(sql.Identifier(OWNER)))
-            for role, password in ((ADMIN, self._passwords.admin), (OWNER, self._passwords.owner)):
-                connection.execute(sql.SQL("alter role {} login password {}").format(sql.Identifier(role), sql.Literal(password)))
-            connection.execute(sql.SQL("alter role {} nosuperuser nocreatedb nocreaterole").format(sql.Identifier(OWNER)))
+            for role in (ADMIN, OWNER, SERVICE):
+                if connection.execute("select 1 from pg_roles where rolname = %s", (role,)).fetchone() is None:
+                    connection.execute(sql.SQL("create role {}").format(sql.Identifier(role)))
+                password = sql.Literal(self._passwords.of(role))
+                connection.execute(sql.SQL("alter role {} login password {}").format(sql.Identifier(role), password))
+            for role in (OWNER, SERVICE):
+                connection.execute(sql.SQL("alter role {} nosuperuser nocreatedb nocreaterole").format(sql.Identifier(role)))
 
     def _ensure_database(self) -> None:
         with psycopg.connect(self.conninfo("postgres"), autocommit=True) as connection:

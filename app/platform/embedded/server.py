@@ -27,7 +27,7 @@ import psutil
 from psycopg import pq
 
 from app.platform.embedded import place
-from app.platform.embedded.access import DATABASE, OWNER, Access, Passwords
+from app.platform.embedded.access import DATABASE, OWNER, SERVICE, Access, Passwords
 from app.platform.embedded.system_user import system_user
 from app.settings import stored_secret
 
@@ -151,7 +151,14 @@ class EmbeddedPostgres:
 
     def url(self, database: str) -> str:
         """SQLAlchemy URL of a database of this server for the service's role, over the server's Unix socket."""
-        return f"postgresql+psycopg://{OWNER}:{self._passwords().owner}@/{database}?host={quote(str(self._sockets), safe='/')}"
+        return self._url(database, SERVICE)
+
+    def owner_url(self, database: str) -> str:
+        """The same for the role that owns the tables: migrations, backup and restore."""
+        return self._url(database, OWNER)
+
+    def _url(self, database: str, role: str) -> str:
+        return f"postgresql+psycopg://{role}:{self._passwords().of(role)}@/{database}?host={quote(str(self._sockets), safe='/')}"
 
     def admin_conninfo(self, database: str = "postgres") -> str:
         """What libpq connects with as superuser: upkeep and tests, never the service."""
@@ -166,7 +173,8 @@ class EmbeddedPostgres:
 
     def _passwords(self) -> Passwords:
         folder = self._asked.parent / "secrets"
-        return Passwords(stored_secret(folder, "database-admin").hex(), stored_secret(folder, "database").hex())
+        admin, owner, service = (stored_secret(folder, name).hex() for name in ("database-admin", "database", "database-service"))
+        return Passwords(admin, owner, service)
 
     def _answers(self) -> bool:
         status = pq.PGconn.ping(f"host='{self._sockets}' dbname=postgres connect_timeout=5".encode())

@@ -28,7 +28,7 @@ from sqlalchemy import Engine, inspect, make_url, text
 from app import __version__
 from app.platform import files
 from app.platform.audit.chain import seal
-from app.platform.database import database_url, get_engine, now, transaction
+from app.platform.database import get_engine, now, owner_url, transaction
 from app.platform.embedded.server import wheel_binaries
 from app.platform.errors import BetaloopError
 from app.platform.migrate import migrate
@@ -37,7 +37,7 @@ from app.settings import get_settings, private_folder
 
 DATABASE, FILES, KEYS, MANIFEST = "database.sealed", "files.sealed", "keys.sealed", "manifest.json"
 FORM = 1
-SERVER_PASSWORDS = ("database", "database-admin")
+SERVER_PASSWORDS = ("database", "database-admin", "database-service")
 _SETTING = re.compile(rb"SET (\w+) = ")
 
 
@@ -192,7 +192,7 @@ def _major_version(program: str) -> int:
 
 def _target() -> tuple[str, dict[str, str]]:
     """Address of the database for libpq, and the environment with its password, which must not stand in a list of processes."""
-    url = make_url(database_url()).set(drivername="postgresql")
+    url = make_url(owner_url()).set(drivername="postgresql")
     password = {"PGPASSWORD": url.password} if isinstance(url.password, str) else {}
     return url.set(password=None).render_as_string(hide_password=False), os.environ | password
 

@@ -18,6 +18,7 @@ from app.platform.audit.chain import verify
 from app.platform.database import new_session, now
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.service import STALE_S
+from app.platform.rights import excess
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -45,7 +46,7 @@ def examine(hashes: bool = False) -> list[Finding]:
     try:
         with new_session() as db:
             trail = [_trail(db)] if hashes else []
-            return [*found, _schema(db), _clock(db), _files(db, hashes), *trail, *_jobs(db)]
+            return [*found, _schema(db), _role(db), _clock(db), _files(db, hashes), *trail, *_jobs(db)]
     except (SQLAlchemyError, RuntimeError) as error:
         reason = str(getattr(error, "orig", error)).strip().splitlines()
         detail = f"it does not answer: {reason[0] if reason else type(error).__name__}"
@@ -70,6 +71,14 @@ def _schema(db: Session) -> Finding:
     has, needs = revision(db), newest_revision()
     hint = "Run `betaloop migrate`; where the database is newer than the program, install the newer betaloop."
     return Finding("database", has == needs, f"answers; schema {has or 'none'}, this betaloop needs {needs}", "" if has == needs else hint)
+
+
+def _role(db: Session) -> Finding:
+    beyond = excess(db.connection())
+    hint = "Give the service a role that owns nothing (docs/operations.md, Database roles), and name the owner's in BETALOOP_OWNER_URL."
+    role = db.scalar(text("select current_user"))
+    detail = f"{role} {', '.join(beyond)}" if beyond else f"{role} owns nothing and cannot change the audit trail"
+    return Finding("database role", not beyond, detail, hint if beyond else "")
 
 
 def _trail(db: Session) -> Finding:

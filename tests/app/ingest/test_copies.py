@@ -188,15 +188,15 @@ def test_a_recording_of_the_next_minutes_is_another_session(send: Any, client: T
 
 
 def test_minutes_that_count_twice_since_before_are_left_out_of_buffers_by_name(
-    send: Any, client: TestClient, db: Session, buffer_steps: Callable[[], int]
+    send: Any, client: TestClient, owner_db: Session, buffer_steps: Callable[[], int]
 ) -> None:
     first = send(("a.zip", FOLDER), **STATED).json()["sessions"][0]["id"]
     steps = buffer_steps()
     second = send(("b.zip", changed(other_signal)), **STATED).json()["proposals"][0]["session"]["id"]
-    db.execute(text("alter table session disable trigger count_time"))
-    db.execute(text("update session set controller = 'random', status = 'confirmed' where id = :id"), {"id": second})
-    db.execute(text("alter table session enable trigger count_time"))
-    db.commit()
+    owner_db.execute(text("alter table session disable trigger count_time"))
+    owner_db.execute(text("update session set controller = 'random', status = 'confirmed' where id = :id"), {"id": second})
+    owner_db.execute(text("alter table session enable trigger count_time"))
+    owner_db.commit()
     assert buffer_steps() == steps
     client.patch(f"/api/v1/sessions/{first}", json={"excluded_reason": "no"})
     assert buffer_steps() > 0, "the first one is excluded, so that the minutes count by the second"

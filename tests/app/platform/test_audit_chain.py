@@ -29,16 +29,16 @@ def trail(client: TestClient, enrolled: str) -> None:
 
 
 @pytest.fixture
-def owner(db: Session) -> Sql:
+def owner(owner_db: Session) -> Sql:
     """SQL of the tables' owner, past every trigger."""
 
     def run(statement: str) -> None:
         for table in ("audit_event", "audit_link", "audit_seal"):
-            db.execute(text(f"alter table {table} disable trigger user"))
-        db.execute(text(statement))
+            owner_db.execute(text(f"alter table {table} disable trigger user"))
+        owner_db.execute(text(statement))
         for table in ("audit_event", "audit_link", "audit_seal"):
-            db.execute(text(f"alter table {table} enable trigger user"))
-        db.commit()
+            owner_db.execute(text(f"alter table {table} enable trigger user"))
+        owner_db.commit()
 
     return run
 
@@ -142,10 +142,10 @@ def test_a_seal_that_was_deleted_from_the_database_still_stands_in_its_file(trai
     assert [(b.kind, b.position) for b in breaks()] == [(BreakKind.REWRITTEN, last())]
 
 
-def test_a_trigger_that_is_off_is_named(trail: None, db: Session) -> None:
-    db.execute(text("alter table qoc disable trigger audit"))
-    db.execute(text("alter table audit_event disable trigger chained"))
-    db.commit()
+def test_a_trigger_that_is_off_is_named(trail: None, owner_db: Session) -> None:
+    owner_db.execute(text("alter table qoc disable trigger audit"))
+    owner_db.execute(text("alter table audit_event disable trigger chained"))
+    owner_db.commit()
     assert {b.table for b in breaks() if b.kind is BreakKind.TRIGGER_OFF} == {"audit_event", "qoc"}
 
 
@@ -161,12 +161,12 @@ def test_the_command_says_where_it_is_broken(trail: None, owner: Sql) -> None:
     assert "is not what was written" in broken.output
 
 
-def test_links_and_seals_take_no_change_from_the_service(trail: None, db: Session) -> None:
+def test_links_and_seals_take_no_change_from_the_owner_by_accident(trail: None, owner_db: Session) -> None:
     for table in ("audit_link", "audit_seal"):
         for statement in (f"delete from {table}", f"update {table} set position = position + 1000", f"truncate {table}"):
             with pytest.raises(Exception, match="never changed or deleted"):
-                db.execute(text(statement))
-            db.rollback()
+                owner_db.execute(text(statement))
+            owner_db.rollback()
 
 
 def actions(entity: str) -> list[tuple[str, str, str]]:

@@ -14,10 +14,11 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.platform import files
-from app.platform.database import database_url, get_engine
+from app.platform.database import database_url, get_engine, owner_url
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.embedded.system_user import system_user
 from app.platform.migrate import migrate
+from app.platform.rights import excess
 from app.settings import get_settings
 from tests.system_users import require_root
 
@@ -112,7 +113,7 @@ def said_to(uid: int, conninfo: str) -> str:
 def test_without_a_password_nobody_gets_in(data: Path) -> None:
     server = server_of(data)
     server.start()
-    for user in ("postgres", "betaloop"):
+    for user in ("postgres", "betaloop", "betaloop_service"):
         with pytest.raises(psycopg.OperationalError, match="password"):
             psycopg.connect(f"host={server._sockets} user={user} dbname=betaloop")
         with pytest.raises(psycopg.OperationalError, match="password authentication failed"):
@@ -124,8 +125,10 @@ def test_the_service_is_no_superuser_and_can_migrate(data: Path) -> None:
     with get_engine().connect() as connection:
         rights = "select rolsuper, rolcreaterole, rolcreatedb, rolbypassrls, rolreplication from pg_roles where rolname = current_user"
         assert connection.exec_driver_sql(rights).fetchone() == (False,) * 5
-        foreign = "select count(*) from pg_tables where schemaname in ('public', 'dbos') and tableowner <> current_user"
-        assert connection.exec_driver_sql(foreign).scalar() == 0
+        owners = "select distinct tableowner from pg_tables where schemaname in ('public', 'dbos')"
+        assert connection.exec_driver_sql(owners).scalars().all() == ["betaloop"]
+        assert connection.exec_driver_sql("select current_user").scalar() == "betaloop_service"
+        assert excess(connection) == []
     get_engine().dispose()
 
 
@@ -135,12 +138,14 @@ def test_a_data_folder_of_0_1_0_opens_with_its_rows_and_is_closed_to_others(data
     with get_engine().begin() as connection:
         assert connection.exec_driver_sql("select name from study where code = 'KEPT'").scalar() == "A study of before"
         assert connection.exec_driver_sql("select rolsuper from pg_roles where rolname = current_user").scalar() is False
-        connection.exec_driver_sql("alter table participant add column added int")
-        connection.exec_driver_sql("alter type colour add value 'green'")
+        assert excess(connection) == []
         owners = """select distinct pg_get_userbyid(o) from (select relowner, relnamespace from pg_class union all
           select proowner, pronamespace from pg_proc) as t(o, n) join pg_namespace s on s.oid = n where s.nspname in ('public', 'dbos')"""
         assert connection.exec_driver_sql(owners).fetchall() == [("betaloop",)]
     get_engine().dispose()
+    with psycopg.connect(owner_url().replace("+psycopg", "")) as connection:
+        connection.execute("alter table participant add column added int")
+        connection.execute("alter type colour add value 'green'")
     with pytest.raises(psycopg.OperationalError):
         psycopg.connect(f"host={data / 'postgres.socket'} user=postgres dbname=postgres")
     assert "password=" not in database_url()

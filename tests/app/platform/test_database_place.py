@@ -39,7 +39,7 @@ def server_of(data: Path) -> EmbeddedPostgres:
 
 
 def tables(server: EmbeddedPostgres) -> list[str]:
-    with psycopg.connect(server.url("betaloop").replace("+psycopg", "")) as connection:
+    with psycopg.connect(server.owner_url("betaloop").replace("+psycopg", "")) as connection:
         rows = connection.execute("select tablename from pg_tables where schemaname = 'public'").fetchall()
     return [row[0] for row in rows]
 
@@ -49,7 +49,7 @@ def started_with(data: Path, table: str | None = None) -> Path:
     server = server_of(data)
     server.start()
     if table:
-        with psycopg.connect(server.url("betaloop").replace("+psycopg", "")) as connection:
+        with psycopg.connect(server.owner_url("betaloop").replace("+psycopg", "")) as connection:
             connection.execute(f"create table {table} (n int)")
     server.leave()
     return server.data

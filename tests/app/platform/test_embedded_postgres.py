@@ -24,7 +24,7 @@ def server(tmp_path: Path):  # type: ignore[no-untyped-def]
 
 
 def connect(server: EmbeddedPostgres) -> psycopg.Connection:
-    return psycopg.connect(server.url("betaloop").replace("+psycopg", ""), autocommit=True)
+    return psycopg.connect(server.owner_url("betaloop").replace("+psycopg", ""), autocommit=True)
 
 
 def test_what_was_committed_survives_kill_9_of_the_postmaster(server: EmbeddedPostgres, tmp_path: Path) -> None:

@@ -45,17 +45,19 @@ def test_every_audited_table_has_its_trigger(db: Session) -> None:
     assert {row[0] for row in rows} == set(AUDITED)
 
 
-def test_the_way_back_to_the_first_release_and_forward_again_gives_the_same_tables(db: Session) -> None:
-    connection = db.connection()
+def test_the_way_back_to_the_first_release_and_forward_again_gives_the_same_tables(owner_db: Session) -> None:
+    connection = owner_db.connection()
     command.downgrade(config(connection), "0001")
     command.upgrade(config(connection), "head")
     assert [d for d in differences(connection) if "alembic_version" not in str(d)] == []
-    rows = db.execute(text("select event_object_table from information_schema.triggers where trigger_name = 'audit'"))
+    rows = owner_db.execute(text("select event_object_table from information_schema.triggers where trigger_name = 'audit'"))
     assert {row[0] for row in rows} == set(AUDITED)
-    db.rollback()
+    owner_db.rollback()
 
 
-def test_releases_of_bundles_are_read_from_the_old_audit_trail_where_they_parse(client: TestClient, enrolled: str, db: Session) -> None:
+def test_releases_of_bundles_are_read_from_the_old_audit_trail_where_they_parse(
+    client: TestClient, enrolled: str, owner_db: Session
+) -> None:
     onnx = {"file": ("e.onnx", constant_onnx(0.6, 10))}
     policy = client.post(f"/api/v1/participants/{enrolled}/policies", data={"name": "flat"}, files=onnx).json()["id"]
     assert client.get(f"/api/v1/policies/{policy}/bundle").status_code == 200
@@ -64,22 +66,22 @@ def test_releases_of_bundles_are_read_from_the_old_audit_trail_where_they_parse(
         f"controller bundle of P1, policy {policy}9: 0 to 3 mA, cDBS 3 mA, ramp 1.5 mA/s",
         "controller bundle, as somebody might write it",
     )
-    (sha256,) = db.scalars(text("select sha256 from bundle_release")).all()
+    (sha256,) = owner_db.scalars(text("select sha256 from bundle_release")).all()
     for reason in reasons:
-        db.execute(
+        owner_db.execute(
             text(
                 "insert into audit_event (actor, action, entity, entity_id, reason)"
                 " values ('ada@clinic.example', 'insert', 'stored_file', :sha, :reason)"
             ),
             {"sha": sha256, "reason": reason},
         )
-    command.downgrade(config(db.connection()), "0005")
-    command.upgrade(config(db.connection()), "head")
-    rows = db.execute(
+    command.downgrade(config(owner_db.connection()), "0005")
+    command.upgrade(config(owner_db.connection()), "head")
+    rows = owner_db.execute(
         text("select policy_id, hemisphere, min_ma, max_ma, ramp_ma_per_s, approvals, created_by, sha256 from bundle_release order by id")
     )
     assert [tuple(row) for row in rows] == [
         (policy, None, 0.0, 3.0, 1.5, None, "admin@clinic.example", sha256),
         (policy, "left", 0.5, 3.25, 1e-05, None, "ada@clinic.example", sha256),
     ]
-    db.rollback()
+    owner_db.rollback()

@@ -83,7 +83,7 @@ def test_every_write_leaves_an_audit_row_that_cannot_be_changed(client: TestClie
     assert rows[0].after is not None
     assert rows[0].after["number"] == 1
     for statement in ("update audit_event set actor = 'nobody'", "delete from audit_event", "truncate audit_event"):
-        with pytest.raises(DBAPIError, match="never changed"):
+        with pytest.raises(DBAPIError, match=r"never changed|permission denied"):
             db.execute(text(statement))
         db.rollback()
 

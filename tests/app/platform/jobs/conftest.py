@@ -17,9 +17,10 @@ from typing import Any
 import psutil
 import pytest
 from sqlalchemy import text
+from sqlalchemy.orm import Session
 
 from app.platform.database import new_session, transaction
-from app.platform.jobs import engine, repository, service
+from app.platform.jobs import repository, service
 from app.platform.jobs.models import Job
 from app.settings import get_settings
 
@@ -37,11 +38,11 @@ def kinds(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 @pytest.fixture
-def jobs(fresh_database: str, kinds: ModuleType) -> Iterator[Jobs]:
+def jobs(owner_db: Session, kinds: ModuleType) -> Iterator[Jobs]:
     """A database for jobs and the hands to work it."""
-    engine.prepare(fresh_database)
-    with transaction("test") as db:
-        db.execute(text("create table counted (job_id text, part int)"))
+    owner_db.execute(text("create table counted (job_id text, part int)"))
+    owner_db.execute(text("grant select, insert on counted to betaloop_service"))
+    owner_db.commit()
     hands = Jobs()
     yield hands
     hands.stop()

@@ -14,7 +14,8 @@ import psutil
 import psycopg
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import create_engine, inspect
+from sqlalchemy import create_engine, inspect, text
+from sqlalchemy.orm import Session
 
 from app import main
 from app.platform.audit.chain import seal
@@ -106,7 +107,7 @@ def test_a_backup_comes_back_in_another_postgresql(place: Path, filled: dict[str
         connection.execute("create database restored owner betaloop")
     new = place / "new"
     new.mkdir()
-    url = server.url("restored").replace("+psycopg", "")
+    url = server.owner_url("restored").replace("+psycopg", "")
     try:
         done = betaloop(new, "restore", str(folder), "--key-file", str(key), "--json", database_url=url)
         assert done.returncode == 0, done.stderr
@@ -172,9 +173,9 @@ def test_a_restore_that_breaks_off_leaves_no_half_of_the_database(
     with psycopg.connect(server.admin_conninfo(), autocommit=True) as connection:
         connection.execute("drop database if exists restored with (force)")
         connection.execute("create database restored owner betaloop")
-    engine = create_engine(server.url("restored"))
+    engine = create_engine(server.owner_url("restored"))
     monkeypatch.setattr(backups, "get_engine", lambda: engine)
-    monkeypatch.setattr(backups, "database_url", lambda: server.url("restored"))
+    monkeypatch.setattr(backups, "owner_url", lambda: server.owner_url("restored"))
 
     def breaks_off(lines: Iterator[bytes], known: frozenset[str]) -> Iterator[bytes]:
         for line in whole(lines, known):
@@ -243,11 +244,11 @@ def test_the_doctor_finds_what_is_missing_damaged_or_standing_open(filled: dict[
     assert filled
 
 
-def test_the_service_is_ready_with_the_right_schema_alone(client: TestClient) -> None:
+def test_the_service_is_ready_with_the_right_schema_alone(client: TestClient, owner_db: Session) -> None:
     ready = client.get("/readyz")
     assert ready.json() == {"status": "ready", "schema": newest_revision()}
-    with transaction("test") as db:
-        db.connection().exec_driver_sql("update alembic_version set version_num = '0001'")
+    owner_db.execute(text("update alembic_version set version_num = '0001'"))
+    owner_db.commit()
     stale = TestClient(main.create_app()).get("/readyz")
     assert stale.status_code == 503
     assert "betaloop migrate" in stale.json()["hint"]

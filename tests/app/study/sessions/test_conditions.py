@@ -50,11 +50,11 @@ def test_a_session_keeps_what_was_in_force_whatever_is_set_afterwards(client: Te
     assert (again["seed"], again["design"], again["design_parameters"]) == (None, None, {"level": None, "holds": []})
 
 
-def test_settings_count_from_when_they_were_made(client: TestClient, confirmed: Callable[..., dict[str, Any]], db: Session) -> None:
+def test_settings_count_from_when_they_were_made(client: TestClient, confirmed: Callable[..., dict[str, Any]], owner_db: Session) -> None:
     began = datetime.now(UTC) - timedelta(hours=2)
-    db.execute(text("alter table settings_version disable trigger never_changed"))
-    db.execute(text("update settings_version set created_at = :early"), {"early": began - timedelta(days=1)})
-    db.commit()
+    owner_db.execute(text("alter table settings_version disable trigger never_changed"))
+    owner_db.execute(text("update settings_version set created_at = :early"), {"early": began - timedelta(days=1)})
+    owner_db.commit()
     settle(client, lower_bound=0.1)
     found = confirmed(table(ROWS), started_at=began.isoformat())
     assert (found["lower_bound"], found["origin"]) == (0.3, "settings")
