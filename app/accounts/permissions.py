@@ -12,6 +12,7 @@ READ_ARMS = "arms:read"  # which controller a session had, also before its visit
 WRITE_STUDY = "study:write"  # participants, visits, sessions, QoCs
 WRITE_QOC = "qoc:write"
 LOCK_VISIT = "visit:lock"
+ASK_QUERIES = "queries:ask"  # open and close questions about values; answering them is WRITE_STUDY
 WRITE_SETTINGS = "settings:write"
 UPLOAD = "upload"
 DECIDE_QUARANTINE = "quarantine:decide"  # may see what could not be freed of identity
@@ -26,13 +27,13 @@ MANAGE_ACCOUNTS = "accounts:write"
 _BLINDED = frozenset({READ, WRITE_QOC})
 _VIEWER = frozenset({READ, READ_ARMS})
 _STAFF = _VIEWER | {WRITE_STUDY, WRITE_QOC, WRITE_SETTINGS, UPLOAD, RUN_JOBS, DRAFT_PLAN, TAKE_BUNDLES, READ_AUDIT}
-_CLINICIAN = _STAFF | {DECIDE_QUARANTINE, APPROVE_PLAN, LOCK_VISIT}
+_CLINICIAN = _STAFF | {DECIDE_QUARANTINE, APPROVE_PLAN, LOCK_VISIT, ASK_QUERIES}
 _ENGINEER = _STAFF | {WRITE_POLICIES}
 PERMISSIONS: dict[Role, frozenset[str]] = {
     Role.BLINDED_ASSESSOR: _BLINDED,
     Role.VIEWER: _VIEWER,
-    Role.MONITOR: _VIEWER | {READ_AUDIT},
-    Role.COORDINATOR: _VIEWER | {WRITE_STUDY, WRITE_QOC, UPLOAD, READ_AUDIT},
+    Role.MONITOR: _VIEWER | {READ_AUDIT, ASK_QUERIES},
+    Role.COORDINATOR: _VIEWER | {WRITE_STUDY, WRITE_QOC, UPLOAD, READ_AUDIT, ASK_QUERIES},
     Role.CLINICIAN: _CLINICIAN,
     Role.ENGINEER: _ENGINEER,
     Role.ADMIN: _CLINICIAN | _ENGINEER | {MANAGE_ACCOUNTS},

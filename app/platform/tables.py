@@ -16,6 +16,7 @@ TABLE_MODULES = (
     "app.accounts.models",
     "app.study.models",
     "app.study.adverse_events.models",
+    "app.study.data_queries.models",
     "app.study.outcomes.models",
     "app.study.sessions.models",
     "app.ingest.models",

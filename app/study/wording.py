@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from app.study.adverse_events.models import EventKind, Severity
+from app.study.data_queries.models import QueriedField
 from app.study.enrolment.codes import CodeQuestion
 from app.study.models import Controller
 from app.study.sessions.contradictions import Contradiction, Kind
@@ -35,6 +36,19 @@ CODE_QUESTIONS = {
 }
 CODE_HINT = "Choose a code that tells nothing about the person, or confirm that this is a study code."
 CODE_CONFIRMED = "looked at by a person: a study code"
+
+QUERIED_FIELDS = {
+    QueriedField.GRASP_HZ: "Grasp frequency",
+    QueriedField.RATING: "Rating",
+    QueriedField.TREMOR_PERCENT: "Tremor",
+    QueriedField.CONTROLLER: "Controller",
+    QueriedField.STARTED_AT: "Start",
+    QueriedField.HEMISPHERE: "Hemisphere",
+    QueriedField.MEDICATION_H: "Time since the last dose",
+    QueriedField.STOPPED_REASON: "Early stop",
+    QueriedField.FILE: "Uploaded file",
+    QueriedField.OTHER: "Something else",
+}
 
 _SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be without DBS"}
 

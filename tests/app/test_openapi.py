@@ -321,6 +321,19 @@ INTENDED: dict[str, str] = {
     ),
     **dict.fromkeys(
         (
+            "components > schemas > DataQueryEntryIn",
+            "components > schemas > DataQueryEntryOut",
+            "components > schemas > DataQueryIn",
+            "components > schemas > DataQueryOut",
+            "components > schemas > QueriedField",
+            "components > schemas > QueryState",
+            "paths > /api/v1/data-queries/{query_id}/entries",
+            "paths > /api/v1/participants/{code}/data-queries",
+        ),
+        "API: data queries about a session's value or an upload are asked, answered, closed and asked again",
+    ),
+    **dict.fromkeys(
+        (
             "components > schemas > AdverseEventEntry",
             "components > schemas > AdverseEventPayload",
             "components > schemas > ClinicalSettingsEntry",

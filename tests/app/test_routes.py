@@ -65,6 +65,7 @@ READABLE = (
     "/api/v1/analyses",
     "/api/v1/participants/{code}/margins/locks",
     "/api/v1/participants/{code}/adverse-events",
+    "/api/v1/participants/{code}/data-queries",
     "/api/v1/participants/{code}/device-history",
     "/api/v1/participants/{code}/replay",
     "/api/v1/visits/{visit_id}/locks",
@@ -86,6 +87,8 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("post", "/api/v1/participants/{code}/adverse-events"): RECORDERS,
     ("put", "/api/v1/adverse-events/{event_id}"): RECORDERS,
     ("post", "/api/v1/adverse-events/{event_id}/clearance"): {"clinician", "admin"},
+    ("post", "/api/v1/participants/{code}/data-queries"): {"monitor", "coordinator", "clinician", "admin"},
+    ("post", "/api/v1/data-queries/{query_id}/entries"): RECORDERS,
     ("patch", "/api/v1/sessions/{session_id}"): RECORDERS,
     ("post", "/api/v1/sessions/{session_id}/outcomes"): RECORDERS,
     ("put", "/api/v1/sessions/{session_id}/conditions"): RECORDERS,
@@ -231,6 +234,11 @@ class World:
             ("put", "/participants/{code}/margins"): {"json": {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}},
             ("get", "/participants/{code}/replay"): {"params": self.replayed(small)},
             ("post", "/participants/{code}/adverse-events"): {"json": SPEECH},
+            ("post", "/participants/{code}/data-queries"): {"json": self.question()},
+            ("post", "/data-queries/{query_id}/entries"): {
+                "query_id": self.send("/participants/P1/data-queries", json=self.question())["id"],
+                "json": {"state": "answered", "text": "read again from the form", "entries": 1},
+            },
             ("put", "/adverse-events/{event_id}"): {"event_id": self.event(), "json": SPEECH | {"revision": 1, "reason": "misread"}},
             ("post", "/adverse-events/{event_id}/clearance"): {"event_id": self.event(), "json": {"revision": 1, "reason": "passed"}},
             ("post", "/participants/{code}/visits"): {"json": {"number": 77}},
@@ -309,6 +317,12 @@ class World:
         visit = self.read("/participants/P1/visits")["items"][0]["id"]
         return {"session": self.read(f"/visits/{visit}/sessions")["items"][0]["id"], "policy": policy}
 
+    def question(self) -> Json:
+        """A data query about a session of P1."""
+        visit = self.read("/participants/P1/visits")["items"][0]["id"]
+        session = self.read(f"/visits/{visit}/sessions")["items"][0]["id"]
+        return {"session_id": session, "field": "rating", "text": "7 in the file, 8 on the form?"}
+
     def event(self) -> int:
         """A serious adverse event of its own for one route."""
         return int(self.send("/participants/P1/adverse-events", json=SPEECH)["id"])
@@ -333,7 +347,7 @@ class World:
     def call(self, client: TestClient, method: str, path: str) -> int:
         """Status of a call that is right in everything but, perhaps, who makes it."""
         form = dict(self.forms.get((method, path.removeprefix("/api/v1")), {}))
-        ids = self.ids | {name: form.pop(name) for name in list(form) if name in self.ids or name in ("file_id", "event_id")}
+        ids = self.ids | {name: form.pop(name) for name in list(form) if name in self.ids or name in ("file_id", "event_id", "query_id")}
         if method == "get":
             form.pop("json", None)
         with client.stream(method, path.format(**ids), **form) as answer:

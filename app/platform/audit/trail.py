@@ -54,6 +54,8 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "session_conditions": (),
     "adverse_event": (),
     "adverse_event_revision": (),
+    "data_query": (),
+    "data_query_entry": (),
     "recording": ("details",),
     "session_segment": (),
     "trace": ("values_f32", "valid_bits"),

@@ -20,6 +20,7 @@ from app.platform.web.templates import render
 from app.study import repository, service
 from app.study.adverse_events.repository import events_of_session
 from app.study.blinding import CONTROLLER_NAMES, arm, may_know, require_known
+from app.study.data_queries.repository import not_closed_of_session
 from app.study.deps import CurrentSession
 from app.study.form_changes import Shown, own_changes
 from app.study.models import QocRevision, Recording, StudySession
@@ -290,6 +291,7 @@ def _page(
         qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
         correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},
         seen=seen,
+        open_queries=not_closed_of_session(db, session.id),
         events=events_of_session(db, session.id),
         event_kinds=EVENT_KINDS,
         event_severities=EVENT_SEVERITIES,

@@ -1,0 +1,40 @@
+"""REST routes of data queries."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from app.accounts.deps import CurrentCaller
+from app.platform.database import Db
+from app.platform.web.schemas import problems
+from app.study.data_queries import repository, service
+from app.study.data_queries.deps import CurrentDataQuery
+from app.study.data_queries.models import QueryState
+from app.study.data_queries.schemas import DataQueryEntryIn, DataQueryIn, DataQueryOut
+from app.study.data_queries.serializers import query_out
+from app.study.deps import CurrentParticipant
+
+router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
+
+
+@router.get("/participants/{code}/data-queries")
+def list_data_queries(participant: CurrentParticipant, db: Db, state: QueryState | None = None) -> list[DataQueryOut]:
+    """A participant's data queries in the order in which they were asked; of one state where it is named."""
+    found = repository.queries_of_participant(db, participant.id)
+    return [query_out(row) for row in found if state in (None, row.state)]
+
+
+@router.post("/participants/{code}/data-queries", status_code=201)
+def ask_data_query(participant: CurrentParticipant, draft: DataQueryIn, db: Db, caller: CurrentCaller) -> DataQueryOut:
+    """Ask about a value of a session, or about an upload."""
+    row = service.ask(db, participant, draft, caller)
+    db.commit()
+    return query_out(row)
+
+
+@router.post("/data-queries/{query_id}/entries", status_code=201, responses=problems(409))
+def follow_data_query(query: CurrentDataQuery, given: DataQueryEntryIn, db: Db, caller: CurrentCaller) -> DataQueryOut:
+    """Answer a query, close it, or open it again. Corrections are made where the value stands; the query keeps the old one."""
+    row = service.follow(db, query, given, caller)
+    db.commit()
+    return query_out(row)

@@ -1,0 +1,53 @@
+"""Queries of the tables of data queries, within what the caller may read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import Select, column, func, select, table
+from sqlalchemy.orm import Session, joinedload, selectinload
+
+from app.accounts.permissions import Caller
+from app.platform.errors import NotFound
+from app.study.data_queries.models import DataQuery, DataQueryEntry, QueryState
+from app.study.models import Participant
+from app.study.repository import in_scope
+
+
+def data_query(db: Session, query_id: int, caller: Caller) -> DataQuery:
+    """A query. Raises NotFound."""
+    mine = _queries().join(DataQuery.participant).join(Participant.site).where(DataQuery.id == query_id, in_scope(caller))
+    row = db.scalar(mine)
+    if row is None:
+        raise NotFound(f"There is no data query {query_id}, or you have no access to it.")
+    return row
+
+
+def queries_of_participant(db: Session, participant_id: int) -> Sequence[DataQuery]:
+    """A participant's queries in the order in which they were asked."""
+    return db.scalars(_queries().where(DataQuery.participant_id == participant_id).order_by(DataQuery.id)).all()
+
+
+def not_closed_of_session(db: Session, session_id: int) -> int:
+    """How many queries about a session are not closed."""
+    newest = select(func.max(DataQueryEntry.id)).join(DataQuery).where(DataQuery.session_id == session_id).group_by(DataQuery.id)
+    waiting = select(func.count()).where(DataQueryEntry.id.in_(newest), DataQueryEntry.state != QueryState.CLOSED)
+    return db.scalar(waiting) or 0
+
+
+def lock_query(db: Session, row: DataQuery) -> None:
+    """Hold a query for this transaction and read its entries again, so that two answers at once are taken in turn."""
+    db.execute(select(DataQuery.id).where(DataQuery.id == row.id).with_for_update())
+    db.expire(row, ["entries"])
+
+
+def upload_of(db: Session, participant_id: int, upload_id: int) -> bool:
+    """Whether an upload is the participant's. Uploads belong to a later phase; of their table only the owner is needed here."""
+    uploads = table("upload", column("id"), column("participant_id"))
+    return db.scalar(select(uploads.c.id).where(uploads.c.id == upload_id, uploads.c.participant_id == participant_id)) is not None
+
+
+def _queries() -> Select[DataQuery]:
+    return select(DataQuery).options(
+        selectinload(DataQuery.entries), joinedload(DataQuery.participant).joinedload(Participant.site), joinedload(DataQuery.session)
+    )

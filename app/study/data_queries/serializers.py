@@ -1,0 +1,19 @@
+"""Data queries as API types."""
+
+from __future__ import annotations
+
+from app.study.data_queries.models import DataQuery
+from app.study.data_queries.schemas import DataQueryEntryOut, DataQueryOut
+
+
+def query_out(row: DataQuery) -> DataQueryOut:
+    """A query with all that was said."""
+    return DataQueryOut(
+        id=row.id,
+        participant=row.participant.code,
+        session_id=row.session_id,
+        upload_id=row.upload_id,
+        field=row.field,
+        state=row.state,
+        entries=[DataQueryEntryOut.model_validate(entry) for entry in row.entries],
+    )
