@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from datetime import datetime
 from enum import StrEnum
+from typing import Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, String, UniqueConstraint, func
+from sqlalchemy import CheckConstraint, ForeignKey, Index, LargeBinary, String, UniqueConstraint, func
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
@@ -100,6 +101,20 @@ class SignIn(Base):
     last_seen_at: Mapped[datetime] = mapped_column(server_default=func.now())
     ended_at: Mapped[datetime | None]
     user: Mapped[User] = relationship()
+
+
+class SecondFactor(Base):
+    """The authenticator app of a user who wants one; it counts from `confirmed_at` on."""
+
+    __tablename__ = "second_factor"
+
+    user_id: Mapped[int] = mapped_column(ForeignKey("app_user.id", ondelete="CASCADE"), primary_key=True, autoincrement=False)
+    sealed_secret: Mapped[bytes] = mapped_column(LargeBinary)
+    recovery: Mapped[list[Any]]
+    """Hashes of the recovery codes that are left."""
+    confirmed_at: Mapped[datetime | None]
+    last_used_at: Mapped[datetime | None]
+    """Begin of the time step of the last code; none at or before it works again."""
 
 
 class ApiToken(Base):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -10,10 +11,11 @@ from sqlalchemy.orm import Session
 from starlette.datastructures import FormData
 
 from app.accounts import permissions as can
-from app.accounts import repository, service
+from app.accounts import repository, second_factor, service, totp
 from app.accounts.addresses import normal_address
 from app.accounts.deps import COOKIE, CurrentCaller
 from app.accounts.models import Role, Scope, User
+from app.accounts.passwords import MIN_PASSWORD
 from app.accounts.permissions import Caller
 from app.platform.database import Db, new_session, now, set_actor
 from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany
@@ -52,7 +54,7 @@ def _sign_in(request: Request, values: FormData) -> Response:
     with new_session() as db:
         try:
             set_actor(db, normal_address(email) or "unknown", request_id=request.state.request_id)
-            token = service.sign_in(db, email, str(values.get("password", "")))
+            token = service.sign_in(db, email, str(values.get("password", "")), str(values.get("code", "")))
         except BetaloopError as error:
             return _sign_in_refused(request, values, error)
         db.commit()
@@ -95,12 +97,53 @@ def change_password(request: Request, db: Db, caller: CurrentCaller, values: For
     try:
         if values.get("password") != values.get("again"):
             raise Invalid("The two new passwords differ.", "Type the same one twice.")
-        service.change_own_password(db, _own_id(caller), str(values.get("present", "")), str(values.get("password", "")))
+        present, new, code = (str(values.get(name, "")) for name in ("present", "password", "code"))
+        service.change_own_password(db, _own_id(caller), present, new, code)
     except BetaloopError as error:
         db.rollback()
         return _account_page(request, db, caller, error)
     db.commit()
     return RedirectResponse("/sign-in?done=password", 303)
+
+
+@router.post("/account/second-factor")
+def begin_second_factor(request: Request, db: Db, caller: CurrentCaller) -> Response:
+    """Begin to set up an authenticator app; the page shows its key until a code of it was given."""
+    caller.require_browser()
+    try:
+        second_factor.begin(db, db.get_one(User, _own_id(caller)))
+    except BetaloopError as error:
+        db.rollback()
+        return _account_page(request, db, caller, error)
+    db.commit()
+    return RedirectResponse("/account#second-factor", 303)
+
+
+@router.post("/account/second-factor/confirm")
+def confirm_second_factor(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Switch the second factor on with a first code, and show the recovery codes this once."""
+    caller.require_browser()
+    try:
+        codes = second_factor.confirm(db, db.get_one(User, _own_id(caller)), str(values.get("code", "")))
+    except BetaloopError as error:
+        db.rollback()
+        return _account_page(request, db, caller, error)
+    db.commit()
+    return _account_page(request, db, caller, codes=codes)
+
+
+@router.post("/account/second-factor/remove")
+def remove_second_factor(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Switch the second factor off with password and code; wrong ones are counted together with sign-ins."""
+    caller.require_browser()
+    try:
+        service.confirm_password(_own_id(caller), str(values.get("present", "")), str(values.get("code", "")))
+        second_factor.remove(db, _own_id(caller))
+    except BetaloopError as error:
+        db.rollback()
+        return _account_page(request, db, caller, error)
+    db.commit()
+    return RedirectResponse("/account?done=factor", 303)
 
 
 @router.post("/account/tokens")
@@ -212,9 +255,25 @@ def _managed_user(db: Session, caller: Caller, user_id: int) -> User:
     return user
 
 
-def _account_page(request: Request, db: Session, caller: Caller, error: BetaloopError | None = None, token: str = "") -> HTMLResponse:
+def _factor(db: Session, user: User) -> dict[str, Any]:
+    """What the account's page shows of the second factor; the secret while it is being set up, in groups to type."""
+    secret = second_factor.pending_secret(db, user.id)
+    shown = totp.base32(secret) if secret else ""
+    return {
+        "on": second_factor.wanted(db, user.id),
+        "secret": " ".join(shown[i : i + 4] for i in range(0, len(shown), 4)),
+        "address": totp.address(secret, user.email) if secret else "",
+        "recovery": second_factor.RECOVERY_CODES,
+        "recovery_left": second_factor.recovery_codes_left(db, user.id),
+    }
+
+
+def _account_page(
+    request: Request, db: Session, caller: Caller, error: BetaloopError | None = None, token: str = "", codes: Sequence[str] = ()
+) -> HTMLResponse:
     user = db.get_one(User, _own_id(caller))
-    values = {"user": user, "tokens": repository.tokens_of(db, user.id), "token": token, "min_password": service.MIN_PASSWORD}
+    values = {"user": user, "tokens": repository.tokens_of(db, user.id), "token": token, "min_password": MIN_PASSWORD}
+    values |= {"factor": _factor(db, user), "codes": codes}
     values |= {"scopes": SCOPE_NAMES, "days": service.TOKEN_DAYS, "most_days": service.MOST_TOKEN_DAYS, "now": now()}
     problem = error.problem(request.url.path) if error else None
     return HTMLResponse(render(request, "accounts/account.html", problem=problem, **values), error.status if error else 200)
@@ -231,6 +290,6 @@ def _accounts_page(
         roles=list(Role),
         draft=draft or {"email": "", "name": "", "role": Role.CLINICIAN, "study": ""},
         problem=error.problem(request.url.path) if error else None,
-        min_password=service.MIN_PASSWORD,
+        min_password=MIN_PASSWORD,
     )
     return HTMLResponse(page, error.status if error else 200)

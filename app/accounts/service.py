@@ -12,21 +12,21 @@ from functools import lru_cache
 from pwdlib import PasswordHash
 from sqlalchemy.orm import Session
 
-from app.accounts import repository
+from app.accounts import repository, second_factor
 from app.accounts.addresses import LONGEST_ADDRESS, normal_address
 from app.accounts.models import ApiToken, Membership, Role, Scope, SignIn, SignInAttempt, Study, User
+from app.accounts.passwords import MIN_PASSWORD, weakness
 from app.accounts.permissions import MANAGE_ACCOUNTS, PERMISSIONS, READ_AUDIT, Caller, Grant
 from app.platform.audit import record
 from app.platform.database import new_session, now
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 from app.settings import get_settings
 
-MIN_PASSWORD = 10
 FAILURES_ALLOWED = 5
 FAILURE_WINDOW = timedelta(minutes=15)
 TOKEN_DAYS, MOST_TOKEN_DAYS = 90, 730
 _SEEN_RESOLUTION = timedelta(minutes=1)
-_TOKEN_PREFIX = "blp_"
+_TOKEN_PREFIX = "blp_"  # noqa: S105 - no secret
 
 _hasher = PasswordHash.recommended()
 
@@ -45,7 +45,7 @@ def add_user(db: Session, email: str, role: Role, password: str, study_code: str
     email = address
     if repository.user_by_email(db, email):
         raise Conflict(f"There is already a user {email}.")
-    check_password(password)
+    check_password(password, email)
     user = User(email=email, name=name, password_hash=_hasher.hash(password))
     user.memberships.append(Membership(study_id=study_of(db, study_code).id, role=role))
     db.add(user)
@@ -53,15 +53,18 @@ def add_user(db: Session, email: str, role: Role, password: str, study_code: str
     return user
 
 
-def check_password(password: str) -> None:
-    """Raises Invalid for a password that is too short."""
-    if len(password) < MIN_PASSWORD:
-        raise Invalid(f"The password has {len(password)} characters.", f"Use at least {MIN_PASSWORD}.")
+def check_password(password: str, email: str) -> None:
+    """Raises Invalid for a password that is too short or too easy to guess."""
+    why = weakness(password, email)
+    if why is not None:
+        raise Invalid(
+            f"The password {why}.", f"Use at least {MIN_PASSWORD} characters, such as four words that have nothing to do with each other."
+        )
 
 
 def set_password(db: Session, user: User, password: str) -> None:
     """Change a password; every browser session and API token of the user ends, for somebody else may have made them."""
-    check_password(password)
+    check_password(password, user.email)
     user.password_hash = _hasher.hash(password)
     for token in repository.tokens_of(db, user.id):
         token.revoked_at = token.revoked_at or now()
@@ -69,28 +72,34 @@ def set_password(db: Session, user: User, password: str) -> None:
         sign_in.ended_at = now()
 
 
-def change_own_password(db: Session, user_id: int, present: str, new: str) -> None:
+def change_own_password(db: Session, user_id: int, present: str, new: str, code: str = "") -> None:
     """Change a password by its owner, who proves to know the present one; tries are counted together with sign-ins, and committed.
 
     Raises:
         TooMany: too many wrong passwords lately. Forbidden: the present one is wrong. Invalid: a bad new one.
     """
-    check_password(new)
-    confirm_password(user_id, present)
-    set_password(db, db.get_one(User, user_id), new)
+    user = db.get_one(User, user_id)
+    check_password(new, user.email)
+    confirm_password(user_id, present, code)
+    set_password(db, user, new)
 
 
-def confirm_password(user_id: int, password: str) -> None:
+def confirm_password(user_id: int, password: str, code: str = "") -> None:
     """Have a user who has signed in prove to be there. Tries are counted together with sign-ins, in a transaction of their own.
 
+    Args:
+        code: of the second factor, where the user has one.
+
     Raises:
-        TooMany: too many wrong passwords lately. Forbidden: it is wrong, or the account is closed.
+        TooMany: too many wrong passwords lately. Forbidden: it or the code is wrong, or the account is closed.
     """
     with new_session() as db:
         user = db.get_one(User, user_id)
         attempt = _count_attempt(db, user.email)
         if not (_hasher.verify(password, user.password_hash) and user.active):
             raise Forbidden("The password is wrong.", "Nothing was changed; try again.")
+        if not second_factor.accepts(db, user.id, code):
+            raise Forbidden("The code of the second factor is wrong or missing.", "Nothing was changed; give the one of now.")
         repository.forget_failures(db, attempt)
         db.commit()
 
@@ -121,25 +130,31 @@ def set_active(db: Session, user: User, active: bool, caller: Caller) -> None:
     db.flush()
 
 
-def sign_in(db: Session, email: str, password: str) -> str:
+def sign_in(db: Session, email: str, password: str, code: str = "") -> str:
     """Check a password and open a browser session; returns the cookie's token.
 
     Every try is counted, and committed, before its password is looked at, and taken back when it was right: however many come at once,
     no more than FAILURES_ALLOWED of an address are judged within FAILURE_WINDOW. The caller commits the session.
 
+    Args:
+        code: of the second factor, where the user has one.
+
     Raises:
-        TooMany: too many failures of this address lately. Unauthorized: wrong address or password.
+        TooMany: too many failures of this address lately. Unauthorized: wrong address, password or code; which of them is not told.
     """
     address = normal_address(email)
     user = repository.user_by_email(db, email)
     attempt = _count_attempt(db, user.email if user else address) if address else None
     # an unknown address costs the same time as a wrong password, so that addresses cannot be guessed by the clock
     ok = _hasher.verify(password, user.password_hash if user else _decoy())
-    if not (ok and user and user.active and attempt):
+    if not (ok and user and user.active and attempt and second_factor.accepts(db, user.id, code)):
         # what was typed as an unknown address may be a password
         record(db, "refuse", "sign_in", user.email if user else "unknown address")
         db.commit()
-        raise Unauthorized("The e-mail address or the password is wrong.")
+        raise Unauthorized(
+            "The e-mail address or the password is wrong.",
+            "If you have set up a second factor, its code is needed too.",
+        )
     repository.forget_failures(db, attempt)
     token = secrets.token_urlsafe(32)
     db.add(SignIn(token_sha256=_hash(token), user_id=user.id))

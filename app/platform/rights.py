@@ -29,6 +29,7 @@ DELETED_FROM = frozenset(
         "membership",
         "plan",
         "plan_item",
+        "second_factor",
         "session",
         "session_segment",
         "sign_in_attempt",

@@ -52,7 +52,7 @@ def run_demo(host: str, port: int) -> None:
     """Start the database, the web service and a worker, load the study, run the first pipelines, and serve until Ctrl-C."""
     settings = get_settings()
     os.environ["BETALOOP_DATA_DIR"] = str(settings.data_dir.resolve())
-    url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"
+    url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"  # noqa: S104
     _refuse_taken_port(url)
     started = time.monotonic()
     with console.status("Starting the database …"):

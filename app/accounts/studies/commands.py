@@ -1,4 +1,4 @@
-"""Commands of studies, sites and roles: `betaloop study add`, `study site` and `user role`."""
+"""Commands of studies, sites and users: `betaloop study add`, `study site`, `user role` and `user remove-second-factor`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Annotated, Any, TypeVar
 import typer
 from pydantic import BaseModel, ValidationError
 
+from app.accounts import repository, second_factor
 from app.accounts import service as accounts
 from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM
 from app.accounts.studies import service
 from app.accounts.studies.schemas import HINT, SiteIn, StudyIn
 from app.platform.database import transaction
-from app.platform.errors import Invalid
+from app.platform.errors import Invalid, NotFound
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 ACTOR = "command line"
@@ -71,11 +72,24 @@ def user_role(
     _print(result, as_json, f"The role of {email} has ended." if role == "none" else f"{email} is now {role} in {result['study']}.")
 
 
+def user_remove_second_factor(email: Annotated[str, typer.Argument(help="E-mail address of the user.")], as_json: AsJson = False) -> None:
+    """Take a user's second factor away, for one who has lost phone and recovery codes. Make sure who asks."""
+    with transaction(ACTOR) as db:
+        user = repository.user_by_email(db, email)
+        if user is None:
+            raise NotFound(f"There is no user {email}.")
+        had = second_factor.remove(db, user.id)
+    said = f"{email} signs in with the password alone now." if had else f"{email} has no second factor."
+    _print({"email": email, "removed": had}, as_json, said)
+
+
 def register(study: typer.Typer, user: typer.Typer) -> None:
     """Put the commands where people look for them."""
     study.command("add", epilog="Example: betaloop study add ADAPT --name 'Adaptive DBS' --site north")(study_add)
     study.command("site", epilog="Example: betaloop study site ADAPT south --name 'Clinic South'")(study_site)
     user.command("role", epilog="Example: betaloop user role ada@clinic.example coordinator --study ADAPT --site north")(user_role)
+    example = "Example: betaloop user remove-second-factor ada@clinic.example"
+    user.command("remove-second-factor", epilog=example)(user_remove_second_factor)
 
 
 def _checked(kind: type[Draft], **values: Any) -> Draft:

@@ -64,7 +64,7 @@ def approve_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller, approval: A
     The signer is a clinician who did not draft it, and gives the password again. What is signed: the order, and of every session its
     policy's bytes, its limits in mA and its ramp.
     """
-    view = service.approve_plan(db, visit, caller, approval.password, approval.plan_id)
+    view = service.approve_plan(db, visit, caller, approval.password, approval.plan_id, approval.code)
     db.commit()
     return plan_out(view)
 

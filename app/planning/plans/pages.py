@@ -101,7 +101,8 @@ def approve(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller
     """Sign the draft that the page showed."""
     try:
         shown = str(values.get("plan_id", ""))
-        service.approve_plan(db, visit, caller, str(values.get("password", "")), int(shown) if shown.isdecimal() else None)
+        password, code = str(values.get("password", "")), str(values.get("code", ""))
+        service.approve_plan(db, visit, caller, password, int(shown) if shown.isdecimal() else None, code)
         db.commit()
     except BetaloopError as error:
         db.rollback()

@@ -90,6 +90,7 @@ class Approval(Model):
     """A signature under a draft."""
 
     password: Text = Field(max_length=1000, description="The signer's own, asked for again.")
+    code: Text = Field("", max_length=40, description="Of the signer's second factor, or a recovery code; empty where there is none.")
     plan_id: Id | None = Field(None, description="Which draft was read; a guard against signing one that somebody replaced meanwhile.")
 
 

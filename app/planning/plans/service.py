@@ -92,12 +92,12 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
     return view_of(db, plan, visit)
 
 
-def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_id: int | None = None) -> PlanView:
+def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_id: int | None = None, code: str = "") -> PlanView:
     """Sign the draft of a visit as approved for use in this participant; from then on it is fixed.
 
     Args:
         db: the session. visit: whose plan. caller: the clinician. password: the clinician's own, asked for again.
-        plan_id: the draft that was looked at; None for whatever is there.
+        plan_id: the draft that was looked at; None for whatever is there. code: of the second factor, where the clinician has one.
 
     Raises:
         NotFound: no plan. Conflict: approved already, replaced meanwhile, with a policy that was retired since it was drafted, limits that
@@ -118,7 +118,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
     refuse_approval(assessment_of(db, visit.participant, view.evaluation) if view.evaluation else None, stated)
     _fix_designs(visit, plan)
     require_limits(visit, plan.items)
-    signature = sign_plan(db, visit, plan, policies, caller, password)
+    signature = sign_plan(db, visit, plan, policies, caller, password, code)
     plan.status, plan.approved_at, plan.approved_by = "approved", signature.signed_at, caller.label
     db.flush()
     return replace(view, signature=signature, signature_state=SignatureState.STANDS)

@@ -30,7 +30,9 @@ class SignatureState(StrEnum):
     NOT_KEPT = "not_kept"  # approved by a version that kept no signatures
 
 
-def sign_plan(db: Session, visit: Visit, plan: Plan, policies: Mapping[int, Policy], caller: Caller, password: str) -> Signature:
+def sign_plan(
+    db: Session, visit: Visit, plan: Plan, policies: Mapping[int, Policy], caller: Caller, password: str, code: str = ""
+) -> Signature:
     """Sign a plan that stands as it shall run.
 
     Raises:
@@ -45,7 +47,8 @@ def sign_plan(db: Session, visit: Visit, plan: Plan, policies: Mapping[int, Poli
             raise Conflict(
                 f"Session {item.position} of plan {plan.id} has no limits in mA.", "Draft the visit anew, so that its limits are set first."
             )
-    return signing.sign(db, caller, password, kind=KIND, subject_id=plan.id, meaning=MEANING, content=signed_content(visit, plan, policies))
+    content = signed_content(visit, plan, policies)
+    return signing.sign(db, caller, password, kind=KIND, subject_id=plan.id, meaning=MEANING, content=content, code=code)
 
 
 def signature_of(db: Session, visit: Visit, plan: Plan, policies: Mapping[int, Policy]) -> tuple[SignatureState, Signature | None]:

@@ -30,7 +30,7 @@ from app.platform.database import Base, transaction
 from app.settings import get_settings, private_folder
 
 GENESIS = hashlib.sha256(b"betaloop audit trail").digest()
-SECRET = "audit-seals"
+SECRET = "audit-seals"  # noqa: S105 - the name of a key
 SEAL_EVERY_S = 60.0
 MOST_BREAKS = 100
 """After so many the rest is not looked for: the trail is broken, and one wants to know where it begins."""

@@ -38,6 +38,7 @@ class AuditEvent(Base):
 AUDITED: dict[str, tuple[str, ...]] = {
     "app_user": ("password_hash",),
     "membership": (),
+    "second_factor": ("sealed_secret", "recovery", "last_used_at"),
     "sign_in": ("token_sha256", "last_seen_at"),
     "api_token": ("token_sha256", "last_used_at"),
     "study": (),

@@ -85,7 +85,8 @@ class Access:
             # a new or older server, or lost secrets: whoever owns the data folder may set new passwords
             self._apply(_SETTING_UP, lambda: self._may("postgres", ADMIN))
             self._set_passwords()
-            self._apply(_RULES, lambda: self._may("postgres", ADMIN) and not self._may("postgres", ADMIN, password="wrong"))
+            wrong = {"password": "wrong"}
+            self._apply(_RULES, lambda: self._may("postgres", ADMIN) and not self._may("postgres", ADMIN, **wrong))
         self._ensure_database()
         if not (self._may(DATABASE, OWNER) and self._may(DATABASE, SERVICE)):
             self._set_passwords()

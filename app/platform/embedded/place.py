@@ -144,8 +144,8 @@ def socket_folder(data: Path) -> Path:
     beside = data.with_name(f"{data.name}.socket")
     if len(str(beside)) <= _SOCKET_PATH_LIMIT:
         return beside
-    # not the folder that TMPDIR names: every process must find the same
-    return Path("/tmp") / f"betaloop-{hashlib.sha256(str(data).encode()).hexdigest()[:12]}"
+    # not the folder that TMPDIR names: every process must find the same; `private_folder` refuses one of somebody else
+    return Path("/tmp") / f"betaloop-{hashlib.sha256(str(data).encode()).hexdigest()[:12]}"  # noqa: S108
 
 
 def reachable_binaries(binaries: Path, user: SystemUser) -> Path:

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-_LOCK_FOLDERS = ("/run", "/var/lock", "/tmp")
+_LOCK_FOLDERS = ("/run", "/var/lock", "/tmp")  # noqa: S108
 _PASSWORD_FILE_BUSY = (1, 10)  # exit codes of useradd: /etc/passwd or /etc/group could not be changed
 _BUSY_WAIT_S = 20.0
 _NAME = re.compile(r"[a-z_][a-z0-9_-]{0,31}")

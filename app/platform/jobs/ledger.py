@@ -207,7 +207,7 @@ def persist(action: Callable[[], Value], check: Callable[[], None]) -> Value:
             if not _worth_repeating(error):
                 raise
             log.warning("the database is away, trying again in %.1f s (%s)", pause, type(error.orig).__name__)
-            time.sleep(pause * random.uniform(0.5, 1.0))
+            time.sleep(pause * random.uniform(0.5, 1.0))  # noqa: S311 - apart from each other, not secret
             pause = min(2 * pause, longest)
 
 

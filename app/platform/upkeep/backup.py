@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from sqlalchemy import Engine, inspect, make_url, text
+from sqlalchemy import Engine, func, inspect, make_url, select, table, text
 
 from app import __version__
 from app.platform import files
@@ -345,4 +345,7 @@ def _whole(sha256: str) -> bool:
 
 def _rows(engine: Engine) -> dict[str, int]:
     with engine.connect() as connection:
-        return {name: connection.scalar(text(f'select count(*) from "{name}"')) or 0 for name in sorted(inspect(engine).get_table_names())}
+        counts = {}
+        for name in sorted(inspect(engine).get_table_names()):
+            counts[name] = connection.scalar(select(func.count()).select_from(table(name))) or 0
+        return counts

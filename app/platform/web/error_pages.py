@@ -7,7 +7,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 _PLAIN_FORM = "application/x-www-form-urlencoded"
-_SECRET = "password"
+_SECRET = "password"  # noqa: S105 - the name of a field
 
 _ADVICE = {
     404: ("There is no such page", "The address may be mistyped; or what it named is gone, or lies outside your study or site."),

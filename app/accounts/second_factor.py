@@ -1,0 +1,126 @@
+"""The optional second factor: codes of an authenticator app, and recovery codes that work once each. The caller commits.
+
+The secret is kept encrypted with a key of the data folder, so that a copy of the database alone makes no codes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+from datetime import UTC, datetime
+
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from sqlalchemy.orm import Session
+
+from app.accounts import totp
+from app.accounts.models import SecondFactor, User
+from app.platform.database import now
+from app.platform.errors import Conflict, Invalid
+from app.settings import get_settings
+
+RECOVERY_CODES = 10
+_NONCE_BYTES = 12
+
+
+def begin(db: Session, user: User) -> bytes:
+    """Give a user a new secret, which counts once a code of it was given (`confirm`); one that was not confirmed is replaced.
+
+    Raises:
+        Conflict: the user has a second factor.
+    """
+    row = db.get(SecondFactor, user.id)
+    if row is not None and row.confirmed_at is not None:
+        raise Conflict("You have a second factor already.", "Remove it first to set up another.")
+    secret = totp.new_secret()
+    if row is None:
+        db.add(SecondFactor(user_id=user.id, sealed_secret=_seal(secret, user.id), recovery=[]))
+    else:
+        row.sealed_secret = _seal(secret, user.id)
+    db.flush()
+    return secret
+
+
+def pending_secret(db: Session, user_id: int) -> bytes | None:
+    """The secret of a set-up that was begun and not confirmed."""
+    row = db.get(SecondFactor, user_id)
+    return _secret(row) if row is not None and row.confirmed_at is None else None
+
+
+def confirm(db: Session, user: User, code: str) -> list[str]:
+    """Have the second factor count from now on; returns the recovery codes, which are shown this once.
+
+    Raises:
+        Invalid: nothing was begun, or the code is wrong.
+    """
+    row = db.get(SecondFactor, user.id)
+    if row is None or row.confirmed_at is not None:
+        raise Invalid("No second factor is being set up.", "Begin again.")
+    if not _takes_code(row, code):
+        raise Invalid("The code is wrong.", "Give the one that the app shows now; both clocks must be right.")
+    codes = [f"{secrets.token_hex(3)}-{secrets.token_hex(3)}" for _ in range(RECOVERY_CODES)]
+    row.recovery = [_hash(c) for c in codes]
+    row.confirmed_at = now()
+    db.flush()
+    return codes
+
+
+def wanted(db: Session, user_id: int) -> bool:
+    """Whether a user must give a code besides the password."""
+    row = db.get(SecondFactor, user_id)
+    return row is not None and row.confirmed_at is not None
+
+
+def accepts(db: Session, user_id: int, code: str) -> bool:
+    """Whether a code, or a recovery code, is right; it works this once. True where the user has no second factor."""
+    row = db.get(SecondFactor, user_id, with_for_update=True, populate_existing=True)
+    if row is None or row.confirmed_at is None:
+        return True
+    if _takes_code(row, code):
+        return True
+    hashed = _hash(code.strip().lower())
+    if hashed not in row.recovery:
+        return False
+    row.recovery = [r for r in row.recovery if r != hashed]
+    return True
+
+
+def remove(db: Session, user_id: int) -> bool:
+    """Take the second factor away; whether there was one."""
+    row = db.get(SecondFactor, user_id)
+    if row is not None:
+        db.delete(row)
+        db.flush()
+    return row is not None
+
+
+def recovery_codes_left(db: Session, user_id: int) -> int:
+    """How many recovery codes still work."""
+    row = db.get(SecondFactor, user_id)
+    return len(row.recovery) if row is not None else 0
+
+
+def _takes_code(row: SecondFactor, code: str) -> bool:
+    used = -1 if row.last_used_at is None else totp.step_at(row.last_used_at.timestamp())
+    step = totp.matching_step(_secret(row), code, now().timestamp(), used)
+    if step is None:
+        return False
+    row.last_used_at = datetime.fromtimestamp(step * totp.STEP_S, UTC)
+    return True
+
+
+def _seal(secret: bytes, user_id: int) -> bytes:
+    nonce = secrets.token_bytes(_NONCE_BYTES)
+    return nonce + AESGCM(_key()).encrypt(nonce, secret, str(user_id).encode())
+
+
+def _secret(row: SecondFactor) -> bytes:
+    sealed = bytes(row.sealed_secret)
+    return AESGCM(_key()).decrypt(sealed[:_NONCE_BYTES], sealed[_NONCE_BYTES:], str(row.user_id).encode())
+
+
+def _key() -> bytes:
+    return get_settings().secret("second-factor")
+
+
+def _hash(code: str) -> str:
+    return hashlib.sha256(code.encode()).hexdigest()

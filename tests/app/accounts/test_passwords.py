@@ -1,0 +1,43 @@
+"""Passwords that anybody would try first are refused; long ones of unrelated words are not."""
+
+from __future__ import annotations
+
+import pytest
+
+from app.accounts.passwords import weakness
+
+
+@pytest.mark.parametrize(
+    "password",
+    [
+        "short",
+        "password123",
+        "Passw0rd2026!",
+        "P@$$w0rd!!!",
+        "1234567890",
+        "0987654321!",
+        "qwertyuiop",
+        "Qwertz123456",
+        "aaaaaaaaaaaa",
+        "abababababab",
+        "abcdefghijkl",
+        "Welcome2026!",
+        "betaloop-admin",
+        "Hospital#2026",
+        "ada.lovelace1",
+        "Clinic!Admin1",
+        "letmein-12345",
+        "!!!!!!!!!!!!",
+        "parkinson2026",
+    ],
+)
+def test_what_is_guessed_first_is_refused(password: str) -> None:
+    assert weakness(password, "ada.lovelace@clinic.example") is not None
+
+
+@pytest.mark.parametrize(
+    "password",
+    ["correct horse battery", "a password of the test", "long enough here", "vK9-tuL2-qqRw", "Grünkohl im Regen", "überquert 7 Brücken"],
+)
+def test_what_is_not_is_taken(password: str) -> None:
+    assert weakness(password, "ada@clinic.example") is None
