@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow check format lock bench clean
+.PHONY: help install demo test test-slow check audit format lock bench clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -34,6 +34,10 @@ check: install ## Lint, types and the import contract.
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+audit: ## Ask a public list for known flaws of the pinned packages (needs network; the tool lives in build/audit).
+	@test -x build/audit/bin/pip-audit || { $(PYTHON) -m venv build/audit && build/audit/bin/python -m pip install -qq --disable-pip-version-check pip-audit; }
+	build/audit/bin/pip-audit --requirement requirements.lock --no-deps --disable-pip
 
 format: install ## Format the code and fix what the linter can.
 	$(BIN)/ruff format .
