@@ -45,6 +45,7 @@ format: install ## Format the code and fix what the linter can.
 
 lock: ## Pin the installed packages in requirements.lock.
 	$(BIN)/python -m pip freeze --exclude-editable --exclude betaloop --all | grep -v -i '^pip==' | sed 's/^torch==\([0-9.]*\).*/torch==\1/' > requirements.lock
+	PYTHONPATH=. $(BIN)/python tests/service_lock.py
 
 bench: install ## Run every benchmark in its quick form.
 	@for script in benchmarks/*.py; do echo "== $$script"; OMP_NUM_THREADS=1 $(BIN)/python $$script --quick || exit 1; done

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from sqlalchemy.orm import Session
 
 from app.accounts import service
 from app.accounts.blinded import is_open
@@ -45,6 +47,22 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
 
 
 CurrentCaller = Annotated[Caller, Depends(get_caller)]
+
+
+def caller_now(request: Request) -> Callable[[Session], Caller | None]:
+    """Who makes a request, asked anew each time, for answers that last: None once session, token or account have ended."""
+    scheme, _, token = request.headers.get("Authorization", "").partition(" ")
+    cookie = request.cookies.get(COOKIE, "")
+
+    def look(db: Session) -> Caller | None:
+        if scheme.lower() == "bearer":
+            return service.caller_of_token(db, token)
+        return service.caller_of_cookie(db, cookie, used=False)
+
+    return look
+
+
+CallerNow = Annotated[Callable[[Session], Caller | None], Depends(caller_now)]
 
 
 def results_viewed(request: Request, db: Db, caller: CurrentCaller) -> None:

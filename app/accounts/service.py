@@ -181,15 +181,15 @@ def sign_out(db: Session, token: str) -> None:
         row.ended_at = now()
 
 
-def caller_of_cookie(db: Session, token: str) -> Caller | None:
-    """Who the cookie's token belongs to, unless the session idled out or ended."""
+def caller_of_cookie(db: Session, token: str, used: bool = True) -> Caller | None:
+    """Who the cookie's token belongs to, unless the session idled out or ended; `used` counts as an act against idling."""
     settings = get_settings()
     row = repository.sign_in_by_token(
         db, _hash(token), now() - timedelta(minutes=settings.session_idle_minutes), now() - timedelta(hours=settings.session_max_hours)
     )
     if row is None or not row.user.active:
         return None
-    if now() - row.last_seen_at > _SEEN_RESOLUTION:
+    if used and now() - row.last_seen_at > _SEEN_RESOLUTION:
         row.last_seen_at = now()
         db.commit()
     return caller_of(row.user)

@@ -6,8 +6,10 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header, Query
 from fastapi.responses import StreamingResponse
+from sqlalchemy.orm import Session
 
-from app.accounts.deps import CurrentCaller
+from app.accounts import permissions as can
+from app.accounts.deps import CallerNow, CurrentCaller
 from app.pipeline import service
 from app.pipeline.deps import CurrentJob
 from app.pipeline.schemas import JobIn, JobOut
@@ -53,12 +55,21 @@ def read_job(found: CurrentJob) -> JobOut:
     response_class=StreamingResponse,
     responses={200: {"content": {"text/event-stream": {}}, "description": "Server-sent events until the job ends."}},
 )
-def follow_job(found: CurrentJob, db: Db, last_event_id: Annotated[str | None, Header(max_length=20)] = None) -> StreamingResponse:
+def follow_job(
+    found: CurrentJob, db: Db, caller_now: CallerNow, last_event_id: Annotated[str | None, Header(max_length=20)] = None
+) -> StreamingResponse:
     """Follow a job: its state, what happens (`status`, `step`, `progress`, `points`, `log`), `end`; goes on after Last-Event-ID."""
-    job_id = found.job.id
+    job_id, site = found.job.id, (found.participant.site.study_id, found.participant.site_id)
+
+    def still(present: Session) -> bool:
+        caller = caller_now(present)
+        return caller is not None and caller.may(can.READ, *site)
+
     # the stream may last for hours and reads with sessions of its own: this one's connection goes back now
     db.close()
-    return StreamingResponse(stream.job_events(job_id, last_event_id), media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
+    return StreamingResponse(
+        stream.job_events(job_id, last_event_id, still), media_type="text/event-stream", headers={"X-Accel-Buffering": "no"}
+    )
 
 
 @router.post("/jobs/{job_id}/cancel", responses=problems(409))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 from fastapi.concurrency import run_in_threadpool
+from sqlalchemy.orm import Session
 
 from app.platform.database import new_session
 from app.platform.jobs import repository
@@ -17,15 +18,21 @@ from app.platform.jobs.service import describe_event
 
 POLL_S = 0.5
 KEEP_ALIVE_S = 15.0
+ASK_AGAIN_S = 10.0
 _BATCH = 500
 
 
-async def job_events(job_id: str, last_event_id: str | None = None) -> AsyncIterator[str]:
+async def job_events(
+    job_id: str, last_event_id: str | None = None, still: Callable[[Session], bool] = lambda _: True
+) -> AsyncIterator[str]:
     """The events of a job as the lines of a `text/event-stream`, until it ends.
 
     First comes an event `job` without an id: the state of the job and its steps. Then every event after `last_event_id` (the header
     Last-Event-ID; anything but a number counts as none) under its kind: `status`, `step`, `progress`, `points`, `log`, `cancel`. Last comes
     `end` with the final state; the browser must then close its EventSource, which would connect again otherwise.
+
+    Args:
+        still: whether whoever listens still may, asked every ASK_AGAIN_S; without an `end` the stream stops where not.
 
     Raises:
         NotFound: there is no such job.
@@ -33,8 +40,12 @@ async def job_events(job_id: str, last_event_id: str | None = None) -> AsyncIter
     last_id = int(last_event_id) if last_event_id and last_event_id.isdecimal() else 0
     state, _ = await run_in_threadpool(_read, job_id, None)
     yield _message("job", state)
-    spoken = time.monotonic()
+    spoken = asked = time.monotonic()
     while True:
+        if time.monotonic() - asked >= ASK_AGAIN_S:
+            if not await run_in_threadpool(_ask, still):
+                return
+            asked = time.monotonic()
         state, events = await run_in_threadpool(_read, job_id, last_id)
         for event in events:
             last_id = event["id"]
@@ -66,6 +77,11 @@ def describe(job: Job) -> dict[str, Any]:
             for s in job.steps
         ],
     }
+
+
+def _ask(still: Callable[[Session], bool]) -> bool:
+    with new_session() as db:
+        return still(db)
 
 
 def _read(job_id: str, last_id: int | None) -> tuple[dict[str, Any], list[dict[str, Any]]]:

@@ -6,12 +6,13 @@ from collections.abc import Callable
 from datetime import timedelta
 
 import pytest
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 from fastapi.testclient import TestClient
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts import service
+from app.accounts.deps import COOKIE, caller_now
 from app.accounts.models import Role, Scope, User
 from app.accounts.permissions import PERMISSIONS, READ_ARMS, SCOPES, Caller, Grant
 from app.platform.database import now
@@ -124,3 +125,21 @@ def test_nobody_administers_a_user_without_any_access(db: Session, ada: str) -> 
     former = db.query(User).filter_by(email="former@clinic.example").one()
     study = service.study_of(db, None)
     assert not service.manages(Caller("x", 1, (Grant(study.id, None, Role.ADMIN),)), former)
+
+
+@pytest.mark.parametrize("by", ["token", "cookie"])
+def test_an_answer_that_lasts_learns_that_its_account_was_closed(db: Session, ada: str, by: str) -> None:
+    """A job's event stream asks this every few seconds; asking keeps no idle session alive."""
+    token = service.create_token(db, ada, "follower") if by == "token" else service.sign_in(db, ada, PASSWORD)
+    db.execute(text("update sign_in set last_seen_at = now() - interval '5 minutes'"))
+    db.commit()
+    header = (b"authorization", f"Bearer {token}".encode()) if by == "token" else (b"cookie", f"{COOKIE}={token}".encode())
+    look = caller_now(Request({"type": "http", "headers": [header]}))
+    found = look(db)
+    assert found is not None
+    assert found.label == ada
+    assert db.scalar(text("select count(*) from sign_in where last_seen_at > now() - interval '4 minutes'")) == 0
+    db.execute(text("update app_user set active = false"))
+    db.commit()
+    db.expire_all()
+    assert look(db) is None

@@ -15,7 +15,7 @@ from sqlalchemy import text
 
 from app.platform.database import new_session, transaction
 from app.platform.errors import NotFound
-from app.platform.jobs import JobContext, StepFailed, StepReport, registry, repository, write_atomically
+from app.platform.jobs import JobContext, StepFailed, StepReport, registry, repository, stream, write_atomically
 from app.platform.jobs.children.child import ChildLimits, params_hash
 from app.platform.jobs.children.slots import Slots
 from app.platform.jobs.children.supervisor import ChildMessages, ChildProcesses, ComputeCall
@@ -234,6 +234,20 @@ def test_the_stream_starts_with_the_state_resumes_after_an_id_and_ends(jobs):
     assert json.loads(messages[-1].split("data: ")[1])["status"] == "succeeded"
     with pytest.raises(NotFound):
         _lines("no-such-job")
+
+
+def test_the_stream_stops_for_whom_may_listen_no_more(jobs, monkeypatch):
+    monkeypatch.setattr(stream, "ASK_AGAIN_S", 0.0)
+    monkeypatch.setattr(stream, "POLL_S", 0.01)
+    job_id = jobs.submit()  # no worker: it would be followed for ever
+    answers = iter([True, True, False])
+
+    async def collect():
+        return [message async for message in job_events(job_id, None, lambda _: next(answers))]
+
+    messages = asyncio.run(collect())
+    assert next(answers, None) is None
+    assert "event: end" not in "".join(messages)
 
 
 def test_progress_is_the_weighted_mean_of_the_steps_and_never_falls(jobs):
