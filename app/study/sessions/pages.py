@@ -24,6 +24,7 @@ from app.study.data_queries.repository import not_closed_of_session
 from app.study.deps import CurrentSession
 from app.study.form_changes import Shown, own_changes
 from app.study.models import QocRevision, Recording, StudySession
+from app.study.recordings import tablet
 from app.study.schemas import ConditionsChange, DerivedChoice, QocIn, SessionChange
 from app.study.sessions import conditions, designs
 from app.study.sessions import view as session_view
@@ -296,6 +297,7 @@ def _page(
         event_kinds=EVENT_KINDS,
         event_severities=EVENT_SEVERITIES,
         drawn=_drawn(db, session, data, caller),
+        ran_on=tablet.of_recording(control_recording(session)),
         beside=_beside(db, session, data),
         ran_under=dict(_conditions_revisions(session)[-1].fields)
         | {"conditions_reason": ""}

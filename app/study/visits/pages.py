@@ -23,9 +23,11 @@ from app.study.form_changes import Shown, own_changes, reason_of
 from app.study.models import Participant, StudySession, Visit
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
+from app.study.recordings import tablet
 from app.study.schemas import CdbsAmplitudeModel, VisitIn
 from app.study.service import may
 from app.study.sessions import pages as session_pages
+from app.study.sessions.contradictions import control_recording
 from app.study.sessions.data import session_data
 from app.study.visits import form
 from app.study.visits import service as visit_locks
@@ -116,6 +118,7 @@ def _visit_page(
     request: Request, db: Session, visit: Visit, caller: Caller, typed: dict[str, str] | None = None, error: BetaloopError | None = None
 ) -> HTMLResponse:
     sessions, _ = repository.sessions_of_visit(db, visit.id)
+    ran = [(arm(s, caller).controller, tablet.of_recording(control_recording(s))) for s in sessions if s.segments]
     seen = form.texts(visit)
     page = render(
         request,
@@ -123,6 +126,7 @@ def _visit_page(
         visit=visit,
         participant=visit.participant,
         rows=[_session_row(db, s, caller) for s in sessions],
+        latencies=tablet.by_controller(ran),
         proposals=[s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id],
         seen=seen,
         draft=seen | {"reason": ""} | (typed or {}),

@@ -80,7 +80,9 @@ def test_logs_fill_the_slots_that_they_name_whatever_else_would_explain_them(cli
 def test_the_draws_of_a_random_session_are_those_of_its_log(client: TestClient, studied: Any, planned: Plan) -> None:
     position = next(i.position for i in planned.items if i.controller == "random")
     holds = [(0, 60, 0.9, -0.25), (60, 90, 0.7, 0.5)]
-    send(client, log_of(planned, position, 20, holds=holds, design="stratified", level=0.8, seed=99, lower_bound=0.45))
+    timed = {"n": 200, "mean": 217.0, "std": 33.0, "median": 200.0, "p99": 300.0}
+    log = log_of(planned, position, 20, holds=holds, design="stratified", level=0.8, seed=99, lower_bound=0.45, latency_us=timed)
+    send(client, log)
     done = client.post(f"/api/v1/visits/{studied.visit}/slots/confirm", json={})
     assert done.status_code == 200, done.text
     session = next(r["session_id"] for r in done.json()["comparison"]["rows"] if r["position"] == position)
@@ -89,6 +91,8 @@ def test_the_draws_of_a_random_session_are_those_of_its_log(client: TestClient, 
     kept = found["design_parameters"]
     assert kept["level"] == 0.8
     assert [(h["start"], h["steps"], h["amplitude"], h["log_density"]) for h in kept["holds"]][:2] == [tuple(h) for h in holds]
+    for page in (f"/sessions/{session}", f"/visits/{studied.visit}"):
+        assert "0.217" in client.get(page, headers={"Accept": "text/html"}).text, "ms that a decision takes, as the tablet measured"
 
 
 def test_a_log_of_another_visit_is_asked_about_and_fills_no_slot_there(client: TestClient, studied: Any, planned: Plan) -> None:
