@@ -21,6 +21,7 @@ from app.planning.plans import view as plan_view
 from app.planning.plans.designs import planned_sessions
 from app.planning.plans.schemas import OverrideIn, PlanIn
 from app.planning.protocol.schedule import total_minutes
+from app.planning.slots import service as slots
 from app.platform.database import new_session, set_actor
 from app.platform.errors import BetaloopError, Conflict, NotFound
 from app.platform.jobs import repository as jobs
@@ -138,6 +139,8 @@ class ParticipantLoop:
                 self.progress.say(self.code, f"visit {number}: {_name(one)}")
                 sessions.hold(db, person, visit, one, self.design.seed, self.caller)
                 self.progress.session_held(self.code)
+            if number > self.design.preset.random_visits:
+                self._fill(db, visit)
 
     def _learn(self, db: Session, person: Participant, number: int) -> None:
         """The pipeline before a visit: the one that was begun for it, or a new one; waits for its end."""
@@ -224,6 +227,20 @@ class ParticipantLoop:
             )
             for line in lines
         ]
+
+    def _fill(self, db: Session, visit: Visit) -> None:
+        """Confirm the visit's sessions into the slots of its signed plan.
+
+        Raises:
+            BetaloopError: a planned session is missing although the day is over, which would be a fault of the simulator.
+        """
+        found = slots.compare(db, visit, self.caller)
+        if found.missing:
+            positions = ", ".join(str(line.item.position) for line in found.missing)
+            raise BetaloopError(f"Visit {visit.number} of {self.code} was held without its planned sessions {positions}.")
+        if found.waiting:
+            slots.confirm(db, visit, self.caller)
+            db.commit()
 
     def _collecting(self, person: Participant, number: int, day: dt.date) -> list[PlacedSession]:
         """The sessions of a visit that only collects; what its random ones try is by the design in the participant's settings."""

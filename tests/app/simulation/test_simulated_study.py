@@ -103,6 +103,7 @@ def test_a_simulated_study_that_is_killed_goes_on_with_nothing_lost_and_nothing_
         assert db.scalars(select(Job.status).where(Job.kind == "pipeline")).all() == [JobStatus.SUCCEEDED]
         (plan,) = db.scalars(select(Plan)).all()
         assert (plan.status, plan.approved_by) == ("approved", SIGNER)
+        assert [s.plan_item_id for s in held[4:]] == [item.id for item in plan.items], "each session stands in its slot"
         (signature,) = signatures_of(db, "plan", plan.id)
         assert (signature.signer, plan.created_by) == (SIGNER, ACCOUNT)
         assert plan.evaluation_id == db.scalar(select(func.max(Evaluation.id)))
