@@ -58,6 +58,7 @@ def _page(
         parents=found.parents(params.parents),
         draft={name: getattr(params, name) for name in _LABELS} | given,
         algorithms=", ".join(ALGORITHM_NAMES[name] for name in params.algorithms),
+        names=ALGORITHM_NAMES,
         tuning=FINE_TUNING,
         fresh=fresh_rates(params.training()),
         refresh_s=REFRESH_S,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from sqlalchemy.orm import Session
@@ -26,8 +27,8 @@ class Outlook:
     """Where a participant's next generation stands.
 
     Attributes:
-        tested: what it may go on from. posterior: estimated returns by policy, from the newest ranking.
-        ranking: the newest one; None without. current: whether it knows everything that was recorded.
+        tested: what it may go on from, the best by the newest ranking first. posterior: its estimated returns by policy.
+        ranking: the newest one; None without any. current: whether it knows everything that was recorded.
         live: the job at work. done: the job that trained the generation of the data as they are now; None where something came since.
     """
 
@@ -51,7 +52,9 @@ def outlook(db: Session, participant: Participant, caller: Caller) -> Outlook:
     rows, _ = jobs.find(db, participant.id, NEXT_GENERATION, jobs.LIVE, limit=1)
     maker = db.get(Job, newest.job_id) if newest is not None and newest.job_id is not None else None
     done = maker if current and maker is not None and maker.kind == NEXT_GENERATION else None
-    return Outlook(tested_policies(db, participant), posterior_of(newest), newest, current, rows[0] if rows else None, done)
+    posterior = posterior_of(newest)
+    tested = sorted(tested_policies(db, participant), key=lambda t: (-posterior.get(t.policy.id, -math.inf), t.policy.id))
+    return Outlook(tested, posterior, newest, current, rows[0] if rows else None, done)
 
 
 def start(db: Session, participant: Participant, params: NextGenerationParams, caller: Caller) -> Job:
