@@ -62,6 +62,7 @@ API_MODULES = (
     "app.analysis.biomarker.api",
     "app.analysis.calibration.api",
     "app.overview.samples.api",
+    "app.overview.signals.api",
 )
 PAGE_MODULES = (
     "app.accounts.pages",
@@ -103,6 +104,7 @@ PAGE_MODULES = (
     "app.overview.reference",
     "app.overview.saved",
     "app.overview.package.pages",
+    "app.overview.signals.pages",
 )
 
 

@@ -50,11 +50,14 @@ async function draw(figure, onPaper = false) {
     const theme = colours(onPaper);
     const { data, layout } = theme.walk(JSON.parse(source.textContent));
     theme.done();
+    const shown = zooms.get(figure.dataset.zoom);
+    if (shown) Object.assign(layout.xaxis, { range: shown, autorange: false });
     plot.querySelector(".loading")?.remove();
     await Plotly.react(plot, data, layout, CONFIG);
     // the table below says it in words; the buttons above stay for everyone
     for (const picture of plot.querySelectorAll(".main-svg")) picture.setAttribute("aria-hidden", "true");
     follow(plot);
+    link(figure, plot);
     figure.dataset.drawn = "yes";
   } catch (error) {
     plot.textContent = `This chart could not be drawn (${error.message}). Its numbers are in the table below.`;
@@ -69,6 +72,25 @@ function follow(plot) {
   plot.on("plotly_click", ({ points }) => {
     const place = points[0]?.customdata;
     if (typeof place === "string" && /^\/[a-z]/.test(place)) location.assign(place);
+  });
+}
+
+// charts of one group (data-zoom) show the same stretch of their horizontal axis
+const zooms = new Map();
+
+function link(figure, plot) {
+  const group = figure.dataset.zoom;
+  if (!group || plot.dataset.linked) return;
+  plot.dataset.linked = "yes";
+  plot.on("plotly_relayout", (change) => {
+    const given = change["xaxis.range"] ?? (("xaxis.range[0]" in change) ? [change["xaxis.range[0]"], change["xaxis.range[1]"]] : null);
+    const range = given ?? (change["xaxis.autorange"] ? null : undefined);
+    if (range === undefined || String(range) === String(zooms.get(group) ?? null)) return;
+    if (range) zooms.set(group, range); else zooms.delete(group);
+    for (const other of document.querySelectorAll(`figure[data-zoom="${group}"][data-drawn=yes]`)) {
+      if (other !== figure) library.then((Plotly) => Plotly.relayout(other.querySelector(".plot"), range ? { "xaxis.range": [...range] } : { "xaxis.autorange": true }));
+    }
+    document.dispatchEvent(new CustomEvent("betaloop:zoom", { detail: { group, range } }));
   });
 }
 

@@ -193,6 +193,15 @@ INTENDED: dict[str, str] = {
     ),
     **dict.fromkeys(
         (
+            "components > schemas > SignalChannelOut",
+            "components > schemas > SignalOut",
+            "components > schemas > SpectrogramOut",
+            "paths > /api/v1/sessions/{session_id}/signal",
+        ),
+        "API: `GET /sessions/{id}/signal` gives raw samples between two times at a wanted resolution, and their spectrogram",
+    ),
+    **dict.fromkeys(
+        (
             "components > schemas > NameChange",
             "components > schemas > SiteIn",
             "components > schemas > SiteOut",

@@ -32,6 +32,7 @@ READABLE = (
     "/api/v1/sessions/{session_id}/trace",
     "/api/v1/sessions/{session_id}/traces",
     "/api/v1/sessions/{session_id}/samples",
+    "/api/v1/sessions/{session_id}/signal",
     "/api/v1/sessions/{session_id}/conditions",
     "/api/v1/sessions/{session_id}/qoc",
     "/api/v1/sessions/{session_id}/outcomes",
@@ -151,6 +152,7 @@ BLINDED = {
 }
 Json = dict[str, Any]
 TABLE = b"t_s,beta,amplitude_fraction\n" + b"".join(b"%d,1,1\n" % (2 * k) for k in range(21))
+SAMPLES = b"t_s,lfp [uV],amplitude_ma\n" + b"".join(b"%.3f,%d,1\n" % (k / 250, k * k % 17) for k in range(-5000, 5001))
 GRASPS = b"t_s\n" + b"".join(b"%.2f\n" % (0.4 * k) for k in range(11))
 SPEECH = {"kind": "speech", "severity": "severe", "serious": True}
 RATED = {
@@ -205,6 +207,7 @@ class World:
         derived = self.upload("d.csv", TABLE, visit="2", controller="other", more=[("g.csv", GRASPS)])["sessions"][0]["id"]
         self.send(f"/sessions/{derived}/qoc", method="put", json={"grasp_hz": 3.0, "reason": "counted by hand"})
         sampled = self.upload("s.csv", TABLE.replace(b"6,1,1", b"6,1.77,1", 1), visit="2", controller="other")["sessions"][0]["id"]
+        drawn = self.upload("lfp.csv", SAMPLES, visit="2", controller="other")["sessions"][0]["id"]
         self.ids: Json = {
             "code": "P1",
             "visit_id": visit,
@@ -223,6 +226,7 @@ class World:
             ("post", "/participants"): {"json": {"code": "Q1", "site": "main"}},
             ("patch", "/participants/{code}"): {"code": "P3", "json": {"status": "completed", "reason": "last visit held"}},
             ("get", "/sessions/{session_id}/samples"): {"session_id": sampled},
+            ("get", "/sessions/{session_id}/signal"): {"session_id": drawn},
             ("post", "/studies"): {"json": {"code": "ADAPT", "name": "Adaptive"}},
             ("patch", "/studies/{study_code}"): {"json": {"name": "Main", "reason": "protocol 2"}},
             ("post", "/studies/{study_code}/sites"): {"json": {"code": "south", "name": "South"}},

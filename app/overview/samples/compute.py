@@ -6,6 +6,7 @@ The child knows no settings and no database: what it needs stands in its params.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from app.overview.samples.parquet import write_parquet
 from app.overview.samples.signal import Signal
 from app.platform.jobs import StepReport
 from ml import formats
-from ml.formats.recording import UndecodableFile
+from ml.formats.recording import SampleLog, UndecodableFile
 
 WRITERS = {"parquet": write_parquet, "nwb": write_nwb}
 
@@ -50,20 +51,35 @@ def write(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
 
 
 def _samples(file: Mapping[str, Any]) -> tuple[list[Signal], list[int]]:
-    """The samples of a file's recordings within the session, and which recordings it no longer gives."""
+    """The samples of a file's recordings within the session as signals, and which recordings it no longer gives."""
+    logs, missing = samples_within(file)
+    return [
+        Signal(row["id"], row["hemisphere"], "lfp", log.channel, log.unit, log.t_s, log.values, log.rates_hz) for row, log in logs
+    ], missing
+
+
+def samples_within(file: Mapping[str, Any]) -> tuple[list[tuple[Mapping[str, Any], SampleLog]], list[int]]:
+    """The samples of a file's recordings within the session.
+
+    Args:
+        file: as `app.overview.samples.service.files_of` gives it.
+
+    Returns:
+        (recording, samples with times from the session's start) per channel, and numbers of the recordings that the present decoder does
+        not find in the file.
+    """
     wanted: Sequence[Mapping[str, Any]] = file["recordings"]
     try:
         decoded = formats.decode(Path(file["source"]), file["kind"], options_of(file["options"]), name=file["name"]).recordings
     except UndecodableFile:
         return [], [r["id"] for r in wanted]
     by_content = {r.fingerprint: r for r in decoded}
-    signals = []
+    found = []
     for row in wanted:
         if row["fingerprint"] not in by_content:
             continue
         for log in by_content[row["fingerprint"]].samples:
             here = log.between(row["begin_s"], row["end_s"])
             if here.values.size:
-                t_s = here.t_s - row["start_s"]
-                signals.append(Signal(row["id"], row["hemisphere"], "lfp", here.channel, here.unit, t_s, here.values, here.rates_hz))
-    return signals, [r["id"] for r in wanted if r["fingerprint"] not in by_content]
+                found.append((row, replace(here, t_s=here.t_s - row["start_s"])))
+    return found, [r["id"] for r in wanted if r["fingerprint"] not in by_content]

@@ -66,15 +66,14 @@ def session_samples(db: Session, session: StudySession, form: SampleFormat, call
         )
     if not session.segments:
         raise Conflict(f"Session {session.id} has no recording.", "Upload its file first.")
-    settings = get_settings()
-    limits = ChildLimits(settings.decode_memory_mb, settings.decode_seconds, niceness=0, quotes=False)
+    limits = reading_limits()
     name = f"{session.visit.participant.code}-session-{session.id}.{form.value}"
     with files.draft_folder() as folder:
         params = _params(db, session, caller, folder) | {"format": form.value, "target": str(folder / "samples")}
         try:
             run_limited(WRITE, params, limits, who=f"samples of {session.visit.participant_id}")
         except ChildEnded as ended:
-            raise _not_written(session, ended) from None
+            raise unread(session, ended) from None
         record(db, "export", "session", session.id, {"format": form.value})
         content = (folder / "samples").open("rb")
         return SampleFile(content, name, (folder / "samples").stat().st_size)
@@ -114,11 +113,21 @@ def _params(db: Session, session: StudySession, caller: Caller, folder: Path) ->
         "rating": qoc and qoc.rating,
         "tremor_percent": qoc and qoc.tremor_percent,
     }
-    return {"files": _files(db, session), "traces": str(folder / "traces.npz"), "headers": headers, "session": about}
+    return {"files": files_of(db, session), "traces": str(folder / "traces.npz"), "headers": headers, "session": about}
 
 
-def _files(db: Session, session: StudySession) -> list[dict[str, Any]]:
-    """The stored files of the session's recordings, and which stretch of each recording is the session's."""
+def reading_limits() -> ChildLimits:
+    """What a child may take that reads the samples of a session, for whom a person waits."""
+    settings = get_settings()
+    return ChildLimits(settings.decode_memory_mb, settings.decode_seconds, niceness=0, quotes=False)
+
+
+def files_of(db: Session, session: StudySession) -> list[dict[str, Any]]:
+    """The stored files of the session's recordings, and which stretch of each recording is the session's.
+
+    Raises:
+        Conflict: a stored file is missing.
+    """
     wanted: dict[int, dict[int, Recording]] = defaultdict(dict)
     for segment in session.segments:
         if segment.recording.upload_file_id is not None:
@@ -144,8 +153,8 @@ def _files(db: Session, session: StudySession) -> list[dict[str, Any]]:
     return found
 
 
-def _not_written(session: StudySession, ended: ChildEnded) -> BetaloopError:
-    """In words, what kept the file from being written. Raises nothing; a fault of ours goes on as the fault that it is."""
+def unread(session: StudySession, ended: ChildEnded) -> BetaloopError:
+    """In words, what kept a session's samples from being read. Raises nothing; a fault of ours goes on as the fault that it is."""
     if ended.cause in ("memory", "time"):
         much = f"{ended.limits.memory_mb} MiB" if ended.cause == "memory" else f"{ended.limits.cpu_s} s of processor time"
         setting = "BETALOOP_DECODE_MEMORY_MB" if ended.cause == "memory" else "BETALOOP_DECODE_SECONDS"

@@ -36,6 +36,7 @@ class Chart:
         columns, rows: the table behind the chart; a column names its unit.
         height: of the plot, CSS pixels.
         digits: significant digits of the table's numbers.
+        zoom: charts of a page that share this name show the same stretch of their horizontal axis; empty for none.
     """
 
     id: str
@@ -46,6 +47,7 @@ class Chart:
     rows: Sequence[Sequence[Cell]]
     height: int = 320
     digits: int = field(default=4)
+    zoom: str = ""
 
 
 def colour(controller: str, alpha: float | None = None) -> str:

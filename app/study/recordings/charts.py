@@ -15,6 +15,8 @@ from app.study.recordings.facts import clock_fit
 from app.study.traces import unpack
 
 _DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
+TIME = "session"
+"""Charts over the time of a session zoom together."""
 _COLOURS = ("token:cdbs", "token:rl", "token:random", "token:distilled", "token:other", "token:no_dbs")
 
 
@@ -48,7 +50,10 @@ def trace_charts(recording: Recording, traces: Sequence[Trace], stretch: Stretch
             known = values[~np.isnan(values)]
             spread: list[Cell] = [float(np.median(known)), float(known.min()), float(known.max())] if known.size else [None, None, None]
             rows.append([name, int(known.size), int(values.size), *spread, trace.source.replace("_", " "), trace.decode_version])
-        layout = {"xaxis": axis("Time in session", "min"), "yaxis": axis("", unit, zeroline=False), "showlegend": True}
+        layout = {
+            "xaxis": axis("Time in session", "min"), "yaxis": axis("", unit, zeroline=False, fixedrange=True), "showlegend": True,
+            "dragmode": "zoom",
+        }  # fmt: skip
         charts.append(
             Chart(
                 f"traces-{recording.id}-{number}",
@@ -58,6 +63,7 @@ def trace_charts(recording: Recording, traces: Sequence[Trace], stretch: Stretch
                 ("Trace", "Valid", "Windows", f"Median ({unit})", f"Minimum ({unit})", f"Maximum ({unit})", "Source", "Decode version"),
                 rows,
                 height=_height(300, lines),
+                zoom=TIME,
             )
         )
     return charts

@@ -10,10 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.platform.web.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, figure, horizontal
-from app.study.recordings.charts import trace_name
+from app.study.recordings.charts import TIME, trace_name
 from app.study.sessions.data import SessionData
 from app.study.traces import amplitude_program, session_offset_s
 from ml.mdp import AMPLITUDE_TOLERANCE
+
+MOST_LEVELS = 12
+"""Amplitudes that stand for themselves; more of them are drawn in bins."""
+BINS = 10
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,12 @@ def operator_conflicts(events: Sequence[Mapping[str, Any]], origin_s: float) -> 
     return [(float(e["t_s"]) - origin_s, str(e["label"]), e["data"].get("device_amplitude_ma")) for e in notes]
 
 
+def notes(events: Sequence[Mapping[str, Any]], origin_s: float, duration_s: float) -> list[tuple[float, str]]:
+    """Operator's notes within the session: time in the session (s), and the note."""
+    found = [(float(e["t_s"]) - origin_s, str(e["label"])) for e in events if e["kind"] == "operator_note"]
+    return sorted((t, label) for t, label in found if 0 <= t <= duration_s)
+
+
 def _fit_axis(yaxis: dict[str, Any], values: NDArray[np.float64], threshold: float | None) -> float | None:
     """Keep a few huge windows (an amplifier's step) from flattening the rest; returns the top of the axis where some lie above it."""
     known = values[~np.isnan(values)]
@@ -123,12 +133,13 @@ def control_chart(data: SessionData) -> Chart:
     layout: dict[str, Any] = {
         "grid": {"rows": 2, "columns": 1},
         "xaxis": axis("Time in session", "min", anchor="y2", zeroline=False),
-        "yaxis": axis(name, unit, domain=[0.47, 1.0], zeroline=False, rangemode="tozero"),
+        "yaxis": axis(name, unit, domain=[0.47, 1.0], zeroline=False, rangemode="tozero", fixedrange=True),
         "yaxis2": axis(
             "Amplitude", "mA" if _has(table.amplitude_ma) else "fraction", domain=[0.0, 0.38], rangemode="nonnegative", zeroline=False,
+            fixedrange=True,
         ),
         "shapes": [], "annotations": [], "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0},
-        "hovermode": "x unified", "margin": {"l": 62, "r": 62, "t": 30, "b": 44},
+        "hovermode": "x unified", "dragmode": "zoom", "margin": {"l": 62, "r": 62, "t": 30, "b": 44},
     }  # fmt: skip
     _mark_lead(layout, float(minutes[0]))
     if data.threshold is not None:
@@ -175,6 +186,7 @@ def control_chart(data: SessionData) -> Chart:
             showgrid=False,
             zeroline=False,
             tickmode="auto",
+            fixedrange=True,
         )
         traces.append({"type": "scatter", "x": [minutes[0]], "y": [None], "yaxis": "y3", "showlegend": False, "hoverinfo": "skip"})
     subtitle = f"{unit or 'no unit'} over {settings.period_s:g} s · n = {known} of {int(np.sum(table.t_s > 0))} steps with a valid window"
@@ -189,7 +201,43 @@ def control_chart(data: SessionData) -> Chart:
         for t, b, a, f, mark in zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, marks, strict=True)
     ]
     title = f"{trace_name(table.beta_trace)} and amplitude" if table.beta_trace else "Amplitude"
-    return Chart("control", title[:1].upper() + title[1:], subtitle, figure(traces, **layout), columns, rows, height=470)
+    return Chart("control", title[:1].upper() + title[1:], subtitle, figure(traces, **layout), columns, rows, height=470, zoom=TIME)
+
+
+def beta_by_amplitude(data: SessionData) -> Chart | None:
+    """Beta of the windows at each amplitude: every amplitude that was held, or ten bins where there were many; None below two of them."""
+    table = data.table
+    in_ma = _has(table.amplitude_ma)
+    amplitude, unit = (table.amplitude_ma, "mA") if in_ma else (100 * table.fraction, "% of cDBS")
+    known = (table.t_s > 0) & ~np.isnan(table.beta) & ~np.isnan(amplitude)
+    beta, held = table.beta[known], amplitude[known]
+    levels = np.unique(np.round(held, 1 if in_ma else 0))
+    if levels.size < 2:
+        return None
+    if levels.size <= MOST_LEVELS:
+        group = np.argmin(np.abs(held[:, None] - levels), axis=1)
+    else:
+        edges = np.linspace(held.min(), held.max(), BINS + 1)
+        group = np.clip(np.searchsorted(edges, held, side="right") - 1, 0, BINS - 1)
+    rows = []
+    for k in np.unique(group):
+        low, middle, high = np.percentile(beta[group == k], (25, 50, 75))
+        rows.append([float(held[group == k].mean()), int(np.sum(group == k)), float(middle), float(low), float(high)])
+    x, n, y, low, high = (np.array(column) for column in zip(*rows, strict=True))
+    beta_unit = table.beta_trace.unit if table.beta_trace else ""
+    line = {
+        "type": "scatter", "mode": "lines+markers", "x": x, "y": y, "customdata": n, "line": {"color": GRID, "width": 1},
+        "marker": {"color": ACCENT, "size": 8},
+        "error_y": {"type": "data", "symmetric": False, "array": high - y, "arrayminus": y - low, "color": ACCENT, "thickness": 1.5},
+        "hovertemplate": f"%{{x:.3g}} {unit}<br>%{{y:.4g}} {beta_unit}<br>n = %{{customdata}} windows<extra></extra>",
+    }  # fmt: skip
+    layout: dict[str, Any] = {"xaxis": axis("Amplitude", unit, zeroline=False), "yaxis": axis("Beta", beta_unit, rangemode="tozero")}
+    if data.threshold is not None:
+        shape, label = horizontal(data.threshold, "threshold", WARN)
+        layout |= {"shapes": [shape], "annotations": [label]}
+    columns = (f"Amplitude ({unit})", "Windows", f"Median ({beta_unit})", f"25 % ({beta_unit})", f"75 % ({beta_unit})")
+    subtitle = f"median and quartiles, {beta_unit} · n = {int(known.sum())} windows · what came together, not what the amplitude did"
+    return Chart("beta-by-amplitude", "Beta by amplitude", subtitle, figure([line], **layout), columns, rows, height=280)
 
 
 def _amplitude_traces(data: SessionData, minutes: NDArray[np.float64]) -> list[dict[str, Any]]:

@@ -28,7 +28,7 @@ from app.study.recordings import tablet
 from app.study.schemas import ConditionsChange, DerivedChoice, QocIn, SessionChange
 from app.study.sessions import conditions, designs
 from app.study.sessions import view as session_view
-from app.study.sessions.charts import operator_conflicts, stimulation_steps
+from app.study.sessions.charts import beta_by_amplitude, notes, operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.stimulation import beside, delivered
@@ -284,11 +284,14 @@ def _page(
         view=view,
         steps=stimulation_steps(data, events, origin) if data else [],
         conflicts=operator_conflicts(events, origin),
+        notes=notes(events, origin, session.duration_s),
+        by_amplitude=beta_by_amplitude(data) if data else None,
         blocks=session_view.recording_blocks(session, recordings, traces, view.used),
         outcomes=session_view.outcomes_view(db, session),
         programs=control_programs(db, session),
         streams=[t for r in recordings for t in traces[r.id] if t.stream not in NO_CONTROL],
         recordings=recordings,
+        samples=any(recording.details.get("spectra") for recording in recordings),
         qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
         correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},
         seen=seen,

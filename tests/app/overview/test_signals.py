@@ -1,0 +1,123 @@
+"""The samples of a session on the screen: what came, where it came, at the resolution that was asked for."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from app.overview.signals import service
+from app.platform.web.png import palette, picture
+from tests.app.ingest.conftest import send, steady  # noqa: F401 (fixture)
+from tests.app.overview.test_samples import lfp_table, session  # noqa: F401 (fixture)
+
+
+def asked(client: TestClient, number: int, **params: Any) -> dict[str, Any]:
+    answer = client.get(f"/api/v1/sessions/{number}/signal", params=params)
+    assert answer.status_code == 200, answer.text
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+def test_a_short_stretch_has_every_sample_and_a_long_one_the_extremes_of_each_bin(client: TestClient, session: int) -> None:  # noqa: F811
+    _, t, x = lfp_table()
+    near = asked(client, session, begin_s=2.0, end_s=3.0, points=200)
+    inside = (t >= 2.0) & (t <= 3.0)
+    assert near["resolution_s"] == 0
+    np.testing.assert_allclose(near["t_s"], t[inside], atol=1e-6)
+    np.testing.assert_allclose(near["low"], x[inside], rtol=1e-5)
+    assert near["high"] == near["low"]
+    (channel,) = near["channels"]
+    assert (channel["samples"], channel["unit"], channel["rates_hz"]) == (t.size, "uV", [250.0])
+
+    far = asked(client, session, points=300)
+    width = far["resolution_s"]
+    assert 0 < width <= 40 / 300
+    assert len(far["t_s"]) >= 300
+    for middle, low, high in zip(far["t_s"], far["low"], far["high"], strict=True):
+        here = x[(t >= middle - width / 2 - 1e-6) & (t < middle + width / 2 - 1e-6)]
+        assert (low is None) == (here.size == 0)
+        if here.size:
+            assert (low, high) == (pytest.approx(here.min(), rel=1e-5), pytest.approx(here.max(), rel=1e-5))
+    lost = [low for middle, low in zip(far["t_s"], far["low"], strict=True) if 8.1 < middle < 12.9]
+    assert lost, "five seconds are missing"
+    assert set(lost) == {None}
+
+
+def test_the_spectrogram_stands_at_the_frequency_of_the_samples_and_is_empty_where_they_are_lost(client: TestClient, session: int) -> None:  # noqa: F811
+    power = asked(client, session)["spectrogram"]
+    for i, column in enumerate(power["decibel"]):
+        begin = power["first_s"] + i * power["width_s"]
+        if 8.1 < begin < 11.9:
+            assert set(column) == {None}
+        elif begin < 6.5 or begin > 13.5:
+            assert power["hz"][int(np.argmax(column))] == 20.0
+
+
+def test_its_files_are_read_once(client: TestClient, session: int, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    first = asked(client, session)
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("the files were read again")
+
+    monkeypatch.setattr(service, "run_limited", never)
+    assert asked(client, session) == first
+
+
+def test_what_nobody_looked_at_for_long_is_forgotten_first(session: int, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    old, young = service._cache() / "old", service._cache() / "young"
+    for folder, age in ((old, 3 * service.KEPT_S), (young, 60.0)):
+        folder.mkdir()
+        os.utime(folder, (time.time() - age, time.time() - age))
+    monkeypatch.setattr(service, "KEPT", 1)
+    asked(client, session)
+    assert (old.exists(), young.exists()) == (False, True)
+
+
+def test_a_window_or_a_channel_that_is_not_there_is_told_in_words(client: TestClient, session: int) -> None:  # noqa: F811
+    outside = client.get(f"/api/v1/sessions/{session}/signal", params={"begin_s": 500, "end_s": 600})
+    assert outside.status_code == 422
+    assert "run from" in outside.json()["hint"]
+    assert client.get(f"/api/v1/sessions/{session}/signal", params={"channel": 7}).status_code == 404
+
+
+def test_a_table_of_steps_has_no_samples_and_its_page_no_chart_of_them(send: Any, client: TestClient) -> None:  # noqa: F811
+    number = send(("steps.csv", steady(1.0)), visit=1, controller="cdbs").json()["sessions"][0]["id"]
+    answer = client.get(f"/api/v1/sessions/{number}/signal")
+    assert (answer.status_code, "have no samples" in answer.json()["detail"]) == (409, True)
+    assert "data-signal" not in client.get(f"/sessions/{number}").text
+
+
+def test_the_page_draws_without_a_script_and_a_blinded_assessor_sees_nothing(client: TestClient, session: int, client_as: Any) -> None:  # noqa: F811
+    assert f'data-signal="/sessions/{session}/signal.json"' in client.get(f"/sessions/{session}").text
+    page = client.get(f"/sessions/{session}/signal", params={"begin_s": "2", "end_s": "4"})
+    assert page.status_code == 200
+    assert re.search(r'<path d="M[^"]{500,}"', page.text), "the samples are drawn"
+    assert "data:image/png;base64," in page.text
+    assert "every sample" in page.text
+    empty = client.get(f"/sessions/{session}/signal", params={"begin_s": "900", "end_s": "950"})
+    assert (empty.status_code, "There are no samples between 900 s and 950 s" in empty.text) == (422, True)
+    chart = client.get(f"/sessions/{session}/signal.json").json()
+    assert [t["type"] for t in chart["figure"]["data"]] == ["scatter", "heatmap"]
+    blinded = client_as("blinded_assessor")
+    for place in ("/api/v1/sessions/{}/signal", "/sessions/{}/signal", "/sessions/{}/signal.json"):
+        assert blinded.get(place.format(session)).status_code == 403
+
+
+def test_a_picture_has_its_size_its_colours_and_nothing_where_nothing_is_known() -> None:
+    import base64
+    import struct
+    import zlib
+
+    values = np.array([[0.0, 1.0, np.nan], [2.0, -5.0, 9.0]])
+    content = base64.b64decode(picture(values, 0.0, 2.0).removeprefix("data:image/png;base64,"))
+    assert struct.unpack(">II", content[16:24]) == (3, 2)
+    at = content.index(b"IDAT")
+    (length,) = struct.unpack(">I", content[at - 4 : at])
+    assert list(zlib.decompress(content[at + 4 : at + 4 + length])) == [0, 1, 128, 0, 0, 255, 1, 255]
+    assert palette()[0].tolist() == [24, 16, 66]
