@@ -88,6 +88,8 @@ DECISION_NAMES: dict[str, str] = {
     "unsafe": "unsafe",
     "cannot_tell": "cannot tell",
 }
+Standing = Literal["test", "test_with_care", "same_as_cdbs", "unsafe", "not_advised", "cannot_tell"]
+STANDING_NAMES: dict[str, str] = DECISION_NAMES | {"not_advised": "not advised"}
 
 
 class GainOut(Model):

@@ -15,7 +15,7 @@ from app.evaluation.ranking.answer import Row, answer
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.picture import Picture, picture
 from app.evaluation.ranking.service import current_assessment
-from app.evaluation.schemas import DECISION_NAMES
+from app.evaluation.schemas import STANDING_NAMES
 from app.learning.deps import CurrentOwnPolicy
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies.curves import curve_charts
@@ -53,7 +53,7 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
         row=row,
         picture=_picture(db, assessment, row, participant.current_settings.lower_bound) if assessment and row else None,
         plainly=wording.plainly,
-        decision_names=DECISION_NAMES,
+        standing_names=STANDING_NAMES,
         may_write=may(caller, can.WRITE_POLICIES, participant),
     )
     return HTMLResponse(page)

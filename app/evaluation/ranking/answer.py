@@ -12,7 +12,7 @@ from app.evaluation.ranking.decisions import Decided
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.verdict import outcome_draws
 
-ORDER = ("test", "test_with_care", "cannot_tell", "unsafe", "same_as_cdbs")
+ORDER = ("test", "test_with_care", "cannot_tell", "not_advised", "unsafe", "same_as_cdbs")
 """Rows by what to do with them; within a verdict as the ranking has them."""
 
 SAME_BEHAVIOUR = 0.02
@@ -70,8 +70,8 @@ class Answer:
     ordered: bool
 
     def of(self, code: str) -> list[Row]:
-        """Rows with a verdict that are not retired."""
-        return [r for r in self.rows if r.decided.decision == code and r.one.policy.retired_reason is None]
+        """Rows that stand so and are not retired."""
+        return [r for r in self.rows if r.decided.standing == code and r.one.policy.retired_reason is None]
 
     @property
     def hazards(self) -> list[Row]:
@@ -99,7 +99,7 @@ class Answer:
 def answer(found: Assessment) -> Answer:
     """What to say of an assessment's candidates."""
     rows = _distinct(found)
-    rows.sort(key=lambda r: ORDER.index(r.decided.decision))  # stable: within a verdict as ranked
+    rows.sort(key=lambda r: ORDER.index(r.decided.standing))  # stable: within a verdict as ranked
     off = [r for r in rows if _like_off(r.one.posterior)]
     same = [r for r in rows if r.decided.decision == "same_as_cdbs" and r not in off]
     return Answer(tuple(r for r in rows if r not in off and r not in same), tuple(same), tuple(off), found.ordered)

@@ -9,7 +9,7 @@ from datetime import datetime
 from typing import Any
 
 from app.evaluation.models import Evaluation
-from app.evaluation.schemas import Decision
+from app.evaluation.schemas import Decision, Standing
 from app.study.margins.service import margins_of
 from app.study.models import MarginsVersion
 from ml.ope.compare.gain import gain_over
@@ -60,6 +60,11 @@ class Decided:
     def needs_override(self) -> bool:
         """Whether it may only be planned with a clinician's stated reason."""
         return self.decision == "unsafe" or bool(self.hazards)
+
+    @property
+    def standing(self) -> Standing:
+        """What a page shows as its verdict: what is dangerous whatever the data say is not advised, also where they cannot tell the rest."""
+        return "not_advised" if self.needs_override and self.decision != "unsafe" else self.decision
 
     @property
     def limit(self) -> float | None:

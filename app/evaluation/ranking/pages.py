@@ -19,7 +19,7 @@ from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.answer import Answer, answer
 from app.evaluation.ranking.export import csv_of
 from app.evaluation.ranking.picture import Picture, picture
-from app.evaluation.schemas import DECISION_NAMES, RANKING_KINDS, RankingFilter, RankingOut
+from app.evaluation.schemas import RANKING_KINDS, STANDING_NAMES, RankingFilter, RankingOut
 from app.learning.snapshots.service import not_ready
 from app.platform.database import Db
 from app.platform.errors import NotFound
@@ -93,7 +93,8 @@ def ranking_page(
         label=charts.label,
         method_names=names(),
         method_short={m.key: m.short for m in estimators.methods()},
-        decision_names=DECISION_NAMES,
+        standing_names=STANDING_NAMES,
+        standings={number: row.decided.standing for number, row in answered.everyone().items()} if answered else {},
         coverage=coverage,
         shown=shown,
         live=live,

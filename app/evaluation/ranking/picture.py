@@ -23,7 +23,7 @@ MAP = "map"
 MOST = 8
 """Candidates that are drawn; more would hide each other, and stand in the table."""
 
-TONES = {"test": "good", "test_with_care": "warn", "unsafe": "bad", "cannot_tell": "accent", "same_as_cdbs": "cdbs"}
+TONES = {"test": "good", "test_with_care": "warn", "unsafe": "bad", "not_advised": "bad", "cannot_tell": "accent", "same_as_cdbs": "cdbs"}
 DASHES = ("", "8 4", "2 4", "10 3 2 3")
 """Of candidates with one colour, so that colour is never the only sign."""
 SHAPES = ("circle", "diamond", "square")
@@ -121,7 +121,7 @@ def picture(found: Assessment, rows: Sequence[Row], unit: str, lower_bound: floa
 def _drawn(rows: Sequence[Row]) -> list[Drawn]:
     found, seen = [], dict.fromkeys(TONES.values(), 0)
     for row in rows:
-        tone = TONES[row.decided.decision]
+        tone = TONES[row.decided.standing]
         nth = seen[tone]
         seen[tone] += 1
         policy = row.one.policy

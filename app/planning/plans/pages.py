@@ -20,7 +20,7 @@ from app.evaluation import wording as evaluation_wording
 from app.evaluation.ranking.answer import Row, answer
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.service import current_assessment
-from app.evaluation.schemas import DECISION_NAMES
+from app.evaluation.schemas import STANDING_NAMES
 from app.evaluation.wording import method_name, sentence
 from app.learning import repository as learning
 from app.learning.models import Policy
@@ -240,7 +240,7 @@ def _page(
         site=participant.site,
         view=view,
         ranking=found,
-        decision_names=DECISION_NAMES,
+        standing_names=STANDING_NAMES,
         plainly=evaluation_wording.plainly,
         amplitude=evaluation_wording.amplitude,
         signed=evaluation_wording.signed,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
@@ -74,6 +75,8 @@ def test_without_ordering_skill_there_are_no_ranks_and_nothing_is_proposed(clien
     words = first_screen(client)
     assert "No policy is worth a visit yet. The recordings so far cannot tell policies apart." in words
     assert "Not advised: p2 : nearly off 42 % of the time" in words
+    assert re.search(r"p2 \w+ not advised nearly off 42 %", words), "the table says the same as the sentence above it"
+    assert len(re.findall(r"p[01] \w+ cannot tell", words)) == 2
     assert "#" not in words.split("Each behaviour against cDBS")[1].split("Policy")[0]
 
 
@@ -89,7 +92,7 @@ def test_the_first_screen_says_what_to_test_why_and_at_what_risk_without_a_word_
         "85 % likely within the margins." in words
     )
     assert "Worth a test with care, one of them at a visit: p2 , not below 1.5 mA" in words
-    assert "Not advised: p1 : nearly off 42 % of the time" in words
+    assert "Not advised: p1 : unsafe, nearly off 42 % of the time" in words
     assert methods_named(words) == []
 
 
