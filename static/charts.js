@@ -42,13 +42,26 @@ function colours(onPaper) {
   return { walk, done: () => probe.remove() };
 }
 
+// a large figure comes by itself, once
+const fetched = new Map();
+
+async function content(source) {
+  const { src } = source.dataset;
+  if (!src) return JSON.parse(source.textContent);
+  if (!fetched.has(src)) fetched.set(src, fetch(src).then((answer) => {
+    if (!answer.ok) throw new Error(`the service answered ${answer.status}`);
+    return answer.json();
+  }));
+  return fetched.get(src);
+}
+
 async function draw(figure, onPaper = false) {
   const plot = figure.querySelector(".plot");
   const source = figure.querySelector('script[type="application/json"]');
   try {
     const Plotly = await plotly();
     const theme = colours(onPaper);
-    const { data, layout } = theme.walk(JSON.parse(source.textContent));
+    const { data, layout } = theme.walk(await content(source));
     theme.done();
     const shown = zooms.get(figure.dataset.zoom);
     if (shown) Object.assign(layout.xaxis, { range: shown, autorange: false });

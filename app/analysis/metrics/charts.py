@@ -78,10 +78,11 @@ def box(at: int, g: Group) -> dict[str, Any]:
 
 
 def points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
-    """Every session of a group."""
+    """Every session of a group, to the four digits that its label shows: a page of many participants has thousands."""
     unit = metric.unit if metric.metric != "rating" else "of 10"
     return {
-        "type": "scatter", "mode": "markers", "x": [at + s for s in _spread(g.values)], "y": list(g.values), "cliponaxis": False,
+        "type": "scatter", "mode": "markers", "x": [round(at + s, 3) for s in _spread(g.values)],
+        "y": [float(f"{v:.4g}") for v in g.values], "cliponaxis": False,
         "marker": marker(g.controller, 7, opacity=0.8), "name": g.label,
         "customdata": list(g.session_ids), "hovertemplate": f"{g.label}, session %{{customdata}}<br>%{{y:.4g}} {unit}<extra></extra>",
     }  # fmt: skip

@@ -56,4 +56,13 @@ def _chart(found: Sequence[FiveMetrics], metric: str) -> Chart:
     sessions = sum(int(r[2] or 0) for r in rows)
     subtitle = f"{unit} \u00b7 n = {sessions} sessions"
     columns = ("Participant", "Controller", "n", "Median", "Quartile 1", "Quartile 3", "p")
-    return Chart(f"all-{metric}", wording.TITLES[metric][0], subtitle, figure(data, **layout), columns, rows, height=280)
+    return Chart(
+        f"all-{metric}",
+        wording.TITLES[metric][0],
+        subtitle,
+        figure(data, **layout),
+        columns,
+        rows,
+        height=280,
+        src=f"/analyses/figure?metric={metric}",
+    )

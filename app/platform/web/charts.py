@@ -37,6 +37,7 @@ class Chart:
         height: of the plot, CSS pixels.
         digits: significant digits of the table's numbers.
         zoom: charts of a page that share this name show the same stretch of their horizontal axis; empty for none.
+        src: address of the figure, for a large one that does not travel with its page; empty where it does.
     """
 
     id: str
@@ -48,6 +49,7 @@ class Chart:
     height: int = 320
     digits: int = field(default=4)
     zoom: str = ""
+    src: str = ""
 
 
 def colour(controller: str, alpha: float | None = None) -> str:

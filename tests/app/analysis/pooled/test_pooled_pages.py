@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Callable
 from typing import Any
 from xml.etree import ElementTree
@@ -59,6 +60,17 @@ def test_the_page_is_reached_from_the_navigation_and_leads_to_each_participant(c
     assert "Trial time" in page
 
 
+def test_the_charts_of_many_sessions_come_by_themselves_and_not_with_the_page(client: TestClient, four: dict[str, float]) -> None:
+    page = client.get("/analyses").text
+    sources = re.findall(r'<script type="application/json" data-src="([^"]+)"></script>', page)
+    assert len(sources) == 4, "energy, beta, grasp and rating were measured"
+    assert '"customdata"' not in page
+    for source in sources:
+        data = client.get(source).json()["data"]
+        assert sum(len(t["y"]) for t in data if t["type"] == "scatter") == 4 * 12
+    assert client.get("/analyses/figure?metric=height").status_code == 404
+
+
 def test_the_figure_is_an_svg_with_every_session(client: TestClient, four: dict[str, float]) -> None:
     for path in ("/analyses/results.svg", "/api/v1/analyses?format=svg", "/participants/P1/analyses/paper.svg"):
         answer = client.get(path)
@@ -111,7 +123,7 @@ def test_computation_time_counts_ended_steps(client: TestClient, db: Session, en
 
 
 def test_without_anything_the_pages_say_so(client: TestClient) -> None:
-    for path in ("/analyses", "/api/v1/analyses", "/analyses/results.csv", "/analyses/results.svg", "/trial-time"):
+    for path in ("/analyses", "/api/v1/analyses", "/analyses/results.csv", "/analyses/results.svg", "/trial-time", "/analyses/figure"):
         assert client.get(path).status_code == 200, path
 
 
