@@ -63,7 +63,7 @@ class Decided:
 
     @property
     def standing(self) -> Standing:
-        """What a page shows as its verdict: what is dangerous whatever the data say is not advised, also where they cannot tell the rest."""
+        """The verdict as a page shows it: what is dangerous is not advised, also where the data cannot tell the rest."""
         return "not_advised" if self.needs_override and self.decision != "unsafe" else self.decision
 
     @property
