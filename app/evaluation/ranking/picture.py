@@ -11,7 +11,7 @@ from markupsafe import Markup
 from app.evaluation.estimates.coverage import STORED
 from app.evaluation.ranking.answer import QUANTITIES, Row
 from app.evaluation.ranking.assessment import Assessed, Assessment
-from app.platform.web.charts import Cell
+from app.platform.web.charts import Cell, written
 from app.platform.web.svg import Plane, apart, drawing
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.verdict import outcome_draws
@@ -139,7 +139,7 @@ def _behaviour(known: BehaviourMap, shown: Sequence[Drawn], scale: Scale, unit: 
                 dark = 0.10 + 0.45 * float(np.log1p(n) / np.log1p(most))
                 low, high = row / DOSES * scale.factor, (row + 1) / DOSES * scale.factor
                 plane.cell(known.edges[k], known.edges[k + 1], low, high, "muted", dark)
-    plane.axes(f"Beta, mean of the policy's window ({unit})", f"Amplitude ({scale.unit})")
+    plane.axes(f"Beta, mean of the policy's window ({written(unit)})", f"Amplitude ({scale.unit})")
     plane.level(scale.factor, f"cDBS {scale.words(1.0)}", "cdbs")
     plane.level(lower_bound * scale.factor, f"lowest of random sessions {scale.words(lower_bound)}", "muted", "2 3")
     centres = [(a + b) / 2 for a, b in zip(known.edges[:-1], known.edges[1:], strict=True)]

@@ -103,6 +103,17 @@ def test_only_what_may_be_planned_without_a_clinicians_reason_can_be_ticked(clie
     assert {i: f'name="policy_ids" value="{i}"' in page for i in policies} == {a: True, b: False, c: True}
 
 
+def test_the_keyboard_reaches_the_first_tick_in_fifteen_tabs(client: TestClient, policies: list[int], judge: Judge) -> None:
+    judge({policy: judged(50.0) for policy in policies})
+    page = client.get(PAGE).text
+    before, after = page.split('id="candidates"')
+    skips = before[: before.index('href="#candidates"')]
+    way = after[: after.index('name="policy_ids"')]
+    focusable = r"<(?:a|button|input(?! type=.hidden)|select|summary|textarea)\b"
+    # a script makes a button of each head of a column; the way is: the links that skip, then from the table to its first tick
+    assert len(re.findall(focusable, skips)) + len(re.findall(focusable, way)) + len(re.findall("<th\\b", way)) <= 15
+
+
 def test_behaviours_that_are_cdbs_or_no_stimulation_by_another_name_are_folded(
     client: TestClient, policies: list[int], judge: Judge
 ) -> None:
