@@ -24,6 +24,8 @@ class BufferSnapshot(Base):
     id: Mapped[int] = mapped_column(primary_key=True)
     participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
     settings_version_id: Mapped[int] = mapped_column(ForeignKey("settings_version.id"))
+    characteristics_id: Mapped[int | None] = mapped_column(ForeignKey("characteristics_version.id"))
+    """The participant's characteristics of the time; None where nobody had stated any."""
     pins_sha256: Mapped[str] = mapped_column(String(64))
     file_sha256: Mapped[str] = mapped_column(ForeignKey("stored_file.sha256"))
     sessions: Mapped[int]
@@ -50,6 +52,7 @@ class SnapshotSession(Base):
     qoc_id: Mapped[int | None] = mapped_column(ForeignKey("qoc.id"))
     conditions_id: Mapped[int | None] = mapped_column(ForeignKey("session_conditions.id"))
     cdbs_amplitude_ma: Mapped[float | None]
+    hours_since_dose: Mapped[float | None]
     steps: Mapped[int | None]
     left_out_reason: Mapped[str | None] = mapped_column(Text)
 

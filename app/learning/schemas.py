@@ -105,6 +105,7 @@ class SnapshotSessionOut(Model):
     qoc_id: int | None
     conditions_id: int | None = Field(description="Revision of the session's conditions; null in snapshots of before there were any.")
     cdbs_amplitude_ma: float | None
+    hours_since_dose: float | None = Field(description="From the last dose to the start; null where not known, and in earlier snapshots.")
     steps: int | None
     left_out_reason: str | None
 
@@ -115,6 +116,7 @@ class SnapshotOut(Model):
     id: int
     participant: str
     settings_version: int
+    characteristics_version: int | None = Field(description="Of the participant, when it was taken; null where nothing was stated.")
     pins_sha256: str
     file_sha256: str
     sessions: int

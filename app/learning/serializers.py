@@ -55,6 +55,7 @@ def snapshot_out(db: Session, s: BufferSnapshot, participant: Participant) -> Sn
         id=s.id,
         participant=participant.code,
         settings_version=study_repository.settings_version(db, s.settings_version_id).version,
+        characteristics_version=next((c.version for c in participant.characteristics if c.id == s.characteristics_id), None),
         pins_sha256=s.pins_sha256,
         file_sha256=s.file_sha256,
         sessions=s.sessions,

@@ -158,6 +158,11 @@ def _version(of: str) -> Callable[[Row, Row, Names], str]:
     return said
 
 
+def _dose(before: Row, after: Row, names: Names) -> str:
+    row = after or before
+    return f"{'took back' if not after else 'wrote down'} a dose of {str(row['drug']).replace('_', ' ')} at {names.visit(row['visit_id'])}"
+
+
 def _of_session(first: str, later: str) -> Callable[[Row, Row, Names], str]:
     def said(before: Row, after: Row, names: Names) -> str:
         row = after or before
@@ -197,6 +202,8 @@ _SAID: dict[str, Callable[[Row, Row, Names], str]] = {
     "participant": _participant,
     "settings_version": _version("settings"),
     "margins_version": _version("margins"),
+    "characteristics_version": _version("characteristics"),
+    "dose": _dose,
     "visit": _visit,
     "session": _session,
     "qoc": _of_session("entered the QoCs of", "corrected the QoCs of"),

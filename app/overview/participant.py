@@ -18,7 +18,9 @@ from app.platform.database import Db
 from app.platform.web.templates import render
 from app.study import repository as study
 from app.study.blinding import visible_arm
+from app.study.characteristics.service import fields_of
 from app.study.deps import CurrentParticipant
+from app.study.wording import characteristics_words
 
 router = APIRouter()
 
@@ -37,6 +39,7 @@ def participant_page(request: Request, participant: CurrentParticipant, db: Db, 
         state=state.states(db, [participant], datetime.now(UTC).date())[participant.id],
         phases=state.PHASES,
         what=wording.what,
+        characteristics=characteristics_words(fields_of(participant.current_characteristics)),
         actors=wording.ACTORS,
         progress=wording.progress,
         days=[(v, [(s, visible_arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in visits],

@@ -15,6 +15,8 @@ TABLE_MODULES = (
     "app.platform.jobs.models",
     "app.accounts.models",
     "app.study.models",
+    "app.study.characteristics.models",
+    "app.study.doses.models",
     "app.study.adverse_events.models",
     "app.study.data_queries.models",
     "app.study.outcomes.models",

@@ -11,7 +11,9 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.accounts.models import Site
 from app.platform.database import Base
-from app.study.sessions.models import SessionConditions
+from app.study.characteristics.models import CharacteristicsVersion
+from app.study.doses.models import Dose
+from app.study.sessions.models import Activity, SessionConditions
 
 
 class Controller(StrEnum):
@@ -55,6 +57,12 @@ class Participant(Base):
     margins: Mapped[list[MarginsVersion]] = relationship(back_populates="participant", order_by="MarginsVersion.version")
     margins_locks: Mapped[list[MarginsLock]] = relationship(back_populates="participant", order_by="MarginsLock.id")
     visits: Mapped[list[Visit]] = relationship(back_populates="participant", order_by="Visit.number")
+    characteristics: Mapped[list[CharacteristicsVersion]] = relationship(order_by=CharacteristicsVersion.version)
+
+    @property
+    def current_characteristics(self) -> CharacteristicsVersion | None:
+        """The newest characteristics; None where nobody stated any."""
+        return self.characteristics[-1] if self.characteristics else None
 
     @property
     def current_margins(self) -> MarginsVersion:
@@ -220,6 +228,7 @@ class Visit(Base):
     participant: Mapped[Participant] = relationship(back_populates="visits")
     sessions: Mapped[list[StudySession]] = relationship(back_populates="visit", order_by="StudySession.ordinal")
     cdbs_amplitudes: Mapped[list[CdbsAmplitude]] = relationship(lazy="selectin")
+    doses: Mapped[list[Dose]] = relationship(lazy="selectin", order_by=(Dose.taken_at, Dose.id))
     locks: Mapped[list[VisitLock]] = relationship(back_populates="visit", order_by="VisitLock.id", lazy="selectin")
 
     @property
@@ -261,6 +270,7 @@ class StudySession(Base):
         CheckConstraint("excluded_reason is null or excluded_reason <> ''", name="excluded_reason"),
         CheckConstraint("stopped_reason is null or stopped_reason <> ''", name="stopped_reason"),
         CheckConstraint("medication_h >= 0 and medication_h <= 72", name="medication"),
+        CheckConstraint("activity in ('rest', 'light', 'exercise', 'meal', 'sleep')", name="activity"),
         CheckConstraint(TIME_CHECK, name="started_at"),
     )
 
@@ -283,7 +293,8 @@ class StudySession(Base):
     stopped_reason: Mapped[str | None] = mapped_column(Text)
     """Why it was stopped for the patient's sake: a failure of its controller, never a missing value. None where it was not."""
     medication_h: Mapped[float | None]
-    """Hours from the last dose of medication to the session's start; None where nobody stated it."""
+    """Hours from the last dose to the start, as a person stated them; what counts says `app.study.doses.since`."""
+    activity: Mapped[Activity | None] = mapped_column(String(10))
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     visit: Mapped[Visit] = relationship(back_populates="sessions")
     segments: Mapped[list[SessionSegment]] = relationship(

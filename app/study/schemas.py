@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
+from app.study.sessions.models import Activity
 
 
 def _one_spelling(unit: str) -> str:
@@ -256,7 +257,9 @@ class SessionOut(Model):
     control_program: int | None = Field(description="Program whose amplitude the controller set; null: the control recording's first.")
     excluded_reason: str | None
     stopped_reason: str | None = Field(description="Why it was stopped for the patient's sake; null: it was not.")
-    medication_h: float | None = Field(description="Hours from the last dose to the start.")
+    medication_h: float | None = Field(description="Hours from the last dose to the start, where a person stated them.")
+    hours_since_dose: float | None = Field(description="What counts: as stated, else by the doses of the visit; null: neither is known.")
+    activity: Activity | None = Field(description="Before the session; null: not stated.")
     recordings: list[int]
     qoc: QocOut | None
 
@@ -272,7 +275,8 @@ class SessionChange(Model):
     control_program: Int | None = Field(None, ge=0, le=15, description="Program whose amplitude the controller set.")
     excluded_reason: Text | None = Field(None, max_length=1000, description="Keeps it out of buffers and analyses; null takes that back.")
     stopped_reason: Text | None = Field(None, max_length=1000, description="Why it was stopped for the patient's sake; null: it was not.")
-    medication_h: Number | None = Field(None, ge=0, le=72, description="Hours from the last dose to the start; null: not known.")
+    medication_h: Number | None = Field(None, ge=0, le=72, description="Hours from the last dose to the start; null: by the visit's doses.")
+    activity: Activity | None = Field(None, description="What the participant did in the half hour before; null: not stated.")
     reason: Text | None = Field(None, max_length=1000)
 
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from app.accounts.permissions import Caller
 from app.study import blinding
+from app.study.doses.since import hours_since_dose
 from app.study.models import Participant, StudySession, Visit
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
@@ -67,6 +68,8 @@ def session_out(s: StudySession, caller: Caller) -> SessionOut:
         excluded_reason=s.excluded_reason,
         stopped_reason=s.stopped_reason,
         medication_h=s.medication_h,
+        hours_since_dose=hours_since_dose(s),
+        activity=s.activity,
         recordings=sorted({g.recording_id for g in s.segments}),
         qoc=QocOut.model_validate(s.qoc) if s.qoc else None,
     )

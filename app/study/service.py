@@ -187,7 +187,13 @@ def require(caller: Caller, permission: str, participant: Participant) -> None:
     Raises Conflict where it would be new work for a participant who has withdrawn.
     """
     caller.require(permission, participant.site.study_id, participant.site_id)
-    if participant.status == WITHDRAWN and permission in NOT_AFTER_WITHDRAWAL:
+    if permission in NOT_AFTER_WITHDRAWAL:
+        refuse_withdrawn(participant)
+
+
+def refuse_withdrawn(participant: Participant) -> None:
+    """Raises Conflict for new work for a participant who has withdrawn."""
+    if participant.status == WITHDRAWN:
         raise Conflict(
             f"Participant {participant.code} has withdrawn from the study: nothing new is recorded, computed or planned.",
             "What is there can be read and exported. A mistake is taken back on the participant's page.",

@@ -6,11 +6,14 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from app.study.adverse_events.models import EventKind, Severity
+from app.study.characteristics.schemas import CharacteristicsFields, Symptom, Target
 from app.study.data_queries.models import QueriedField
+from app.study.doses.drugs import DRUGS
 from app.study.enrolment.codes import CodeQuestion
 from app.study.models import Controller
 from app.study.sessions.contradictions import Contradiction, Kind
 from app.study.sessions.designs import Drawn
+from app.study.sessions.models import Activity
 
 EVENT_KINDS = {
     EventKind.DYSKINESIA: "Dyskinesia",
@@ -28,6 +31,25 @@ EVENT_KINDS = {
     EventKind.OTHER: "Other",
 }
 EVENT_SEVERITIES = {Severity.NONE: "none", Severity.MILD: "mild", Severity.SEVERE: "severe"}
+
+DRUG_NAMES = {drug.value: facts.name for drug, facts in DRUGS.items()}
+SYMPTOMS = {
+    Symptom.TREMOR: "Tremor",
+    Symptom.BRADYKINESIA: "Bradykinesia",
+    Symptom.RIGIDITY: "Rigidity",
+    Symptom.GAIT: "Gait",
+    Symptom.DYSKINESIA: "Dyskinesia",
+    Symptom.DYSTONIA: "Dystonia",
+    Symptom.SPEECH: "Speech",
+}
+TARGETS = {Target.STN: "STN", Target.GPI: "GPi", Target.GPE: "GPe", Target.VIM: "Vim", Target.OTHER: "other"}
+ACTIVITIES = {
+    Activity.REST: "sat or lay",
+    Activity.LIGHT: "walked, talked",
+    Activity.EXERCISE: "exercised",
+    Activity.MEAL: "ate",
+    Activity.SLEEP: "slept",
+}
 
 CODE_QUESTIONS = {
     CodeQuestion.NAME: "it holds a word that may be a name",
@@ -51,6 +73,20 @@ QUERIED_FIELDS = {
 }
 
 _SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be without DBS"}
+
+
+def characteristics_words(known: CharacteristicsFields) -> dict[str, str]:
+    """Characteristics in words, by label; empty where nothing is stated."""
+    leads = "; ".join(
+        f"{lead.hemisphere} {TARGETS[lead.target]}"
+        + (f", {lead.model}" if lead.model else "")
+        + (f", sensing {lead.sensing}" if lead.sensing else "")
+        + (f", stimulating {lead.stimulating}" if lead.stimulating else "")
+        for lead in known.leads
+    )
+    medication = "; ".join(f"{d.at} {DRUGS[d.drug].name} {d.mg:g} mg" for d in known.medication)
+    symptoms = ", ".join(SYMPTOMS[s].lower() for s in known.symptoms)
+    return {"Leads": leads, "Symptoms": symptoms, "Hand of the grasp test": str(known.hand or ""), "Medication of a visit day": medication}
 
 
 def code_questions(code: str, found: Iterable[CodeQuestion]) -> str:
@@ -92,7 +128,7 @@ def _start(f: Mapping[str, Any]) -> str:
 def _side(f: Mapping[str, Any]) -> str:
     return (
         f"Said to be controlled on the {f['stated']} side, but its control trace is of recording {f['recording']}, which is of "
-        f"the {f['recorded']} side. Correct the hemisphere, which also chooses the hand of the grasp test."
+        f"the {f['recorded']} side. Correct the hemisphere, which the hand of the grasp test follows where the participant's is not stated."
     )
 
 
@@ -174,6 +210,10 @@ _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
         "learning sees that one alone, energy all of them. Correct the program if the controller set another one."
     ),
     Kind.LOGGED_CDBS: _logged_cdbs,
+    Kind.LAST_DOSE: lambda f: (
+        f"The last dose is said to have been {f['stated']:.3g} h before the start, which counts; by the visit's doses it was "
+        f"{f['by_doses']:.3g} h. Correct one of them."
+    ),
     Kind.NO_POLICY: lambda f: (
         "No policy is named for this session: it cannot be compared with its estimate. Name one on the session's page."
     ),

@@ -67,6 +67,8 @@ READABLE = (
     "/api/v1/participants/{code}/margins/locks",
     "/api/v1/participants/{code}/adverse-events",
     "/api/v1/participants/{code}/data-queries",
+    "/api/v1/participants/{code}/characteristics",
+    "/api/v1/visits/{visit_id}/doses",
     "/api/v1/participants/{code}/device-history",
     "/api/v1/participants/{code}/replay",
     "/api/v1/visits/{visit_id}/locks",
@@ -85,6 +87,9 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("post", "/api/v1/visits/{visit_id}/lock"): {"clinician", "admin"},
     ("post", "/api/v1/visits/{visit_id}/unlock"): {"clinician", "admin"},
     ("post", "/api/v1/participants/{code}/margins/locks"): {"clinician", "admin"},
+    ("put", "/api/v1/participants/{code}/characteristics"): RECORDERS,
+    ("post", "/api/v1/visits/{visit_id}/doses"): RECORDERS,
+    ("post", "/api/v1/doses/{dose_id}/removal"): RECORDERS,
     ("post", "/api/v1/participants/{code}/adverse-events"): RECORDERS,
     ("put", "/api/v1/adverse-events/{event_id}"): RECORDERS,
     ("post", "/api/v1/adverse-events/{event_id}/clearance"): {"clinician", "admin"},
@@ -155,6 +160,7 @@ TABLE = b"t_s,beta,amplitude_fraction\n" + b"".join(b"%d,1,1\n" % (2 * k) for k 
 SAMPLES = b"t_s,lfp [uV],amplitude_ma\n" + b"".join(b"%.3f,%d,1\n" % (k / 250, k * k % 17) for k in range(-5000, 5001))
 GRASPS = b"t_s\n" + b"".join(b"%.2f\n" % (0.4 * k) for k in range(11))
 SPEECH = {"kind": "speech", "severity": "severe", "serious": True}
+DOSE = {"drug": "levodopa", "mg": 100, "taken_at": "2026-03-02T07:00:00Z"}
 RATED = {
     "uuid": "0b6e2a8c-6f43-4c58-9d3a-2f1a7f4f0c11", "kind": "rating", "payload": {"value": 7}, "device_time": "2026-11-22T10:00:00Z",
 }  # fmt: skip
@@ -237,6 +243,14 @@ class World:
             ("post", "/participants/{code}/margins/locks"): {"json": {"version": 2, "reason": "protocol"}},
             ("put", "/participants/{code}/margins"): {"json": {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}},
             ("get", "/participants/{code}/replay"): {"params": self.replayed(small)},
+            ("put", "/participants/{code}/characteristics"): {
+                "json": {"version": 0, "characteristics": {"hand": "left"}, "reason": "asked"}
+            },
+            ("post", "/visits/{visit_id}/doses"): {"visit_id": empty, "json": DOSE},
+            ("post", "/doses/{dose_id}/removal"): {
+                "dose_id": self.send(f"/visits/{moved}/doses", json=DOSE)["id"],
+                "json": {"reason": "not taken"},
+            },
             ("post", "/participants/{code}/adverse-events"): {"json": SPEECH},
             ("post", "/participants/{code}/data-queries"): {"json": self.question()},
             ("post", "/data-queries/{query_id}/entries"): {
@@ -351,7 +365,9 @@ class World:
     def call(self, client: TestClient, method: str, path: str) -> int:
         """Status of a call that is right in everything but, perhaps, who makes it."""
         form = dict(self.forms.get((method, path.removeprefix("/api/v1")), {}))
-        ids = self.ids | {name: form.pop(name) for name in list(form) if name in self.ids or name in ("file_id", "event_id", "query_id")}
+        ids = self.ids | {
+            name: form.pop(name) for name in list(form) if name in self.ids or name in ("file_id", "event_id", "query_id", "dose_id")
+        }
         if method == "get":
             form.pop("json", None)
         with client.stream(method, path.format(**ids), **form) as answer:

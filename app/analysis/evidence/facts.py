@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from app.platform.errors import Invalid
 from app.study.blinding import Arm
+from app.study.doses.since import hours_since_dose
 from app.study.models import Controller, StudySession
 from app.study.sessions.data import qoc_of
 from app.study.sessions.stimulation import delivered_by
@@ -80,7 +81,7 @@ class Facts:
 
     Attributes:
         values: by metric, absent where not measured. missing: why, by metric. steps: usable share of beta and amplitude is judged on them.
-        stopped: it was stopped for the patient's sake, for the reason given. medication_h: hours since the last dose, where stated.
+        stopped: it was stopped for the patient's sake, for the reason given. medication_h: hours since the last dose, where known.
         created_at: when the record of the session came into being.
     """
 
@@ -151,7 +152,7 @@ def read(session: StudySession, arm: Arm, traces: TracesOf) -> Facts:
         mean_fraction=fraction.mean,
         sides=_sides(session, table, fraction, traces),
         stopped=session.stopped_reason,
-        medication_h=session.medication_h,
+        medication_h=hours_since_dose(session),
     )
 
 

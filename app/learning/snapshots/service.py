@@ -27,6 +27,8 @@ from app.platform.errors import Invalid
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
+from app.study.characteristics.models import CharacteristicsVersion
+from app.study.doses.since import hours_since_dose
 from app.study.models import Hemisphere, Participant, SettingsVersion, StudySession
 from app.study.sessions.data import session_data
 from app.study.sessions.programming import Program, differences, stored
@@ -67,6 +69,9 @@ class Member:
             table.cdbs_ma if table else None,
             self.left_out,
             _digest(s) if s else None,
+            *(
+                [hours] if (hours := hours_since_dose(self.session)) is not None else []
+            ),  # buffers of before there were doses keep their pins
         ]
 
     @property
@@ -95,6 +100,11 @@ class Collection:
     beta_unit: str
     beta_source: str
 
+    @property
+    def characteristics(self) -> CharacteristicsVersion | None:
+        """Of the participant, as they are now."""
+        return self.settings_version.participant.current_characteristics
+
     @cached_property
     def buffer(self) -> ReplayBuffer:
         """The sessions that entered."""
@@ -104,12 +114,14 @@ class Collection:
     @cached_property
     def pins_sha256(self) -> str:
         """Name of everything pinned: equal exactly when nothing that a result depends on has changed."""
-        pins = {
+        pins: dict[str, Any] = {
             "version": PINS_VERSION,
             "settings_version_id": self.settings_version.id,
             "beta": [self.beta_unit, self.beta_source],
             "sessions": [m.pins() for m in self.members],
         }
+        if self.characteristics is not None:
+            pins["characteristics_id"] = self.characteristics.id
         return hashlib.sha256(json.dumps(pins, sort_keys=True).encode()).hexdigest()
 
 
@@ -170,6 +182,7 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
         db,
         participant_id=participant.id,
         settings_version_id=found.settings_version.id,
+        characteristics_id=found.characteristics.id if found.characteristics else None,
         pins_sha256=found.pins_sha256,
         file_sha256=stored.sha256,
         sessions=len(found.buffer.sessions),
@@ -280,6 +293,7 @@ def _row(snapshot_id: int, m: Member) -> SnapshotSession:
         qoc_id=m.session.qoc.id if m.session.qoc else None,
         conditions_id=m.session.conditions.id if m.session.conditions else None,
         cdbs_amplitude_ma=table.cdbs_ma if table else None,
+        hours_since_dose=hours_since_dose(m.session),
         steps=m.steps,
         left_out_reason=m.left_out,
     )

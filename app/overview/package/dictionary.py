@@ -42,6 +42,7 @@ TITLES = {
     "policies": "every policy of the participant",
     "estimates": "every estimate of a return, with its interval",
     "coverage": "what the data could say about each policy, checked before it was estimated",
+    "doses": "medication taken at each visit; times since a dose count those of drugs whose effect comes and goes within hours",
     "margins": "versions of the non-inferiority margins, and when they were locked",
     "primary": "controllers and policies against the same visit's cDBS; recompute.py checks those of controllers",
     "noninferiority": "outcomes of the verdicts; recompute.py checks them",
@@ -71,7 +72,8 @@ FIELDS: dict[str, tuple[Field, ...]] = {
         steps_above_cdbs integer Steps above the cDBS amplitude.
         excluded_reason string Why somebody excluded it; such a session counts in no analysis.
         stopped_reason string Why it was stopped for the patient's sake; a failure of its controller.
-        medication_h number Hours from the last dose to its start.
+        hours_since_dose number Hours from the last dose to its start, as stated, else by doses.csv.
+        activity string What the participant did in the half hour before: rest, light, exercise, meal or sleep.
         grasp_hz number Grasp frequency, Hz, newest revision.
         rating_1_10 integer The participant's rating, 1 worst to 10 best, newest revision.
         tremor_percent number Share of the session with mild or worse tremor, %, newest revision.
@@ -126,6 +128,13 @@ FIELDS: dict[str, tuple[Field, ...]] = {
         limit number What it was held against.
         limit_is string least or greatest.
         verdict string Outcome of the check.
+    """),
+    "doses": _fields("""
+        visit integer Number of the visit.
+        drug string What was taken.
+        mg number Of the active drug, mg; of levodopa combinations the levodopa.
+        levodopa_equivalent_mg number What it counts as, mg of levodopa; empty where no equivalent is stated.
+        taken_day number When it was taken, days since enrolment.
     """),
     "margins": _fields("""
         version integer Version of the margins.

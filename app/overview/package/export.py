@@ -27,6 +27,9 @@ from app.platform.audit import record
 from app.platform.errors import BetaloopError
 from app.study import blinding, service
 from app.study import repository as study
+from app.study.characteristics.schemas import CharacteristicsOut
+from app.study.doses.drugs import Drug, levodopa_equivalent_mg
+from app.study.doses.since import hours_since_dose
 from app.study.models import Participant
 from app.study.schemas import SettingsOut
 from app.study.sessions.data import session_data
@@ -52,6 +55,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
         "estimates": _estimate_rows(db, participant),
         "coverage": _coverage_rows(db, participant),
         "margins": _margin_rows(participant, day),
+        "doses": _dose_rows(participant, day),
         "primary": [row[1:] for row in csv_rows(found)],
         "noninferiority": _noninferiority_rows(found),
     }
@@ -59,7 +63,12 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
     contents = {
         f"{name}.csv": csv_of([f.name for f in FIELDS[name]], ([_cell(c) for c in row] for row in rows)) for name, rows in tables.items()
     }
+    stated = [
+        CharacteristicsOut.model_validate(c).model_dump(mode="json", exclude={"created_at", "created_by"})
+        for c in participant.characteristics
+    ]
     contents |= {
+        "characteristics.json": json.dumps(stated, indent=2),
         "datapackage.json": json.dumps(descriptor(participant.code, contents), indent=2, ensure_ascii=False),
         "settings.json": json.dumps(settings, indent=2),
         "recompute.py": Path(recompute.__file__).read_text("utf-8"),
@@ -89,7 +98,8 @@ def _sessions(
             (session.id, session.visit.number, session.ordinal, arm.controller.value, arm.policy_id, session.hemisphere,
              day.of(session.started_at), day.of(session.created_at), session.duration_s, beta and beta.unit, beta and beta.source,
              session.id in compared, table and table.cdbs_ma, table and table.above_one, session.excluded_reason, session.stopped_reason,
-             session.medication_h, qoc and qoc.grasp_hz, qoc and qoc.rating, qoc and qoc.tremor_percent, qoc and qoc.revision, problem)
+             hours_since_dose(session), session.activity,
+             qoc and qoc.grasp_hz, qoc and qoc.rating, qoc and qoc.tremor_percent, qoc and qoc.revision, problem)
         )  # fmt: skip
         if table is not None:
             rows = zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, strict=True)
@@ -102,6 +112,14 @@ def _margin_rows(participant: Participant, day: Days) -> list[tuple[Any, ...]]:
     return [
         (m.version, m.grasp_share, m.rating_points, m.tremor_points, day.of(m.created_at), day.of(locked.get(m.id)))
         for m in participant.margins
+    ]
+
+
+def _dose_rows(participant: Participant, day: Days) -> list[tuple[Any, ...]]:
+    return [
+        (v.number, d.drug, d.mg, levodopa_equivalent_mg(Drug(d.drug), d.mg), day.of(d.taken_at))
+        for v in participant.visits
+        for d in v.doses
     ]
 
 
@@ -149,6 +167,7 @@ def _readme(participant: Participant) -> str:
         "datapackage.json      the dictionary: every column of every table with its type, unit and meaning\n"
         f"{listed}\n"
         "settings.json         every settings version\n"
+        "characteristics.json  leads, symptoms, hand and medication schedule, every version\n"
         "recompute.py          recomputes the primary tables from sessions and steps with numpy and scipy, and compares\n\n"
         "Days are counted from the enrolment in the software; what happened before has a day below 0.\n"
     )

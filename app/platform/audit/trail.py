@@ -53,6 +53,8 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "visit_lock": (),
     "session": (),
     "session_conditions": (),
+    "characteristics_version": (),
+    "dose": (),
     "adverse_event": (),
     "adverse_event_revision": (),
     "data_query": (),

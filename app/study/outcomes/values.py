@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from app.study import repository
+from app.study.characteristics.models import CharacteristicsVersion
 from app.study.models import Hemisphere, StudySession
 from app.study.outcomes import tremor
 from app.study.outcomes.models import GraspTest
@@ -150,20 +151,37 @@ def _tremor_value(reading: TremorReading) -> tuple[float | None, str]:
 def grasp_outcome(db: Session, session: StudySession) -> GraspOutcome | None:
     """Grasp frequency from a session's tests (eq:grasp_speed); None where there is no test.
 
-    Of several tests of one hand the newest counts. Where both hands were tested, the one contralateral to the session's hemisphere counts
-    (the paper takes the hand that goes with the participant's symptom, which is that one for all four), else their mean.
+    Of several tests of one hand the newest counts. The hand is the participant's, as their characteristics state it: the one that goes
+    with the symptoms, as in the paper. A test of the other hand alone gives no value until a person enters it. Only where nobody has
+    stated the hand, the one contralateral to the session's hemisphere is taken, else the mean of both.
     """
     rows = repository.grasp_tests(db, session.id)
     if not rows:
         return None
     newest = {row.hand: row for row in rows}
     views = [_view(row) for row in reversed(rows)]
-    counted, how = _which_hands({v.row.hand: v for v in views if newest[v.row.hand] is v.row}, session.hemisphere)
+    current = session.visit.participant.current_characteristics
+    by_hand = {v.row.hand: v for v in views if newest[v.row.hand] is v.row}
+    counted, how = _of_own_hand(by_hand, current) if current and current.hand else _which_hands(by_hand, session.hemisphere)
     value, basis = _grasp_value(counted, how)
     used = {v.row.id for v in counted}
     tests = [_with_role(v, newest, used) for v in views]
     files = tuple(sorted({v.row.upload_file_id for v in counted}))
     return GraspOutcome(tests, Derived("grasp_hz", value, basis, files))
+
+
+def _of_own_hand(views: Mapping[Hemisphere | None, GraspView], known: CharacteristicsVersion) -> tuple[list[GraspView], str]:
+    """The test of the participant's hand, or one whose file names no hand; none where the other hand alone was tested, and why."""
+    hand = Hemisphere(known.hand)  # type: ignore[arg-type]
+    if hand in views:
+        return [views[hand]], f"{hand} hand, the participant's by the characteristics (version {known.version})"
+    if None in views:
+        return [views[None]], f"hand not stated in the file; taken for the participant's, the {hand} one"
+    tested = " and ".join(v.whose for v in views.values())
+    return [], (
+        f"{tested} tested, but the participant's hand is the {hand} one by the characteristics (version {known.version}): correct the one "
+        "that is wrong, or enter the frequency by hand if it shall count"
+    )
 
 
 def _which_hands(views: Mapping[Hemisphere | None, GraspView], hemisphere: Hemisphere | None) -> tuple[list[GraspView], str]:
@@ -175,13 +193,15 @@ def _which_hands(views: Mapping[Hemisphere | None, GraspView], hemisphere: Hemis
         return [view], view.whose
     other = _SIDES.get(Hemisphere(hemisphere)) if hemisphere else None
     if other is not None and other in views:
-        return [views[other]], f"{other} hand, contralateral to the {hemisphere} hemisphere"
+        return [views[other]], f"{other} hand, contralateral to the {hemisphere} hemisphere; the participant's hand is not stated"
     why = "the session names no hemisphere" if hemisphere is None else f"no test of the {other} hand"
     both = sorted(views.values(), key=lambda v: v.row.hand or "")
     return both, f"mean of {' and '.join(v.whose for v in both)}: {why}"
 
 
 def _grasp_value(counted: list[GraspView], how: str) -> tuple[float | None, str]:
+    if not counted:
+        return None, how
     undefined = [v for v in counted if v.hz is None]
     if undefined:
         return None, f"{how}; fewer than two open fists ({', '.join(v.whose for v in undefined)})"

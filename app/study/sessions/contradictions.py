@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.platform.errors import Invalid
 from app.study import blinding
+from app.study.doses.since import disagreement_h
 from app.study.models import Controller, Recording, StudySession
 from app.study.sessions import logged, repeated
 from app.study.sessions.stimulation import SILENT_MA, Delivered, contradicts, delivered
@@ -49,6 +50,8 @@ class Kind(StrEnum):
     NO_SLOT = "no_slot"
     """`plan`, `position`, `visit`, `visit_date`: of a session of a plan that this participant does not have, or not any more."""
     BENCH = "bench"
+    LAST_DOSE = "last_dose"
+    """`stated`, `by_doses`: hours from the last dose to the start."""
     REPEATED = "repeated"
     """`session`, `recording`: of the other one; `seconds`: that both hold; `counts`: whether the other one counts; `own`: recording."""
 
@@ -68,7 +71,8 @@ def contradictions(db: Session, session: StudySession, visit_open: bool = False,
         visit_open: nobody has said the visit yet, so that its date contradicts nothing.
         steps_shown: the reader sees elsewhere why steps cannot be read, and which lie above the cDBS amplitude.
     """
-    found = [*_of_minutes(db, session), *_of_day(session, visit_open), *_of_start(session), *_of_side(session), *_of_slot(db, session)]
+    found = [*_of_minutes(db, session), *_of_day(session, visit_open), *_of_start(session), *_of_side(session)]
+    found += [*_of_slot(db, session), *_of_dose(session)]
     try:
         table = step_table(db, session, session.visit.participant.current_settings)
         sides = delivered(db, session)
@@ -142,6 +146,12 @@ def _of_side(session: StudySession) -> Iterator[Contradiction]:
     if session.hemisphere and recording.hemisphere and session.hemisphere != recording.hemisphere:
         facts = {"stated": session.hemisphere, "recording": recording.id, "recorded": recording.hemisphere}
         yield Contradiction(Kind.SIDE, facts)
+
+
+def _of_dose(session: StudySession) -> Iterator[Contradiction]:
+    apart = disagreement_h(session)
+    if apart is not None:
+        yield Contradiction(Kind.LAST_DOSE, {"stated": apart[0], "by_doses": apart[1]})
 
 
 def _of_log(ran: logged.Logged, arm: blinding.Arm | None, cdbs_ma: float | None) -> Iterator[Contradiction]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
+from enum import StrEnum
 from typing import Any
 
 from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, String, Text, UniqueConstraint, func
@@ -31,6 +32,16 @@ class CountedTime(Base):
     start_s: Mapped[float] = mapped_column(primary_key=True)
     device_side: Mapped[Range[int]] = mapped_column(INT4RANGE)
     span: Mapped[Range[datetime]] = mapped_column(TSTZRANGE)
+
+
+class Activity(StrEnum):
+    """What a participant did in the half hour before a session."""
+
+    REST = "rest"
+    LIGHT = "light"
+    EXERCISE = "exercise"
+    MEAL = "meal"
+    SLEEP = "sleep"
 
 
 class SessionConditions(Base):

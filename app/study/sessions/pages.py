@@ -22,6 +22,7 @@ from app.study.adverse_events.repository import events_of_session
 from app.study.blinding import CONTROLLER_NAMES, arm, may_know, require_known
 from app.study.data_queries.repository import not_closed_of_session
 from app.study.deps import CurrentSession
+from app.study.doses.since import since_last_dose
 from app.study.form_changes import Shown, own_changes
 from app.study.models import QocRevision, Recording, StudySession
 from app.study.recordings import tablet
@@ -33,7 +34,7 @@ from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.stimulation import beside, delivered
 from app.study.traces import NO_CONTROL, control_programs, session_offset_s
-from app.study.wording import EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
+from app.study.wording import ACTIVITIES, EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
 from ml.energy import relative_energy
 
 router = APIRouter()
@@ -42,7 +43,7 @@ _QOC_LABELS = {"grasp_hz": "Grasp frequency", "rating": "Rating", "tremor_percen
 _CORRECTION_LABELS = {
     "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "control": "Control trace", "correction_reason": "Reason",
     "control_program": "Program",
-    "stopped_reason": "Stopped for the patient's sake", "medication_h": "Time since the last dose",
+    "stopped_reason": "Stopped for the patient's sake", "medication_h": "Time since the last dose", "activity": "Before the session",
 }  # fmt: skip
 _CONDITIONS_LABELS = {
     "lower_bound": "Lower bound B", "xi_beta": "Beta threshold", "min_ma": "Lowest amplitude", "max_ma": "Highest amplitude",
@@ -50,7 +51,7 @@ _CONDITIONS_LABELS = {
 }  # fmt: skip
 
 
-_STATED = ("controller", "hemisphere", "stopped_reason", "medication_h", "control_program")
+_STATED = ("controller", "hemisphere", "stopped_reason", "medication_h", "activity", "control_program")
 
 
 @dataclass(frozen=True)
@@ -217,6 +218,7 @@ def _correction(session: StudySession, caller: Caller) -> dict[str, str]:
         "control_program": "" if session.control_program is None else str(session.control_program),
         "stopped_reason": session.stopped_reason or "",
         "medication_h": "" if session.medication_h is None else f"{session.medication_h:g}",
+        "activity": session.activity or "",
     }
 
 
@@ -296,6 +298,8 @@ def _page(
         correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},
         seen=seen,
         open_queries=not_closed_of_session(db, session.id),
+        since=since_last_dose(session),
+        activities=ACTIVITIES,
         events=events_of_session(db, session.id),
         event_kinds=EVENT_KINDS,
         event_severities=EVENT_SEVERITIES,

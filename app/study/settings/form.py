@@ -152,11 +152,15 @@ class VersionChange(Generic[Row]):
 
 
 def history(versions: Sequence[Row], labels: Mapping[str, str] = LABELS) -> list[VersionChange[Row]]:
-    """All versions, newest first, with their changes."""
-    found = [VersionChange(versions[0], [])]
-    for before, after in pairwise(versions):
-        old, new = texts(before, labels), texts(after, labels)
-        found.append(VersionChange(after, [(labels[n], old[n] or "—", new[n] or "—") for n in labels if old[n] != new[n]]))
+    """All versions, newest first, with their changes; the first one is the enrolment's."""
+    return history_of([(row, {labels[n]: text for n, text in texts(row, labels).items()}) for row in versions])
+
+
+def history_of(versions: Sequence[tuple[Row, Mapping[str, str]]], first_tells: bool = False) -> list[VersionChange[Row]]:
+    """Versions with what each says, by label, newest first, with their changes; with `first_tells` the first one is a change of nothing."""
+    found = [VersionChange(row, [(n, "—", text) for n, text in said.items() if text and first_tells]) for row, said in versions[:1]]
+    for (_, old), (after, new) in pairwise(versions):
+        found.append(VersionChange(after, [(n, old[n] or "—", new[n] or "—") for n in new if old[n] != new[n]]))
     return found[::-1]
 
 

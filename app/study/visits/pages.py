@@ -19,6 +19,8 @@ from app.platform.web.templates import render
 from app.study import repository, service
 from app.study.blinding import arm, may_know, visible_arm
 from app.study.deps import CurrentParticipant, CurrentVisit
+from app.study.doses.serializers import dose_out
+from app.study.doses.since import since_last_dose
 from app.study.form_changes import Shown, own_changes, reason_of
 from app.study.models import Participant, StudySession, Visit
 from app.study.outcomes import service as outcomes
@@ -31,6 +33,7 @@ from app.study.sessions.contradictions import control_recording
 from app.study.sessions.data import session_data
 from app.study.visits import form
 from app.study.visits import service as visit_locks
+from app.study.wording import DRUG_NAMES
 
 router = APIRouter()
 
@@ -80,7 +83,7 @@ def visit_page(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCal
     """One visit day: its sessions in order; to a blinded assessor without what gives the controllers away."""
     if not may_know(visit, caller):
         return _blinded_page(request, db, visit, caller)
-    return _visit_page(request, db, visit, caller)
+    return shown_visit(request, db, visit, caller)
 
 
 @router.post("/visits/{visit_id}/lock")
@@ -91,7 +94,7 @@ def lock_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCal
         (visit_locks.unlock if unlock else visit_locks.lock)(db, visit, str(values.get("lock_reason", ""))[:1000], caller)
     except BetaloopError as error:
         db.rollback()
-        return _visit_page(request, db, visit, caller, None, error)
+        return shown_visit(request, db, visit, caller, None, error)
     db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done={'unlocked' if unlock else 'locked'}#lock", 303)
 
@@ -109,14 +112,21 @@ def change_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentC
         service.change_visit(db, visit, form.change(present.fields, changes.fields, typed["reason"]), caller)
     except BetaloopError as error:
         db.rollback()
-        return _visit_page(request, db, visit, caller, typed, error)
+        return shown_visit(request, db, visit, caller, typed, error)
     db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done=corrected", 303)
 
 
-def _visit_page(
-    request: Request, db: Session, visit: Visit, caller: Caller, typed: dict[str, str] | None = None, error: BetaloopError | None = None
+def shown_visit(
+    request: Request,
+    db: Session,
+    visit: Visit,
+    caller: Caller,
+    typed: dict[str, str] | None = None,
+    error: BetaloopError | None = None,
+    dose: dict[str, str] | None = None,
 ) -> HTMLResponse:
+    """The page of a visit; `typed` and `dose` are what a refused form of a correction or a dose said."""
     sessions, _ = repository.sessions_of_visit(db, visit.id)
     ran = [(arm(s, caller).controller, tablet.of_recording(control_recording(s))) for s in sessions if s.segments]
     seen = form.texts(visit)
@@ -133,6 +143,10 @@ def _visit_page(
         labels=form.labels(seen),
         may_write=may(caller, can.WRITE_STUDY, visit.participant),
         may_run=may(caller, can.RUN_JOBS, visit.participant),
+        doses=[dose_out(row) for row in visit.doses],
+        drugs=DRUG_NAMES,
+        dose=dose,
+        may_dose=may(caller, can.WRITE_STUDY, visit.participant) and visit.participant.status != service.WITHDRAWN and not visit.locked,
         may_lock=may(caller, can.LOCK_VISIT, visit.participant),
         problem=error.problem(request.url.path) if error else None,
     )
@@ -151,6 +165,7 @@ def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str
     """What the visit's table says of a session; a session that cannot be laid on the grid says why."""
     clashes = outcomes.disagreements(session, outcome_values.derive(db, session))
     row: dict[str, Any] = {"session": session, "arm": arm(session, caller), "summary": None, "problem": "", "clashes": clashes}
+    row["since"] = since_last_dose(session)
     try:
         row["summary"] = session_pages.summarise(session_data(db, session))
     except BetaloopError as error:

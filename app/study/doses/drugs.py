@@ -1,0 +1,69 @@
+"""The drugs that can be named: a fixed list, so that no free text of a prescription enters.
+
+Levodopa equivalents per mg: Tomlinson et al. 2010 (Movement Disorders 25, 2649), where they give one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Drug(StrEnum):
+    """What was taken."""
+
+    LEVODOPA = "levodopa"
+    LEVODOPA_CR = "levodopa_cr"
+    LEVODOPA_COMT = "levodopa_comt"
+    LEVODOPA_EQUIVALENT = "levodopa_equivalent"
+    APOMORPHINE = "apomorphine"
+    PRAMIPEXOLE = "pramipexole"
+    ROPINIROLE = "ropinirole"
+    ROTIGOTINE = "rotigotine"
+    SELEGILINE = "selegiline"
+    RASAGILINE = "rasagiline"
+    SAFINAMIDE = "safinamide"
+    AMANTADINE = "amantadine"
+    ANTICHOLINERGIC = "anticholinergic"
+    MUSCLE_RELAXANT = "muscle_relaxant"
+    OTHER = "other"
+
+
+@dataclass(frozen=True)
+class DrugFacts:
+    """What is known of a drug.
+
+    Attributes:
+        name: as pages show it.
+        equivalent: mg of levodopa that 1 mg counts as; None where none is stated.
+        within_hours: its effect on symptoms rises and wanes within hours of a dose, so that the time since that dose says something.
+    """
+
+    name: str
+    equivalent: float | None
+    within_hours: bool
+
+
+DRUGS: dict[Drug, DrugFacts] = {
+    Drug.LEVODOPA: DrugFacts("Levodopa (carbidopa, benserazide)", 1.0, True),
+    Drug.LEVODOPA_CR: DrugFacts("Levodopa, controlled release", 0.75, True),
+    Drug.LEVODOPA_COMT: DrugFacts("Levodopa with entacapone", 1.33, True),
+    Drug.LEVODOPA_EQUIVALENT: DrugFacts("All of a time together, as levodopa equivalent", 1.0, True),
+    Drug.APOMORPHINE: DrugFacts("Apomorphine", 10.0, True),
+    Drug.PRAMIPEXOLE: DrugFacts("Pramipexole (salt)", 100.0, True),
+    Drug.ROPINIROLE: DrugFacts("Ropinirole", 20.0, True),
+    Drug.ROTIGOTINE: DrugFacts("Rotigotine", 30.0, False),  # a patch: its level hardly changes over a visit
+    Drug.SELEGILINE: DrugFacts("Selegiline", 10.0, False),
+    Drug.RASAGILINE: DrugFacts("Rasagiline", 100.0, False),
+    Drug.SAFINAMIDE: DrugFacts("Safinamide", None, False),
+    Drug.AMANTADINE: DrugFacts("Amantadine", 1.0, False),
+    Drug.ANTICHOLINERGIC: DrugFacts("Anticholinergic", None, False),
+    Drug.MUSCLE_RELAXANT: DrugFacts("Muscle relaxant", None, False),
+    Drug.OTHER: DrugFacts("Other", None, False),
+}
+
+
+def levodopa_equivalent_mg(drug: Drug, mg: float) -> float | None:
+    """What a dose counts as, mg of levodopa; None where no equivalent is stated."""
+    factor = DRUGS[drug].equivalent
+    return None if factor is None else factor * mg

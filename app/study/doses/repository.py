@@ -1,0 +1,24 @@
+"""Queries of doses, within what the caller may read."""
+
+from __future__ import annotations
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import Caller
+from app.platform.errors import NotFound
+from app.study.doses.models import Dose
+from app.study.models import Visit
+from app.study.repository import visit
+
+
+def dose_with_visit(db: Session, dose_id: int, caller: Caller) -> tuple[Dose, Visit]:
+    """A dose and its visit. Raises NotFound."""
+    row = db.scalar(select(Dose).where(Dose.id == dose_id))
+    gone = NotFound(f"There is no dose {dose_id}, or you have no access to it.")
+    if row is None:
+        raise gone
+    try:
+        return row, visit(db, row.visit_id, caller)
+    except NotFound:
+        raise gone from None

@@ -1,0 +1,77 @@
+"""Rules of doses. The caller commits."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, time, timedelta
+
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.platform.database import now, set_reason
+from app.platform.errors import Conflict, Invalid
+from app.study import service as study
+from app.study.doses.drugs import DRUGS
+from app.study.doses.models import Dose
+from app.study.doses.schemas import DoseIn
+from app.study.models import Visit
+from app.study.visits.service import require_unlocked
+
+_BEFORE, _AFTER = timedelta(days=3), timedelta(hours=38)
+"""A dose lies between three days before the visit's day and that day's end in the westernmost time zone, in UTC."""
+_AHEAD = timedelta(minutes=10)
+"""By how much the clock of whoever enters a dose may be ahead."""
+
+
+def add_dose(db: Session, visit: Visit, draft: DoseIn, caller: Caller) -> Dose:
+    """Write down a dose that was taken.
+
+    Raises:
+        Forbidden: the caller enters no data. Conflict: the visit is locked, the participant has withdrawn, or the dose is there already.
+        Invalid: a time that is not near the visit's day, or has not come yet.
+    """
+    study.require(caller, can.WRITE_STUDY, visit.participant)
+    study.refuse_withdrawn(visit.participant)
+    require_unlocked(visit)
+    _check_time(visit, draft.taken_at)
+    row = Dose(visit_id=visit.id, entered_by=caller.label, **draft.model_dump())
+    visit.doses.append(row)
+    try:
+        db.flush()
+    except IntegrityError as error:
+        db.rollback()
+        raise Conflict(
+            f"{DRUGS[draft.drug].name} at {draft.taken_at:%Y-%m-%d %H:%M} UTC is written down at this visit already.",
+            "Two tablets at one time are one dose: remove the one that is there, and enter both together.",
+        ) from error
+    return row
+
+
+def remove_dose(db: Session, dose: Dose, visit: Visit, reason: str, caller: Caller) -> None:
+    """Take back a dose that was not taken so.
+
+    Raises:
+        Forbidden: the caller enters no data. Conflict: the visit is locked. Invalid: no reason.
+    """
+    study.require(caller, can.WRITE_STUDY, visit.participant)
+    require_unlocked(visit)
+    if not reason.strip():
+        raise Invalid("A reason is missing.", "Say why the dose is taken back; the audit trail keeps it.")
+    set_reason(db, reason.strip())
+    visit.doses.remove(dose)
+    db.delete(dose)
+    db.flush()
+
+
+def _check_time(visit: Visit, taken_at: datetime) -> None:
+    if taken_at > now() + _AHEAD:
+        raise Invalid(f"{taken_at:%Y-%m-%d %H:%M} UTC has not come yet.", "Doses are written down when they were taken. Times are UTC.")
+    if visit.date is None:
+        return
+    day = datetime.combine(visit.date, time(), UTC)
+    if not day - _BEFORE <= taken_at <= day + _AFTER:
+        raise Invalid(
+            f"{taken_at:%Y-%m-%d %H:%M} UTC is not near visit {visit.number} of {visit.date}.",
+            "Give a time on its day or in the three days before, in UTC.",
+        )
