@@ -25,6 +25,7 @@ DELETED_FROM = frozenset(
     {
         "cdbs_amplitude",
         "counted_time",
+        "dose",
         "grasp_test",
         "membership",
         "plan",
@@ -40,8 +41,8 @@ DELETED_FROM = frozenset(
         "worker",
     }
 )
-"""Tables of which the service deletes rows: proposals and drafts that were given up, what a newer reading replaced, its own upkeep. Rows of
-audited tables stay in the trail."""
+"""Tables of which the service deletes rows: proposals and drafts that were given up, doses taken back with a reason, what a newer reading
+replaced, its own upkeep. Rows of audited tables stay in the trail."""
 
 ENGINE_SCHEMA = "dbos"
 SCHEMAS = ("public", ENGINE_SCHEMA)

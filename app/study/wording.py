@@ -8,7 +8,8 @@ from typing import Any
 from app.study.adverse_events.models import EventKind, Severity
 from app.study.characteristics.schemas import CharacteristicsFields, Symptom, Target
 from app.study.data_queries.models import QueriedField
-from app.study.doses.drugs import DRUGS
+from app.study.doses.drugs import DRUGS, Drug
+from app.study.doses.models import Dose
 from app.study.enrolment.codes import CodeQuestion
 from app.study.models import Controller
 from app.study.sessions.contradictions import Contradiction, Kind
@@ -43,6 +44,7 @@ SYMPTOMS = {
     Symptom.SPEECH: "Speech",
 }
 TARGETS = {Target.STN: "STN", Target.GPI: "GPi", Target.GPE: "GPe", Target.VIM: "Vim", Target.OTHER: "other"}
+MEDICATION = "Medication of a visit day"
 ACTIVITIES = {
     Activity.REST: "sat or lay",
     Activity.LIGHT: "walked, talked",
@@ -86,7 +88,12 @@ def characteristics_words(known: CharacteristicsFields) -> dict[str, str]:
     )
     medication = "; ".join(f"{d.at} {DRUGS[d.drug].name} {d.mg:g} mg" for d in known.medication)
     symptoms = ", ".join(SYMPTOMS[s].lower() for s in known.symptoms)
-    return {"Leads": leads, "Symptoms": symptoms, "Hand of the grasp test": str(known.hand or ""), "Medication of a visit day": medication}
+    return {"Leads": leads, "Symptoms": symptoms, "Hand of the grasp test": str(known.hand or ""), MEDICATION: medication}
+
+
+def doses_words(doses: Iterable[Dose]) -> str:
+    """Doses that were taken, by time."""
+    return "; ".join(f"{d.taken_at:%Y-%m-%d %H:%M} {DRUGS[Drug(d.drug)].name} {d.mg:g} mg" for d in doses)
 
 
 def code_questions(code: str, found: Iterable[CodeQuestion]) -> str:

@@ -246,7 +246,7 @@ class World:
             ("put", "/participants/{code}/characteristics"): {
                 "json": {"version": 0, "characteristics": {"hand": "left"}, "reason": "asked"}
             },
-            ("post", "/visits/{visit_id}/doses"): {"visit_id": empty, "json": DOSE},
+            ("post", "/visits/{visit_id}/doses"): {"visit_id": moved, "json": DOSE | {"mg": 50, "taken_at": "2026-03-02T08:00:00Z"}},
             ("post", "/doses/{dose_id}/removal"): {
                 "dose_id": self.send(f"/visits/{moved}/doses", json=DOSE)["id"],
                 "json": {"reason": "not taken"},

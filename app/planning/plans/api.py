@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import APIRouter, Response
+from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
 from app.evaluation.shown import estimate_out
 from app.planning import wording
+from app.planning.bundles.repository import releases_of_slots
 from app.planning.plans import key, service, visits
 from app.planning.plans.models import Plan
 from app.planning.plans.schemas import (
@@ -76,9 +78,14 @@ def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
     record(db, "download", "plan", view.plan.id)
     db.commit()
     name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
-    return Response(
-        pdf.render(view, caller.label, now()), media_type="application/pdf", headers={"Content-Disposition": f'inline; filename="{name}"'}
-    )
+    content = pdf.render(view, _bundles(db, view), caller.label, now())
+    return Response(content, media_type="application/pdf", headers={"Content-Disposition": f'inline; filename="{name}"'})
+
+
+def _bundles(db: Session, view: PlanView) -> dict[int, str]:
+    """The newest bundle that was taken for each session, by the number of its plan item."""
+    newest_last = reversed(releases_of_slots(db, [line.item.id for line in view.lines]))
+    return {row.plan_item_id: row.sha256 for row in newest_last if row.plan_item_id is not None}
 
 
 @router.post("/visits/{visit_id}/plan/moves", responses=problems(409))

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session, selectinload
 from app.evaluation.models import Evaluation
 from app.planning.plans.models import Plan, PlanItem
 from app.study.adverse_events.models import AdverseEvent
+from app.study.doses.models import Dose
 from app.study.models import Hemisphere, Recording, StudySession, Visit, VisitLock
 from app.study.repository import CONFIRMED, count
 
@@ -92,7 +93,9 @@ def what_holds(db: Session, visit_id: int) -> list[str]:
     signed = db.scalar(select(func.count()).select_from(Plan).where(Plan.visit_id == visit_id, Plan.approved_at.is_not(None))) or 0
     events = db.scalar(select(func.count()).select_from(AdverseEvent).where(AdverseEvent.visit_id == visit_id)) or 0
     locks = db.scalar(select(func.count()).select_from(VisitLock).where(VisitLock.visit_id == visit_id)) or 0
+    doses = db.scalar(select(func.count()).select_from(Dose).where(Dose.visit_id == visit_id)) or 0
     counted = {"sessions or proposals": sessions, "a plan that was signed": signed, "adverse events": events, "locks": locks}
+    counted["doses of medication"] = doses
     return [what for what, count in counted.items() if count]
 
 

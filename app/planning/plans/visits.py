@@ -50,7 +50,8 @@ def remove_visit(db: Session, visit: Visit, reason: str, caller: Caller) -> None
     """Remove a visit in which nothing was done, with its drafts; the audit trail keeps what it was, and why it went.
 
     Raises:
-        Conflict: it is locked, has sessions (proposed ones too) or adverse events, or a plan of it was once signed. Invalid: no reason.
+        Conflict: it is locked, has sessions (proposed ones too), doses or adverse events, or a plan of it was once signed.
+        Invalid: no reason.
     """
     study.require(caller, can.WRITE_STUDY, visit.participant)
     if not reason.strip():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -27,7 +28,8 @@ def _sheet(client: TestClient, visit_id: int) -> list[str]:
 def test_a_draft_says_so_and_holds_everything_that_the_clinic_needs(client: TestClient, studied: Any) -> None:
     body = {"policy_ids": list(studied.policies), "seed": 7, "no_dbs": True, "note": "left hand only"}
     plan = client.post(f"/api/v1/visits/{studied.visit}/plan", json=body).json()
-    (text,) = _sheet(client, studied.visit)
+    pages = _sheet(client, studied.visit)
+    text = " ".join(pages)
     for words in (
         "DRAFT",
         "NOT APPROVED",
@@ -35,7 +37,9 @@ def test_a_draft_says_so_and_holds_everything_that_the_clinic_needs(client: Test
         "Note: left hand only",
         "rl-01-small",
         "95 (93 to 96.5)",
-        "0.40",
+        "energy 0.40 of cDBS",
+        "Limits",
+        "Bundle not taken yet",
         "Started",
         "Rating",
         "Grasp",
@@ -43,7 +47,7 @@ def test_a_draft_says_so_and_holds_everything_that_the_clinic_needs(client: Test
         "Stop rules",
         "return to the clinical stimulation",
         "name, signature, date",
-        "Page 1 of 1",
+        f"Page 1 of {len(pages)}",
         f"plan {plan['id']}, seed 7, evaluation {studied.evaluation}, snapshot {plan['evaluation']['snapshot_id']}",
         "by admin@clinic.example",
         "by DLSM, with its 90 % interval",
@@ -51,7 +55,7 @@ def test_a_draft_says_so_and_holds_everything_that_the_clinic_needs(client: Test
     ):
         assert words in text, words
     rows = [f"{s['position']} {int(s['start_minute']) // 60}:{int(s['start_minute']) % 60:02d} " for s in plan["sessions"]]
-    places = [text.index(row, text.index("Notes, adverse effects")) for row in rows]
+    places = [text.index(row, text.index("Stimulation site")) for row in rows]
     assert places == sorted(places)
 
 
@@ -69,11 +73,49 @@ def test_a_long_day_goes_over_pages_with_its_head_repeated(client: TestClient, s
     body = {"policy_ids": list(studied.policies), "random_sessions": 10, "total_minutes": 600, "note": "word " * 300}
     client.post(f"/api/v1/visits/{studied.visit}/plan", json=body)
     pages = _sheet(client, studied.visit)
-    assert len(pages) == 2
+    assert len(pages) >= 2
     for number, text in enumerate(pages, start=1):
-        assert f"Page {number} of 2" in text
-        assert "Notes, adverse effects" in text
+        assert f"Page {number} of {len(pages)}" in text
+        assert "Visit plan P1 visit 2" in text
         assert "DRAFT" in text
+    assert sum(text.count("Started hh:mm") for text in pages) == client.get(f"/api/v1/visits/{studied.visit}/plan").text.count('"position"')
+
+
+def test_the_sheet_says_who_the_participant_is_and_when_medication_is_due(client: TestClient, studied: Any) -> None:
+    stated = {
+        "leads": [{"hemisphere": "left", "target": "stn", "sensing": "0-2", "stimulating": "C+1-"}],
+        "hand": "right",
+        "medication": [{"drug": "levodopa", "mg": 100, "at": "07:00"}, {"drug": "levodopa", "mg": 50, "at": "09:20"}],
+    }
+    change = {"version": 0, "characteristics": stated, "reason": "asked"}
+    assert client.put("/api/v1/participants/P1/characteristics", json=change).status_code == 200
+    body = {"policy_ids": [studied.policies[0]], "starts_at": "09:00"}
+    plan = client.post(f"/api/v1/visits/{studied.visit}/plan", json=body).json()
+    due = [s["medication"] for s in plan["sessions"]]
+    assert due[0].startswith("07:00 Levodopa")
+    begins = [s["start_minute"] for s in plan["sessions"]]
+    assert [bool(d) for d in due] == [True, *(a < 20 <= b for a, b in pairwise(begins))]
+    text = " ".join(_sheet(client, studied.visit))
+    for words in (
+        "Leads: left STN, sensing 0-2, stimulating C+1-",
+        "Hand of the grasp test: right",
+        "1 09:00 cDBS",
+        f"due before: {due[0]}",
+    ):
+        assert words in text, words
+
+
+def test_a_blinded_sheet_has_letters_and_common_limits_and_predicts_nothing(client: TestClient, studied: Any, sign_plan: Any) -> None:
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0}})
+    body = {"policy_ids": [studied.policies[0]], "blinded": True}
+    client.post(f"/api/v1/visits/{studied.visit}/plan", json=body)
+    assert sign_plan(studied.visit).status_code == 200
+    text = " ".join(_sheet(client, studied.visit))
+    assert "Session A" in text
+    assert text.count("Limits") == text.count("Started hh:mm")
+    assert "Stop rules" in text
+    for words in ("Predicted", "Policy", "Bundle 1", "not taken yet", "rl-01-small", "energy 0.40"):
+        assert words not in text, words
 
 
 def test_the_sheet_has_the_amplitudes_of_random_sessions_and_their_bound(client: TestClient, studied: Any) -> None:

@@ -26,14 +26,14 @@ def state(db: Session, participant: Participant, seen: int = 0, **fields: object
     service.change_characteristics(db, participant, seen, CharacteristicsFields(**fields), "asked", SYSTEM)  # type: ignore[arg-type]
 
 
-def tested(db: Session, session: StudySession, file: int, hand: str, hz: float) -> list[str]:
+def grasped(db: Session, session: StudySession, file: int, hand: str, hz: float) -> list[str]:
     return outcomes.store_grasp(db, session, file, hand, np.arange(10) / hz, np.zeros(9, dtype=bool))
 
 
 def test_the_stated_hand_counts_and_not_the_rule(db: Session, study_session: StudySession, new_file: NewFile) -> None:
     file = new_file(study_session)
-    tested(db, study_session, file, "left", 3.0)
-    tested(db, study_session, file, "right", 2.0)
+    grasped(db, study_session, file, "left", 3.0)
+    grasped(db, study_session, file, "right", 2.0)
     assert study_session.qoc is not None
     assert study_session.qoc.grasp_hz == pytest.approx(2.0)  # the hemisphere is the left one, and nobody stated a hand
     assert "the participant's hand is not stated" in (study_session.qoc.reason or "")
@@ -46,7 +46,7 @@ def test_a_test_of_the_other_hand_alone_is_questioned_and_gives_no_value(
     db: Session, study_session: StudySession, new_file: NewFile
 ) -> None:
     state(db, study_session.visit.participant, hand=LEFT)
-    said = tested(db, study_session, new_file(study_session), "right", 2.0)
+    said = grasped(db, study_session, new_file(study_session), "right", 2.0)
     assert study_session.qoc is None
     assert "right hand tested, but the participant's hand is the left one by the characteristics (version 1)" in said[-1]
     state(db, study_session.visit.participant, 1, hand=RIGHT)
