@@ -117,16 +117,37 @@ function report({ item, head, words }, status, answer) {
     item.append(note);
   }
   const states = new Map((answer.files ?? []).map((file) => [file.name, file]));
+  const groups = []; // a file, and the members of an archive after it
   for (const one of answer.report ?? []) {
-    const file = states.get(one.name);
-    const line = element("div", { className: "row" }, element("h3", { textContent: one.name })); // a file, or a member of an archive
-    if (file) line.append(file.duplicate ? badge("known already", "info") : badge(...(STATES[file.status] ?? ["not usable, kept", "bad"])));
-    item.append(line);
-    if (one.problem && good) item.append(element("div", { className: "note bad" }, element("b", { textContent: one.problem.what }), element("div", { textContent: one.problem.where }), element("div", { textContent: one.problem.hint })));
-    const pairs = element("dl", { className: "pairs" });
-    for (const [key, label] of Object.entries(LABELS)) if (one[key]?.length) {
-      pairs.append(element("dt", { textContent: label }), element("dd", {}, ...one[key].map((text) => element("div", { textContent: text }))));
-    }
-    if (pairs.children.length) item.append(pairs);
+    if (states.has(one.name) || !groups.length) groups.push({ one, inner: [] });
+    else groups.at(-1).inner.push(one);
   }
+  for (const { one, inner } of groups) {
+    const file = states.get(one.name);
+    const line = element("div", { className: "row" }, element("h3", { textContent: one.name }));
+    if (file) line.append(file.duplicate ? badge("known already", "info") : badge(...(STATES[file.status] ?? ["not usable, kept", "bad"])));
+    item.append(line, ...said(one, good));
+    const told = inner.filter((r) => r.problem || Object.keys(LABELS).some((key) => r[key]?.length));
+    if (!told.length) continue;
+    const odd = told.filter((r) => r.flagged?.length).length;
+    item.append(element("details", { open: told.some((r) => r.problem) },
+      element("summary", { textContent: `${inner.length} files in it${odd ? `, ${odd} with something to look at` : ""}` }),
+      ...told.flatMap((r) => [element("h3", { textContent: r.name }), ...said(r, good)])));
+  }
+}
+
+// what a report says: what was understood and is to be looked at stands open, the rest is folded
+function said(one, good) {
+  const found = [];
+  if (one.problem && good) found.push(element("div", { className: "note bad" }, ...["what", "where", "hint"].map((part) => element("div", { textContent: one.problem[part] }))));
+  const listed = (keys) => {
+    const pairs = element("dl", { className: "pairs" });
+    for (const key of keys.filter((k) => one[k]?.length)) pairs.append(element("dt", {}, key === "flagged" ? badge("look at this", "warn") : LABELS[key]), element("dd", {}, ...one[key].map((text) => element("div", { textContent: text }))));
+    return pairs;
+  };
+  const main = listed(["understood", "flagged"]);
+  if (main.children.length) found.push(main);
+  const rest = ["repaired", "ignored", "removed"].filter((key) => one[key]?.length);
+  if (rest.length) found.push(element("details", { open: !main.children.length }, element("summary", { textContent: rest.map((key, i) => `${i ? LABELS[key].toLowerCase() : LABELS[key]} ${one[key].length}`).join(", ") }), listed(rest)));
+  return found;
 }

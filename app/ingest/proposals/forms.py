@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
+from markupsafe import Markup
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
@@ -40,6 +41,7 @@ class ProposalForm:
         drawn: how the amplitudes of a random session were drawn; empty for other sessions.
         usable: usable steps by channel, the control channel first.
         programs: that the control recording has an amplitude of.
+        thumbnail: beta and amplitude at a glance, None where neither is known.
         problem: why the form was refused.
     """
 
@@ -54,6 +56,7 @@ class ProposalForm:
     drawn: str
     usable: list[UsableSteps]
     programs: list[int]
+    thumbnail: Markup | None = None
     reason: str = ""
     problem: dict[str, Any] | None = None
 

@@ -17,6 +17,7 @@ from app.ingest.deps import CurrentProposal
 from app.ingest.models import SessionProposal
 from app.ingest.proposals import service as proposals
 from app.ingest.proposals.forms import ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
+from app.ingest.proposals.thumbnail import thumbnail
 from app.ingest.uploads import service
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
@@ -31,7 +32,7 @@ from app.study.models import Participant, StudySession
 from app.study.sessions import designs
 from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions
-from app.study.sessions.data import session_data
+from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.usable_steps import usable_steps
 from app.study.traces import control_programs
 from app.study.wording import drawn_words, sentences
@@ -191,6 +192,8 @@ def _form(
     sent: Mapping[str, str],
 ) -> ProposalForm:
     stored = texts(db, session, proposal, caller)
+    data = _steps(db, session)
+    found = designs.of_session(db, session, data.table, caller) if data else None
     return ProposalForm(
         session,
         proposal,
@@ -200,25 +203,22 @@ def _form(
         is_clocked(session),
         wording.reasons(proposal.evidence),
         sentences(contradictions(db, session, proposal.visit_open)),
-        _drawn(db, session, caller),
+        drawn_words(found) if found else "",
         usable_steps(db, session),
         control_programs(db, session),
+        thumbnail(data) if data else None,
         sent.get(f"reason-{session.id}", "") if error else "",
         error.problem(request.url.path) if error else None,
     )
 
 
-def _drawn(db: Session, session: StudySession, caller: Caller) -> str:
+def _steps(db: Session, session: StudySession) -> SessionData | None:
     try:
-        found = designs.of_session(db, session, session_data(db, session).table, caller)
+        return session_data(db, session)
     except Invalid:
-        return ""  # the proposal's notes say why its steps cannot be read
-    return drawn_words(found) if found else ""
+        return None  # the proposal's notes say why its steps cannot be read
 
 
 def _chart(db: Session, session: StudySession) -> Any:
-    try:
-        data = session_data(db, session)
-    except Invalid:
-        return None  # the proposal's notes say why its steps cannot be read
-    return control_chart(data) if data.table.beta_trace or data.table.amplitude_trace else None
+    data = _steps(db, session)
+    return control_chart(data) if data and (data.table.beta_trace or data.table.amplitude_trace) else None
