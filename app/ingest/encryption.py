@@ -10,17 +10,18 @@ from cryptography.fernet import Fernet
 
 from app.platform.files import CHUNK, draft_path
 from app.settings import get_settings
+from ml.formats.source import Source
 
 
 def _cipher() -> Fernet:
     return Fernet(base64.urlsafe_b64encode(get_settings().secret("quarantine")))
 
 
-def encrypt(path: Path) -> Path:
-    """A draft file with the encrypted bytes of `path`, one line per MiB; the original is left where it is."""
+def encrypt(original: Source) -> Path:
+    """A draft file with the encrypted bytes of a file, one line per MiB; the original is left where it is."""
     cipher, sealed = _cipher(), draft_path()
     try:
-        with path.open("rb") as source, sealed.open("wb") as out:
+        with original.open("rb") as source, sealed.open("wb") as out:
             while chunk := source.read(CHUNK):
                 out.write(cipher.encrypt(chunk) + b"\n")
     except BaseException:

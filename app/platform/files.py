@@ -63,7 +63,7 @@ def draft_path() -> Path:
     """A fresh, empty file inside the store's folder, on the same file system, for bytes whose hash is not yet known.
 
     It lies in a folder of this process, both readable by the owner only; what a killed process leaves there, `remove_abandoned` removes.
-    Bytes that may name a person do not belong here, but into `nameless_file`.
+    Bytes that may name a person do not belong here, but into `raw_bytes.raw_file`.
     """
     path = _draft_folder() / secrets.token_hex(16)
     os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
@@ -142,20 +142,41 @@ def draft_folder() -> Iterator[Path]:
 
 @contextmanager
 def nameless_file() -> Iterator[tuple[BinaryIO, Path]]:
-    """A file without a name for raw bytes, and a path by which this process and its children, and no other user, can open it again.
+    """A file without a name, and a path by which this process and its children, and no other user, can open it again.
 
     It is gone when the context ends and when the process is killed, at whatever moment: nobody has to clear up.
     """
     draft = draft_path()
     with draft.open("w+b", buffering=0) as file:
-        nameless = _OPEN_FILES / str(os.getpid()) / "fd" / str(file.fileno())
-        named = not nameless.exists()
+        path = _path_of_open(file)
+        named = not path.exists()
         if not named:
             draft.unlink()
         try:
-            yield file, draft if named else nameless
+            yield file, draft if named else path
         finally:
             draft.unlink(missing_ok=True)
+
+
+@contextmanager
+def in_memory(content: bytes) -> Iterator[Path]:
+    """A path by which this process and its children can read a few bytes that are on no disk, as long as the context lasts.
+
+    Where the system has no files in memory (it is not Linux), they are in a draft for the owner alone.
+    """
+    if hasattr(os, "memfd_create") and _OPEN_FILES.is_dir():
+        with os.fdopen(os.memfd_create("betaloop"), "w+b", buffering=0) as file:
+            file.write(content)
+            yield _path_of_open(file)
+    else:
+        with nameless_file() as (file, path):
+            file.write(content)
+            yield path
+
+
+def _path_of_open(file: BinaryIO) -> Path:
+    """The path of an open file, with or without a name, where the system lists open files."""
+    return _OPEN_FILES / str(os.getpid()) / "fd" / str(file.fileno())
 
 
 def store(db: Session, content: bytes | Path, media_type: str) -> StoredFile:
@@ -204,31 +225,6 @@ def read(sha256: str) -> bytes:
     if hashlib.sha256(content).hexdigest() != sha256:
         raise MissingFile(f"The stored file {sha256} is damaged: its bytes have another hash.")
     return content
-
-
-@contextmanager
-def received(stream: BinaryIO, limit: int) -> Iterator[tuple[Path, str, int]]:
-    """Copy a stream to a `nameless_file` without holding it in memory; gives path, SHA-256 and size, valid inside the context.
-
-    Raises:
-        OverflowError: more than `limit` bytes.
-    """
-    digest, size = hashlib.sha256(), 0
-    with nameless_file() as (out, path):
-        while chunk := stream.read(CHUNK):
-            size += len(chunk)
-            if size > limit:
-                raise OverflowError(f"more than {limit} bytes")
-            digest.update(chunk)
-            write_all(out, chunk)
-        yield path, digest.hexdigest(), size
-
-
-def write_all(out: BinaryIO, content: bytes) -> None:
-    """Write all bytes to an unbuffered file. Raises OSError, e.g. where the disk is full."""
-    left = memoryview(content)
-    while left:
-        left = left[out.write(left) :]
 
 
 def close_to_others() -> None:

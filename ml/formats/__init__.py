@@ -29,6 +29,7 @@ from ml.formats.recording import (
     UndecodableFile,
 )
 from ml.formats.redaction_record import REDACTOR_VERSION, Redaction
+from ml.formats.source import Source
 from ml.formats.tables import TableKind, decode_table, kind_of_text
 from ml.formats.tables.delimited import utf16_without_mark
 
@@ -63,21 +64,22 @@ HINT = (
 )
 
 
-def sniff(path: Path) -> FileKind:
+def sniff(path: Source) -> FileKind:
     """What a file is, by its content; its name and extension are not asked.
 
     Raises:
         UndecodableFile: empty, or nothing this service reads.
     """
-    if path.is_dir():
+    if isinstance(path, Path) and path.is_dir():
         return "rcs"
     with path.open("rb") as stream:
         head = stream.read(HEAD)
+        zipped = head.startswith((b"PK\x03\x04", b"PK\x05\x06")) or zipfile.is_zipfile(stream)
     if not head:
         raise UndecodableFile("the file is empty", "file", HINT)
     if head.startswith(b"PAR1"):
         return "parquet"
-    if head.startswith((b"PK\x03\x04", b"PK\x05\x06")) or zipfile.is_zipfile(path):
+    if zipped:
         return _kind_of_zip(path)
     if looks_like_report(head):
         return "percept"
@@ -92,7 +94,7 @@ def sniff(path: Path) -> FileKind:
     raise UndecodableFile("no format this service reads", "first bytes", HINT)
 
 
-def _kind_of_zip(path: Path) -> FileKind:
+def _kind_of_zip(path: Source) -> FileKind:
     """A zip of Percept reports where it holds no RC+S file; what cannot be opened is left to the decoder of RC+S, which says why."""
     try:
         with ZipFiles(path, ArchiveLimits()) as files:

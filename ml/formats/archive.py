@@ -8,7 +8,7 @@ import zipfile
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -17,6 +17,7 @@ from typing import IO, Protocol, Self
 
 from ml.formats.options import ArchiveLimits
 from ml.formats.recording import UndecodableFile
+from ml.formats.source import Source
 
 NESTED = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".bz2", ".xz")
 SUFFIXES = frozenset({".json", ".csv", ".parquet", ".txt", ".tsv", ".xml", ".pdf", ".png", ".jpg", ".mat", ".edf", ".exe", *NESTED})
@@ -142,21 +143,21 @@ class ZipFiles:
         UndecodableFile: not a zip, encrypted, larger than the limits, or compressed beyond belief.
     """
 
-    def __init__(self, path: Path, limits: ArchiveLimits) -> None:
+    def __init__(self, path: Source, limits: ArchiveLimits) -> None:
         self.left_out: list[LeftOut] = []
         self._limits = limits
         self._members: dict[str, zipfile.ZipInfo] = {}
         self._number: dict[str, int] = {}
         self._bytes = self._read = 0
-        try:
-            self._zip = zipfile.ZipFile(path)
-        except READ_ERRORS as error:
-            raise UndecodableFile("this is no readable zip archive", "file", "Zip the session folder again and upload that.") from error
-        try:
+        self._open = ExitStack()
+        with ExitStack() as opened:
+            stream = opened.enter_context(path.open("rb"))
+            try:
+                self._zip = opened.enter_context(zipfile.ZipFile(stream))
+            except READ_ERRORS as error:
+                raise UndecodableFile("this is no readable zip archive", "file", "Zip the session folder again and upload that.") from error
             self._check(self._zip.infolist())
-        except BaseException:
-            self._zip.close()
-            raise
+            self._open = opened.pop_all()
 
     def _check(self, infos: list[zipfile.ZipInfo]) -> None:
         limits = self._limits
@@ -229,4 +230,4 @@ class ZipFiles:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._zip.close()
+        self._open.close()

@@ -9,13 +9,14 @@ from ml.formats.options import DecodeOptions
 from ml.formats.percept import redact_percept
 from ml.formats.rcs import redact_rcs_zip
 from ml.formats.redaction_record import Redaction
+from ml.formats.source import Source
 from ml.formats.tables import redact_table
 
 if TYPE_CHECKING:
     from ml.formats import FileKind
 
 
-def redact(source: Path, target: Path, kind: FileKind, key: bytes, options: DecodeOptions | None = None) -> Redaction:
+def redact(source: Source, target: Path, kind: FileKind, key: bytes, options: DecodeOptions | None = None) -> Redaction:
     """Write a file without identity; the same bytes in give the same bytes out, and they decode to the same content.
 
     Args:

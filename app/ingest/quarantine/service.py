@@ -9,7 +9,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
 from cryptography.fernet import InvalidToken
 from sqlalchemy.orm import Session
@@ -25,6 +24,7 @@ from app.ingest.uploads.service import UploadOutcome
 from app.platform import files
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
+from app.platform.raw_bytes import RawFile, raw_file
 from app.study import service as study_service
 from app.study.models import Participant
 from ml.formats.recording import UndecodableFile
@@ -39,10 +39,10 @@ def review(db: Session, file_id: int, caller: Caller) -> Iterator[bytes]:
     """
     file, _ = _held(db, file_id, caller)
     with ExitStack() as held:
-        path = held.enter_context(_original(file))  # all of it is checked before the first byte leaves
+        original = held.enter_context(_original(file))  # all of it is checked before the first byte leaves
         file.reviewed_by, file.reviewed_at = caller.label, now()
         db.commit()
-        return _pieces(path, held.pop_all())
+        return _pieces(original, held.pop_all())
 
 
 def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> UploadOutcome:
@@ -126,28 +126,28 @@ def _decide(db: Session, file: UploadFile, reason: str, caller: Caller) -> None:
     db.flush()
 
 
-def _pieces(path: Path, held: ExitStack) -> Iterator[bytes]:
-    with held, path.open("rb") as source:
+def _pieces(original: RawFile, held: ExitStack) -> Iterator[bytes]:
+    with held, original.open() as source:
         while piece := source.read(files.CHUNK):
             yield piece
 
 
 @contextmanager
-def _original(file: UploadFile) -> Iterator[Path]:
-    """The decrypted original as a file without a name, which goes when it was used.
+def _original(file: UploadFile) -> Iterator[RawFile]:
+    """The original, encrypted as when it came, with a key that goes when it was used.
 
     Raises:
         Conflict: its bytes cannot be decrypted, or are not those that came.
     """
     assert file.quarantine_sha256 is not None
-    with files.nameless_file() as (out, raw):
+    with raw_file() as (out, raw):
         try:
             for chunk in encryption.decrypt(files.path_of(file.quarantine_sha256)):
-                files.write_all(out, chunk)
+                out.write(chunk)
         except (InvalidToken, OSError) as error:
             hint = "Restore the data folder, with its keys, from a backup."
             raise Conflict(f"The encrypted bytes of file {file.id} are missing or damaged.", hint) from error
-        if files.hash_file(raw)[0] != file.report.get(ASIDE, file.original_sha256):
+        if raw.sha256() != file.report.get(ASIDE, file.original_sha256):
             raise Conflict(f"The bytes of file {file.id} are not those that came: their hash differs.", "Restore a backup.")
         yield raw
 

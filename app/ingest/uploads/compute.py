@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from app.platform.jobs import StepReport
+from app.platform.raw_bytes import RawFile
 from app.settings import stored_secret
 from ml import formats
 from ml.formats import transfer
@@ -34,14 +35,14 @@ def clean(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
     """Take identity out of a file.
 
     Args:
-        params: `source`, `target` (paths), `secrets` (the folder of keys), `options`.
+        params: `source` and `key` (paths of a `RawFile`), `target` (path), `secrets` (the folder of keys), `options`.
         workdir: not used.
         report: takes the share that was read.
 
     Returns:
         `kind` and `redaction`; or the `problem` that keeps it from being cleaned, and what was `left_out` of its archive, if it is one.
     """
-    source, options = Path(params["source"]), options_of(params["options"])
+    source, options = RawFile(Path(params["source"]), Path(params["key"])), options_of(params["options"])
     try:
         kind = formats.sniff(source)
         key = stored_secret(Path(params["secrets"]), "pseudonyms")
@@ -98,13 +99,14 @@ def _told(report: StepReport, doing: str) -> Callable[[float], None]:
     return lambda share: report.progress(share, doing)
 
 
-def _left_out(path: Path, limits: ArchiveLimits) -> list[str]:
+def _left_out(source: RawFile, limits: ArchiveLimits) -> list[str]:
     """Why members of an archive of no use were left out, counted, without their names, which may identify a person."""
-    if not zipfile.is_zipfile(path):
-        return []
+    with source.open() as stream:
+        if not zipfile.is_zipfile(stream):
+            return []
     listing = FileReport("archive")
     try:
-        with ZipFiles(path, limits) as members:
+        with ZipFiles(source, limits) as members:
             find_sessions(members, listing)
             reasons = Counter(member.reason for member in members.left_out)
     except UndecodableFile:

@@ -1,4 +1,7 @@
-"""Uploads are refused by role before their body is read: a form is parsed before any dependency is asked, and may have gigabytes."""
+"""Uploads are refused by role before their body is read: a form is parsed before any dependency is asked, and may have gigabytes.
+
+What is read then is encrypted on its way (`encrypted_form`).
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from starlette.concurrency import run_in_threadpool
 
 from app.accounts import permissions as can
 from app.accounts.deps import get_caller
+from app.ingest.uploads.encrypted_form import EncryptedForm
 from app.platform.database import new_session
 
 _bearer = HTTPBearer(auto_error=False)
@@ -27,7 +31,7 @@ class UploadRoute(APIRoute):
         async def checked(request: Request) -> Response:
             if request.method == "POST":
                 await run_in_threadpool(_check, request, await _bearer(request))
-            return await handle(request)
+            return await handle(EncryptedForm(request.scope, request.receive))
 
         return checked
 

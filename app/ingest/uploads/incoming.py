@@ -11,6 +11,7 @@ from pathlib import PurePosixPath
 from typing import BinaryIO
 
 from app.platform import files
+from app.platform.raw_bytes import raw_file
 from ml.formats.rcs.folder import KNOWN, MIXED
 from ml.formats.rcs.opening import HEAD, Opening, group, read_opening, stem_in_name
 from ml.formats.recording import FileReport
@@ -124,14 +125,14 @@ def _digest(one: Incoming) -> str:
 
 def _bundle(folder: str, number: str, members: Sequence[tuple[str, Incoming]]) -> Incoming:
     """One zip of loose files: the same files give the same bytes, whatever their order, dates and folder."""
-    with files.nameless_file() as (_, raw):
-        with zipfile.ZipFile(raw, "w", zipfile.ZIP_STORED) as archive:
+    with raw_file() as (sink, raw):
+        with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive:
             for stem, one in sorted(members, key=lambda m: m[0]):
                 info = zipfile.ZipInfo(f"{stem}.json", EPOCH)
                 info.create_system, info.external_attr = 3, 0o100600 << 16
                 with archive.open(info, "w", force_zip64=True) as out:
                     while chunk := one.stream.read(files.CHUNK):
                         out.write(chunk)
-        stream = raw.open("rb")  # keeps the bytes until they are received
+        stream = raw.open()  # keeps the bytes until they are received
     name = PurePosixPath(folder).name or "RC+S files"
     return Incoming(f"{name}{number} ({len(members)} file{'s' if len(members) != 1 else ''} together)", stream)

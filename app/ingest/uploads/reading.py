@@ -12,6 +12,7 @@ from app.ingest import wording
 from app.platform import files
 from app.platform.jobs.children.child import Cause, ChildLimits
 from app.platform.jobs.children.limited import ChildEnded, run_limited
+from app.platform.raw_bytes import RawFile
 from app.settings import get_settings
 from ml.formats import transfer
 from ml.formats.options import DecodeOptions
@@ -50,7 +51,7 @@ class Cleaned:
     problem: UndecodableFile | None = None
 
 
-def clean(source: Path, target: Path, options: DecodeOptions, who: str = "", told: Told = lambda *_: None) -> Cleaned:
+def clean(source: RawFile, target: Path, options: DecodeOptions, who: str = "", told: Told = lambda *_: None) -> Cleaned:
     """Write a file without identity to `target`.
 
     Args:
@@ -64,7 +65,8 @@ def clean(source: Path, target: Path, options: DecodeOptions, who: str = "", tol
         ReaderEnded: the child met a limit or was ended. ReaderFault: our decoder failed.
     """
     params = {
-        "source": os.path.abspath(source),
+        "source": os.path.abspath(source.encrypted),
+        "key": os.path.abspath(source.key),
         "target": os.path.abspath(target),
         "secrets": str(get_settings().data_dir.resolve() / "secrets"),
         "options": asdict(options),

@@ -21,15 +21,17 @@ from app.ingest.uploads.in_progress import tell
 from app.ingest.uploads.incoming import Incoming
 from app.ingest.uploads.reading import ReaderEnded, ReaderFault
 from app.ingest.uploads.reports import ASIDE, BEGUN, add_redaction, aside, known_recordings, store_reports, stored_reports
-from app.platform import files
+from app.platform import files, raw_bytes
 from app.platform.errors import TooLarge
 from app.platform.jobs.children import child
+from app.platform.raw_bytes import RawFile
 from app.settings import get_settings
 from app.study.models import Participant, Recording, SettingsVersion
 from ml.formats.archive import cleaned_suffix
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, GraspLog, Problem, TraceLog, TraceSource, UndecodableFile
 from ml.formats.redaction_record import REDACTOR_VERSION, Redaction
+from ml.formats.source import Source
 from ml.formats.tables.numbers import unit_name
 
 log = structlog.get_logger()
@@ -120,7 +122,7 @@ class Receiver:
         name = Path(one.name.replace("\\", "/")).name[:255] or "file"
         limit_mb = get_settings().upload_limit_mb
         try:
-            with files.received(one.stream, limit_mb * 1024 * 1024) as (raw, sha256, size):
+            with raw_bytes.received(one.stream, limit_mb * 1024 * 1024) as (raw, sha256, size):
                 if known := self._known(name, sha256):
                     return known
                 content = self._store(raw) if size else StoredContent("unreadable", None, None, Redaction(), EMPTY)
@@ -197,7 +199,7 @@ class Receiver:
     def _told(self, share: float | None, doing: str | None) -> None:
         tell(self.upload.id, share, doing)
 
-    def _store(self, raw: Path) -> StoredContent:
+    def _store(self, raw: RawFile) -> StoredContent:
         """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted.
 
         A table is cleaned by reading it with the participant's options: one that cannot be decoded is kept encrypted too.
@@ -223,12 +225,12 @@ class Receiver:
         sealed = self._seal(raw) if found.redaction.unreadable else None
         return StoredContent(found.kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, found.redaction, None)
 
-    def _quarantined(self, raw: Path, clean: Path, problem: UndecodableFile, redaction: Redaction | None = None) -> StoredContent:
+    def _quarantined(self, raw: RawFile, clean: Path, problem: UndecodableFile, redaction: Redaction | None = None) -> StoredContent:
         clean.unlink(missing_ok=True)
         sealed = self._seal(raw)
         return StoredContent("unreadable", sealed, sealed, redaction or Redaction(), problem)
 
-    def _seal(self, raw: Path) -> str:
+    def _seal(self, raw: Source) -> str:
         return files.store(self.db, encryption.encrypt(raw), MEDIA_TYPE).sha256
 
     def decode(self, name: str, row: UploadFile, content: StoredContent) -> FileOutcome:

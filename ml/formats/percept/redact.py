@@ -23,6 +23,7 @@ from ml.formats.percept.report import report_members
 from ml.formats.percept.report_json import HINT, SECTIONS, channel_names, moment, read_report
 from ml.formats.recording import UndecodableFile
 from ml.formats.redaction_record import Redaction, pseudonym
+from ml.formats.source import Source
 
 EPOCH = (1980, 1, 1, 0, 0, 0)
 SERIAL = "NeurostimulatorSerialNumber"
@@ -51,7 +52,7 @@ ENUM = re.compile(r"(Ins(Location|Port)|[A-Za-z]{2,40}Def)[._][A-Za-z0-9_]{1,60}
 """What looks like an enumeration; only those of `enums.py` stay."""
 
 
-def redact_percept(source: Path, target: Path, key: bytes, limits: ArchiveLimits | None = None) -> Redaction:
+def redact_percept(source: Source, target: Path, key: bytes, limits: ArchiveLimits | None = None) -> Redaction:
     """Write the session report, or the zip of reports, without identity; the same bytes in give the same bytes out.
 
     Args:

@@ -26,6 +26,7 @@ from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
 from ml.formats.rcs.packets.scan import Batch, scan
 from ml.formats.recording import FileReport, UndecodableFile
 from ml.formats.redaction_record import PSEUDONYM, Redaction, pseudonym
+from ml.formats.source import Source
 
 DEFLATE_LEVEL = 1
 """Packing is what cleaning an archive takes longest over: level 6 takes five times as long and saves a fifth."""
@@ -56,7 +57,7 @@ PACKET_WORDS = frozenset(
 _QUOTED = re.compile(r'"([^"]*)"')
 
 
-def redact_rcs_zip(source: Path, target: Path, key: bytes, limits: ArchiveLimits | None = None) -> Redaction:
+def redact_rcs_zip(source: Source, target: Path, key: bytes, limits: ArchiveLimits | None = None) -> Redaction:
     """Write the archive without identity; the same bytes in give the same bytes out.
 
     Args:

@@ -8,6 +8,7 @@ from typing import Literal
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, UndecodableFile
+from ml.formats.source import Source
 from ml.formats.tables.control_log import decode_log, is_log
 from ml.formats.tables.delimited import read_headers
 from ml.formats.tables.grasps import decode_grasps, looks_like_grasps
@@ -33,7 +34,7 @@ def decode_table(path: Path, kind: TableKind, options: DecodeOptions, name: str 
     return _DECODERS[kind](path, options, name)
 
 
-def kind_of_text(path: Path) -> TableKind:
+def kind_of_text(path: Source) -> TableKind:
     """Which table a text is, by its first line or its headers."""
     if is_log(path):
         return "control_log"

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import FileReport, UndecodableFile
+from ml.formats.source import Source
 from ml.formats.tables.delimited import TextTable, read_delimited, read_head, rows_behind
 from ml.formats.tables.numbers import MISSING, column_name, iso_time, known_unit, shown, unit_name
 from ml.formats.tables.plain import read_plain
@@ -216,7 +216,7 @@ def _unknown_unit(role: str, unit: str, header: str) -> UndecodableFile:
     return UndecodableFile(what, f"column {header.strip()}", hint, f"unknown unit of the {column} column", f"column {role}")
 
 
-def read_csv(path: Path, options: DecodeOptions) -> Columns:
+def read_csv(path: Source, options: DecodeOptions) -> Columns:
     """Cells of a text table; see `decode_csv`."""
     head = read_head(path, NEEDED)
     found, units, unused, notes = match_columns(head.headers)
@@ -264,14 +264,19 @@ def _dates(table: TextTable, column: int, first_s: float) -> NDArray[np.float64]
     return out - known[0] + first_s
 
 
-def read_parquet(path: Path, options: DecodeOptions) -> Columns:
+def read_parquet(path: Source, options: DecodeOptions) -> Columns:
     """Columns of a Parquet table; see `decode_parquet`."""
+    with path.open("rb") as stream:
+        return _parquet_columns(stream, options)
+
+
+def _parquet_columns(stream: BinaryIO, options: DecodeOptions) -> Columns:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     hint = "Write the table again, for example with pandas' to_parquet."
     try:
-        file = pq.ParquetFile(path)
+        file = pq.ParquetFile(stream)
         headers = [str(n) for n in file.schema_arrow.names]
     except (pa.ArrowException, OSError, ValueError) as error:
         raise UndecodableFile("the Parquet file is damaged or cut", "file", hint) from error

@@ -7,6 +7,7 @@ a table of steps both belong to two rows: here each beta stands beside the ampli
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, TraceSource, UndecodableFile
 from ml.formats.redaction_record import Redaction
+from ml.formats.source import Source
 from ml.formats.tables.columns import Columns
 from ml.formats.tables.log_head import ENDS, MEND, Ran, read_head
 from ml.formats.tables.numbers import NotANumber, known_unit, parse_number, shown
@@ -70,13 +72,13 @@ class Log:
         return float(self.due_s[int(np.argmax(self.followed))])
 
 
-def is_log(path: Path) -> bool:
+def is_log(path: Source) -> bool:
     """Whether a file says in its first line that it is a controller's log."""
     with path.open("rb") as stream:
         return stream.read(200).removeprefix(b"\xef\xbb\xbf").startswith(MARK)
 
 
-def decode_log(path: Path, options: DecodeOptions, name: str | None = None) -> DecodedFile:
+def decode_log(path: Source, options: DecodeOptions, name: str | None = None) -> DecodedFile:
     """Decode a controller's log into beta and the amplitude in force, one row per period; the last decision has no period yet.
 
     Raises:
@@ -157,7 +159,7 @@ def in_force(log: Log) -> Floats:
     return np.where(known, mean, np.nan)
 
 
-def redact_log(source: Path, target: Path, options: DecodeOptions) -> Redaction:
+def redact_log(source: Source, target: Path, options: DecodeOptions) -> Redaction:
     """Write a log of its numbers alone, which decodes to the same recording. Raises UndecodableFile as `decode_log`, before it writes."""
     log = _read(source, options)
     decode_log(source, options, "log")
@@ -180,12 +182,12 @@ def _cell(value: Any) -> str:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Iterator[str]]:
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as stream:
+def _opened(path: Source) -> Iterator[Iterator[str]]:
+    with path.open("rb") as raw, io.TextIOWrapper(raw, encoding="utf-8-sig", errors="replace", newline="") as stream:
         yield iter(stream)
 
 
-def _read(path: Path, options: DecodeOptions) -> Log:
+def _read(path: Source, options: DecodeOptions) -> Log:
     with _opened(path) as lines:
         period_s, ran, head = read_head(lines, options)
         before = head.count("\n") + 1

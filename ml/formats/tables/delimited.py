@@ -14,12 +14,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.recording import UndecodableFile
+from ml.formats.source import Source
 from ml.formats.tables.numbers import TIME_COLUMNS, TIME_UNITS, NotANumber, column_name, known_unit, parse_number, shown
 
 MOSTLY = 0.9
@@ -110,7 +110,7 @@ class TableHead:
     notes: list[str]
 
 
-def read_delimited(path: Path, max_rows: int | Callable[[Sequence[str]], int], needed: str) -> TextTable:
+def read_delimited(path: Source, max_rows: int | Callable[[Sequence[str]], int], needed: str) -> TextTable:
     """Read a text table.
 
     Args:
@@ -128,7 +128,7 @@ def read_delimited(path: Path, max_rows: int | Callable[[Sequence[str]], int], n
     return TextTable(head.headers, lines, rows, head.delimiter, list(head.notes))
 
 
-def read_head(path: Path, needed: str) -> TableHead:
+def read_head(path: Source, needed: str) -> TableHead:
     """The headers of a text table and how it is written. Raises UndecodableFile for an empty or a binary file."""
     notes: list[str] = []
     encoding = _encoding(path, notes, needed)
@@ -157,7 +157,7 @@ def read_head(path: Path, needed: str) -> TableHead:
 
 
 @contextmanager
-def rows_behind(path: Path, head: TableHead) -> Iterator[Iterator[str]]:
+def rows_behind(path: Source, head: TableHead) -> Iterator[Iterator[str]]:
     """The lines below the head of a table."""
     with path.open("rb") as raw, io.TextIOWrapper(raw, encoding=head.encoding, errors="replace", newline=None) as stream:
         lines = _lines(stream)
@@ -197,7 +197,7 @@ def _units(line: str, delimiter: str, width: int) -> list[str] | None:
     return ["" if cell == "-" else cell for cell in cells]
 
 
-def _encoding(path: Path, notes: list[str], needed: str) -> str:
+def _encoding(path: Source, notes: list[str], needed: str) -> str:
     """How the text is encoded, by its first bytes. Raises UndecodableFile for what is no text."""
     with path.open("rb") as stream:
         head = stream.read(4096)
@@ -267,6 +267,6 @@ def _cells(source: Iterator[str], delimiter: str, width: int, offset: int, max_r
     return lines, rows
 
 
-def read_headers(path: Path) -> list[str]:
+def read_headers(path: Source) -> list[str]:
     """The headers of a text table, nothing else of it; empty where there are none. Raises UndecodableFile for what is no text."""
     return read_head(path, "t_s").headers

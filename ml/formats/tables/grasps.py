@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, GraspLog, Hemisphere, UndecodableFile
+from ml.formats.source import Source
 from ml.formats.tables.columns import BETA_NAMES
 from ml.formats.tables.delimited import TextTable, read_delimited
 from ml.formats.tables.numbers import column_name, shown
@@ -35,7 +35,7 @@ def looks_like_grasps(headers: Sequence[str]) -> bool:
     return bool(times) and ("hand" in keys or any(key in TELLING for key in keys) or not others)
 
 
-def decode_grasps(path: Path, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
+def decode_grasps(path: Source, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
     """Decode a table of open-fist times (`t_s` or `t_us`, optional `hand`).
 
     Implausible intervals (under 80 ms, over 3 s) are flagged and kept.

@@ -13,6 +13,7 @@ import numpy as np
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import TREMOR_CLASSES, GraspLog, TremorLog
 from ml.formats.redaction_record import Redaction
+from ml.formats.source import Source
 from ml.formats.tables.columns import Columns, read_csv, read_parquet
 from ml.formats.tables.control_log import redact_log
 from ml.formats.tables.grasps import decode_grasps
@@ -23,7 +24,7 @@ from ml.formats.tables.strivepd import decode_strivepd
 TableKind = Literal["csv", "parquet", "control_log", "tremor", "grasp"]
 
 
-def redact_table(source: Path, target: Path, kind: TableKind, options: DecodeOptions) -> Redaction:
+def redact_table(source: Source, target: Path, kind: TableKind, options: DecodeOptions) -> Redaction:
     """Write a table of the known columns alone; the same bytes in give the same bytes out.
 
     Headers become the column's role with its unit in brackets, cells the numbers that were read. A table of steps or of raw LFP keeps its
@@ -51,7 +52,7 @@ def redact_table(source: Path, target: Path, kind: TableKind, options: DecodeOpt
     return Redaction(removed=removed_columns(columns.ignored), repaired=list(columns.notes))
 
 
-def _redact_outcomes(source: Path, target: Path, kind: str, options: DecodeOptions) -> Redaction:
+def _redact_outcomes(source: Source, target: Path, kind: str, options: DecodeOptions) -> Redaction:
     decoded = decode_strivepd(source, options) if kind == "tremor" else decode_grasps(source, options)
     report = decoded.reports[0]
     lines = _tremor_lines(decoded.tremor[0]) if kind == "tremor" else _grasp_lines(decoded.grasps)

@@ -9,13 +9,13 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import TREMOR_CLASSES, DecodedFile, FileReport, TremorLog, UndecodableFile
+from ml.formats.source import Source
 from ml.formats.tables.delimited import TextTable, read_delimited
 from ml.formats.tables.numbers import NotANumber, column_name, parse_number, shown
 from ml.formats.tables.removed import removed_columns
@@ -54,7 +54,7 @@ def _key(header: str) -> str:
     return plain if plain in TREMOR_CLASSES else key
 
 
-def decode_strivepd(path: Path, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
+def decode_strivepd(path: Source, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
     """Decode minutes of tremor in any of three layouts, recognised by their columns.
 
     Times are ISO 8601 or Unix time; a time without a zone is read as UTC, and that is said.

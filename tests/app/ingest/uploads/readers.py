@@ -12,6 +12,7 @@ import numpy as np
 
 from app.ingest.uploads import compute
 from app.platform.jobs import StepReport
+from app.platform.raw_bytes import RawFile
 from tests.app.ingest.safety.planted import NOTE, WHO
 
 
@@ -67,7 +68,7 @@ def fault_of_rcs(params: dict[str, Any], workdir: Path, report: StepReport) -> d
 
 def fault_of_cleaning(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """Fail with half of the file written, unless it is a table."""
-    with open(params["source"], "rb") as source:
+    with RawFile(Path(params["source"]), Path(params["key"])).open() as source:
         if source.read(4) == b"PK\x03\x04":
             Path(params["target"]).write_bytes(b"SYN000001H, half cleaned")
             raise ZeroDivisionError("a fault of ours, in the file of Ada Lovelace")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
+import random
 import signal
 import stat
 import subprocess
@@ -14,7 +16,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from app.platform import files
+from app.platform import files, raw_bytes
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -90,14 +92,14 @@ def test_the_start_of_the_service_removes_what_killed_processes_left(service_app
 FULL = """
 import io, resource, sys
 from app.ingest import encryption
-from app.platform import files
+from app.platform import files, raw_bytes
 resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
 source = sys.argv[1]
 big = bytes(5 << 20)
 for action in (
     lambda: files.store(None, big, "text/plain"),
     lambda: encryption.encrypt(__import__("pathlib").Path(source)),
-    lambda: files.received(io.BytesIO(big), 1 << 30).__enter__(),
+    lambda: raw_bytes.received(io.BytesIO(big), 1 << 30).__enter__(),
 ):
     try:
         action()
@@ -118,15 +120,73 @@ def test_without_a_list_of_open_files_the_bytes_have_a_name_that_only_the_owner_
     fresh_database: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(files, "_OPEN_FILES", Path("/nowhere"))
-    with files.received(io.BytesIO(NAME), 100) as (path, _, size):
-        assert (path.read_bytes(), size) == (NAME, len(NAME))
-        assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert not path.exists()
+    with raw_bytes.received(io.BytesIO(NAME), 100) as (raw, _, size):
+        assert (raw.open().read(), size) == (NAME, len(NAME))
+        assert NAME not in raw.encrypted.read_bytes()
+        assert {stat.S_IMODE(p.stat().st_mode) for p in (raw.encrypted, raw.key)} == {0o600}
+    assert not raw.encrypted.exists()
+    assert not raw.key.exists()
 
 
-def test_raw_bytes_have_no_name_and_can_be_read_by_their_path(fresh_database: str) -> None:
-    with files.received(io.BytesIO(NAME), 100) as (path, _, _):
-        assert path.read_bytes() == NAME
+def test_raw_bytes_have_no_name_are_encrypted_and_can_be_opened_by_their_owner(fresh_database: str) -> None:
+    with raw_bytes.received(io.BytesIO(NAME), 100) as (raw, sha256, _):
+        assert raw.open().read() == NAME
+        assert raw.sha256() == sha256 == hashlib.sha256(NAME).hexdigest()
+        assert NAME not in raw.encrypted.read_bytes()
         assert [p for p in incoming().rglob("*") if p.is_file() and p.name != ".lock"] == []
-    with pytest.raises(OverflowError), files.received(io.BytesIO(NAME), 3):
+        assert "memfd" in os.readlink(raw.key), "the key is on no disk"
+        later = raw.open()
+    assert later.read() == NAME, "what is open stays open"
+    with pytest.raises(OverflowError), raw_bytes.received(io.BytesIO(NAME), 3):
         pass
+
+
+def test_any_place_of_raw_bytes_is_read_and_written_as_in_a_plain_file(fresh_database: str) -> None:
+    rng, plain = random.Random(7), io.BytesIO()
+    with raw_bytes.raw_file() as (out, raw):
+        for _ in range(200):
+            begin, part = rng.randrange(plain.getbuffer().nbytes + 1), rng.randbytes(rng.randrange(1, 70))
+            for sink in (out, plain):
+                sink.seek(begin)
+                sink.write(part)
+        size = plain.getbuffer().nbytes
+        assert raw.open().read() == plain.getvalue()
+        with raw.open() as stream:
+            for _ in range(200):
+                begin, length = rng.randrange(size), rng.randrange(1, 100)
+                stream.seek(begin)
+                assert stream.read(length) == plain.getvalue()[begin : begin + length]
+            stream.seek(-5, os.SEEK_END)
+            assert stream.read() == plain.getvalue()[-5:]
+
+
+FORM = """
+import asyncio, sys
+from app.ingest.uploads.encrypted_form import EncryptedForm
+
+head = b'--b\\r\\nContent-Disposition: form-data; name="file"; filename="t.csv"\\r\\nContent-Type: text/csv\\r\\n\\r\\n'
+chunks = iter([head, *([b"NAME-OF-THE-PATIENT," * 3000] * 50)])
+
+async def receive():
+    chunk = next(chunks, None)
+    if chunk is None:
+        print("here", flush=True)
+        await asyncio.sleep(600)
+    return {"type": "http.request", "body": chunk, "more_body": True}
+
+kind = (b"content-type", b"multipart/form-data; boundary=b")
+scope = {"type": "http", "method": "POST", "path": "/", "query_string": b"", "headers": [kind]}
+asyncio.run(EncryptedForm(scope, receive).form().__aenter__())
+"""
+
+
+@pytest.mark.parametrize(("program", "moment"), [(FORM, "form"), (UPLOAD, "coming"), (UPLOAD, "cleaning")])
+def test_no_file_that_a_process_has_open_in_mid_upload_shows_raw_bytes(enrolled: str, program: str, moment: str) -> None:
+    with subprocess.Popen([sys.executable, "-c", program, moment], cwd=ROOT, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"here\n", "the upload is in its middle"
+        opened = [p for p in Path(f"/proc/{process.pid}/fd").iterdir() if p.is_file()]
+        content = {os.readlink(p): p.read_bytes() for p in opened}
+        process.kill()
+    assert sum(map(len, content.values())) > 2 << 20, "the bytes that came are in one of them"
+    assert [name for name, held in content.items() if NAME in held] == []
