@@ -70,19 +70,36 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedPostgre
         rights.grant(connection, "betaloop_service", None)
     engine.dispose()
     yield server
+    for connection in _administrators.values():
+        connection.close()
+    _administrators.clear()
     server.remove()
 
 
 _counter = iter(range(10**9))
 
 
+_administrators: dict[str, psycopg.Connection] = {}
+
+
+def _administer(server: EmbeddedPostgres, statement: str) -> None:
+    """Execute a statement as the server's administrator, over one connection for all tests: to connect twice for each takes longer."""
+    conninfo = server.admin_conninfo()
+    try:
+        if conninfo not in _administrators:
+            _administrators[conninfo] = psycopg.connect(conninfo, autocommit=True)
+        _administrators[conninfo].execute(statement)
+    except psycopg.OperationalError:  # a test has killed the server meanwhile
+        _administrators.pop(conninfo).close()
+        _administrators[conninfo] = psycopg.connect(conninfo, autocommit=True)
+        _administrators[conninfo].execute(statement)
+
+
 @contextmanager
 def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.MonkeyPatch, template: str) -> Iterator[str]:
     """A database and data folder of one test, named in the environment too, so that child processes find them."""
     name = f"test_{os.getpid()}_{next(_counter)}"
-    admin = server.admin_conninfo()
-    with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f"create database {name} template {template} owner betaloop strategy file_copy")
+    _administer(server, f"create database {name} template {template} owner betaloop strategy file_copy")
     url = server.url(name)
     monkeypatch.setenv("BETALOOP_DATABASE_URL", url)
     monkeypatch.setenv("BETALOOP_OWNER_URL", server.owner_url(name))
@@ -93,8 +110,7 @@ def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.Monke
         engine.dispose()
     database._engines.clear()
     get_settings.cache_clear()
-    with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f"drop database {name} with (force)")
+    _administer(server, f"drop database {name} with (force)")
     shutil.rmtree(data, ignore_errors=True)
 
 

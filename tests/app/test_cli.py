@@ -144,6 +144,7 @@ def test_a_path_of_no_use_is_one_line_and_exit_code_2(study: str, arguments: lis
     assert len(result.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_session_that_cannot_be_read_does_not_stop_the_export(study: str, tmp_path: Path) -> None:
     table = tmp_path / "session.csv"
     table.write_text(TABLE)

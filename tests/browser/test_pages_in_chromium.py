@@ -6,9 +6,12 @@ from collections.abc import Callable
 
 import pytest
 from fastapi.testclient import TestClient
+from playwright.sync_api import expect
 
 pytestmark = pytest.mark.browser
 
+COLOURS = """() => [document.body, document.querySelector('#control path.js-line')].map((e) => e && getComputedStyle(e))
+  .map((style) => style && `${style.color} ${style.stroke}`)"""
 SMALL_TARGETS = """() => [...document.querySelectorAll('a, button, input:not([type=hidden]), select, summary, textarea')]
   .filter((e) => e.checkVisibility() && !e.closest('.modebar, .skip, .behind table'))
   .filter((e) => !e.closest('p, .note, .help, dd') || e.matches('button, .button'))
@@ -22,7 +25,7 @@ def test_from_sign_in_to_a_participants_charts(window: Callable, studied: list[i
     watched = window()
     watched.sign_in()
     watched.page.click("article.participant h3 a")
-    assert watched.page.inner_text("h1") == "P1"
+    expect(watched.page.locator("h1")).to_have_text("P1")
     assert watched.charts_drawn() == 6
     assert watched.errors == []
     assert watched.foreign == []
@@ -57,22 +60,11 @@ def test_the_theme_is_chosen_kept_and_redraws_the_charts(window: Callable, studi
     watched.sign_in()
     watched.open(f"/sessions/{studied[0]}")
     watched.charts_drawn()
-
-    def colours() -> tuple[str, str]:
-        return tuple(
-            watched.page.evaluate(
-                "() => [getComputedStyle(document.body).color, getComputedStyle(document.querySelector('#control path.js-line')).stroke]"
-            )
-        )
-
-    light = colours()
+    light = watched.page.evaluate(COLOURS)
     watched.page.click("[data-theme-toggle]")
-    watched.page.wait_for_timeout(1500)
-    dark = colours()
-    assert light[0] != dark[0]
-    assert light[1] != dark[1]
+    watched.page.wait_for_function(f"(light) => ({COLOURS})().every((colour, i) => colour !== light[i])", arg=light)
     watched.page.reload()
-    assert watched.page.get_attribute("html", "data-theme") == "dark"
+    expect(watched.page.locator("html")).to_have_attribute("data-theme", "dark")
 
 
 def test_paper_takes_every_chart_in_the_light_colours(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
@@ -115,10 +107,9 @@ def test_files_dropped_on_the_upload_page_become_sessions(window: Callable, enro
         files,
     )
     watched.page.dispatch_event("[data-drop]", "drop", {"dataTransfer": transfer})
-    watched.page.wait_for_selector("[data-upload-list] li .badge", timeout=60_000)
-    outcomes = [b.inner_text() for b in watched.page.query_selector_all("[data-upload-list] .badge")]
-    assert outcomes == ["received", "decoded", "not usable, kept", "known already"]
-    assert "bad <b>.csv" in watched.page.inner_text("[data-upload-list] li")
+    outcomes = ["received", "decoded", "not usable, kept", "known already"]
+    expect(watched.page.locator("[data-upload-list] .badge")).to_have_text(outcomes, timeout=60_000)
+    expect(watched.page.locator("[data-upload-list] li").first).to_contain_text("bad <b>.csv")
     assert client.get("/api/v1/visits/1/sessions").json()["total"] == 1
     watched.page.click("[data-upload-list] li a")
     assert watched.charts_drawn() == 1
@@ -134,12 +125,12 @@ def test_what_cannot_be_taken_back_asks_first(window: Callable, enrolled: str) -
     row = watched.page.locator("tr", has_text="a tablet")
     row.locator("button").click()
     watched.page.click("dialog[open] >> text=Leave it as it is")
-    assert row.locator(".badge").inner_text() == "live"
+    expect(row.locator(".badge")).to_have_text("live")
     row.locator("button").click()
     assert watched.page.inner_text("dialog[open] [value=yes]") == "Revoke"
     watched.page.click("dialog[open] [value=yes]")
     watched.page.wait_for_selector("text=Token revoked")
-    assert row.locator(".badge").inner_text() == "revoked"
+    expect(row.locator(".badge")).to_have_text("revoked")
 
 
 def test_tables_sort_numbers_as_numbers_with_missing_ones_last(window: Callable, studied: list[int], client: TestClient) -> None:  # type: ignore[type-arg]
@@ -147,13 +138,10 @@ def test_tables_sort_numbers_as_numbers_with_missing_ones_last(window: Callable,
     watched = window()
     watched.sign_in()
     watched.open("/visits/1")
-
-    def grasp() -> list[str]:
-        return [c.inner_text() for c in watched.page.query_selector_all("table.data tbody td:nth-child(9)")]
-
-    assert grasp() == ["2.00", "—", "4.00"]
+    grasp = watched.page.locator("table.data tbody td:nth-child(9)")
+    expect(grasp).to_have_text(["2.00", "—", "4.00"])
     watched.page.click("table.data th:nth-child(9) button")
-    assert grasp() == ["2.00", "4.00", "—"]
+    expect(grasp).to_have_text(["2.00", "4.00", "—"])
     watched.page.click("table.data th:nth-child(9) button")
-    assert grasp() == ["4.00", "2.00", "—"]
-    assert watched.page.get_attribute("table.data th:nth-child(9)", "aria-sort") == "descending"
+    expect(grasp).to_have_text(["4.00", "2.00", "—"])
+    expect(watched.page.locator("table.data th:nth-child(9)")).to_have_attribute("aria-sort", "descending")

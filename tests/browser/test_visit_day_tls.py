@@ -23,6 +23,7 @@ from cryptography.x509.oid import NameOID
 
 from tests.browser.conftest import FLAGS, Watched, program
 from tests.clinic_day import ClinicDay, clinic_day
+from tests.ports import free_port
 
 __all__ = ["clinic_day"]
 pytestmark = pytest.mark.browser
@@ -32,9 +33,7 @@ HOST = "clinic.example"
 @contextmanager
 def served(certificate: Path, key: Path, log: Path) -> Iterator[str]:
     """`betaloop serve` with a certificate, in a process of its own, on the test's database."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     command = ["serve", "--port", str(port), "--tls-certificate", str(certificate), "--tls-key", str(key)]
     with log.open("wb") as out:
         process = subprocess.Popen([sys.executable, "-c", "from app.cli import main; main()", *command], stdout=out, stderr=out)
@@ -85,8 +84,9 @@ def test_without_tls_nothing_is_kept_and_the_plain_form_remains(chromium: Any, a
         watched.sign_in()
         watched.open(f"/visit-day/{clinic_day.visit}")
         watched.page.wait_for_selector("text=Nothing can be kept on this tablet")
-        watched.page.click("#plain >> text=Start")
-        watched.page.click("#plain button[value='8']")
+        for button in ("#plain >> text=Start", "#plain button[value='8']"):
+            with watched.page.expect_navigation():
+                watched.page.click(button)
         assert watched.page.evaluate("() => indexedDB.databases().then((all) => all.length)") == 0
     kinds = [e["kind"] for e in clinic_day.client.get(f"/api/v1/visits/{clinic_day.visit}/day/entries").json()["items"]]
     assert kinds == ["start", "rating"]

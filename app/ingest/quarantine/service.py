@@ -89,10 +89,14 @@ def release_as_is(db: Session, file_id: int, reason: str, caller: Caller) -> Upl
     file, _ = _held(db, file_id, caller)
     if file.reviewed_at is None:
         raise Conflict(f"Nobody has looked at file {file.id} yet.", "Review its content first: it may name the participant.")
-    with _original(file) as path:
+    with _original(file) as original:
         draft = files.draft_path()
-        shutil.copyfile(path, draft)
-        file.released_sha256 = files.store(db, draft, MEDIA_TYPE).sha256
+        try:
+            with original.open() as source, draft.open("wb") as out:
+                shutil.copyfileobj(source, out, files.CHUNK)
+            file.released_sha256 = files.store(db, draft, MEDIA_TYPE).sha256
+        finally:
+            draft.unlink(missing_ok=True)
     file.status = "released" if file.status == "failed" else file.status
     _decide(db, file, reason, caller)
     _erase(db, file)

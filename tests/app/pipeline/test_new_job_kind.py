@@ -54,6 +54,7 @@ def worker(fresh_database: str) -> Any:
     process.wait(20)
 
 
+@pytest.mark.slow
 def test_a_new_kind_is_one_registration(
     client: TestClient, upload: Callable[..., int], make_token: Callable[[str], str], worker: Any, ended: Any
 ) -> None:

@@ -51,6 +51,7 @@ def sessions(upload: Upload) -> list[int]:
 CHEAP = ["linear", "fqe", "wdr", "wis", "pdis", "cwpdis"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("worker")
 def test_an_evaluation_gives_the_numbers_that_the_estimators_give(
     client: TestClient, sessions: list[int], ended: Ended, db: Session

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ import pytest
 
 from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
+from tests.ports import free_port
 
 ROOT = Path(__file__).resolve().parents[3]
 SIGNALS = [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
@@ -45,12 +45,6 @@ def left_in(data: Path) -> list[psutil.Process]:
         if str(data) in words and process.pid != os.getpid():
             found.append(process)
     return found
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _as_a_background_job() -> None:

@@ -103,6 +103,7 @@ def test_cancelling_stops_a_fit(small_buffer):
         Dlmm(TINY).fit(small_buffer, stop)
 
 
+@pytest.mark.slow
 def test_on_a_system_whose_next_beta_follows_the_window_and_the_action_it_ranks_constant_amplitudes(linear_simulator):
     config = DlmmConfig(members=1, updates=1200, rollouts=64, learning_rate=3e-3)
     fitted = Dlmm(config).fit(linear_simulator.buffer(seed=0))

@@ -37,6 +37,7 @@ def exact(target):
     return d
 
 
+@pytest.mark.slow
 def test_ratios_and_values_of_a_tabular_mdp_are_the_exact_ones_for_two_policies_at_once():
     targets = [np.array([1, 0]), np.array([1, 1])]
     now, then = chain(targets[0])[0], np.stack([chain(t)[1] for t in targets])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -16,6 +15,7 @@ from fastapi.testclient import TestClient
 
 from tests.app.ingest.safety import hostile
 from tests.app.learning.policies.test_foreign_policies import constant_of
+from tests.ports import free_port
 
 ROOT = Path(__file__).resolve().parents[4]
 MOST_MB = 600
@@ -25,9 +25,7 @@ MOST_MB = 600
 @pytest.fixture
 def service(enrolled: str, make_token: Callable[[str], str]) -> Iterator[tuple[httpx.Client, subprocess.Popen[bytes]]]:
     """`betaloop serve` on the test's database, and a client of an engineer."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     command = [sys.executable, "-m", "app.cli", "serve", "--port", str(port)]
     process = subprocess.Popen(command, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}, stderr=subprocess.DEVNULL)
     headers = {"Authorization": f"Bearer {make_token('engineer')}"}

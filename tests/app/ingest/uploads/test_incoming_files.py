@@ -16,6 +16,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
+from app.ingest.uploads import encrypted_form
 from app.platform import files, raw_bytes
 from app.settings import get_settings
 
@@ -58,6 +59,13 @@ def incoming() -> Path:
     return get_settings().files_dir / "incoming"
 
 
+def assert_open_files_show_nothing(process: subprocess.Popen[bytes]) -> None:
+    """Whoever reads the disk while an upload comes finds megabytes of it, and no name."""
+    content = {os.readlink(p): p.read_bytes() for p in Path(f"/proc/{process.pid}/fd").iterdir() if p.is_file()}
+    assert sum(map(len, content.values())) > 2 << 20
+    assert [name for name, held in content.items() if NAME in held] == []
+
+
 @pytest.mark.parametrize("moment", ["coming", "cleaning"])
 def test_a_process_killed_in_mid_upload_leaves_no_raw_bytes(enrolled: str, moment: str) -> None:
     with subprocess.Popen([sys.executable, "-c", UPLOAD, moment], cwd=ROOT, stdout=subprocess.PIPE) as process:
@@ -68,6 +76,7 @@ def test_a_process_killed_in_mid_upload_leaves_no_raw_bytes(enrolled: str, momen
         assert {stat.S_IMODE(p.stat().st_mode) for p in folder.iterdir()} == {0o600}
         assert files.remove_abandoned() == 0
         assert folder.is_dir(), "a live process keeps what it writes"
+        assert_open_files_show_nothing(process)
         os.kill(process.pid, signal.SIGKILL)
     assert [p for p in stored() if NAME in p.read_bytes()] == []
     assert sum(p.stat().st_size for p in stored()) == 0, "nothing of it keeps the disk full"
@@ -180,13 +189,19 @@ asyncio.run(EncryptedForm(scope, receive).form().__aenter__())
 """
 
 
-@pytest.mark.parametrize(("program", "moment"), [(FORM, "form"), (UPLOAD, "coming"), (UPLOAD, "cleaning")])
-def test_no_file_that_a_process_has_open_in_mid_upload_shows_raw_bytes(enrolled: str, program: str, moment: str) -> None:
-    with subprocess.Popen([sys.executable, "-c", program, moment], cwd=ROOT, stdout=subprocess.PIPE) as process:
+def test_what_the_parser_of_the_form_puts_aside_is_encrypted(fresh_database: str) -> None:
+    with subprocess.Popen([sys.executable, "-c", FORM], cwd=ROOT, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        assert process.stdout.readline() == b"here\n", "the upload is in its middle"
-        opened = [p for p in Path(f"/proc/{process.pid}/fd").iterdir() if p.is_file()]
-        content = {os.readlink(p): p.read_bytes() for p in opened}
+        assert process.stdout.readline() == b"here\n", "the form is in its middle"
+        assert_open_files_show_nothing(process)
         process.kill()
-    assert sum(map(len, content.values())) > 2 << 20, "the bytes that came are in one of them"
-    assert [name for name, held in content.items() if NAME in held] == []
+
+
+def test_the_routes_of_uploads_read_their_forms_encrypted(client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[object] = []
+    monkeypatch.setattr(encrypted_form, "raw_stream", lambda: made.append(raw := raw_bytes.raw_stream()) or raw)
+    for path in ("/api/v1/uploads", f"/participants/{enrolled}/upload"):
+        table = b"t_s,beta,amplitude_fraction\n" + b"".join(b"%d,1,1\n" % (2 * k) for k in range(20 + len(made)))
+        fields = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+        assert client.post(path, data=fields, files={"file": ("t.csv", table)}).status_code in (200, 201, 303), path
+    assert [stream.closed for stream in made] == [True, True]

@@ -145,6 +145,7 @@ def test_the_lead_over_the_usual_first_is_the_mean_over_pairs_with_a_jackknife_o
     assert lead(rows[:2] + rows[4:], "linear", "fqe") == (0.0, float("inf"))
 
 
+@pytest.mark.slow
 def test_a_method_takes_the_place_of_the_usual_first_only_by_more_than_a_standard_error(linear_simulator):
     class Said:
         """Predictions by the mean amplitude of the policy: exact to a slope and an offset of one controller."""

@@ -101,6 +101,7 @@ def data(seed, steps=6):
     return rng.normal(size=steps + 1), rng.uniform(0, 1, steps), rng.normal(size=steps)
 
 
+@pytest.mark.slow
 def test_the_bound_equals_the_exact_log_likelihood_where_the_filtering_encoder_is_the_exact_posterior():
     states, actions, rewards = data(0)
     value, error = bound(linear_gaussian(0.0, 0.0), states, actions, rewards, None)

@@ -38,6 +38,7 @@ def training(buffer, config=TINY, fingerprint="this fit"):
     return MemberTraining(buffer, make_batch(buffer, scale), scale, [0, 5], config, 7, fingerprint)
 
 
+@pytest.mark.slow
 def test_a_resumed_training_ends_exactly_where_an_uninterrupted_one_does(small_buffer, tmp_path):
     whole = training(small_buffer).run()
 

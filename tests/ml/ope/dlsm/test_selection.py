@@ -168,6 +168,7 @@ def test_a_report_that_raises_stops_a_choice_at_its_next_check(small_buffer, mon
     assert len(steps) == TINY.check_every
 
 
+@pytest.mark.slow
 def test_members_trained_on_their_own_make_the_same_choice(small_buffer, tmp_path):
     config = replace(TINY, select=True)
     member = Dlsm(config).fit_member(small_buffer, 1, checkpoint_dir=tmp_path)
