@@ -101,10 +101,10 @@ def address(service_app) -> Iterator[str]:  # type: ignore[no-untyped-def]
     server = uvicorn.Server(uvicorn.Config(service_app, host="127.0.0.1", port=0, log_level="warning"))
     thread = threading.Thread(target=server.run)
     thread.start()
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 180
     while not server.started:
         assert thread.is_alive(), "the service ended before it listened"
-        assert time.monotonic() < deadline, "the service did not listen within 60 s"
+        assert time.monotonic() < deadline, "the service did not listen within 180 s"
         time.sleep(0.05)
     yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
     server.should_exit = True

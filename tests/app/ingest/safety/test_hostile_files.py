@@ -39,7 +39,7 @@ def service(enrolled: str, make_token: Callable[[str], str]) -> Iterator[tuple[h
 
 
 def _wait_for(client: httpx.Client) -> None:
-    deadline = time.monotonic() + 90
+    deadline = time.monotonic() + 180
     while True:
         try:
             client.get("/healthz").raise_for_status()
