@@ -1,6 +1,6 @@
 """Uploads are refused by role before their body is read: a form is parsed before any dependency is asked, and may have gigabytes.
 
-What is read then is encrypted on its way (`encrypted_form`).
+What is read then is encrypted on its way (`app.platform.web.encrypted_form`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from starlette.concurrency import run_in_threadpool
 
 from app.accounts import permissions as can
 from app.accounts.deps import get_caller
-from app.ingest.uploads.encrypted_form import EncryptedForm
 from app.platform.database import new_session
+from app.platform.web.encrypted_form import EncryptedForm
 
 _bearer = HTTPBearer(auto_error=False)
 

@@ -16,8 +16,8 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from app.ingest.uploads import encrypted_form
 from app.platform import files, raw_bytes
+from app.platform.web import encrypted_form
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -171,7 +171,7 @@ def test_any_place_of_raw_bytes_is_read_and_written_as_in_a_plain_file(fresh_dat
 
 FORM = """
 import asyncio, sys
-from app.ingest.uploads.encrypted_form import EncryptedForm
+from app.platform.web.encrypted_form import EncryptedForm
 
 head = b'--b\\r\\nContent-Disposition: form-data; name="file"; filename="t.csv"\\r\\nContent-Type: text/csv\\r\\n\\r\\n'
 chunks = iter([head, *([b"NAME-OF-THE-PATIENT," * 3000] * 50)])
