@@ -1,7 +1,7 @@
 """Simulated studies in which nothing is to be found, and studies at the margin: do the tests keep their level, do the intervals cover?
 
     python benchmarks/null_studies.py --quick
-    python benchmarks/null_studies.py [--studies 2000] [--workers 2] [--json FILE]
+    python benchmarks/null_studies.py [--studies 2000] [--workers 2] [--keep FOLDER] [--json FILE]
 
 A study is one participant's visits with sessions of one controller and of cDBS. Every scenario adds to the noise of sessions what visits
 bring: days that differ, a controller that does better on some days and worse on others (its average effect being what is tested), drift
@@ -15,11 +15,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -106,18 +109,25 @@ def layout(world: World, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarr
     return np.array(visit), np.array(tested, dtype=bool), np.array(order, dtype=float)
 
 
-def latent(world: World, effect: float, rng: np.random.Generator, design: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-    """What a continuous metric is made of, in standard deviations of a session."""
+def latent(
+    world: World, effect: float, rng: np.random.Generator, design: tuple[np.ndarray, np.ndarray, np.ndarray], either: bool = False
+) -> np.ndarray:
+    """What a metric is made of, in standard deviations of a session.
+
+    `either`: what differs between visits befalls either arm with the same chance, so that the average effect is nil in every metric, also
+    in one that has a floor or a ceiling.
+    """
     visit, tested, order = design
     noise = rng.standard_t(3, visit.size) / np.sqrt(3) if world.heavy else rng.standard_normal(visit.size)
     last = np.maximum(np.maximum.reduceat(order, np.flatnonzero(np.diff(visit, prepend=-1))), 1)[visit]
     level = world.day * rng.standard_normal(world.visits)
     slope = effect + world.slope * rng.standard_normal(world.visits)
-    return level[visit] + slope[visit] * tested + world.drift * order / last + noise
+    changed = tested ^ (rng.random(world.visits) < 0.5)[visit] if either and world.slope else tested
+    return level[visit] + slope[visit] * changed + world.drift * order / last + noise
 
 
 def measure(metric: str, z: np.ndarray, design: tuple[np.ndarray, np.ndarray, np.ndarray], world: World, rng: np.random.Generator):
-    """A metric of the study; symmetric in its latent value, so that a null of the latent value is one of the metric."""
+    """A metric of the study from its latent value."""
     visit, tested, order = design
     value = {
         "grasp": lambda: 2.3 + 0.15 * z,
@@ -156,6 +166,19 @@ class Tally:
             cell[0] += hits
             cell[1] += number
 
+    def write(self, path: Path) -> None:
+        """Whole or not at all."""
+        draft = path.with_suffix(".part")
+        draft.write_text(json.dumps([[*key, *counts] for key, counts in self.counts.items()]))
+        draft.replace(path)
+
+    @classmethod
+    def read(cls, path: Path) -> Tally:
+        """What `write` wrote."""
+        tally = cls()
+        tally.counts = {tuple(row[:-2]): row[-2:] for row in json.loads(path.read_text())}
+        return tally
+
     def share(self, *key: str) -> tuple[float, int]:
         hits, number = self.counts.get(key, [0, 0])
         return (hits / number if number else float("nan")), number
@@ -180,7 +203,7 @@ def null_studies(name: str, studies: int) -> Tally:
         for metric in METRICS:
             # Energy follows from what the controller does: days and drift reach it through the controller alone.
             mine = replace(world, day=0.0, drift=0.0) if metric == "energy" else world
-            data = measure(metric, latent(mine, 0.0, rng, design), design, world, rng)
+            data = measure(metric, latent(mine, 0.0, rng, design, either=True), design, world, rng)
             one_null(name, metric, data, tally, study)
     return tally
 
@@ -281,6 +304,17 @@ def power_studies(visits: int, studies: int) -> Tally:
             tally.add((key, "primary"), isinstance(found, Average) and found.p_value < ALPHA)
             tally.add((key, "van elteren"), not isinstance(exact, Unavailable) and exact.p_value < ALPHA)
             tally.add((key, "naive"), naive(data)[0])
+    return tally
+
+
+def cell(work: Callable[[Any, int], Tally], argument: str | int, studies: int, folder: Path | None) -> Tally:
+    """One part of the benchmark; read where the folder has it from an earlier run of as many studies."""
+    path = folder / f"{work.__name__}-{re.sub('[^a-z0-9]+', '-', str(argument).lower())}-{studies}.json" if folder else None
+    if path and path.exists():
+        return Tally.read(path)
+    tally = work(argument, studies)
+    if path:
+        tally.write(path)
     return tally
 
 
@@ -393,15 +427,18 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="150 studies of each scenario")
     parser.add_argument("--studies", type=int, default=2000)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--keep", type=Path, help="a folder for finished parts, which a later run of the same code reads")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     studies = 150 if arguments.quick else arguments.studies
     tally = Tally()
+    parts: list[tuple[Callable[[Any, int], Tally], str | int, int]] = [(null_studies, name, studies) for name in WORLDS]
+    parts += [(margin_studies, v, studies // 2 if v > 2 else studies // 20) for v in (12, 8, 6, 4, 3, 2, 1)]
+    parts += [(power_studies, v, studies // 4) for v in (3, 4, 6, 8)]
+    if arguments.keep:
+        arguments.keep.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(arguments.workers) as pool:
-        running = [pool.submit(null_studies, name, studies) for name in WORLDS]
-        running += [pool.submit(margin_studies, v, studies // 2 if v > 2 else studies // 20) for v in (12, 8, 6, 4, 3, 2, 1)]
-        running += [pool.submit(power_studies, v, studies // 4) for v in (3, 4, 6, 8)]
-        for part in running:
+        for part in [pool.submit(cell, *p, arguments.keep) for p in parts]:
             tally.merge(part.result())
     figures = show_null(tally, studies) | show_margin(tally) | {"degenerate_answers_wrong": float(degenerate())}
     out("\npower for an effect of one standard deviation of a session, 4 sessions of either arm a visit: primary, van Elteren, paper's\n")

@@ -1,11 +1,12 @@
 """Six visits of the synthetic participants, margins locked before: how many questions are concluded, and how many conclusions are true?
 
     python benchmarks/visits_in_silico.py --quick
-    python benchmarks/visits_in_silico.py [--seeds 40] [--visits 6] [--minutes 120] [--session-minutes 5] [--json FILE]
+    python benchmarks/visits_in_silico.py [--seeds 40] [--first-seed 1] [--visits 6] [--minutes 120] [--session-minutes 10] [--json FILE]
 
 A question is one controller of one participant in one study: is it non-inferior to cDBS on grasp, rating and tremor, and does it save
-energy? A visit is the day that the service plans (`app.planning.plans.schedule`) with as many sessions of the controller as fit into its
-minutes, a cDBS session between any two of them: of 5 minutes six against five, of 10 minutes four against three. The verdict is the
+energy? A visit is the day that the service plans (`app.planning.protocol.schedule`) with as many sessions of the controller as fit into its
+minutes, a cDBS session between any two of them: of 10 minutes, the service's default, four against three, of 5 minutes six against five.
+Studies whose first seeds lie apart by the number of seeds have nothing in common. The verdict is the
 service's own (`app.analysis.primary.verdict`); the truth is a large sample over other days at the same hours. Beside it, `bound` is what
 would be concluded from the same averages by somebody who knows the standard deviation of every outcome: no test of these averages at
 these levels can conclude much more. The participants are synthetic and not fitted to patients. CPU seconds of one thread.
@@ -19,22 +20,22 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
-from app.planning.plans.schedule import Candidate, Rules, most_policies, schedule
 from scipy.special import ndtr
 
 from app.analysis.evidence.facts import Facts
 from app.analysis.primary.verdict import LockedMargins, verdicts
+from app.planning.protocol.schedule import MOST_REPEATS, Candidate, Rules, most_policies, schedule
 from app.study.blinding import Arm
 from app.study.models import Controller
 from ml.policies.policy import ConstantPolicy
 from ml.population import PARTICIPANTS, run_sessions
 from ml.qoc import Margins
-from ml.statistics.multiplicity import holm
+from ml.statistics.multiplicity import hommel
 from ml.statistics.noninferiority import Assessment, Inferior, NonInferiorAndSaving
 from ml.statistics.within_visits.contrasts import Average, Unavailable
 
@@ -60,8 +61,10 @@ class Day:
 
     @classmethod
     def planned(cls, rules: Rules) -> Day:
-        """The service's plan with as many sessions of the controller as fit."""
-        sessions = schedule([Candidate(i, Controller.RL) for i in range(most_policies(rules))], rules, seed=0)
+        """The service's plan with as many sessions of the controller as fit: policies of it, each repeated."""
+        repeated = [replace(rules, repeats=r) for r in range(1, MOST_REPEATS + 1)]
+        best = max(repeated, key=lambda r: most_policies(r) * r.repeats)
+        sessions = schedule([Candidate(i, Controller.RL) for i in range(most_policies(best))], best, seed=0)
         places = {tested: [i for i, s in enumerate(sessions) if (s.controller is Controller.RL) == tested] for tested in (True, False)}
         return cls(places, [s.start_minute / 60 for s in sessions], round(rules.session_minutes * STEPS_PER_MINUTE))
 
@@ -117,12 +120,13 @@ def recorded(visit: int) -> datetime:
     return LOCKED_AT + timedelta(days=28 * visit)
 
 
-def studies(code: str, level: float, day: Day, seeds: int, visits: int) -> list[list[Facts]]:
-    """The sessions of a level in every study."""
+def studies(code: str, level: float, day: Day, seeds: range, visits: int) -> list[list[Facts]]:
+    """The sessions of a level in every study; one study a seed."""
     mine = day.of(level)
-    of_visit = np.tile(np.repeat(np.arange(1, visits + 1), len(mine)), seeds).tolist()
-    hours = np.tile([day.hours[i] for i in mine], visits * seeds).tolist()
-    rows = simulate(code, level, of_visit, hours, np.repeat(np.arange(seeds) + 1, visits * len(mine)).tolist(), day.steps, 7919)
+    of_visit = np.tile(np.repeat(np.arange(1, visits + 1), len(mine)), len(seeds)).tolist()
+    hours = np.tile([day.hours[i] for i in mine], visits * len(seeds)).tolist()
+    of_study = np.repeat(seeds, visits * len(mine)).tolist()
+    rows = simulate(code, level, of_visit, hours, of_study, day.steps, 7919 + seeds.start - 1)
     arm = Arm(Controller.CDBS if level == 1 else Controller.RL, None)
     facts = [
         Facts(i, v, v, mine[i % len(mine)], arm, None, None, recorded(v), 60.0 * day.steps / STEPS_PER_MINUTE, row, {}, None, None, (),
@@ -130,7 +134,7 @@ def studies(code: str, level: float, day: Day, seeds: int, visits: int) -> list[
         for i, (v, row) in enumerate(zip(of_visit, rows, strict=True))
     ]  # fmt: skip
     each = visits * len(mine)
-    return [facts[k * each : (k + 1) * each] for k in range(seeds)]
+    return [facts[k * each : (k + 1) * each] for k in range(len(seeds))]
 
 
 def known_spread(found: Sequence[Assessment]) -> dict[str, float]:
@@ -147,14 +151,14 @@ def bound(found: Assessment, spread: dict[str, float]) -> str:
     """What is concluded where the standard deviations are known."""
     averages = [(o, o.average) for o in found.outcomes if isinstance(o.average, Average)]
     lost = [float(ndtr((a.estimate + o.margin) / spread[o.name])) for o, a in averages]
-    if min(holm(lost), default=1.0) < found.alpha:
+    if min(hommel(lost), default=1.0) < found.alpha:
         return BAD
     shown = len(averages) == len(found.outcomes) and all(1 - p < found.alpha for p in lost)
     saves = not isinstance(found.saving, Unavailable) and found.saving.p_value < found.alpha
     return GOOD if shown and saves else OPEN
 
 
-def questions(code: str, day: Day, seeds: int, visits: int) -> list[Question]:
+def questions(code: str, day: Day, seeds: range, visits: int) -> list[Question]:
     """Every question of one participant."""
     cdbs, reference = truth(code, 1.0, day, 101), studies(code, 1.0, day, seeds, visits)
     locked = LockedMargins(MARGINS, 1, LOCKED_AT, "benchmark")
@@ -184,14 +188,15 @@ def main() -> None:
     """Run, print, and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=40)
+    parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--visits", type=int, default=6)
     parser.add_argument("--minutes", type=float, default=Rules().total_minutes, help="of a visit")
-    parser.add_argument("--session-minutes", type=float, default=5.0)
+    parser.add_argument("--session-minutes", type=float, default=Rules().session_minutes)
     parser.add_argument("--quick", action="store_true", help="four seeds")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     day = Day.planned(Rules(session_minutes=asked.session_minutes, total_minutes=asked.minutes))
-    seeds, started = 4 if asked.quick else asked.seeds, time.process_time()
+    seeds, started = range(asked.first_seed, asked.first_seed + (4 if asked.quick else asked.seeds)), time.process_time()
     asks = [q for code in PARTICIPANTS for q in questions(code, day, seeds, asked.visits)]
     concluded = [q for q in asks if q.concluded]
     out(f"{asked.visits} visits of {len(day.places[True])} sessions of the controller and {len(day.places[False])} of cDBS, ")

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from html import escape
 
 COLOURS = {"cdbs": "#0067a8", "rl": "#c24e00", "distilled": "#9b3f86", "no_dbs": "#5d6770", "random": "#00795a", "other": "#7a6200"}
-PANEL_W, PANEL_H, LEFT, TOP, BOTTOM, GAP = 250, 190, 52, 44, 52, 18
+PANEL_W, PANEL_H, LEFT, TOP, BOTTOM, GAP, EMPTY_W = 250, 190, 52, 44, 52, 18, 1000
+CHARACTER_W = 6.3
+"""Of the figures' font, px, on average."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +33,14 @@ class Panel:
 
 def boxes_svg(panels: Sequence[Panel], title: str, note: str) -> str:
     """Boxes (quartiles, whiskers to the extremes) with every session as a point, a panel per metric."""
-    widths = [max(PANEL_W, 36 * len(p.boxes) + 40) for p in panels]
-    width = LEFT + sum(widths) + (GAP + LEFT) * (len(panels) - 1) + 16 if panels else 320
+    widths = [max(PANEL_W, _place_width(p) * len(p.boxes) + 40) for p in panels]
+    width = LEFT + sum(widths) + (GAP + LEFT) * (len(panels) - 1) + 16 if panels else EMPTY_W
     height = TOP + PANEL_H + BOTTOM + 40
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height}" width="{width:.0f}" height="{height}" '
         'font-family="system-ui, sans-serif" font-size="11" fill="#1f2937">',
         f"<title>{escape(title)}</title>",
-        f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
+        f'<rect width="{width:.0f}" height="{height}" fill="#ffffff"/>',
     ]
     x = float(LEFT)
     for panel, w in zip(panels, widths, strict=True):
@@ -46,6 +48,12 @@ def boxes_svg(panels: Sequence[Panel], title: str, note: str) -> str:
         x += w + GAP + LEFT
     parts += [f'<text x="{LEFT}" y="{height - 12}" fill="#6b7280">{escape(note)}</text>', "</svg>"]
     return "\n".join(parts)
+
+
+def _place_width(panel: Panel) -> float:
+    """Of one box: wide enough for the longest line of a label, so that none runs into the next."""
+    lines = [line for b in panel.boxes for line in (*b.label.split("\n"), b.above)]
+    return max(36.0, CHARACTER_W * max(map(len, lines), default=0) + 6)
 
 
 def _panel(panel: Panel, x: float, w: float) -> list[str]:

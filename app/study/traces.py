@@ -61,7 +61,8 @@ def unpack(trace: Trace) -> NDArray[np.float64]:
     """Values of a trace, shape [n], NaN where invalid."""
     values = np.frombuffer(trace.values_f32, dtype="<f4").astype(np.float64)
     valid = np.unpackbits(np.frombuffer(trace.valid_bits, dtype=np.uint8), count=trace.n)
-    values[valid == 0] = np.nan
+    if not valid.all():
+        values[valid == 0] = np.nan
     return values
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.statistics.effects import Saving, energy_saving, saving_contrasts
-from ml.statistics.multiplicity import holm
+from ml.statistics.multiplicity import hommel
 from ml.statistics.power import MOST_VISITS, Posterior, Target, first_reaching, posterior, success
 from ml.statistics.within_visits.contrasts import (
     Adjustment,
@@ -261,9 +261,9 @@ def _less_favourable(adjusted: Average, plain: Average | Unavailable, outcome: O
 
 
 def _verdict(results: Sequence[OutcomeResult], saving: Saving | Unavailable, alpha: float) -> Verdict:
-    # That one outcome of several is inferior is a union: Holm keeps its level.
+    # That one outcome of several is inferior is a union. Outcomes of the same sessions get worse together, so that Hommel keeps its level.
     judged = [r for r in results if r.p_inferior is not None]
-    adjusted = holm([r.p_inferior for r in judged if r.p_inferior is not None])
+    adjusted = hommel([r.p_inferior for r in judged if r.p_inferior is not None])
     worse = tuple(r.name for r, p in zip(judged, adjusted, strict=True) if p < alpha)
     if worse:
         return Inferior(worse)

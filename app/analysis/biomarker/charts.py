@@ -23,10 +23,16 @@ def unit(name: str, beta_unit: str) -> str:
     return beta_unit if name == "mean_beta" else UNITS.get(name, "")
 
 
+def _some(visits: list[int]) -> list[int]:
+    """At most seven visits, the first and the last among them."""
+    step = max(1, -(-(len(visits) - 1) // 6))
+    return [*visits[:-1:step], visits[-1]] if visits else []
+
+
 def scatter(pair: Pairing, beta_unit: str) -> Chart:
     """All sessions that have both."""
     visits = [p[1] for p in pair.points]
-    bar = {"title": {"text": "Visit"}, "thickness": 10, "tickvals": sorted(set(visits))}
+    bar = {"title": {"text": "Visit"}, "thickness": 10, "tickvals": _some(sorted(set(visits)))}
     data = [
         {
             "type": "scatter", "mode": "markers", "x": [p[2] for p in pair.points], "y": [p[3] for p in pair.points],

@@ -27,6 +27,6 @@ class BySeedOut(Model):
     participant: str
     snapshot_id: int | None
     seeds: list[int]
-    policies: int = Field(description="Policies of the snapshot's evaluations that ran afterwards.")
+    policies: int = Field(description="Policies estimated under every seed that ran afterwards.")
     rows: list[SeedRowOut]
     text: str = Field(description="What is missing; empty where nothing is.")

@@ -31,8 +31,8 @@ def missing(found: BySeed) -> str:
         return "No evaluation has been made yet."
     if found.policies < LEAST_POLICIES:
         return (
-            f"{found.policies} of the policies estimated on snapshot {found.snapshot_id} ran after it with a known return; it takes "
-            f"{LEAST_POLICIES}. Sessions inside the snapshot were there to be fitted and prove nothing."
+            f"{found.policies} of the policies estimated under every seed on snapshot {found.snapshot_id} ran after it with a known "
+            f"return; it takes {LEAST_POLICIES}. Sessions inside the snapshot were there to be fitted and prove nothing."
         )
     if len(found.seeds) < WANTED_SEEDS:
         return f"Snapshot {found.snapshot_id} was evaluated under {len(found.seeds)} of {WANTED_SEEDS} seeds."

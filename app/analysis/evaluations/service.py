@@ -45,11 +45,11 @@ class SeedRow:
 
 @dataclass(frozen=True)
 class BySeed:
-    """The snapshot with most seeds under one horizon and settings version, newest first among equals.
+    """The snapshot with most seeds under one horizon, settings version and preset, newest first among equals.
 
     Attributes:
-        snapshot_id: None without an evaluation. seeds: that were run on it. rows: where later sessions tell. policies: with a return after
-            the snapshot.
+        snapshot_id: None without an evaluation. seeds: that were run on it. rows: where later sessions tell. policies: estimated under
+            every seed, with a return after the snapshot; the errors are of these.
     """
 
     participant: str
@@ -61,15 +61,18 @@ class BySeed:
 
 def by_seed(db: Session, participant: Participant, caller: Caller) -> BySeed:
     """Errors of every method and seed on one snapshot; raises Forbidden as `app.study.blinding`."""
-    alike: dict[tuple[int, int, int], dict[int, Evaluation]] = defaultdict(dict)
+    alike: dict[tuple[int, int, int, str], dict[int, Evaluation]] = defaultdict(dict)
     for one in repository.evaluations(db, participant.id):
-        # seeds are compared where nothing else differs: returns under another horizon or settings are other numbers
-        alike[(one.snapshot_id, one.settings_version_id, one.horizon_steps)][int(one.config.get("seed", 0))] = one
+        # seeds are compared where nothing else differs: returns under another horizon or settings are other numbers, and a quick
+        # estimate is not one of full size
+        key = (one.snapshot_id, one.settings_version_id, one.horizon_steps, str(one.config.get("preset", "")))
+        alike[key][int(one.config.get("seed", 0))] = one
     if not alike:
         return BySeed(participant.code, None, (), 0, ())
     chosen = max(alike, key=lambda k: (min(len(alike[k]), WANTED_SEEDS), k[0], max(e.id for e in alike[k].values())))
     snapshot_id, seeds = chosen[0], alike[chosen]
-    returns = _later_returns(db, seeds[min(seeds)], caller)
+    everywhere = set.intersection(*({e.policy_id for e in one.estimates} for one in seeds.values()))
+    returns = {i: value for i, value in _later_returns(db, seeds[min(seeds)], caller).items() if i in everywhere}
     rows: list[SeedRow] = []
     if len(returns) >= LEAST_POLICIES:
         rows = [row for seed in sorted(seeds) for row in _rows(seeds[seed], seed, returns)]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from app.platform.errors import Invalid
 from app.study.blinding import Arm
 from app.study.doses.since import hours_since_dose
-from app.study.models import Controller, StudySession
+from app.study.models import Controller, StudySession, Trace
 from app.study.sessions.data import qoc_of
 from app.study.sessions.stimulation import delivered_by
 from app.study.traces import AMPLITUDE_STREAM, StepTable, TracesOf, amplitude_program, laid_out
@@ -109,13 +109,19 @@ class Facts:
 
 @dataclass(frozen=True)
 class Excluded:
-    """A session that the analyses leave out altogether; `detail` is the reason that somebody gave, or what could not be read."""
+    """A session that the analyses leave out altogether.
+
+    Attributes:
+        detail: the reason that somebody gave, or what could not be read. arm, duration_s: of a session that could not be read: it ran.
+    """
 
     session_id: int
     visit: int
     ordinal: int
     why: LeftOut
     detail: str
+    arm: Arm | None = None
+    duration_s: float = 0.0
 
 
 def read(session: StudySession, arm: Arm, traces: TracesOf) -> Facts:
@@ -171,14 +177,23 @@ def _sides(session: StudySession, table: StepTable, fraction: _Means, traces: Tr
 
     Where another side cannot be read, it is there without numbers, so that no sum over sides passes for the whole.
     """
-    recordings = {s.recording_id for s in session.segments}
-    amplitudes = [t for i in recordings for t in traces(i) if t.stream == AMPLITUDE_STREAM]
-    if len(recordings) == 1 and len(amplitudes) <= 1:
-        return (_side("controlled side", True, table, fraction),) if amplitudes and any(s.is_control for s in session.segments) else ()
+    if not several_sides(session, traces):
+        controlled = any(_amplitudes(s.recording_id, traces) for s in session.segments if s.is_control)
+        return (_side("controlled side", True, table, fraction),) if controlled else ()
     try:
         return tuple(_side(d.name, d.is_control, d.table) for d in delivered_by(session, traces) if d.table is not None)
     except Invalid:
         return (_side("controlled side", True, table, fraction), _side("other side", False, None))
+
+
+def several_sides(session: StudySession, traces: TracesOf) -> bool:
+    """Whether a session has several recordings, or one with amplitudes of several programs: then its recordings are read too."""
+    recordings = {s.recording_id for s in session.segments}
+    return len(recordings) > 1 or sum(len(_amplitudes(i, traces)) for i in recordings) > 1
+
+
+def _amplitudes(recording_id: int, traces: TracesOf) -> list[Trace]:
+    return [t for t in traces(recording_id) if t.stream == AMPLITUDE_STREAM]
 
 
 def _side(name: str, is_control: bool, table: StepTable | None, fraction: _Means | None = None) -> Side:
@@ -202,7 +217,8 @@ class _Means:
 
 def _means(values: NDArray[np.float64], square: Callable[[ArrayLike], float] | None = None) -> _Means:
     """Of a session's steps, shape [n], NaN where unknown; `square` takes the mean square of the known ones."""
-    known = values[~np.isnan(values)]
+    unknown = np.isnan(values)
+    known = values[~unknown] if unknown.any() else values
     if not known.size or known.size < KNOWN_SHARE * values.size:
         return _Means(None, None)
     return _Means(float(known.mean()), square(known) if square else None)

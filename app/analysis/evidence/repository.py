@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from sqlalchemy import cast, func, literal, select
 from sqlalchemy.dialects.postgresql import JSONPATH
-from sqlalchemy.orm import Session, contains_eager, joinedload, selectinload
+from sqlalchemy.orm import Session, contains_eager, defer, joinedload, selectinload
 
 from app.study.models import (
     Participant,
@@ -21,7 +21,7 @@ STIMULATION_EVENTS = '$.events[*] ? (@.kind == "stimulation")'
 
 
 def sessions_of(db: Session, participant_ids: Collection[int]) -> dict[int, list[StudySession]]:
-    """Sessions and proposals by participant, visit and order, to read many at once: without their conditions and what recordings tell."""
+    """Sessions and proposals by participant, visit and order, to read many at once: without their conditions and recordings."""
     visit = contains_eager(StudySession.visit).options(
         joinedload(Visit.participant).joinedload(Participant.site), selectinload(Visit.locks), selectinload(Visit.cdbs_amplitudes)
     )
@@ -32,7 +32,7 @@ def sessions_of(db: Session, participant_ids: Collection[int]) -> dict[int, list
         .options(
             visit,
             selectinload(StudySession.qocs),
-            selectinload(StudySession.segments).joinedload(SessionSegment.recording).defer(Recording.details),
+            selectinload(StudySession.segments),
         )
         .order_by(Visit.number, StudySession.ordinal)
     )
@@ -40,6 +40,13 @@ def sessions_of(db: Session, participant_ids: Collection[int]) -> dict[int, list
     for session in db.scalars(query):
         found.setdefault(session.visit.participant_id, []).append(session)
     return found
+
+
+def recordings(db: Session, recording_ids: Collection[int]) -> Sequence[Recording]:
+    """Recordings without what they tell; while somebody holds them, segments find theirs without a query."""
+    if not recording_ids:
+        return []
+    return db.scalars(select(Recording).where(Recording.id.in_(recording_ids)).options(defer(Recording.details))).all()
 
 
 def stimulation_events(db: Session, recording_ids: Collection[int]) -> dict[int, list[dict[str, Any]]]:

@@ -9,12 +9,12 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.analysis.evidence import repository
-from app.analysis.evidence.facts import Excluded, Facts, LeftOut, read
+from app.analysis.evidence.facts import Excluded, Facts, LeftOut, read, several_sides
 from app.platform.errors import Invalid
 from app.platform.kept import keep, recalled
 from app.study import blinding
 from app.study import repository as study
-from app.study.models import Participant, StudySession, Trace
+from app.study.models import Participant, Recording, StudySession, Trace
 from app.study.sessions.repository import fingerprints
 
 READ_AT_ONCE = 8
@@ -54,12 +54,22 @@ def of_all(db: Session, participants: Sequence[Participant], caller: Caller) -> 
     for start in range(0, len(lacking), READ_AT_ONCE):
         some = lacking[start : start + READ_AT_ONCE]
         sessions = repository.sessions_of(db, [participants[i].id for i in some])
-        recordings = {s.recording_id for held in sessions.values() for session in held for s in session.segments}
-        traces = study.traces_of_recordings(db, recordings)
+        everything = [session for held in sessions.values() for session in held]
+        traces = study.traces_of_recordings(db, {s.recording_id for session in everything for s in session.segments})
+        held = _recordings_of_several_sides(db, everything, traces)
         for i in some:
             result = _read(participants[i], sessions.get(participants[i].id, []), traces, caller, keys[i])
             found[i] = keep(keys[i], result)
+        del held  # until here the segments found theirs without a query each
     return [known for known in found if known is not None]
+
+
+def _recordings_of_several_sides(
+    db: Session, sessions: Sequence[StudySession], traces: Mapping[int, Sequence[Trace]]
+) -> Sequence[Recording]:
+    """Recordings of sessions with several sides or programs; those of all others, nearly all, are never asked for."""
+    several = [s for s in sessions if several_sides(s, lambda i: traces.get(i, []))]
+    return repository.recordings(db, {g.recording_id for s in several for g in s.segments})
 
 
 def _read(
@@ -69,16 +79,16 @@ def _read(
     excluded: list[Excluded] = []
     for session in held:
         place = session.id, session.visit.number, session.ordinal
-        if session.excluded_reason:
-            excluded.append(Excluded(*place, LeftOut.EXCLUDED, session.excluded_reason))
-        elif session.status == "proposed":
+        if session.status == "proposed":
             excluded.append(Excluded(*place, LeftOut.NOT_CONFIRMED, ""))
+        elif session.excluded_reason:
+            excluded.append(Excluded(*place, LeftOut.EXCLUDED, session.excluded_reason))
         elif (arm := blinding.visible_arm(session, caller)) is None:
             excluded.append(Excluded(*place, LeftOut.HIDDEN, ""))
         else:
             try:
                 counted.append(read(session, arm, lambda i: traces.get(i, [])))
             except Invalid as error:
-                excluded.append(Excluded(*place, LeftOut.UNREADABLE, error.detail))
+                excluded.append(Excluded(*place, LeftOut.UNREADABLE, error.detail, arm, session.duration_s))
     settings = participant.current_settings
     return Evidence(participant.code, participant.id, key, tuple(counted), tuple(excluded), settings.beta_unit, settings.beta_source)

@@ -10,6 +10,7 @@ from app.analysis.evidence.measurements import HIGHER_IS_BETTER
 from app.analysis.metrics.comparisons import ALPHA, Comparison, Group
 from app.analysis.metrics.service import FiveMetrics, MetricResult
 from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, figure, marker
+from app.platform.web.templates import p_text
 from app.study.models import Controller
 
 SHORT = {Controller.DISTILLED: "Distilled"}
@@ -57,15 +58,6 @@ def metric_chart(metric: MetricResult) -> Chart:
     rows = [_row(g, tests.get(g.controller)) for g in metric.groups]
     subtitle = f"{metric.unit} \u00b7 n = {metric.n} sessions"
     return Chart(f"metric-{metric.metric}", metric.title, subtitle, figure(data, **layout), COLUMNS, rows, height=270)
-
-
-def p_text(p: float | None) -> str:
-    """A p-value for people, without the p and without the zero that every p has before its point."""
-    if p is None:
-        return "\u2014"
-    if p < 0.001:
-        return "< .001"
-    return "1" if p > 0.9995 else f"{p:.3f}".removeprefix("0")
 
 
 def box(at: int, g: Group) -> dict[str, Any]:

@@ -34,4 +34,4 @@ def read_pooled(
     found = service.pooled(db, participants, caller)
     if format != "json":
         return (export.table if format == "csv" else export.svg)(found.paper, "all")
-    return pooled_out(found, service.times_tested(db, participants, caller, found), service.computation_times(db, participants))
+    return pooled_out(found, service.computation_times(db, participants))

@@ -32,7 +32,7 @@ def pooled_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse
         "analysis/pooled.html",
         found=found,
         charts=_charts(found),
-        trial=service.times_tested(db, participants, caller, found),
+        trial=found.trial,
         times=service.computation_times(db, participants),
         wording=wording,
     )

@@ -17,12 +17,11 @@ from app.analysis.pooled.schemas import (
 )
 from app.analysis.pooled.service import Pooled, StepTime
 from app.analysis.primary.serializers import average_out, verdict_out
-from app.analysis.trial_time.service import TrialTime
 from ml.statistics.pooling import Summary
 from ml.statistics.within_visits.contrasts import Unavailable
 
 
-def pooled_out(found: Pooled, trial: TrialTime, times: Sequence[StepTime]) -> PooledOut:
+def pooled_out(found: Pooled, times: Sequence[StepTime]) -> PooledOut:
     """Everything of the page."""
     return PooledOut(
         verdicts=[
@@ -41,7 +40,7 @@ def pooled_out(found: Pooled, trial: TrialTime, times: Sequence[StepTime]) -> Po
         ],
         trial_time=[
             TimeTestedOut(participant=row.participant, controller=t.controller, sessions=t.sessions, minutes=t.minutes)
-            for row in trial.rows
+            for row in found.trial.rows
             for t in row.tested
         ],
         computation_time=[StepTimeOut(**asdict(t)) for t in times],

@@ -16,7 +16,7 @@ from app.analysis.pooled import repository
 from app.analysis.primary import service as primary
 from app.analysis.primary.results import PLANNED
 from app.analysis.primary.service import Primary
-from app.analysis.trial_time.service import TrialTime, trial_time
+from app.analysis.trial_time.service import TrialTime, of_evidence
 from app.platform.kept import kept
 from app.study import repository as study
 from app.study.models import Controller, Participant
@@ -55,6 +55,7 @@ class Pooled:
     participants: tuple[Primary, ...]
     paper: tuple[FiveMetrics, ...]
     controllers: tuple[PooledController, ...]
+    trial: TrialTime
 
 
 def readable(db: Session, caller: Caller) -> Sequence[Participant]:
@@ -67,12 +68,7 @@ def pooled(db: Session, participants: Sequence[Participant], caller: Caller) -> 
     held = of_all(db, participants, caller)
     found, paper = tuple(primary.of_all(db, participants, held)), tuple(metrics.of_all(db, participants, held))
     key = ("pooled", tuple((p.evidence.key, p.locked) for p in found))
-    return Pooled(found, paper, kept(key, lambda: tuple(_controller(found, c) for c in PLANNED if _ran(found, c))))
-
-
-def times_tested(db: Session, participants: Sequence[Participant], caller: Caller, found: Pooled) -> TrialTime:
-    """The table of trial time of these participants."""
-    return kept(("trial time", tuple(p.evidence.key for p in found.participants)), lambda: trial_time(db, participants, caller))
+    return Pooled(found, paper, kept(key, lambda: tuple(_controller(found, c) for c in PLANNED if _ran(found, c))), of_evidence(held))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ def by_visit(tested: Tested, found: Comparison, unit: str) -> Chart:
             "hovertemplate": "%{text}<br>%{y:.3g} " + unit + "<extra></extra>", "name": name,
         }
     ]  # fmt: skip
-    ticks = [f"Visit {r.visit}" for r in rows]
+    ticks = [str(r.visit) for r in rows]
     if isinstance(found.result, Average):
         a = found.result
         data.append(
@@ -37,7 +37,7 @@ def by_visit(tested: Tested, found: Comparison, unit: str) -> Chart:
         places, ticks = [*places, len(rows) + 0.3], [*ticks, "Average"]
     better = "higher is better" if HIGHER_IS_BETTER[found.metric] else "lower is better"
     layout = {
-        "xaxis": {"tickvals": places, "ticktext": ticks, "showgrid": False, "zeroline": False, "range": [-0.6, len(rows) + 0.9]},
+        "xaxis": axis("Visit", tickvals=places, ticktext=ticks, showgrid=False, zeroline=False, range=[-0.6, len(rows) + 0.9]),
         "yaxis": axis(f"{name} less cDBS", unit),
         "shapes": [horizontal(0.0, "", MUTED)[0]],
         "showlegend": False, "dragmode": False,

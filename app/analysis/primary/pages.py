@@ -17,6 +17,7 @@ from app.analysis.primary.results import PLANNED
 from app.analysis.primary.serializers import unit_of
 from app.platform.database import Db
 from app.platform.errors import NotFound
+from app.platform.web.charts import written
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 
@@ -33,7 +34,7 @@ def primary_page(request: Request, participant: CurrentParticipant, db: Db, call
         participant=participant,
         found=found,
         wording=wording,
-        units={m: unit_of(m, found) for m in METRICS},
+        units={m: written(unit_of(m, found)) for m in METRICS},
     )
     return HTMLResponse(page)
 
@@ -49,7 +50,7 @@ def visits_page(request: Request, key: str, participant: CurrentParticipant, db:
     """One controller or policy visit by visit, with the sessions behind every number and what else could explain it."""
     found = service.primary(db, participant, caller)
     result = service.result_of(found, key)
-    units = {m: unit_of(m, found) for m in METRICS}
+    units = {m: written(unit_of(m, found)) for m in METRICS}
     charts = {c.metric: by_visit(result.tested, c, units[c.metric]) for c in result.comparisons}
     sessions = {s.session_id: s for s in found.sessions}
     page = render(
@@ -89,7 +90,7 @@ def models_page(
         per_arm=sessions,
         names=service.policy_names(db, participant),
         planned=result.tested.controller in PLANNED,
-        units={m: unit_of(m, found) for m in METRICS},
+        units={m: written(unit_of(m, found)) for m in METRICS},
         wording=wording,
     )
     return HTMLResponse(page)

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
+from app.analysis.evidence.facts import LeftOut
+from app.analysis.evidence.service import Evidence
 from app.study import repository as study
-from app.study.blinding import CONTROLLER_NAMES, visible_arm
+from app.study.blinding import CONTROLLER_NAMES, Arm, visible_arm
 from app.study.models import Controller, Participant, StudySession
 
 PAPER_ORDER = (Controller.CDBS, Controller.RL, Controller.DISTILLED, Controller.NO_DBS)
@@ -51,26 +53,50 @@ class TrialTime:
 
 def trial_time(db: Session, participants: Sequence[Participant], caller: Caller) -> TrialTime:
     """The table over these participants, in their order. Proposed and excluded sessions do not count."""
-    counted: list[dict[Controller, list[float]]] = []
-    excluded: list[int] = []
     by_participant: dict[int, list[StudySession]] = {p.id: [] for p in participants}
     for session in study.sessions_without_data(db, list(by_participant)):
         by_participant[session.visit.participant_id].append(session)
+    counted = []
     for participant in participants:
         held = by_participant[participant.id]
+        ran = [(visible_arm(s, caller), s.duration_s) for s in held if s.excluded_reason is None]
+        counted.append(_Counted(participant.code, ran, sum(s.excluded_reason is not None for s in held)))
+    return _table(counted)
+
+
+def of_evidence(held: Sequence[Evidence]) -> TrialTime:
+    """The same where the evidence of the participants is at hand."""
+    counted = []
+    for one in held:
+        ran = [(s.arm, s.duration_s) for s in one.sessions] + [(e.arm, e.duration_s) for e in one.excluded]
+        counted.append(_Counted(one.participant, ran, sum(e.why is LeftOut.EXCLUDED for e in one.excluded)))
+    return _table(counted)
+
+
+@dataclass(frozen=True)
+class _Counted:
+    """Sessions of one participant with their seconds, no arm where it is not known to the reader; and how many are excluded."""
+
+    participant: str
+    ran: Sequence[tuple[Arm | None, float]]
+    excluded: int
+
+
+def _table(counted: Sequence[_Counted]) -> TrialTime:
+    by_controller: list[dict[Controller, list[float]]] = []
+    for one in counted:
         seconds: dict[Controller, list[float]] = {}
-        for session in held:
-            if session.excluded_reason is None and (known := visible_arm(session, caller)) is not None:
-                seconds.setdefault(known.controller, []).append(session.duration_s)
-        counted.append(seconds)
-        excluded.append(sum(session.excluded_reason is not None for session in held))
-    others = [c for c in Controller if c not in PAPER_ORDER and any(c in seconds for seconds in counted)]
+        for arm, duration_s in one.ran:
+            if arm is not None:
+                seconds.setdefault(arm.controller, []).append(duration_s)
+        by_controller.append(seconds)
+    others = [c for c in Controller if c not in PAPER_ORDER and any(c in seconds for seconds in by_controller)]
     controllers = [*PAPER_ORDER, *others]
     rows = [
-        TrialTimeRow(participant.code, [_tested(c, seconds.get(c, [])) for c in controllers], left_out)
-        for participant, seconds, left_out in zip(participants, counted, excluded, strict=True)
+        TrialTimeRow(one.participant, [_tested(c, seconds.get(c, [])) for c in controllers], one.excluded)
+        for one, seconds in zip(counted, by_controller, strict=True)
     ]
-    totals = [_tested(c, [s for seconds in counted for s in seconds.get(c, [])]) for c in controllers]
+    totals = [_tested(c, [s for seconds in by_controller for s in seconds.get(c, [])]) for c in controllers]
     return TrialTime(controllers, [CONTROLLER_NAMES[c] for c in controllers], rows, totals)
 
 

@@ -117,18 +117,19 @@ def written(text: str) -> str:
 
 def plain(value: Any) -> Any:
     """JSON-ready copy: arrays become lists, numpy numbers Python's, what is not finite null; `_DIGITS` significant digits."""
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {k: plain(v) for k, v in value.items()}
+    # numbers and lists of them first: they are nearly all that a figure holds
+    if isinstance(value, float) and not isinstance(value, np.generic):
+        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
     if isinstance(value, str):
         return written(value)
-    if isinstance(value, float):
-        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, Mapping):
+        return {k: plain(v) for k, v in value.items()}
     return value
 
 

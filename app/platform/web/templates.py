@@ -71,6 +71,15 @@ def fixed(value: float | None, decimals: int = 1) -> str:
     return "—" if value is None or math.isnan(value) else f"{value:z.{decimals}f}".replace("-", "\u2212")
 
 
+def p_text(p: float | None) -> str:
+    """A p-value for people, without the zero that every p has before its point; one that rounds to nothing is said to be below .001."""
+    if p is None or math.isnan(p):
+        return "\u2014"
+    if p < 0.001:
+        return "< .001"
+    return "1" if p > 0.9995 else f"{p:.3f}".removeprefix("0")
+
+
 def minutes(seconds: float | None) -> str:
     """A length of time for people: 10 min 20 s."""
     if seconds is None:
@@ -100,5 +109,7 @@ def when(value: datetime | date | None) -> str:
     return value.strftime("%Y-%m-%d %H:%M UTC") if isinstance(value, datetime) else value.isoformat()
 
 
-_environment.filters.update(written=written, number=number, fixed=fixed, minutes=minutes, minutes_left=minutes_left, size=size, when=when)
+_environment.filters.update(
+    written=written, number=number, fixed=fixed, p=p_text, minutes=minutes, minutes_left=minutes_left, size=size, when=when
+)
 _environment.globals.update(static_url=static_url, plotly_url=plotly_url, now=now)

@@ -19,10 +19,10 @@ PATH = "/api/v1/participants/P1/analyses/evaluations"
 Upload = Callable[..., int]
 
 
-def evaluated(db: Session, snapshot: BufferSnapshot, seed: int, horizon: int, values: dict[int, float]) -> None:
+def evaluated(db: Session, snapshot: BufferSnapshot, seed: int, horizon: int, values: dict[int, float], preset: str = "full") -> None:
     """An evaluation of one seed."""
     table = {"estimates": {str(i): estimate("dlsm", v) for i, v in values.items()}}
-    config = {"seed": seed}
+    config = {"seed": seed, "preset": preset}
     store_evaluation(
         db, job_id=None, created_by="test", snapshot=snapshot, horizon_steps=horizon, candidates=list(values), results={"dlsm": table},
         config=config,
@@ -52,10 +52,14 @@ def test_seeds_of_one_horizon_stand_together(
     assert {r["seed"] for r in found["rows"]} == {1, 2}
     # equal estimates under equal horizons have equal errors
     assert len({round(r["mae"], 9) for r in found["rows"]}) == 1
+    # estimates of another size are not the same methods under other seeds, and policies that one seed lacks are compared under none
+    evaluated(db, snapshot, 5, 10, dict.fromkeys(policies[:2], 70.0), preset="quick")
+    assert client.get(PATH).json() == found
     evaluated(db, snapshot, 3, 60, values)
-    evaluated(db, snapshot, 4, 60, values)
+    evaluated(db, snapshot, 4, 60, dict.fromkeys(policies[:2], 80.0))
     longer = client.get(PATH).json()
     assert longer["seeds"] == [0, 3, 4]
+    assert {r["policies"] for r in longer["rows"]} == {2}
     assert longer["rows"][0]["mae"] != pytest.approx(found["rows"][0]["mae"])
     assert client.get("/participants/P1/analyses/evaluations").status_code == 200
     assert len(client.get("/participants/P1/analyses/evaluations.csv").text.splitlines()) == 4

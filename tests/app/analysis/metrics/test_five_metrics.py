@@ -147,7 +147,7 @@ def test_the_page_shows_charts_tables_tests_and_limits(client: TestClient, study
     page = client.get("/participants/P1/analyses/paper", headers={"Accept": "text/html"})
     assert page.status_code == 200
     assert page.text.count("data-chart") == 5
-    for words in ("0.0286", "too few", "not independent", "Hodges-Lehmann", "exact", "covers all 5 comparisons"):
+    for words in (".029", "too few", "not independent", "Hodges-Lehmann", "exact", "covers all 5 comparisons"):
         assert words in page.text
     assert "<b>Not enough data</b> for 5 of 10 comparisons" in page.text
 

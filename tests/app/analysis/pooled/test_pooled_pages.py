@@ -129,5 +129,5 @@ def test_without_anything_the_pages_say_so(client: TestClient) -> None:
 
 def test_beta_that_is_not_pooled_has_the_same_reason_on_the_page_and_over_rest() -> None:
     beta = PooledMetric("mean_beta", (), Unavailable(Reason.NOT_IDENTIFIED))
-    answer = pooled_out(Pooled((), (), (PooledController(Controller.RL, (beta,)),)), TrialTime([], [], [], []), [])
+    answer = pooled_out(Pooled((), (), (PooledController(Controller.RL, (beta,)),), TrialTime([], [], [], [])), [])
     assert answer.metrics[0].together.text == "Beta of different unit or source is not pooled."

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import pytest
+from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.analysis.trial_time.service import trial_time
+from app.analysis.evidence.service import of_all
+from app.analysis.trial_time.service import of_evidence, trial_time
 from app.study import repository as study
 from app.study.models import Controller
+from tests.app.analysis.conftest import AddSession
 
 
 def test_minutes_are_those_of_the_sessions_and_excluded_ones_are_counted_apart(upload, client, enrolled, db):
@@ -29,6 +32,20 @@ def test_minutes_are_those_of_the_sessions_and_excluded_ones_are_counted_apart(u
     assert row.excluded == 1
     assert [(t.sessions, t.minutes) for t in table.totals] == list(found.values())
     assert table.labels[:4] == ["cDBS", "RL", "Distilled RL", "No DBS"]
+
+
+def test_the_evidence_at_hand_gives_the_same_table(add_session: AddSession, db: Session, enrolled: str) -> None:
+    add_session("cdbs")
+    add_session("rl", duration_s=600.0, visit=2)
+    add_session("random", excluded="the lead moved")
+    add_session("other", status="proposed", excluded="sent twice")
+    add_session("no_dbs", beta=None, fraction=None, duration_s=1e9)  # longer than can be laid out: not readable, but it ran
+    db.rollback()
+    people = [study.participant_by_code(db, enrolled, SYSTEM)]
+    table = trial_time(db, people, SYSTEM)
+    assert of_evidence(of_all(db, people, SYSTEM)) == table
+    assert [t.sessions for t in table.totals] == [1, 1, 0, 1]
+    assert table.rows[0].excluded == 1
 
 
 def test_the_page_shows_minutes_and_n_for_every_participant(upload, client, enrolled):
