@@ -25,6 +25,7 @@ Upload = Callable[..., int]
 
 
 def taken(db: Session) -> tuple[BufferSnapshot, ReplayBuffer]:
+    db.expire_all()  # what others have written since this session last looked
     db.rollback()
     snapshot = take_snapshot(db, participant_by_code(db, "P1", SYSTEM), SYSTEM)
     db.commit()
