@@ -156,7 +156,8 @@ def test_broken_database_connections_fail_no_job_and_stop_no_worker(jobs):
         with new_session() as db:
             broken = db.scalars(
                 text(
-                    "select pg_terminate_backend(pid) from pg_stat_activity where datname = current_database() and pid <> pg_backend_pid()"
+                    "select pg_terminate_backend(pid) from pg_stat_activity"
+                    " where datname = current_database() and usename = current_user and pid <> pg_backend_pid()"
                 )
             ).all()
         assert len(broken) >= 3
