@@ -5,11 +5,15 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, Index, String, Text, func
+from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, Index, String, Text, UniqueConstraint, func
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
 from app.study.models import StudySession
+from ml.formats.tables.mapping import TableMapping
+
+PREVIEW = "preview"
+"""Member of a file's report: what may be shown of a table that waits for a column mapping."""
 
 
 class Upload(Base):
@@ -70,7 +74,45 @@ class UploadFile(Base):
     decided_by: Mapped[str | None] = mapped_column(String(254))
     decided_at: Mapped[datetime | None]
     decision_reason: Mapped[str | None] = mapped_column(Text)
+    column_mapping_id: Mapped[int | None] = mapped_column(ForeignKey("column_mapping.id"), index=True)
+    """The version of the column mapping that read this table."""
     upload: Mapped[Upload] = relationship(back_populates="files")
+    column_mapping: Mapped[ColumnMapping | None] = relationship()
+
+    @property
+    def preview(self) -> dict[str, Any] | None:
+        """What may be shown of a table that waits for a column mapping (`ml.formats.tables.mapping.preview_of`); None for other files."""
+        waits = self.status == "failed" and self.quarantine_sha256 is not None
+        found: dict[str, Any] | None = (self.report or {}).get(PREVIEW)
+        return found if waits else None
+
+
+class ColumnMapping(Base):
+    """Which column of the tables with one header holds what, in one study. Never changed, only followed by a newer version.
+
+    `header` is the keyed hash of the line that names the columns. A version that is `removed` ends a mapping: the next table asks again.
+    """
+
+    __tablename__ = "column_mapping"
+    __table_args__ = (UniqueConstraint("study_id", "header", "version"), CheckConstraint("version >= 1", name="version"))
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    study_id: Mapped[int] = mapped_column(ForeignKey("study.id"), index=True)
+    header: Mapped[str] = mapped_column(String(64))
+    version: Mapped[int]
+    name: Mapped[str] = mapped_column(String(100))
+    mapping: Mapped[dict[str, Any]]
+    labels: Mapped[dict[str, Any]]
+    """By column number, what the preview showed of its name."""
+    removed: Mapped[bool] = mapped_column(server_default="false")
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+    reason: Mapped[str | None] = mapped_column(Text)
+
+    @property
+    def as_mapping(self) -> TableMapping:
+        """As the readers take it."""
+        return TableMapping.from_json(self.mapping)
 
 
 class SessionProposal(Base):

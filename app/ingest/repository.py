@@ -195,6 +195,11 @@ def upload_file(db: Session, file_id: int, caller: Caller, lock: bool = False) -
     return row[0], row[1]
 
 
+def files_of_upload(db: Session, upload_id: int) -> Sequence[UploadFile]:
+    """The files of an upload in the order in which they came."""
+    return db.scalars(select(UploadFile).where(UploadFile.upload_id == upload_id).order_by(UploadFile.id)).all()
+
+
 def quarantined_files(db: Session, participant_id: int) -> Sequence[UploadFile]:
     """Files that are, or were, kept encrypted because they could not be read, newest first."""
     touched = UploadFile.quarantine_sha256.is_not(None) | UploadFile.decided_at.is_not(None)

@@ -183,6 +183,7 @@ class UploadedFileOut(Model):
     redactor_version: int | None
     quarantined: bool = Field(description="Whether the original is kept, encrypted, because it could not all be read.")
     status: str
+    waits_for_mapping: bool = Field(description="Whether it is a table that can be read once somebody says what its columns are.")
     duplicate: bool
     session_ids: list[int]
 

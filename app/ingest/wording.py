@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from app.ingest.models import ColumnMapping
 from app.ingest.proposals.evidence import Evidence, Reason, Source, stored_courses
 from app.study.models import Recording
 from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern
@@ -47,6 +48,11 @@ def cut_short(upload_id: int, kept: int, of: int) -> tuple[str, str]:
     what = f"Upload {upload_id} was cut short: the bytes of {kept} of its {of} file{'s' if of != 1 else ''} are kept."
     rest = "" if kept >= of else " Send the others again; what came before is recognised."
     return what, f"What is kept is read by itself within some minutes: its report will be on /uploads/{upload_id}.{rest}"
+
+
+def read_by_mapping(mapping: ColumnMapping) -> str:
+    """That a table was read by a column mapping of its study, and by which."""
+    return f"read by the study's column mapping '{mapping.name}', version {mapping.version}"
 
 
 def unreadable(members: list[str]) -> list[str]:

@@ -193,6 +193,11 @@ def _file(before: Row, after: Row, _: Names) -> str:
     return f"{'read' if before else 'received'} file {row['id']} of upload {row['upload_id']}"
 
 
+def _column_mapping(before: Row, after: Row, names: Names) -> str:
+    row = after or before
+    return f"{'removed' if row.get('removed') else 'stated'} the column mapping '{row['name']}'"
+
+
 _SAID: dict[str, Callable[[Row, Row, Names], str]] = {
     "plan": _plan,
     "visit_lock": lambda b, a, n: f"{'locked' if a.get('locked') else 'unlocked'} {n.visit(a['visit_id'])}",
@@ -216,6 +221,7 @@ _SAID: dict[str, Callable[[Row, Row, Names], str]] = {
     "app_user": _account,
     "api_token": _token,
     "sign_in": lambda b, a, n: "signed out" if a.get("ended_at") and not b.get("ended_at") else "signed in",
+    "column_mapping": _column_mapping,
     "upload": _upload,
     "upload_file": _file,
 }

@@ -28,7 +28,10 @@ def redact(source: Source, target: Path, kind: FileKind, key: bytes, options: De
 
     Raises:
         UndecodableFile: it cannot be parsed, and so not be cleaned; nothing is written then.
+        ValueError: a table that a column mapping reads; `tables.mapping.redact_mapped` cleans it.
     """
+    if kind == "mapped":
+        raise ValueError("a table that a column mapping reads is cleaned by that mapping")
     options = options or DecodeOptions()
     if kind == "rcs":
         return redact_rcs_zip(source, target, key, options.archive)

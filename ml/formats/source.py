@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from dataclasses import dataclass, field
 from typing import BinaryIO, Literal, Protocol
 
 
@@ -14,3 +16,15 @@ class Source(Protocol):
 
     def open(self, mode: Literal["rb"]) -> BinaryIO:
         """Its bytes from the first on; they can be sought in. Raises OSError."""
+
+
+@dataclass(frozen=True)
+class InMemory:
+    """A file that lies on no disk."""
+
+    content: bytes = field(repr=False)
+    name: str = "table"
+
+    def open(self, mode: Literal["rb"] = "rb") -> BinaryIO:
+        """The content from the first byte on."""
+        return io.BytesIO(self.content)

@@ -74,6 +74,7 @@ READABLE = (
     "/api/v1/visits/{visit_id}/locks",
     "/api/v1/participants/{code}/calibration",
     "/api/v1/studies",
+    "/api/v1/studies/{study_code}/column-mappings",
     "/healthz",
     "/readyz",
 )
@@ -108,6 +109,9 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("post", "/api/v1/uploaded-files/{file_id}/review"): {"clinician", "admin"},
     ("post", "/api/v1/uploaded-files/{file_id}/release"): {"clinician", "admin"},
     ("post", "/api/v1/uploaded-files/{file_id}/discard"): {"clinician", "admin"},
+    ("get", "/api/v1/uploaded-files/{file_id}/preview"): RECORDERS,
+    ("put", "/api/v1/uploaded-files/{file_id}/mapping"): RECORDERS,
+    ("post", "/api/v1/column-mappings/{mapping_id}/removal"): RECORDERS,
     ("post", "/api/v1/participants/{code}/policies"): {"engineer", "admin"},
     ("patch", "/api/v1/policies/{policy_id}"): {"engineer", "admin"},
     ("post", "/api/v1/participants/{code}/snapshots"): {"clinician", "engineer", "admin"},
@@ -130,6 +134,18 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("post", "/api/v1/studies/{study_code}/sites"): {"admin"},
     ("patch", "/api/v1/studies/{study_code}/sites/{site_code}"): {"admin"},
     **{("get", path): EVERYONE for path in READABLE},
+}
+MAPPING = {
+    "name": "two columns",
+    "header_line": 1,
+    "holds": "steps",
+    "time_format": "seconds",
+    "time_at": "end",
+    "columns": [
+        {"number": 1, "role": "time"},
+        {"number": 2, "role": "beta", "unit": "uV"},
+        {"number": 3, "role": "amplitude_ma", "unit": "mA"},
+    ],
 }
 BLINDED = {
     # what is open to a blinded assessor while no visit is locked
@@ -284,6 +300,12 @@ class World:
                 "json": {"how": "as_is", "reason": "no names in it"},
             },
             ("post", "/uploaded-files/{file_id}/discard"): {"file_id": self.unreadable(b"three"), "json": {"reason": "a picture"}},
+            ("get", "/uploaded-files/{file_id}/preview"): {"file_id": self.unknown_columns("a")},
+            ("put", "/uploaded-files/{file_id}/mapping"): {"file_id": self.unknown_columns("b"), "json": MAPPING},
+            ("post", "/column-mappings/{mapping_id}/removal"): {
+                "mapping_id": self.send(f"/uploaded-files/{self.unknown_columns('c')}/mapping", "put", json=MAPPING)["mapping"]["id"],
+                "json": {"reason": "the program changed"},
+            },
             ("post", "/participants/{code}/policies"): {"data": {"name": "x"}, "files": {"file": ("x.onnx", constant_onnx(0.5, 10))}},
             ("patch", "/policies/{policy_id}"): {"json": {"retired_reason": "worn out"}},
             ("post", "/participants/{code}/jobs"): {"code": "P4", "json": {"kind": "evaluate", "preset": "quick", "methods": ["linear"]}},
@@ -362,12 +384,17 @@ class World:
             self.send(f"/uploaded-files/{number}/review")
         return number
 
+    def unknown_columns(self, name: str) -> int:
+        """A table that waits for a column mapping, of its own for one route."""
+        table = f"{name};signal;current\n" + "".join(f"{2 * k};{k / 7:.2f};1.5\n" for k in range(1, 12))
+        body = self.upload("t.csv", TABLE.replace(b"4,1,1", b"4,7.%d,1" % ord(name), 1), more=[("u.csv", table.encode())], visit="3")
+        return next(int(f["id"]) for f in body["files"] if f["waits_for_mapping"])
+
     def call(self, client: TestClient, method: str, path: str) -> int:
         """Status of a call that is right in everything but, perhaps, who makes it."""
         form = dict(self.forms.get((method, path.removeprefix("/api/v1")), {}))
-        ids = self.ids | {
-            name: form.pop(name) for name in list(form) if name in self.ids or name in ("file_id", "event_id", "query_id", "dose_id")
-        }
+        own = ("file_id", "event_id", "query_id", "dose_id", "mapping_id")
+        ids = self.ids | {name: form.pop(name) for name in list(form) if name in self.ids or name in own}
         if method == "get":
             form.pop("json", None)
         with client.stream(method, path.format(**ids), **form) as answer:

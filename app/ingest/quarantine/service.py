@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 from cryptography.fernet import InvalidToken
 from sqlalchemy.orm import Session
@@ -16,7 +17,8 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.ingest import encryption, repository
-from app.ingest.models import UploadFile
+from app.ingest.mappings import repository as mappings
+from app.ingest.models import PREVIEW, UploadFile
 from app.ingest.uploads import reading, service
 from app.ingest.uploads.receiving import MEDIA_TYPE, BetaStated, Receiver, StoredContent, twice
 from app.ingest.uploads.reports import ASIDE
@@ -52,6 +54,11 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
         Conflict: not in quarantine, or the same bytes were decoded meanwhile. Invalid: still unreadable, and why.
     """
     file, participant = _held(db, file_id, caller)
+    return read_held(db, file, participant, reason, caller)
+
+
+def read_held(db: Session, file: UploadFile, participant: Participant, reason: str, caller: Caller) -> UploadOutcome:
+    """Read a quarantined file, as `read_again` does, for whoever may decide that it can be read."""
     if file.status == "failed" and (known := repository.decoded_file(db, participant.id, file.original_sha256)) is not None:
         raise Conflict(f"The same bytes were read as file {known.id} of upload {known.upload_id}.", "Discard this copy.")
     upload = repository.upload(db, file.upload_id, caller)[0]
@@ -59,10 +66,13 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
     beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
     options = service.decode_options(participant, beta)
     clean = files.draft_path()
+    known_mappings = mappings.present(db, participant.site.study_id)
+    ways = [m.as_mapping for m in known_mappings]
     with _original(file) as original:
         try:
-            found = twice(lambda: reading.clean(original, clean, options))
+            found = twice(lambda: reading.clean(original, clean, options, mappings=ways))
             if found.problem is not None:
+                _keep_preview(db, file, found.preview)
                 raise found.problem
         except BaseException as error:
             clean.unlink(missing_ok=True)
@@ -72,16 +82,27 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
     kind, redaction, sealed = found.kind, found.redaction, file.quarantine_sha256
     stored = files.store(db, clean, MEDIA_TYPE).sha256
     file.kind, file.stored_sha256, file.redactor_version = kind, stored, REDACTOR_VERSION
+    file.column_mapping = known_mappings[found.mapping] if found.mapping is not None else None
     _decide(db, file, reason, caller)
     db.commit()
     content = StoredContent(kind, stored, sealed if redaction.unreadable else None, redaction, None)
     outcome = UploadOutcome(upload, participant, [Receiver(db, participant, upload, options, beta).decode(file.name, file, content)])
     if file.status == "decoded":
-        service.make_sessions(db, outcome, service.as_stated(db, participant, said))
+        stated = service.as_stated(db, participant, said)
+        service.make_sessions(db, outcome, stated)
+        service.attach_grasps_of(db, outcome, stated)
+        upload.status = "decoded"
         if not redaction.unreadable:
             _erase(db, file)
     db.commit()
     return outcome
+
+
+def _keep_preview(db: Session, file: UploadFile, preview: dict[str, Any] | None) -> None:
+    """Keep what may be shown of a table that came before there were column mappings, so that one can be stated. Commits."""
+    if preview is not None and PREVIEW not in file.report:
+        file.report = {**file.report, PREVIEW: preview}
+        db.commit()
 
 
 def release_as_is(db: Session, file_id: int, reason: str, caller: Caller) -> UploadFile:
@@ -161,6 +182,7 @@ def _erase(db: Session, file: UploadFile) -> None:
     sealed = file.quarantine_sha256
     assert sealed is not None
     file.quarantine_sha256 = None
+    file.report = {name: value for name, value in file.report.items() if name != PREVIEW}
     if file.stored_sha256 == sealed:
         file.stored_sha256 = None
     db.flush()

@@ -95,6 +95,7 @@ def unusable(outcome: UploadOutcome) -> UnusableUpload:
         where=first.problem.where,
         upload_id=outcome.upload.id,
         sha256=outcome.files[0].row.original_sha256,
+        waits_for_mapping=[f.row.id for f in outcome.files if f.row.preview is not None],
         report=reports,
     )
 
@@ -129,6 +130,7 @@ def _file_out(name: str, row: UploadFileRow, duplicate: bool, session_ids: list[
         redactor_version=row.redactor_version,
         quarantined=row.quarantine_sha256 is not None,
         status=row.status,
+        waits_for_mapping=row.preview is not None,
         duplicate=duplicate,
         session_ids=session_ids,
     )

@@ -22,6 +22,7 @@ from ml.formats.archive import ZipFiles, reading_of_members
 from ml.formats.options import ArchiveLimits, DecodeOptions
 from ml.formats.rcs import find_sessions
 from ml.formats.recording import FileReport, UndecodableFile
+from ml.formats.tables.mapping import TableMapping, find_mapping, preview_of, redact_mapped
 
 EXAMPLE = """[{"RecordInfo":{"DeviceId":"E","HostUnixTime":1700000000000,"SessionId":"1700000000000"},"TimeDomainData":[%s]}]"""
 PACKET = (
@@ -31,26 +32,42 @@ PACKET = (
 )
 
 
+MAPPABLE = ("csv", "parquet", "tremor", "grasp")
+"""Kinds of files that a column mapping may read."""
+
+
 def clean(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """Take identity out of a file.
 
     Args:
-        params: `source` and `key` (paths of a `RawFile`), `target` (path), `secrets` (the folder of keys), `options`.
+        params: `source` and `key` (paths of a `RawFile`), `target` (path), `secrets` (the folder of keys), `options`, `mappings` (the
+            study's column mappings).
         workdir: not used.
         report: takes the share that was read.
 
     Returns:
-        `kind` and `redaction`; or the `problem` that keeps it from being cleaned, and what was `left_out` of its archive, if it is one.
+        `kind`, `redaction`, and `mapping`, the place of the column mapping that read it; or the `problem` that keeps it from being cleaned,
+        what was `left_out` of its archive, if it is one, and the `preview` of a table.
     """
-    source, options = RawFile(Path(params["source"]), Path(params["key"])), options_of(params["options"])
+    source, target = RawFile(Path(params["source"]), Path(params["key"])), Path(params["target"])
+    options = options_of(params["options"])
+    key = stored_secret(Path(params["secrets"]), "pseudonyms")
+    mappings = [TableMapping.from_json(m) for m in params["mappings"]]
+    kind: formats.FileKind | None = None
+    mapping: int | None = None
     try:
         kind = formats.sniff(source)
-        key = stored_secret(Path(params["secrets"]), "pseudonyms")
+        mapping = find_mapping(source, mappings, key) if kind in MAPPABLE else None
         with reading_of_members(_told(report, "taking identity out")):
-            redaction = formats.redact(source, Path(params["target"]), kind, key, options)
+            if mapping is None:
+                redaction = formats.redact(source, target, kind, key, options)
+            else:
+                kind = mappings[mapping].kind
+                redaction = redact_mapped(source, target, mappings[mapping], key, options)
     except UndecodableFile as error:
-        return {"problem": error.args_of(), "left_out": _left_out(source, options.archive)}
-    return {"kind": kind, "redaction": asdict(redaction)}
+        preview = preview_of(source, key) if mapping is not None or kind in MAPPABLE else None
+        return {"problem": error.args_of(), "left_out": _left_out(source, options.archive), "preview": preview}
+    return {"kind": kind, "redaction": asdict(redaction), "mapping": mapping}
 
 
 def decode(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:

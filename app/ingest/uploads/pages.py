@@ -117,6 +117,8 @@ def _state(upload: Upload) -> tuple[str, str]:
     """What became of an upload, in a few words, and their tone."""
     if upload.status == "decoded":
         return "decoded", "good"
+    if any(f.preview is not None for f in upload.files):
+        return "columns not known", "warn"
     if upload.status == "failed":
         return "not usable", "bad"
     found = told(upload.id)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from ml.formats import transfer
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, UndecodableFile
 from ml.formats.redaction_record import Redaction
+from ml.formats.tables.mapping import TableMapping
 
 CLEAN, DECODE = "app.ingest.uploads.compute:clean", "app.ingest.uploads.compute:decode"
 """What the children run."""
@@ -44,14 +45,28 @@ class ReaderFault(Exception):
 
 @dataclass(frozen=True)
 class Cleaned:
-    """What came of cleaning a file: its kind and what was done to it, or why it cannot be cleaned, and what of it was left out."""
+    """What came of cleaning a file: its kind and what was done to it, or why it cannot be cleaned, and what of it was left out.
+
+    Attributes:
+        mapping: place of the column mapping that read it.
+        preview: of a table that cannot be read, what may be shown of it.
+    """
 
     kind: str
     redaction: Redaction = field(default_factory=Redaction)
     problem: UndecodableFile | None = None
+    mapping: int | None = None
+    preview: dict[str, Any] | None = None
 
 
-def clean(source: RawFile, target: Path, options: DecodeOptions, who: str = "", told: Told = lambda *_: None) -> Cleaned:
+def clean(
+    source: RawFile,
+    target: Path,
+    options: DecodeOptions,
+    who: str = "",
+    told: Told = lambda *_: None,
+    mappings: Sequence[TableMapping] = (),
+) -> Cleaned:
     """Write a file without identity to `target`.
 
     Args:
@@ -60,6 +75,7 @@ def clean(source: RawFile, target: Path, options: DecodeOptions, who: str = "", 
         options: choices of the decoder, which checks tables as the sender wrote them.
         who: whose files take turns where many are to be read.
         told: takes progress.
+        mappings: the study's column mappings; a table with the header of one is read by it.
 
     Raises:
         ReaderEnded: the child met a limit or was ended. ReaderFault: our decoder failed.
@@ -70,12 +86,14 @@ def clean(source: RawFile, target: Path, options: DecodeOptions, who: str = "", 
         "target": os.path.abspath(target),
         "secrets": str(get_settings().data_dir.resolve() / "secrets"),
         "options": asdict(options),
+        "mappings": [m.to_json() for m in mappings],
     }
     get_settings().secret("pseudonyms")  # made here, where it is missing: children only read it
     found = _run(CLEAN, params, who, told)
     if "problem" in found:
-        return Cleaned("unreadable", Redaction(ignored=found["left_out"]), UndecodableFile(*found["problem"]))
-    return Cleaned(found["kind"], Redaction(**found["redaction"]))
+        problem = UndecodableFile(*found["problem"])
+        return Cleaned("unreadable", Redaction(ignored=found["left_out"]), problem, preview=found["preview"])
+    return Cleaned(found["kind"], Redaction(**found["redaction"]), mapping=found["mapping"])
 
 
 def decode(source: Path, kind: str, options: DecodeOptions, name: str, who: str = "", told: Told = lambda *_: None) -> DecodedFile:

@@ -8,19 +8,20 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import structlog
 from sqlalchemy.orm import Session
 
-from app.ingest import encryption, repository
-from app.ingest.models import Upload, UploadFile
+from app.ingest import encryption, repository, wording
+from app.ingest.mappings import repository as mappings
+from app.ingest.models import PREVIEW, Upload, UploadFile
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading, recordings
 from app.ingest.uploads.in_progress import tell
 from app.ingest.uploads.incoming import Incoming
 from app.ingest.uploads.reading import ReaderEnded, ReaderFault
-from app.ingest.uploads.reports import ASIDE, BEGUN, add_redaction, aside, known_recordings, store_reports, stored_reports
+from app.ingest.uploads.reports import ASIDE, BEGUN, add_redaction, known_recordings, lasting, store_reports, stored_reports
 from app.platform import files, raw_bytes
 from app.platform.errors import TooLarge
 from app.platform.jobs.children import child
@@ -49,7 +50,7 @@ ENDED_THE_SERVICE = UndecodableFile(
     "Look at it on the page of the quarantine. Send it again with what is wrong mended, or read it again when the service was mended.",
 )
 RESUMED = "Reading this file was cut short; it was read from the kept bytes since, and what was removed from it is not listed again."
-TABLES = ("csv", "parquet", "control_log")
+TABLES = ("csv", "parquet", "control_log", "mapped")
 MEDIA_TYPE = "application/octet-stream"
 
 
@@ -93,13 +94,15 @@ class FileOutcome:
 
 @dataclass(frozen=True)
 class StoredContent:
-    """A file as it was stored, and why it cannot be decoded, if so."""
+    """A file as it was stored, and why it cannot be decoded, if so; which column mapping read it, or what a mapping may be made from."""
 
     kind: str
     stored_sha256: str | None
     quarantine_sha256: str | None
     redaction: Redaction
     problem: UndecodableFile | None
+    column_mapping_id: int | None = None
+    preview: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,8 @@ class Receiver:
             stored_sha256=content.stored_sha256,
             quarantine_sha256=content.quarantine_sha256,
             redactor_version=REDACTOR_VERSION,
-            report={BEGUN: 1},
+            column_mapping_id=content.column_mapping_id,
+            report={BEGUN: 1} | ({PREVIEW: content.preview} if content.preview else {}),
         )
         self.db.add(row)
         self.db.commit()  # the bytes are safe from here on, whatever the decoder does with them
@@ -166,7 +170,7 @@ class Receiver:
         if not sealed and row.report.get(BEGUN, 0) >= LETHAL:
             return self._put_aside(row, self._content(row), ENDED_THE_SERVICE)
         # committed before the file is read, so that it is known whom to blame when that ends the process
-        row.report = {BEGUN: row.report.get(BEGUN, 0) + 1}
+        row.report = {**lasting(row), BEGUN: row.report.get(BEGUN, 0) + 1}
         self.db.commit()
         outcome = self.decode(row.name, row, replace(self._content(row), problem=CUT_SHORT if sealed else None))
         if not outcome.same_bytes:
@@ -193,7 +197,7 @@ class Receiver:
         sealed = row.quarantine_sha256 is not None
         if not sealed:
             row.quarantine_sha256 = self._seal(files.path_of(content.stored_sha256))
-        row.report = aside(row) if sealed else {ASIDE: content.stored_sha256}
+        row.report = lasting(row) if sealed else {ASIDE: content.stored_sha256}
         return self._failed(row.name, row, replace(content, quarantine_sha256=row.quarantine_sha256), problem)
 
     def _told(self, share: float | None, doing: str | None) -> None:
@@ -205,8 +209,10 @@ class Receiver:
         A table is cleaned by reading it with the participant's options: one that cannot be decoded is kept encrypted too.
         """
         clean = files.draft_path()
+        known = mappings.present(self.db, self.participant.site.study_id)
+        ways = [m.as_mapping for m in known]
         try:
-            found = twice(lambda: reading.clean(raw, clean, self.options, str(self.upload.id), self._told))
+            found = twice(lambda: reading.clean(raw, clean, self.options, str(self.upload.id), self._told, ways))
         except ReaderEnded as ended:
             log.error("file put aside: cleaning it ended the reader", upload=self.upload.id, cause=ended.cause)
             return self._quarantined(raw, clean, ended)
@@ -221,14 +227,22 @@ class Receiver:
             clean.unlink(missing_ok=True)
             raise
         if found.problem is not None:
-            return self._quarantined(raw, clean, found.problem, found.redaction)
+            return self._quarantined(raw, clean, found.problem, found.redaction, found.preview)
         sealed = self._seal(raw) if found.redaction.unreadable else None
-        return StoredContent(found.kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, found.redaction, None)
+        by = known[found.mapping].id if found.mapping is not None else None
+        return StoredContent(found.kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, found.redaction, None, by)
 
-    def _quarantined(self, raw: RawFile, clean: Path, problem: UndecodableFile, redaction: Redaction | None = None) -> StoredContent:
+    def _quarantined(
+        self,
+        raw: RawFile,
+        clean: Path,
+        problem: UndecodableFile,
+        redaction: Redaction | None = None,
+        preview: dict[str, Any] | None = None,
+    ) -> StoredContent:
         clean.unlink(missing_ok=True)
         sealed = self._seal(raw)
-        return StoredContent("unreadable", sealed, sealed, redaction or Redaction(), problem)
+        return StoredContent("unreadable", sealed, sealed, redaction or Redaction(), problem, preview=preview)
 
     def _seal(self, raw: Source) -> str:
         return files.store(self.db, encryption.encrypt(raw), MEDIA_TYPE).sha256
@@ -264,6 +278,8 @@ class Receiver:
             return self._failed(name, row, content, ours)
         reports = list(decoded.reports)
         add_redaction(reports[0], content.redaction, tremor)
+        if row.column_mapping is not None:
+            reports[0].understood.insert(0, wording.read_by_mapping(row.column_mapping))
         reports[0].understood.extend(stored.understood)
         reports[0].flagged.extend(stored.flagged)
         row.status = "decoded"
@@ -294,7 +310,7 @@ class Receiver:
         def again() -> bool:
             begun = row.report.get(BEGUN, 1)
             if begun < LETHAL:
-                row.report = {**aside(row), BEGUN: begun + 1}
+                row.report = {**lasting(row), BEGUN: begun + 1}
                 self.db.commit()
             return bool(begun < LETHAL)
 
@@ -315,6 +331,7 @@ class Receiver:
         """The same bytes were of no use before, and still are: they are kept once."""
         report.understood.append(f"The same bytes came before, as file {before.id} in upload {before.upload_id}; they are kept once.")
         sealed = row.quarantine_sha256
+        before.report = {**(before.report or {}), **lasting(row)}
         self.db.delete(row)
         self.db.flush()
         if sealed is not None:
@@ -346,6 +363,9 @@ def twice(read: Callable[[], _Read], again: Callable[[], bool] = lambda: True) -
         return read()
 
 
+_UNITS_OF_FILES = {"header": "as the file's header says", "mapping": "as the column mapping says"}
+
+
 def name_beta(decoded: DecodedFile, beta: BetaStated, settings: SettingsVersion) -> DecodedFile:
     """A table's own beta under its source; the report gets a sentence that says who stated unit and source.
 
@@ -358,12 +378,12 @@ def name_beta(decoded: DecodedFile, beta: BetaStated, settings: SettingsVersion)
     report = decoded.reports[0]
     source_from = _stated_by(beta.source, settings.beta_source)
     for trace in (t for r in decoded.recordings for t in r.traces if _stated_by_a_person(t)):
-        in_header = trace.details["unit_from"] == "header"
-        unit_from = "as the file's header says" if in_header else _stated_by(beta.unit, settings.beta_unit)
+        in_header = trace.details["unit_from"] in _UNITS_OF_FILES
+        unit_from = _UNITS_OF_FILES.get(trace.details["unit_from"]) or _stated_by(beta.unit, settings.beta_unit)
         report.understood.append(f"beta: unit '{trace.unit}' {unit_from}, source '{source}' {source_from}")
         if in_header and beta.unit and unit_name(beta.unit) != trace.unit:
             stated = unit_name(beta.unit)
-            report.flagged.append(f"the file's header gives beta in '{trace.unit}', the upload says '{stated}': the header was taken")
+            report.flagged.append(f"beta is in '{trace.unit}' {unit_from}, the upload says '{stated}': the former was taken")
     return replace(decoded, recordings=named)
 
 

@@ -6,9 +6,10 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, replace
+from typing import Any
 
 from app.ingest import wording
-from app.ingest.models import UploadFile
+from app.ingest.models import PREVIEW, UploadFile
 from ml.formats.recording import FileReport, Problem
 from ml.formats.redaction_record import Redaction
 
@@ -25,12 +26,12 @@ def store_reports(
     found = unreadable_members(row) if unreadable is None else list(unreadable)
     for report in reports:
         count_equal_lines(report)
-    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known), "unreadable": found, **aside(row)}
+    row.report = {"reports": [asdict(r) for r in reports], "known_recordings": list(known), "unreadable": found, **lasting(row)}
 
 
-def aside(row: UploadFile) -> dict[str, str]:
-    """The member `ASIDE` of a file's report, where it has one."""
-    return {ASIDE: row.report[ASIDE]} if ASIDE in (row.report or {}) else {}
+def lasting(row: UploadFile) -> dict[str, Any]:
+    """The members of a file's report that stay when it is written anew: `ASIDE` and `PREVIEW`, where it has them."""
+    return {name: row.report[name] for name in (ASIDE, PREVIEW) if name in (row.report or {})}
 
 
 def count_equal_lines(report: FileReport) -> None:

@@ -200,7 +200,7 @@ def finish(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
         upload.stated = {**upload.stated, SESSIONS_BEGUN: begun + 1}
         db.commit()
         make_sessions(db, outcome, stated)
-        _attach_grasps(db, outcome, stated)
+        attach_grasps_of(db, outcome, stated)
     else:
         _leave_without_sessions(outcome)
     # a file that came before has its row in another upload; this one only points at it
@@ -290,7 +290,7 @@ def _no_session(without: int, of: int) -> str:
     return f"{without} of {of} recordings hold no data of a session: they are kept, and no session was made of them."
 
 
-def _attach_grasps(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
+def attach_grasps_of(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
     """Grasp tests to the stated session, else to the only one that this upload gave."""
     target = stated.session
     if target is None and len(outcome.session_ids) == 1:

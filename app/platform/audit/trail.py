@@ -68,6 +68,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "stored_file": (),
     "upload": ("report",),
     "upload_file": ("report",),
+    "column_mapping": (),
     "session_proposal": (),
     "policy": (),
     "buffer_snapshot": (),

@@ -12,13 +12,14 @@ from ml.formats.source import Source
 from ml.formats.tables.control_log import decode_log, is_log
 from ml.formats.tables.delimited import read_headers
 from ml.formats.tables.grasps import decode_grasps, looks_like_grasps
+from ml.formats.tables.mapping import decode_mapped
 from ml.formats.tables.redact import redact_table
 from ml.formats.tables.steps import decode_csv, decode_parquet
 from ml.formats.tables.strivepd import decode_strivepd, looks_like_tremor
 
 __all__ = ["TableKind", "decode_table", "kind_of_text", "redact_table"]
 
-TableKind = Literal["csv", "parquet", "control_log", "tremor", "grasp"]
+TableKind = Literal["csv", "parquet", "control_log", "tremor", "grasp", "mapped"]
 
 _DECODERS: dict[TableKind, Callable[[Path, DecodeOptions, str | None], DecodedFile]] = {
     "csv": decode_csv,
@@ -26,6 +27,7 @@ _DECODERS: dict[TableKind, Callable[[Path, DecodeOptions, str | None], DecodedFi
     "control_log": decode_log,
     "tremor": decode_strivepd,
     "grasp": decode_grasps,
+    "mapped": decode_mapped,
 }
 
 

@@ -124,7 +124,7 @@ def read_delimited(path: Source, max_rows: int | Callable[[Sequence[str]], int],
     head = read_head(path, needed)
     most = max_rows if isinstance(max_rows, int) else max_rows(head.headers)
     with rows_behind(path, head) as source:
-        lines, rows = _cells(source, head.delimiter, len(head.headers), head.lines, most)
+        lines, rows = rows_of(source, head.delimiter, len(head.headers), head.lines, most)
     return TextTable(head.headers, lines, rows, head.delimiter, list(head.notes))
 
 
@@ -166,6 +166,14 @@ def rows_behind(path: Source, head: TableHead) -> Iterator[Iterator[str]]:
         yield lines
 
 
+@contextmanager
+def text_lines(path: Source, needed: str) -> Iterator[Iterator[str]]:
+    """The lines of a text table from its first one. Raises UndecodableFile for an empty or a binary file."""
+    encoding = _encoding(path, [], needed)
+    with path.open("rb") as raw, io.TextIOWrapper(raw, encoding=encoding, errors="replace", newline=None) as stream:
+        yield _lines(stream)
+
+
 def _header_line(top: list[str], begin: int, separator: str | None) -> int:
     """Place of the first line that names a column of times; the first line where none of the top does."""
     for i, line in enumerate(top[begin : begin + MOST_TITLES + 1], start=begin):
@@ -176,6 +184,14 @@ def _header_line(top: list[str], begin: int, separator: str | None) -> int:
         if any(column_name(cell)[0] in TIME_COLUMNS for cell in cells):
             return i
     return begin
+
+
+def split_line(line: str, delimiter: str) -> list[str]:
+    """Cells of one line, without line end or blanks around them; empty for a line that is no row of a table."""
+    try:
+        return [cell.strip() for cell in next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter), [])]
+    except csv.Error:
+        return []
 
 
 def _split(line: str, delimiter: str, number: int) -> list[str]:
@@ -242,8 +258,12 @@ def _delimiter(header: str) -> str:
     return max("\t;|,", key=lambda mark: (header.count(mark), mark != ","))
 
 
-def _cells(source: Iterator[str], delimiter: str, width: int, offset: int, max_rows: int) -> tuple[list[int], list[list[str]]]:
-    """Line numbers and cells of every row that is not blank."""
+def rows_of(source: Iterator[str], delimiter: str, width: int, offset: int, max_rows: int) -> tuple[list[int], list[list[str]]]:
+    """Line numbers and cells of every row that is not blank, of lines of which the first has the number `offset` + 1.
+
+    Raises:
+        UndecodableFile: a row of another width, more than `max_rows`, no table; names the line.
+    """
     reader = csv.reader(source, delimiter=delimiter)
     lines: list[int] = []
     rows: list[list[str]] = []

@@ -40,7 +40,7 @@ def redact_table(source: Source, target: Path, kind: TableKind, options: DecodeO
         UndecodableFile: the table cannot be decoded; nothing is written then.
     """
     if kind in ("tremor", "grasp"):
-        return _redact_outcomes(source, target, kind, options)
+        return redact_outcomes(source, target, kind, options)
     if kind == "control_log":
         return redact_log(source, target, options)
     columns = read_csv(source, options) if kind == "csv" else read_parquet(source, options)
@@ -52,7 +52,8 @@ def redact_table(source: Source, target: Path, kind: TableKind, options: DecodeO
     return Redaction(removed=removed_columns(columns.ignored), repaired=list(columns.notes))
 
 
-def _redact_outcomes(source: Source, target: Path, kind: str, options: DecodeOptions) -> Redaction:
+def redact_outcomes(source: Source, target: Path, kind: str, options: DecodeOptions) -> Redaction:
+    """Write a tremor export or a grasp test as the minutes or open fists that were read from it; see `redact_table`."""
     decoded = decode_strivepd(source, options) if kind == "tremor" else decode_grasps(source, options)
     report = decoded.reports[0]
     lines = _tremor_lines(decoded.tremor[0]) if kind == "tremor" else _grasp_lines(decoded.grasps)

@@ -32,6 +32,15 @@ def removed_columns(headers: Iterable[str]) -> list[str]:
     return [f"{total} other column{'s' if total != 1 else ''}: {', '.join(listed)}"]
 
 
+PERSONAL = ("a date", "a note", "an identifier")
+"""Likenesses of columns of which no cell is shown to anybody."""
+
+
+def is_personal(header: str) -> bool:
+    """Whether a column is called like one that says who somebody is."""
+    return _kind(header) in PERSONAL
+
+
 def _kind(header: str) -> str:
     # words apart: patientName, patient-name and "Patient name (full)" are patient_name
     words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", header.strip())

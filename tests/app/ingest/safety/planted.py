@@ -135,6 +135,27 @@ def steps(beta: float = 1.0, cell: str = "1") -> str:
     return head + "".join(rows) + f"40,1,{cell},,,\n"
 
 
+def unknown_columns() -> str:
+    """A table that nobody knows, with a name in its title, in a column's name and in cells, and numbers that are a person's."""
+    head = f"{WHO}; {NOTE}\nZeit {NAME};Signal;{NUMBER};Patient;{BORN};Strom\n"
+    return head + "".join(f"{2 * k};{k / 7:.3f};{NUMBER};{NAME};{BORN};1.5\n" for k in range(1, 15))
+
+
+MAPPING = {
+    "name": "a clinic's program",
+    "header_line": 2,
+    "holds": "steps",
+    "time_format": "seconds",
+    "time_at": "end",
+    "columns": [
+        {"number": 1, "role": "time"},
+        {"number": 2, "role": "beta", "unit": "uV"},
+        {"number": 6, "role": "amplitude_ma", "unit": "mA"},
+    ],
+}
+"""What the columns of `unknown_columns` are."""
+
+
 def parquet() -> bytes:
     """A table whose columns and metadata hold a name."""
     n = 20
@@ -170,6 +191,7 @@ def every_file() -> list[tuple[str, bytes]]:
         (f"{WHO}.csv", steps().encode()),
         (f"{WHO} words.csv", steps(2.0, f"{NAME}").encode()),
         (f"{WHO} columns.csv", f"{NAME},{BORN}\n{NOTE},{SERIAL}\n".encode()),
+        (f"{WHO} unknown.csv", unknown_columns().encode()),
         (f"{WHO}.parquet", parquet()),
         (f"{WHO} tremor.csv", tremor().encode()),
         (f"{WHO} grasps.csv", grasps().encode()),

@@ -87,6 +87,12 @@ def outside_the_senders_words(answer: Any) -> list[str]:
     return found(json.dumps(body))
 
 
+def _waiting(answer: Any) -> list[int]:
+    """Numbers of the tables that wait for a column mapping, in the answer to an upload or in its problem document."""
+    listed = [f["id"] for f in answer.get("files", []) if f["waits_for_mapping"]]
+    return [*listed, *answer.get("waits_for_mapping", [])]
+
+
 def test_nothing_that_says_who_somebody_is_is_kept_or_said_anywhere(
     client: TestClient,
     send: Send,
@@ -121,6 +127,17 @@ def test_nothing_that_says_who_somebody_is_is_kept_or_said_anywhere(
         page = client.post("/participants/P1/upload", files=[("file", (f"{WHO}.csv", planted.steps(7.0).encode()))], headers=PAGE)
     assert (broken.status_code, page.status_code) == (500, 500)
     assert (found(broken.text), found(page.text)) == ([], [])
+    waiting = sorted({n for answer in answers for n in _waiting(answer.json())})
+    assert waiting, "a table is previewed"
+    places = [f"/uploaded-files/{n}/mapping" for n in waiting] + [f"/api/v1/uploaded-files/{n}/preview" for n in waiting]
+    shown = {place: client.get(place, headers=PAGE if not place.startswith("/api") else {}) for place in places}
+    assert {a.status_code for a in shown.values()} == {200}
+    assert {place: hit for place, a in shown.items() if (hit := found(a.text))} == {}
+    mapped = [client.put(f"/api/v1/uploaded-files/{n}/mapping", json=planted.MAPPING) for n in waiting]
+    assert 200 in {a.status_code for a in mapped}, [a.text for a in mapped]
+    answers += [a for a in mapped if a.status_code == 200]
+    study = db.scalar(text("select code from study order by id"))
+    assert found(client.get(f"/studies/{study}/column-mappings", headers=PAGE).text) == []
     for content in (constant_onnx(0.6, 10), b"not a network"):
         client.post("/api/v1/participants/P1/policies", data={"name": "theirs"}, files={"file": (f"{WHO}.onnx", content)})
 

@@ -252,7 +252,7 @@ def test_the_headers_unit_wins_over_the_stated_one_and_a_contradiction_is_flagge
     body = upload(client, TABLE.replace(b"beta", b"beta [mV]"), beta_unit="uV").json()
     report = body["report"][0]
     assert any("unit 'mV' as the file's header says, source 'table' as the participant's settings say" in s for s in report["understood"])
-    assert any("header gives beta in 'mV', the upload says 'uV'" in s for s in report["flagged"])
+    assert any("beta is in 'mV' as the file's header says, the upload says 'uV'" in s for s in report["flagged"])
 
 
 def test_other_columns_of_a_table_are_neither_stored_nor_named(client: TestClient, enrolled: str) -> None:

@@ -1,0 +1,1 @@
+"""Column mappings: how tables that no decoder knows are read in one study, stated once by a person who saw a preview."""

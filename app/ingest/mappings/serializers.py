@@ -1,0 +1,68 @@
+"""Previews and column mappings as API types."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from app.ingest.mappings.schemas import MappedColumnIn, MappedOut, MappingOut, PreviewLineOut, PreviewOut
+from app.ingest.mappings.service import Applied, WaitingTable
+from app.ingest.models import ColumnMapping
+from app.ingest.quarantine.serializers import problem_of
+from app.ingest.schemas import FileReportOut
+
+
+def mapping_out(row: ColumnMapping, current: bool) -> MappingOut:
+    """A version of a mapping for the API."""
+    stored = row.as_mapping
+    return MappingOut(
+        id=row.id,
+        name=row.name,
+        version=row.version,
+        current=current,
+        removed=row.removed,
+        unit_lines=stored.unit_lines,
+        holds=stored.holds,
+        time_format=stored.time_format,
+        zone=stored.zone,
+        rate_hz=stored.rate_hz,
+        time_at=("begin" if stored.row_begins else "end") if stored.holds == "steps" else None,
+        columns=[
+            MappedColumnIn.model_validate({"number": c.number, "role": c.role, "unit": c.unit, "side": c.side, "channel": c.channel})
+            for c in stored.columns
+        ],
+        labels=row.labels,
+        created_at=row.created_at,
+        created_by=row.created_by,
+        reason=row.reason,
+    )
+
+
+def mappings_out(rows: Sequence[ColumnMapping], present: Sequence[ColumnMapping]) -> list[MappingOut]:
+    """Versions of mappings for the API; `present` are those in force."""
+    in_force = {row.id for row in present}
+    return [mapping_out(row, row.id in in_force) for row in rows]
+
+
+def preview_out(table: WaitingTable) -> PreviewOut:
+    """A waiting table for the API."""
+    shown = table.preview
+    return PreviewOut(
+        file_id=table.file.id,
+        participant=table.participant.code,
+        problem=problem_of(table.file),
+        width=shown["width"],
+        lines=[PreviewLineOut(number=x["number"], cells=x["cells"], may_be_header=x["header"] is not None) for x in shown["lines"]],
+        header_line=shown["header_line"],
+        unit_lines=shown["unit_lines"],
+        mapping=mapping_out(table.known, True) if table.known else None,
+    )
+
+
+def applied_out(applied: Applied) -> MappedOut:
+    """What came of a mapping for the API."""
+    return MappedOut(
+        mapping=mapping_out(applied.mapping, True),
+        report=[FileReportOut.model_validate(r) for f in applied.outcomes for r in f.reports],
+        session_ids=sorted({i for f in applied.outcomes for i in f.session_ids}),
+        waiting=applied.waiting,
+    )

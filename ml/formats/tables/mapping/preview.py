@@ -1,0 +1,145 @@
+"""The first lines of a table that could not be read, as much of them as may be shown and stored: enough to say which column is which.
+
+Words stay where they are words of the field, numbers where they are measurements; of everything else the shape is left.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from ml.formats.recording import TREMOR_CLASSES, UndecodableFile
+from ml.formats.source import Source
+from ml.formats.tables.delimited import MOST_TITLES
+from ml.formats.tables.mapping.lines import MOST_COLUMNS, Top, read_top
+from ml.formats.tables.mapping.model import header_hash
+from ml.formats.tables.numbers import MISSING, TIME_UNITS, NotANumber, known_unit, parse_number
+from ml.formats.tables.removed import is_personal
+
+LONGEST_CELL = 40
+MOST_SHOWN = 12
+"""Lines of a preview."""
+MOST_DIGITS = 4
+"""Digits before the decimal point of a number that is shown: longer ones may be a number that names a person, or a time."""
+LEAST_NUMBERS = 2
+HIDDEN = "…"
+_LISTED = """
+    a acc accel acceleration accelerometer active adaptive adc ain amp ampere amperes amplitude amplitudes amps analog apple arm average
+    avg axis band bandpower baseline battery beta bipolar c channel channels class clock cluster code column contact contacts control
+    controller cortex counts counter current d data dbs delivered delta device dominant duration dx dy dz e ecog eeg elapsed electrode
+    emg end energy epoch error event fft filtered fist fists fraction freq frequency gamma gpi grasp grasps group gyro hand hemisphere
+    hertz high hold hz impedance index intensity inv kinetic l ladder lead left length level lfp limit local log low lower m ma mean
+    measure measured measurement median micro mild milli milliampere milliamps milliseconds minute minutes mode moderate motor movement
+    ms mv n neural no none norm normalized number nv off on open order output p peak percent period phase policy potential power program
+    psd pulse r rate raw ratio rec record recording relative right rms row s sample samples sampling sec second seconds segment
+    sensing sensor sequence severity share side sig signal slight smoothed spectral spectrum start state step steps stim stimulation stn
+    stop strong sync t target tap theta threshold tick ticks time times timestamp total trace tremor trial type ua unit units unix
+    unknown upper us utc uv v value values vol volt voltage volts w watch wave wearable width window x y z zeit strom links rechts
+    spannung dauer kanal temps gauche droite tiempo canal izquierda derecha tempo sinistra destra tijd
+"""
+WORDS = frozenset(_LISTED.split())
+"""Words of the field, in headers of tables; none of them is a person's name."""
+ROW_WORDS = frozenset({*TREMOR_CLASSES, "l", "r", "left", "right"})
+_WORD = re.compile(r"[^\W\d_]+")
+
+
+def preview_of(path: Source, key: bytes) -> dict[str, Any] | None:
+    """What may be shown of a table, as plain JSON; None for what is no table that a mapping could read.
+
+    Args:
+        path: the uploaded bytes.
+        key: secret of the installation, for the hashes of lines that may be the header.
+
+    Returns:
+        `width`; `lines`, each with its `number`, screened `cells` and `header`, the keyed hash of the line, where it may name the columns;
+        `header_line` and `unit_lines` as they look like.
+    """
+    try:
+        top = read_top(path)
+    except UndecodableFile:
+        return None
+    width = max((len(cells) for _, cells in top.lines), default=0)
+    if top.is_log or len(top.lines) < 2 or not 1 <= width <= MOST_COLUMNS:
+        return None
+    first = next((i for i, (_, cells) in enumerate(top.lines) if _is_row(cells, width)), None)
+    if first is None or first == 0:
+        return None
+    units = 1 if first > 1 and _is_units(top.lines[first - 1][1]) else 0
+    header = first - 1 - units
+    shown = [_numbers_shown(top, column, first) for column in range(width)]
+    named = top.lines[header][1]
+    lines = [
+        {
+            "number": number,
+            "cells": [
+                _cell(cell, i < first and len(cells) == width, i >= first and shown[j] and not (j < len(named) and is_personal(named[j])))
+                for j, cell in enumerate(cells)
+            ],
+            "header": header_hash(cells, key) if number <= MOST_TITLES + 1 and len(cells) == width else None,
+        }
+        for i, (number, cells) in enumerate(top.lines[: first + MOST_SHOWN])
+    ]
+    return {"width": width, "lines": lines, "header_line": top.lines[header][0], "unit_lines": units}
+
+
+def _is_row(cells: list[str], width: int) -> bool:
+    """Whether a line is one of measurements: it has all its cells, and at least half of those that are not empty are numbers or times."""
+    filled = [cell for cell in cells if cell.lower() not in MISSING]
+    telling = [cell for cell in filled if _number(cell) is not None or _has_date(cell)]
+    return len(cells) == width and bool(telling) and 2 * len(telling) >= len(filled)
+
+
+def _is_units(cells: list[str]) -> bool:
+    named = [cell.strip("[]()").strip() for cell in cells if cell not in ("", "-")]
+    return bool(named) and all(known_unit(cell) or cell.lower() in TIME_UNITS for cell in named)
+
+
+def _has_date(cell: str) -> bool:
+    return re.search(r"\d{1,4}[-./]\d{1,2}[-./]\d{1,4}", cell) is not None
+
+
+def _number(cell: str) -> float | None:
+    for decimal in (".", ","):
+        try:
+            return parse_number(cell, decimal)
+        except NotANumber:
+            continue
+    return None
+
+
+def _numbers_shown(top: Top, column: int, first: int) -> bool:
+    """Whether the numbers of a column are measurements: some, not all one whole number, which may name a person."""
+    cells = [cells[column] for _, cells in top.lines[first:] if column < len(cells) and cells[column]]
+    found = [n for cell in cells if (n := _number(cell)) is not None]
+    if len(found) < LEAST_NUMBERS or 2 * len(found) < len(cells):
+        return False
+    return len(set(found)) > 1 or abs(found[0]) < 100 or found[0] != int(found[0])
+
+
+def _cell(cell: str, names: bool, measured: bool) -> str:
+    """A cell as it may be shown: words of the field where it `names` columns, numbers where they were `measured`, else its shape."""
+    text = cell.strip()[: 4 * LONGEST_CELL]
+    if text.lower() in MISSING | ROW_WORDS:
+        return text.lower()
+    value = _number(text)
+    if value is not None:
+        plain = measured and abs(value) < 10**MOST_DIGITS
+        return f"{value:.6g}" if plain else re.sub(r"\d", "#", text)[:LONGEST_CELL]
+    if names:
+        return known_unit(text.strip("[]()")) or _words(text)
+    return _tidy(re.sub(r"\d", "#", re.sub(_WORD, lambda w: w[0] if w[0] in "TZ" else HIDDEN, text)))
+
+
+def _words(text: str) -> str:
+    """Words of the field and marks; other words as `…`, digits as `#` but single ones, such as those of contacts, beside such a word."""
+    whole = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", text)
+    known = any(len(w) > 1 and w.lower() in WORDS for w in _WORD.findall(whole))
+    out = re.sub(_WORD, lambda w: w[0] if w[0].lower() in WORDS or known_unit(w[0]) else HIDDEN, whole)
+    single = known and not re.search(r"\d{2}|\d[./-]\d[./-]\d", out)
+    return _tidy(out if single else re.sub(r"\d", "#", out))
+
+
+def _tidy(text: str) -> str:
+    """A text in which several hidden words are one, without what a terminal or page would act on."""
+    plain = "".join(mark for mark in text if mark.isprintable())
+    return re.sub(r"…[\s…]*…", HIDDEN, plain)[:LONGEST_CELL]

@@ -1,0 +1,71 @@
+"""Times of a mapped table, in the format and zone that a person stated."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from zoneinfo import ZoneInfo
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ml.formats.recording import UndecodableFile
+from ml.formats.tables.delimited import TextTable
+from ml.formats.tables.mapping.model import RELATIVE, UNIX, WRITTEN, TableMapping, TimeFormat
+from ml.formats.tables.numbers import MISSING, shown
+
+_WRITTEN = re.compile(r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})[T ,]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,6}))?)?", re.ASCII)
+_SPAN_S = (datetime(1990, 1, 1, tzinfo=UTC).timestamp(), datetime(2200, 1, 1, tzinfo=UTC).timestamp())
+EXAMPLES = {"iso": "2026-03-02 10:00:00", "dmy": "02.03.2026 10:00:00", "mdy": "03/02/2026 10:00:00"}
+
+
+def is_absolute(time_format: TimeFormat) -> bool:
+    """Whether times of a format are moments, not seconds from the session's start."""
+    return time_format in UNIX or time_format in WRITTEN
+
+
+def read_times(table: TextTable, column: int, mapping: TableMapping) -> NDArray[np.float64]:
+    """A column of times, [rows]: Unix time in s where they are moments, else seconds from the session's start; NaN for empty cells.
+
+    Raises:
+        UndecodableFile: a cell that is not written so, or a moment that no clock of a study shows; names the line.
+    """
+    if mapping.time_format in WRITTEN:
+        out = np.array([_moment(row[column], table, i, column, mapping) for i, row in enumerate(table.rows)], dtype=np.float64)
+    else:
+        numbers = table.numbers(column, table.decimal_mark([column]), "time")
+        if mapping.time_format == "samples":
+            assert mapping.rate_hz is not None
+            return numbers / mapping.rate_hz
+        out = numbers * {**RELATIVE, **UNIX}[mapping.time_format]
+    if is_absolute(mapping.time_format) and (off := np.flatnonzero((out < _SPAN_S[0]) | (out >= _SPAN_S[1]))).size:
+        what, hint = "the time lies before 1990 or after 2200", "State in which format and unit the times are written."
+        raise UndecodableFile(what, f"line {table.lines[off[0]]}, column {column + 1}", hint)
+    return out
+
+
+def _moment(cell: str, table: TextTable, row: int, column: int, mapping: TableMapping) -> float:
+    text = cell.strip()
+    if text.lower() in MISSING:
+        return float("nan")
+    try:
+        found = datetime.fromisoformat(text) if mapping.time_format == "iso" else _day_or_month_first(text, mapping.time_format)
+        if found.tzinfo is None:
+            assert mapping.zone is not None
+            found = found.replace(tzinfo=ZoneInfo(mapping.zone))
+        return found.timestamp()
+    except (ValueError, OverflowError) as error:
+        what = f"is no date and time written like {EXAMPLES[mapping.time_format]}"
+        where = f"line {table.lines[row]}, column {column + 1}"
+        hint = "State in which format the times are written, or give every row its date and time."
+        raise UndecodableFile(f"{shown(text)} {what}", where, hint, f"a cell {what}") from error
+
+
+def _day_or_month_first(text: str, which: str) -> datetime:
+    """A date with the year last. Raises ValueError."""
+    match = _WRITTEN.fullmatch(text)
+    if match is None:
+        raise ValueError("no date of this format")
+    first, second, year, hour, minute, sec, part = match.groups()
+    day, month = (first, second) if which == "dmy" else (second, first)
+    return datetime(int(year), int(month), int(day), int(hour), int(minute), int(sec or 0), int((part or "0").ljust(6, "0")))
