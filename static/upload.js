@@ -125,7 +125,8 @@ function report({ item, head, words }, status, answer) {
   for (const { one, inner } of groups) {
     const file = states.get(one.name);
     const line = element("div", { className: "row" }, element("h3", { textContent: one.name }));
-    if (file) line.append(file.duplicate ? badge("known already", "info") : badge(...(STATES[file.status] ?? ["not usable, kept", "bad"])));
+    if (file) line.append(file.duplicate ? badge("known already", "info") : badge(...(STATES[file.status] ?? (file.waits_for_mapping ? ["columns not known", "warn"] : ["not usable, kept", "bad"]))));
+    if (file?.waits_for_mapping) line.append(element("a", { className: "button primary", href: `/uploaded-files/${file.id}/mapping`, textContent: "Say what its columns are" }));
     item.append(line, ...said(one, good));
     const told = inner.filter((r) => r.problem || Object.keys(LABELS).some((key) => r[key]?.length));
     if (!told.length) continue;

@@ -154,7 +154,7 @@ def test_a_suggested_threshold_does_not_replace_one_that_was_set_meanwhile(brows
     page = browser.get("/participants/P2/settings").text
     button = page[: page.index("<button>Use ")]
     fields = fields_of(button + "</form>", "/participants/P2/settings")
-    assert set(fields) == {"version", "xi_beta", "reason"}
+    assert set(fields) == {"version", "xi_beta", "beta_unit", "beta_source", "reason"}
     assert client.put("/api/v1/participants/P2/settings", json={"settings": {"xi_beta": 9.0}}).status_code == 200
     assert browser.post("/participants/P2/settings", data=fields).status_code == 409
     assert client.get("/api/v1/participants/P2").json()["settings"]["xi_beta"] == 9.0

@@ -31,7 +31,8 @@ def page_of(client: TestClient, recordings: Path) -> Callable[[str, float], str]
 
 
 def figures(page: str) -> list[Any]:
-    return [json.loads(f) for f in re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)]
+    scripts = map(json.loads, re.findall(r'<script type="application/json">(.*?)</script>', page, re.S))
+    return [f for f in scripts if "layout" in f]
 
 
 def trace(page: str, name: str) -> Any:
