@@ -7,7 +7,7 @@ its sessions, those of locked visits aside. Where both differ, or each holds wha
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from enum import StrEnum
 
@@ -24,13 +24,19 @@ from app.study.traces import unpack
 from ml.formats.beta import ERROR_STREAM
 from ml.formats.recording import TraceLog
 
-NEURAL = ("beta", "band_power")
+BETA = "beta"
+NEURAL = (BETA, "band_power")
 """Streams that tell whether two recordings hold the same signal."""
 FEWEST_ROWS = 5
 """Rows of a channel that both have, from which on they are held against each other."""
 EXACT_S = 0.001
 EQUAL_SHARE = 0.8
 """Share of rows on the same grid that are equal where two copies hold the same signal; ends and gaps may be cut elsewhere."""
+WITHIN_ERRORS = 0.25
+"""Rows with gaps of two copies differ by no more than this share of their standard error: the same samples are there, and what fills the
+gaps is predicted from all that each copy has."""
+TELLING = 0.5
+"""Where that tolerance is more than this share of the rows' standard deviation, it cannot tell two signals from each other."""
 LIKE = 0.5
 """Correlation of rows on shifted grids, of which each covers a part of two others, from which on the signal is the same."""
 LOST = 0.02
@@ -50,12 +56,21 @@ class Relation(StrEnum):
 
 @dataclass(frozen=True)
 class Rows:
-    """A trace for comparison: ends of its rows in s of a common clock, values with NaN where invalid, both [n]."""
+    """A trace for comparison: ends of its rows in s of a common clock, values with NaN where invalid, both [n].
+
+    `error` is the standard error of each value for what is missing of its row, [n]; None where none is known, as of whole rows.
+    """
 
     end_s: NDArray[np.float64]
     values: NDArray[np.float64]
     dt_s: float
     unit: str
+    error: NDArray[np.float64] | None = None
+
+    @property
+    def errors(self) -> NDArray[np.float64]:
+        """Standard errors, 0 where none is known, [n]."""
+        return np.zeros(self.values.size) if self.error is None else np.nan_to_num(self.error)
 
     @property
     def valid_end_s(self) -> NDArray[np.float64]:
@@ -87,7 +102,7 @@ class Verdict:
 
 def of_logs(traces: Sequence[TraceLog]) -> dict[Channel, Rows]:
     """Traces as they were decoded, on their own clock."""
-    return {(t.stream, t.channel): Rows(t.t_end_s, _with_gaps(t), t.dt_s, t.unit) for t in traces if t.stream != ERROR_STREAM}
+    return _with_errors({(t.stream, t.channel): Rows(t.t_end_s, _with_gaps(t), t.dt_s, t.unit) for t in traces})
 
 
 def _with_gaps(trace: TraceLog) -> NDArray[np.float64]:
@@ -98,10 +113,21 @@ def _with_gaps(trace: TraceLog) -> NDArray[np.float64]:
 
 def of_stored(traces: Sequence[Trace], ahead_s: float) -> dict[Channel, Rows]:
     """Stored traces on the clock of a recording that begins `ahead_s` after them."""
+    return _with_errors(
+        {
+            (t.stream, t.channel): Rows(t.first_end_s - ahead_s + t.dt_s * np.arange(t.n, dtype=np.float64), unpack(t), t.dt_s, t.unit)
+            for t in traces
+        }
+    )
+
+
+def _with_errors(found: Mapping[Channel, Rows]) -> dict[Channel, Rows]:
+    """The traces without the standard errors of beta, which go with beta's rows."""
+    errors = {channel: rows.values for (stream, channel), rows in found.items() if stream == ERROR_STREAM}
     return {
-        (t.stream, t.channel): Rows(t.first_end_s - ahead_s + t.dt_s * np.arange(t.n, dtype=np.float64), unpack(t), t.dt_s, t.unit)
-        for t in traces
-        if t.stream != ERROR_STREAM
+        key: replace(rows, error=errors[key[1]]) if key[0] == BETA and key[1] in errors else rows
+        for key, rows in found.items()
+        if key[0] != ERROR_STREAM
     }
 
 
@@ -130,9 +156,7 @@ def _alike(a: Rows, b: Rows) -> bool | None:
         inside = (rows >= 0) & (rows < b.end_s.size)
         x, y = a.values[inside], b.values[rows[inside]]
         both = np.isfinite(x) & np.isfinite(y)
-        if both.sum() < FEWEST_ROWS:
-            return None
-        return float(np.mean(np.isclose(x[both], y[both], rtol=1e-3, atol=0))) >= EQUAL_SHARE
+        return _equal(x[both], y[both], np.maximum(a.errors[inside], b.errors[rows[inside]])[both])
     place = np.searchsorted(b.end_s, a.end_s)
     inside = (place > 0) & (place < b.end_s.size)
     x, right = a.values[inside], place[inside]
@@ -142,6 +166,27 @@ def _alike(a: Rows, b: Rows) -> bool | None:
     if both.sum() < FEWEST_ROWS or np.ptp(x[both]) == 0 or np.ptp(y[both]) == 0:
         return None
     return float(np.corrcoef(x[both], y[both])[0, 1]) >= LIKE
+
+
+def _equal(x: NDArray[np.float64], y: NDArray[np.float64], error: NDArray[np.float64]) -> bool | None:
+    """Whether rows on one grid are those of one signal; None where they cannot tell.
+
+    Whole rows, for which nothing was predicted, are held against each other; where they are too few, all rows, to within a part of their
+    standard errors.
+
+    Args:
+        x, y: values, [n].
+        error: the larger standard error of either, 0 in whole rows, [n].
+    """
+    whole = error == 0
+    tolerance = 1e-3 * np.abs(y)
+    if whole.sum() >= FEWEST_ROWS:
+        x, y, tolerance = x[whole], y[whole], tolerance[whole]
+    else:
+        tolerance = tolerance + WITHIN_ERRORS * error
+        if x.size < FEWEST_ROWS or np.median(tolerance) > TELLING * np.std(y):
+            return None
+    return float(np.mean(np.abs(x - y) <= tolerance)) >= EQUAL_SHARE
 
 
 def _holds(fuller: Mapping[Channel, Rows], less: Mapping[Channel, Rows]) -> bool:

@@ -1,10 +1,11 @@
-"""P_beta as it is known at the end of each period: the definition of `ml/signals.py` without the samples that are yet to come.
+"""P_beta as it is known at the end of each period: the definition of `ml/signals` without the samples that are yet to come.
 
-A period's value is the same zero-phase band-pass and the same root mean square over the same samples, with the same lines over short gaps.
+A period's value is the same zero-phase band-pass and the same root mean square over the same samples.
 What differs from the value that is computed afterwards: (1) the filter's right edge lies at the last sample of the period, where it is
 mirrored, instead of in the samples that follow; (2) its left edge lies `CONTEXT_S` before the period, instead of where the recording or a
 long gap left it; (3) samples that have just begun after a long gap are judged by what has come of them, so that too few at the end of a
-period are not counted there, though more follow. The measured effect stands in docs/deployment.md.
+period are not counted there, though more follow; (4) short gaps are predicted from the samples of the context and the period alone.
+The measured effect stands in docs/deployment.md.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from ml.formats.rcs.packets.time import PacketTimes
 from ml.formats.rcs.settings import Sensing, Settings
 from ml.formats.rcs.traces import Grid
 from ml.formats.recording import SampleLog, SpectrumLog, TraceLog
-from ml.signals import BandRows, band_rows, spectrum
+from ml.signals import BandRows, band_rows, gap_models, spectrum
 
 UV_PER_MV = 1000.0
 ROWS_AT_ONCE = 300
@@ -136,9 +136,12 @@ def time_domain_samples(channels: dict[str, list[Stretch]], grid: Grid) -> list[
 def band_rows_in_blocks(stretches: list[Stretch], grid: Grid) -> BandRows:
     """`ml.signals.band_rows` of samples in uV, a block of rows at a time.
 
-    Amplitudes equal those of the whole; the standard errors rest on the block's own autocorrelation.
+    Amplitudes equal those of the whole, for one model of the whole fills the gaps; the standard errors rest on the block's own
+    autocorrelation.
     """
     options = grid.options
+    found = gap_models([(start / 1000.0, rate, x) for start, rate, x in stretches])
+    models = {rate: model and model.scaled(UV_PER_MV) for rate, model in found.items()}
     margin_s = MARGIN_CYCLES / (options.beta_high_hz - options.beta_low_hz) + 1.0
     begin_s = np.array([(start - grid.start_ms) / 1000.0 for start, _, _ in stretches])
     end_s = begin_s + np.array([x.size / rate for _, rate, x in stretches])
@@ -155,7 +158,7 @@ def band_rows_in_blocks(stretches: list[Stretch], grid: Grid) -> BandRows:
         # one row more in front, so that a sample on the border belongs to the row before and to no other
         ahead = min(first, 1)
         t0_s = (first - ahead) * options.period_s
-        rows = band_rows(block, end - first + ahead, options.period_s, options.beta_low_hz, options.beta_high_hz, t0_s)
+        rows = band_rows(block, end - first + ahead, options.period_s, options.beta_low_hz, options.beta_high_hz, t0_s, models)
         for name in ("rms", "power", "covered", "rms_error"):
             getattr(out, name)[first:end] = getattr(rows, name)[ahead:]
     return out

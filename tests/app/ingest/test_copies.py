@@ -6,6 +6,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,10 +41,10 @@ def with_member(name: str, content: bytes) -> bytes:
     return sink.getvalue()
 
 
-def changed(change: Callable[[str, bytes], bytes]) -> bytes:
-    """The folder with every file changed."""
+def changed(change: Callable[[str, bytes], bytes], folder: bytes = FOLDER) -> bytes:
+    """A folder with every file changed."""
     sink = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(FOLDER)) as old, zipfile.ZipFile(sink, "w") as new:
+    with zipfile.ZipFile(io.BytesIO(folder)) as old, zipfile.ZipFile(sink, "w") as new:
         for name in old.namelist():
             new.writestr(name, change(name, old.read(name)))
     return sink.getvalue()
@@ -128,6 +129,20 @@ def test_an_empty_file_more_another_zip_and_a_truncated_copy_are_no_new_session(
     assert len(sessions_of(client)) == 1
 
 
+def test_a_truncated_copy_of_a_lossy_recording_counts_once_and_another_signal_does_not(
+    send: Any, client: TestClient, recordings: Path
+) -> None:
+    lossy = (recordings / "rcs" / "montage_packet_loss.zip").read_bytes()
+    first = send(("m.zip", lossy), visit=1, controller="other").json()["sessions"][0]["id"]
+    truncated = send(("half.zip", changed(cut, lossy)), visit=1, controller="other")
+    assert [s["id"] for s in truncated.json()["sessions"]] == [first], "gaps are predicted from all that a copy has, and it has half"
+    answer = send(("other.zip", changed(other_signal, lossy)), visit=1, controller="other").json()
+    (second,) = [s for s in answer["sessions"] if s["id"] != first]
+    assert second["status"] == "proposed"
+    refused = client.post(f"/api/v1/proposals/{second['id']}/confirm", json={"version": 1, "controller": "other"})
+    assert (refused.status_code, refused.json()["sessions"]) == (409, [second["id"], first])
+
+
 def test_a_truncated_copy_first_gives_way_to_the_whole_recording(send: Any, client: TestClient) -> None:
     first = send(("half.zip", changed(cut)), visit=1).json()["proposals"][0]
     half = client.get(f"/api/v1/proposals/{first['session']['id']}").json()["session"]["duration_s"]
@@ -202,9 +217,9 @@ def test_minutes_that_count_twice_since_before_are_left_out_of_buffers_by_name(
     assert buffer_steps() > 0, "the first one is excluded, so that the minutes count by the second"
 
 
-def rows(values: list[float], at: float = 0.0) -> Rows:
+def rows(values: list[float], at: float = 0.0, error: list[float] | None = None) -> Rows:
     x = np.array(values)
-    return Rows(at + 2.0 * np.arange(1, x.size + 1), x, 2.0, "uV")
+    return Rows(at + 2.0 * np.arange(1, x.size + 1), x, 2.0, "uV", None if error is None else np.array(error))
 
 
 def test_what_two_recordings_of_the_same_minutes_are_to_each_other() -> None:
@@ -226,6 +241,24 @@ def test_what_two_recordings_of_the_same_minutes_are_to_each_other() -> None:
     holed = [*signal[:80], *[float("nan")] * 10]
     assert relation({beta: rows(holed), amplitude: rows([1.0] * 90)}, old) is Relation.NO_MORE
     assert relation(old, {beta: rows(holed)}) is Relation.FULLER
+
+
+def test_rows_with_predicted_samples_are_equal_to_within_a_part_of_their_errors() -> None:
+    rng = np.random.default_rng(5)
+    beta, signal = ("beta", "a"), 1 + 0.15 * rng.standard_normal(60)
+    gaps = np.full(60, 0.04)
+    near, other = signal + 0.003 * rng.standard_normal(60), 1 + 0.15 * rng.standard_normal(60)
+
+    def held(values: np.ndarray, error: np.ndarray) -> Relation:
+        return relation({beta: rows(list(values), error=list(error))}, {beta: rows(list(signal), error=list(error))})
+
+    assert held(near, gaps) is Relation.NO_MORE
+    assert held(near, np.zeros(60)) is Relation.DIFFERS, "nothing was predicted, so that nothing may differ"
+    assert held(other, gaps) is Relation.DIFFERS
+    partly = np.where(np.arange(60) < 12, 0.0, 0.04)
+    assert held(np.where(partly == 0, signal, near + 0.1), partly) is Relation.NO_MORE, "12 whole rows are enough, and equal"
+    assert held(np.where(partly == 0, other, signal), partly) is Relation.DIFFERS
+    assert held(other, np.full(60, 0.5)) is Relation.EACH_ITS_OWN, "errors as large as the signal's changes tell nothing"
 
 
 def test_a_recording_that_goes_on_after_a_stored_one_ended_is_no_copy_of_it() -> None:

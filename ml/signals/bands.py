@@ -1,13 +1,13 @@
 """Beta amplitude from local field potentials, and averages per step of streams with gaps. P_beta: Gao et al. 2023, section 3.
 
-Row i of every result covers (t0 + i * period, t0 + (i + 1) * period]. Short gaps are interpolated for the filter alone: only samples that
+Row i of every result covers (t0 + i * period, t0 + (i + 1) * period]. Short gaps are predicted for the filter alone: only samples that
 were measured are scored, and a row without one is NaN.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg import toeplitz
 from scipy.signal import butter, fftconvolve, sosfiltfilt, welch
+
+from ml.signals.prediction import Model, fit, predict, unsaid
+from ml.signals.rows import row_of
 
 FILTER_ORDER = 4
 MIN_CYCLES = 3.0
@@ -119,12 +122,14 @@ def band_rows(
     low_hz: float,
     high_hz: float,
     t0_s: float = 0.0,
+    models: Mapping[float, Model | None] | None = None,
 ) -> BandRows:
     """Band amplitude of a lossy signal per row.
 
-    Stretches of one rate with at most `BRIDGE_S` between them are filtered as one, with straight lines over the gaps. Only measured samples
-    count. Near a gap the filter lacks part of what it would have seen, so the sum of squares is divided by the share of a flat band's power
-    that the measured samples around each one pass on: without gaps that is the number of samples.
+    Stretches of one rate with at most `BRIDGE_S` between them are filtered as one, the gaps filled with what an autoregressive model of the
+    measured samples predicts from both sides (`ml.signals.prediction`; straight lines where there is none). Only measured samples count.
+    Near a gap the filter lacks what the prediction does not know, so the sum of squares is divided by the share of the band's power that
+    reaches each sample, by the model (of a flat band, where there is none): without gaps that is the number of samples.
 
     The standard error of a row is that of its power against the mean over the whole row, of a Gaussian signal whose band-passed
     autocorrelation rho is that of the measured samples. A sample of which the share g is passed is sqrt(g) of the signal and lacks an
@@ -137,16 +142,19 @@ def band_rows(
         period_s: length of a row, s.
         low_hz, high_hz: band edges, Hz.
         t0_s: where row 0 begins.
+        models: what fills the gaps, by rate, where the stretches are a part of a longer signal; of the stretches, where not given.
 
     Raises:
         ValueError: a band outside (0, rate / 2) of a stretch.
     """
+    by_rate = _by_rate(stretches)
+    known = _models(by_rate) if models is None else models
     bins = min(MAX_BINS, max(1, round(period_s / BIN_S)))
     energy, seconds = np.zeros(rows), np.zeros(rows)
     passed, mixed = np.zeros(rows * bins), np.zeros(rows * bins)
     lags_s = period_s / bins * np.arange(bins, dtype=np.float64)
     squared, weight = np.zeros(bins), 0.0
-    for run in _runs(stretches, low_hz):
+    for run in _runs(by_rate, known, low_hz):
         if run.measured.sum() < MIN_CYCLES * run.rate_hz / low_hz:
             continue
         filtered = band_pass(run.bridged, run.rate_hz, low_hz, high_hz)[run.measured]
@@ -175,41 +183,67 @@ class _Run:
 
     Attributes:
         rate_hz: samples per second.
-        bridged: samples with straight lines over the gaps, [m].
+        bridged: samples with the gaps filled, [m].
         measured: which of them were measured, [m].
         t_s: times of the measured ones, [n].
+        model: what filled the gaps; None: straight lines.
     """
 
     rate_hz: float
     bridged: NDArray[np.float64]
     measured: NDArray[np.bool_]
     t_s: NDArray[np.float64]
+    model: Model | None
 
 
-def _runs(stretches: Iterable[Stretch], low_hz: float) -> Iterator[_Run]:
-    """Runs of stretches of one rate, each stretch at its nearest place on the grid of that rate."""
+def gap_models(stretches: Iterable[Stretch]) -> dict[float, Model | None]:
+    """The model of a signal that fills its gaps, by the rate of its stretches; None: straight lines do."""
+    return _models(_by_rate(stretches))
+
+
+def _models(by_rate: Mapping[float, list[Stretch]]) -> dict[float, Model | None]:
+    # a single stretch has no gap to fill
+    return {
+        rate_hz: fit([(p, s[2]) for p, s in zip(_places(own, rate_hz), own, strict=True)], rate_hz) if len(own) > 1 else None
+        for rate_hz, own in by_rate.items()
+    }
+
+
+def _by_rate(stretches: Iterable[Stretch]) -> dict[float, list[Stretch]]:
+    """Stretches with samples, by their rate and in order of time."""
     by_rate: dict[float, list[Stretch]] = defaultdict(list)
     for stretch in stretches:
         if stretch[2].size:
             by_rate[stretch[1]].append(stretch)
+    return {rate_hz: sorted(own, key=lambda s: s[0]) for rate_hz, own in by_rate.items()}
+
+
+def _places(stretches: Sequence[Stretch], rate_hz: float) -> list[int]:
+    """The nearest place of each stretch's first sample on the grid of its rate, after the samples before it."""
+    places: list[int] = []
+    end = -np.inf
+    for start_s, _, samples in stretches:
+        places.append(int(max(np.rint(start_s * rate_hz), end)))
+        end = places[-1] + samples.size
+    return places
+
+
+def _runs(by_rate: Mapping[float, list[Stretch]], models: Mapping[float, Model | None], low_hz: float) -> Iterator[_Run]:
+    """Runs of stretches of one rate, each stretch at its nearest place on the grid of that rate."""
     for rate_hz, own in by_rate.items():
         together: list[Stretch] = []
         end_s = -np.inf
-        for stretch in sorted(own, key=lambda s: s[0]):
+        for stretch in own:
             if together and stretch[0] - end_s > BRIDGE_S:
-                yield _run(rate_hz, together, low_hz)
+                yield _run(rate_hz, together, models.get(rate_hz), low_hz)
                 together = []
             together.append(stretch)
             end_s = max(end_s, stretch[0] + stretch[2].size / rate_hz)
-        yield _run(rate_hz, together, low_hz)
+        yield _run(rate_hz, together, models.get(rate_hz), low_hz)
 
 
-def _run(rate_hz: float, stretches: list[Stretch], low_hz: float) -> _Run:
-    places, end = [], -np.inf
-    for start_s, _, samples in stretches:
-        place = int(max(np.rint(start_s * rate_hz), end))
-        places.append(place)
-        end = place + samples.size
+def _run(rate_hz: float, stretches: list[Stretch], model: Model | None, low_hz: float) -> _Run:
+    places = _places(stretches, rate_hz)
     index = np.concatenate([p - places[0] + np.arange(s[2].size) for p, s in zip(places, stretches, strict=True)])
     samples = np.concatenate([s[2] for s in stretches])
     t_s = np.concatenate([s[0] + np.arange(s[2].size) / rate_hz for s in stretches])
@@ -217,8 +251,11 @@ def _run(rate_hz: float, stretches: list[Stretch], low_hz: float) -> _Run:
     measured[index] = True
     bridged = np.zeros(measured.size)
     bridged[index] = samples
-    _bridge(bridged, measured, max(1, round(rate_hz / low_hz)))
-    return _Run(rate_hz, bridged, measured, t_s)
+    if model is None:
+        _bridge(bridged, measured, max(1, round(rate_hz / low_hz)))
+    elif not measured.all():
+        bridged = predict(model, bridged, measured)
+    return _Run(rate_hz, bridged, measured, t_s, model)
 
 
 def _bridge(x: NDArray[np.float64], measured: NDArray[np.bool_], cycle: int) -> None:
@@ -238,22 +275,24 @@ def _bridge(x: NDArray[np.float64], measured: NDArray[np.bool_], cycle: int) -> 
 
 
 def _passed(run: _Run, low_hz: float, high_hz: float) -> NDArray[np.float64]:
-    """Share of a flat band's power that reaches each measured sample, 0..1; 1 far from gaps. Beyond the run's ends nothing is missing."""
+    """Share of the band's power that reaches each measured sample, 0..1; 1 far from gaps. Beyond the run's ends nothing is missing."""
     if run.measured.all():
         return np.ones(run.t_s.size)
-    response = _squared_response(run.rate_hz, low_hz, high_hz)
+    impulse = _impulse_response(run.rate_hz, low_hz, high_hz)
+    if run.model is not None:
+        return np.clip(1.0 - unsaid(run.model, run.measured, impulse)[run.measured], LEAST_PASSED, 1.0)
+    response = impulse**2 / np.sum(impulse**2)
     around = np.pad(run.measured.astype(np.float64), response.size // 2, constant_values=1.0)
     return np.clip(fftconvolve(around, response, mode="valid")[run.measured], LEAST_PASSED, 1.0)
 
 
 @lru_cache(maxsize=64)
-def _squared_response(rate_hz: float, low_hz: float, high_hz: float) -> NDArray[np.float64]:
-    """Square of the zero-phase filter's impulse response, of sum 1."""
+def _impulse_response(rate_hz: float, low_hz: float, high_hz: float) -> NDArray[np.float64]:
+    """The zero-phase filter's impulse response, as far as it counts, about its middle."""
     half = int(np.ceil(RESPONSE_CYCLES * rate_hz / (high_hz - low_hz)))
     impulse = np.zeros(2 * half + 1)
     impulse[half] = 1.0
-    response: NDArray[np.float64] = band_pass(impulse, rate_hz, low_hz, high_hz) ** 2
-    return response / response.sum()
+    return band_pass(impulse, rate_hz, low_hz, high_hz)
 
 
 def _squared_correlation(run: _Run, filtered: NDArray[np.float64], lags_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -298,64 +337,6 @@ def _relative_error(
         variance = sum(np.einsum("ri,ri->r", w @ covariance, w) for w in (weights, lost))
         out[some] = np.sqrt(np.maximum(variance, 0.0))
     return out
-
-
-def row_of(t_s: NDArray[np.float64], period_s: float) -> NDArray[np.int64]:
-    """Row that holds each time; rows are open on the left and closed on the right, except that 0 belongs to row 0. Shape as t_s."""
-    row = np.ceil(t_s / period_s - 1e-9).astype(np.int64) - 1
-    return np.where((row == -1) & (t_s > -1e-9), 0, row)
-
-
-def row_means(
-    t_s: NDArray[np.float64], values: NDArray[np.float64], interval_s: NDArray[np.float64], rows: int, period_s: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean per row of values that come at intervals, such as the device's own band power.
-
-    Args:
-        t_s: time of each value, [n]; values with NaN are gaps.
-        values: [n].
-        interval_s: time each value stands for, [n].
-        rows: number of rows, the first beginning at 0.
-        period_s: length of a row, s.
-
-    Returns:
-        Means [rows], NaN without a value, and the share of each row covered, 0..1.
-    """
-    row = row_of(t_s, period_s)
-    use = np.isfinite(values) & (row >= 0) & (row < rows)
-    total = np.bincount(row[use], weights=values[use] * interval_s[use], minlength=rows)
-    seconds = np.bincount(row[use], weights=interval_s[use], minlength=rows)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(seconds > 0, total / seconds, np.nan), np.minimum(seconds / period_s, 1.0)
-
-
-def step_means(
-    t_s: NDArray[np.float64], values: NDArray[np.float64], end_s: float, rows: int, period_s: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Time-weighted mean per row of a value that holds from its time until the next, such as the stimulation amplitude.
-
-    Args:
-        t_s: when each value begins to hold, [n], not decreasing; may begin before 0.
-        values: [n]; NaN where unknown.
-        end_s: until when the last value holds, s.
-        rows: number of rows, the first beginning at 0.
-        period_s: length of a row, s.
-
-    Returns:
-        Means over the known part of each row [rows], NaN where nothing is known, and the known share of each row, 0..1.
-    """
-    if t_s.size == 0:
-        return np.full(rows, np.nan), np.zeros(rows)
-    edges = period_s * np.arange(rows + 1)
-    knots = np.append(t_s, max(end_s, float(t_s[-1])))
-    known = np.isfinite(values)
-    held = np.diff(knots)
-    integral = np.concatenate(([0.0], np.cumsum(np.where(known, values, 0.0) * held)))
-    seconds = np.concatenate(([0.0], np.cumsum(np.where(known, held, 0.0))))
-    area = np.diff(np.interp(edges, knots, integral))
-    span = np.diff(np.interp(edges, knots, seconds))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(span > 1e-9, area / span, np.nan), np.clip(span / period_s, 0.0, 1.0)
 
 
 def spectrum(

@@ -1,0 +1,198 @@
+"""What an autoregressive model of a signal says of the samples that are missing in it, and how much of a band it leaves unsaid.
+
+The missing samples that make the squared residual of the model least are their best linear prediction from both sides (Janssen, Veldhuis
+and Vries 1986, IEEE Trans. ASSP 34, 317-330): with b the autocorrelation of the model's coefficients, they solve B x = -B' m, where B and
+B' hold b at the distances of missing samples to each other and to measured ones. Their covariance is the residual's variance times the
+inverse of B.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import next_fast_len, rfft
+from scipy.linalg import LinAlgError, cholesky, solve_toeplitz, solve_triangular, solveh_banded, toeplitz
+from scipy.signal import fftconvolve
+
+MEMORY_S = 0.1
+"""How far back a sample is predicted from: two to three cycles of beta."""
+
+SAMPLES_PER_COEFFICIENT = 40
+"""Fewer measured samples per coefficient give no model."""
+
+RIDGE = 1e-3
+"""White noise that is added to a signal's power before its model is fitted, as a share: what amplifiers add, and a bound on resonance."""
+
+BEYOND = 4
+"""How many times its memory a signal is predicted on beyond its ends, until it has come back to its mean."""
+
+MISSING_AT_ONCE = 4096
+"""Missing samples that are solved for together, about, so that memory follows no length of a recording."""
+
+SAMPLES_AT_ONCE = 65_536
+"""Samples whose lagged products are summed together."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Model:
+    """An autoregressive model of a signal.
+
+    Attributes:
+        mean: of the measured samples.
+        b: autocorrelation of the coefficients (1, -a_1, ..., -a_p) at lags 0 to p, [p + 1].
+        residual: variance of what the model does not predict.
+        coefficients: 1, -a_1, ..., -a_p, [p + 1].
+    """
+
+    mean: float
+    b: Floats
+    residual: float
+    coefficients: Floats
+
+    def scaled(self, factor: float) -> Model:
+        """The model of the same signal in another unit, of which one old unit is `factor`."""
+        return replace(self, mean=factor * self.mean, residual=factor**2 * self.residual)
+
+
+def fit(pieces: Sequence[tuple[int, Floats]], rate_hz: float) -> Model | None:
+    """The model of the measured samples of a signal, by Yule and Walker; None where they are too few, or say nothing.
+
+    Args:
+        pieces: place of the first sample on the grid of the rate and samples [n] of each gap-free piece, in order, not overlapping.
+        rate_hz: samples per second.
+    """
+    order = round(MEMORY_S * rate_hz)
+    measured = sum(x.size for _, x in pieces)
+    if order < 1 or measured < SAMPLES_PER_COEFFICIENT * order:
+        return None
+    mean = sum(float(x.sum()) for _, x in pieces) / measured
+    products, pairs = _lagged(pieces, mean, order)
+    # few pairs of a lag draw it to 0
+    r = products / np.maximum(pairs, 0.5 * pairs[0])
+    if r[0] <= 0:
+        return None
+    r[0] *= 1.0 + RIDGE
+    try:
+        a = np.concatenate(([1.0], -solve_toeplitz(r[:-1], r[1:])))
+    except LinAlgError:
+        return None
+    residual = float(a @ r)
+    # gaps can make an autocovariance that no signal has
+    if not (np.isfinite(a).all() and 0.0 < residual <= r[0]):
+        return None
+    return Model(mean, np.correlate(a, a, "full")[order:], residual, a)
+
+
+def _lagged(pieces: Sequence[tuple[int, Floats]], mean: float, order: int) -> tuple[Floats, Floats]:
+    """Sums of the products of samples about the mean at lags 0 to `order`, and of how many pairs each is; both [order + 1].
+
+    A block of samples at a time, with those that the longest lag reaches back to, so that memory follows no length of a recording.
+    """
+    products, pairs = np.zeros(order + 1), np.zeros(order + 1)
+    values, there, end = np.zeros(order), np.zeros(order), pieces[0][0]
+    for place, samples in pieces:
+        skipped = min(place - end, order)
+        values, there = (np.concatenate((past[skipped:], np.zeros(skipped))) for past in (values, there))
+        for first in range(0, samples.size, SAMPLES_AT_ONCE):
+            x = samples[first : first + SAMPLES_AT_ONCE] - mean
+            values, there = np.concatenate((values, x)), np.concatenate((there, np.ones(x.size)))
+            products += np.correlate(values, x, "valid")[::-1]
+            pairs += np.correlate(there, np.ones(x.size), "valid")[::-1]
+            values, there = values[x.size :], there[x.size :]
+        end = place + samples.size
+    return products, pairs
+
+
+def predict(model: Model, x: Floats, measured: NDArray[np.bool_]) -> Floats:
+    """A signal with its missing samples predicted from both sides, [m].
+
+    Args:
+        model: of the signal.
+        x: samples, [m]; those that are not measured are not looked at.
+        measured: which were, [m].
+    """
+    order = model.b.size - 1
+    # what lies beyond the ends is missing too, and would draw gaps near an end to the mean if it were taken as measured
+    beyond = BEYOND * order
+    there = np.pad(measured, beyond)
+    known = np.where(there, np.pad(x, beyond) - model.mean, 0.0)
+    right = -fftconvolve(known, np.concatenate((model.b[:0:-1], model.b)), mode="same")
+    missing = np.flatnonzero(~there)
+    out = known.copy()
+    # gaps further apart than the model remembers have nothing to do with each other
+    apart = np.flatnonzero(np.diff(missing) > order) + 1
+    ends = [*apart.tolist(), missing.size]
+    begin = 0
+    for i, end in enumerate(ends):
+        if end - begin < MISSING_AT_ONCE and i < len(ends) - 1:
+            continue
+        some = missing[begin:end]
+        out[some] = _solve(model.b, some, right[some])
+        begin = end
+    return out[beyond : beyond + x.size] + model.mean
+
+
+def _solve(b: Floats, missing: NDArray[np.int64], right: Floats) -> Floats:
+    """Missing samples, which lie at these places, from the right-hand side of their equations."""
+    order = min(b.size - 1, missing.size - 1)
+    banded = np.zeros((order + 1, missing.size))
+    for d in range(order + 1):
+        distance = missing[d:] - missing[: missing.size - d]
+        banded[d, : distance.size] = np.where(distance < b.size, b[np.minimum(distance, b.size - 1)], 0.0)
+    return np.asarray(solveh_banded(banded, right, lower=True))
+
+
+def unsaid(model: Model, measured: NDArray[np.bool_], impulse: Floats) -> Floats:
+    """Share of a filter's output power that the prediction of missing samples lacks at each sample, [m], 0 far from gaps.
+
+    What two gaps lack is added up, so that it is too much rather than too little where they are near each other.
+
+    Args:
+        model: of the signal.
+        measured: which samples were measured, [m].
+        impulse: the filter's impulse response, symmetric about its middle, [2 half + 1].
+    """
+    half = impulse.size // 2
+    edges = np.flatnonzero(np.diff(np.concatenate(([1], measured.astype(np.int8), [1]))))
+    lacking = np.zeros(measured.size + 2 * half)
+    total = _power(model, impulse)
+    profiles: dict[int, tuple[Floats, Floats]] = {}
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        size = min(end - begin, half)
+        if size not in profiles:
+            profiles[size] = _profile(model, size, impulse)
+        before, behind = profiles[size]
+        lacking[begin : begin + half] += before
+        lacking[end + half : end + 2 * half] += behind
+    return lacking[half : half + measured.size] / total
+
+
+def _profile(model: Model, size: int, impulse: Floats) -> tuple[Floats, Floats]:
+    """Variance that a gap of so many samples leaves in the filter's output before and behind it, each [half].
+
+    A gap longer than the filter is wide acts on either side as one of that length.
+    """
+    half = impulse.size // 2
+    b = np.zeros(size)
+    b[: min(size, model.b.size)] = model.b[:size]
+    # y = h * e with e of covariance residual * inv(B) and B = L L': its variance is residual times the squares of the columns of inv(L) h
+    lower = cholesky(toeplitz(b), lower=True)
+    places = np.concatenate((np.arange(-half, 0), np.arange(size, size + half)))
+    distance = np.abs(places[:, None] - np.arange(size))
+    weights = np.where(distance <= half, impulse[half + np.minimum(distance, half)], 0.0)
+    lacking = model.residual * np.sum(solve_triangular(lower, weights.T, lower=True) ** 2, axis=0)
+    return lacking[:half], lacking[half:]
+
+
+def _power(model: Model, impulse: Floats) -> float:
+    """Power of the filter's output, of a signal of this model."""
+    length = next_fast_len(4 * max(impulse.size, model.coefficients.size), real=True)
+    density = model.residual / np.abs(rfft(model.coefficients, length)) ** 2
+    weight = np.abs(rfft(impulse, length)) ** 2 * density
+    whole = np.concatenate((weight, weight[1 : length - weight.size + 1]))
+    return float(whole.mean())
