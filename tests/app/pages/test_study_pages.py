@@ -213,7 +213,7 @@ def test_the_upload_form_takes_files_and_reports_on_each(browser: TestClient, cl
     assert page.status_code == 200
     assert "good.csv" in page.text
     assert "&lt;b&gt;bad.csv" in page.text
-    assert "not usable" in page.text
+    assert "columns not known" in page.text
     again = browser.post(url, data=fields, files=[("file", ("good.csv", table))])
     assert "known already" in again.text
     assert client.get("/api/v1/visits/1/sessions").json()["total"] == 1
