@@ -286,10 +286,14 @@ def lock_session(db: Session, session: StudySession) -> None:
     db.expire(session, ["qocs", "conditions_revisions"])
 
 
-def tremor_series(db: Session, participant_id: int, start: datetime, stop: datetime) -> Sequence[TremorSeries]:
-    """Files of minutes of tremor that reach into a stretch of time, oldest first."""
+def tremor_series(
+    db: Session, participant_id: int, start: datetime, stop: datetime, but_file_id: int | None = None
+) -> Sequence[TremorSeries]:
+    """Files of minutes of tremor that reach into a stretch of time, oldest first; one of them can be left out, for each may be a year."""
     reaching = (TremorSeries.last_end_at > start) & (TremorSeries.first_start_at < stop)
     own = select(TremorSeries).where(TremorSeries.participant_id == participant_id, reaching)
+    if but_file_id is not None:
+        own = own.where(TremorSeries.upload_file_id != but_file_id)
     return db.scalars(own.order_by(TremorSeries.upload_file_id)).all()
 
 

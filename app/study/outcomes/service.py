@@ -83,7 +83,7 @@ def store_tremor(
     db.flush()
     spans.append((row.first_start_at, row.last_end_at))
     said = [f"{row.n} minutes of tremor from {_when(row.first_start_at)} to {_when(row.last_end_at)} UTC are kept."]
-    others = [s for s in repository.tremor_series(db, participant_id, row.first_start_at, row.last_end_at) if s.id != row.id]
+    others = repository.tremor_series(db, participant_id, row.first_start_at, row.last_end_at, but_file_id=upload_file_id)
     same, different = tremor.compare(minutes, others)
     if same or different:
         said.append(
