@@ -85,7 +85,7 @@ def every_file() -> Iterator[tuple[str, bytes]]:
     for unit, factor in (("seconds", 1), ("milliseconds", 1000), ("nanoseconds", 10**9)):
         yield f"unix {unit}.csv", table([(factor * (UNIX + 2 * k), 1.0, 1.0) for k in range(60)])
     yield "one step at 1.7e9 s.csv", table([(2.0, 1.0, 1.0), (1.7e9, 1.0, 1.0)])
-    yield "200 MB of packets.zip", packets(200)
+    yield "600 MB of packets.zip", packets(600)
     yield "80 MB of zeros.zip", _zip({"D/RawDataTD.json": bytes(80 * MEGABYTE)})
     yield "a claim of 4 GB.zip", claim()
     yield "60 000 members.zip", _zip({f"{n}.json": b"" for n in range(60_000)})
