@@ -27,7 +27,8 @@ def advised(status: int, title: str, has_entries: bool) -> tuple[str, str]:
 
 async def kept_entries(request: Request) -> list[tuple[str, str]]:
     """Names and values of a plain form that was sent, in its order; passwords are left out. Empty for other requests."""
-    if request.method != "POST" or not request.headers.get("content-type", "").startswith(_PLAIN_FORM):
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if request.method != "POST" or media_type != _PLAIN_FORM:
         return []
     try:
         form = await request.form(max_files=0, max_fields=2000)

@@ -1,0 +1,248 @@
+"""A study in which every route of the REST interface has a row to work on, with a call that is right for each."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from fastapi.testclient import TestClient
+
+from app.accounts import service as accounts
+from app.accounts.models import Role
+from app.learning.policies.baselines import constant_onnx
+from app.platform.database import transaction
+
+MAPPING = {
+    "name": "two columns",
+    "header_line": 1,
+    "holds": "steps",
+    "time_format": "seconds",
+    "time_at": "end",
+    "columns": [
+        {"number": 1, "role": "time"},
+        {"number": 2, "role": "beta", "unit": "uV"},
+        {"number": 3, "role": "amplitude_ma", "unit": "mA"},
+    ],
+}
+Json = dict[str, Any]
+TABLE = b"t_s,beta,amplitude_fraction\n" + b"".join(b"%d,1,1\n" % (2 * k) for k in range(21))
+SAMPLES = b"t_s,lfp [uV],amplitude_ma\n" + b"".join(b"%.3f,%d,1\n" % (k / 250, k * k % 17) for k in range(-5000, 5001))
+GRASPS = b"t_s\n" + b"".join(b"%.2f\n" % (0.4 * k) for k in range(11))
+SPEECH = {"kind": "speech", "severity": "severe", "serious": True}
+DOSE = {"drug": "levodopa", "mg": 100, "taken_at": "2026-03-02T07:00:00Z"}
+RATED = {
+    "uuid": "0b6e2a8c-6f43-4c58-9d3a-2f1a7f4f0c11", "kind": "rating", "payload": {"value": 7}, "device_time": "2026-11-22T10:00:00Z",
+}  # fmt: skip
+PASSWORD = "a password of the test"
+
+
+def token_of(role: str, study: str | None = None, name: str | None = None) -> str:
+    """A new person with a role, and their token."""
+    address = f"{name or role}@{study or 'clinic'}.example"
+    with transaction("test") as db:
+        accounts.add_user(db, address, Role(role), PASSWORD, study_code=study)
+        return accounts.create_token(db, address, "tests")
+
+
+class World:
+    """A study in which every route has a row to work on: the one that a release filled, and what is waiting to be decided on."""
+
+    def __init__(self, app: Any) -> None:
+        self.app = app
+        self.made = 0
+        self.admin = self.calling(token_of("admin"))
+        ranking = self.read("/participants/P2/ranking")
+        open_visit = next(v["id"] for v in self.read("/participants/P2/visits")["items"] if v["number"] == 4)
+        first = {"policy_ids": [ranking["policies"][0]["policy_id"]], "seed": 1}
+        # by somebody who signs no plan of these tests
+        assert self.calling(token_of("engineer", name="drafter")).post(f"/api/v1/visits/{open_visit}/plan", json=first).status_code == 201
+        held = self.send("/participants/P2/visits", json={"number": 88, "date": f"{datetime.now(UTC):%Y-%m-%d}"})["id"]
+        drafter = self.calling(token_of("engineer", name="second-drafter"))
+        assert drafter.post(f"/api/v1/visits/{held}/plan", json={"random_sessions": 1, "seed": 1}).status_code == 201
+        approved = self.send(f"/visits/{held}/plan/approve", json={"password": PASSWORD})["id"]
+        slot = self.read(f"/visits/{held}/day")["slots"][0]["plan_item_id"]
+        of_slot = {"participant": "P2", "visit": "88", "controller": "cdbs"}
+        self.send("/uploads", data=of_slot, files={"file": ("day.csv", TABLE.replace(b"2,1,1", b"2,1.88,1", 1))})
+        two = {"policy_ids": [p["policy_id"] for p in ranking["policies"][:2]], "order": "stated", "seed": 1}
+        moved, blinded, empty = (self.send("/participants/P2/visits", json={"number": n})["id"] for n in (91, 92, 93))
+        self.send(f"/visits/{moved}/plan", json=two)
+        self.send(f"/visits/{blinded}/plan", json=two | {"blinded": True})
+        signing = self.calling(token_of("clinician", name="signer"))
+        assert signing.post(f"/api/v1/visits/{blinded}/plan/approve", json={"password": PASSWORD}).status_code == 200
+        jobs = self.read("/participants/P4/jobs")["items"]
+        small = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "distilled")
+        visit = self.read("/participants/P4/visits")["items"][0]["id"]
+        session, graspless = (s["id"] for s in self.read(f"/visits/{visit}/sessions")["items"][:2])
+        derived = self.upload("d.csv", TABLE, visit="2", controller="other", more=[("g.csv", GRASPS)])["sessions"][0]["id"]
+        self.send(f"/sessions/{derived}/qoc", method="put", json={"grasp_hz": 3.0, "reason": "counted by hand"})
+        sampled = self.upload("s.csv", TABLE.replace(b"6,1,1", b"6,1.77,1", 1), visit="2", controller="other")["sessions"][0]["id"]
+        drawn = self.upload("lfp.csv", SAMPLES, visit="2", controller="other")["sessions"][0]["id"]
+        self.ids: Json = {
+            "code": "P1",
+            "visit_id": visit,
+            "session_id": session,
+            "upload_id": 1,
+            "policy_id": small,
+            "position": 1,
+            "study_code": "main",
+            "site_code": "main",
+            "snapshot_id": 1,
+            "sweep_id": self.read("/participants/P1/sweeps")["items"][0]["id"],
+            "job_id": next(j["id"] for j in jobs if j["status"] == "cancelled"),
+        }
+        self.forms: dict[tuple[str, str], Json] = {
+            # members of `ids` that differ, and what is sent
+            ("post", "/participants"): {"json": {"code": "Q1", "site": "main"}},
+            ("patch", "/participants/{code}"): {"code": "P3", "json": {"status": "completed", "reason": "last visit held"}},
+            ("get", "/sessions/{session_id}/samples"): {"session_id": sampled},
+            ("get", "/sessions/{session_id}/signal"): {"session_id": drawn},
+            ("post", "/studies"): {"json": {"code": "ADAPT", "name": "Adaptive"}},
+            ("patch", "/studies/{study_code}"): {"json": {"name": "Main", "reason": "protocol 2"}},
+            ("post", "/studies/{study_code}/sites"): {"json": {"code": "south", "name": "South"}},
+            ("patch", "/studies/{study_code}/sites/{site_code}"): {"json": {"name": "Main clinic", "reason": "moved"}},
+            ("put", "/participants/{code}/settings"): {"code": "P3", "json": {"settings": {"gamma": 0.9}}},
+            ("post", "/visits/{visit_id}/lock"): {"json": {"reason": "complete"}},
+            ("post", "/visits/{visit_id}/unlock"): {"json": {"reason": "rating misread"}},
+            ("post", "/participants/{code}/margins/locks"): {"json": {"version": 2, "reason": "protocol"}},
+            ("put", "/participants/{code}/margins"): {"json": {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}},
+            ("get", "/participants/{code}/replay"): {"params": self.replayed(small)},
+            ("put", "/participants/{code}/characteristics"): {
+                "json": {"version": 0, "characteristics": {"hand": "left"}, "reason": "asked"}
+            },
+            ("post", "/visits/{visit_id}/doses"): {"visit_id": moved, "json": DOSE | {"mg": 50, "taken_at": "2026-03-02T08:00:00Z"}},
+            ("post", "/doses/{dose_id}/removal"): {
+                "dose_id": self.send(f"/visits/{moved}/doses", json=DOSE)["id"],
+                "json": {"reason": "not taken"},
+            },
+            ("post", "/participants/{code}/adverse-events"): {"json": SPEECH},
+            ("post", "/participants/{code}/data-queries"): {"json": self.question()},
+            ("post", "/data-queries/{query_id}/entries"): {
+                "query_id": self.send("/participants/P1/data-queries", json=self.question())["id"],
+                "json": {"state": "answered", "text": "read again from the form", "entries": 1},
+            },
+            ("put", "/adverse-events/{event_id}"): {"event_id": self.event(), "json": SPEECH | {"revision": 1, "reason": "misread"}},
+            ("post", "/adverse-events/{event_id}/clearance"): {"event_id": self.event(), "json": {"revision": 1, "reason": "passed"}},
+            ("post", "/participants/{code}/visits"): {"json": {"number": 77}},
+            ("patch", "/visits/{visit_id}"): {"json": {"note": "tired", "reason": "forgotten"}},
+            ("patch", "/sessions/{session_id}"): {"json": {"excluded_reason": "cable", "reason": "said so"}},
+            ("post", "/sessions/{session_id}/outcomes"): {"session_id": derived, "json": {"name": "grasp_hz", "value": 2.5}},
+            ("put", "/sessions/{session_id}/conditions"): {"json": {"lower_bound": 0.2, "reason": "protocol sheet"}},
+            ("put", "/sessions/{session_id}/qoc"): {"json": {"rating": 5, "reason": "misread"}},
+            ("post", "/uploads"): {
+                "data": {"participant": "P3", "visit": "1", "controller": "cdbs"},
+                "files": {"file": ("other.csv", TABLE + b"42,1,1\n")},
+            },
+            ("get", "/proposals/{session_id}"): self.proposal(),
+            ("patch", "/proposals/{session_id}"): self.proposal(),
+            ("post", "/proposals/{session_id}/confirm"): self.proposal(controller="random"),
+            ("post", "/proposals/{session_id}/split"): self.proposal(parts=[{"start_s": 0, "stop_s": 10}, {"start_s": 10, "stop_s": 30}]),
+            ("post", "/proposals/{session_id}/discard"): self.proposal(reason="no session"),
+            ("post", "/uploaded-files/{file_id}/session"): {
+                "file_id": self.upload("h.csv", GRASPS.replace(b"0.40", b"0.41"))["files"][0]["id"],
+                "json": {"session_id": graspless},
+            },
+            ("post", "/uploaded-files/{file_id}/review"): {"file_id": self.unreadable(b"one")},
+            ("post", "/uploaded-files/{file_id}/release"): {
+                "file_id": self.unreadable(b"two", reviewed=True),
+                "json": {"how": "as_is", "reason": "no names in it"},
+            },
+            ("post", "/uploaded-files/{file_id}/discard"): {"file_id": self.unreadable(b"three"), "json": {"reason": "a picture"}},
+            ("get", "/uploaded-files/{file_id}/preview"): {"file_id": self.unknown_columns("a")},
+            ("put", "/uploaded-files/{file_id}/mapping"): {"file_id": self.unknown_columns("b"), "json": MAPPING},
+            ("post", "/column-mappings/{mapping_id}/removal"): {
+                "mapping_id": self.send(f"/uploaded-files/{self.unknown_columns('c')}/mapping", "put", json=MAPPING)["mapping"]["id"],
+                "json": {"reason": "the program changed"},
+            },
+            ("post", "/participants/{code}/policies"): {"data": {"name": "x"}, "files": {"file": ("x.onnx", constant_onnx(0.5, 10))}},
+            ("patch", "/policies/{policy_id}"): {"json": {"retired_reason": "worn out"}},
+            ("post", "/participants/{code}/jobs"): {"code": "P4", "json": {"kind": "evaluate", "preset": "quick", "methods": ["linear"]}},
+            ("post", "/jobs/{job_id}/cancel"): {
+                "job_id": self.send("/participants/P4/jobs", json={"kind": "evaluate", "preset": "quick", "methods": ["linear"]})["id"]
+            },
+            ("post", "/visits/{visit_id}/plan"): {"visit_id": visit, "json": {"policy_ids": [2]}},
+            ("get", "/visits/{visit_id}/plan"): {"visit_id": open_visit},
+            ("get", "/visits/{visit_id}/plan.pdf"): {"visit_id": open_visit},
+            ("post", "/visits/{visit_id}/plan/approve"): {"visit_id": open_visit, "json": {"password": PASSWORD}},
+            ("get", "/visits/{visit_id}/plan/sessions/{position}/bundle"): {"visit_id": held, "position": 1},
+            ("get", "/visits/{visit_id}/day"): {"visit_id": held},
+            ("get", "/visits/{visit_id}/day/entries"): {"visit_id": held},
+            ("post", "/visits/{visit_id}/day/entries"): {
+                "visit_id": held,
+                "json": {"plan_id": approved, "entries": [RATED | {"plan_item_id": slot}]},
+            },
+            ("get", "/visits/{visit_id}/slots"): {"visit_id": held},
+            ("post", "/visits/{visit_id}/slots/confirm"): {"visit_id": held, "json": {}},
+            ("post", "/visits/{visit_id}/plan/moves"): {"visit_id": moved, "json": {"position": 1, "earlier": False}},
+            ("post", "/visits/{visit_id}/plan/key"): {"visit_id": blinded, "json": {"reason": "end of the visit"}},
+            ("post", "/visits/{visit_id}/removal"): {"visit_id": empty, "json": {"reason": "nobody came"}},
+            ("post", "/participants/{code}/buffer-gate"): {"json": {"choice": "open", "reason": "agreed in the trial meeting"}},
+        }
+
+    def calling(self, token: str | None) -> TestClient:
+        """A client with a token."""
+        return TestClient(self.app, headers={"Authorization": f"Bearer {token}"} if token else {})
+
+    def read(self, path: str) -> Any:
+        """What a GET gives."""
+        answer = self.admin.get(f"/api/v1{path}")
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    def send(self, path: str, method: str = "post", **form: Any) -> Any:
+        """What a call that must succeed gives."""
+        answer = self.admin.request(method, f"/api/v1{path}", **form)
+        assert answer.is_success, answer.text
+        return answer.json() if "json" in answer.headers["content-type"] else answer.content
+
+    def upload(self, name: str, content: bytes, more: list[tuple[str, bytes]] | None = None, **stated: str) -> Json:
+        """Upload files of P4."""
+        given = [("file", file) for file in [(name, content), *(more or [])]]
+        return dict(self.send("/uploads", data={"participant": "P4", **stated}, files=given))
+
+    def replayed(self, policy: int) -> Json:
+        """A session of P1 and a policy to run over it."""
+        visit = self.read("/participants/P1/visits")["items"][0]["id"]
+        return {"session": self.read(f"/visits/{visit}/sessions")["items"][0]["id"], "policy": policy}
+
+    def question(self) -> Json:
+        """A data query about a session of P1."""
+        visit = self.read("/participants/P1/visits")["items"][0]["id"]
+        session = self.read(f"/visits/{visit}/sessions")["items"][0]["id"]
+        return {"session_id": session, "field": "rating", "text": "7 in the file, 8 on the form?"}
+
+    def event(self) -> int:
+        """A serious adverse event of its own for one route."""
+        return int(self.send("/participants/P1/adverse-events", json=SPEECH)["id"])
+
+    def proposal(self, **change: Any) -> Json:
+        """A proposal of its own for one route."""
+        self.made += 1
+        body = self.upload(f"p{self.made}.csv", TABLE.replace(b"2,1,1", b"2,1.%d,1" % self.made, 1), visit="3")
+        (proposal,) = body["proposals"]
+        return {"session_id": proposal["session"]["id"], "json": {"version": proposal["version"]} | change}
+
+    def unreadable(self, content: bytes, reviewed: bool = False) -> int:
+        """A file in quarantine of its own for one route."""
+        body = self.upload(
+            "t.csv", TABLE.replace(b"4,1,1", b"4,%d,1" % len(content), 1), more=[("noise.bin", b"\x00\x01" + content)], visit="3"
+        )
+        number = next(int(f["id"]) for f in body["files"] if f["quarantined"])
+        if reviewed:
+            self.send(f"/uploaded-files/{number}/review")
+        return number
+
+    def unknown_columns(self, name: str) -> int:
+        """A table that waits for a column mapping, of its own for one route."""
+        table = f"{name};signal;current\n" + "".join(f"{2 * k};{k / 7:.2f};1.5\n" for k in range(1, 12))
+        body = self.upload("t.csv", TABLE.replace(b"4,1,1", b"4,7.%d,1" % ord(name), 1), more=[("u.csv", table.encode())], visit="3")
+        return next(int(f["id"]) for f in body["files"] if f["waits_for_mapping"])
+
+    def call(self, client: TestClient, method: str, path: str) -> int:
+        """Status of a call that is right in everything but, perhaps, who makes it."""
+        form = dict(self.forms.get((method, path.removeprefix("/api/v1")), {}))
+        own = ("file_id", "event_id", "query_id", "dose_id", "mapping_id")
+        ids = self.ids | {name: form.pop(name) for name in list(form) if name in self.ids or name in own}
+        if method == "get":
+            form.pop("json", None)
+        with client.stream(method, path.format(**ids), **form) as answer:
+            return int(answer.status_code)
