@@ -102,6 +102,9 @@ function follow(shown, request) {
   }, 1000);
 }
 
+// of a table whose columns nobody has stated yet
+function mappingLink(id) { return element("a", { className: "button primary", href: `/uploaded-files/${id}/mapping`, textContent: "Say what its columns are" }); }
+
 function badge(text, tone) { return element("span", { className: `badge ${tone}`, textContent: text }); }
 
 function report({ item, head, words }, status, answer) {
@@ -114,6 +117,7 @@ function report({ item, head, words }, status, answer) {
     const note = element("div", { className: "note bad" }, element("b", { textContent: answer.detail ?? `The service answered ${status}.` }));
     note.setAttribute("role", "alert");
     if (answer.hint) note.append(element("div", { textContent: answer.hint }));
+    note.append(...(answer.waits_for_mapping ?? []).map(mappingLink));
     item.append(note);
   }
   const states = new Map((answer.files ?? []).map((file) => [file.name, file]));
@@ -126,7 +130,7 @@ function report({ item, head, words }, status, answer) {
     const file = states.get(one.name);
     const line = element("div", { className: "row" }, element("h3", { textContent: one.name }));
     if (file) line.append(file.duplicate ? badge("known already", "info") : badge(...(STATES[file.status] ?? (file.waits_for_mapping ? ["columns not known", "warn"] : ["not usable, kept", "bad"]))));
-    if (file?.waits_for_mapping) line.append(element("a", { className: "button primary", href: `/uploaded-files/${file.id}/mapping`, textContent: "Say what its columns are" }));
+    if (file?.waits_for_mapping) line.append(mappingLink(file.id));
     item.append(line, ...said(one, good));
     const told = inner.filter((r) => r.problem || Object.keys(LABELS).some((key) => r[key]?.length));
     if (!told.length) continue;

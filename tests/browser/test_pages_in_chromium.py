@@ -111,8 +111,20 @@ def test_files_dropped_on_the_upload_page_become_sessions(window: Callable, enro
     expect(watched.page.locator("[data-upload-list] .badge")).to_have_text(outcomes, timeout=60_000)
     expect(watched.page.locator("[data-upload-list] li").first).to_contain_text("bad <b>.csv")
     assert client.get("/api/v1/visits/1/sessions").json()["total"] == 1
+    assert watched.page.locator("[data-upload-list] a", has_text="Say what its columns are").count() == 1
     watched.page.click("[data-upload-list] li a")
     assert watched.charts_drawn() == 2
+
+
+def test_a_table_alone_whose_columns_nobody_knows_leads_to_its_mapping(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
+    watched = window(768, 1024)
+    watched.sign_in()
+    watched.open(f"/participants/{enrolled}/upload?visit=1")
+    rows = "".join(f"{2 * k};{1 + k % 5};2.0\n" for k in range(1, 12)).encode()
+    watched.page.set_input_files("input[type=file]", {"name": "t.csv", "mimeType": "text/csv", "buffer": b"Zeit;Signal;Strom\n" + rows})
+    watched.page.click("button.primary")
+    watched.page.click("[data-upload-list] a:has-text('Say what its columns are')", timeout=60_000)
+    expect(watched.page.locator("h1")).to_have_text("What the columns are")
 
 
 def test_what_cannot_be_taken_back_asks_first(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
