@@ -47,6 +47,10 @@ class Planned:
     began: datetime | None = None
 
 
+NO_SLOT = 0
+"""Slot of a log whose plan is none of this participant's; the numbers of slots begin with 1."""
+
+
 @dataclass(frozen=True)
 class Done:
     """One session of the visit; controller and policy None where they are open."""
@@ -59,7 +63,9 @@ class Done:
     filled: int | None = None
     """The slot that somebody confirmed it into."""
     logged: int | None = None
-    """The slot of which its controller's log says it is."""
+    """The slot of which its controller's log says it is; NO_SLOT where that is none of this participant's."""
+    bench: bool = False
+    """Its controller's log is of a trial on a bench, which fills no slot."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +90,8 @@ def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) 
             pairs.setdefault(session.logged, session)
     taken = {s.session_id for s in pairs.values()}
     open_slots = [p for p in slots if p.item_id not in pairs]
-    # a log that names its slot fills that one or none
-    free = [s for s in sessions if s.session_id not in taken and s.logged is None]
+    # a log that names its slot fills that one or none, and one of a bench never any
+    free = [s for s in sessions if s.session_id not in taken and s.logged is None and not s.bench]
     in_order = _aligned(open_slots, free)
     pairs |= in_order
     taken |= {s.session_id for s in in_order.values()}

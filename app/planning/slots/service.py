@@ -16,7 +16,7 @@ from app.ingest.schemas import ProposalChange
 from app.planning.plans import view as plans
 from app.planning.plans.view import PlanLine, PlanView
 from app.planning.slots import repository
-from app.planning.slots.matching import Deviation, Done, Match, Planned, match
+from app.planning.slots.matching import NO_SLOT, Deviation, Done, Match, Planned, match
 from app.planning.visit_day import repository as clinic_day
 from app.planning.visit_day.record import SlotTimes
 from app.planning.visit_day.session_outcomes import take_outcomes
@@ -164,11 +164,21 @@ def _planned(line: PlanLine, times: dict[int, SlotTimes]) -> Planned:
 
 
 def _done(db: Session, session: StudySession, caller: Caller) -> Done:
-    slot = logged.slot_of_recording(db, control_recording(session))
+    recording = control_recording(session)
+    slot = logged.slot_of_recording(db, recording)
+    # a number that this participant's plans do not have, or have for another session, may be that of any slot here
+    of_log = None if slot is None else slot.slot_id if slot.planned is not None else NO_SLOT
     arm = stated_arm(session, caller)
     controller, policy = (arm.controller, arm.policy_id) if arm is not None else (None, None)
     return Done(
-        session.id, controller, policy, session.duration_s, session.started_at, session.plan_item_id, slot.slot_id if slot else None
+        session.id,
+        controller,
+        policy,
+        session.duration_s,
+        session.started_at,
+        session.plan_item_id,
+        of_log,
+        logged.rehearsed(recording),
     )
 
 

@@ -82,8 +82,8 @@ def slot_of_recording(db: Session, recording: Recording) -> LoggedSlot | None:
     if said is None or said.get("purpose") != "session" or said.get("slot_id") is None:
         return None
     head = slot_head(db, recording.participant_id, int(said["slot_id"]))
-    # numbers of another installation may be anything: plan and slot must belong together
-    planned = head if head is not None and head.plan_id == said["plan_id"] else None
+    # numbers of another installation may be anything: plan, place and slot must belong together
+    planned = head if head is not None and (head.plan_id, head.position) == (said["plan_id"], said["position"]) else None
     return LoggedSlot(
         int(said["slot_id"]), int(said["plan_id"]), int(said["position"]), int(said["visit_number"]), str(said["visit_date"]), planned
     )

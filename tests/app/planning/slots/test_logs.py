@@ -31,7 +31,7 @@ def planned(client: TestClient, studied: Any, sign_plan: Callable[..., Any], db:
 
 
 def log_of(
-    plan: Plan, position: int, minute: int, *, number: int = 0, holds: list[tuple[int, int, float, float]] | None = None, **said: Any
+    plan: Plan, position: int, minute: int, /, *, number: int = 0, holds: list[tuple[int, int, float, float]] | None = None, **said: Any
 ) -> str:
     """The log of the runner for a session of the plan; held draws as (start, steps, fraction, log density)."""
     item = plan.items[position - 1]
@@ -125,7 +125,13 @@ def test_a_log_of_a_plan_that_is_not_signed_any_more_is_said_and_stands_beside_t
 
 
 @pytest.mark.parametrize(
-    ("change", "words"), [({"slot_id": 4711}, "which is no signed plan"), ({"purpose": "bench"}, "of a trial on a bench")]
+    ("change", "words"),
+    [
+        ({"slot_id": 4711}, "which is no signed plan"),
+        ({"plan_id": 4711}, "which is no signed plan"),
+        ({"position": 2}, "which is no signed plan"),
+        ({"purpose": "bench"}, "of a trial on a bench"),
+    ],
 )
 def test_a_log_that_names_no_session_here_fills_none_by_its_name(
     client: TestClient, studied: Any, planned: Plan, change: dict[str, Any], words: str
@@ -134,3 +140,7 @@ def test_a_log_that_names_no_session_here_fills_none_by_its_name(
     body = send(client, log_of(planned, 1, 0, **change), **stated)
     assert words in " ".join(body["report"][0]["flagged"])
     assert len(body["proposals"]) == (1 if "purpose" in change else 0), "a trial on a bench never counts at once"
+    path = f"/api/v1/visits/{studied.visit}/slots"
+    found = [(r["position"], r["deviations"]) for r in client.get(path).json()["rows"] if r["session_id"]]
+    assert found == [(None, ["unplanned" if "purpose" in change else "other_plan"])]
+    assert client.post(f"{path}/confirm", json={}).status_code == 409, "there is nothing to confirm into a slot"
