@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from html import unescape
 from itertools import pairwise
 from typing import Any
 
@@ -95,6 +96,8 @@ def test_the_sheet_says_who_the_participant_is_and_when_medication_is_due(client
     assert due[0].startswith("07:00 Levodopa")
     begins = [s["start_minute"] for s in plan["sessions"]]
     assert [bool(d) for d in due] == [True, *(a < 20 <= b for a, b in pairwise(begins))]
+    page = unescape(client.get(f"/visits/{studied.visit}/plan", headers={"Accept": "text/html"}).text)
+    assert page.count("due before:") == sum(bool(d) for d in due), "who signs reads it, whatever runs"
     text = " ".join(_sheet(client, studied.visit))
     for words in (
         "Leads: left STN, sensing 0-2, stimulating C+1-",
