@@ -25,7 +25,7 @@ _TASKS: dict[Task, str | Callable[[int], str]] = {
     Task.WAIT_FOR_RANKING: "The first ranking is being made",
     Task.RANK: "No ranking yet: start the pipeline",
     Task.RANK_AGAIN: "New sessions since the last ranking; it is stale",
-    Task.TRAIN_NEXT: "New sessions since the last ranking, of policies too: train the next generation",
+    Task.TRAIN_NEXT: "New sessions since the last ranking: train the next generation",
     Task.DRAFT_PLAN: "No plan for this visit yet",
     Task.APPROVE_PLAN: "A visit plan waits for approval",
     Task.LOOK_AT_FAILED: lambda n: f"{counted(n, 'job')} failed in the last 7 days",

@@ -17,7 +17,7 @@ from app.pipeline import service as pipeline
 from app.pipeline.next_generation.parents import Tested, best, posterior_of, tested_policies
 from app.pipeline.params import NEXT_GENERATION, NextGenerationParams
 from app.platform.jobs import repository as jobs
-from app.platform.jobs.models import Job
+from app.platform.jobs.models import Job, JobStatus
 from app.study import service as study
 from app.study.models import Participant
 
@@ -50,11 +50,17 @@ def outlook(db: Session, participant: Participant, caller: Caller) -> Outlook:
     newest = evaluation.newest_evaluation(db, participant.id)
     current = newest is not None and not stale_reasons(db, participant, newest)
     rows, _ = jobs.find(db, participant.id, NEXT_GENERATION, jobs.LIVE, limit=1)
-    maker = db.get(Job, newest.job_id) if newest is not None and newest.job_id is not None else None
-    done = maker if current and maker is not None and maker.kind == NEXT_GENERATION else None
+    done = _made_on(db, participant.id, newest.snapshot_id) if newest is not None and current else None
     posterior = posterior_of(newest)
     tested = sorted(tested_policies(db, participant), key=lambda t: (-posterior.get(t.policy.id, -math.inf), t.policy.id))
     return Outlook(tested, posterior, newest, current, rows[0] if rows else None, done)
+
+
+def _made_on(db: Session, participant_id: int, snapshot_id: int) -> Job | None:
+    """The job that trained a generation on a snapshot, whoever evaluated it again since; None where none did."""
+    ended, _ = jobs.find(db, participant_id, NEXT_GENERATION, (JobStatus.SUCCEEDED,), limit=1)
+    made = evaluation.evaluation_of_job(db, ended[0].id) if ended else None
+    return ended[0] if made is not None and made.snapshot_id == snapshot_id else None
 
 
 def start(db: Session, participant: Participant, params: NextGenerationParams, caller: Caller) -> Job:

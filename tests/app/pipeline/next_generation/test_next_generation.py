@@ -55,7 +55,7 @@ def test_each_parent_gets_slow_and_fast_rates_of_the_paper_and_fresh_policies_th
 
 
 @pytest.fixture
-def tested(client: TestClient, db: Session, policies: list[int], upload: Upload) -> list[int]:
+def policies_tested(client: TestClient, db: Session, policies: list[int], upload: Upload) -> list[int]:
     """Three policies that can be trained further; the first two ran in a session of visit 2."""
     snapshot = take_snapshot(db, participant_by_code(db, "P1", SYSTEM), SYSTEM)
     db.execute(update(Policy).where(Policy.id.in_(policies)).values(kind="trained", algorithm="ddpg", snapshot_id=snapshot.id))
@@ -83,7 +83,7 @@ def test_nothing_starts_before_a_policy_was_tested(client: TestClient) -> None:
     assert "next-generation" not in client.get(f"{HOME}/ranking").text
 
 
-def test_pressed_twice_there_is_one_job_which_the_page_follows(client: TestClient, tested: list[int]) -> None:
+def test_pressed_twice_there_is_one_job_which_the_page_follows(client: TestClient, policies_tested: list[int]) -> None:
     first = press(client)
     assert press(client) == first
     assert client.post(JOBS, json={"kind": "next_generation"}).json()["id"] == first, "nor does the interface start a second one"
@@ -98,11 +98,11 @@ def test_pressed_twice_there_is_one_job_which_the_page_follows(client: TestClien
 
 
 def test_the_page_names_what_it_goes_on_from_and_a_trained_generation_is_not_trained_again(
-    client: TestClient, db: Session, tested: list[int], judge: Judge, upload: Upload
+    client: TestClient, db: Session, policies_tested: list[int], judge: Judge, upload: Upload
 ) -> None:
     before = client.get(f"{HOME}/next-generation").text
     assert "the job first judges these policies" in before
-    evaluation = judge({tested[0]: judged(80.0), tested[1]: judged(95.0), tested[2]: judged(99.0)})
+    evaluation = judge({policies_tested[0]: judged(80.0), policies_tested[1]: judged(95.0), policies_tested[2]: judged(99.0)})
     page = client.get(f"{HOME}/next-generation").text
     rows = [row for row in page.split("<tr") if "/policies/" in row]
     assert ["p1" in rows[0], "p0" in rows[1], len(rows)] == [True, True, 2], "p2, the best by its estimate, was never tested"
@@ -117,12 +117,14 @@ def test_the_page_names_what_it_goes_on_from_and_a_trained_generation_is_not_tra
     db.execute(update(Evaluation).where(Evaluation.id == evaluation).values(job_id=job))
     db.commit()
     assert press(client) == job, "nothing was recorded since"
+    judge({i: judged(80.0) for i in policies_tested})
+    assert press(client) == job, "nor does another evaluation of the same data ask for a second generation"
     assert "The next generation is trained" in client.get(f"{HOME}/next-generation").text
-    upload("rl", visit=2, policy=str(tested[0]))
+    upload("rl", visit=2, policy=str(policies_tested[0]))
     assert press(client) != job
 
 
-def test_who_may_not_run_jobs_starts_none(client_as: Callable[[str], TestClient], tested: list[int]) -> None:
+def test_who_may_not_run_jobs_starts_none(client_as: Callable[[str], TestClient], policies_tested: list[int]) -> None:
     for role, may in (("viewer", False), ("monitor", False), ("coordinator", False), ("clinician", True), ("engineer", True)):
         user = client_as(role)
         assert user.get(f"{HOME}/next-generation").status_code == (200 if may else 403), role
