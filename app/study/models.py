@@ -33,6 +33,11 @@ class Hemisphere(StrEnum):
     LEFT = "left"
     RIGHT = "right"
 
+    @property
+    def opposite(self) -> Hemisphere:
+        """The other side, whose hand this one moves."""
+        return Hemisphere.RIGHT if self is Hemisphere.LEFT else Hemisphere.LEFT
+
 
 TIME_CHECK = "started_at >= '1990-01-01Z' and started_at < '2201-01-01Z'"
 HEMISPHERE_CHECK = "hemisphere in ('left', 'right')"

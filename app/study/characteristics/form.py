@@ -8,7 +8,6 @@ from typing import Any
 from app.platform.errors import Invalid
 from app.platform.web.forms import parse
 from app.study.characteristics.schemas import MOST_DOSES, MOST_LEADS, CharacteristicsFields, Lead, PlannedDose, Symptom
-from app.study.models import Hemisphere
 
 LEAD_LABELS = {"hemisphere": "Side", "target": "Target", "model": "Type", "sensing": "Sensing", "stimulating": "Stimulating"}
 DOSE_LABELS = {"drug": "Drug", "mg": "Dose", "at": "At"}
@@ -31,6 +30,12 @@ def posted(values: Mapping[str, Any]) -> dict[str, str]:
     return {name: str(values.get(name, "")).strip() for name in texts(CharacteristicsFields())}
 
 
+def shown_rows(typed: Mapping[str, str], name: str) -> int:
+    """Rows of leads (`lead`) or doses (`dose`) that stand open: up to the last one that says something, at least one."""
+    labels, most = (LEAD_LABELS, MOST_LEADS) if name == "lead" else (DOSE_LABELS, MOST_DOSES)
+    return max((i for i, _ in _rows(typed, name, labels, most)), default=1)
+
+
 def characteristics(typed: Mapping[str, str]) -> CharacteristicsFields:
     """What a form says; an empty row says nothing.
 
@@ -42,7 +47,7 @@ def characteristics(typed: Mapping[str, str]) -> CharacteristicsFields:
     if len({(d.drug, d.at) for d in doses}) < len(doses):
         raise Invalid("The same drug stands twice at one time in the schedule.", "Give both together in one row.")
     symptoms = [s for s in Symptom if typed[f"symptom_{s}"]]
-    hand = Hemisphere(typed["hand"]) if typed["hand"] in set(Hemisphere) else None
+    hand = parse(CharacteristicsFields, {"hand": typed["hand"]}, {"hand": "Hand of the grasp test"}).hand
     return CharacteristicsFields(leads=leads, symptoms=symptoms, hand=hand, medication=doses)
 
 

@@ -17,8 +17,6 @@ from app.study.characteristics.schemas import CharacteristicsFields
 from app.study.models import Hemisphere, Participant
 from app.study.outcomes import service as outcomes
 
-OPPOSITE = {Hemisphere.LEFT: Hemisphere.RIGHT, Hemisphere.RIGHT: Hemisphere.LEFT}
-
 
 def fields_of(row: CharacteristicsVersion | None) -> CharacteristicsFields:
     """What a version says; nothing where there is none yet."""
@@ -70,4 +68,4 @@ def suggested_hand(db: Session, participant: Participant) -> Hemisphere | None:
     if not sides:
         leads = fields_of(participant.current_characteristics).leads
         sides = {lead.hemisphere for lead in leads if lead.stimulating} or {lead.hemisphere for lead in leads}
-    return OPPOSITE[sides.pop()] if len(sides) == 1 else None
+    return sides.pop().opposite if len(sides) == 1 else None

@@ -30,8 +30,6 @@ MAX_UNKNOWN = 0.5
 MAX_GRASP_HZ = 20.0
 """No hand opens and closes this often; a tracker that says so has lost it."""
 
-_SIDES = {Hemisphere.LEFT: Hemisphere.RIGHT, Hemisphere.RIGHT: Hemisphere.LEFT}
-
 
 @dataclass(frozen=True)
 class Derived:
@@ -191,7 +189,7 @@ def _which_hands(views: Mapping[Hemisphere | None, GraspView], hemisphere: Hemis
         if hemisphere is not None and view.row.hand == hemisphere:
             return [view], f"{view.whose}, on the side of the stimulated {hemisphere} hemisphere: the other hand was not tested"
         return [view], view.whose
-    other = _SIDES.get(Hemisphere(hemisphere)) if hemisphere else None
+    other = Hemisphere(hemisphere).opposite if hemisphere else None
     if other is not None and other in views:
         return [views[other]], f"{other} hand, contralateral to the {hemisphere} hemisphere; the participant's hand is not stated"
     why = "the session names no hemisphere" if hemisphere is None else f"no test of the {other} hand"

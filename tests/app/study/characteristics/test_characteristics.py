@@ -105,3 +105,8 @@ def test_the_interface_and_the_page_state_them(client: TestClient, enrolled: str
     wrong = client.post(f"/participants/{enrolled}/characteristics", data=sent | {"version": "2", "dose1_mg": "much"})
     assert wrong.status_code == 422
     assert "Dose 1, dose" in wrong.text
+    wrong = client.post(f"/participants/{enrolled}/characteristics", data=sent | {"version": "2", "lead4_model": "3389"})
+    assert (wrong.status_code, "Lead 4, side" in wrong.text) == (422, True)
+    assert "More leads" not in wrong.text, "what was typed stays in sight"
+    wrong = client.post(f"/participants/{enrolled}/characteristics", data=sent | {"version": "2", "hand": "both"})
+    assert (wrong.status_code, len(client.get(api).json())) == (422, 2), "no hand is dropped silently"
