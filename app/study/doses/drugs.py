@@ -1,6 +1,8 @@
 """The drugs that can be named: a fixed list, so that no free text of a prescription enters.
 
-Levodopa equivalents per mg: Tomlinson et al. 2010 (Movement Disorders 25, 2649), where they give one.
+Levodopa equivalents per mg: Tomlinson et al. 2010 (Movement Disorders 25, 2649), where they give one. A form that these names leave out
+(prolonged-release agonists, whose effect hardly wanes within a visit; selegiline under the tongue, which counts eight times as much;
+tolcapone; levodopa gel) is `other`: no equivalent, and no time since it, rather than those of another form.
 """
 
 from __future__ import annotations
@@ -50,10 +52,10 @@ DRUGS: dict[Drug, DrugFacts] = {
     Drug.LEVODOPA_COMT: DrugFacts("Levodopa with entacapone", 1.33, True),
     Drug.LEVODOPA_EQUIVALENT: DrugFacts("All of a time together, as levodopa equivalent", 1.0, True),
     Drug.APOMORPHINE: DrugFacts("Apomorphine", 10.0, True),
-    Drug.PRAMIPEXOLE: DrugFacts("Pramipexole (salt)", 100.0, True),
-    Drug.ROPINIROLE: DrugFacts("Ropinirole", 20.0, True),
-    Drug.ROTIGOTINE: DrugFacts("Rotigotine", 30.0, False),  # a patch: its level hardly changes over a visit
-    Drug.SELEGILINE: DrugFacts("Selegiline", 10.0, False),
+    Drug.PRAMIPEXOLE: DrugFacts("Pramipexole (salt), immediate release", 100.0, True),
+    Drug.ROPINIROLE: DrugFacts("Ropinirole, immediate release", 20.0, True),
+    Drug.ROTIGOTINE: DrugFacts("Rotigotine, mg per 24 h", 30.0, False),  # a patch: its level hardly changes over a visit
+    Drug.SELEGILINE: DrugFacts("Selegiline, swallowed tablet", 10.0, False),
     Drug.RASAGILINE: DrugFacts("Rasagiline", 100.0, False),
     Drug.SAFINAMIDE: DrugFacts("Safinamide", None, False),
     Drug.AMANTADINE: DrugFacts("Amantadine", 1.0, False),

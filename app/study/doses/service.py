@@ -18,7 +18,7 @@ from app.study.doses.schemas import DoseIn
 from app.study.models import Visit
 from app.study.visits.service import require_unlocked
 
-_BEFORE, _AFTER = timedelta(days=3), timedelta(hours=38)
+_BEFORE, _AFTER = timedelta(days=3), timedelta(hours=36)
 """A dose lies between three days before the visit's day and that day's end in the westernmost time zone, in UTC."""
 _AHEAD = timedelta(minutes=10)
 """By how much the clock of whoever enters a dose may be ahead."""

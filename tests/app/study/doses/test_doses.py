@@ -59,9 +59,23 @@ def test_what_a_person_stated_of_the_session_counts_and_is_questioned_where_the_
 
 
 def test_levodopa_equivalents_are_those_of_tomlinson_2010() -> None:
-    found = [levodopa_equivalent_mg(Drug(d), mg) for d, mg in (("levodopa", 100), ("levodopa_cr", 100), ("pramipexole", 1), ("other", 5))]
-    assert found == [100, 75, 100, None]
+    published = {
+        Drug.LEVODOPA: 1.0,
+        Drug.LEVODOPA_CR: 0.75,
+        Drug.LEVODOPA_COMT: 1.33,  # entacapone adds a third
+        Drug.LEVODOPA_EQUIVALENT: 1.0,
+        Drug.APOMORPHINE: 10.0,
+        Drug.PRAMIPEXOLE: 100.0,
+        Drug.ROPINIROLE: 20.0,
+        Drug.ROTIGOTINE: 30.0,
+        Drug.SELEGILINE: 10.0,
+        Drug.RASAGILINE: 100.0,
+        Drug.AMANTADINE: 1.0,
+    }
+    assert {d: levodopa_equivalent_mg(d, 1.0) for d in Drug} == dict.fromkeys(Drug) | published
     assert set(DRUGS) == set(Drug)
+    for drug, form in ((Drug.PRAMIPEXOLE, "immediate release"), (Drug.ROPINIROLE, "immediate release"), (Drug.SELEGILINE, "swallowed")):
+        assert form in DRUGS[drug].name, "other forms have other factors, or no time since a dose"
 
 
 def test_doses_are_entered_refused_and_taken_back(client: TestClient, enrolled: str) -> None:
@@ -71,7 +85,8 @@ def test_doses_are_entered_refused_and_taken_back(client: TestClient, enrolled: 
     made = client.post(api, json=dose).json()
     assert (made["taken_at"], made["levodopa_equivalent_mg"], made["counts_for_time"]) == ("2026-03-02T05:00:00Z", 100.0, True)
     assert client.post(api, json=dose).status_code == 409
-    assert "not near visit 5" in client.post(api, json=dose | {"taken_at": "2026-03-05T07:00:00Z"}).json()["detail"]
+    for taken_at in ("2026-03-05T07:00:00Z", "2026-03-03T12:30:00Z"):  # the latter is the next day in every time zone
+        assert "not near visit 5" in client.post(api, json=dose | {"taken_at": taken_at}).json()["detail"]
     tomorrow = (datetime.now(UTC) + timedelta(days=1)).isoformat()
     assert "has not come yet" in client.post(api, json=dose | {"taken_at": tomorrow}).json()["detail"]
     client.post(f"/api/v1/visits/{visit}/lock", json={"reason": "complete"})
