@@ -53,19 +53,21 @@ def test_no_interval_is_given_where_sessions_or_visits_are_too_few() -> None:
     many_sessions = [pair(1.0, 10.0, 12.0, 11.0, visit=v) for v in (2, 3)] + [pair(2.0, 4.0, 5.0, visit=v) for v in (2, 3)]
     two = accuracies("fqe", many_sessions)[0]
     assert (two.visit, two.mae.low, two.mae.high, two.regret.low) == (None, None, None, None)
-    three = accuracies("fqe", [*many_sessions, pair(3.0, 5.0, visit=4)])[0]
-    assert three.mae.low is not None
+    more = [pair(3.0, 5.0, visit=v) for v in (4, 5, 6)]
+    four, five = (accuracies("fqe", [*many_sessions, *more[:n]])[0] for n in (2, 3))
+    assert (four.mae.low, four.mae.high) == (None, None), "90 % intervals of so few visits cover three quarters"
+    assert five.mae.low is not None
 
 
 def test_visits_are_resampled_whole_and_not_their_sessions() -> None:
-    # the error is 10 at one visit and 0 at three others, whatever the number of sessions: a visit is one draw of four
-    pairs = [pair(20.0, *[10.0] * 30, visit=1)] + [pair(10.0, 10.0, visit=v) for v in (2, 3, 4)]
+    # the error is 10 at one visit and 0 at four others, whatever the number of sessions: a visit is one draw of five
+    pairs = [pair(20.0, *[10.0] * 30, visit=1)] + [pair(10.0, 10.0, visit=v) for v in (2, 3, 4, 5)]
     mae = accuracies("fqe", pairs)[0].mae
-    assert (mae.value, mae.low) == (2.5, 0.0)
+    assert (mae.value, mae.low) == (2.0, 0.0)
     assert mae.high is not None
-    assert mae.high >= 5.0, "two of four draws are that visit in more than 5 % of the resamples"
+    assert mae.high >= 4.0, "two of five draws are that visit in more than 5 % of the resamples"
     # the same policy at two visits is two facts
-    assert accuracies("fqe", pairs)[0].policies == 4
+    assert accuracies("fqe", pairs)[0].policies == 5
 
 
 def test_nothing_is_divided_by_a_range_within_the_noise_of_a_session() -> None:
@@ -79,6 +81,9 @@ def test_nothing_is_divided_by_a_range_within_the_noise_of_a_session() -> None:
     # nobody was tested twice: a range of 1 around 80 is none either, and one of 20 is
     assert accuracies("fqe", [pair(109.5, 80.0), pair(110.5, 81.0)])[0].mae_of_range.value is None
     assert accuracies("fqe", [pair(109.5, 80.0), pair(110.5, 100.0)])[0].mae_of_range.value == pytest.approx(1.0)
+    # two sessions that agree by chance say nothing of the noise
+    assert least_range([pair(109.5, 80.0, 80.0), pair(110.5, 80.1)]) == pytest.approx(0.801)
+    assert accuracies("fqe", [pair(109.5, 80.0, 80.0), pair(110.5, 80.1)])[0].mae_of_range.value is None
     # a best return next to 0 is no divisor
     assert accuracies("fqe", [pair(1.0, 0.01), pair(0.0, -20.0)])[0].regret_as_paper.value is None
 

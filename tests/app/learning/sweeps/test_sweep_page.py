@@ -49,13 +49,13 @@ def store(upload: Upload, db: Session) -> Store:
     """Store a sweep of policies with given metrics, without training them."""
     upload("random")
 
-    def make(*each: dict[str, Any]) -> Sweep:
+    def make(*each: dict[str, Any], also: tuple[dict[str, Any], ...] = ()) -> Sweep:
         db.rollback()
         participant = participant_by_code(db, "P1", SYSTEM)
         snapshot = take_snapshot(db, participant, SYSTEM)
         job = jobs.submit(db, "train", participant.id, {}, "ada")
         half = {"controller": "constant 0.50", "score": 5.0, "mean_amplitude": 0.5, "gain_over_cdbs": estimated(2.5, 1.0)}
-        rows = [{"controller": "cDBS", "score": 4.5, "mean_amplitude": 1.0, "gain_over_cdbs": estimated(0.0, 0.0)}, half]
+        rows = [{"controller": "cDBS", "score": 4.5, "mean_amplitude": 1.0, "gain_over_cdbs": estimated(0.0, 0.0)}, half, *also]
         sweep = Sweep(
             participant_id=participant.id, name="s", snapshot_id=snapshot.id, job_id=job.id, config={}, code_version="0", created_by="ada",
             baselines={"rows": rows, "best_constant": 1.0, "held_out_sessions": [1]},
@@ -163,7 +163,13 @@ def test_policies_are_ordered_by_the_posterior_and_not_by_the_held_out_score(sto
     assert [b["gain_over_cdbs"] for b in told["baselines"]] == [0.0, 2.5]
     page = client.get(f"/sweeps/{sweep.id}").text
     assert "rl-1 has the largest lower bound" in page, "the larger bound of rl-2 is extrapolation"
-    assert "no session near" in page
+    assert page.count("no session near<") == 1
+
+
+def test_a_controller_without_learning_that_no_session_supports_is_marked(store: Store, client: TestClient) -> None:
+    off = {"controller": "no DBS", "score": 1.0, "mean_amplitude": 0.0, "gain_over_cdbs": estimated(40.0, 30.0, supported=False)}
+    sweep = store(metrics(9.0, 1.0, -1.0, 0.0), also=(off,))
+    assert client.get(f"/sweeps/{sweep.id}").text.count("no session near<") == 1
 
 
 def test_where_sessions_cannot_order_policies_nothing_is_preferred(store: Store, client: TestClient) -> None:
