@@ -5,9 +5,10 @@
 
 A study is one participant's visits with sessions of one controller and of cDBS. Every scenario adds to the noise of sessions what visits
 bring: days that differ, a controller that does better on some days and worse on others (its average effect being what is tested), drift
-over the day,
-ties, arms of different size, missing values, arms on different visits. The paper's test (all sessions as independent) is printed beside
-the primary one. CPU seconds of one thread.
+over the day, ties, arms of different size, missing values, arms on different visits. The paper's test (all sessions as independent) is
+printed beside the primary one. Where the controller's effect differs between days, the same studies are made again with an effect that has
+no average in the latent value alone: of rating and tremor, which saturate, that is no null, and how often the primary test then errs is
+printed, for information. CPU seconds of one thread.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from support.null_worlds import METRICS, MINUTES, WORLDS, World, latent, layout, measure, metric_average
 
 from ml.statistics.association import within_visits
 from ml.statistics.effects import cliffs_delta, energy_saving
@@ -36,108 +38,10 @@ from ml.statistics.within_visits.stratified import aligned_rank_test, shift_inte
 
 out = sys.stdout.write
 ALPHA, LEVEL = 0.05, 0.95
-MINUTES = 10
-METRICS = ("grasp", "beta", "rating", "tremor", "energy")
 CONTINUOUS = ("grasp", "beta", "energy")
 LAWS = (CONTINUOUS, ("rating",), ("tremor",))
-RESOLUTION = {"rating": 1.0, "tremor": 100 / MINUTES}
-
-
-@dataclass(frozen=True)
-class World:
-    """One scenario.
-
-    Attributes:
-        visits, each: visits, and sessions of either arm at each.
-        day, slope: standard deviations of visits' levels and of the controller's effect between visits, in those of a session.
-        drift: change from the first to the last session of a visit, in the same.
-        design: `shuffled`, `alternating` (cDBS between any two), `cdbs_first` (alternating from cDBS on, so that the controller comes
-            later), `apart` (every visit has one arm), `uneven` (one to five sessions of either arm).
-        missing: share of values that are missing. heavy: noise of Student's t with 3 degrees of freedom.
-    """
-
-    visits: int = 5
-    each: int = 3
-    day: float = 1.5
-    slope: float = 0.0
-    drift: float = 0.0
-    design: str = "shuffled"
-    missing: float = 0.0
-    heavy: bool = False
-
-
-WORLDS = {
-    "plain": World(day=0.0),
-    "days": World(),
-    "days, 3 visits": World(visits=3),
-    "days, 8 visits": World(visits=8),
-    "days, 1 v 1": World(visits=6, each=1),
-    "day x dose": World(slope=1.0),
-    "day x dose, 3 visits": World(visits=3, slope=1.0),
-    "day x dose, 8 visits": World(visits=8, slope=1.0),
-    "strong day x dose": World(visits=6, slope=3.0),
-    "drift, shuffled": World(drift=2.0),
-    "drift, alternating": World(drift=2.0, design="alternating"),
-    "drift, cDBS first": World(drift=2.0, design="cdbs_first"),
-    "drift, cDBS first, 3": World(visits=3, drift=2.0, design="cdbs_first"),
-    "imbalance": World(visits=6, design="uneven"),
-    "imbalance, dose": World(visits=6, slope=1.0, design="uneven"),
-    "missing 30 %": World(each=4, missing=0.3),
-    "heavy tails": World(heavy=True),
-    "all of it": World(visits=6, slope=0.7, drift=1.0, design="uneven", missing=0.2, heavy=True),
-    "arms apart": World(visits=6, each=4, design="apart"),
-}
-
-
-def layout(world: World, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Visit, arm and place in the visit of every session."""
-    visit, tested, order = [], [], []
-    for v in range(world.visits):
-        if world.design == "apart":
-            arm = np.full(world.each, v % 2 == 1)
-        elif world.design == "uneven":
-            arm = rng.permutation(np.repeat([False, True], rng.integers(1, 6, 2)))
-        elif world.design == "alternating":
-            arm = np.resize([True, False], 2 * world.each - 1)
-        elif world.design == "cdbs_first":
-            arm = np.resize([False, True], 2 * world.each)
-        else:
-            arm = rng.permutation(np.repeat([False, True], world.each))
-        visit += [v] * arm.size
-        tested += arm.tolist()
-        order += range(arm.size)
-    return np.array(visit), np.array(tested, dtype=bool), np.array(order, dtype=float)
-
-
-def latent(
-    world: World, effect: float, rng: np.random.Generator, design: tuple[np.ndarray, np.ndarray, np.ndarray], either: bool = False
-) -> np.ndarray:
-    """What a metric is made of, in standard deviations of a session.
-
-    `either`: what differs between visits befalls either arm with the same chance, so that the average effect is nil in every metric, also
-    in one that has a floor or a ceiling.
-    """
-    visit, tested, order = design
-    noise = rng.standard_t(3, visit.size) / np.sqrt(3) if world.heavy else rng.standard_normal(visit.size)
-    last = np.maximum(np.maximum.reduceat(order, np.flatnonzero(np.diff(visit, prepend=-1))), 1)[visit]
-    level = world.day * rng.standard_normal(world.visits)
-    slope = effect + world.slope * rng.standard_normal(world.visits)
-    changed = tested ^ (rng.random(world.visits) < 0.5)[visit] if either and world.slope else tested
-    return level[visit] + slope[visit] * changed + world.drift * order / last + noise
-
-
-def measure(metric: str, z: np.ndarray, design: tuple[np.ndarray, np.ndarray, np.ndarray], world: World, rng: np.random.Generator):
-    """A metric of the study from its latent value."""
-    visit, tested, order = design
-    value = {
-        "grasp": lambda: 2.3 + 0.15 * z,
-        "beta": lambda: 1.0 + 0.12 * z,
-        "rating": lambda: np.clip(np.round(7 + 0.8 * z), 1, 10),
-        "tremor": lambda: 100 * rng.binomial(MINUTES, 1 / (1 + np.exp(1.5 - 0.8 * z))) / MINUTES,
-        "energy": lambda: 1.0 + 0.05 * z,
-    }[metric]()
-    value = np.where(rng.random(value.size) < world.missing, np.nan, value)
-    return Measurements.of(value, visit, tested, order=order, resolution=RESOLUTION.get(metric, 0.0))
+SKEWED = tuple(name for name, world in WORLDS.items() if world.slope)
+"""Scenarios in which the controller's effect differs between days."""
 
 
 def naive(data: Measurements) -> tuple[bool | None, bool | None]:
@@ -195,16 +99,34 @@ def error(number: int, level: float = ALPHA) -> float:
     return float(np.sqrt(level * (1 - level) / number))
 
 
-def null_studies(name: str, studies: int) -> Tally:
-    """One scenario with no average effect. The slower analyses are made in every twentieth study, the paper's test in every fourth."""
-    tally, world, rng = Tally(), WORLDS[name], np.random.default_rng(sum(map(ord, name)))
+def drawn(name: str, studies: int, either: bool) -> Iterator[tuple[int, str, Measurements]]:
+    """Number, metric and data of the studies of one scenario; `either` as in `latent`."""
+    world, rng = WORLDS[name], np.random.default_rng(sum(map(ord, name)))
     for study in range(studies):
         design = layout(world, rng)
         for metric in METRICS:
             # Energy follows from what the controller does: days and drift reach it through the controller alone.
             mine = replace(world, day=0.0, drift=0.0) if metric == "energy" else world
-            data = measure(metric, latent(mine, 0.0, rng, design, either=True), design, world, rng)
-            one_null(name, metric, data, tally, study)
+            yield study, metric, measure(metric, latent(mine, 0.0, rng, design, either), design, world, rng)
+
+
+def null_studies(name: str, studies: int) -> Tally:
+    """One scenario with no average effect. The slower analyses are made in every twentieth study, the paper's test in every fourth."""
+    tally = Tally()
+    for study, metric, data in drawn(name, studies, either=True):
+        one_null(name, metric, data, tally, study)
+    return tally
+
+
+def skewed_studies(name: str, studies: int) -> Tally:
+    """One scenario whose effect has no average in the latent value: rating and tremor held against none, and against their own average."""
+    tally, own = Tally(), {metric: metric_average(WORLDS[name], metric) for metric in ("rating", "tremor")}
+    for _, metric, data in drawn(name, studies, either=False):
+        if metric in own:
+            found = primary(data, LEVEL)
+            shown = isinstance(found, Average)
+            tally.add((name, metric, "latent null"), shown and found.p_value < ALPHA)
+            tally.add((name, metric, "misses its average"), shown and not found.low <= own[metric] <= found.high)
     return tally
 
 
@@ -404,6 +326,18 @@ def show_null(tally: Tally, studies: int) -> dict[str, float]:
     }
 
 
+def show_skewed(tally: Tally) -> None:
+    """Studies whose null is one of the latent value alone; for information, not among the figures."""
+    out("the effect differs between days, without an average in the latent value; rating, tremor: their own average | share rejected |")
+    out(" share of intervals that miss their own average\n")
+    for name in SKEWED:
+        for metric in ("rating", "tremor"):
+            rejected, missed = (tally.share(name, metric, label)[0] for label in ("latent null", "misses its average"))
+            own = metric_average(WORLDS[name], metric)
+            out(f"{name:<22}{metric:<8}{own:>8.2f} |{rejected:>8.4f} |{missed:>8.4f}\n")
+    out("\n")
+
+
 def show_margin(tally: Tally) -> dict[str, float]:
     """Non-inferiority at the margin and where nothing is lost."""
     out("non-inferiority shown: grasp exactly at its margin (an error) | nothing lost (power), of it with the saving shown\n")
@@ -433,6 +367,7 @@ def main() -> None:
     studies = 150 if arguments.quick else arguments.studies
     tally = Tally()
     parts: list[tuple[Callable[[Any, int], Tally], str | int, int]] = [(null_studies, name, studies) for name in WORLDS]
+    parts += [(skewed_studies, name, studies) for name in SKEWED]
     parts += [(margin_studies, v, studies // 2 if v > 2 else studies // 20) for v in (12, 8, 6, 4, 3, 2, 1)]
     parts += [(power_studies, v, studies // 4) for v in (3, 4, 6, 8)]
     if arguments.keep:
@@ -440,7 +375,9 @@ def main() -> None:
     with ProcessPoolExecutor(arguments.workers) as pool:
         for part in [pool.submit(cell, *p, arguments.keep) for p in parts]:
             tally.merge(part.result())
-    figures = show_null(tally, studies) | show_margin(tally) | {"degenerate_answers_wrong": float(degenerate())}
+    figures = show_null(tally, studies)
+    show_skewed(tally)
+    figures |= show_margin(tally) | {"degenerate_answers_wrong": float(degenerate())}
     out("\npower for an effect of one standard deviation of a session, 4 sessions of either arm a visit: primary, van Elteren, paper's\n")
     for key in dict.fromkeys(k[0] for k in tally.counts if len(k) == 2):
         out(f"  {key:<28}" + "".join(f"{tally.share(key, label)[0]:>8.3f}" for label in ("primary", "van elteren", "naive")) + "\n")
