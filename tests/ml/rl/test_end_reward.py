@@ -29,13 +29,25 @@ def buffer(grasp, sessions=16, steps=60, seed=0):
 
 
 def test_the_shares_of_a_session_add_up_to_its_end_reward_where_that_is_linear_in_them():
+    data = buffer(lambda a, beta: 1.0 + a.mean() - 0.5 * (beta >= 1.0).mean())
+    share = fit_end_reward(data)
+    assert share is not None
+    assert share.skill > 0.99
+    for session in data.sessions:
+        assert told_of(share, session) == pytest.approx(session.end_reward(SETTINGS), abs=0.3)
+
+
+def test_slopes_beyond_what_any_patient_has_are_drawn_in_and_keep_their_order():
+    # 2 Hz by the dose and 3 Hz by burden, the second against its sign: both 1.75 to 2.5 standard deviations of their priors away
     data = buffer(lambda a, beta: 1.0 + 2.0 * a.mean() + 3.0 * (beta >= 1.0).mean())
     share = fit_end_reward(data)
     assert share is not None
-    assert share.skill > 0.95, "priors draw large slopes in a little"
-    for session in data.sessions:
-        told = share.per_step(session).mean() / share.factor
-        assert told == pytest.approx(session.end_reward(SETTINGS), abs=1.0)
+    assert share.skill > 0.95
+    true = [session.end_reward(SETTINGS) for session in data.sessions]
+    told = [told_of(share, session) for session in data.sessions]
+    assert told == pytest.approx(true, abs=1.0)
+    assert 0.9 < np.polyfit(true, told, 1)[0] < 1.0
+    assert np.corrcoef(true, told)[0, 1] > 0.99
 
 
 def test_shares_and_step_rewards_stand_in_the_proportion_of_the_return():
@@ -49,10 +61,14 @@ def test_shares_and_step_rewards_stand_in_the_proportion_of_the_return():
     assert end_for_critic / steps_for_critic == pytest.approx(1 / steps_in_return)
 
 
+def told_of(share, session):
+    """r_end that the share tells of a session."""
+    return float(share.per_step(session).mean()) / share.factor
+
+
 def told_at(share, level):
     """r_end that the share tells of a session at a constant amplitude, beta at 0.5."""
-    session = SessionTrajectory(0, 1, "other", np.full(10, 0.5), np.full(20, 0.5), np.full(20, float(level)))
-    return float(share.per_step(session).mean()) / share.factor
+    return told_of(share, SessionTrajectory(0, 1, "other", np.full(10, 0.5), np.full(20, 0.5), np.full(20, float(level))))
 
 
 def test_a_good_day_that_chanced_upon_low_amplitudes_is_not_taken_for_their_merit():
@@ -68,8 +84,11 @@ def test_a_good_day_that_chanced_upon_low_amplitudes_is_not_taken_for_their_meri
     assert share is not None
     assert told_at(share, 0.8) - told_at(share, 0.2) == pytest.approx(6.0, abs=3.0)
     as_one_day = fit_end_reward(replace(data, sessions=tuple(replace(s, visit=1) for s in moved)))
-    hidden = 0.0 if as_one_day is None else told_at(as_one_day, 0.8) - told_at(as_one_day, 0.2)
-    assert hidden < 3.0, "over all days together the good day hides what the amplitude brings"
+    line = np.polyfit([s.amplitude.mean() for s in moved], [s.end_reward(SETTINGS) for s in moved], 1)
+    assert as_one_day is not None
+    hidden = told_at(as_one_day, 0.8) - told_at(as_one_day, 0.2)
+    assert hidden == pytest.approx(0.6 * line[0], abs=1.0), "without days it tells what a line through all sessions tells"
+    assert hidden < 0, "over all days together the good day turns round what the amplitude brings"
 
 
 def test_a_noisy_rating_does_not_drown_what_the_grasp_tells():

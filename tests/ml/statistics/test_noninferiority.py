@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import ttest_1samp
+from scipy.stats import t, ttest_1samp
 
 from ml.statistics.noninferiority import (
     FailureRule,
@@ -196,3 +196,19 @@ def test_a_failure_is_not_explained_away_as_a_drift():
     as_measured = dict(found.sensitivity)[FailureRule.AS_MEASURED]
     assert isinstance(as_measured, NonInferiorAndSaving)
     assert as_measured.high <= 100
+
+
+def test_three_outcomes_that_are_each_probably_worse_are_inferior_by_hommel():
+    # each outcome's one-sided p of a loss beyond its margin is between .0167 and .05: Holm's first step rejects none, Simes' test all
+    visits, flags = np.repeat(np.arange(6), 2), np.zeros(12, dtype=bool)
+    arms, pattern = np.tile([False, True], 6), np.array([-1.0, 0.0, 1.0, -1.0, 0.0, 1.0])
+    p_wanted = (0.03, 0.032, 0.035)
+    outcomes = []
+    for k, p in enumerate(p_wanted):
+        spread = pattern.std(ddof=1) / np.sqrt(6)
+        contrast = pattern - 1.0 + spread * t.ppf(p, 5)  # mean below the margin of 1 by that many standard errors
+        value = np.where(arms, 5.0 + contrast[visits], 5.0)
+        outcomes.append(Outcome(f"outcome {k}", Measurements.of(value, visits, arms), flags, 1.0, True))
+    found = assess(outcomes, Measurements.of(np.where(arms, 0.6, 1.0), visits, arms), flags)
+    assert [r.p_inferior for r in found.outcomes] == pytest.approx(p_wanted)
+    assert found.verdict == Inferior(("outcome 0", "outcome 1", "outcome 2"))
