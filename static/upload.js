@@ -7,6 +7,7 @@ const list = document.querySelector("[data-upload-list]");
 const home = `/participants/${form.dataset.participant}`;
 const LABELS = { understood: "Understood", flagged: "Flagged", repaired: "Repaired", ignored: "Left aside", removed: "Removed" };
 const FIELDS = ["visit", "controller", "policy", "started_at", "hemisphere", "beta_unit", "beta_source", "lfp_unit", "session"];
+const UNKNOWN_COLUMNS = ["columns not known", "warn"];
 const STATES = { decoded: ["decoded", "good"], received: ["being read", "info"], released: ["released unread", "warn"], discarded: ["discarded", "warn"] };
 
 form.querySelector("[data-drop-hint]").prepend("Drop files or whole folders here, or choose them. ");
@@ -103,35 +104,37 @@ function follow(shown, request) {
 }
 
 // of a table whose columns nobody has stated yet
-function mappingLink(id) { return element("a", { className: "button primary", href: `/uploaded-files/${id}/mapping`, textContent: "Say what its columns are" }); }
+function mappingLink(id, which = "") { return element("a", { className: "button primary", href: `/uploaded-files/${id}/mapping`, textContent: `Say what its columns are${which}` }); }
 
 function badge(text, tone) { return element("span", { className: `badge ${tone}`, textContent: text }); }
 
 function report({ item, head, words }, status, answer) {
   item.querySelector(".progress").remove();
   const good = status >= 200 && status < 300;
-  words.replaceWith(badge(!good ? "not usable" : answer.duplicate ? "known already" : "received", !good ? "bad" : answer.duplicate ? "info" : "good"));
+  const waiting = answer.waits_for_mapping ?? []; // where nothing was usable; else each file says so itself
+  const [came, tone] = waiting.length ? UNKNOWN_COLUMNS : !good ? ["not usable", "bad"] : answer.duplicate ? ["known already", "info"] : ["received", "good"];
+  words.replaceWith(badge(came, tone));
   if (answer.proposals?.length) head.append(element("a", { className: "button primary", href: `${home}/proposals`, textContent: `Confirm ${answer.proposals.length} proposed session${answer.proposals.length > 1 ? "s" : ""}` }));
   for (const session of answer.sessions ?? []) if (session.status === "confirmed") head.append(element("a", { className: "button", href: `/sessions/${session.id}`, textContent: `Session ${session.id}` }));
   if (!good) {
     const note = element("div", { className: "note bad" }, element("b", { textContent: answer.detail ?? `The service answered ${status}.` }));
     note.setAttribute("role", "alert");
     if (answer.hint) note.append(element("div", { textContent: answer.hint }));
-    note.append(...(answer.waits_for_mapping ?? []).map(mappingLink));
+    note.append(...waiting.map((id, i) => mappingLink(id, waiting.length > 1 ? ` (${i + 1} of ${waiting.length})` : "")));
     item.append(note);
   }
   const states = new Map((answer.files ?? []).map((file) => [file.name, file]));
   const groups = []; // a file, and the members of an archive after it
   for (const one of answer.report ?? []) {
-    if (states.has(one.name) || !groups.length) groups.push({ one, inner: [] });
+    if (!answer.files || states.has(one.name) || !groups.length) groups.push({ one, inner: [] });
     else groups.at(-1).inner.push(one);
   }
   for (const { one, inner } of groups) {
     const file = states.get(one.name);
     const line = element("div", { className: "row" }, element("h3", { textContent: one.name }));
-    if (file) line.append(file.duplicate ? badge("known already", "info") : badge(...(STATES[file.status] ?? (file.waits_for_mapping ? ["columns not known", "warn"] : ["not usable, kept", "bad"]))));
+    if (file) line.append(file.duplicate ? badge("known already", "info") : badge(...(STATES[file.status] ?? (file.waits_for_mapping ? UNKNOWN_COLUMNS : ["not usable, kept", "bad"]))));
     if (file?.waits_for_mapping) line.append(mappingLink(file.id));
-    item.append(line, ...said(one, good));
+    item.append(line, ...said(one, good || one.name !== answer.file)); // the note above has that file's problem
     const told = inner.filter((r) => r.problem || Object.keys(LABELS).some((key) => r[key]?.length));
     if (!told.length) continue;
     const odd = told.filter((r) => r.flagged?.length).length;

@@ -127,6 +127,25 @@ def test_a_table_alone_whose_columns_nobody_knows_leads_to_its_mapping(window: C
     expect(watched.page.locator("h1")).to_have_text("What the columns are")
 
 
+def test_tables_of_unknown_columns_alone_lead_to_their_mappings_and_each_says_what_is_wrong(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
+    watched = window()
+    watched.sign_in()
+    watched.open(f"/participants/{enrolled}/upload?visit=1")
+    transfer = watched.page.evaluate_handle(
+        "() => { const t = new DataTransfer(); for (const [n, x] of [['one.csv', 'a,b\\n1,2\\n3,4\\n'], ['two.csv', 'c,d\\n1,2\\n3,4\\n']])"
+        " t.items.add(new File([x], n)); return t; }"
+    )
+    watched.page.dispatch_event("[data-drop]", "drop", {"dataTransfer": transfer})
+    item = watched.page.locator("[data-upload-list] li")
+    expect(item.locator(".badge").first).to_have_text("columns not known", timeout=60_000)
+    expect(item.locator("h3")).to_have_text(["one.csv", "two.csv"])
+    expect(item.locator(".note.bad")).to_have_count(2)
+    expect(item.locator("summary", has_text="files in it")).to_have_count(0)
+    expect(item.locator("a.button")).to_have_text(["Say what its columns are (1 of 2)", "Say what its columns are (2 of 2)"])
+    item.locator("a.button").last.click()
+    expect(watched.page.locator("select[name=role_1]")).to_be_visible()
+
+
 def test_what_cannot_be_taken_back_asks_first(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
     watched = window()
     watched.sign_in()
