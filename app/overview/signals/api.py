@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 
 from app.accounts.deps import CurrentCaller
-from app.overview.signals.schemas import SignalOut
+from app.overview.signals.schemas import ChannelNumber, SignalOut, Time
 from app.overview.signals.serializers import signal_out
 from app.overview.signals.service import signals_of
 from app.platform.database import Db
@@ -16,8 +16,6 @@ from app.study.deps import CurrentSession
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 409, 422))
 
-ChannelNumber = Annotated[int, Query(ge=0, le=1000, description="A channel's place in the session, from 0.")]
-Time = Annotated[float | None, Query(ge=-1e6, le=1e6, allow_inf_nan=False, description="Seconds from the session's start.")]
 Points = Annotated[int, Query(ge=50, le=4000, description="Bins wanted; there are at most four times as many.")]
 
 

@@ -9,6 +9,7 @@ from fastapi.responses import HTMLResponse, JSONResponse
 
 from app.accounts.deps import CurrentCaller
 from app.overview.signals.figures import chart_figure, picture_of, table_of
+from app.overview.signals.schemas import ChannelNumber, Time
 from app.overview.signals.service import SignalWindow, signals_of
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
@@ -27,9 +28,9 @@ def signal_figure(
     session: CurrentSession,
     db: Db,
     caller: CurrentCaller,
-    channel: int = 0,
-    begin_s: float | None = None,
-    end_s: float | None = None,
+    channel: ChannelNumber = 0,
+    begin_s: Time = None,
+    end_s: Time = None,
 ) -> JSONResponse:
     """The chart of a channel between two times, its title, and the names of all channels."""
     signals = signals_of(db, session, caller)
@@ -53,7 +54,7 @@ def signal_page(
     settings = session.visit.participant.current_settings
     low_hz, high_hz = settings.beta_low_hz, settings.beta_high_hz
     signals = signals_of(db, session, caller)
-    number = int(channel) if channel.isdecimal() and int(channel) < len(signals.channels) else 0
+    number = next((c.number for c in signals.channels if str(c.number) == channel.strip()), 0)
     problem, status = None, 200
     try:
         window = signals.window(number, _seconds(begin_s), _seconds(end_s), POINTS)

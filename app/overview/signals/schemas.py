@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from fastapi import Query
 from pydantic import Field
 
 from app.platform.web.schemas import Model
+
+ChannelNumber = Annotated[int, Query(ge=0, le=1000, description="A channel's place in the session, from 0.")]
+Time = Annotated[float | None, Query(ge=-1e6, le=1e6, allow_inf_nan=False, description="Seconds from the session's start.")]
 
 
 class SignalChannelOut(Model):

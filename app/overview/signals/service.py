@@ -181,7 +181,7 @@ def _build(session: StudySession, wanted: Sequence[dict[str, Any]], folder: Path
             raise unread(session, ended) from None
         _forget_old()
         try:
-            shutil.move(target, folder)
+            target.rename(folder)
         except OSError as error:
             # two who asked at once wrote the same; whoever is second leaves the first one's
             if not (folder / HEADER).exists():

@@ -86,6 +86,28 @@ def test_a_window_or_a_channel_that_is_not_there_is_told_in_words(client: TestCl
     assert client.get(f"/api/v1/sessions/{session}/signal", params={"channel": 7}).status_code == 404
 
 
+@pytest.mark.parametrize("end", ["begin_s", "end_s"])
+def test_a_chart_has_the_bounds_of_the_api_and_a_page_takes_any_number_for_a_channel(client: TestClient, session: int, end: str) -> None:  # noqa: F811
+    for value in ("inf", "-inf", "nan", "1e9"):
+        assert client.get(f"/sessions/{session}/signal.json", params={end: value}).status_code == 422, value
+    assert client.get(f"/sessions/{session}/signal", params={"channel": "9" * 5000}).status_code == 200
+
+
+def test_two_who_ask_at_once_leave_one_folder(client: TestClient, session: int, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    build = service.run_limited
+
+    def twice(*args: Any, **kwargs: Any) -> Any:
+        monkeypatch.setattr(service, "run_limited", build)
+        asked(client, session)  # somebody else is done first
+        return build(*args, **kwargs)
+
+    monkeypatch.setattr(service, "run_limited", twice)
+    found = asked(client, session)
+    (folder,) = service._cache().iterdir()
+    assert [p for p in folder.iterdir() if p.is_dir()] == []
+    assert found == asked(client, session)
+
+
 def test_a_table_of_steps_has_no_samples_and_its_page_no_chart_of_them(send: Any, client: TestClient) -> None:  # noqa: F811
     number = send(("steps.csv", steady(1.0)), visit=1, controller="cdbs").json()["sessions"][0]["id"]
     answer = client.get(f"/api/v1/sessions/{number}/signal")
