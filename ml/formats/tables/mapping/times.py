@@ -28,7 +28,8 @@ def read_times(table: TextTable, column: int, mapping: TableMapping) -> NDArray[
     """A column of times, [rows]: Unix time in s where they are moments, else seconds from the session's start; NaN for empty cells.
 
     Raises:
-        UndecodableFile: a cell that is not written so, or a moment that no clock of a study shows; names the line.
+        UndecodableFile: a cell that is not written so, a moment that no clock of a study shows, or one that its zone has twice or never;
+            names the line.
     """
     if mapping.time_format in WRITTEN:
         out = np.array([_moment(row[column], table, i, column, mapping) for i, row in enumerate(table.rows)], dtype=np.float64)
@@ -52,13 +53,21 @@ def _moment(cell: str, table: TextTable, row: int, column: int, mapping: TableMa
         found = datetime.fromisoformat(text) if mapping.time_format == "iso" else _day_or_month_first(text, mapping.time_format)
         if found.tzinfo is None:
             assert mapping.zone is not None
-            found = found.replace(tzinfo=ZoneInfo(mapping.zone))
+            found = found.replace(tzinfo=ZoneInfo(mapping.zone), fold=0)
+            if found.utcoffset() != found.replace(fold=1).utcoffset():
+                raise _changed_clocks(text, table.lines[row], column, mapping.zone)
         return found.timestamp()
     except (ValueError, OverflowError) as error:
         what = f"is no date and time written like {EXAMPLES[mapping.time_format]}"
         where = f"line {table.lines[row]}, column {column + 1}"
         hint = "State in which format the times are written, or give every row its date and time."
         raise UndecodableFile(f"{shown(text)} {what}", where, hint, f"a cell {what}") from error
+
+
+def _changed_clocks(text: str, line: int, column: int, zone: str) -> UndecodableFile:
+    what = f"is a time that the clocks of {zone} show twice or never, in the night in which they are changed"
+    hint = "Write the times in UTC, or year first with their offset, such as 2026-10-25 02:30:00+02:00."
+    return UndecodableFile(f"{shown(text)} {what}", f"line {line}, column {column + 1}", hint, f"a cell {what}")
 
 
 def _day_or_month_first(text: str, which: str) -> datetime:
