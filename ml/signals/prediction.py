@@ -150,7 +150,8 @@ def _solve(b: Floats, missing: NDArray[np.int64], right: Floats) -> Floats:
 def unsaid(model: Model, measured: NDArray[np.bool_], impulse: Floats) -> Floats:
     """Share of a filter's output power that the prediction of missing samples lacks at each sample, [m], 0 far from gaps.
 
-    What two gaps lack is added up, so that it is too much rather than too little where they are near each other.
+    What two gaps lack is added up, each as if the samples of the other were known. That is a little too little where less than half of the
+    model's memory lies between them: by 0.05 of the band's power for 6 samples between gaps of 30 at 250 Hz, by up to 0.25 for fewer.
 
     Args:
         model: of the signal.
