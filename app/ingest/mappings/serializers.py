@@ -26,10 +26,7 @@ def mapping_out(row: ColumnMapping, current: bool) -> MappingOut:
         zone=stored.zone,
         rate_hz=stored.rate_hz,
         time_at=("begin" if stored.row_begins else "end") if stored.holds == "steps" else None,
-        columns=[
-            MappedColumnIn.model_validate({"number": c.number, "role": c.role, "unit": c.unit, "side": c.side, "channel": c.channel})
-            for c in stored.columns
-        ],
+        columns=[MappedColumnIn.model_validate(c) for c in stored.columns],
         labels=row.labels,
         created_at=row.created_at,
         created_by=row.created_by,

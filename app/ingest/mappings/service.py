@@ -74,8 +74,8 @@ def read_by(db: Session, file_id: int, wanted: MappingIn, caller: Caller) -> App
             continue
         try:
             applied.outcomes += quarantine.read_held(db, other, table.participant, why, caller).files
-        except Invalid:
-            # what is wrong with it stands in its own report; it waits on
+        except (Conflict, Invalid):
+            # the mapping is stored and has read the first table: what is wrong with another one is said where that one is read; it waits on
             applied.waiting.append(other.id)
     return applied
 

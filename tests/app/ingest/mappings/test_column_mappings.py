@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 from app.ingest.mappings import rules
 from app.ingest.mappings.schemas import MappingIn
 from app.platform.errors import Invalid
+from app.platform.files import path_of
 from tests.app.ingest.conftest import Send
 
 API, PAGE = "/api/v1", {"Accept": "text/html"}
@@ -217,6 +218,14 @@ def test_all_tables_of_an_upload_with_one_header_are_read_together(client: TestC
     body = client.put(f"{API}/uploaded-files/{first}/mapping", json=STEPS).json()
     assert len(body["session_ids"]) == 2
     assert client.get(f"{API}/uploaded-files/{second}/preview").status_code == 404
+
+
+def test_a_damaged_table_of_the_same_upload_waits_on_and_hides_no_result(client: TestClient, send: Send, db: Session) -> None:
+    both = [(f"{i}.csv", strange(begin_ms=T0_MS + 600_000 * i, beta=1.0 + i)) for i in range(2)]
+    first, second = send(*both, visit=1).json()["waits_for_mapping"]
+    path_of(db.execute(text("select quarantine_sha256 from upload_file where id = :id"), {"id": second}).scalar_one()).write_bytes(b"x\n")
+    answer = client.put(f"{API}/uploaded-files/{first}/mapping", json=STEPS)
+    assert (answer.status_code, answer.json().get("waiting")) == (200, [second]), answer.text
 
 
 def test_the_form_works_without_javascript(client: TestClient, waiting: int, db: Session) -> None:
