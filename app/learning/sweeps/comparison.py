@@ -102,9 +102,10 @@ def better_without_learning(found: Sequence[Candidate], baselines: Sequence[dict
 def surely_above_cdbs(found: Sequence[Candidate]) -> Candidate | None:
     """The policy with the largest lower bound of its gain over cDBS by the posterior; None where no bound lies above 0.
 
-    Policies that no session supports, and all where the data cannot order policies, are left out.
+    Policies that are retired or that no session supports, and all where the data cannot order policies, are left out.
     """
-    name = surest({str(k): c.gain for k, c in enumerate(found) if c.gain is not None and c.by_posterior and c.supported and c.told})
+    judged = {str(k): c for k, c in enumerate(found) if c.by_posterior and c.supported and c.told and c.policy.retired_reason is None}
+    name = surest({k: c.gain for k, c in judged.items() if c.gain is not None})
     return None if name is None else found[int(name)]
 
 

@@ -32,11 +32,6 @@ class PosteriorGain:
     supported: bool
     told: bool
 
-    @property
-    def standing(self) -> tuple[bool, float]:
-        """Larger is better: policies that no session supports stand last."""
-        return self.supported, self.gain.value
-
 
 def gains_over_cdbs(
     buffer: ReplayBuffer, policies: Mapping[str, Policy], seed: int = 0, report: Report = silent
@@ -59,5 +54,5 @@ def gains_over_cdbs(
 
 
 def preferred(gains: Mapping[str, PosteriorGain]) -> str | None:
-    """Name of the policy with the largest lower bound of its gain; None where no bound of a supported one lies above 0."""
+    """Name of the supported policy with the largest lower bound of its gain; None where none lies above 0, or no order can be told."""
     return surest({name: one.gain for name, one in gains.items() if one.told and one.supported})

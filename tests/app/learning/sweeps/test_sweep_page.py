@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
@@ -178,6 +179,15 @@ def test_where_sessions_cannot_order_policies_nothing_is_preferred(store: Store,
     page = client.get(f"/sweeps/{sweep.id}").text
     assert "These sessions cannot order policies" in page
     assert "largest lower bound" not in page
+
+
+def test_a_retired_policy_has_no_claim_to_replace_cdbs(store: Store, client: TestClient, db: Session) -> None:
+    sweep = store(metrics(9.0, 6.0, 3.0, 0.0), metrics(2.0, 5.0, 1.0, 0.0))
+    assert "rl-0 has the largest lower bound" in client.get(f"/sweeps/{sweep.id}").text
+    policy = db.scalars(select(Policy).where(Policy.name == "rl-0")).one()
+    retired = client.post(f"/participants/P1/policies/{policy.id}/retire", data={"reason": "made somebody dizzy"}, follow_redirects=True)
+    assert retired.status_code == 200
+    assert "rl-1 has the largest lower bound" in client.get(f"/sweeps/{sweep.id}").text
 
 
 def test_gains_by_fitted_q_evaluation_of_older_sweeps_decide_nothing(store: Store, client: TestClient) -> None:
