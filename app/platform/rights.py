@@ -50,7 +50,14 @@ SCHEMAS = ("public", ENGINE_SCHEMA)
 _TABLES = """
 select n.nspname, c.relname, c.relkind::text, coalesce(array_agg(a.privilege_type) filter (where a.grantee = r.oid), '{}')
 from pg_class c join pg_namespace n on n.oid = c.relnamespace cross join pg_roles r left join lateral aclexplode(c.relacl) a on true
-where r.rolname = :role and n.nspname = any(:schemas) and c.relkind in ('r', 'p', 'v', 'S') group by 1, 2, 3 order by 1, 2
+where r.rolname = :role and c.relowner <> r.oid and n.nspname = any(:schemas) and c.relkind in ('r', 'p', 'v', 'S')
+group by 1, 2, 3 order by 1, 2
+"""
+# who may make a trigger of such a function, if only on a temporary table, writes what it likes into the trail
+_WRITERS = """
+select p.oid::regprocedure::text from pg_proc p join pg_namespace n on n.oid = p.pronamespace cross join pg_roles r
+where r.rolname = :role and p.proowner <> r.oid and n.nspname = 'public' and p.prosecdef and p.prorettype = 'trigger'::regtype
+and has_function_privilege(r.oid, p.oid, 'EXECUTE') order by 1
 """
 
 
@@ -70,6 +77,8 @@ def wanted(schema: str, table: str) -> frozenset[str]:
 def grant(connection: Connection, role: str, password: str | None) -> int:
     """Give the role exactly its rights, and make it where it is missing and the owner may. Returns on how many relations they changed.
 
+    What the role itself owns is left alone: the triggers that write the trail run with the owner's rights. `excess` tells of it.
+
     Raises:
         RuntimeError: there is no such role and the owner may not make it.
     """
@@ -84,6 +93,8 @@ def grant(connection: Connection, role: str, password: str | None) -> int:
         connection.exec_driver_sql(f"revoke all on {target} from {name}, public")
         connection.exec_driver_sql(f"grant {', '.join(sorted(rights))} on {target} to {name}")
         changed += 1
+    for function in connection.scalars(text(_WRITERS), {"role": role}).all():
+        connection.exec_driver_sql(f"revoke execute on function {function} from {name}, public")
     if changed:
         database = _quoted(connection, str(connection.scalar(text("select current_database()"))))
         connection.exec_driver_sql(f"grant connect on database {database} to {name}")
@@ -123,8 +134,8 @@ def _ensure_role(connection: Connection, role: str, password: str | None) -> Non
     may = connection.scalar(text("select rolsuper or rolcreaterole from pg_roles where rolname = current_user"))
     if not may:
         raise RuntimeError(f"There is no database role {role}. Have it made: create role {role} login password '...';")
-    secret = "" if password is None else f" password {_literal(connection, password)}"
-    connection.exec_driver_sql(f"create role {_quoted(connection, role)} login{secret}".replace("%", "%%"))
+    secret = "" if password is None else f" password {_literal(connection, password)}".replace("%", "%%")
+    connection.exec_driver_sql(f"create role {_quoted(connection, role)} login{secret}")
 
 
 def _quoted(connection: Connection, name: str) -> str:

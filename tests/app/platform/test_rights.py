@@ -79,6 +79,19 @@ def test_a_temporary_table_does_not_catch_what_the_trail_gets(fresh_database: st
         assert db.scalar(text("select count(*) from public.audit_event")) == before + 1
 
 
+def test_no_trigger_of_the_services_own_writes_the_trail(fresh_database: str) -> None:
+    with new_session() as db:
+        db.execute(text("create temporary table qoc (id int, rating int)"))
+        with pytest.raises(ProgrammingError, match="permission denied for function audit_row"):
+            db.execute(text("create trigger forged after insert on qoc for each row execute function audit_row('', 'id')"))
+
+
+def test_an_owner_who_is_named_as_the_service_keeps_the_rights_that_the_trail_needs(owner_db: Session) -> None:
+    assert rights.grant(owner_db.connection(), "betaloop", None) == 0
+    owner_db.execute(text("insert into study (code, name) values ('S2', 'A second study')"))
+    assert owner_db.scalar(text("select count(*) from audit_event where entity = 'study' and after ->> 'code' = 'S2'")) == 1
+
+
 def test_the_service_has_the_rights_it_needs_and_no_other(client: TestClient, enrolled: str, db: Session) -> None:
     rows = db.execute(
         text(
