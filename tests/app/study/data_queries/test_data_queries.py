@@ -81,6 +81,21 @@ def test_a_controller_is_asked_about_without_telling_it(client: TestClient, sess
     assert asked["entries"][0]["value"] is None
 
 
+def test_a_blinded_assessor_neither_reads_queries_nor_is_led_to_them(
+    client: TestClient, client_as: Callable[[str], TestClient], session_id: int
+) -> None:
+    assert client.post(HOME, json={"session_id": session_id, "field": "controller", "text": "The log says cDBS."}).status_code == 201
+    assert "data-queries" in client.get(f"/sessions/{session_id}").text
+    blinded = client_as("blinded_assessor")
+    assert blinded.get(f"/sessions/{session_id}").status_code == 403
+    visit = client.get(f"/api/v1/sessions/{session_id}").json()["visit_id"]
+    assert client.post(f"/api/v1/visits/{visit}/lock", json={"reason": "data complete"}).status_code == 200
+    page = blinded.get(f"/sessions/{session_id}")
+    assert (page.status_code, "data-queries" in page.text) == (200, False)
+    for closed in (HOME, "/participants/P1/data-queries"):
+        assert blinded.get(closed).status_code == 403
+
+
 def test_the_page_asks_answers_and_closes(client: TestClient, service_app, session_id: int) -> None:  # type: ignore[no-untyped-def]
     with transaction("test") as db:
         accounts.add_user(db, "cora@clinic.example", Role.COORDINATOR, PASSWORD)
