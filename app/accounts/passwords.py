@@ -41,7 +41,7 @@ def weakness(password: str, email: str = "") -> str | None:
     # digits were read as letters where they stand for some; what is left of a year or of an exclamation mark is no word
     kept = [typed for typed, read in zip(folded, _aligned(folded, words), strict=True) if read and typed.isalpha()]
     if len(kept) < _LEAST_REST:
-        return "is made of common words or of the e-mail address"
+        return f"has fewer than {_LEAST_REST} letters that belong neither to a common word nor to the e-mail address"
     return None
 
 

@@ -41,3 +41,8 @@ def test_what_is_guessed_first_is_refused(password: str) -> None:
 )
 def test_what_is_not_is_taken(password: str) -> None:
     assert weakness(password, "ada@clinic.example") is None
+
+
+@pytest.mark.parametrize("password", ["83#05!71%62", "x7#9k!2w@5"])
+def test_few_letters_are_refused_for_what_they_are(password: str) -> None:
+    assert weakness(password) == "has fewer than 4 letters that belong neither to a common word nor to the e-mail address"
