@@ -107,10 +107,12 @@ def change_password(request: Request, db: Db, caller: CurrentCaller, values: For
 
 
 @router.post("/account/second-factor")
-def begin_second_factor(request: Request, db: Db, caller: CurrentCaller) -> Response:
-    """Begin to set up an authenticator app; the page shows its key until a code of it was given."""
+def begin_second_factor(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Begin to set up an authenticator app, with the password; the page shows its key until a code of it was given."""
     caller.require_browser()
     try:
+        # else whoever finds a browser signed in could shut its user out
+        service.confirm_password(_own_id(caller), str(values.get("present", "")))
         second_factor.begin(db, db.get_one(User, _own_id(caller)))
     except BetaloopError as error:
         db.rollback()

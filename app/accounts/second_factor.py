@@ -1,11 +1,12 @@
 """The optional second factor: codes of an authenticator app, and recovery codes that work once each. The caller commits.
 
-The secret is kept encrypted with a key of the data folder, so that a copy of the database alone makes no codes.
+The secret is kept encrypted, and recovery codes are hashed, with a key of the data folder, so that a copy of the database alone gives none.
 """
 
 from __future__ import annotations
 
 import hashlib
+import hmac
 import secrets
 from datetime import UTC, datetime
 
@@ -52,7 +53,7 @@ def confirm(db: Session, user: User, code: str) -> list[str]:
     Raises:
         Invalid: nothing was begun, or the code is wrong.
     """
-    row = db.get(SecondFactor, user.id)
+    row = _locked(db, user.id)
     if row is None or row.confirmed_at is not None:
         raise Invalid("No second factor is being set up.", "Begin again.")
     if not _takes_code(row, code):
@@ -72,7 +73,7 @@ def wanted(db: Session, user_id: int) -> bool:
 
 def accepts(db: Session, user_id: int, code: str) -> bool:
     """Whether a code, or a recovery code, is right; it works this once. True where the user has no second factor."""
-    row = db.get(SecondFactor, user_id, with_for_update=True, populate_existing=True)
+    row = _locked(db, user_id)
     if row is None or row.confirmed_at is None:
         return True
     if _takes_code(row, code):
@@ -99,6 +100,11 @@ def recovery_codes_left(db: Session, user_id: int) -> int:
     return len(row.recovery) if row is not None else 0
 
 
+def _locked(db: Session, user_id: int) -> SecondFactor | None:
+    """The row, held until the transaction ends: of two who give one code at once, one is taken."""
+    return db.get(SecondFactor, user_id, with_for_update=True, populate_existing=True)
+
+
 def _takes_code(row: SecondFactor, code: str) -> bool:
     used = -1 if row.last_used_at is None else totp.step_at(row.last_used_at.timestamp())
     step = totp.matching_step(_secret(row), code, now().timestamp(), used)
@@ -123,4 +129,5 @@ def _key() -> bytes:
 
 
 def _hash(code: str) -> str:
-    return hashlib.sha256(code.encode()).hexdigest()
+    # keyed: short enough to be typed, codes could be guessed from plain hashes
+    return hmac.digest(_key(), code.encode(), hashlib.sha256).hex()

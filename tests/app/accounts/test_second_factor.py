@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import re
 import time
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import pytest
 from fastapi.testclient import TestClient
@@ -15,7 +17,8 @@ from typer.testing import CliRunner
 from app import cli
 from app.accounts import second_factor, service, totp
 from app.accounts.models import Role, User
-from app.platform.errors import Forbidden, Unauthorized
+from app.platform.database import new_session
+from app.platform.errors import Forbidden, Invalid, Unauthorized
 from tests.conftest import PASSWORD
 
 EMAIL = "ada@clinic.example"
@@ -95,12 +98,43 @@ def test_neither_the_database_nor_the_trail_holds_the_secret(db: Session, ada: t
         assert hidden not in kept
 
 
+def test_recovery_codes_cannot_be_guessed_from_a_copy_of_the_database(db: Session, ada: tuple[User, bytes, list[str]]) -> None:
+    _, _, codes = ada
+    kept = db.scalars(text("select jsonb_array_elements_text(recovery) from second_factor")).all()
+    assert len(kept) == second_factor.RECOVERY_CODES
+    assert not {hashlib.sha256(code.encode()).hexdigest() for code in codes} & set(kept)
+
+
+def test_of_two_first_codes_at_once_one_gives_recovery_codes(db: Session) -> None:
+    user = service.add_user(db, EMAIL, Role.CLINICIAN, PASSWORD)
+    code = code_now(second_factor.begin(db, user))
+    db.commit()
+
+    def confirm_beside() -> list[str]:
+        with new_session() as other:
+            codes = second_factor.confirm(other, other.get_one(User, user.id), code)
+            other.commit()
+            return codes
+
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        codes = second_factor.confirm(db, user, code)
+        beside = pool.submit(confirm_beside)
+        wait([beside], timeout=0.5)  # it reads the row, or waits for it
+        db.commit()
+        with pytest.raises(Invalid, match="No second factor is being set up"):
+            beside.result(timeout=60)
+    assert second_factor.accepts(db, user.id, codes[0])
+
+
 def test_the_account_page_sets_it_up_and_removes_it(service_app, db: Session) -> None:  # type: ignore[no-untyped-def]
     user = service.add_user(db, EMAIL, Role.VIEWER, PASSWORD)
     db.commit()
     page = TestClient(service_app)
     assert page.post("/sign-in", data={"email": EMAIL, "password": PASSWORD}, follow_redirects=False).status_code == 303
-    shown = page.post("/account/second-factor").text
+    for wrong in ({}, {"present": "wrong"}):
+        refused = page.post("/account/second-factor", data=wrong)
+        assert (refused.status_code, 'class="secret"' in refused.text) == (403, False)
+    shown = page.post("/account/second-factor", data={"present": PASSWORD}).text
     key = re.search(r'<code class="secret">([A-Z2-7 ]+)</code>', shown)
     assert key is not None
     secret = base64.b32decode(key[1].replace(" ", ""))
