@@ -1,7 +1,8 @@
 """Raw bytes of uploads, which may name a person: in files without a name, encrypted with keys that never leave the memory.
 
 Whoever reads the disk, while the service runs or after it was killed, finds neither a file nor a byte that can be read. Each file has a key
-of its own (AES-256 in counter mode, which decrypts from any place on), drawn when the file is made and forgotten with it.
+of its own (AES-256 in counter mode, which decrypts from any place on), drawn when the file is made and forgotten with it. Where the system
+has no files in memory (it is not Linux), a key lies beside its file as long as that is used (`files.in_memory`).
 """
 
 from __future__ import annotations

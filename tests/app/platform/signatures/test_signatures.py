@@ -55,8 +55,9 @@ def test_a_signature_is_never_changed_and_stands_in_the_audit_trail(db: Session,
     event = db.scalars(select(AuditEvent).where(AuditEvent.entity == "signature")).one()
     assert event.after is not None
     assert (event.after["sha256"], "content" in event.after) == (content_hash(CONTENT), False)
-    for change in ("update signature set content = '{}'", "delete from signature"):
-        with pytest.raises(DBAPIError, match=r"never changed|permission denied"):
+    refused = {"update signature set content = '{}'": "never changed", "delete from signature": "permission denied"}
+    for change, why in refused.items():
+        with pytest.raises(DBAPIError, match=why):
             db.execute(text(change))
         db.rollback()
 
