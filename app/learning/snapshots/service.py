@@ -56,6 +56,7 @@ class Member:
         """Everything of this session that a result depends on."""
         table, s = self.table, self.trajectory
         arm = blinding.arm(self.session, SYSTEM)
+        hours = hours_since_dose(self.session)
         return [
             self.session.id,
             self.session.visit.number,
@@ -69,9 +70,8 @@ class Member:
             table.cdbs_ma if table else None,
             self.left_out,
             _digest(s) if s else None,
-            *(
-                [hours] if (hours := hours_since_dose(self.session)) is not None else []
-            ),  # buffers of before there were doses keep their pins
+            # absent where not known, so that sessions without a dose keep the pins of before hours were pinned
+            *([] if hours is None else [hours]),
         ]
 
     @property
