@@ -17,7 +17,8 @@ class VisitProgress:
 
     Attributes:
         planned: sessions of the plan. held: those that a confirmed session fills.
-        logs_missing: those that none fills although the day is past; 0 before it, and of a visit without a date.
+        logs_missing: those that none fills although the day is past; 0 before it, of a visit without a date, and of a
+            locked one, which takes no data any more.
         tested: those held that ran a policy.
     """
 
@@ -38,6 +39,6 @@ def visit_progress(db: Session, participant_ids: Sequence[int], today: dt.date) 
     found: dict[int, list[VisitProgress]] = {i: [] for i in participant_ids}
     for row in slots.slots_filled(db, participant_ids):
         past = row.date is not None and row.date < today
-        missing = row.slots - row.filled if past else 0
+        missing = row.slots - row.filled if past and not row.locked else 0
         found[row.participant_id].append(VisitProgress(row.visit_id, row.number, row.date, row.slots, row.filled, missing, row.tested))
     return found

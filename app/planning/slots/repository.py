@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
 
-from sqlalchemy import func, select
+from sqlalchemy import false, func, select
 from sqlalchemy.orm import Session
 
 from app.planning.plans.models import Plan, PlanItem
-from app.study.models import StudySession, Visit
+from app.study.models import StudySession, Visit, VisitLock
 
 
 def sessions_of_day(db: Session, visit_id: int) -> Sequence[StudySession]:
@@ -21,7 +21,10 @@ def sessions_of_day(db: Session, visit_id: int) -> Sequence[StudySession]:
 
 @dataclass(frozen=True)
 class Filled:
-    """How many slots of a visit's approved plan a confirmed session fills; `tested`: of those that run a policy."""
+    """How many slots of a visit's approved plan a confirmed session fills.
+
+    `tested`: of those that run a policy. `locked`: whether the visit is.
+    """
 
     participant_id: int
     visit_id: int
@@ -30,6 +33,7 @@ class Filled:
     slots: int
     filled: int
     tested: int
+    locked: bool
 
 
 def slots_filled(db: Session, participant_ids: Sequence[int]) -> list[Filled]:
@@ -37,8 +41,10 @@ def slots_filled(db: Session, participant_ids: Sequence[int]) -> list[Filled]:
     confirmed = StudySession.status == "confirmed"
     filled = func.count(StudySession.id).filter(confirmed)
     tested = func.count(StudySession.id).filter(confirmed & PlanItem.policy_id.is_not(None))
+    newest = select(VisitLock.locked).where(VisitLock.visit_id == Visit.id).order_by(VisitLock.id.desc()).limit(1)
+    locked = func.coalesce(newest.correlate(Visit).scalar_subquery(), false())
     query = (
-        select(Visit.participant_id, Visit.id, Visit.number, Visit.date, func.count(PlanItem.id), filled, tested)
+        select(Visit.participant_id, Visit.id, Visit.number, Visit.date, func.count(PlanItem.id), filled, tested, locked)
         .join(Plan, Plan.visit_id == Visit.id)
         .join(PlanItem, PlanItem.plan_id == Plan.id)
         .outerjoin(StudySession, StudySession.plan_item_id == PlanItem.id)

@@ -29,6 +29,10 @@ def test_logs_are_missing_only_after_the_day_of_the_visit(clinic_day: Any, db: S
     assert f'<a href="/visits/{clinic_day.visit}/slots">Visit 2: 1 of 3 planned sessions held</a>' in home
     db.expire_all()
     assert visit_progress(db, [1], date(2099, 11, 23)) == {1: [VisitProgress(clinic_day.visit, 2, day, 3, 1, 2, 0)]}
+    for change, missing in (("lock", 0), ("unlock", 2)):
+        assert clinic_day.client.post(f"/api/v1/visits/{clinic_day.visit}/{change}", json={"reason": "complete"}).status_code in (200, 201)
+        (found,) = visit_progress(db, [1], date(2099, 11, 23))[1]
+        assert found.logs_missing == missing, "a locked visit takes no logs"
 
 
 def test_the_steps_name_missing_logs_and_go_on_from_policies_that_were_tested() -> None:
