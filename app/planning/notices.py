@@ -25,6 +25,8 @@ class Code(StrEnum):
     DATE_PAST = "date_past"
     ONE_POLICY = "one_policy"
     KEY_REASON_MISSING = "key_reason_missing"
+    OTHER_MEDICATION = "other_medication"
+    """The participant's schedule says otherwise now than when the plan was drafted."""
 
 
 @dataclass(frozen=True)

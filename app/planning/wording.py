@@ -46,6 +46,8 @@ _ABOUT: dict[Code, str] = {
     Code.DATE_PAST: "The visit's date, {date}, is past.",
     Code.ONE_POLICY: "The visit tests a single policy; the protocol tests 2 to 4, each against the others and cDBS of the same day.",
     Code.KEY_REASON_MISSING: "The key was opened in an emergency by {by}; the reason is still missing.",
+    Code.OTHER_MEDICATION: "The participant's medication schedule was changed after this plan was drafted: what is due before its "
+    "sessions is that of the draft. Draft it anew for the present one.",
 }
 
 

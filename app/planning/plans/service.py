@@ -24,14 +24,12 @@ from app.planning.plans.models import Plan, PlanItem
 from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
 from app.planning.plans.schemas import PlanIn, PlanOptions
 from app.planning.plans.sign_off import SignatureState, sign_plan
-from app.planning.plans.view import PlanView, read_plan, refuse_withdrawn, view_of
-from app.planning.protocol.medication import due_before
+from app.planning.plans.view import PlanView, medication_due, read_plan, refuse_withdrawn, view_of
 from app.planning.protocol.orders import Order
 from app.planning.protocol.schedule import Candidate, Rules, schedule
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import service as study
-from app.study.characteristics.service import fields_of
 from app.study.models import Controller, Participant, Visit
 from app.study.sessions.logged import CONTROLLER_OF_KIND
 
@@ -203,9 +201,7 @@ def reorder(db: Session, visit: Visit, position: int, earlier: bool, caller: Cal
 
 def _set_medication(visit: Visit, plan: Plan) -> None:
     """State for each session what is due before it, by the participant's schedule."""
-    lengths = [i.minutes + i.washout_minutes + i.break_minutes for i in plan.items]
-    due = due_before(lengths, plan.starts_at, fields_of(visit.participant.current_characteristics).medication)
-    for item, words in zip(plan.items, due, strict=True):
+    for item, words in zip(plan.items, medication_due(visit, plan), strict=True):
         item.medication = words
 
 

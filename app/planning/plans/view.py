@@ -26,9 +26,11 @@ from app.planning.plans.limits import require_limits
 from app.planning.plans.models import Plan, PlanItem
 from app.planning.plans.sign_off import SignatureState, signature_of
 from app.planning.plans.visits import today
+from app.planning.protocol.medication import due_before
 from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
 from app.platform.signatures.models import Signature
 from app.study import service as study
+from app.study.characteristics.service import fields_of
 from app.study.models import Controller, Participant, Visit
 from ml.ope.estimate import Estimate
 
@@ -87,6 +89,14 @@ def read_plan(db: Session, visit: Visit, caller: Caller) -> PlanView:
             "Choose policies in the ranking and draft one, or post their ids here.",
         )
     return view_of(db, plan, visit)
+
+
+def medication_due(visit: Visit, plan: Plan) -> list[str]:
+    """What is due before each session by the participant's schedule of today, in words; empty where none is, or no time is planned."""
+    if plan.starts_at is None:
+        return [""] * len(plan.items)
+    lengths = [i.minutes + i.washout_minutes + i.break_minutes for i in plan.items]
+    return due_before(lengths, plan.starts_at, fields_of(visit.participant.current_characteristics).medication)
 
 
 def refuse_withdrawn(view: PlanView) -> None:
@@ -211,6 +221,8 @@ def _warnings(
         except BetaloopError as error:
             warnings.append(PlanWarning(Code.CANNOT_BE_SIGNED, values={"why": str(error)}))
     held = repository.session_count(db, visit.id)
+    if not held and medication_due(visit, plan) != [line.item.medication for line in lines]:
+        warnings.append(PlanWarning(Code.OTHER_MEDICATION))
     if held:
         warnings.append(PlanWarning(Code.VISIT_HELD, values={"sessions": held}))
     if plan.status == "draft" and visit.date and visit.date < today():

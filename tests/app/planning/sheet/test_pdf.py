@@ -98,6 +98,7 @@ def test_the_sheet_says_who_the_participant_is_and_when_medication_is_due(client
     assert [bool(d) for d in due] == [True, *(a < 20 <= b for a, b in pairwise(begins))]
     page = unescape(client.get(f"/visits/{studied.visit}/plan", headers={"Accept": "text/html"}).text)
     assert page.count("due before:") == sum(bool(d) for d in due), "who signs reads it, whatever runs"
+    assert "other_medication" not in [w["code"] for w in plan["warnings"]]
     text = " ".join(_sheet(client, studied.visit))
     for words in (
         "Leads: left STN, sensing 0-2, stimulating C+1-",
@@ -106,6 +107,12 @@ def test_the_sheet_says_who_the_participant_is_and_when_medication_is_due(client
         f"due before: {due[0]}",
     ):
         assert words in text, words
+    later = {"version": 1, "characteristics": stated | {"medication": []}, "reason": "changed by the neurologist"}
+    assert client.put("/api/v1/participants/P1/characteristics", json=later).status_code == 200
+    now = client.get(f"/api/v1/visits/{studied.visit}/plan").json()
+    assert [s["medication"] for s in now["sessions"]] == due
+    assert [w["code"] for w in now["warnings"] if w["code"] == "other_medication"] == ["other_medication"]
+    assert "schedule was changed after this plan was drafted" in " ".join(_sheet(client, studied.visit))
 
 
 def test_a_blinded_sheet_has_letters_and_common_limits_and_predicts_nothing(client: TestClient, studied: Any, sign_plan: Any) -> None:
