@@ -19,6 +19,7 @@ from ml.formats.source import InMemory, Source
 from ml.formats.tables.delimited import MOST_TITLES, TextTable
 from ml.formats.tables.mapping.lines import Top, read_rows, read_top
 from ml.formats.tables.mapping.model import AMPLITUDES, SIGNALS, TREMOR_SHARES, TableMapping, header_hash
+from ml.formats.tables.mapping.preview import is_row
 from ml.formats.tables.mapping.stored import MappedTable, decode_table_of, write
 from ml.formats.tables.mapping.times import is_absolute, read_times
 from ml.formats.tables.redact import redact_outcomes
@@ -63,6 +64,7 @@ def redact_mapped(source: Source, target: Path, mapping: TableMapping, key: byte
     """
     top = read_top(source)
     number, names = next((n, cells) for n, cells in _may_be_header(top) if header_hash(cells, key) == mapping.header)
+    _check_passed_over(top, number, mapping)
     used = [c.number - 1 for c in mapping.columns]
     most = options.max_lfp_rows if mapping.holds == "lfp" else options.max_table_rows
     lines, rows = read_rows(source, top, number + mapping.unit_lines, mapping.width, used, most)
@@ -80,6 +82,15 @@ def redact_mapped(source: Source, target: Path, mapping: TableMapping, key: byte
     redaction = redact_outcomes(InMemory(_outcomes(table, mapping).encode()), target, mapping.kind, options)
     redaction.removed.extend(removed)
     return redaction
+
+
+def _check_passed_over(top: Top, names: int, mapping: TableMapping) -> None:
+    """Raises UndecodableFile where the line of names or a line of units is a row, which would be lost without a word."""
+    for number, cells in top.lines:
+        if names <= number <= names + mapping.unit_lines and is_row(cells, mapping.width):
+            what = f"holds measurements, and the column mapping takes it for a line of {'names' if number == names else 'units'}"
+            hint = "State which line names the columns and how many lines of units follow, or put the line of units there."
+            raise UndecodableFile(f"the line {what}", f"line {number}", hint)
 
 
 def _signals(table: TextTable, mapping: TableMapping, options: DecodeOptions) -> MappedTable:

@@ -61,7 +61,7 @@ def preview_of(path: Source, key: bytes) -> dict[str, Any] | None:
     width = max((len(cells) for _, cells in top.lines), default=0)
     if top.is_log or len(top.lines) < 2 or not 1 <= width <= MOST_COLUMNS:
         return None
-    first = next((i for i, (_, cells) in enumerate(top.lines) if _is_row(cells, width)), None)
+    first = next((i for i, (_, cells) in enumerate(top.lines) if is_row(cells, width)), None)
     if first is None or first == 0:
         return None
     units = 1 if first > 1 and _is_units(top.lines[first - 1][1]) else 0
@@ -82,7 +82,7 @@ def preview_of(path: Source, key: bytes) -> dict[str, Any] | None:
     return {"width": width, "lines": lines, "header_line": top.lines[header][0], "unit_lines": units}
 
 
-def _is_row(cells: list[str], width: int) -> bool:
+def is_row(cells: list[str], width: int) -> bool:
     """Whether a line is one of measurements: it has all its cells, and at least half of those that are not empty are numbers or times."""
     filled = [cell for cell in cells if cell.lower() not in MISSING]
     telling = [cell for cell in filled if _number(cell) is not None or _has_date(cell)]

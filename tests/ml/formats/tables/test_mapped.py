@@ -1,4 +1,4 @@
-"""Times of tables that a column mapping reads: a step's begin or end, and the nights in which clocks are changed."""
+"""Tables that a column mapping reads: a step's begin or end, lines that are no rows, nights in which clocks are changed."""
 
 from __future__ import annotations
 
@@ -43,6 +43,22 @@ def test_the_begin_and_the_end_of_steps_put_every_amplitude_to_the_same_step(
     for trace, same in zip(found[0].traces, found[1].traces, strict=True):
         assert trace.t_end_s[0] == same.t_end_s[0] == 2.0
         np.testing.assert_array_equal(trace.values, same.values)
+
+
+def test_a_row_is_never_passed_over_as_a_line_of_units_or_of_names(tmp_path: Path) -> None:
+    rows = [f"{2 * k};{k};0.5" for k in range(1, 12)]
+    for mapping, lines, where in (
+        (replace(STEPS, unit_lines=1), [";".join(NAMES), *rows], "line 2"),
+        (replace(STEPS, header=header_hash(rows[0].split(";"), KEY)), [";".join(NAMES), *rows], "line 2"),
+    ):
+        with pytest.raises(UndecodableFile, match="holds measurements") as refused:
+            redact_mapped(InMemory("\n".join(lines).encode()), tmp_path / "t", mapping, KEY, DecodeOptions())
+        assert refused.value.where == where
+    assert not (tmp_path / "t").exists()
+    units = "\n".join([";".join(NAMES), "s;uV;mA", *rows]).encode()
+    redact_mapped(InMemory(units), tmp_path / "t", replace(STEPS, unit_lines=1), KEY, DecodeOptions())
+    (recording,) = decode_mapped(tmp_path / "t", DecodeOptions()).recordings
+    assert recording.traces[0].values.size == 11
 
 
 @pytest.mark.parametrize("cell", ["25.10.2026 02:30:00", "29.03.2026 02:30:00"])
