@@ -66,15 +66,12 @@ def preview_of(path: Source, key: bytes) -> dict[str, Any] | None:
         return None
     units = 1 if first > 1 and _is_units(top.lines[first - 1][1]) else 0
     header = first - 1 - units
-    shown = [_numbers_shown(top, column, first) for column in range(width)]
     named = top.lines[header][1]
+    shown = [_numbers_shown(top, column, first, named[column] if column < len(named) else "") for column in range(width)]
     lines = [
         {
             "number": number,
-            "cells": [
-                _cell(cell, i < first and len(cells) == width, i >= first and shown[j] and not (j < len(named) and is_personal(named[j])))
-                for j, cell in enumerate(cells)
-            ],
+            "cells": [_cell(cell, i < first and len(cells) == width, i >= first and shown[j]) for j, cell in enumerate(cells)],
             "header": header_hash(cells, key) if number <= MOST_TITLES + 1 and len(cells) == width else None,
         }
         for i, (number, cells) in enumerate(top.lines[: first + MOST_SHOWN])
@@ -107,13 +104,19 @@ def _number(cell: str) -> float | None:
     return None
 
 
-def _numbers_shown(top: Top, column: int, first: int) -> bool:
-    """Whether the numbers of a column are measurements: some, not all one whole number, which may name a person."""
+def _numbers_shown(top: Top, column: int, first: int, name: str) -> bool:
+    """Whether the numbers of a column are measurements, and none that may name a person.
+
+    Those are whole numbers from 100 on: all one, or in a column whose name has no word of the field.
+    """
+    if is_personal(name):
+        return False
     cells = [cells[column] for _, cells in top.lines[first:] if column < len(cells) and cells[column]]
     found = [n for cell in cells if (n := _number(cell)) is not None]
     if len(found) < LEAST_NUMBERS or 2 * len(found) < len(cells):
         return False
-    return len(set(found)) > 1 or abs(found[0]) < 100 or found[0] != int(found[0])
+    whole = all(n == int(n) for n in found)
+    return not whole or max(map(abs, found)) < 100 or (len(set(found)) > 1 and _has_known_word(name))
 
 
 def _cell(cell: str, names: bool, measured: bool) -> str:
@@ -132,11 +135,19 @@ def _cell(cell: str, names: bool, measured: bool) -> str:
 
 def _words(text: str) -> str:
     """Words of the field and marks; other words as `…`, digits as `#` but single ones, such as those of contacts, beside such a word."""
-    whole = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", text)
-    known = any(len(w) > 1 and w.lower() in WORDS for w in _WORD.findall(whole))
-    out = re.sub(_WORD, lambda w: w[0] if w[0].lower() in WORDS or known_unit(w[0]) else HIDDEN, whole)
-    single = known and not re.search(r"\d{2}|\d[./-]\d[./-]\d", out)
+    out = re.sub(_WORD, lambda w: w[0] if w[0].lower() in WORDS or known_unit(w[0]) else HIDDEN, _apart(text))
+    single = _has_known_word(text) and not re.search(r"\d{2}|\d[./-]\d[./-]\d", out)
     return _tidy(out if single else re.sub(r"\d", "#", out))
+
+
+def _has_known_word(text: str) -> bool:
+    """Whether a text has a word of the field of two letters or more."""
+    return any(len(w) > 1 and w.lower() in WORDS for w in _WORD.findall(_apart(text)))
+
+
+def _apart(text: str) -> str:
+    """A text with a blank between the words of `likeThis`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", text)
 
 
 def _tidy(text: str) -> str:

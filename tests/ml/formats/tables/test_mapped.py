@@ -12,7 +12,7 @@ from ml.formats.options import DecodeOptions
 from ml.formats.recording import UndecodableFile
 from ml.formats.source import InMemory
 from ml.formats.tables.delimited import TextTable
-from ml.formats.tables.mapping import MappedColumn, TableMapping, decode_mapped, redact_mapped
+from ml.formats.tables.mapping import MappedColumn, TableMapping, decode_mapped, preview_of, redact_mapped
 from ml.formats.tables.mapping.model import header_hash
 from ml.formats.tables.mapping.times import read_times
 
@@ -74,3 +74,10 @@ def test_times_before_and_after_clocks_are_changed_and_those_with_an_offset_are_
     assert np.diff(night).tolist() == [7201], "the hour from 2 to 3 is there twice"
     iso = replace(DATES, time_format="iso")
     assert np.diff(times(iso, "2026-10-25 02:30:00+02:00", "2026-10-25 02:30:00+01:00")).tolist() == [3600]
+
+
+def test_whole_numbers_that_may_name_a_person_are_not_shown() -> None:
+    rows = "".join(f"{2 * k};{700 + k};{8100 + k};{1950 + k % 2};4711;{k + 0.5}\n" for k in range(1, 9))
+    shown = preview_of(InMemory(("time;left counts;FallNr;geb;sample;x7\n" + rows).encode()), KEY)
+    assert shown is not None
+    assert shown["lines"][1]["cells"] == ["2", "701", "####", "####", "####", "1.5"]
