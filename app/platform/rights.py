@@ -122,7 +122,9 @@ def excess(connection: Connection) -> list[str]:
     )
     if owned:
         found.append(f"owns {owned} tables and sequences, or may become their owner")
-    rights = text("select has_table_privilege(c.oid, 'UPDATE, DELETE, TRUNCATE') from pg_class c where c.oid = to_regclass('audit_event')")
+    rights = text(
+        "select has_table_privilege(c.oid, 'INSERT, UPDATE, DELETE, TRUNCATE') from pg_class c where c.oid = to_regclass('audit_event')"
+    )
     if connection.scalar(rights):
         found.append("may change the audit trail")
     return found

@@ -117,6 +117,12 @@ def test_a_role_that_owns_the_tables_is_found(fresh_database: str, monkeypatch: 
     assert "may change the audit trail" in found.detail
 
 
+def test_a_right_to_add_rows_to_the_trail_is_found(owner_db: Session, db: Session) -> None:
+    owner_db.execute(text("grant insert on audit_event to public"))
+    owner_db.commit()
+    assert rights.excess(db.connection()) == ["may change the audit trail"]
+
+
 def test_the_service_alone_cannot_migrate_and_says_what_to_do(
     fresh_database: str, owner_db: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
