@@ -49,6 +49,8 @@ lock: ## Pin the installed packages in requirements.lock.
 
 bench: install ## Run every benchmark in its quick form.
 	@for script in benchmarks/*.py; do echo "== $$script"; OMP_NUM_THREADS=1 $(BIN)/python $$script --quick || exit 1; done
+	@for script in benchmarks/development/*.py; do tool=benchmarks.development.$$(basename $$script .py); \
+	  echo "== $$tool"; OMP_NUM_THREADS=1 $(BIN)/python -m $$tool --quick || exit 1; done
 
 clean: ## Remove the demo's data and everything made here (not the code).
 	rm -rf $(VENV) var build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

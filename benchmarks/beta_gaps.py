@@ -21,8 +21,8 @@ import argparse
 import json
 
 import numpy as np
+from support.gaps import OPTIONS, PERIOD, Rule, recording, scored
 
-from benchmarks.support.gaps import OPTIONS, PERIOD, Rule, recording, scored
 from ml.trajectories import SessionTrajectory
 
 LIMITS = (0.5, 0.6, 0.69, OPTIONS.min_valid_fraction, 0.8)

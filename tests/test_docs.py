@@ -18,7 +18,7 @@ from app.main import create_app
 from app.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 CODE_FOLDERS = ("app", "ml", "tests", "benchmarks", "migrations", "static", "docs", ".ci")
 SUFFIXES = ("py", "md", "toml", "yml", "ini", "lock", "svg")
 METHOD = r"(GET|POST|PUT|PATCH|DELETE)"
@@ -210,7 +210,7 @@ def wrong_files(markdown: str) -> list[str]:
                 found.append(f"line {code.number}: no file {path}")
             elif name and not any(defines(f.read_text(), name) for f in files if f.is_file()):
                 found.append(f"line {code.number}: {path} has no {name}")
-        for module in re.findall(r"(?<![\w./])((?:app|ml)(?:\.[a-z_]\w*)+)(?!\w)", code.text):
+        for module in re.findall(r"(?<![\w./])((?:app|ml|benchmarks)(?:\.[a-z_]\w*)+)(?!\w)", code.text):
             if not is_module(module) and not (ROOT / module.replace(".py", "")).exists():
                 found.append(f"line {code.number}: no module {module}")
     return found
@@ -237,14 +237,15 @@ def is_module(dotted: str) -> bool:
 def wrong_options(markdown: str) -> list[str]:
     """Options of benchmarks that the script does not know, and options named alone that nothing has."""
     found = []
-    scripts = "".join(p.read_text() for p in (ROOT / "benchmarks").glob("*.py"))
+    scripts = "".join(p.read_text() for p in (ROOT / "benchmarks").rglob("*.py"))
     for code in pieces(markdown):
         alone = re.findall(r"(?<![\w-])--[a-z][a-z-]*", code.text) if code.text.startswith("--") else []
         found += [f"line {code.number}: no option {o}" for o in alone if o not in every_option() and f'"{o}"' not in scripts]
-        script = re.search(r"(benchmarks/\w+\.py)(.*)", code.text)
-        source = (ROOT / script[1]).read_text() if script and (ROOT / script[1]).exists() else ""
-        missing = [o for o in re.findall(r"(?<![\w-])--[a-z][a-z-]*", script[2] if script else "") if source and f'"{o}"' not in source]
-        found += [f"line {code.number}: {script[1] if script else ''} has no {option}" for option in missing]
+        if script := re.search(r"(benchmarks/[\w/]+\.py|-m benchmarks\.[\w.]+)(.*)", code.text):
+            file = ROOT / (script[1] if "/" in script[1] else script[1].removeprefix("-m ").replace(".", "/") + ".py")
+            source = file.read_text() if file.exists() else ""
+            missing = [o for o in re.findall(r"(?<![\w-])--[a-z][a-z-]*", script[2]) if source and f'"{o}"' not in source]
+            found += [f"line {code.number}: {script[1]} has no {option}" for option in missing]
     return found
 
 
@@ -280,6 +281,11 @@ def test_what_a_document_names_exists(document: Path) -> None:
     assert wrong(document.read_text(), document) == []
 
 
+def test_every_picture_is_shown_by_a_document() -> None:
+    shown = {(d.parent / target).resolve() for d in DOCUMENTS for target in re.findall(r"!\[[^\]]*\]\(([^)\s]+)\)", d.read_text())}
+    assert {p for p in (ROOT / "docs").rglob("*") if p.is_file() and p.suffix != ".md"} <= shown
+
+
 @pytest.mark.parametrize(
     ("markdown", "says"),
     [
@@ -298,6 +304,8 @@ def test_what_a_document_names_exists(document: Path) -> None:
         ("`ml/mdp.py: no_such_name`", "ml/mdp.py has no no_such_name"),
         ("`ml.nothing.at_all`", "no module ml.nothing.at_all"),
         ("`python benchmarks/ope.py --warp 9`", "benchmarks/ope.py has no --warp"),
+        ("`python -m benchmarks.development.portfolio --warp 9`", "-m benchmarks.development.portfolio has no --warp"),
+        ("`python -m benchmarks.portfolio`", "no module benchmarks.portfolio"),
         ("`betaloop control` with `--warp`", "no option --warp"),
         ("[x](nothing.md)", "no file nothing.md"),
         ("[x](README.md#no-such-heading)", "no heading README.md#no-such-heading"),

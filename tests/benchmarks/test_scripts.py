@@ -1,4 +1,5 @@
-"""What `make bench` runs: every file in `benchmarks/` is a script that knows `--quick`; what scripts share lies in `benchmarks/support`."""
+"""What `make bench` runs: every file in `benchmarks/` and `benchmarks/development/` is a script that knows `--quick`; what scripts share
+lies in `benchmarks/support`."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SCRIPTS = sorted((ROOT / "benchmarks").glob("*.py"))
+SCRIPTS = sorted([*(ROOT / "benchmarks").glob("*.py"), *(ROOT / "benchmarks" / "development").glob("*.py")])
 
 
 def options(source: str) -> set[str]:
@@ -32,9 +33,34 @@ def test_what_scripts_share_is_no_script() -> None:
     assert shared == []
 
 
-@pytest.mark.parametrize("script", ["ope", "population", "dlsm_selection"])
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.name)
+def test_a_script_imports_only_what_is_there_when_it_is_called(script: Path) -> None:
+    """A script finds `support` beside it; a module of `benchmarks.development` is called from the root, and finds `benchmarks` there."""
+    tree = ast.parse(script.read_text())
+    modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
+    shared = {m for m in modules if m.split(".")[0] in ("support", "benchmarks")}
+    prefix = "benchmarks.support." if script.parent.name == "development" else "support."
+    assert all(m.startswith(prefix) for m in shared), shared
+    assert all((ROOT / "benchmarks" / "support" / f"{m.removeprefix(prefix)}.py").exists() for m in shared)
+
+
+@pytest.mark.parametrize("script", ["ope", "population", "beta_gaps"])
 def test_a_script_finds_what_it_shares_wherever_it_is_called_from(script: str, tmp_path: Path) -> None:
-    called = [sys.executable, str(ROOT / "benchmarks" / f"{script}.py"), "--help"]
-    found = subprocess.run(called, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=100)
+    # app and ml alone are on the path, as where betaloop is installed: the root itself would hide an import that needs it
+    path = tmp_path / "path"
+    path.mkdir()
+    for package in ("app", "ml"):
+        (path / package).symlink_to(ROOT / package)
+    assert_shows_its_options([str(ROOT / "benchmarks" / f"{script}.py")], tmp_path, str(path))
+
+
+def test_a_tool_of_development_is_a_module_of_the_root() -> None:
+    assert_shows_its_options(["-m", "benchmarks.development.dlsm_selection"], ROOT, "")
+
+
+def assert_shows_its_options(called: list[str], folder: Path, path: str) -> None:
+    """Call a script with `--help` in a folder, with these folders alone on the path of modules."""
+    environment = {"PYTHONPATH": path}
+    found = subprocess.run([sys.executable, *called, "--help"], cwd=folder, env=environment, capture_output=True, text=True, timeout=100)
     assert found.returncode == 0, found.stderr
     assert "--quick" in found.stdout

@@ -271,7 +271,7 @@ def _page(
     events, origin = _control_events(session, recordings)
     page = render(
         request,
-        "study/session.html",
+        "study/sessions/session.html",
         session=session,
         visit=session.visit,
         participant=participant,

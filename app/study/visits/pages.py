@@ -48,7 +48,9 @@ def visits(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
     days = [(v, [(s, visible_arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in rows]
     may_write = may(caller, can.WRITE_STUDY, participant)
     waiting = repository.proposals_of_participant(db, participant.id)
-    return HTMLResponse(render(request, "study/visits.html", participant=participant, days=days, waiting=waiting, may_write=may_write))
+    return HTMLResponse(
+        render(request, "study/visits/visits.html", participant=participant, days=days, waiting=waiting, may_write=may_write)
+    )
 
 
 @router.get("/participants/{code}/visits/new")
@@ -132,7 +134,7 @@ def shown_visit(
     seen = form.texts(visit)
     page = render(
         request,
-        "study/visit.html",
+        "study/visits/visit.html",
         visit=visit,
         participant=visit.participant,
         rows=[_session_row(db, s, caller) for s in sessions],
@@ -157,7 +159,7 @@ def _blinded_page(request: Request, db: Session, visit: Visit, caller: Caller) -
     sessions, _ = repository.sessions_of_visit(db, visit.id)
     may_rate = may(caller, can.WRITE_QOC, visit.participant)
     return HTMLResponse(
-        render(request, "study/visit_blinded.html", visit=visit, participant=visit.participant, sessions=sessions, may_rate=may_rate)
+        render(request, "study/visits/visit_blinded.html", visit=visit, participant=visit.participant, sessions=sessions, may_rate=may_rate)
     )
 
 
@@ -177,5 +179,6 @@ def _visit_form(request: Request, participant: Participant, draft: dict[str, str
     problem = error.problem(request.url.path) if error else None
     values = {"cdbs_left": "", "cdbs_right": "", "number": "", "date": "", "note": ""} | draft
     return HTMLResponse(
-        render(request, "study/visit_new.html", participant=participant, draft=values, problem=problem), error.status if error else 200
+        render(request, "study/visits/visit_new.html", participant=participant, draft=values, problem=problem),
+        error.status if error else 200,
     )

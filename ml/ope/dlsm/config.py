@@ -2,10 +2,10 @@
 
 How the defaults came about: sizes and training (latent 8, hidden 24, 150 steps at 6e-3) were first set by looking at known returns on one
 simulator outside the cohort (`hidden` of the tests). They and the objective were then compared by held-out free-running prediction alone
-(`benchmarks/dlsm_selection.py`, table in docs/history.md): smaller, shorter and longer trained models predicted worse on average, larger
-ones alike at twice the cost. No objective was best on every data set; `sum` had the least mean and the least bad worst score, by less than
-the scatter, and a choice per data set (`select`) did no better on sessions that had not made it. Known returns were looked at after that
-and changed nothing, though `free_running` was a little better by them.
+(`benchmarks/development/dlsm_selection.py`, table in docs/history.md): smaller, shorter and longer trained models predicted worse on
+average, larger ones alike at twice the cost. No objective was best on every data set; `sum` had the least mean and the least bad worst
+score, by less than the scatter, and a choice per data set (`select`) did no better on sessions that had not made it. Known returns were
+looked at after that and changed nothing, though `free_running` was a little better by them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How well end-of-session outcomes are predicted, dynamics apart: the outcome model is given true sessions of each policy.
 
-    python benchmarks/outcomes.py                   every second world of part A, both designs
-    python benchmarks/outcomes.py --participants    the four detailed participants: three visits, and all visits of six data seeds
+    python -m benchmarks.development.outcomes                  every second world of part A, both designs
+    python -m benchmarks.development.outcomes --participants   the four detailed participants: three visits, all visits of six data seeds
 
 A model that is fitted to the data sees beta and amplitudes of simulated sessions of the candidates on new days and predicts their mean
 outcomes, which are known. Left-out visits are sessions of the data; beside them stand the mean of the other visits and that of the very
@@ -18,10 +18,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from support.ope_policies import fixed_policies
-from support.simulators import VISITS
-from support.simulators import WORLDS as SIMULATORS
 
+from benchmarks.support.ope_policies import fixed_policies
+from benchmarks.support.simulators import VISITS
+from benchmarks.support.simulators import WORLDS as SIMULATORS
 from ml.mdp import MdpSettings
 from ml.ope.compare.metrics import spearman
 from ml.ope.outcomes.minutes import by_minute

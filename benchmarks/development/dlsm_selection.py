@@ -1,8 +1,8 @@
 """The DLSM's settings compared by held-out free-running prediction on several data sets; then, with --truth, against known returns.
 
-    python benchmarks/dlsm_selection.py --quick
-    python benchmarks/dlsm_selection.py --out FOLDER [--data hidden,P1] [--candidates sum,posterior] [--minutes 30]
-    python benchmarks/dlsm_selection.py --out FOLDER --truth
+    python -m benchmarks.development.dlsm_selection --quick
+    python -m benchmarks.development.dlsm_selection --out FOLDER [--data hidden,P1] [--candidates sum,posterior] [--minutes 30]
+    python -m benchmarks.development.dlsm_selection --out FOLDER --truth
 
 The first table holds shares of a constant's error (`ml/ope/dlsm/held_out.py: Shares`); it is what a default is chosen by. Known returns are
 computed only with --truth, in a second table, for what has been chosen. Finished cells are lines of FOLDER/selection.jsonl; a run that is
@@ -24,9 +24,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from support.cells import Cells
-from support.simulators import STEPS, VISITS, WORLDS
 
+from benchmarks.support.cells import Cells
+from benchmarks.support.simulators import STEPS, VISITS, WORLDS
 from ml.ope.compare.metrics import accuracy
 from ml.ope.dlsm.batches import make_batch
 from ml.ope.dlsm.config import DlsmConfig
@@ -61,7 +61,7 @@ PARTS = ("beta", "head", "known", "outcomes", "contrast")
 
 def small_simulators() -> Any:
     """The two simulators of the tests."""
-    path = Path(__file__).parents[1] / "tests" / "ml" / "ope" / "conftest.py"
+    path = Path(__file__).parents[2] / "tests" / "ml" / "ope" / "conftest.py"
     spec = importlib.util.spec_from_file_location("ope_test_simulators", path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} is not there")

@@ -1,7 +1,7 @@
 """Where the posterior's order of candidates is lost: in the step returns, in r_end, or in the days of the data.
 
-    python benchmarks/posterior_parts.py --quick              two worlds of part A
-    python benchmarks/posterior_parts.py --worlds 24 --out FOLDER
+    python -m benchmarks.development.posterior_parts --quick              two worlds of part A
+    python -m benchmarks.development.posterior_parts --worlds 24 --out FOLDER
 
 Of each world and design it replaces one part of the estimate by what is true: the return of the steps, or r_end on new days. `true
 sessions` gives the fitted outcome model the true sessions of every candidate on the days of the data, so that nothing but the model of
@@ -21,10 +21,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from support.cells import Cells
-from support.ope_cases import DESIGNS, STEPS, Case, virtual_case
-from support.worlds_figure import draw_worlds
 
+from benchmarks.support.cells import Cells
+from benchmarks.support.ope_cases import DESIGNS, STEPS, Case, virtual_case
+from benchmarks.support.worlds_figure import draw_worlds
 from ml.ope.compare.metrics import spearman
 from ml.ope.outcomes.minutes import Minutes, by_minute, of_buffer
 from ml.ope.outcomes.model import EndModel

@@ -1,6 +1,6 @@
 """What gaps in beta, and imputed betas in states, cost a learner: the cohort's sessions with the gaps of a real recording.
 
-    python benchmarks/beta_gaps_learning.py [--updates N] [--seeds N] [--sessions N] [--quick]
+    python -m benchmarks.development.beta_gaps_learning [--updates N] [--seeds N] [--sessions N] [--quick]
 
 Each synthetic participant's sessions (four random, one of cDBS, one without DBS, as at a first visit) get the gaps of the montage
 recording with packet loss, in patterns drawn per session, and on the rows that stay the errors that such gaps make

@@ -1,8 +1,8 @@
 """Which policies three visits find: the portfolio of the posterior against rankings by single methods and against chance.
 
-    python benchmarks/portfolio.py --quick                    two worlds of part A
-    python benchmarks/portfolio.py --worlds 40 --out FOLDER   40 worlds; resumable
-    python benchmarks/portfolio.py --dlsm ...                 the order of the DLSM too, which costs a minute per world
+    python -m benchmarks.development.portfolio --quick                    two worlds of part A
+    python -m benchmarks.development.portfolio --worlds 40 --out FOLDER   40 worlds; resumable
+    python -m benchmarks.development.portfolio --dlsm ...                 the order of the DLSM too, which costs a minute per world
 
 Every virtual patient has three visits of data by the stratified design. Three more visits test up to four policies each: 60 minutes, two
 cDBS sessions and four others of ten minutes. `portfolio` is what the plan's page suggests: verdicts are respected, and tested sessions move
@@ -26,10 +26,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from support.cells import Cells
-from support.looks import look
-from support.ope_cases import CDBS, STEPS, virtual_case
 
+from benchmarks.support.cells import Cells
+from benchmarks.support.looks import look
+from benchmarks.support.ope_cases import CDBS, STEPS, virtual_case
 from ml.mdp import step_reward
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.estimator import FittedPosterior, build
@@ -179,7 +179,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder of the finished worlds; a temporary one by default")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    look("A", " ".join(["portfolio.py", *sys.argv[1:]]), None)
+    look("A", " ".join(["portfolio", *sys.argv[1:]]), None)
     out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-portfolio-"))
     out.mkdir(parents=True, exist_ok=True)
     cells = Cells(out / f"portfolio{'-quick' if chosen.quick else ''}{'-dlsm' if chosen.dlsm else ''}.jsonl")
