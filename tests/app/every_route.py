@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
+from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 
 from app.accounts import service as accounts
@@ -34,6 +35,15 @@ RATED = {
     "uuid": "0b6e2a8c-6f43-4c58-9d3a-2f1a7f4f0c11", "kind": "rating", "payload": {"value": 7}, "device_time": "2026-11-22T10:00:00Z",
 }  # fmt: skip
 PASSWORD = "a password of the test"
+
+
+METHODS = ("get", "post", "put", "patch", "delete")
+
+
+def routes(app: Any) -> list[tuple[str, str]]:
+    """(method, path) of every route of the REST interface, as the service has them, but its own description."""
+    found = [(m.lower(), c.path) for c in iter_route_contexts(app.routes) if c.path for m in sorted(getattr(c, "methods", None) or ())]
+    return [(m, p) for m, p in found if m in METHODS and p.startswith(("/api/", "/healthz", "/readyz")) and p != app.openapi_url]
 
 
 def token_of(role: str, study: str | None = None, name: str | None = None) -> str:
