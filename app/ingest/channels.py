@@ -1,15 +1,13 @@
-"""Which channel a controller is taken to have seen: by the target of its lead and by its contacts, before the number of its valid steps."""
+"""Which channel a controller is taken to have seen: by the target of its lead, by its contacts, and by how much it can teach."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from app.study.models import Hemisphere, Recording, Trace
-from app.study.traces import unpack
+from app.study.models import Hemisphere, Recording, SettingsVersion, Trace
+from app.study.sessions.usable_steps import CONTROL_STREAMS, Worth, worth_of
 
 STIMULATED = ("STN", "GPi")
 """Targets whose beta follows the stimulation of Parkinson's disease; other deep targets come after them."""
@@ -17,6 +15,10 @@ CORTEX = ("M1", "S1", "PMC", "SMA", "PFC", "OFC", "ACC")
 _PAIR = re.compile(r"\+(\d+)-(\d+)")
 SURVEY_MONTAGES = 3
 """So many sets of sensing contacts within one recording are a survey of montages: a controller keeps the one it was trained on."""
+
+
+LITTLE = 0.5
+"""A channel with less than this share of the usable steps of another channel of its target is not taken for its contacts."""
 
 
 @dataclass(frozen=True)
@@ -64,20 +66,47 @@ def _contacts_of_key(settings: dict[str, object], key: int | None) -> str:
     return pairs.pop() if len(pairs) == 1 else ""
 
 
-def choose(candidates: Sequence[Trace], recording: Recording, side: Hemisphere | None) -> Trace | None:
+def of_part(
+    traces: Sequence[Trace], recording: Recording, settings: SettingsVersion, part_s: tuple[float, float], side: Hemisphere | None
+) -> Trace | None:
+    """The channel that a controller is taken to have seen in a part of a recording: of the participant's source where there is one.
+
+    Args:
+        traces: of the recording.
+        settings: of the participant.
+        part_s: begin and end within the recording, s.
+        side: the stated one; None: the recording's own.
+    """
+    candidates = [t for stream in CONTROL_STREAMS for t in traces if t.stream == stream and any(t.valid_bits)]
+    wanted = [t for t in candidates if t.source == settings.beta_source] or [t for t in candidates if t.stream == candidates[0].stream]
+    return choose(wanted, recording, side or recording.hemisphere, lambda trace: worth_of(trace, settings, *part_s))
+
+
+def choose(candidates: Sequence[Trace], recording: Recording, side: Hemisphere | None, worth: Callable[[Trace], Worth]) -> Trace | None:
     """The channel that a controller is taken to have seen, of those of one kind.
 
-    Not one contact against itself, not of the other side, of a deep target before one that is not known and that before cortex, around the
-    stimulating contact before beside it and that before with it; of equals the one with the most valid steps, then the first.
+    Not one contact against itself, not of the other side, of a deep target before one that is not known and that before cortex. Of one
+    target those that teach little (`LITTLE`) come last; then around the stimulating contact before beside it and that before with it; of
+    equals the one with the most usable steps, then the most valid ones, then the first.
     """
     cathodes = _cathodes(recording)
+    places = {id(trace): place_of(trace, recording) for trace in candidates}
+    worths = {id(trace): worth(trace) for trace in candidates}
 
-    def rank(trace: Trace) -> tuple[bool, bool, int, int, int]:
-        place = place_of(trace, recording)
+    def target(trace: Trace) -> tuple[bool, bool, int]:
+        place = places[id(trace)]
         other_side = side is not None and place.lead.split()[:1] in (["left"], ["right"]) and place.lead.split()[0] != side
-        return (place.shorted, other_side, _of_target(place.target), _of_contacts(place, cathodes), -int(np.sum(~np.isnan(unpack(trace)))))
+        return place.shorted, other_side, _of_target(place.target)
 
-    return min(candidates, key=rank, default=None)
+    best = min(map(target, candidates), default=None)
+    of_target = [trace for trace in candidates if target(trace) == best]
+    most = max((worths[id(trace)].usable for trace in of_target), default=0)
+
+    def rank(trace: Trace) -> tuple[bool, int, int, int]:
+        own = worths[id(trace)]
+        return own.usable < LITTLE * most, _of_contacts(places[id(trace)], cathodes), -own.usable, -own.valid
+
+    return min(of_target, key=rank, default=None)
 
 
 def _of_target(target: str) -> int:

@@ -102,19 +102,26 @@ def place(db: Session, participant: Participant, recordings: Sequence[Recording]
     A stated start counts where it lies within the recording: a recording's own clock is never overruled, but the notes say so.
     """
     settings = participant.current_settings
-    choices = [(_control(study.traces_of_recording(db, r.id), settings.beta_source, r, stated.hemisphere), r) for r in recordings]
+    choices = []
+    for r in recordings:
+        part_s = (offset_s(r, _start(stated, r, alone), settings.period_s), r.duration_s)
+        choices.append((channels.of_part(study.traces_of_recording(db, r.id), r, settings, part_s, stated.hemisphere), r))
     # the stated side first, then recordings that a controller could have seen
     choices.sort(key=lambda c: (stated.hemisphere is not None and c[1].hemisphere != stated.hemisphere, c[0] is None))
     trace, control = choices[0]
-    started_at = control.started_at
-    if stated.started_at is not None and _inside(stated.started_at, control) and (alone or control.started_at is not None):
-        started_at = stated.started_at
+    started_at = _start(stated, control, alone)
     start_s = offset_s(control, started_at, settings.period_s)
     stream, channel = (trace.stream, trace.channel) if trace else (CONTROL_STREAMS[0], None)
     placement = Placement(control, list(recordings), start_s, control.duration_s, started_at, stream, channel)
     if stated.started_at is not None and started_at is not stated.started_at:
         placement.notes.append(_start_refused(stated.started_at, control))
     return placement
+
+
+def _start(stated: StatedSession, recording: Recording, alone: bool) -> datetime | None:
+    """When a session of a recording begins: as stated where that lies within the recording, else with the recording."""
+    counts = stated.started_at is not None and _inside(stated.started_at, recording) and (alone or recording.started_at is not None)
+    return stated.started_at if counts else recording.started_at
 
 
 def _start_refused(stated: datetime, control: Recording) -> str:
@@ -129,16 +136,6 @@ def _start_refused(stated: datetime, control: Recording) -> str:
 
 def _inside(moment: datetime, recording: Recording) -> bool:
     return recording.started_at is None or 0 <= (moment - recording.started_at).total_seconds() < recording.duration_s
-
-
-def _control(traces: Sequence[Trace], wanted_source: str | None, recording: Recording, side: Hemisphere | None) -> Trace | None:
-    """The trace that the controller is taken to have seen: of the participant's source where there is one, else of the first stream.
-
-    Of several channels by target and montage, as `app.ingest.channels.choose`.
-    """
-    candidates = [t for stream in CONTROL_STREAMS for t in traces if t.stream == stream and any(t.valid_bits)]
-    wanted = [t for t in candidates if t.source == wanted_source] or [t for t in candidates if t.stream == candidates[0].stream]
-    return channels.choose(wanted, recording, side or recording.hemisphere)
 
 
 def offset_s(recording: Recording, started_at: datetime | None, period_s: float) -> float:

@@ -89,9 +89,17 @@ def _channel(facts: Mapping[str, Any]) -> str:
     name = f"{facts['stream'].replace('_', ' ')} {facts['channel']}".strip()
     lead = facts["lead"]
     said = f"{name} of the {lead}" if lead else f"{name}, whose target the recording does not tell"
+    said += f", with {_steps(facts)}" if _steps(facts) else ""
     why = {"shorted": "one contact against itself"}
-    passed = [f"{p['channel']} ({why.get(p['why'], p['why'])})" for p in facts["passed"] if p["why"]]
-    return f"{said}; not {', '.join(passed)}" if passed else said
+    passed = [(p["channel"], ", ".join(filter(None, (why.get(p["why"], p["why"]), _steps(p))))) for p in facts["passed"]]
+    named = [f"{channel} ({reason})" for channel, reason in passed if reason]
+    return f"{said}; not {', '.join(named)}" if named else said
+
+
+def _steps(facts: Mapping[str, Any]) -> str:
+    """Usable steps of a channel; empty in evidence that does not tell them."""
+    usable = facts.get("usable")
+    return "" if usable is None else f"{usable} usable step{'' if usable == 1 else 's'}"
 
 
 def _program(facts: Mapping[str, Any]) -> str:

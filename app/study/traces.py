@@ -167,6 +167,18 @@ def shown_table(
     return _table(t_s, beta, amount, trace, amplitude, cdbs)
 
 
+def beta_of_part(trace: Trace, settings: SettingsVersion, start_s: float, stop_s: float) -> NDArray[np.float64]:
+    """A trace between two times of its recording on the grid of steps, with the W rows before, shape [W + T]; NaN where invalid.
+
+    Raises:
+        Invalid: a part of more than MOST_STEPS, or a trace that is not on the participant's grid.
+    """
+    t_s = _rows(f"The part from {start_s:.9g} s", stop_s - start_s, settings)
+    beta = np.full(t_s.size, np.nan)
+    _place(beta, t_s, trace, start_s, settings.period_s)
+    return beta
+
+
 @dataclass(frozen=True)
 class RecordedTrace:
     """One trace within a session: ends of its rows, s from the session's start, and values with NaN where invalid, both [n]."""
@@ -204,11 +216,14 @@ def amplitude_program(trace: Trace | repository.TraceHead) -> int:
 
 def _grid(session: StudySession, settings: SettingsVersion) -> NDArray[np.float64]:
     """Ends of the session's rows, with W rows before its start, s. Raises Invalid for a session of more than MOST_STEPS."""
-    steps = int(np.floor(session.duration_s / settings.period_s + 1e-6))
+    return _rows(f"Session {session.id}", session.duration_s, settings)
+
+
+def _rows(named: str, duration_s: float, settings: SettingsVersion) -> NDArray[np.float64]:
+    steps = int(np.floor(duration_s / settings.period_s + 1e-6))
     if steps > MOST_STEPS:
         raise Invalid(
-            f"Session {session.id} is said to last {session.duration_s:.9g} s: {steps} steps of {settings.period_s:g} s, "
-            f"where {MOST_STEPS} are the most.",
+            f"{named} is said to last {duration_s:.9g} s: {steps} steps of {settings.period_s:g} s, where {MOST_STEPS} are the most.",
             "Exclude it, or drop its proposal. Send a table whose times are Unix times again, with seconds from the session's start.",
         )
     return settings.period_s * np.arange(-settings.window + 1, steps + 1, dtype=np.float64)

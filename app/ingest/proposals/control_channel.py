@@ -13,6 +13,7 @@ from app.study import repository as study
 from app.study import service
 from app.study.models import StudySession
 from app.study.sessions.contradictions import control_recording
+from app.study.sessions.usable_steps import usable_steps
 
 
 def survey(session: StudySession) -> Evidence | None:
@@ -24,17 +25,32 @@ def survey(session: StudySession) -> Evidence | None:
 
 
 def why(db: Session, session: StudySession) -> Evidence:
-    """Why the control channel is what it is."""
+    """Why the control channel is what it is: its lead and usable steps, and those of the channels that were passed over."""
     recording = control_recording(session)
     traces = [t for t in study.traces_of_recording(db, recording.id) if t.stream == session.control_stream and any(t.valid_bits)]
     chosen = next((t for t in traces if t.channel == session.control_channel), None)
     facts: dict[str, object] = {"stream": session.control_stream, "channel": session.control_channel or "", "lead": "", "passed": []}
     if chosen is not None:
+        usable = {u.channel: u.usable for u in usable_steps(db, session) if u.stream == session.control_stream}
         places = {t.channel: channels.place_of(t, recording) for t in traces}
-        facts["lead"] = places[chosen.channel].lead
+        facts |= {"lead": places[chosen.channel].lead, "usable": usable.get(chosen.channel)}
         others = {c: p for c, p in places.items() if c != chosen.channel}
-        facts["passed"] = [{"channel": c, "why": "shorted" if p.shorted else p.lead} for c, p in others.items()]
+        facts["passed"] = [{"channel": c, "why": "shorted" if p.shorted else p.lead, "usable": usable.get(c)} for c, p in others.items()]
     return Evidence(Source.RECORDING, Reason.CHANNEL, facts)
+
+
+def renewed(db: Session, session: StudySession, evidence: Mapping[str, Any]) -> dict[str, Any]:
+    """The evidence of a proposal whose part changed: the control channel is chosen anew for it, unless a person stated it."""
+    if "control" in evidence and Evidence.from_json(evidence["control"]).stated:
+        return dict(evidence)
+    control = next(s for s in session.segments if s.is_control)
+    settings = session.visit.participant.current_settings
+    traces = study.traces_of_recording(db, control.recording_id)
+    chosen = channels.of_part(traces, control.recording, settings, (control.start_s, control.stop_s), session.hemisphere)
+    if chosen is not None:
+        session.control_stream, session.control_channel = chosen.stream, chosen.channel
+        db.flush()
+    return dict(evidence) | {"control": why(db, session).as_json()}
 
 
 def choose_program(db: Session, session: StudySession) -> Evidence | None:

@@ -48,7 +48,8 @@ class Reason(StrEnum):
     SURVEY = "survey"
     """`recording`; `montages`: how many sets of sensing contacts it went through."""
     CHANNEL = "channel"
-    """`stream`, `channel`; `lead`, `contacts` (text) where known; `passed`: channels that were not taken, each with `why`."""
+    """`stream`, `channel`; `lead` where known; `usable`: its usable steps when it was chosen; `passed`: channels that were not taken, each
+    with `why` and `usable`. Evidence of earlier versions has no `usable`."""
     PROGRAM = "program"
     """`program`; `programs`: every one of the control recording, with `number`, `how`, `low`, `high` (mA or fraction)."""
     UNREADABLE = "unreadable"

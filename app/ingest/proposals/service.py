@@ -15,9 +15,10 @@ from app.ingest import repository, sessions, wording
 from app.ingest.models import SessionProposal, Upload
 from app.ingest.proposals import control_channel, guesses
 from app.ingest.proposals.evidence import BY_CUT, BY_UPLOAD, Evidence, Reason, Source, guess_visit
+from app.ingest.proposals.parts import choose_part, choose_side, on_grid, placement_of
 from app.ingest.proposals.slots import differs_from_slot, visit_of_slot
 from app.ingest.schemas import PartIn, ProposalChange
-from app.ingest.sessions import Placement, StatedSession, add_session, set_segments
+from app.ingest.sessions import Placement, StatedSession, add_session
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
@@ -34,6 +35,9 @@ from app.study.wording import sentences
 
 RESTS_ON = frozenset({"visit", "hemisphere", "start_s", "stop_s", "started_at", "controller"})
 """Fields of a correction after which a guessed controller is guessed anew."""
+
+PART = frozenset({"start_s", "stop_s", "started_at"})
+"""Fields of a correction after which a control channel that nobody stated is chosen anew."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +147,7 @@ def _join_earlier(db: Session, participant: Participant, group: list[Recording],
         if any(r.device_id == k.device_id for r in group for k in known) or len(sessions.together([*known, *group])) != 1:
             continue
         control = next(s for s in session.segments if s.is_control)
-        placement = _placement(session, control.start_s, control.stop_s)
+        placement = placement_of(session, control.start_s, control.stop_s)
         period_s = participant.current_settings.period_s
         added = [sessions.add_beside(session, r, placement, period_s) for r in group]
         if not any(added):
@@ -208,11 +212,11 @@ def _correct(db: Session, session: StudySession, wanted: ProposalChange, caller:
     _move_to_visit(db, session, proposal, given)
     _name_controller(db, session, given, caller)
     if "hemisphere" in given:
-        _choose_side(db, session, given)
+        choose_side(db, session, given)
     if {"control_stream", "control_channel", "control_program"} & given.keys():
         control_channel.choose(db, session, given)
-    if {"start_s", "stop_s", "started_at"} & given.keys():
-        _choose_part(session, given)
+    if PART & given.keys():
+        choose_part(session, given)
     stated = {name: _by(caller) for name in ("visit", "controller", "hemisphere") if given.get(name) is not None}
     if "controller" in given and given["controller"] is None:
         stated["controller"] = _by(caller, open=True)
@@ -223,6 +227,9 @@ def _correct(db: Session, session: StudySession, wanted: ProposalChange, caller:
     proposal.evidence = {**proposal.evidence, **{name: e.as_json() for name, e in stated.items()}}
     if given.get("control_program") is not None:
         proposal.evidence = {**proposal.evidence, "program": _by(caller).as_json()}
+    if PART & given.keys():
+        db.flush()
+        proposal.evidence = control_channel.renewed(db, session, proposal.evidence)
     if RESTS_ON & given.keys():
         db.flush()
         proposal.evidence = control_channel.renewed_program(db, session, proposal.evidence)
@@ -275,7 +282,7 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
     arm = blinding.stated_arm(session, caller)
     made = []
     for part in sorted(parts, key=lambda p: p.start_s):
-        placement = _placement(session, *_on_grid(session, part.start_s, part.stop_s))
+        placement = placement_of(session, *on_grid(session, part.start_s, part.stop_s))
         new = add_session(db, session.visit, placement, part.controller, None, session.hemisphere, counts=False)
         new.control_program = session.control_program
         why = BY_CUT
@@ -284,7 +291,7 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
             guess.assign(new, arm.policy_id if arm and guess.controller == arm.controller else None)
             why = guess.why
         part_of = Evidence(Source.CUT, Reason.CUT_OUT, {"session": session.id})
-        evidence = {**proposal.evidence, "controller": why.as_json(), "part": part_of.as_json()}
+        evidence = {**control_channel.renewed(db, new, proposal.evidence), "controller": why.as_json(), "part": part_of.as_json()}
         db.add(
             SessionProposal(
                 session_id=new.id,
@@ -361,60 +368,3 @@ def _name_controller(db: Session, session: StudySession, given: dict[str, object
     if policy_id is not None and controller not in POLICY_CONTROLLERS:
         raise Invalid(f"A {controller or ''} session has no policy.".replace("  ", " "), "Leave the policy empty, or name the controller.")
     blinding.assign(session, controller, policy_id)
-
-
-def _choose_side(db: Session, session: StudySession, given: dict[str, object]) -> None:
-    """The stated side; where a recording of that side belongs to the session, its trace is the one that the controller saw."""
-    side = given["hemisphere"]
-    session.hemisphere = side  # type: ignore[assignment]
-    control = next(s for s in session.segments if s.is_control)
-    other = next((s for s in session.segments if s.recording.hemisphere == side), None)
-    if side is None or other is None or other.recording_id == control.recording_id:
-        return
-    placement = sessions.place(db, session.visit.participant, [other.recording], StatedSession(started_at=session.started_at), alone=True)
-    placement.stop_s = min(placement.start_s + session.duration_s, placement.control.duration_s)
-    placement.recordings = list(dict.fromkeys(s.recording for s in session.segments))
-    session.control_stream, session.control_channel = placement.stream, placement.channel
-    _move(session, placement)
-
-
-def _choose_part(session: StudySession, given: dict[str, object]) -> None:
-    control = next(s for s in session.segments if s.is_control)
-    started_at = given.get("started_at")
-    start_s, stop_s = given.get("start_s"), given.get("stop_s")
-    begin = float(start_s) if isinstance(start_s, int | float) else control.start_s
-    end = float(stop_s) if isinstance(stop_s, int | float) else control.stop_s
-    if started_at is not None and control.recording.started_at is not None:
-        begin = (started_at - control.recording.started_at).total_seconds()  # type: ignore[operator]
-    placement = _placement(session, *_on_grid(session, begin, end))
-    if control.recording.started_at is None and "started_at" in given:
-        placement.started_at = started_at  # type: ignore[assignment]
-    _move(session, placement)
-
-
-def _move(session: StudySession, placement: Placement) -> None:
-    set_segments(session, placement, session.visit.participant.current_settings.period_s)
-    session.started_at, session.duration_s = placement.started_at, placement.stop_s - placement.start_s
-
-
-def _on_grid(session: StudySession, start_s: float, stop_s: float) -> tuple[float, float]:
-    """A part of the control recording on the grid of steps. Raises Invalid where it is empty or outside the recording."""
-    period = session.visit.participant.current_settings.period_s
-    length = next(s for s in session.segments if s.is_control).recording.duration_s
-    start, stop = round(start_s / period) * period, round(stop_s / period) * period
-    if not 0 <= start < length or stop_s > length + period:
-        raise Invalid(f"The recording is {length:.0f} s long; {start_s:.0f} to {stop_s:.0f} s is not within it.", "Choose a part of it.")
-    # its end is the last row, whole or not: forms show it in whole seconds
-    stop = length if stop_s > length - 1.0 and length - stop > 0.1 else min(stop, length)
-    if stop - start < period:
-        raise Invalid(f"The part from {start_s:.0f} to {stop_s:.0f} s holds no step of {period:g} s.", "Let it end after it begins.")
-    return start, stop
-
-
-def _placement(session: StudySession, start_s: float, stop_s: float) -> Placement:
-    """A session's recordings, placement on another part of its control recording."""
-    control = next(s for s in session.segments if s.is_control)
-    recordings = list(dict.fromkeys(s.recording for s in session.segments))
-    # a stated start may differ from the device's clock: the session's own start is what moves
-    started_at = session.started_at + timedelta(seconds=start_s - control.start_s) if session.started_at is not None else None
-    return Placement(control.recording, recordings, start_s, stop_s, started_at, session.control_stream, session.control_channel)

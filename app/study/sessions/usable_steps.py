@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
 from app.study import repository
 from app.study.models import SettingsVersion, StudySession, Trace
-from app.study.traces import AMPLITUDE_STREAM, StepTable, driving, shown_table
+from app.study.traces import AMPLITUDE_STREAM, StepTable, beta_of_part, driving, shown_table
 from ml.trajectories import SessionTrajectory
 
 CONTROL_STREAMS = ("beta", "band_power")
@@ -38,6 +39,24 @@ class UsableSteps:
     usable: int
     reason: str | None
     at: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What a channel's beta alone can teach: steps that are usable where the amplitude is known, and steps with a valid beta."""
+
+    usable: int
+    valid: int
+
+
+def worth_of(trace: Trace, settings: SettingsVersion, start_s: float, stop_s: float) -> Worth:
+    """What a channel can teach within a part of its recording, before there is a session of it; nothing off the participant's grid."""
+    try:
+        beta = beta_of_part(trace, settings, start_s, stop_s)
+    except Invalid:
+        return Worth(0, 0)
+    whole = _trajectory(0, 0, beta, np.zeros(beta.size), settings)
+    return Worth(int(whole.usable().sum()), int(np.sum(~np.isnan(whole.beta))))
 
 
 def on_any(found: Sequence[UsableSteps], source: str = "time_domain") -> int:
@@ -110,18 +129,25 @@ def _of_channel(
     steps = int(np.sum(table.t_s > 0))
     if steps == 0:
         return UsableSteps(*named, 0, 0, 0, "the session is shorter than one step")
-    trajectory = SessionTrajectory(
-        session_id=session.id,
-        visit=session.visit.number,
-        controller="other",
-        lead_beta=table.beta[: settings.window],
-        beta=table.beta[settings.window :],
-        amplitude=table.fraction[settings.window :],
-        most_imputed=min(settings.most_imputed, settings.window - 1),
-    )
+    trajectory = _trajectory(session.id, session.visit.number, table.beta, table.fraction, settings)
     at = frozenset(np.flatnonzero(trajectory.usable()).tolist())
     valid = int(np.sum(~np.isnan(trajectory.beta)))
     return UsableSteps(*named, steps, valid, len(at), None if at else _reason(trajectory, table, settings, valid), at)
+
+
+def _trajectory(
+    session_id: int, visit: int, beta: NDArray[np.float64], fraction: NDArray[np.float64], settings: SettingsVersion
+) -> SessionTrajectory:
+    """A session's rows, [W + T] each, as learning would have them."""
+    return SessionTrajectory(
+        session_id=session_id,
+        visit=visit,
+        controller="other",
+        lead_beta=beta[: settings.window],
+        beta=beta[settings.window :],
+        amplitude=fraction[settings.window :],
+        most_imputed=min(settings.most_imputed, settings.window - 1),
+    )
 
 
 def _reason(s: SessionTrajectory, table: StepTable, settings: SettingsVersion, valid: int) -> str:

@@ -15,7 +15,8 @@ from fastapi.testclient import TestClient
 
 from app.ingest.channels import Place, choose, is_survey, place_of
 from app.study.models import Hemisphere, Recording, Trace
-from app.study.traces import pack
+from app.study.sessions.usable_steps import Worth
+from app.study.traces import pack, unpack
 from tests.app.ingest.conftest import device_zip
 
 LEADS = ["left STN", "", "left M1", ""]
@@ -33,8 +34,11 @@ def recording(cathode: str = "", leads: list[str] = LEADS, contacts: list[list[s
     return Recording(details={"settings": {"leads": leads, "sensing": sensing}, "events": events}, duration_s=200.0, hemisphere="left")
 
 
-def chosen(traces: list[Trace], where: Recording, side: Hemisphere | None = None) -> str:
-    found = choose(traces, where, side)
+def chosen(traces: list[Trace], where: Recording, side: Hemisphere | None = None, usable: dict[str, int] | None = None) -> str:
+    def worth(trace: Trace) -> Worth:
+        return Worth((usable or {}).get(trace.channel, 0), int(np.sum(~np.isnan(unpack(trace)))))
+
+    found = choose(traces, where, side, worth)
     assert found is not None
     return found.channel
 
@@ -56,6 +60,19 @@ def test_the_pair_around_the_stimulating_contact_comes_first_and_one_with_it_las
     pairs = [trace("key 0 +1-0"), trace("key 1 +3-2"), trace("key 1 +2-0", valid=5)]
     assert chosen(pairs, recording("-1 +C")) == "key 1 +2-0"
     assert chosen(pairs[:2], recording("-1 +C")) == "key 1 +3-2"
+
+
+def test_of_one_lead_the_channel_that_teaches_most_is_taken() -> None:
+    pairs = [trace("key 0 +2-0", valid=9), trace("key 1 +3-1", valid=8), trace("key 2 +9-8")]
+    assert chosen(pairs, recording()) == "key 0 +2-0"
+    assert chosen(pairs, recording(), usable={"key 0 +2-0": 4, "key 1 +3-1": 10, "key 2 +9-8": 18}) == "key 1 +3-1"
+
+
+def test_contacts_decide_between_channels_that_teach_about_as_much() -> None:
+    pairs = [trace("key 0 +1-0"), trace("key 1 +2-0")]
+    around = recording("-1 +C")
+    assert chosen(pairs, around, usable={"key 0 +1-0": 20, "key 1 +2-0": 10}) == "key 1 +2-0", "half as much is about as much"
+    assert chosen(pairs, around, usable={"key 0 +1-0": 20, "key 1 +2-0": 9}) == "key 0 +1-0"
 
 
 def test_the_stated_side_decides_between_two_leads() -> None:
