@@ -62,11 +62,12 @@ class Group:
 
 @dataclass(frozen=True)
 class Marked:
-    """An event: `patient` marked it, or the `device` logged it."""
+    """An event: `patient` marked it, the `device` logged it, or it is an `annotation` or a `rating`, whose number is `value`."""
 
     at: datetime
     kind: str
     label: str
+    value: float | None = None
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,11 @@ class History:
     events: list[Marked]
     battery_percent: float | None
     battery_months: float | None
+
+    @property
+    def notes(self) -> list[Marked]:
+        """Annotations and ratings."""
+        return [e for e in self.events if e.kind in ("annotation", "rating")]
 
     @property
     def patient_events(self) -> list[Marked]:
@@ -126,7 +132,7 @@ def _events(recording: Recording) -> list[Marked]:
     if begin is None:
         return []
     stored = recording.details.get("events") or []
-    return [Marked(begin + timedelta(seconds=float(e["t_s"])), e["kind"], e["label"]) for e in stored]
+    return [Marked(begin + timedelta(seconds=float(e["t_s"])), e["kind"], e["label"], e["data"].get("value")) for e in stored]
 
 
 def _moment(stored: str | None) -> datetime | None:

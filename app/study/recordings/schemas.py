@@ -53,11 +53,12 @@ class TherapyGroupOut(Model):
 
 
 class DeviceEventOut(Model):
-    """An event that the patient marked or the device logged."""
+    """An event that the patient marked or the device logged, an annotation or a symptom rating."""
 
     at: datetime
-    kind: str = Field(description="patient or device.")
-    label: str = Field(description="A known word, or the event's number: other names are not stored.")
+    kind: str = Field(description="patient, device, annotation or rating.")
+    label: str = Field(description="Known words, or the event's number: other names and texts are not stored.")
+    value: float | None = Field(description="Of a rating, 0 to 100 on the scale of the report; null of everything else.")
 
 
 class DeviceHistoryOut(Model):

@@ -18,6 +18,8 @@ from ml.mdp import AMPLITUDE_TOLERANCE
 MOST_LEVELS = 12
 """Amplitudes that stand for themselves; more of them are drawn in bins."""
 BINS = 10
+NOTED = {"operator_note": "", "patient": "marked by the patient", "annotation": "annotation", "rating": "rating"}
+"""Kinds of events that people noted, and what is said behind them."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +80,15 @@ def operator_conflicts(events: Sequence[Mapping[str, Any]], origin_s: float) -> 
 
 
 def notes(events: Sequence[Mapping[str, Any]], origin_s: float, duration_s: float) -> list[tuple[float, str]]:
-    """Operator's notes within the session: time in the session (s), and the note."""
-    found = [(float(e["t_s"]) - origin_s, str(e["label"])) for e in events if e["kind"] == "operator_note"]
+    """What people noted within the session: time in the session (s), and an operator's note, a patient's event, an annotation, a rating."""
+    found = [(float(e["t_s"]) - origin_s, _noted(e)) for e in events if e["kind"] in NOTED]
     return sorted((t, label) for t, label in found if 0 <= t <= duration_s)
+
+
+def _noted(event: Mapping[str, Any]) -> str:
+    value = event["data"].get("value") if event["kind"] == "rating" else None
+    label = f"{event['label']}: {value:g}" if isinstance(value, int | float) else str(event["label"])
+    return f"{label} ({NOTED[event['kind']]})" if NOTED[event["kind"]] else label
 
 
 def _fit_axis(yaxis: dict[str, Any], values: NDArray[np.float64], threshold: float | None) -> float | None:

@@ -10,35 +10,11 @@ from collections.abc import Iterable
 from datetime import datetime
 from typing import Any
 
+from ml.formats.percept.annotations import Annotation
 from ml.formats.percept.enums import word
 from ml.formats.percept.report_json import SIDES, entries, finite, inside, moment, samples, side_of
+from ml.formats.percept.words import EVENT_WORDS
 from ml.formats.recording import EventLog
-
-EVENT_WORDS = (
-    "tremor",
-    "dyskinesia",
-    "stiffness",
-    "rigidity",
-    "bradykinesia",
-    "slowness",
-    "freezing",
-    "walking",
-    "fall",
-    "balance",
-    "speech",
-    "dystonia",
-    "pain",
-    "cramp",
-    "took medication",
-    "medication",
-    "feeling good",
-    "streaming",
-    "sleep",
-    "exercise",
-    "on",
-    "off",
-)
-"""Names of patient events that are kept; any other name may say who somebody is, and is shown as its number."""
 
 MAX_EVENTS = 5_000
 
@@ -245,9 +221,13 @@ def impedance(value: Any) -> list[dict[str, Any]]:
     return out
 
 
-def dated_events(report: dict[str, Any]) -> list[tuple[datetime, str, str, dict[str, Any]]]:
-    """(time, kind, label, data) of the device's event log and of the patient's events, in time order."""
-    out: list[tuple[datetime, str, str, dict[str, Any]]] = []
+DatedEvent = tuple[datetime, str, str, dict[str, Any]]
+"""Time, kind (`device`, `patient`, `annotation`, `rating`), label, data."""
+
+
+def dated_events(report: dict[str, Any], annotations: Iterable[Annotation] = ()) -> list[DatedEvent]:
+    """The device's event log, the patient's events and the annotations, in time order."""
+    out: list[DatedEvent] = [_noted(a) for a in annotations]
     for entry in _log_entries(report):
         when = moment(entry.get("DateTime", entry.get("EventDateTime")))
         if when is None:
@@ -260,12 +240,27 @@ def dated_events(report: dict[str, Any]) -> list[tuple[datetime, str, str, dict[
     return sorted(out, key=lambda e: e[0])[-MAX_EVENTS:]
 
 
+def _noted(a: Annotation) -> DatedEvent:
+    if a.value is None:
+        return a.at, "annotation", a.label, {"under": a.under}
+    return a.at, "rating", a.label, {"under": a.under, "value": a.value}
+
+
+def undated_events(report: dict[str, Any]) -> int:
+    """Entries of the patient's events that tell no time: the programmer lists there which events can be marked."""
+    return sum(moment(e.get("DateTime", e.get("EventDateTime"))) is None for e in _patient_entries(report))
+
+
 LOG_WORDS = ("SessionType", "NewGroupId", "OldGroupId", "TherapyStatus", "AdaptiveTherapyStatus", "ParameterTrendId", "SensingStatus")
 
 
 def _log_entries(report: dict[str, Any]) -> Iterable[dict[str, Any]]:
     yield from entries(inside(report, "DiagnosticData", "EventLogs"))
     yield from entries(inside(report, "DiagnosticData", "LfpFrequencySnapshotEvents"))
+    yield from _patient_entries(report)
+
+
+def _patient_entries(report: dict[str, Any]) -> Iterable[dict[str, Any]]:
     patient = report.get("PatientEvents")
     if isinstance(patient, dict) and not {"EventName", "DateTime"} & set(patient):
         for part in patient.values():
@@ -274,7 +269,7 @@ def _log_entries(report: dict[str, Any]) -> Iterable[dict[str, Any]]:
         yield from entries(patient)
 
 
-def as_events(dated: Iterable[tuple[datetime, str, str, dict[str, Any]]], origin: datetime) -> tuple[EventLog, ...]:
+def as_events(dated: Iterable[DatedEvent], origin: datetime) -> tuple[EventLog, ...]:
     """The events in seconds after `origin`."""
     return tuple(EventLog(round((when - origin).total_seconds(), 3), kind, label, data) for when, kind, label, data in dated)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from datetime import datetime
 from typing import Any
 
@@ -40,8 +42,20 @@ def _inner(value: Any) -> list[dict[str, Any]]:
     return [inner for entry in entries(value) for held in entry.values() if isinstance(held, list) for inner in entries(held)]
 
 
-def history_recording(report: dict[str, Any], said: FileReport, options: DecodeOptions) -> RecordingLog | None:
-    """Surveys, and what the device keeps: groups, their history, trends, snapshots, events; a recording that belongs to no session."""
+def _counted(dated: Sequence[details.DatedEvent]) -> list[str]:
+    """How many events, annotations and ratings, in words."""
+    kinds = Counter({"annotation": "annotations", "rating": "ratings"}.get(kind, "events") for _, kind, _, _ in dated)
+    return [f"{kinds[name]} {name}" for name in ("events", "annotations", "ratings") if kinds[name]]
+
+
+def history_recording(
+    report: dict[str, Any], said: FileReport, options: DecodeOptions, dated: Sequence[details.DatedEvent]
+) -> RecordingLog | None:
+    """Surveys, and what the device keeps: groups, their history, trends, snapshots, events; a recording that belongs to no session.
+
+    Args:
+        report: as it was read. said: what was understood is added to it. options: of the decoder. dated: the report's events.
+    """
     spectra = _surveys(report, said)
     diagnostic = report.get("DiagnosticData")
     kept: dict[str, Any] = {
@@ -52,14 +66,16 @@ def history_recording(report: dict[str, Any], said: FileReport, options: DecodeO
         "montage": details.montage(report.get("LFPMontage") or _inner(report.get("BrainSenseSurveys"))),
         "impedance": details.impedance(report.get("Impedance")),
     }
-    dated = details.dated_events(report)
     kept = {name: value for name, value in kept.items() if value}
     if not (kept or dated or spectra):
         return None
     battery = {k: v for k, v in details.battery(report).items() if v is not None}
     started = moment(inside(report, "DeviceInformation", "Initial", "DeviceDateTime")) or (dated[0][0] if dated else None)
     origin = started or datetime.fromisoformat("2000-01-01T00:00:00+00:00")
-    counts = [f"{len(v)} {name.replace('_', ' ')}" for name, v in kept.items()] + ([f"{len(dated)} events"] if dated else [])
+    counts = [f"{len(v)} {name.replace('_', ' ')}" for name, v in kept.items()] + _counted(dated)
+    if undated := details.undated_events(report):
+        entries_of = f"{undated} entr{'y' if undated == 1 else 'ies'} of PatientEvents"
+        said.ignored.append(f"{entries_of} without a time: names of events, none that was marked")
     if counts:
         said.understood.append(f"history of the device: {', '.join(counts)}; kept, no session")
     return RecordingLog(

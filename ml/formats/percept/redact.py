@@ -16,11 +16,12 @@ from typing import Any
 
 from ml.formats.archive import ZipFiles, told
 from ml.formats.options import ArchiveLimits
-from ml.formats.percept.details import EVENT_WORDS
+from ml.formats.percept.annotations import SECTION, as_section, gather, speaks_of
 from ml.formats.percept.enums import is_known
 from ml.formats.percept.keys import KEYS
 from ml.formats.percept.report import report_members
 from ml.formats.percept.report_json import HINT, SECTIONS, channel_names, moment, read_report
+from ml.formats.percept.words import EVENT_WORDS, cleaned
 from ml.formats.recording import UndecodableFile
 from ml.formats.redaction_record import Redaction, pseudonym
 from ml.formats.source import Source
@@ -31,6 +32,9 @@ BLANKED = frozenset({"PatientInformation", "ProgrammerTimezone", "ProgrammerLoca
 """Sections that say who and where somebody is; the programmer's offset from UTC stays."""
 
 DEEPEST = 40
+MOST_NAMED = 8
+"""Unknown sections or fields that one sentence names."""
+
 HEMISPHERE = re.compile(r"HemisphereLocationDef[._](Left|Right)")
 NUMBERS = re.compile(r"\s*\[?[\d\s,.eE+-]*\]?\s*")
 PACKET_LISTS = frozenset({"GlobalSequences", "GlobalPacketSizes", "TicksInMses", "TicksInMs"})
@@ -116,6 +120,8 @@ class _Scrubber:
     def __init__(self, key: bytes) -> None:
         self._key = key
         self._gone: Counter[str] = Counter()
+        self._named: dict[str, Counter[str]] = {"section": Counter(), "key": Counter()}
+        self._lost: Counter[str] = Counter()
 
     def report(self, report: dict[str, Any]) -> dict[str, Any]:
         """The report without identity."""
@@ -123,11 +129,19 @@ class _Scrubber:
         for name, value in report.items():
             if name in BLANKED:
                 self._gone["patient" if name == "PatientInformation" else "place"] += 1
-            elif name not in SECTIONS:
-                self._gone["section"] += 1
-            else:
+            elif name in SECTIONS:
                 out[name] = self._clean(value, name, 1)
+            elif not speaks_of(name):
+                self._unknown("section", name)
+        noted = gather(report)
+        self._lost.update(noted.lost)
+        if noted.kept:
+            out[SECTION] = as_section(noted)
         return out
+
+    def _unknown(self, what: str, name: str) -> None:
+        self._gone[what] += 1
+        self._named[what][cleaned(name)] += 1
 
     def _clean(self, node: Any, key: str, depth: int) -> Any:
         if depth > DEEPEST:
@@ -151,7 +165,7 @@ class _Scrubber:
             self._gone["device"] += 1
             return pseudonym(item, self._key)
         if not (name in KEYS or HEMISPHERE.fullmatch(name) or moment(name) is not None):
-            self._gone["key"] += 1
+            self._unknown("key", name)
             return _GONE
         return self._clean(item, name, depth + 1)
 
@@ -189,7 +203,17 @@ class _Scrubber:
             "key": "fields not known to be technical, such as names of devices and groups, notes and the date of the implant",
             "deep": "parts nested beyond reason",
         }
-        return [f"{text} ({self._gone[name]}×)" for name, text in said.items() if self._gone[name]]
+        lost = [f"{reason} ({count}×)" for reason, count in self._lost.items()]
+        return [
+            *(f"{text} ({self._gone[name]}×{self._called(name)})" for name, text in said.items() if self._gone[name]),
+            *([f"of annotations and ratings: {', '.join(lost)}"] if lost else []),
+        ]
+
+    def _called(self, what: str) -> str:
+        """What was taken out is called, as far as that is technical."""
+        names = [name for name, _ in self._named.get(what, Counter()).most_common() if name != "…"]
+        more = f" and {len(names) - MOST_NAMED} others" if len(names) > MOST_NAMED else ""
+        return f": {', '.join(names[:MOST_NAMED])}{more}" if names else ""
 
 
 _GONE = object()

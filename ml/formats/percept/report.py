@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,12 @@ from ml.formats.archive import READ_ERRORS, ZipFiles, told
 from ml.formats.beta import channel_spectrum, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
 from ml.formats.percept import details
+from ml.formats.percept.annotations import gather
 from ml.formats.percept.enums import word
 from ml.formats.percept.history import history_recording
 from ml.formats.percept.report_json import SIDES, entries, inside, looks_like_report, moment, read_report, side_of, utc_offset_h
 from ml.formats.percept.streams import DevicePower, Side, TimeDomain, device_powers, time_domains
-from ml.formats.recording import DecodedFile, FileReport, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
+from ml.formats.recording import DecodedFile, EventLog, FileReport, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
 from ml.signals import row_means
 
 SAME_RUN_MS = 2_000.0
@@ -134,12 +135,13 @@ def decode_report(report: dict[str, Any], said: FileReport, options: DecodeOptio
     channels = time_domains("BrainSenseTimeDomain", report.get("BrainSenseTimeDomain"))
     runs = pair_runs(channels, device_powers(report.get("BrainSenseLfp")), said)
     recordings: list[RecordingLog] = []
+    dated = details.dated_events(report, gather(report).kept)
     for number, run in enumerate(runs):
-        recordings += _run_recordings(run, number, first_run, report, said, options)
+        recordings += _run_recordings(run, number, first_run, report, said, options, dated)
     if not runs:
         said.flagged.append("no streaming run (BrainSenseTimeDomain, BrainSenseLfp) in this report: nothing in it can be a session")
     recordings += _indefinite(report, said, options)
-    history = history_recording(report, said, options)
+    history = history_recording(report, said, options, dated)
     recordings += [history] if history is not None else []
     _check_dates(report, recordings, said)
     if not recordings:
@@ -218,10 +220,11 @@ def _apart_s(one: datetime | None, other: datetime | None) -> float:
 
 
 def _run_recordings(
-    run: Run, number: int, first_run: int, report: dict[str, Any], said: FileReport, options: DecodeOptions
+    run: Run, number: int, first_run: int, report: dict[str, Any], said: FileReport, options: DecodeOptions, dated: list[details.DatedEvent]
 ) -> list[RecordingLog]:
-    """One recording per side that streamed or was stimulated."""
+    """One recording per side that streamed or was stimulated, with what was marked, noted and rated during the run."""
     begin, end = run.span_ms
+    noted = _noted_within(dated, run.first_packet, (end - begin) / 1000.0)
     rows = math.ceil((end - begin) / 1000.0 / options.period_s - 1e-6)
     label = f"run {first_run + number + 1}"
     leads = {side_of(word(lead.get("Hemisphere"))) for lead in entries(inside(report, "LeadConfiguration", "Final"))}
@@ -237,7 +240,8 @@ def _run_recordings(
         # the amplitude of a side without a lead is a row of zeros that means nothing
         if not (sensed or driven or (traces and side in leads)):
             continue
-        out.append(_recording(run, side, channels, traces, begin, end, first_run + number, options))
+        one = _recording(run, side, channels, traces, begin, end, first_run + number, options)
+        out.append(replace(one, events=noted))
         _describe(said, label, side, channels, traces, (end - begin) / 1000.0)
     for note in dict.fromkeys(n for c in run.channels for n in c.notes):
         said.repaired.append(f"{label}: {note}")
@@ -245,6 +249,14 @@ def _run_recordings(
         said.repaired.append(f"{label}: {note}")
     _check_lengths(run, label, said)
     return out
+
+
+def _noted_within(dated: list[details.DatedEvent], start: datetime | None, length_s: float) -> tuple[EventLog, ...]:
+    """Events of people within a run, in seconds of it; none where the run has no date. What the device logs stays in its history."""
+    if start is None:
+        return ()
+    end = start + timedelta(seconds=length_s)
+    return details.as_events((e for e in dated if e[1] != "device" and start <= e[0] <= end), start)
 
 
 def _beta(channel: TimeDomain, begin: float, rows: int, options: DecodeOptions) -> list[TraceLog]:

@@ -103,13 +103,17 @@ def percept_report() -> dict[str, Any]:
     }
     report["DeviceInformation"]["Final"] |= {"NeurostimulatorSerialNumber": SERIAL, "DeviceName": NAME, "ImplantDate": f"{BORN}T00:00:00Z"}
     report["LeadConfiguration"] = {"Final": [{"Hemisphere": "HemisphereLocationDef.Right", "LeadSerialNumber": LEAD, "Model": NAME}]}
-    report["BrainSenseTimeDomain"][0]["Pass"] = NAME
+    report["BrainSenseTimeDomain"][0] |= {"Pass": NAME, f"{NAME} Annotations": [{"OffsetInSeconds": 5, "Text": WHO, "Author": NAME}]}
     event = {"EventName": f"{NOTE} {NAME}", "EventID": 3, "DateTime": "2024-03-14T10:00:00Z", "Note": NOTE}
     return report | {
         "PatientEvents": {"Initial": [event]},
         "Groups": {"Final": [{"GroupId": "GroupIdDef.GROUP_A", "GroupName": f"{NAME}'s", "ActiveGroup": True, "ProgramSettings": {}}]},
         "ClinicianNotes": f"{NOTE} 03.02.1901",
         WHO: {NAME: BORN},
+        f"{NAME}Ratings": [
+            {"DateTime": "2024-03-14T10:05:55Z", "Tremor": 4, NAME: 3, "Name": NAME, "Under": f"{NAME} ratings", "DateOfBirth": BORN},
+            {"DateTime": f"{BORN}T00:00:00Z", "Score": 19010203, "Text": f"{NOTE} tremor"},
+        ],
         "EventSummary": {"Note": NOTE, WHO: 1, "DOB": BORN},
         "DiagnosticData": {"EventLogs": [{"DateTime": "2024-03-14T10:00:00Z", "Comment": NOTE, "SessionType": f"SessionStateDef.{NAME}"}]},
     }

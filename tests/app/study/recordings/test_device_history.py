@@ -50,6 +50,10 @@ def report() -> bytes:
                 "LFPTrendLogs": {"HemisphereLocationDef.Left": {at(4000): averages}},
                 "LfpFrequencySnapshotEvents": marked,
             },
+            "SymptomRatings": [
+                {"DateTime": at(180), "Symptom": "Severe tremor", "Rating": 7, "RatedBy": NAMES[0]},
+                {"DateTime": at(190), "Comment": f"{NAMES[0]} felt better"},
+            ],
         }
     ).encode()
 
@@ -68,8 +72,9 @@ def test_the_history_of_a_device_has_a_route_and_a_page_with_pictures(client: Te
     assert [(s["label"], s["side"], s["magnitude"]) for s in told["snapshots"]] == [
         ("tremor", "left", [1.0, 2.0, 3.0]), ("event 2", "left", [1.0, 2.0, 3.0])
     ]  # fmt: skip
-    assert [(e["kind"], e["label"], e["at"][:16]) for e in told["events"]] == [
-        ("patient", "tremor", at(60)[:16]), ("patient", "event 2", at(120)[:16])
+    assert [(e["kind"], e["label"], e["value"], e["at"][:16]) for e in told["events"]] == [
+        ("patient", "tremor", None, at(60)[:16]), ("patient", "event 2", None, at(120)[:16]),
+        ("rating", "severe tremor", 7.0, at(180)[:16]), ("annotation", "symptom ratings", None, at(190)[:16]),
     ]  # fmt: skip
     assert [(g["name"], g["active"], g["programs"][0]["amplitude_ma"]) for g in told["groups"]] == [
         ("A", True, 1.8), ("B", False, 0.0), ("A", True, 2.4)
@@ -78,7 +83,8 @@ def test_the_history_of_a_device_has_a_route_and_a_page_with_pictures(client: Te
     for chart in ("trend-power", "trend-amplitude", "groups", "snapshot-left"):
         assert f'id="{chart}-{told["recording_id"]}"' in page
     assert "left: 290 averages" in page
-    assert "marked by the patient" in page
+    assert "2 marked by the patient, 2 annotations and ratings, 0 logged by the device" in page
+    assert '<td>severe tremor</td><td class="num">7</td>' in page
     assert not any(name in text for name in NAMES for text in (page, json.dumps(told)))
 
 

@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from tests.ml.formats.conftest import Percept
+
 
 @pytest.fixture
 def page_of(client: TestClient, recordings: Path) -> Callable[[str, float], str]:
@@ -83,3 +85,17 @@ def test_a_montage_shows_its_five_configurations_its_loss_and_its_gaps(page_of: 
     stn = next(t for t in spectrum["data"] if t["name"] == "key 0 +2-0")
     inside = [(y, x) for x, y in zip(stn["x"], stn["y"], strict=True) if 20 <= x <= 35]
     assert 24 <= max(inside)[1] <= 29
+
+
+def test_annotations_and_ratings_within_a_run_stand_on_the_sessions_page(client: TestClient, enrolled: str) -> None:
+    percept = Percept()
+    report = percept.one_run(seconds=60.0)
+    report["SymptomRatings"] = [
+        {"DateTime": "2024-03-14T10:06:12Z", "Symptom": "Tremor", "Rating": 7, "By": "Ada"},
+        {"DateTime": "2024-03-14T12:00:00Z", "Symptom": "Rigidity", "Rating": 1},
+    ]
+    fields = {"participant": enrolled, "visit": "1", "controller": "other"}
+    answer = client.post("/api/v1/uploads", data=fields, files={"file": ("r.json", json.dumps(report).encode())})
+    session = answer.json()["sessions"][0]["id"]
+    page = unescape(client.get(f"/sessions/{session}", headers={"Accept": "text/html"}).text)
+    assert table_after(page, "Operator's notes, annotations and ratings") == [["20.0", "tremor: 7 (rating)"]]
