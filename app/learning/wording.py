@@ -6,7 +6,17 @@ from collections.abc import Sequence
 
 from app.learning.gate.service import ALPHA, Gate, QocTest
 from app.learning.models import GateChoice
+from app.learning.sweeps.parallel import Standing
 from app.study.sessions.programming import Difference
+
+STANDINGS = {
+    Standing.RETIRED: "retired",
+    Standing.BELOW_TRIED: "below what the random controller tried",
+    Standing.NO_SESSION_NEAR: "no session near",
+    Standing.ABOVE_CDBS: "estimated above cDBS",
+    Standing.NOT_ABOVE_CDBS: "not above cDBS with confidence",
+    Standing.NOT_ESTIMATED: "not estimated",
+}
 
 
 def gate_grounds(gate: Gate) -> str:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 
+from app.learning import wording
 from app.learning.deps import CurrentSweep
 from app.learning.schemas import ALGORITHM_NAMES
-from app.learning.sweeps import comparison
+from app.learning.sweeps import comparison, parallel
 from app.platform.database import Db
 from app.platform.web.templates import render
 from app.study.models import Participant
@@ -34,6 +35,9 @@ def sweep_page(request: Request, sweep: CurrentSweep, db: Db) -> HTMLResponse:
         baselines=sorted(sweep.baselines["rows"], key=lambda row: -row["score"]),
         held_out=sweep.baselines["held_out_sessions"],
         charts=comparison.charts(sweep),
+        parallel=parallel.parallel(found, wording.STANDINGS),
+        standings=wording.STANDINGS,
+        looks=parallel.LOOKS,
         algorithm_names=ALGORITHM_NAMES,
     )
     return HTMLResponse(page)

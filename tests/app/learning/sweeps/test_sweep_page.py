@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -11,10 +12,13 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.learning import wording
 from app.learning.models import Policy, Sweep
 from app.learning.policies.baselines import ONNX, constant_onnx
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.snapshots.service import take_snapshot
+from app.learning.sweeps import parallel
+from app.learning.sweeps.comparison import candidates
 from app.learning.training.compute import best_supported, stored_gains
 from app.platform import files
 from app.platform.jobs import service as jobs
@@ -164,13 +168,13 @@ def test_policies_are_ordered_by_the_posterior_and_not_by_the_held_out_score(sto
     assert [b["gain_over_cdbs"] for b in told["baselines"]] == [0.0, 2.5]
     page = client.get(f"/sweeps/{sweep.id}").text
     assert "rl-1 has the largest lower bound" in page, "the larger bound of rl-2 is extrapolation"
-    assert page.count("no session near<") == 1
+    assert page.count(">no session near</span>") == 1
 
 
 def test_a_controller_without_learning_that_no_session_supports_is_marked(store: Store, client: TestClient) -> None:
     off = {"controller": "no DBS", "score": 1.0, "mean_amplitude": 0.0, "gain_over_cdbs": estimated(40.0, 30.0, supported=False)}
     sweep = store(metrics(9.0, 1.0, -1.0, 0.0), also=(off,))
-    assert client.get(f"/sweeps/{sweep.id}").text.count("no session near<") == 1
+    assert client.get(f"/sweeps/{sweep.id}").text.count(">no session near</span>") == 1
 
 
 def test_where_sessions_cannot_order_policies_nothing_is_preferred(store: Store, client: TestClient) -> None:
@@ -198,3 +202,39 @@ def test_gains_by_fitted_q_evaluation_of_older_sweeps_decide_nothing(store: Stor
     told = client.get(f"/api/v1/sweeps/{sweep.id}").json()["candidates"]
     assert [(c["name"], c["gain_method"], c["gain_over_cdbs"]) for c in told] == [("rl-1", "fqe", 3.0), ("rl-0", "fqe", 3.0)]
     assert "largest lower bound" not in client.get(f"/sweeps/{sweep.id}").text
+
+
+def test_each_policy_is_a_line_from_its_hyper_parameters_to_its_standing(store: Store, client: TestClient, db: Session) -> None:
+    rows = [
+        metrics(9.0, 8.0, 2.0, 0.0),
+        metrics(8.0, 3.0, -1.0, 0.0),
+        metrics(7.0, 2.0, 1.0, 0.2),
+        metrics(6.0, 1.0, 0.5, 0.0, supported=False),
+    ]
+    sweep = store(*rows)
+    for k, policy in enumerate(db.query(Policy).order_by(Policy.id).limit(4)):
+        policy.config = {"actor_lr": 10.0 ** (k - 5), "critic_lr": 1e-3}
+    db.commit()
+    found = parallel.parallel(candidates(db.get_one(Sweep, sweep.id)), wording.STANDINGS)
+    assert found is not None
+    assert found.columns[1] == "Learning rate"
+    assert "Critic's rate" not in found.columns  # all are alike
+    assert [(row[0], row[1], row[-1]) for row in found.rows] == [
+        ("rl-0", 1e-5, "estimated above cDBS"),
+        ("rl-1", 1e-4, "not above cDBS with confidence"),
+        ("rl-2", 1e-3, "below what the random controller tried"),
+        ("rl-3", 1e-2, "no session near"),
+    ]
+    lines = re.findall(r'<path d="([^"]*)" fill="none" stroke="var\(--c-(\w+)\)"', str(found.figure))
+    ends = {colour: d for d, colour in lines if colour != "border"}
+    assert set(ends) == {"good", "accent", "bad", "warn"}
+    # a learning rate a thousand times as large lies at the other end of its axis
+    heights = {colour: float(d[1:].split("L")[0].split()[1]) for colour, d in ends.items()}
+    assert heights["accent"] == pytest.approx((2 * heights["good"] + heights["warn"]) / 3, abs=0.2)
+    page = client.get(f"/sweeps/{sweep.id}").text
+    assert "From hyper-parameters to what became of them" in page
+    assert page.index("From hyper-parameters") < page.index("Policies of this sweep")
+
+
+def test_one_policy_alone_is_compared_with_nothing(store: Store, db: Session) -> None:
+    assert parallel.parallel(candidates(store(metrics(9.0, 8.0, 2.0, 0.0))), wording.STANDINGS) is None
