@@ -146,6 +146,7 @@ class World:
             ("patch", "/proposals/{session_id}"): self.proposal(),
             ("post", "/proposals/{session_id}/confirm"): self.proposal(controller="random"),
             ("post", "/proposals/{session_id}/split"): self.proposal(parts=[{"start_s": 0, "stop_s": 10}, {"start_s": 10, "stop_s": 30}]),
+            ("post", "/proposals/{session_id}/visit"): self.proposal_of_another_day(),
             ("post", "/proposals/{session_id}/discard"): self.proposal(reason="no session"),
             ("post", "/uploaded-files/{file_id}/session"): {
                 "file_id": self.upload("h.csv", GRASPS.replace(b"0.40", b"0.41"))["files"][0]["id"],
@@ -230,6 +231,12 @@ class World:
         body = self.upload(f"p{self.made}.csv", TABLE.replace(b"2,1,1", b"2,1.%d,1" % self.made, 1), visit="3")
         (proposal,) = body["proposals"]
         return {"session_id": proposal["session"]["id"], "json": {"version": proposal["version"]} | change}
+
+    def proposal_of_another_day(self) -> Json:
+        """A proposal on whose day there is no visit, for the route that adds one."""
+        body = self.upload("day.csv", TABLE.replace(b"2,1,1", b"2,1.99,1", 1), visit="", started_at="2025-07-01T09:00:00Z")
+        (proposal,) = body["proposals"]
+        return {"session_id": proposal["session"]["id"], "json": {"version": proposal["version"]}}
 
     def unreadable(self, content: bytes, reviewed: bool = False) -> int:
         """A file in quarantine of its own for one route."""

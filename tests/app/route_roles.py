@@ -88,6 +88,7 @@ ROLES: dict[tuple[str, str], set[str]] = {
     ("patch", "/api/v1/proposals/{session_id}"): RECORDERS,
     ("post", "/api/v1/proposals/{session_id}/confirm"): RECORDERS,
     ("post", "/api/v1/proposals/{session_id}/split"): RECORDERS,
+    ("post", "/api/v1/proposals/{session_id}/visit"): RECORDERS,
     ("post", "/api/v1/proposals/{session_id}/discard"): RECORDERS,
     ("post", "/api/v1/uploaded-files/{file_id}/session"): RECORDERS,
     ("post", "/api/v1/uploaded-files/{file_id}/review"): {"clinician", "admin"},

@@ -12,6 +12,7 @@ from app.ingest import repository
 from app.ingest.deps import CurrentProposal
 from app.ingest.proposals import service as proposals
 from app.ingest.proposals.serializers import proposal_out, proposals_out
+from app.ingest.proposals.visit_of_recording import add_visit_of_recording
 from app.ingest.schemas import (
     AttachedOut,
     AttachIn,
@@ -20,6 +21,8 @@ from app.ingest.schemas import (
     ProposalChange,
     ProposalOut,
     SplitIn,
+    VisitOfRecordingIn,
+    VisitOfRecordingOut,
 )
 from app.ingest.uploads import service
 from app.platform.database import Db
@@ -29,7 +32,7 @@ from app.study import repository as study
 from app.study import service as study_service
 from app.study.deps import CurrentParticipant
 from app.study.models import StudySession
-from app.study.serializers import session_out
+from app.study.serializers import session_out, visit_out
 
 router = APIRouter(tags=["proposals"], responses=problems(401, 403, 404, 422))
 
@@ -60,6 +63,16 @@ def confirm_proposal(session: CurrentProposal, change: ProposalChange, db: Db, c
     notes = proposals.confirm(db, session, change, caller)
     db.commit()
     return ConfirmedOut(session=session_out(study.session(db, session.id, caller), caller), notes=notes)
+
+
+@router.post("/proposals/{session_id}/visit", status_code=201, responses=problems(409))
+def add_visit(session: CurrentProposal, of: VisitOfRecordingIn, db: Db, caller: CurrentCaller) -> VisitOfRecordingOut:
+    """Add a visit on the day of the recording, and give it to every proposal of that day whose visit is open."""
+    visit, moved = add_visit_of_recording(db, session, of.version, caller)
+    db.commit()
+    behind = repository.proposals(db, [s.id for s in moved])
+    told = [proposal_out(db, s, behind[s.id], caller) for s in moved]
+    return VisitOfRecordingOut(visit=visit_out(visit, visit.participant.code), proposals=told)
 
 
 @router.post("/proposals/{session_id}/split", status_code=201, responses=problems(409))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
 from markupsafe import Markup
@@ -43,6 +43,7 @@ class ProposalForm:
         programs: that the control recording has an amplitude of.
         thumbnail: beta and amplitude at a glance, None where neither is known.
         problem: why the form was refused.
+        day_to_add: on which a visit can be made of the recording.
     """
 
     session: StudySession
@@ -59,6 +60,7 @@ class ProposalForm:
     thumbnail: Markup | None = None
     reason: str = ""
     problem: dict[str, Any] | None = None
+    day_to_add: date | None = None
 
     @property
     def seen(self) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -18,6 +18,7 @@ from app.ingest.models import SessionProposal
 from app.ingest.proposals import service as proposals
 from app.ingest.proposals.forms import ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
 from app.ingest.proposals.thumbnail import thumbnail
+from app.ingest.proposals.visit_of_recording import add_visit_of_recording, day_to_add
 from app.ingest.uploads import service
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
@@ -28,7 +29,7 @@ from app.study import repository as study
 from app.study import service as study_service
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.deps import CurrentParticipant
-from app.study.models import Participant, StudySession
+from app.study.models import Participant, StudySession, Visit
 from app.study.sessions import designs
 from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions
@@ -83,7 +84,7 @@ def decide(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
         return _page(request, db, participant, caller, error=gone)
     if refused:
         return _page(request, db, participant, caller, refused=refused, sent=typed, confirmed=confirmed)
-    done = {"discard": "dropped", "split": "cut", "confirm": "confirmed"}.get(verb, "saved")
+    done = {"discard": "dropped", "split": "cut", "confirm": "confirmed", "visit": "visit"}.get(verb, "saved")
     listed = f"&confirmed={','.join(map(str, confirmed))}" if confirmed else ""
     return RedirectResponse(f"/participants/{participant.code}/proposals?done={done}{listed}", 303)
 
@@ -127,6 +128,10 @@ def _decide_one(
         proposals.discard(db, session, _version(version), why[:1000], caller)
     elif mine and verb == "split":
         proposals.split(db, session, _version(version), as_parts(session, typed_parts(values, session.id)), caller)
+    elif mine and verb == "visit":
+        if own:
+            version = str(proposals.change(db, session, as_change(session, version, stored, typed), caller).version)
+        add_visit_of_recording(db, session, _version(version), caller)
     elif verb == "confirm" and (mine or (everyone and typed["visit"] and typed["controller"])):
         proposals.confirm(db, session, as_change(session, version, stored, typed), caller)
         return True
@@ -156,8 +161,9 @@ def _page(
     refused, sent = refused or {}, sent or {}
     waiting = [only] if only else list(study.proposals_of_participant(db, participant.id))
     behind = repository.proposals(db, [s.id for s in waiting])
+    visits = study.visits(db, participant.id, 1000, 0)[0]
     forms = [
-        _form(request, db, s, behind[s.id], caller, refused.get(s.id), sent) for s in waiting[:SHOWN] if s.id in behind
+        _form(request, db, s, behind[s.id], caller, refused.get(s.id), sent, visits) for s in waiting[:SHOWN] if s.id in behind
     ]  # fmt: skip
     everyone = study.sessions_of_participant(db, participant.id, with_proposals=True)
     fresh = [(s, sentences(contradictions(db, s))) for s in everyone if s.id in (confirmed or []) and s.status == "confirmed"]
@@ -172,7 +178,7 @@ def _page(
         confirmed=fresh,
         grasp_files=[] if only else repository.waiting_grasp_files(db, participant.id),
         sessions=everyone,
-        visits=study.visits(db, participant.id, 1000, 0)[0],
+        visits=visits,
         controllers=[("", "open: choose …"), *((c.value, name) for c, name in CONTROLLER_NAMES.items())],
         policies=study.policy_names(db, participant.id),
         may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
@@ -190,6 +196,7 @@ def _form(
     caller: Caller,
     error: BetaloopError | None,
     sent: Mapping[str, str],
+    visits: Sequence[Visit],
 ) -> ProposalForm:
     stored = texts(db, session, proposal, caller)
     data = _steps(db, session)
@@ -209,6 +216,7 @@ def _form(
         thumbnail(data) if data else None,
         sent.get(f"reason-{session.id}", "") if error else "",
         error.problem(request.url.path) if error else None,
+        day_to_add(session, proposal, visits),
     )
 
 

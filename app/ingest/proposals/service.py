@@ -206,7 +206,7 @@ def change(db: Session, session: StudySession, wanted: ProposalChange, caller: C
 
 
 def _correct(db: Session, session: StudySession, wanted: ProposalChange, caller: Caller, confirming: bool) -> SessionProposal:
-    proposal = _locked(db, session, wanted.version, caller)
+    proposal = locked(db, session, wanted.version, caller)
     given = wanted.model_dump(exclude_unset=True, exclude={"version", "reason"})
     set_reason(db, wanted.reason)
     _move_to_visit(db, session, proposal, given)
@@ -274,7 +274,7 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
     Raises:
         Conflict: as `change`. Invalid: parts outside the recording or over each other.
     """
-    proposal = _locked(db, session, version, caller)
+    proposal = locked(db, session, version, caller)
     spans = sorted((p.start_s, p.stop_s) for p in parts)
     for (_, stop), (start, _) in pairwise(spans):
         if start < stop - 1e-6:
@@ -311,13 +311,14 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
 
 def discard(db: Session, session: StudySession, version: int, reason: str, caller: Caller) -> None:
     """Drop a proposal that is no session; its recordings stay. Raises Conflict as `change`."""
-    _locked(db, session, version, caller)
+    locked(db, session, version, caller)
     set_reason(db, reason)
     db.delete(session)
     db.flush()
 
 
-def _locked(db: Session, session: StudySession, version: int, caller: Caller) -> SessionProposal:
+def locked(db: Session, session: StudySession, version: int, caller: Caller) -> SessionProposal:
+    """The proposal's row, locked for a change. Raises Conflict where it was confirmed, or changed after the caller looked at it."""
     study_service.require(caller, can.WRITE_STUDY, session.visit.participant)
     proposal = repository.proposal(db, session.id, caller, lock=True)
     db.refresh(session, ["status"])

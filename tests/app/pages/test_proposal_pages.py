@@ -158,6 +158,19 @@ def test_what_cannot_be_is_said_at_the_proposal_and_stays_typed(
     assert confirmed(client) == set()
 
 
+def test_one_button_adds_the_visit_of_a_recording_and_keeps_what_was_typed(browser: TestClient, client: TestClient, propose: Any) -> None:
+    (number,) = propose(("a.zip", device_zip(("random",), minute=26 * 60)))
+    assert "Create visit 2026-03-03 from the recording" in browser.get(URL).text
+    done = press(browser, f"visit:{number}", **{f"controller_{number}": "random"})
+    assert done.headers["location"].endswith("?done=visit")
+    page = browser.get(done.headers["location"]).text
+    assert "Visit added" in page
+    assert "Create visit" not in page
+    kept = client.get(f"/api/v1/proposals/{number}").json()
+    assert (kept["session"]["visit"], kept["session"]["controller"], kept["visit_open"]) == (2, "random", False)
+    assert press(browser, f"visit:{number}").status_code == 422
+
+
 def test_the_page_of_one_proposal_shows_its_traces_and_a_session_link_leads_there(browser: TestClient, propose: Any) -> None:
     (number,) = propose(("s.zip", device_zip(("cdbs",))))
     moved = browser.get(f"/sessions/{number}")

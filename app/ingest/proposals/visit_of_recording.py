@@ -1,0 +1,68 @@
+"""A visit on the day of a recording, made in one step for every proposal of that day. The caller commits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import date
+
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
+from app.ingest import repository
+from app.ingest.models import SessionProposal
+from app.ingest.proposals.evidence import Evidence, Reason, Source
+from app.ingest.proposals.service import locked, renew
+from app.platform.errors import Conflict, Invalid
+from app.study import repository as study
+from app.study import service as study_service
+from app.study.models import StudySession, Visit
+from app.study.schemas import VisitIn
+from app.study.sessions.contradictions import control_recording, local_day
+
+
+def day_to_add(session: StudySession, proposal: SessionProposal, visits: Sequence[Visit]) -> date | None:
+    """The day of a proposal whose visit is open and that no visit has; None where there is a visit to choose, or no date."""
+    if not proposal.visit_open or session.started_at is None:
+        return None
+    day = local_day(control_recording(session), session.started_at)
+    return None if any(v.date == day for v in visits) else day
+
+
+def add_visit_of_recording(db: Session, session: StudySession, version: int, caller: Caller) -> tuple[Visit, list[StudySession]]:
+    """Add the visit on whose day a proposal was recorded, and give it to every proposal of that day whose visit is open.
+
+    Its number follows the highest one of the participant.
+
+    Returns:
+        The visit, and the proposals that belong to it now.
+
+    Raises:
+        Conflict: the proposal was confirmed, or changed after the caller looked at it; the day has a visit already. Invalid: the proposal
+            has a visit, or its recording states no date.
+    """
+    participant = session.visit.participant
+    study_service.require(caller, can.WRITE_STUDY, participant)
+    proposal = locked(db, session, version, caller)
+    visits = study.visits(db, participant.id, 1000, 0)[0]
+    if not proposal.visit_open:
+        raise Invalid(f"Proposed session {session.id} has visit {session.visit.number} already.", "Correct it there, or leave it.")
+    if session.started_at is None:
+        raise Invalid(f"The recording of session {session.id} states no date.", "Add the visit yourself, or state the session's start.")
+    day = day_to_add(session, proposal, visits)
+    if day is None:
+        raise Conflict("A visit on the day of this recording is there already.", "Choose it in the proposal.")
+    visit = study_service.add_visit(db, participant, VisitIn(number=max(v.number for v in visits) + 1, date=day), caller)
+    why = Evidence(Source.RECORDING, Reason.DAY_OF_VISIT, {"day": str(day), "visit": visit.number}).as_json()
+    waiting = study.proposals_of_participant(db, participant.id)
+    behind = repository.proposals(db, [s.id for s in waiting])
+    moved = [s for s in waiting if s.id in behind and day_to_add(s, behind[s.id], visits) == day]
+    for one in moved:
+        row = behind[one.id]
+        one.ordinal = study.next_ordinal(db, visit.id)
+        one.visit = visit
+        row.visit_open, row.changed_by = False, caller.label
+        row.evidence = {**row.evidence, "visit": why}
+        db.flush()
+        renew(db, one)
+    return visit, moved
