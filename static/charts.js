@@ -4,6 +4,8 @@ const CONFIG = {
   modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "toggleSpikelines"], toImageButtonOptions: { format: "svg" },
 };
 
+const PAPER_PX = 660; // what the margins and cards of print.css leave of A4
+
 let library = null;
 
 function plotly() {
@@ -65,6 +67,8 @@ async function draw(figure, onPaper = false) {
     theme.done();
     const shown = zooms.get(figure.dataset.zoom);
     if (shown) Object.assign(layout.xaxis, { range: shown, autorange: false });
+    // a sheet is narrower than most windows, and nothing tells the library how wide it is
+    if (onPaper) Object.assign(layout, { width: Math.min(PAPER_PX, plot.clientWidth || PAPER_PX), autosize: false });
     plot.querySelector(".loading")?.remove();
     await Plotly.react(plot, data, layout, CONFIG);
     // the table below says it in words; the buttons above stay for everyone
