@@ -226,7 +226,9 @@ class _Loader:
                 fields["started_at"] = session.started_at.isoformat()
             answer = self.client.post("/uploads", data=fields, files={"file": (name, content)})
             stored = self._checked(answer)["sessions"][0]["id"]
-            self._checked(self.client.put(f"/sessions/{stored}/qoc", json=session.qoc()))
+            self._checked(
+                self.client.put(f"/sessions/{stored}/qoc", json=session.qoc() | {"sure": ["grasp_hz", "rating", "tremor_percent"]})
+            )
             if (conditions := session.conditions()) is not None:
                 self._checked(self.client.put(f"/sessions/{stored}/conditions", json=conditions))
             bars.advance(bar)

@@ -101,7 +101,8 @@ def hold(db: Session, participant: Participant, visit: Visit, placed: PlacedSess
     if placed.design is not None:
         conditions.change(db, held, _stated(placed.design), caller)
     qoc = simulated.qoc
-    study.record_qoc(db, held, QocIn(grasp_hz=qoc.grasp_hz, rating=simulated.rating, tremor_percent=qoc.tremor_percent), caller)
+    values = {"grasp_hz": qoc.grasp_hz, "rating": simulated.rating, "tremor_percent": qoc.tremor_percent}
+    study.record_qoc(db, held, QocIn.model_validate(values | {"sure": list(values)}), caller)
     db.commit()
 
 

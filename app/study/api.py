@@ -72,7 +72,7 @@ def list_settings(participant: CurrentParticipant) -> list[SettingsOut]:
 @router.put("/participants/{code}/settings", responses=problems(409))
 def change_settings(participant: CurrentParticipant, change: SettingsChange, db: Db, caller: CurrentCaller) -> SettingsOut:
     """Change settings: a new version; members left out keep their value."""
-    row = service.change_settings(db, participant, change.settings, change.reason, caller)
+    row = service.change_settings(db, participant, change.settings, change.reason, caller, change.sure)
     db.commit()
     return SettingsOut.model_validate(row)
 

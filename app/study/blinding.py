@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.platform.errors import BetaloopError, Conflict, Forbidden
+from app.platform.errors import Conflict, Forbidden
 from app.study import repository
 from app.study.models import Controller, Participant, StudySession, Visit
 
@@ -70,10 +70,10 @@ def may_know(visit: Visit, user: Caller) -> bool:
     return user.may(can.READ_ARMS, site.study_id, site.id) or visit.locked
 
 
-def require_known(visit: Visit, user: Caller, instead: BetaloopError | None = None) -> None:
-    """Raises Forbidden (or `instead`) where the user may not know the arms of a visit, nor see what gives them away."""
+def require_known(visit: Visit, user: Caller) -> None:
+    """Raises Forbidden where the user may not know the arms of a visit, nor see what gives them away."""
     if not may_know(visit, user):
-        raise instead or Forbidden(
+        raise Forbidden(
             f"What ran at visit {visit.number} is hidden from you until the visit is locked.",
             "You are a blinded assessor; a clinician locks the visit when its data are complete.",
         )

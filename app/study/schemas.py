@@ -26,6 +26,9 @@ BetaSource = Literal["time_domain", "device_power", "percept_lfp", "table"]
 Code = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$")]
 
 
+SURE = "Values outside the usual that a person has looked at: they are right."
+
+
 class Bound(NamedTuple):
     """What a number may be: from `low` to `high` in `unit`, both allowed; where it is not 0, its magnitude is `least` at the least."""
 
@@ -142,6 +145,7 @@ class SettingsChange(Model):
 
     settings: SettingsIn
     reason: Text | None = Field(None, max_length=1000)
+    sure: list[Literal["cdbs_amplitude_ma"]] = Field(default_factory=list, max_length=1, description=SURE)
 
 
 class ParticipantOut(Model):
@@ -168,6 +172,7 @@ class CdbsAmplitudeModel(CdbsAmplitudeOut):
     amplitude_ma: Annotated[
         Number, AfterValidator(CDBS_MA.check), Field(json_schema_extra={"minimum": CDBS_MA.low, "maximum": CDBS_MA.high})
     ]
+    sure: Bool = Field(False, description="A person has looked at an amplitude outside the usual: it is right.")
 
 
 class VisitIn(Model):
@@ -206,6 +211,7 @@ class QocIn(Model):
     rating: Int | None = Field(None, ge=1, le=10, description="The participant's rating, 1-10.")
     tremor_percent: Number | None = Field(None, ge=0, le=100, description="Share of the session with mild or worse tremor, %.")
     reason: Text | None = Field(None, max_length=1000, description="Why, when values are corrected.")
+    sure: list[Literal["grasp_hz", "rating", "tremor_percent"]] = Field(default_factory=list, max_length=3, description=SURE)
 
 
 class QocOut(Model):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 from sqlalchemy.exc import IntegrityError
@@ -19,6 +20,8 @@ from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, QocIn, SessionC
 from app.study.sessions import repeated
 from app.study.threshold import MDP_FIELDS
 from app.study.traces import NO_CONTROL, control_programs
+from app.study.usual import questions
+from app.study.usual.values import Question, question
 from app.study.visits.service import require_unlocked
 from ml.mdp import MdpSettings
 
@@ -33,24 +36,31 @@ POLICY_CONTROLLERS = {Controller.RL, Controller.DISTILLED, Controller.OTHER}
 """Controllers that a policy can stand behind."""
 
 
-def change_settings(db: Session, participant: Participant, change: SettingsIn, reason: str | None, caller: Caller) -> SettingsVersion:
-    """Make a new settings version of what the change names; old results keep theirs. No change, no version."""
+def change_settings(
+    db: Session, participant: Participant, change: SettingsIn, reason: str | None, caller: Caller, sure: Collection[str] = ()
+) -> SettingsVersion:
+    """Make a new settings version of what the change names; old results keep theirs. No change, no version.
+
+    Raises Unusual for a value outside the usual whose name is not among `sure`.
+    """
     require(caller, can.WRITE_SETTINGS, participant)
     current = participant.current_settings
     values = {name: getattr(current, name) for name in SettingsIn.model_fields} | change.model_dump(exclude_unset=True)
     if all(getattr(current, name) == value for name, value in values.items()):
         return current
+    questions.require_sure(change.model_dump(exclude_unset=True), sure, current)
     return add_settings(db, participant, values, caller, reason)
 
 
 def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Caller) -> Visit:
-    """Add a visit. Raises Conflict when its number is taken."""
+    """Add a visit. Raises Conflict when its number is taken, Unusual for an amplitude outside the usual that nobody has confirmed."""
     require(caller, can.WRITE_STUDY, participant)
     if repository.visit_by_number(db, participant.id, draft.number):
         raise Conflict(f"Participant {participant.code} already has a visit {draft.number}.", "Choose the next number.")
     _each_once(draft.cdbs_amplitudes)
+    questions.refuse(q for a in draft.cdbs_amplitudes if (q := _asked(a)))
     visit = Visit(participant_id=participant.id, number=draft.number, date=draft.date, note=draft.note)
-    visit.cdbs_amplitudes = [CdbsAmplitude(**a.model_dump()) for a in draft.cdbs_amplitudes]
+    visit.cdbs_amplitudes = [CdbsAmplitude(**a.model_dump(exclude={"sure"})) for a in draft.cdbs_amplitudes]
     db.add(visit)
     db.flush()
     return visit
@@ -69,6 +79,8 @@ def change_visit(db: Session, visit: Visit, change: VisitChange, caller: Caller)
     if "cdbs_amplitudes" in given:
         wanted = change.cdbs_amplitudes or []
         _each_once(wanted)
+        standing = {(a.hemisphere, a.program, a.amplitude_ma) for a in visit.cdbs_amplitudes}
+        questions.refuse(q for a in wanted if (a.hemisphere, a.program, a.amplitude_ma) not in standing and (q := _asked(a)))
         stated = {(a.hemisphere, a.program): a.amplitude_ma for a in wanted}
         for row in list(visit.cdbs_amplitudes):
             amplitude = stated.pop((row.hemisphere, row.program), None)
@@ -88,19 +100,32 @@ def _each_once(amplitudes: Sequence[CdbsAmplitudeModel]) -> None:
         raise Invalid("The same hemisphere and program stand twice in cdbs_amplitudes.", "Give each once.")
 
 
+def _asked(amplitude: CdbsAmplitudeModel) -> Question | None:
+    """What there is to ask about an amplitude of a visit; None where it is usual."""
+    asked = question("cdbs_amplitude_ma", amplitude.amplitude_ma)
+    if asked is None:
+        return None
+    side, program = amplitude.hemisphere.value, amplitude.program
+    return replace(asked, field="cdbs_amplitudes", hemisphere=side, program=program, confirmed=amplitude.sure)
+
+
 def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller) -> QocRevision:
-    """Enter or correct QoCs: a new revision that keeps what the call leaves out. Same values, no revision."""
+    """Enter or correct QoCs: a new revision that keeps what the call leaves out. Same values, no revision.
+
+    Raises Unusual for values outside the usual that nobody has confirmed.
+    """
     require(caller, can.WRITE_QOC, session.visit.participant)
     _refuse_proposal(session)
     require_unlocked(session.visit)
     repository.lock_session(db, session)
     known = session.qoc
-    given = values.model_dump(exclude_unset=True, exclude={"reason"})
+    given = values.model_dump(exclude_unset=True, exclude={"reason", "sure"})
     merged = {name: getattr(known, name, None) for name in outcomes.QOC_FIELDS} | given
     if known is not None and all(getattr(known, name) == value for name, value in merged.items()):
         return known
     if known is None and all(value is None for value in merged.values()):
         raise Invalid("No QoC was given.", "Enter at least one of grasp frequency, rating and tremor.")
+    questions.require_sure(given, values.sure, known, {"rating": repository.other_ratings(db, session)})
     kept = [name for name in (known.derived if known else ()) if merged[name] == getattr(known, name)]
     return outcomes.add_revision(db, session, given, caller.label, values.reason, kept)
 

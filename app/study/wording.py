@@ -15,6 +15,7 @@ from app.study.models import Controller
 from app.study.sessions.contradictions import Contradiction, Kind
 from app.study.sessions.designs import Drawn
 from app.study.sessions.models import Activity
+from app.study.usual.values import Question, Why
 
 EVENT_KINDS = {
     EventKind.DYSKINESIA: "Dyskinesia",
@@ -52,6 +53,25 @@ ACTIVITIES = {
     Activity.MEAL: "ate",
     Activity.SLEEP: "slept",
 }
+
+UNUSUAL = "Some values are unusual: are they right?"
+UNUSUAL_HINT = "Correct them, or say that they are right; nothing was saved yet."
+
+
+def unusual(asked: Question) -> str:
+    """What is asked about one value."""
+    value = f"{asked.value:.4g} {asked.unit}".strip()
+    usual = f"{asked.low:g} to {asked.high:g} {asked.unit}".strip()
+    match asked.code:
+        case Why.SHARE:
+            return f"{value}: less than one per cent. Was it meant as a share, {100 * asked.value:.3g} %?"
+        case Why.FAR_FROM_VISIT:
+            return f"{value}, where the other sessions of this visit have {usual}: 1 is worst, 10 is best. Is it right?"
+        case Why.BELOW:
+            return f"{value} is below what is usual ({usual}). Is it right?"
+        case Why.ABOVE:
+            return f"{value} is above what is usual ({usual}). Is it right?"
+
 
 CODE_QUESTIONS = {
     CodeQuestion.NAME: "it holds a word that may be a name",

@@ -82,13 +82,20 @@ export function countGrasps(keep) {
   });
 }
 
+const USUAL_HZ = [0.3, 6]; // app/study/usual/values.py
 export function typeGrasp(keep) {
   openDialog("Grasp frequency", (dialog, close) => {
     const field = el("input", { type: "number", inputmode: "decimal", min: "0", max: "19.9", step: "0.01", "aria-label": "Grasp frequency in Hz", autofocus: true });
     const told = el("p", { role: "alert" });
+    let sure = null;
     const check = async () => {
       const hz = Number(field.value);
       if (field.value === "" || !Number.isFinite(hz) || hz < 0 || hz >= 20) { told.textContent = "Give a frequency from 0 to below 20 Hz."; return; }
+      if ((hz < USUAL_HZ[0] || hz > USUAL_HZ[1]) && sure !== field.value) {
+        sure = field.value;
+        told.textContent = `${hz} Hz lies outside what is usual (${USUAL_HZ[0]} to ${USUAL_HZ[1]} Hz). Is it right? Keep it once more, or correct it.`;
+        return;
+      }
       await keep({ method: "typed", hz, taps_s: [], began_at: null, ended_at: null });
       close();
     };

@@ -44,6 +44,22 @@ INTENDED: dict[str, str] = {
         ),
         "API: `gain_method` and `supported` of a sweep's policies",
     ),
+    **dict.fromkeys(
+        (
+            "components > schemas > ParticipantIn > properties > sure",
+            "components > schemas > QocIn > properties > sure",
+            "components > schemas > SettingsChange > properties > sure",
+        ),
+        "API: QoCs and cDBS amplitudes outside the usual are questioned (422, `questions`)",
+    ),
+    **dict.fromkeys(
+        (
+            "components > schemas > VisitOfRecordingIn",
+            "components > schemas > VisitOfRecordingOut",
+            "paths > /api/v1/proposals/{session_id}/visit",
+        ),
+        "API: `POST /proposals/{id}/visit` adds a visit on the day of a recording",
+    ),
     "paths > /readyz": "`GET /readyz` says whether requests can be served (the database answers and has this version's schema).",
     **dict.fromkeys(
         ("components > schemas > Problem", "components > schemas > ProblemOut"),

@@ -50,7 +50,7 @@ def _qoc(db: Session, session: StudySession, outcome: SlotOutcome, caller: Calle
     new = {name: value for name, value in entered.items() if known[name] is None}
     if new:
         who = sorted(set(outcome.entered_by.values()))
-        record_qoc(db, session, QocIn.model_validate(new | {"reason": wording.from_the_day(who)}), caller)
+        record_qoc(db, session, QocIn.model_validate(new | {"reason": wording.from_the_day(who), "sure": list(new)}), caller)
     both = [(name, value, before) for name, value in entered.items() if (before := known[name]) is not None]
     return [wording.day_differs(name, value, before) for name, value, before in both if value != before]
 

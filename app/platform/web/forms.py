@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
@@ -10,7 +11,7 @@ from fastapi import Depends, Request
 from pydantic import BaseModel, ValidationError
 from starlette.datastructures import FormData
 
-from app.platform.errors import Invalid
+from app.platform.errors import BetaloopError, Invalid
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -34,7 +35,7 @@ def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] |
         labels: names as the page shows them, for the errors.
 
     Raises:
-        Invalid: names each field that is wrong and why; the document's `errors` holds them too.
+        Invalid: names each field that is wrong and why; the document's `errors` holds them too, `name` being that of the field.
     """
     labels = labels or {}
     errors: list[dict[str, str]] = []
@@ -47,15 +48,58 @@ def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] |
             try:
                 data[name] = _value(str(values[name]), info.annotation, info.is_required())
             except ValueError as error:
-                errors.append({"where": labels.get(name, name), "what": str(error)})
+                errors.append({"where": labels.get(name, name), "what": str(error), "name": name})
     if not errors:
         try:
             return model.model_validate(data)
         except ValidationError as error:
             for e in error.errors():
                 name = ".".join(map(str, e["loc"]))
-                errors.append({"where": labels.get(name, name), "what": e["msg"]})
+                errors.append({"where": labels.get(name, name), "what": e["msg"], "name": name})
     raise Invalid("Some fields cannot be used.", "Correct them and send the form again.", errors=errors)
+
+
+@dataclass(frozen=True)
+class FieldNote:
+    """What stands at a field of a refused form.
+
+    Attributes:
+        text: what is wrong, or what is asked.
+        answer: of a question: the value of the box that says yes to what is typed now; empty for an error.
+        confirmed: whether that box was ticked already.
+    """
+
+    text: str
+    answer: str = ""
+    confirmed: bool = False
+
+
+def field_notes(
+    error: BetaloopError | None, typed: Mapping[str, str], name_of: Callable[[Mapping[str, Any]], str] | None = None
+) -> dict[str, FieldNote]:
+    """By field of a form, what its refusal says of it: the problem's `errors` with a `name`, and its `questions` with a `field`.
+
+    Args:
+        error: why the form was refused. typed: what its fields held.
+        name_of: the form's field that a question is about, where it is not called like the question's.
+    """
+    extra = error.extra if error else {}
+    notes = {str(e["name"]): FieldNote(str(e["what"])) for e in extra.get("errors", ()) if "name" in e}
+    for asked in extra.get("questions", ()):
+        name = name_of(asked) if name_of else str(asked.get("field", ""))
+        if name in typed:
+            notes[name] = FieldNote(str(asked["text"]), _answer(name, typed[name]), bool(asked["confirmed"]))
+    return notes
+
+
+def confirmed(values: FormData, typed: Mapping[str, str]) -> list[str]:
+    """Fields of a form whose present text a person confirmed; a text that was changed after the question is asked about again."""
+    given = {str(answer) for answer in values.getlist("sure")}
+    return [name for name, text in typed.items() if _answer(name, text) in given]
+
+
+def _answer(name: str, text: str) -> str:
+    return f"{name}={text.strip()}"
 
 
 def _value(text: str, annotation: Any, required: bool) -> Any:

@@ -12,7 +12,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import render
 from app.study import repository
 from app.study.enrolment import service
@@ -39,6 +39,8 @@ def enrol(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -
     try:
         draft = parse(ParticipantIn, {k: v for k, v in known.items() if v}, _LABELS)
         draft.settings = parse(SettingsIn, values, form.LABELS)
+        answered = confirmed(values, {"cdbs_amplitude_ma": str(values.get("cdbs_amplitude_ma", ""))})
+        draft.sure = ["cdbs_amplitude_ma"] if answered else []
         participant = service.enrol(db, draft, caller)
     except BetaloopError as error:
         db.rollback()
@@ -59,7 +61,8 @@ def _enrolment(
         stated=form.AT_ENROLMENT,
         constants=form.LATER,
         sites=sites,
-        questioned=bool(error and error.extra.get("questions")),
+        questioned=bool(error and any("field" not in q for q in error.extra.get("questions", ()))),
+        remarks=field_notes(error, known | values),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

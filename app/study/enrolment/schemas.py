@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from app.platform.web.schemas import Bool, Model, Text
-from app.study.schemas import Code, SettingsIn
+from app.study.schemas import SURE, Code, SettingsIn
 
 
 class ParticipantIn(Model):
@@ -17,3 +19,4 @@ class ParticipantIn(Model):
     )
     site: Text | None = Field(None, max_length=40, description="Code of the site; needed when there are several.")
     settings: SettingsIn = Field(default_factory=SettingsIn)
+    sure: list[Literal["cdbs_amplitude_ma"]] = Field(default_factory=list, max_length=1, description=SURE)

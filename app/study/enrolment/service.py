@@ -16,6 +16,7 @@ from app.study.enrolment.schemas import ParticipantIn
 from app.study.margins.schemas import MarginsFields
 from app.study.models import MarginsVersion, Participant
 from app.study.service import add_settings
+from app.study.usual.questions import require_sure
 
 RESERVED_CODES = {"new"}
 
@@ -25,7 +26,9 @@ def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
 
     Raises:
         Invalid: the code is a page's address, or looks like somebody's identity and nobody said that it is a study code (the problem's
-            `questions` say what it looks like). Conflict: the code is taken. NotFound: no such site. Forbidden: not the caller's to enrol.
+            `questions` say what it looks like).
+        Unusual: the cDBS amplitude is outside the usual, and nobody is sure of it. Conflict: the code is taken. NotFound: no such site.
+        Forbidden: not the caller's to enrol.
     """
     if draft.code.lower() in RESERVED_CODES:
         raise Invalid(f"'{draft.code}' cannot be a participant's code: it is the address of a page.", "Choose another code.")
@@ -37,6 +40,7 @@ def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
         raise Invalid(told, wording.CODE_HINT, questions=[{"code": q.value, "text": wording.CODE_QUESTIONS[q]} for q in asked])
     if asked:
         set_reason(db, wording.CODE_CONFIRMED)
+    require_sure(draft.settings.model_dump(exclude_unset=True), draft.sure)
     participant = Participant(site_id=site.id, code=draft.code)
     db.add(participant)
     try:

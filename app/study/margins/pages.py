@@ -10,7 +10,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.form_changes import Shown, own_changes, reason_of
@@ -105,6 +105,7 @@ def _page(
         groups=GROUPS,
         history=history(participant.margins, LABELS),
         may_write=may(caller, can.APPROVE_PLAN, participant),
+        remarks=field_notes(error, values),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

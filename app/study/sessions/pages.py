@@ -15,11 +15,11 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import render
 from app.study import repository, service
 from app.study.adverse_events.repository import events_of_session
-from app.study.blinding import CONTROLLER_NAMES, arm, may_know, require_known
+from app.study.blinding import CONTROLLER_NAMES, arm, may_know
 from app.study.data_queries.repository import not_closed_of_session
 from app.study.deps import CurrentSession
 from app.study.doses.since import since_last_dose
@@ -34,6 +34,7 @@ from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.stimulation import beside, delivered
 from app.study.traces import NO_CONTROL, control_programs, session_offset_s
+from app.study.visits.blinded import blinded_page
 from app.study.wording import ACTIVITIES, EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
 from ml.energy import relative_energy
 
@@ -122,10 +123,12 @@ def record_qoc(request: Request, session: CurrentSession, db: Db, caller: Curren
     try:
         service.require(caller, can.WRITE_QOC, session.visit.participant)
         changes.refuse_conflicts()
-        service.record_qoc(db, session, parse(QocIn, changes.fields | reason, _QOC_LABELS), caller)
+        answers = {"sure": confirmed(values, changes.fields)}
+        service.record_qoc(db, session, parse(QocIn, changes.fields | reason | answers, _QOC_LABELS), caller)
     except BetaloopError as error:
         db.rollback()
-        require_known(session.visit, caller, error)
+        if not may_know(session.visit, caller):
+            return blinded_page(request, db, session.visit, caller, error, session, changes.fields | reason)
         return _page(request, db, session, caller, error, typed=changes.fields | reason)
     db.commit()
     if not may_know(session.visit, caller):
@@ -311,6 +314,7 @@ def _page(
         | {k: v for k, v in (typed or {}).items() if k in _CONDITIONS_LABELS},
         may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
         problem=error.problem(request.url.path) if error else None,
+        remarks=field_notes(error, typed or {}),
     )
     return HTMLResponse(page, error.status if error else 200)
 

@@ -12,7 +12,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import render
 from app.study import service
 from app.study.deps import CurrentParticipant
@@ -44,7 +44,8 @@ def change_settings(request: Request, participant: CurrentParticipant, db: Db, c
     try:
         service.require(caller, can.WRITE_SETTINGS, participant)
         changes.refuse_conflicts()
-        row = service.change_settings(db, participant, parse(SettingsIn, changes.fields, form.LABELS), reason_of(values), caller)
+        wanted, sure = parse(SettingsIn, changes.fields, form.LABELS), confirmed(values, changes.fields)
+        row = service.change_settings(db, participant, wanted, reason_of(values), caller, sure)
     except BetaloopError as error:
         db.rollback()
         typed = form.texts(participant.current_settings) | changes.fields
@@ -75,6 +76,7 @@ def _settings_page(
         may_write=may(caller, can.WRITE_SETTINGS, participant),
         may_change_status=may(caller, can.WRITE_STUDY, participant),
         problem=error.problem(request.url.path) if error else None,
+        remarks=field_notes(error, values),
     )
     return HTMLResponse(page, error.status if error else 200)
 

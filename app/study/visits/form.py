@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -40,8 +40,18 @@ def posted(values: Mapping[str, Any]) -> dict[str, str]:
     return {str(name): str(value).replace("\r\n", "\n") for name, value in values.items()}
 
 
-def change(present: Mapping[str, str], changed: Mapping[str, str], reason: str) -> VisitChange:
-    """The change of a visit that the form asks for.
+def amplitudes(typed: Mapping[str, str], sure: Collection[str] = ()) -> list[CdbsAmplitudeModel]:
+    """The amplitudes that a form states, `sure` being the fields that a person confirmed. Raises Invalid, naming the field."""
+    return [_amplitude(n, text, n in sure) for n, text in typed.items() if n.startswith("cdbs_") and text.strip()]
+
+
+def asked_about(question: Mapping[str, Any]) -> str:
+    """The field of the correction form that a question about an amplitude belongs to."""
+    return f"cdbs_{question['hemisphere']}_{question['program']}"
+
+
+def change(present: Mapping[str, str], changed: Mapping[str, str], reason: str, sure: Collection[str] = ()) -> VisitChange:
+    """The change of a visit that the form asks for; `sure`: fields that a person confirmed.
 
     Raises:
         Invalid: no reason, or a field that cannot be read; names it.
@@ -52,7 +62,7 @@ def change(present: Mapping[str, str], changed: Mapping[str, str], reason: str) 
     draft = parse(VisitChange, fields | {"reason": reason}, _PLAIN)
     merged = {**present, **changed}
     if any(name.startswith("cdbs_") for name in changed):
-        draft.cdbs_amplitudes = [_amplitude(n, text) for n, text in merged.items() if n.startswith("cdbs_") and text.strip()]
+        draft.cdbs_amplitudes = amplitudes(merged, sure)
     return draft
 
 
@@ -61,11 +71,20 @@ def last_editor(db: Session, visit: Visit) -> str:
     return repository.last_editor(db, "visit", visit.id)
 
 
-def _amplitude(name: str, text: str) -> CdbsAmplitudeModel:
-    _, side, program = name.split("_")
-    return parse(CdbsAmplitudeModel, {"hemisphere": side, "program": program, "amplitude_ma": text}, {"amplitude_ma": _label(name)})
+def _amplitude(name: str, text: str, sure: bool) -> CdbsAmplitudeModel:
+    side, program = _place(name)
+    values = {"hemisphere": side, "program": program, "amplitude_ma": text, "sure": "yes" if sure else "no"}
+    try:
+        return parse(CdbsAmplitudeModel, values, {"amplitude_ma": _label(name)})
+    except Invalid as error:
+        raise Invalid(error.detail, error.hint, errors=[e | {"name": name} for e in error.extra["errors"]]) from error
+
+
+def _place(name: str) -> tuple[str, str]:
+    _, side, *program = name.split("_")
+    return side, program[0] if program else "0"
 
 
 def _label(name: str) -> str:
-    _, side, program = name.split("_")
+    side, program = _place(name)
     return f"cDBS amplitude, {side}" + (f", program {program}" if program != "0" else "")

@@ -14,7 +14,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import render
 from app.study import repository, service
 from app.study.blinding import arm, may_know, visible_arm
@@ -26,18 +26,20 @@ from app.study.models import Participant, StudySession, Visit
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
 from app.study.recordings import tablet
-from app.study.schemas import CdbsAmplitudeModel, VisitIn
+from app.study.schemas import VisitIn
 from app.study.service import may
 from app.study.sessions import pages as session_pages
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.data import session_data
 from app.study.visits import form
 from app.study.visits import service as visit_locks
+from app.study.visits.blinded import blinded_page
 from app.study.wording import DRUG_NAMES
 
 router = APIRouter()
 
 _VISIT_LABELS = {"number": "Number", "date": "Date", "note": "Note", "amplitude_ma": "cDBS amplitude"}
+_FIRST_PROGRAM = ("cdbs_left", "cdbs_right")
 
 
 @router.get("/participants/{code}/visits")
@@ -65,17 +67,14 @@ def new_visit(request: Request, participant: CurrentParticipant, db: Db, caller:
 @router.post("/participants/{code}/visits")
 def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Add a visit."""
+    typed = {str(k): str(v) for k, v in values.items()}
     try:
         draft = parse(VisitIn, {name: values.get(name, "") for name in ("number", "date", "note")}, _VISIT_LABELS)
-        draft.cdbs_amplitudes = [
-            parse(CdbsAmplitudeModel, {"hemisphere": side, "amplitude_ma": values[f"cdbs_{side}"]}, _VISIT_LABELS)
-            for side in ("left", "right")
-            if str(values.get(f"cdbs_{side}", "")).strip()
-        ]
+        draft.cdbs_amplitudes = form.amplitudes({n: typed[n] for n in _FIRST_PROGRAM if n in typed}, confirmed(values, typed))
         visit = service.add_visit(db, participant, draft, caller)
     except BetaloopError as error:
         db.rollback()
-        return _visit_form(request, participant, {k: str(v) for k, v in values.items()}, error)
+        return _visit_form(request, participant, typed, error)
     db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done=added", 303)
 
@@ -84,7 +83,7 @@ def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller:
 def visit_page(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """One visit day: its sessions in order; to a blinded assessor without what gives the controllers away."""
     if not may_know(visit, caller):
-        return _blinded_page(request, db, visit, caller)
+        return blinded_page(request, db, visit, caller)
     return shown_visit(request, db, visit, caller)
 
 
@@ -111,7 +110,8 @@ def change_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentC
     try:
         service.require(caller, can.WRITE_STUDY, visit.participant)
         changes.refuse_conflicts()
-        service.change_visit(db, visit, form.change(present.fields, changes.fields, typed["reason"]), caller)
+        sure = confirmed(values, {**present.fields, **changes.fields})
+        service.change_visit(db, visit, form.change(present.fields, changes.fields, typed["reason"], sure), caller)
     except BetaloopError as error:
         db.rollback()
         return shown_visit(request, db, visit, caller, typed, error)
@@ -151,16 +151,9 @@ def shown_visit(
         may_dose=may(caller, can.WRITE_STUDY, visit.participant) and visit.participant.status != service.WITHDRAWN and not visit.locked,
         may_lock=may(caller, can.LOCK_VISIT, visit.participant),
         problem=error.problem(request.url.path) if error else None,
+        remarks=field_notes(error, seen | (typed or {}), form.asked_about),
     )
     return HTMLResponse(page, error.status if error else 200)
-
-
-def _blinded_page(request: Request, db: Session, visit: Visit, caller: Caller) -> HTMLResponse:
-    sessions, _ = repository.sessions_of_visit(db, visit.id)
-    may_rate = may(caller, can.WRITE_QOC, visit.participant)
-    return HTMLResponse(
-        render(request, "study/visits/visit_blinded.html", visit=visit, participant=visit.participant, sessions=sessions, may_rate=may_rate)
-    )
 
 
 def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str, Any]:
@@ -178,7 +171,8 @@ def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str
 def _visit_form(request: Request, participant: Participant, draft: dict[str, str], error: BetaloopError | None = None) -> HTMLResponse:
     problem = error.problem(request.url.path) if error else None
     values = {"cdbs_left": "", "cdbs_right": "", "number": "", "date": "", "note": ""} | draft
+    remarks = field_notes(error, values, lambda q: f"cdbs_{q['hemisphere']}")
     return HTMLResponse(
-        render(request, "study/visits/visit_new.html", participant=participant, draft=values, problem=problem),
+        render(request, "study/visits/visit_new.html", participant=participant, draft=values, problem=problem, remarks=remarks),
         error.status if error else 200,
     )

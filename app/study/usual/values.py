@@ -1,0 +1,78 @@
+"""Values that can be, but seldom are: asked about once, and kept where a person says that they are right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+
+class Why(StrEnum):
+    """What is unusual about a value."""
+
+    BELOW = "below_usual"
+    ABOVE = "above_usual"
+    SHARE = "share_not_percent"
+    """Between 0 and 1 where per cent are asked for."""
+    FAR_FROM_VISIT = "far_from_visit"
+    """A rating far from every other one of the visit: the scale may have been read the other way round."""
+
+
+class Usual(NamedTuple):
+    """From where to where a value lies as a rule, both included."""
+
+    low: float
+    high: float
+    unit: str
+
+
+USUAL = {
+    "grasp_hz": Usual(0.3, 6.0, "Hz"),
+    "tremor_percent": Usual(0.0, 95.0, "%"),
+    "cdbs_amplitude_ma": Usual(0.5, 6.0, "mA"),
+}
+"""Hands open and close about 1 to 4 times per second in Parkinson disease, seldom above 6 in health; chronic stimulation has 1 to 4 mA."""
+FAR, LEAST_OTHERS = 5, 3
+"""Points that a rating differs by from each of so many others of its visit before it is asked about."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """A value to look at again.
+
+    Attributes:
+        field: of the request. value: what was given, in `unit`. low, high: what is usual.
+        hemisphere, program: of an amplitude that a visit states.
+        confirmed: whether a person has said that it is right.
+    """
+
+    field: str
+    code: Why
+    value: float
+    unit: str
+    low: float
+    high: float
+    hemisphere: str | None = None
+    program: int | None = None
+    confirmed: bool = False
+
+
+def question(name: str, value: float | None, others: Sequence[float] = ()) -> Question | None:
+    """What to ask about one value; None where it is usual.
+
+    Args:
+        name: `grasp_hz`, `rating`, `tremor_percent` or `cdbs_amplitude_ma`. value: Hz, 1-10, % or mA.
+        others: the same value of the visit's other sessions.
+    """
+    if value is None:
+        return None
+    if name == "rating":
+        far = len(others) >= LEAST_OTHERS and all(abs(value - other) >= FAR for other in others)
+        return Question(name, Why.FAR_FROM_VISIT, value, "", min(others), max(others)) if far else None
+    low, high, unit = USUAL[name]
+    if name == "tremor_percent" and 0 < value < 1:
+        return Question(name, Why.SHARE, value, unit, low, high)
+    if low <= value <= high:
+        return None
+    return Question(name, Why.BELOW if value < low else Why.ABOVE, value, unit, low, high)
