@@ -24,9 +24,9 @@ from app.learning.snapshots.service import collect, take_snapshot
 from app.platform import files
 from app.platform.jobs.models import Job, JobEvent, JobStatus, JobStep
 from app.study import blinding
-from app.study import service as study
+from app.study.enrolment.schemas import ParticipantIn
+from app.study.enrolment.service import enrol
 from app.study.models import Controller, Device, Participant, QocRevision, Recording, SessionSegment, StudySession, Trace, Visit
-from app.study.schemas import ParticipantIn
 from app.study.sessions.models import SessionConditions
 from app.study.traces import pack
 from ml.ope.estimate import Estimate
@@ -64,7 +64,7 @@ def add_participant(db: Session, number: int, extent: Extent) -> None:
     """One participant with everything that pages show of it."""
     rng = np.random.default_rng(number)
     settings = {"xi_beta": 1.0, "cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"}
-    participant = study.enrol(db, ParticipantIn.model_validate({"code": f"P{number:02d}", "settings": settings}), SYSTEM)
+    participant = enrol(db, ParticipantIn.model_validate({"code": f"P{number:02d}", "settings": settings}), SYSTEM)
     db.flush()
     policies = [_policy_file(db, i) for i in range(extent.policies)]
     # Policies are of the first visit's snapshot, so that later sessions can have run them
