@@ -9,7 +9,7 @@ from pydantic import Field
 
 from app.platform.web.schemas import Int, Model, Moment, Number, Text
 from app.study.models import Controller, Hemisphere
-from app.study.schemas import SessionOut, VisitOut
+from app.study.schemas import SessionOut
 
 
 class UploadForm(Model):
@@ -52,12 +52,6 @@ class SplitIn(Model):
 
     version: Int = Field(ge=1)
     parts: list[PartIn] = Field(min_length=1, max_length=50)
-
-
-class VisitOfRecordingIn(Model):
-    """Which proposal, as the caller looked at it, a visit is added for."""
-
-    version: Int = Field(ge=1)
 
 
 class DiscardIn(Model):
@@ -104,13 +98,6 @@ class ProposalOut(Model):
     parts: list[PartOut]
     usable_steps: list[UsableStepsOut] = Field(description="By channel of the control recording, the control channel first.")
     usable_on_any: int = Field(description="Steps that are usable on one time-domain channel or another, each counted once.")
-
-
-class VisitOfRecordingOut(Model):
-    """A visit on the day of a recording, and the proposals of that day, which belong to it now."""
-
-    visit: VisitOut
-    proposals: list[ProposalOut]
 
 
 class ConfirmedOut(Model):

@@ -154,14 +154,6 @@ def proposals_of_participant(db: Session, participant_id: int) -> Sequence[Study
     return db.scalars(query.order_by(Visit.number, StudySession.started_at, StudySession.id)).all()
 
 
-def other_ratings(db: Session, session: StudySession) -> list[float]:
-    """The newest ratings of the visit's other confirmed sessions that have one."""
-    mine = (StudySession.visit_id == session.visit_id) & CONFIRMED & (StudySession.id != session.id)
-    revisions = select(QocRevision.session_id, QocRevision.rating).join(StudySession, StudySession.id == QocRevision.session_id).where(mine)
-    newest = {row.session_id: row.rating for row in db.execute(revisions.order_by(QocRevision.revision))}
-    return [float(rating) for rating in newest.values() if rating is not None]
-
-
 def next_ordinal(db: Session, visit_id: int) -> int:
     """The next free place in a visit."""
     return (db.scalar(select(func.max(StudySession.ordinal)).where(StudySession.visit_id == visit_id)) or 0) + 1

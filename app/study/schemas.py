@@ -13,6 +13,7 @@ from pydantic_core import PydanticCustomError
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
 from app.study.sessions.models import Activity
+from app.study.usual.values import SURE
 
 
 def _one_spelling(unit: str) -> str:
@@ -24,9 +25,6 @@ Unit = Annotated[Text, AfterValidator(_one_spelling)]
 BetaMeasure = Literal["rms", "power"]
 BetaSource = Literal["time_domain", "device_power", "percept_lfp", "table"]
 Code = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$")]
-
-
-SURE = "Values outside the usual that a person has looked at: they are right."
 
 
 class Bound(NamedTuple):

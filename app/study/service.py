@@ -18,6 +18,7 @@ from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision
 from app.study.outcomes import service as outcomes
 from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, QocIn, SessionChange, SettingsIn, VisitChange, VisitIn
 from app.study.sessions import repeated
+from app.study.sessions.repository import other_ratings
 from app.study.threshold import MDP_FIELDS
 from app.study.traces import NO_CONTROL, control_programs
 from app.study.usual import questions
@@ -125,7 +126,7 @@ def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller
         return known
     if known is None and all(value is None for value in merged.values()):
         raise Invalid("No QoC was given.", "Enter at least one of grasp frequency, rating and tremor.")
-    questions.require_sure(given, values.sure, known, {"rating": repository.other_ratings(db, session)})
+    questions.require_sure(given, values.sure, known, {"rating": other_ratings(db, session)})
     kept = [name for name in (known.derived if known else ()) if merged[name] == getattr(known, name)]
     return outcomes.add_revision(db, session, given, caller.label, values.reason, kept)
 

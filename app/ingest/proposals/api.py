@@ -11,6 +11,7 @@ from app.accounts.permissions import Caller
 from app.ingest import repository
 from app.ingest.deps import CurrentProposal
 from app.ingest.proposals import service as proposals
+from app.ingest.proposals.schemas import VisitOfRecordingIn, VisitOfRecordingOut
 from app.ingest.proposals.serializers import proposal_out, proposals_out
 from app.ingest.proposals.visit_of_recording import add_visit_of_recording
 from app.ingest.schemas import (
@@ -21,8 +22,6 @@ from app.ingest.schemas import (
     ProposalChange,
     ProposalOut,
     SplitIn,
-    VisitOfRecordingIn,
-    VisitOfRecordingOut,
 )
 from app.ingest.uploads import service
 from app.platform.database import Db

@@ -325,11 +325,9 @@ def locked(db: Session, session: StudySession, version: int, caller: Caller) -> 
     if session.status != "proposed":
         raise Conflict(f"Session {session.id} was confirmed meanwhile.", "Correct it on its own page.")
     if proposal.version != version:
-        raise Conflict(
-            f"Proposed session {session.id} was changed by {proposal.changed_by} after this form was opened; nothing was saved.",
-            "What you typed still stands in the form: send it again to replace what is stored, or load the page again to keep that.",
-            version=proposal.version,
-        )
+        what = f"Proposed session {session.id} was changed by {proposal.changed_by} after this form was opened; nothing was saved."
+        way = "What you typed still stands in the form: send it again to replace what is stored, or load the page again to keep that."
+        raise Conflict(what, way, version=proposal.version)
     return proposal
 
 

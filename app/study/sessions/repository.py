@@ -76,3 +76,11 @@ def slot_head(db: Session, participant_id: int, slot_id: int) -> SlotHead | None
     query = select(*wanted).join_from(items, plans, items.c.plan_id == plans.c.id).join(Visit, Visit.id == plans.c.visit_id)
     row = db.execute(query.where(items.c.id == slot_id, Visit.participant_id == participant_id)).first()
     return None if row is None else SlotHead(*row)
+
+
+def other_ratings(db: Session, session: StudySession) -> list[float]:
+    """The newest ratings of the visit's other confirmed sessions that have one."""
+    mine = (StudySession.visit_id == session.visit_id) & (StudySession.status == "confirmed") & (StudySession.id != session.id)
+    revisions = select(QocRevision.session_id, QocRevision.rating).join(StudySession, StudySession.id == QocRevision.session_id).where(mine)
+    newest = {row.session_id: row.rating for row in db.execute(revisions.order_by(QocRevision.revision))}
+    return [float(rating) for rating in newest.values() if rating is not None]

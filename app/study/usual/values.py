@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
+SURE = "Values outside the usual that a person has looked at: they are right."
+
 
 class Why(StrEnum):
     """What is unusual about a value."""
