@@ -25,7 +25,7 @@ from sqlalchemy.orm import Session
 import app.platform.database as database
 from app.accounts import service as accounts
 from app.accounts.models import Role
-from app.platform import rights
+from app.platform import service_role
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.files import path_of
 from app.platform.jobs import engine as jobs_engine
@@ -67,7 +67,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedPostgre
         command.upgrade(config, "head")
     jobs_engine.prepare(server.owner_url("betaloop"))
     with engine.begin() as connection:
-        rights.grant(connection, "betaloop_service", None)
+        service_role.grant(connection, "betaloop_service", None)
     engine.dispose()
     yield server
     for connection in _administrators.values():

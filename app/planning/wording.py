@@ -8,7 +8,7 @@ from app.evaluation.wording import amplitude, chance, joined
 from app.planning.notices import Code, PlanWarning
 from app.planning.plans.designs import Bound, Planned, delivered_ma
 from app.planning.plans.models import Plan, PlanItem
-from app.planning.protocol.orders import Order
+from app.planning.protocol.session_order import Order
 from app.planning.slots.matching import Deviation
 from app.planning.visit_day.record import Contradiction, Entry, grasp_hz, moment
 from app.planning.visit_day.schemas import SlotOut

@@ -12,7 +12,7 @@ from psycopg.errors import InsufficientPrivilege
 from sqlalchemy import Connection, Engine, NullPool, create_engine, make_url, text
 from sqlalchemy.exc import ProgrammingError
 
-from app.platform import rights
+from app.platform import service_role
 from app.platform.database import database_url, get_engine, owner_url
 from app.platform.files import close_to_others
 from app.platform.jobs import engine as jobs_engine
@@ -37,12 +37,12 @@ def migrate() -> None:
         jobs_engine.prepare(owner)
         if owner != service:
             with _one_at_a_time(engine) as connection:
-                rights.grant(connection, rights.role_of(service), make_url(service).password)
+                service_role.grant(connection, service_role.role_of(service), make_url(service).password)
     except ProgrammingError as error:
         if isinstance(error.orig, InsufficientPrivilege):
             raise RuntimeError(
-                f"the database role {rights.role_of(owner)} may not change the tables: run `betaloop migrate` with BETALOOP_OWNER_URL, the"
-                " address with the role that owns them"
+                f"the database role {service_role.role_of(owner)} may not change the tables: run `betaloop migrate` with"
+                " BETALOOP_OWNER_URL, the address with the role that owns them"
             ) from error
         raise
 

@@ -30,7 +30,7 @@ from app.planning.plans.schemas import (
 )
 from app.planning.plans.view import PlanLine, PlanView, shown
 from app.planning.plans.view import read_plan as plan_of
-from app.planning.protocol.orders import Order
+from app.planning.protocol.session_order import Order
 from app.planning.sheet import pdf
 from app.platform.audit import record
 from app.platform.database import Db, now

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from app.evaluation.schemas import EstimateSummary
 from app.planning.notices import Code
-from app.planning.protocol.orders import Order
+from app.planning.protocol.session_order import Order
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
 

@@ -25,8 +25,8 @@ from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
 from app.planning.plans.schemas import PlanIn, PlanOptions
 from app.planning.plans.sign_off import SignatureState, sign_plan
 from app.planning.plans.view import PlanView, medication_due, read_plan, refuse_withdrawn, view_of
-from app.planning.protocol.orders import Order
 from app.planning.protocol.schedule import Candidate, Rules, schedule
+from app.planning.protocol.session_order import Order
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import service as study

@@ -12,7 +12,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from app.planning.protocol.orders import Order, rounds
+from app.planning.protocol.session_order import Order, rounds
 from app.platform.errors import Invalid
 from app.study.models import Controller
 

@@ -1,8 +1,8 @@
 """Who may use the embedded database: three roles with generated passwords, and no one else.
 
 `postgres` is the superuser of the server's own upkeep; `betaloop` owns the database, and migrations run as it; `betaloop_service`, as which
-the service connects, owns nothing and has the rights of `app.platform.rights`. A data folder of version 0.1.0 (no passwords, everything
-owned by the superuser) is converted at its next start, and one without the third role gets it.
+the service connects, owns nothing and has the rights of `app.platform.service_role`. A data folder of version 0.1.0 (no passwords,
+everything owned by the superuser) is converted at its next start, and one without the third role gets it.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from app.platform.audit.chain import verify
 from app.platform.database import new_session, now
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.service import STALE_S
-from app.platform.rights import excess
+from app.platform.service_role import excess
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -18,7 +18,7 @@ from app.platform.database import database_url, get_engine, owner_url
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.embedded.system_user import system_user
 from app.platform.migrate import migrate
-from app.platform.rights import excess
+from app.platform.service_role import excess
 from app.settings import get_settings
 from tests.system_users import require_root
 

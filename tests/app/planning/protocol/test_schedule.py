@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.planning.protocol.orders import Order
 from app.planning.protocol.schedule import Candidate, Rule, Rules, most_policies, schedule, total_minutes
+from app.planning.protocol.session_order import Order
 from app.platform.errors import Invalid
 from app.study.models import Controller
 

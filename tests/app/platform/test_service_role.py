@@ -9,7 +9,7 @@ from sqlalchemy import text
 from sqlalchemy.exc import ProgrammingError
 from sqlalchemy.orm import Session
 
-from app.platform import rights
+from app.platform import service_role
 from app.platform.audit import AUDITED
 from app.platform.audit.chain import verify
 from app.platform.database import new_session, owner_url
@@ -87,7 +87,7 @@ def test_no_trigger_of_the_services_own_writes_the_trail(fresh_database: str) ->
 
 
 def test_an_owner_who_is_named_as_the_service_keeps_the_rights_that_the_trail_needs(owner_db: Session) -> None:
-    assert rights.grant(owner_db.connection(), "betaloop", None) == 0
+    assert service_role.grant(owner_db.connection(), "betaloop", None) == 0
     owner_db.execute(text("insert into study (code, name) values ('S2', 'A second study')"))
     assert owner_db.scalar(text("select count(*) from audit_event where entity = 'study' and after ->> 'code' = 'S2'")) == 1
 
@@ -99,11 +99,11 @@ def test_the_service_has_the_rights_it_needs_and_no_other(client: TestClient, en
             " lateral aclexplode(c.relacl) a where a.grantee in (0, 'betaloop_service'::regrole) and c.relkind in ('r', 'p', 'v')"
             " and n.nspname = any(:schemas) group by 1, 2"
         ),
-        {"schemas": list(rights.SCHEMAS)},
+        {"schemas": list(service_role.SCHEMAS)},
     ).all()
-    assert {(s, t): frozenset(p) for s, t, p in rows} == {(s, t): rights.wanted(s, t) for s, t, _ in rows}
+    assert {(s, t): frozenset(p) for s, t, p in rows} == {(s, t): service_role.wanted(s, t) for s, t, _ in rows}
     assert {t for s, t, _ in rows if s == "public"} >= set(AUDITED)
-    assert rights.excess(db.connection()) == []
+    assert service_role.excess(db.connection()) == []
     assert verify(db).whole  # what the service wrote reached the trail and its chain all the same
 
 
@@ -120,7 +120,7 @@ def test_a_role_that_owns_the_tables_is_found(fresh_database: str, monkeypatch: 
 def test_a_right_to_add_rows_to_the_trail_is_found(owner_db: Session, db: Session) -> None:
     owner_db.execute(text("grant insert on audit_event to public"))
     owner_db.commit()
-    assert rights.excess(db.connection()) == ["may change the audit trail"]
+    assert service_role.excess(db.connection()) == ["may change the audit trail"]
 
 
 def test_the_service_alone_cannot_migrate_and_says_what_to_do(
@@ -148,4 +148,4 @@ def test_a_table_of_a_later_migration_gets_its_rights(fresh_database: str, owner
 
 def test_a_role_that_is_missing_is_asked_for(owner_db: Session) -> None:
     with pytest.raises(RuntimeError, match="create role nobody_yet login"):
-        rights.grant(owner_db.connection(), "nobody_yet", "secret")
+        service_role.grant(owner_db.connection(), "nobody_yet", "secret")
