@@ -28,6 +28,9 @@ COARSE = tuple(float(v) for v in 10.0 ** np.arange(-5.0, 2.5, 0.5))
 FINE = tuple(float(v) for v in 10.0 ** np.arange(-0.5, 0.55, 0.1))
 """Multiples of them that it tries next."""
 
+FINER = tuple(10.0 ** (np.linspace(-1, 1, 9)[None] * np.array([[0.1], [0.03], [0.01], [0.003]])))
+"""Multiples that a fit at one point tries after these, ever closer: the square root of a lambda is then found to half a per cent."""
+
 STEPS = (1.2, 1.5, 2.0, 3.0, 5.0, 8.0)
 """Ratios between neighbouring lambdas of the grid that the posterior is averaged over; the first at which the log posterior has fallen by
 a half on average is taken, so that the grid is as wide as what the data leave open."""
@@ -109,10 +112,11 @@ class MixedModel:
         if sums.rows < 1:
             raise ValueError("a mixed model needs at least one row")
         problem = _Problem(self, sums, prior=False)
-        best = problem.search(len(self.estimated))
+        best = problem.refined(problem.search(len(self.estimated)))
         _, means, factors, squares = problem.solve(best[None])
         variance = float(squares[0]) / problem.degrees
-        return RestrictedFit(tuple(self.estimated), best, means[0], variance * factors[0] @ factors[0].T, variance)
+        degrees = problem.satterthwaite(best, variance)
+        return RestrictedFit(tuple(self.estimated), best, means[0], variance * factors[0] @ factors[0].T, variance, degrees)
 
     def likeliest(self, sums: Sums) -> tuple[Floats, Floats]:
         """The likeliest lambdas [G] and the coefficients [q] there: `fit` without what the data leave open.
@@ -200,6 +204,7 @@ class RestrictedFit:
         groups: names of the estimated groups, G. ratios: their lambdas, [G]; at the lower end of the grid where the data show no such
             variance.
         coefficients: [q]. covariance: of them given the lambdas, [q, q]. variance: sigma^2.
+        degrees: of freedom of every coefficient's variance by Satterthwaite's approximation, [q]; inf where the data leave it none.
     """
 
     groups: tuple[str, ...]
@@ -207,6 +212,7 @@ class RestrictedFit:
     coefficients: Floats
     covariance: Floats
     variance: float
+    degrees: Floats
 
 
 class _Problem:
@@ -285,6 +291,48 @@ class _Problem:
             for g in range(groups):
                 best[g] = self._along(best, g, np.clip(best[g] * np.array(FINE), SMALLEST, LARGEST))
         return best
+
+    def refined(self, best: Floats) -> Floats:
+        """The likeliest lambdas [G] near those that the search found, which lie on a grid."""
+        best = best.copy()
+        for multiples in FINER:
+            for _ in range(3):  # one coordinate at a time: what one gains another gives up
+                for g in range(best.size):
+                    best[g] = self._along(best, g, np.clip(best[g] * multiples, SMALLEST, LARGEST))
+        return best
+
+    def satterthwaite(self, best: Floats, variance: float) -> Floats:
+        """Degrees of freedom of the coefficients' variances, [q], at the largest restricted likelihood (Satterthwaite 1946; Giesbrecht and
+        Burns 1985).
+
+        2 over the variance of the logarithm of a coefficient's variance, which has that of log lambda and log sigma^2 from the curvature of
+        the likelihood. Groups without a variance of their own are left out, as in lmerTest (Kuznetsova, Brockhoff and Christensen 2017).
+        """
+        active = [g for g, columns in enumerate(self.groups) if columns and 1e2 * SMALLEST < best[g] < LARGEST]
+        n, step = len(active) + 1, 1e-2
+        moves = [np.array(m) for m in product((-1, 0, 1), repeat=n)]
+        ratios = np.tile(best, (len(moves), 1))
+        ratios[:, active] *= np.exp(step * np.array(moves)[:, :-1])
+        logs, _, factors, squares = self.solve(ratios)
+        sigma2 = variance * np.exp(step * np.array(moves)[:, -1])
+        # the likelihood where sigma^2 follows from the lambdas, less what another sigma^2 costs
+        logs += 0.5 * self.degrees * (np.log(squares / (self.degrees * sigma2)) + 1) - 0.5 * squares / sigma2
+        place, unit = {tuple(m): i for i, m in enumerate(moves)}, np.eye(n, dtype=int)
+
+        def second(i: int, k: int) -> float:
+            plus, minus = unit[i] + unit[k], unit[i] - unit[k]
+            if i == k:
+                return float(logs[place[tuple(unit[i])]] + logs[place[tuple(-unit[i])]] - 2 * logs[place[(0,) * n]])
+            return float(sum(s * (logs[place[tuple(m)]] + logs[place[tuple(-m)]]) for m, s in ((plus, 0.25), (minus, -0.25))))
+
+        information = -np.array([[second(i, k) for k in range(n)] for i in range(n)]) / step**2
+        if np.linalg.eigvalsh(information)[0] <= 1e-9:
+            return np.ones(self.q)  # the likelihood has no top here: nothing is known of the spread
+        variances = np.maximum(np.einsum("kij,kij->ki", factors, factors), 1e-300) * sigma2[:, None]
+        slope = np.array([np.log(variances[place[tuple(u)]] / variances[place[tuple(-u)]]) for u in unit]) / (2 * step)
+        slope[:, np.diagonal(factors[0] @ factors[0].T) == 0] = 0.0
+        spread = np.einsum("iq,ij,jq->q", slope, np.linalg.inv(information), slope)
+        return np.asarray(np.divide(2.0, spread, out=np.full(self.q, np.inf), where=spread > 0))
 
     def steps(self, best: Floats) -> list[float]:
         """Ratio between neighbouring lambdas of the grid, per group."""

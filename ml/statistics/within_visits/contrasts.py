@@ -22,7 +22,7 @@ from ml.statistics.within_visits.cells import Cells, cells_of
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Scale = Literal["difference", "win_probability"]
+Scale = Literal["difference", "win_probability", "ordinal"]
 
 UNBALANCED = 0.5
 """Arms whose mean places in the order differ by more than this many standard deviations of the place, on average over visits, are compared
@@ -202,7 +202,7 @@ class Average:
     level: float
     p_value: float
     standard_error: float
-    degrees: int
+    degrees: float
     null: float
     visits: int
     n_tested: int
@@ -224,7 +224,9 @@ def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitCon
     Args:
         data: sessions of both arms; those without a value are left out.
         scale: `difference` of means, or `win_probability`: the share of pairs of one session of either arm of the visit in which the
-            controller's value is the higher one, ties counting one half (then the null is 0.5).
+            controller's value is the higher one, ties counting one half (then the null is 0.5). `ordinal` is the same for steps of
+            `resolution`, to which a shift may have been added: pairs less than a step apart count in proportion, so that a shift between
+            two whole steps lies between what these give.
 
     Returns:
         The contrasts, or why there is none: no session of an arm, or no visit with both.
@@ -239,16 +241,27 @@ def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitCon
         # Rounding to steps of r adds a variance of r^2 / 12 to every session (Sheppard 1898).
         floor = data.resolution**2 / 12 * (1 / n_tested + 1 / n_cdbs)
     else:
-        contrast = np.array([win_probability(data.value[one], data.value[two]) for _, one, two in data.arms])
+        step = step_of(data, scale)
+        contrast = np.array([win_probability(data.value[one], data.value[two], step) for _, one, two in data.arms])
         # A visit resolves the probability no finer than by half a pair.
         floor = (0.5 / (n_tested * n_cdbs)) ** 2
     return VisitContrasts(cells.visit, contrast, n_tested, n_cdbs, floor, 0.0 if scale == "difference" else 0.5)
 
 
-def win_probability(x: Floats, y: Floats) -> float:
-    """Share of pairs with x > y, ties counting one half."""
-    comparison = np.sign(np.subtract.outer(x, y))
-    return float(0.5 + 0.5 * comparison.mean())
+def win_probability(x: Floats, y: Floats, step: float = 0.0) -> float:
+    """Share of pairs with x > y, ties counting one half; of a scale in steps, pairs less than a step apart count in proportion."""
+    return float(pairs(x, y, step).mean())
+
+
+def pairs(x: Floats, y: Floats, step: float = 0.0) -> Floats:
+    """What each pair counts for `win_probability`, 0 to 1, [n_x, n_y]."""
+    difference = np.subtract.outer(x, y)
+    return np.asarray(0.5 + 0.5 * (np.clip(difference / step, -1.0, 1.0) if step else np.sign(difference)))
+
+
+def step_of(data: Measurements, scale: Scale) -> float:
+    """Step of the comparison of pairs; 0 where any difference counts whole."""
+    return data.resolution if scale == "ordinal" else 0.0
 
 
 def average(contrasts: VisitContrasts | Unavailable, level: float = 0.95) -> Average | Unavailable:
@@ -267,12 +280,14 @@ def average(contrasts: VisitContrasts | Unavailable, level: float = 0.95) -> Ave
     return student(float(contrasts.contrast.mean()), contrasts.variance / contrasts.visits, contrasts, level, Adjustment.NONE)
 
 
-def student(estimate: float, variance: float, of: VisitContrasts, level: float, adjustment: Adjustment) -> Average | Unavailable:
-    """An average with its variance, on t with one degree of freedom fewer than visits."""
+def student(
+    estimate: float, variance: float, of: VisitContrasts, level: float, adjustment: Adjustment, at_most: float = np.inf
+) -> Average | Unavailable:
+    """An average with its variance, on t with one degree of freedom fewer than visits, or `at_most` so many."""
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")
     scale = 1e-12 * max(1.0, float(np.abs(of.contrast).max()))
-    error, degrees = float(np.sqrt(variance)), of.visits - 1
+    error, degrees = float(np.sqrt(variance)), min(of.visits - 1, at_most)
     if error <= scale:
         return Unavailable(Reason.NO_VARIANCE)
     half = float(stdtrit(degrees, (1 + level) / 2)) * error
@@ -348,7 +363,8 @@ def adjusted_average(
         freed = contrasts.contrast - slopes @ shift.T
     else:
         values = kept.value - slopes @ table.T
-        freed = np.array([[win_probability(row[one], row[two]) for _, one, two in kept.arms] for row in values])
+        step = step_of(kept, scale)
+        freed = np.array([[win_probability(row[one], row[two], step) for _, one, two in kept.arms] for row in values])
     estimate = float(freed[0].mean())
     without = (freed[1:].sum(1) - np.diag(freed[1:])) / (n - 1)
     variance = (n - 1) / n * float(np.sum((without - without.mean()) ** 2))

@@ -2,7 +2,8 @@
 within it.
 
 They use every session at once and say how far visits and policies differ. All are tested on t with one degree of freedom fewer than visits
-with both arms, never as a normal deviate: the spread between visits is what they know least. Metrics that are measured on a scale follow
+with both arms, never as a normal deviate: the spread between visits is what they know least. Where Satterthwaite's approximation has fewer
+degrees (policies that differ, and few of them), the linear model takes those. Metrics that are measured on a scale follow
 the linear model; a rating follows ordered categories, and minutes with tremor are counts out of the minutes watched, with a level of each
 session because the minutes of one session resemble each other.
 """
@@ -79,7 +80,7 @@ def linear_comparison(data: Measurements, policy: Integers | None = None, level:
         return Unavailable(Reason.NO_VARIANCE)
     found = MixedModel(design.shape[1], prepared.groups, {}).restricted(Sums.of(design, y / scale))
     estimate, variance = scale * float(found.coefficients[EFFECT]), scale**2 * float(found.covariance[EFFECT, EFFECT])
-    effect = student(estimate, variance, prepared.contrasts, level, Adjustment.NONE)
+    effect = student(estimate, variance, prepared.contrasts, level, Adjustment.NONE, max(float(found.degrees[EFFECT]), 1.0))
     if isinstance(effect, Unavailable):
         return effect
     session_sd = scale * float(np.sqrt(found.variance))
