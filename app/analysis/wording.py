@@ -153,6 +153,11 @@ def outlook(result: VerdictResult, sessions_per_arm: int) -> str:
     return f"{settled}. More sessions at a visit would not replace one."
 
 
+def judged_as(outcome: str, unit: str) -> str:
+    """In what an outcome of a verdict and its margin are stated."""
+    return {"rating": "points; share of pairs won with them added", "tremor": "% points"}.get(outcome, unit)
+
+
 def verdict_kind(result: VerdictResult, locked: LockedMargins) -> str:
     """Whether a verdict confirms, and why not."""
     if result.confirmatory:

@@ -59,11 +59,14 @@ class Outcome:
         name: of the outcome. data: values of both arms, NaN where not measured.
         stopped: sessions stopped for the patient's sake, [n].
         margin: largest loss that is accepted, above zero; in the unit of the values, or a probability below 0.5 for `win_probability`.
-        higher_is_better: direction. scale: of the contrast (`visits.visit_contrasts`).
-        failure: value of a failed session; None for the worst value measured in either arm.
+        higher_is_better: direction. scale: of the contrast (`visits.visit_contrasts`). With `ordinal` the controller's values are made
+            better by the margin, and must then win at least half of the pairs: that its shift is no loss of the margin or more is shown
+            without taking steps of a rating for equal distances.
+        failure: value of a failed session, to which no margin is added; None for the worst value measured in either arm.
 
     Raises:
-        ValueError: a margin that is not above zero (or not below 0.5 for a probability), or `stopped` of another shape.
+        ValueError: a margin that is not above zero (or not below 0.5 for a probability), `ordinal` values without a step, or `stopped` of
+            another shape.
     """
 
     name: str
@@ -79,16 +82,20 @@ class Outcome:
             raise ValueError(f"the margin of {self.name} must be above 0, not {self.margin}")
         if self.scale == "win_probability" and not self.margin < 0.5:
             raise ValueError(f"the margin of {self.name} is a probability and must be below 0.5, not {self.margin}")
+        if self.scale == "ordinal" and not self.data.resolution > 0:
+            raise ValueError(f"{self.name} is to be compared in steps, so its `resolution` must be above 0")
         if self.stopped.shape != self.data.value.shape:
             raise ValueError(f"`stopped` of {self.name} has the shape {self.stopped.shape}, its values {self.data.value.shape}")
 
     def counted(self, rule: FailureRule) -> Measurements:
-        """The sessions with failures filled in, turned so that higher is better."""
+        """The sessions with failures filled in, turned so that higher is better; `ordinal` values with the margin added."""
         sign = 1.0 if self.higher_is_better else -1.0
         value = sign * self.data.value
+        if self.scale == "ordinal":
+            value = np.where(self.data.tested, value + self.margin, value)
         if rule is not FailureRule.AS_MEASURED:
             rows = self.stopped & self.data.tested if rule is FailureRule.WORST_CASE else self.stopped
-            known = value[np.isfinite(value)]
+            known = sign * self.data.value[np.isfinite(self.data.value)]
             worst = sign * self.failure if self.failure is not None else float(known.min()) if known.size else np.nan
             value = np.where(rows, worst, value)
         return replace(self.data, value=value)
@@ -96,7 +103,7 @@ class Outcome:
     @property
     def loss(self) -> float:
         """The contrast that is to be excluded, higher being better."""
-        return (0.5 if self.scale == "win_probability" else 0.0) - self.margin
+        return {"difference": -self.margin, "win_probability": 0.5 - self.margin, "ordinal": 0.5}[self.scale]
 
 
 @dataclass(frozen=True)
@@ -104,7 +111,7 @@ class OutcomeResult:
     """Non-inferiority of one outcome.
 
     Attributes:
-        average: the average contrast, turned so that higher is better; or why there is none.
+        average: the average contrast, turned so that higher is better; or why there is none. loss: of it, that is to be excluded.
         p_non_inferior: one-sided, of a loss of the margin or more. p_inferior: one-sided, of a loss of less than the margin. None without
             average.
         failures: failed sessions of the controller. missing: sessions without a value that are not failures.
@@ -112,6 +119,7 @@ class OutcomeResult:
 
     name: str
     margin: float
+    loss: float
     average: Average | Unavailable
     p_non_inferior: float | None
     p_inferior: float | None
@@ -245,9 +253,11 @@ def _outcome(outcome: Outcome, rule: FailureRule, level: float) -> OutcomeResult
     failures = int(np.sum(outcome.stopped & outcome.data.tested))
     missing = int(np.sum(~np.isfinite(counted.value)))
     if isinstance(found, Unavailable):
-        return OutcomeResult(outcome.name, outcome.margin, found, None, None, failures, missing)
+        return OutcomeResult(outcome.name, outcome.margin, outcome.loss, found, None, None, failures, missing)
     p = found.p_above(outcome.loss), found.p_below(outcome.loss)
-    return OutcomeResult(outcome.name, outcome.margin, found, *p, failures, missing)
+    if outcome.scale != "difference":  # a share of pairs ends at 0 and 1
+        found = replace(found, low=max(0.0, found.low), high=min(1.0, found.high))
+    return OutcomeResult(outcome.name, outcome.margin, outcome.loss, found, *p, failures, missing)
 
 
 def _less_favourable(adjusted: Average, plain: Average | Unavailable, outcome: Outcome) -> Average:

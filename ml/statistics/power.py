@@ -15,7 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from ml.statistics.within_visits.contrasts import Measurements, Reason, Scale, Unavailable, VisitContrasts, visit_contrasts
+from ml.statistics.within_visits.contrasts import (
+    Measurements,
+    Reason,
+    Scale,
+    Unavailable,
+    VisitContrasts,
+    pairs,
+    step_of,
+    visit_contrasts,
+)
 
 Floats = NDArray[np.float64]
 Alternative = Literal["two_sided", "greater"]
@@ -23,9 +32,6 @@ Alternative = Literal["two_sided", "greater"]
 RATIOS: Floats = np.exp(np.linspace(np.log(0.02), np.log(50.0), 60))
 MOST_VISITS = 12
 """Further visits that are looked at: one a month makes a year."""
-
-KNOWN_DEGREES = 1000
-"""Degrees of freedom given to the variance of a win probability within a visit, which follows from the numbers of sessions."""
 
 
 @dataclass(frozen=True)
@@ -163,8 +169,11 @@ def first_reaching(chances: Floats, wanted: float) -> int | None:
 
 def _within(data: Measurements, contrasts: VisitContrasts, scale: Scale) -> tuple[float, int]:
     """Sum of squares within arms of visits, and its degrees of freedom."""
-    if scale == "win_probability":
-        # The Mann-Whitney variance of U / (n m) is (n + m + 1) / (12 n m), that is 1/12 (1/n + 1/m) but for the third of its terms.
-        return KNOWN_DEGREES / 12, KNOWN_DEGREES
+    if scale != "difference":
+        # What one session adds to a share of pairs is the share that it wins by itself (DeLong, DeLong and Clarke-Pearson 1988). Where all
+        # of them win all, nothing is told of the spread: one session more, as without a difference (1/12), keeps it above zero.
+        won = [pairs(data.value[one], data.value[two], step_of(data, scale)) for _, one, two in data.arms]
+        squares = sum(float(np.sum((p.mean(axis) - p.mean()) ** 2)) for p in won for axis in (0, 1))
+        return squares + 1 / 12, int(contrasts.n_tested.sum() + contrasts.n_cdbs.sum()) - 2 * len(won) + 1
     arms = [data.value[rows] for _, one, two in data.arms for rows in (one, two)]
     return float(sum(np.sum((a - a.mean()) ** 2) for a in arms)), int(contrasts.n_tested.sum() + contrasts.n_cdbs.sum()) - len(arms)

@@ -75,6 +75,10 @@ class OutcomeVerdictOut(Model):
 
     outcome: str
     margin: float
+    scale: str = Field(
+        description="difference: of the visits' means. ordinal: share of pairs that the controller's values win once the margin is added."
+    )
+    excluded: float = Field(description="What `estimate` must be shown to exceed.")
     estimate: float | None
     low: float | None
     high: float | None

@@ -16,7 +16,7 @@ from app.analysis.primary.schemas import (
     VisitRowOut,
 )
 from app.analysis.primary.service import Primary
-from app.analysis.primary.verdict import VerdictResult
+from app.analysis.primary.verdict import SCALE, VerdictResult
 from ml.statistics.effects import Saving
 from ml.statistics.noninferiority import Inconclusive, Inferior, NonInferiorAndSaving
 from ml.statistics.ranksum import RankSum
@@ -102,6 +102,8 @@ def verdict_out(result: VerdictResult, found: Primary) -> VerdictOut:
             OutcomeVerdictOut(
                 outcome=o.name,
                 margin=o.margin,
+                scale=SCALE[o.name],
+                excluded=o.loss,
                 estimate=average and average.estimate,
                 low=average and average.low,
                 high=average and average.high,

@@ -2,7 +2,8 @@
 
 A verdict confirms where the margins were locked before every session that it rests on; else it explores. The margin of grasp is a share of
 the frequency under cDBS: the cDBS values are lowered by it, so that what is tested is "no slower than 1 - share of the same visit's cDBS",
-with the spread of that reference in the error.
+with the spread of that reference in the error. A rating has no equal steps: made better by its margin it must win at least half of the
+pairs with the same visit's cDBS ratings.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from app.analysis.evidence.measurements import HIGHER_IS_BETTER, Chosen, choose_
 from app.study.models import Controller
 from ml.qoc import Margins
 from ml.statistics.noninferiority import LEAST_VISITS, Assessment, Outcome, assess
+from ml.statistics.within_visits.contrasts import Scale
 
+SCALE: dict[str, Scale] = {"grasp": "difference", "rating": "ordinal", "tremor": "difference"}
 FAILURE = {"grasp": None, "rating": 1.0, "tremor": 100.0}
 """What a stopped session counts as; of grasp, the worst frequency measured."""
 
@@ -126,4 +129,4 @@ def _outcome(chosen: Chosen, name: str, margins: Margins) -> Outcome | None:
         margin = margins.grasp_share * reference
         # lowered by the share and lifted by the margin: the average contrast stays, its spread gains that of the reference
         data = replace(data, value=np.where(data.tested, data.value, (1 - margins.grasp_share) * data.value + margin))
-    return Outcome(name, data, chosen.stopped, margin, HIGHER_IS_BETTER[name], failure=FAILURE[name])
+    return Outcome(name, data, chosen.stopped, margin, HIGHER_IS_BETTER[name], SCALE[name], FAILURE[name])

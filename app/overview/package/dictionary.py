@@ -175,7 +175,7 @@ FIELDS: dict[str, tuple[Field, ...]] = {
         outcome string grasp, rating or tremor.
         margin number Largest loss that is accepted, in the unit of the outcome.
         grasp_share number The margin of grasp as a share of the frequency under cDBS.
-        estimate number Average over visits, turned so that higher is better.
+        estimate number Average over visits, turned so that higher is better; of the rating the share of pairs won once the margin is added.
         p_non_inferior number One-sided, of a loss of the margin or more.
         failures integer Sessions of the controller that were stopped for the patient's sake.
         visits string Visits whose sessions it rests on.

@@ -89,6 +89,15 @@ class Contrasts:
             found.append((self.order[one].mean() - self.order[two].mean()) / sd if sd > 0 else 0.0)
         return float(np.mean(found)) if found else 0.0
 
+    def wins(self, value: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        """Share of pairs that the controller wins, by visit; pairs less than one step of the scale apart count in proportion."""
+        pairs = [np.clip(np.subtract.outer(value[one], value[two]), -1, 1) for one, two in self.arms]
+        return np.array([0.5 + 0.5 * p.mean() for p in pairs])
+
+    def half_pairs(self) -> float:
+        """Mean squared half of one pair, which is as fine as a visit tells a share of pairs: a correction for continuity."""
+        return float(np.mean([(0.5 / (one.size * two.size)) ** 2 for one, two in self.arms]))
+
     def slope(self, visits: Iterable[int]) -> float:
         """Common slope of the value on the place within arms of visits; NaN where nothing tells it."""
         xx = xy = 0.0
@@ -103,38 +112,41 @@ class Contrasts:
         return float(np.mean([resolution**2 / 12 * (1 / one.size + 1 / two.size) for one, two in self.arms]))
 
 
-def average(c: Contrasts, resolution: float, adjust: bool) -> tuple[float, float, int] | None:
+def average(c: Contrasts, resolution: float, adjust: bool, ordinal: bool = False) -> tuple[float, float, int] | None:
     """Average over visits, its standard error and degrees of freedom; freed from a linear drift where `adjust`.
 
-    The drift's slope is common to all visits, so that its error is that of leaving out one visit at a time.
+    The drift's slope is common to all visits, so that its error is that of leaving out one visit at a time. `ordinal`: of shares of pairs.
     """
     n = len(c.arms)
     if n < 2:
         return None
-    plain = c.means(c.value)
+    contrast = c.wins if ordinal else c.means
+    plain = contrast(c.value)
+    floor = c.half_pairs() if ordinal else c.floor(resolution)
     if adjust:
-        places = c.means(c.order)
         slopes = [c.slope(range(n))] + [c.slope(k for k in range(n) if k != out) for out in range(n)]
         if not np.isfinite(slopes).all():
             return None
-        estimate = float(np.mean(plain - slopes[0] * places))
-        without = [float(np.mean(np.delete(plain - slopes[1 + k] * places, k))) for k in range(n)]
+        freed = [contrast(c.value - slope * c.order) for slope in slopes]
+        estimate = float(np.mean(freed[0]))
+        without = [float(np.mean(np.delete(freed[1 + k], k))) for k in range(n)]
         variance = (n - 1) / n * float(np.sum((np.array(without) - np.mean(without)) ** 2))
-        variance = max(variance, c.floor(resolution) / n)
+        variance = variance + floor / n if ordinal else max(variance, floor / n)
     else:
-        estimate, variance = float(plain.mean()), max(float(plain.var(ddof=1)), c.floor(resolution)) / n
+        spread = float(plain.var(ddof=1))
+        estimate, variance = float(plain.mean()), (spread + floor if ordinal else max(spread, floor)) / n
     if math.sqrt(variance) <= 1e-12 * max(1.0, float(np.abs(plain).max())):
         return None
     return estimate, math.sqrt(variance), n - 1
 
 
-def primary(c: Contrasts, resolution: float) -> tuple[float, float, int] | None:
+def primary(c: Contrasts, resolution: float, ordinal: bool = False) -> tuple[float, float, int] | None:
     """The average, freed from the order where one arm stands later than the other by more than half a standard deviation."""
     if abs(c.imbalance()) > UNBALANCED:
-        adjusted = average(c, resolution, adjust=True)
+        adjusted = average(c, resolution, True, ordinal)
         if adjusted is not None:
             return adjusted
-    return average(c, resolution, adjust=False)
+    return average(c, resolution, False, ordinal)
 
 
 def rank_sum_p(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> float:
@@ -188,7 +200,8 @@ def primary_table(sessions: Sequence[dict[str, Any]], controllers: Sequence[str]
 def noninferiority(sessions: Sequence[dict[str, Any]], row: Row, grasp_share: float) -> dict[str, float]:
     """One outcome of one verdict: a stopped session of the controller counts as the worst; the one-sided p of a loss of the margin or more.
 
-    The margin of grasp is a share of cDBS: the cDBS values are lowered by that share and lifted by the margin.
+    The margin of grasp is a share of cDBS: the cDBS values are lowered by that share and lifted by the margin. Ratings of the controller
+    are raised by the margin, and must then win at least half of the pairs with the same visit's cDBS.
     """
     visits, outcome, controller = {int(v) for v in row["visits"].split()}, row["outcome"], row["controller"]
     taken = [s for s in sessions if s["visit"] in visits and s["controller"] in (controller, "cdbs")]
@@ -200,16 +213,20 @@ def noninferiority(sessions: Sequence[dict[str, Any]], row: Row, grasp_share: fl
     value = sign * value
     failed = tested & np.array([bool(s["stopped_reason"]) for s in taken])
     measured = value[np.isfinite(value)]
+    ordinal = outcome == "rating"
+    if ordinal:
+        value = np.where(tested, value + margin, value)
     worst = sign * WORST[outcome] if outcome in WORST else float(measured.min()) if measured.size else math.nan
     value = np.where(failed, worst, value)
     c = Contrasts(value.tolist(), [s["visit"] for s in taken], tested.tolist(), [s["order"] for s in taken])
     if len(c.arms) < 3:
         return {}
     resolution = RESOLUTION.get(outcome, 0.0)
-    candidates = [primary(c, resolution)]
+    candidates = [primary(c, resolution, ordinal)]
     if failed.any():
-        candidates.append(average(c, resolution, adjust=False))  # a drift must not explain a failure away
-    found = [(estimate, float(t.cdf((-margin - estimate) / error, degrees))) for estimate, error, degrees in filter(None, candidates)]
+        candidates.append(average(c, resolution, False, ordinal))  # a drift must not explain a failure away
+    loss = 0.5 if ordinal else -margin
+    found = [(estimate, float(t.cdf((loss - estimate) / error, degrees))) for estimate, error, degrees in filter(None, candidates)]
     if not found:
         return {}
     estimate, p = max(found, key=lambda pair: pair[1])

@@ -145,6 +145,60 @@ def test_the_rating_may_be_judged_by_the_win_probability():
     assert assess([replace(rating, margin=0.01)], energy, flags).verdict.open == ("rating",)
 
 
+def ratings(one, two, visits=6, margin=1.0, scale="ordinal"):
+    """The same ratings of either arm at every visit, but for one session of cDBS that differs from visit to visit."""
+    value = np.concatenate([np.r_[one, two, 7 + v % 2] for v in range(visits)])
+    arms = np.tile(np.r_[np.ones(len(one)), np.zeros(len(two) + 1)] == 1, visits)
+    visit = np.repeat(np.arange(visits), len(one) + len(two) + 1)
+    data = Measurements.of(value, visit, arms, resolution=1)
+    return Outcome("rating", data, np.zeros(visit.size, dtype=bool), margin, True, scale, 1.0)
+
+
+def shares(outcome):
+    return visit_contrasts(outcome.counted(FailureRule.WORST_CASE), "ordinal").contrast
+
+
+def test_an_ordinal_rating_is_judged_by_the_pairs_that_it_wins_once_the_margin_is_added():
+    even = ratings([7, 6], [7])  # of the pairs with 7 and 7: 8 wins both, 7 ties both; with 8: 8 ties, 7 loses
+    assert shares(even)[:2].tolist() == [0.75, pytest.approx((1 + 0.5 + 0.5 + 0) / 4)]
+    # half a point is half way between none and one
+    wins = [shares(ratings([7, 6], [7], margin=m))[0] for m in (1e-9, 0.5, 1.0)]
+    assert wins[1] == pytest.approx((wins[0] + wins[2]) / 2)
+    assert wins[2] == 0.75
+    assert wins[0] == pytest.approx(0.25)
+    # that steps are equal is not assumed: a single very low rating costs no more than its pairs
+    deep, shallow = (shares(ratings([7, low], [7])) for low in (1, 5))
+    assert deep == pytest.approx(shallow)
+    energy = Measurements.of(np.where(even.data.tested, 0.6, 1.0), even.data.visit, even.data.tested, resolution=0.05)
+    found = assess([ratings([8, 7], [7])], energy, even.stopped)
+    assert (found.outcomes[0].loss, found.outcomes[0].average.null) == (0.5, 0.5)
+    assert found.outcomes[0].average.high <= 1
+    assert isinstance(found.verdict, NonInferiorAndSaving)
+    assert assess([ratings([3, 4], [7])], energy, even.stopped).verdict == Inferior(("rating",))
+
+
+def test_a_failure_gains_nothing_from_the_margin_of_an_ordinal_rating():
+    plain = ratings([7, 7], [1])
+    failed = replace(plain, stopped=plain.data.tested & (np.arange(plain.data.value.size) % 4 == 0))
+    counted = failed.counted(FailureRule.WORST_CASE)
+    assert counted.value[failed.stopped].tolist() == [1.0] * 6
+    assert counted.value[plain.data.tested & ~failed.stopped].tolist() == [8.0] * 6
+    assert failed.counted(FailureRule.AS_MEASURED).value[failed.stopped].tolist() == [8.0] * 6
+    with pytest.raises(ValueError, match="compared in steps"):
+        replace(plain, data=replace(plain.data, resolution=0.0))
+
+
+def test_at_the_margin_of_an_ordinal_rating_it_errs_no_more_than_its_level():
+    rng, wrong, number = np.random.default_rng(11), 0, 600
+    visit, arms = design(6)
+    flags, energy = np.zeros(visit.size, dtype=bool), Measurements.of(np.where(arms, 0.6, 1.0), visit, arms, resolution=0.05)
+    for _ in range(number):  # the controller loses exactly one point, on days that differ
+        value = np.round(7 + rng.normal(0, 0.7, 6)[visit] + rng.normal(0, 0.7, visit.size)) - arms
+        outcome = Outcome("rating", Measurements.of(value, visit, arms, resolution=1), flags, 1.0, True, "ordinal", 1.0)
+        wrong += isinstance(assess([outcome], energy, flags, plan=False).verdict, NonInferiorAndSaving)
+    assert wrong / number <= 0.05 + 2 * np.sqrt(0.05 * 0.95 / number)
+
+
 def test_at_the_margin_it_errs_no_more_than_its_level_even_where_effects_differ_between_visits():
     wrong, number = 0, 400
     rng = np.random.default_rng(5)
