@@ -1,4 +1,4 @@
-// What is asked in a window of its own: reasons, notes, grasp tests, adverse events.
+// What is asked in a window of its own: reasons, notes, grasp tests, adverse events, doses.
 import { graspHz } from "./record.js";
 import { screen } from "./screening.js";
 import { button, clock, el, openDialog } from "./dom.js";
@@ -124,3 +124,50 @@ export function adverseEvent(app, where, kinds, rules) {
       el("div", { class: "day-events" }, rows), el("menu", {}, button("Cancel", "quiet big", close))];
   });
 }
+
+// --- doses: the second tap says what was taken, just now or so many minutes ago
+const USUAL_MG = [50, 100, 150, 200];
+const AGO = [[0, "just now"], [15, "15 min ago"], [30, "30 min ago"], [60, "1 h ago"]];
+
+export function enterDose(app) {
+  const at = Date.now();
+  openDialog("Dose taken", (dialog, close) => {
+    let ago = 0;
+    const told = el("p", { role: "alert" });
+    const when = el("div", { class: "day-ago", role: "group", "aria-label": "When" }, AGO.map(([minutes, text]) => button(text, "", () => {
+      ago = minutes;
+      clockTime.value = "";
+      press();
+    }, { "data-ago": String(minutes), "data-act": `ago-${minutes}` })));
+    const press = () => when.querySelectorAll("[data-ago]").forEach((one) => one.setAttribute("aria-pressed", String(!clockTime.value && Number(one.dataset.ago) === ago)));
+    const clockTime = el("input", { type: "time", "aria-label": "Taken at, by this tablet's clock", oninput: () => press() });
+    const enter = async (drug, mg) => { await app.enter("dose", { drug, mg }, { at: taken(at, ago, clockTime.value) }); close(); };
+    const offered = new Map([...app.day.planned_doses, ...USUAL_MG.map((mg) => ({ drug: "levodopa", mg }))].map((dose) => [`${dose.drug} ${dose.mg}`, dose]));
+    const drug = el("select", { "aria-label": "Drug" }, [...app.drugs].map(([value, text]) => el("option", { value, text })));
+    const mg = el("input", { type: "number", inputmode: "decimal", min: "0", max: "5000", step: "any", "aria-label": "Dose in mg" });
+    const other = () => {
+      const value = Number(mg.value);
+      if (!(value > 0 && value <= 5000)) { told.textContent = "Give the dose in mg."; return null; }
+      return enter(drug.value, value);
+    };
+    press();
+    return [when, el("label", { class: "day-line" }, el("span", { text: "or at" }), clockTime),
+      el("div", { class: "day-doses" }, [...offered.values()].map((dose) => button(`${short(app.drugs.get(dose.drug))} ${dose.mg} mg`, "", () => enter(dose.drug, dose.mg), { "data-act": `dose-${dose.drug}-${dose.mg}` }))),
+      el("details", {}, el("summary", { text: "Another drug or dose" }), el("div", { class: "day-line" }, drug,
+        el("div", { class: "with-unit" }, mg, el("span", { class: "unit", text: "mg" })), button("Enter", "", other, { "data-act": "dose-other" }))),
+      told, el("p", { class: "muted", text: "Of levodopa combinations the levodopa: 100 of a 25/100 tablet. A wrong dose is removed on the visit's page, with a reason." }),
+      el("menu", {}, button("Cancel", "quiet big", close))];
+  });
+}
+
+// When a dose was taken: at a time of this tablet's day, or of the day before where that has not come yet; else so many minutes ago.
+function taken(now, minutesAgo, clockTime) {
+  if (!clockTime) return now - minutesAgo * 60_000;
+  const [hours, minutes] = clockTime.split(":").map(Number);
+  const that = new Date(now);
+  that.setHours(hours, minutes, 0, 0);
+  if (that.getTime() > now) that.setDate(that.getDate() - 1);
+  return that.getTime();
+}
+
+export const short = (name) => name.replace(/ \(.*\)/, "");

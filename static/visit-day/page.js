@@ -1,5 +1,5 @@
 // The page of the clinic day: what is entered is on the disk first, then on the screen, then on its way to the service.
-import { dayEnd } from "./record.js";
+import { dayEnd, dosesOf } from "./record.js";
 import { el } from "./dom.js";
 import { Store } from "./store.js";
 import { Link, call } from "./sync.js";
@@ -39,6 +39,7 @@ class App {
   async acknowledged(entries) {
     const known = new Set(this.day.entries.map((e) => e.uuid));
     this.day.entries.push(...entries.filter((e) => !known.has(e.uuid)).map((e) => ({ ...e, entered_by: this.store.name })));
+    this.day.doses = dosesOf(this.day, entries);
     await this.keep();
   }
 
@@ -86,6 +87,7 @@ async function boot() {
   const app = new App();
   app.noteRules = JSON.parse(root.dataset.noteRules);
   app.eventKinds = JSON.parse(root.dataset.eventKinds);
+  app.drugs = new Map(JSON.parse(root.dataset.drugs));
   app.store = await Store.open();
   let status = 0;
   try {

@@ -1,7 +1,7 @@
 // What the entries of a clinic day amount to; app/planning/visit_day/record.py does the same for the study.
 export const SAME_MOMENT_MS = 5000;
 export const GRADED = ["dyskinesia", "speech", "gait"];
-const LOGS = new Set(["note", "adverse_event", "clinical_settings", "repeat"]);
+const LOGS = new Set(["note", "adverse_event", "clinical_settings", "repeat", "dose"]);
 const STATES = [["skip", "skipped"], ["session_end", "done"], ["stop", "asked"], ["start", "running"]];
 
 export const moment = (entry) => Date.parse(entry.device_time) + (entry.clock_offset_ms ?? 0);
@@ -71,3 +71,12 @@ export function dayEnd(entries) {
   const last = Math.max(-Infinity, ...rows.filter((e) => e.kind === "start" || e.kind === "stop").map(moment));
   return rows.find((e) => e.kind === "clinical_settings" && e.plan_item_id === null && moment(e) >= last) ?? null;
 }
+
+// The doses of the visit, those of entries that the service does not list yet among them, by time.
+export function dosesOf(day, entries) {
+  const entered = entries.filter((e) => e.kind === "dose" && e.payload).map((e) => ({ ...e.payload, taken_at: new Date(minute(moment(e))).toISOString() }));
+  const key = (dose) => `${dose.drug} ${minute(Date.parse(dose.taken_at))}`;
+  return [...new Map([...day.doses, ...entered].map((dose) => [key(dose), dose])).values()].sort((a, b) => Date.parse(a.taken_at) - Date.parse(b.taken_at));
+}
+
+const minute = (ms) => ms - (((ms % 60_000) + 60_000) % 60_000);

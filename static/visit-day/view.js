@@ -1,7 +1,7 @@
 // What is on the screen: one session at a time, and what must be known about the day as a whole.
 import * as record from "./record.js";
 import { button, clock, el, timeOfDay } from "./dom.js";
-import { adverseEvent, askReason, showRules } from "./dialogs.js";
+import { adverseEvent, askReason, enterDose, short, showRules } from "./dialogs.js";
 import { outcomes, summary } from "./outcomes.js";
 
 const SYMBOLS = { waiting: "○", running: "▶", asked: "✎", done: "✓", skipped: "–" };
@@ -36,9 +36,17 @@ function top(app) {
   return el("header", { class: "day-top" },
     el("div", { class: "day-who" }, el("b", { text: `${day.participant} · visit ${day.visit}` }), el("span", { class: "muted", text: day.date ?? "no date" })),
     chip(app),
+    lastDose(app),
     el("nav", { class: "day-nav", "aria-label": "Sessions" },
       button("‹", "icon", go(-1), { "aria-label": "Session before", disabled: at <= 0, "data-focus": "before" }), steps,
       button("›", "icon", go(1), { "aria-label": "Session after", disabled: at >= day.slots.length - 1, "data-focus": "after" })));
+}
+
+function lastDose(app) {
+  const doses = record.dosesOf(app.day, app.link.waiting.filter((row) => !row.refused).map((row) => row.entry));
+  if (!doses.length) return null;
+  const said = doses.slice(-3).map((dose) => `${timeOfDay(Date.parse(dose.taken_at)).slice(0, 5)} ${short(app.drugs.get(dose.drug))} ${dose.mg} mg`);
+  return el("p", { class: "day-last-dose", "data-doses": String(doses.length) }, `Doses: ${said.join(", ")}`);
 }
 
 function chip(app) {
@@ -224,6 +232,7 @@ function bottom(app, slot) {
   const rules = app.noteRules;
   return el("footer", { class: "day-bottom" },
     button("Adverse event", "danger", () => adverseEvent(app, where, app.eventKinds, rules), { "data-act": "event", disabled: !app.day.may_enter }),
+    app.day.may_dose ? button("Dose", "", () => enterDose(app), { "data-act": "dose" }) : null,
     slot && state === "waiting" ? button("Skip", "", () => askReason(`Skip session ${slot.position}`, rules, enter("skip")), { "data-act": "skip", disabled: !app.day.may_enter }) : null,
     slot && ["asked", "done", "skipped"].includes(state) ? button(state === "skipped" ? "Run it after all" : "Repeat", "", () => askReason(`Repeat session ${slot.position}`, rules, enter("repeat")), { "data-act": "repeat", disabled: !app.day.may_enter }) : null,
     button("Stop rules", "", () => showRules(app.day.stop_rules)));

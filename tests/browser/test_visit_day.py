@@ -130,6 +130,36 @@ def test_a_cut_network_and_a_reload_without_it_lose_nothing(window: Callable[...
     assert watched.foreign == []
 
 
+def test_a_dose_takes_two_taps_without_network_too(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
+    day = datetime.now(UTC).date().isoformat()
+    assert clinic_day.client.patch(f"/api/v1/visits/{clinic_day.visit}", json={"date": day, "reason": "moved"}).status_code == 200
+    schedule = {"medication": [{"drug": "pramipexole", "mg": 0.25, "at": "08:00"}]}
+    body = {"version": 0, "characteristics": schedule, "reason": "asked"}
+    assert clinic_day.client.put("/api/v1/participants/P1/characteristics", json=body).status_code == 200
+    watched = window(768, 1024)
+    watched.sign_in()
+    open_day(watched, clinic_day)
+    watched.page.context.set_offline(True)
+    tap(watched, "dose")
+    assert once_drawn(watched) == []
+    tap(watched, "dose-levodopa-100")
+    wait_for(watched, 1, "offline")
+    tap(watched, "dose")
+    tap(watched, "ago-30")
+    tap(watched, "dose-pramipexole-0.25")  # of the participant's own schedule
+    wait_for(watched, 2, "offline")
+    expect(watched.page.locator("[data-doses='2']")).to_contain_text("Pramipexole")
+    watched.page.context.set_offline(False)
+    wait_for(watched, 0)
+    stored_doses = clinic_day.client.get(f"/api/v1/visits/{clinic_day.visit}/doses").json()
+    assert [(d["drug"], d["mg"]) for d in stored_doses] == [("pramipexole", 0.25), ("levodopa", 100)]
+    first, second = (datetime.fromisoformat(d["taken_at"]) for d in stored_doses)
+    assert 29 <= (second - first).total_seconds() / 60 <= 31
+    watched.page.reload()
+    expect(watched.page.locator("[data-doses='2']")).to_be_visible()
+    assert watched.errors == [e for e in watched.errors if "ERR_INTERNET_DISCONNECTED" in e]
+
+
 def test_a_killed_browser_sends_what_it_held_when_it_comes_back(chromium: Any, address: str, clinic_day: ClinicDay, tmp_path: Path) -> None:
     profile = str(tmp_path / "profile")
     context = chromium.browser_type.launch_persistent_context(profile, executable_path=program(), args=FLAGS)

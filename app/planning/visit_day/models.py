@@ -13,9 +13,9 @@ from app.platform.database import Base
 
 KINDS = (
     "start", "stop", "stop_cause", "rating", "grasp", "dyskinesia", "speech", "gait", "note", "adverse_event", "skip", "repeat",
-    "session_end", "clinical_settings",
+    "session_end", "clinical_settings", "dose",
 )  # fmt: skip
-OF_THE_DAY = ("note", "adverse_event", "clinical_settings")
+OF_THE_DAY = ("note", "adverse_event", "clinical_settings", "dose")
 """Kinds that may belong to the day as a whole; all others belong to one session of the plan."""
 
 

@@ -20,9 +20,11 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.planning import wording
 from app.planning.visit_day import service
-from app.planning.visit_day.record import contradictions, last_attempt, open_severe, outcomes_of, standing, state_of
+from app.planning.visit_day.record import MANY, contradictions, last_attempt, open_severe, outcomes_of, standing, state_of
 from app.planning.visit_day.schemas import (
     AdverseEventPayload,
+    DeviceTime,
+    DosePayload,
     EntryIn,
     GradePayload,
     GraspPayload,
@@ -41,18 +43,37 @@ from app.platform.web.schemas import Model
 from app.platform.web.templates import STATIC, render
 from app.study.deps import CurrentVisit
 from app.study.models import Visit
-from app.study.wording import EVENT_KINDS
+from app.study.wording import DRUG_NAMES, EVENT_KINDS
 
 router = APIRouter()
 
 FILES = STATIC / "visit-day"
 _ENTRY: TypeAdapter[Any] = TypeAdapter(EntryIn)
+
+
+class _When(Model):
+    """When a dose was taken, where the form says it."""
+
+    taken_at: DeviceTime | None = None
+
+
 _PAYLOADS: dict[str, type[Model]] = {
     "start": Nothing, "stop": Nothing, "session_end": Nothing, "clinical_settings": Nothing, "stop_cause": StopCausePayload,
     "rating": RatingPayload, "grasp": GraspPayload, "dyskinesia": GradePayload, "speech": GradePayload, "gait": GradePayload,
     "note": NotePayload, "skip": ReasonPayload, "repeat": ReasonPayload, "adverse_event": AdverseEventPayload,
+    "dose": DosePayload,
 }  # fmt: skip
-_LABELS = {"value": "Rating", "hz": "Grasp frequency", "grade": "Grade", "text": "Note", "reason": "Reason", "cause": "Cause"}
+_LABELS = {
+    "value": "Rating",
+    "hz": "Grasp frequency",
+    "grade": "Grade",
+    "text": "Note",
+    "reason": "Reason",
+    "cause": "Cause",
+    "drug": "Drug",
+    "mg": "Dose",
+    "taken_at": "Taken at",
+}
 
 
 @router.get("/visit-day/shell")
@@ -116,9 +137,10 @@ def _entry(values: FormData) -> tuple[Any, int]:
     replaces = [u for u in texts.get("replaces", "").split() if u]
     if kind in ("note", "adverse_event") and texts.get("no_names_ok"):
         payload = payload.model_copy(update={"no_names": texts["no_names_ok"].split()})
+    taken_at = parse(_When, texts, _LABELS).taken_at if kind == "dose" else None
     draft = {
         "uuid": texts.get("uuid", ""), "kind": kind, "plan_item_id": numbers["plan_item_id"], "attempt": numbers["attempt"],
-        "payload": payload.model_dump(), "device_time": now(), "clock_offset_ms": 0, "replaces": replaces,
+        "payload": payload.model_dump(), "device_time": taken_at or now(), "clock_offset_ms": 0, "replaces": replaces,
     }  # fmt: skip
     try:
         return _ENTRY.validate_python(draft), numbers["plan_id"] or 0
@@ -164,7 +186,7 @@ def _page(
         states=states,
         state_names=wording.DAY_STATES,
         outcome=outcomes_of(day.entries).get(current.plan_item_id) if current else None,
-        latest={e.kind: e for e in mine},
+        latest={e.kind: e for e in mine if e.kind not in MANY},
         contradictions=[wording.contradiction(c, shown.slots) for c in contradictions(day.entries)],
         severe=open_severe(day.entries),
         confirmed=[e for e in said if e.kind == "clinical_settings" and e.plan_item_id is None],
@@ -184,6 +206,8 @@ def _frame() -> dict[str, Any]:
         "modules": [n for n in _names() if n.endswith(".js") and n != "worker.js"],
         "note_rules": rules(),
         "event_kinds": [(k.value, n) for k, n in EVENT_KINDS.items()],
+        "drugs": list(DRUG_NAMES.items()),
+        "drug_names": DRUG_NAMES,
     }
 
 

@@ -17,6 +17,8 @@ from ml.qoc import grasp_frequency
 
 SAME_MOMENT_S = 5.0
 """Two starts (or stops) of one session within this time are the same event pressed twice."""
+MANY = ("note", "adverse_event", "clinical_settings", "repeat", "dose")
+"""Kinds of which there may be several: one more says nothing against the one before."""
 MILD, SEVERE = "mild", "severe"
 GRADED = ("dyskinesia", "speech", "gait")
 
@@ -25,7 +27,14 @@ State = Literal["waiting", "running", "asked", "done", "skipped"]
 _STATES: tuple[tuple[str, State], ...] = (("skip", "skipped"), ("session_end", "done"), ("stop", "asked"), ("start", "running"))
 
 
-class Entry(Protocol):
+class Timed(Protocol):
+    """By whose clock, and how far that is off."""
+
+    device_time: Any
+    clock_offset_ms: Any
+
+
+class Entry(Timed, Protocol):
     """What is read of an entry."""
 
     uuid: Any
@@ -34,8 +43,6 @@ class Entry(Protocol):
     kind: Any
     payload: Any
     replaces: Any
-    device_time: Any
-    clock_offset_ms: Any
     entered_by: Any
 
 
@@ -108,7 +115,7 @@ class Contradiction:
     entries: tuple[Entry, ...]
 
 
-def moment(entry: Entry) -> datetime:
+def moment(entry: Timed) -> datetime:
     """When an entry was made, by the service's clock."""
     return entry.device_time + timedelta(milliseconds=entry.clock_offset_ms or 0)  # type: ignore[no-any-return]
 
@@ -138,7 +145,7 @@ def contradictions(entries: Iterable[Entry]) -> list[Contradiction]:
     """Every matter of which two entries stand that say different things."""
     matters: dict[tuple[int, int, str], list[Entry]] = {}
     for entry in standing(entries):
-        if entry.plan_item_id is not None and entry.kind not in ("note", "adverse_event", "clinical_settings", "repeat"):
+        if entry.plan_item_id is not None and entry.kind not in MANY:
             matters.setdefault((entry.plan_item_id, entry.attempt, entry.kind), []).append(entry)
     return [Contradiction(*key, tuple(rows)) for key, rows in matters.items() if not all(agree(rows[0], row) for row in rows[1:])]
 

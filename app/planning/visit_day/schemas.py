@@ -12,6 +12,8 @@ from pydantic import AfterValidator, Field, Strict, model_validator
 
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.adverse_events.models import EventKind
+from app.study.characteristics.schemas import PlannedDose
+from app.study.doses.drugs import Drug
 
 MOST_TAPS = 200
 TEST_S = 10.0
@@ -100,6 +102,13 @@ class AdverseEventPayload(Model):
         if self.kind is EventKind.OTHER and not self.note.strip():
             raise ValueError("say what happened: the kind is 'other'")
         return self
+
+
+class DosePayload(Model):
+    """A dose of medication; the entry's time is when it was taken, and it stands among the visit's doses as soon as it arrives."""
+
+    drug: Drug
+    mg: Number = Field(gt=0, le=5000, description="Of the active drug; of levodopa combinations the levodopa.")
 
 
 class ReasonPayload(Model):
@@ -191,9 +200,17 @@ class ClinicalSettingsEntry(EntryBase):
     payload: Nothing = Nothing()
 
 
+class DoseEntry(EntryBase):
+    """Medication that was taken, on the day or before it."""
+
+    kind: Literal["dose"]
+    payload: DosePayload
+
+
 AnyEntry = (
     Mark | StopCauseEntry | RatingEntry | GraspEntry | GradeEntry | ReasonEntry | NoteEntry | AdverseEventEntry | ClinicalSettingsEntry
-)
+    | DoseEntry
+)  # fmt: skip
 EntryIn = Annotated[AnyEntry, Field(discriminator="kind")]
 
 
@@ -258,6 +275,14 @@ class SlotOut(Model):
     note: str
 
 
+class DayDoseOut(Model):
+    """A dose that is written down at the visit."""
+
+    drug: Drug
+    mg: float
+    taken_at: datetime
+
+
 class DayOut(Model):
     """A clinic day: the sessions of the approved plan, and what has been entered."""
 
@@ -273,6 +298,9 @@ class DayOut(Model):
     stop_rules: list[str]
     slots: list[SlotOut]
     entries: list[EntryOut]
+    doses: list[DayDoseOut] = Field(description="Written down at this visit so far, by whichever way, by time.")
+    planned_doses: list[PlannedDose] = Field(description="The participant's schedule of an ordinary day: what the page offers to enter.")
     reader: str
     may_enter: bool
+    may_dose: bool = Field(description="Whether the reader may write down doses; blinded assessors may not.")
     server_time: datetime

@@ -8,10 +8,12 @@ from app.planning import wording
 from app.planning.plans.designs import Planned
 from app.planning.plans.key import common_limits, sealed
 from app.planning.plans.models import PlanItem
-from app.planning.visit_day.schemas import DayOut, EntryOut, LimitsOut, SlotOut
+from app.planning.visit_day.schemas import DayDoseOut, DayOut, EntryOut, LimitsOut, SlotOut
 from app.planning.visit_day.service import Day
 from app.platform.database import now
+from app.study import service as study
 from app.study.blinding import CONTROLLER_NAMES, may_know
+from app.study.characteristics.service import fields_of
 from app.study.models import Controller
 from app.study.service import may
 
@@ -35,8 +37,11 @@ def day_out(day: Day, caller: Caller) -> DayOut:
         stop_rules=[wording.STOP_RULES],
         slots=[_slot(item, day, common if blinded else limits_of(item), blinded) for item in plan.items],
         entries=[EntryOut.model_validate(row) for row in day.entries],
+        doses=[DayDoseOut.model_validate(row) for row in visit.doses],
+        planned_doses=fields_of(visit.participant.current_characteristics).medication,
         reader=caller.label,
         may_enter=may(caller, can.WRITE_QOC, visit.participant) and not visit.locked,
+        may_dose=may(caller, can.WRITE_STUDY, visit.participant) and not visit.locked and visit.participant.status != study.WITHDRAWN,
         server_time=now(),
     )
 

@@ -22,7 +22,7 @@ from app.planning.plans.view import read_plan, refuse_running
 from app.planning.visit_day import repository
 from app.planning.visit_day.models import DayEntry
 from app.planning.visit_day.record import GRADED, SEVERE, moment
-from app.planning.visit_day.schemas import AdverseEventPayload, EntryIn, EntryResult, NotePayload
+from app.planning.visit_day.schemas import AdverseEventPayload, DosePayload, EntryIn, EntryResult, NotePayload
 from app.planning.visit_day.screening import screen
 from app.platform.database import now
 from app.platform.errors import BetaloopError, Conflict, Forbidden, Invalid, NotFound
@@ -30,6 +30,8 @@ from app.settings import get_settings
 from app.study import service as study
 from app.study.adverse_events.schemas import AdverseEventIn
 from app.study.adverse_events.service import add_adverse_event
+from app.study.doses import service as doses
+from app.study.doses.schemas import DoseIn
 from app.study.models import Visit
 from app.study.visits.service import require_unlocked
 
@@ -102,6 +104,8 @@ def add_entries(db: Session, visit: Visit, plan_id: int, entries: Sequence[Entry
             if entry.kind != "adverse_event":  # what harms a participant is written down whenever it becomes known
                 require_unlocked(visit)
             _check(entry, items)
+            if entry.kind == "dose":
+                doses.add_dose(db, visit, dose_of(entry), caller)
         except BetaloopError as error:
             results.append(EntryResult(uuid=entry.uuid, outcome="refused", detail=error.detail, hint=error.hint))
             continue
@@ -158,6 +162,21 @@ def _check(entry: EntryIn, items: dict[int, PlanItem]) -> None:
     found = screen(*_free_text(entry))
     if found:
         raise Invalid(wording.screened(found), "Take it out, or say that a word is no name.")
+
+
+def dose_of(entry: EntryIn) -> DoseIn:
+    """The dose that an entry says was taken, to the minute: the same one twice within a minute is one that was entered twice.
+
+    Raises:
+        Invalid: the tablet had lost its clock, and nobody knows when the dose was taken.
+    """
+    assert isinstance(entry.payload, DosePayload)
+    taken_at = moment(entry).replace(second=0, microsecond=0)
+    if taken_at.year < FIRST_YEAR:
+        raise Invalid(
+            f"The tablet's clock said {taken_at:%Y-%m-%d %H:%M} UTC.", "Write the dose down on the page of the visit, with its time."
+        )
+    return DoseIn(drug=entry.payload.drug, mg=entry.payload.mg, taken_at=taken_at)
 
 
 def _free_text(entry: EntryIn) -> tuple[str, Sequence[str]]:

@@ -1,8 +1,9 @@
 """The drugs that can be named: a fixed list, so that no free text of a prescription enters.
 
-Levodopa equivalents per mg: Tomlinson et al. 2010 (Movement Disorders 25, 2649), where they give one. A form that these names leave out
-(prolonged-release agonists, whose effect hardly wanes within a visit; selegiline under the tongue, which counts eight times as much;
-tolcapone; levodopa gel) is `other`: no equivalent, and no time since it, rather than those of another form.
+Levodopa equivalents per mg: Tomlinson et al. 2010 (Movement Disorders 25, 2649), where they give one. What Jost et al. 2023 (Movement
+Disorders 38, 1236) propose for drugs that came later, safinamide among them, is not taken up: such a drug has no equivalent here. A form
+that these names leave out (prolonged-release agonists, whose effect hardly wanes within a visit; selegiline under the tongue, which counts
+eight times as much; tolcapone; levodopa gel) is `other`: no equivalent, and no time since it, rather than those of another form.
 """
 
 from __future__ import annotations

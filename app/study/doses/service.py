@@ -28,7 +28,8 @@ def add_dose(db: Session, visit: Visit, draft: DoseIn, caller: Caller) -> Dose:
     """Write down a dose that was taken.
 
     Raises:
-        Forbidden: the caller enters no data. Conflict: the visit is locked, the participant has withdrawn, or the dose is there already.
+        Forbidden: the caller enters no data. Conflict: the visit is locked, the participant has withdrawn, or the dose is there already;
+            what else was done in the transaction stays.
         Invalid: a time that is not near the visit's day, or has not come yet.
     """
     study.require(caller, can.WRITE_STUDY, visit.participant)
@@ -36,15 +37,15 @@ def add_dose(db: Session, visit: Visit, draft: DoseIn, caller: Caller) -> Dose:
     require_unlocked(visit)
     _check_time(visit, draft.taken_at)
     row = Dose(visit_id=visit.id, entered_by=caller.label, **draft.model_dump())
-    visit.doses.append(row)
     try:
-        db.flush()
+        with db.begin_nested():
+            db.add(row)
     except IntegrityError as error:
-        db.rollback()
         raise Conflict(
             f"{DRUGS[draft.drug].name} at {draft.taken_at:%Y-%m-%d %H:%M} UTC is written down at this visit already.",
             "Two tablets at one time are one dose: remove the one that is there, and enter both together.",
         ) from error
+    db.refresh(visit, ["doses"])
     return row
 
 
