@@ -19,6 +19,7 @@ from starlette.concurrency import run_in_threadpool
 from app import __version__
 from app.accounts.deps import results_viewed
 from app.analysis.primary.outlook import outlook
+from app.planning.slots.pages import facts as slots_of_visit
 from app.platform import logs
 from app.platform.database import Db, check_connection
 from app.platform.errors import DatabaseAway
@@ -146,6 +147,7 @@ def create_app() -> FastAPI:
     app.mount("/static/plotly", CompressedFiles(packages=[(plotly.__name__, "package_data")]))
     app.mount("/static", _Static(directory=STATIC))
     app.state.outlook = outlook  # of the analyses, for the plan, which stands before them
+    app.state.slots_of_visit = slots_of_visit  # of the plan, for the page of the visit
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
 

@@ -117,6 +117,8 @@ function announce(root) {
   root.dispatchEvent(new CustomEvent("betaloop:swap", { bubbles: true }));
 }
 
+document.addEventListener("betaloop:renewed", (event) => announce(event.target)); // a part that a page's own script has drawn anew
+
 // --- a table that shows all its columns needs no stop of the Tab key for scrolling
 const fitting = new ResizeObserver((entries) => {
   for (const { target } of entries) {

@@ -85,10 +85,25 @@ function send(files, fields, shown) {
       shown.words.textContent = event.loaded < event.total ? `sending, ${Math.round((100 * event.loaded) / event.total)} %` : "decoding …";
     });
     request.upload.addEventListener("load", () => follow(shown, request));
-    request.addEventListener("load", () => { report(shown, request.status, request.response ?? {}); done(); });
+    request.addEventListener("load", () => { report(shown, request.status, request.response ?? {}); renew(); done(); });
     request.addEventListener("error", () => { report(shown, 0, { detail: "The connection broke off.", hint: "Send the files again; what has arrived is not counted twice." }); done(); });
     request.send(body);
   });
+}
+
+// on the page of a visit, what the files changed is shown at once
+async function renew() {
+  const old = document.querySelector("[data-after-upload][id]");
+  if (!old) return;
+  try {
+    const answer = await fetch(old.dataset.afterUpload, { headers: { Accept: "text/html" } });
+    const fresh = answer.ok && new DOMParser().parseFromString(await answer.text(), "text/html").getElementById(old.id);
+    if (!fresh) return;
+    old.replaceWith(fresh);
+    fresh.dispatchEvent(new CustomEvent("betaloop:renewed", { bubbles: true }));
+  } catch (error) {
+    console.info("the page is as it was before the upload; load it again", error);
+  }
 }
 
 // while the service reads a file, which may take minutes, the page asks how far it is

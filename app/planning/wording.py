@@ -195,10 +195,10 @@ DEVIATIONS: dict[Deviation, str] = {
 }
 
 
-def slots_summary(planned: int, missing: Sequence[str]) -> str:
-    """How many of the planned sessions were found, and which are missing."""
+def slots_summary(planned: int, missing: Sequence[str], due: bool = True) -> str:
+    """How many of the planned sessions were found, and which are missing; before anything can be there (`due` False) none is."""
     found = f"{planned - len(missing)} of {planned} planned sessions found"
-    return found if not missing else f"{found}; {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
+    return found if not missing or not due else f"{found}; {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
 
 
 def order_words(plan: Plan) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 from sqlalchemy.orm import Session
@@ -10,12 +12,15 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.planning import wording
+from app.planning.plans import repository as plans
+from app.planning.plans.visits import today
 from app.planning.slots import service
 from app.planning.slots.serializers import comparison_out
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues
 from app.platform.web.templates import render
+from app.settings import get_settings
 from app.study.deps import CurrentVisit
 from app.study.models import Visit
 from app.study.service import may
@@ -50,13 +55,32 @@ def _page(
         "planning/slots.html",
         visit=visit,
         participant=visit.participant,
-        found=comparison_out(found),
-        waiting=len(found.waiting),
-        asks_about_day=bool(found.asks_about_day),
-        summary=wording.slots_summary(found.planned, comparison_out(found).missing),
-        deviation_words=wording.DEVIATIONS,
+        slots=_facts(found, caller),
         notes=notes,
         may_run=may(caller, can.RUN_JOBS, visit.participant) and any(r.confirmed for r in found.rows),
-        may_confirm=may(caller, can.WRITE_STUDY, visit.participant),
+        may_upload=may(caller, can.UPLOAD, visit.participant) and not visit.locked,
+        limit_mb=get_settings().upload_limit_mb,
         problem=error.problem(request.url.path) if error else None,
     )
+
+
+def facts(db: Session, visit: Visit, caller: Caller) -> dict[str, Any] | None:
+    """What the page of a visit shows of planned against done, as `planning/_slots.html` takes it; None where no plan is signed."""
+    plan = plans.live_plan(db, visit.id)
+    if plan is None or plan.status != "approved":
+        return None
+    return _facts(service.compare(db, visit, caller), caller)
+
+
+def _facts(found: service.Comparison, caller: Caller) -> dict[str, Any]:
+    shown, visit = comparison_out(found), found.view.visit
+    due = found.found > 0 or (visit.date is not None and visit.date < today())  # before that nothing can be there
+    return {
+        "found": shown,
+        "waiting": len(found.waiting),
+        "asks_about_day": bool(found.asks_about_day),
+        "due": due,
+        "summary": wording.slots_summary(found.planned, shown.missing, due),
+        "deviation_words": wording.DEVIATIONS,
+        "may_confirm": may(caller, can.WRITE_STUDY, visit.participant) and not visit.locked,
+    }

@@ -16,6 +16,7 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import render
+from app.settings import get_settings
 from app.study import repository, service
 from app.study.blinding import arm, may_know, visible_arm
 from app.study.deps import CurrentParticipant, CurrentVisit
@@ -139,6 +140,9 @@ def shown_visit(
         participant=visit.participant,
         rows=[_session_row(db, s, caller) for s in sessions],
         latencies=tablet.by_controller(ran),
+        slots=request.app.state.slots_of_visit(db, visit, caller),
+        may_upload=may(caller, can.UPLOAD, visit.participant) and not visit.locked,
+        limit_mb=get_settings().upload_limit_mb,
         proposals=[s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id],
         seen=seen,
         draft=seen | {"reason": ""} | (typed or {}),

@@ -144,3 +144,31 @@ def test_a_log_that_names_no_session_here_fills_none_by_its_name(
     found = [(r["position"], r["deviations"]) for r in client.get(path).json()["rows"] if r["session_id"]]
     assert found == [(None, ["unplanned" if "purpose" in change else "other_plan"])]
     assert client.post(f"{path}/confirm", json={}).status_code == 409, "there is nothing to confirm into a slot"
+
+
+def test_the_log_of_a_simulated_device_is_said_to_be_one(client: TestClient, studied: Any, planned: Plan) -> None:
+    body = send(client, log_of(planned, 1, 0, simulated=True))
+    assert "is of a simulated device: nobody was stimulated" in " ".join(body["report"][0]["flagged"])
+    other = send(client, log_of(planned, 2, 20, number=3))
+    assert "simulated" not in str(other["report"])
+
+
+def test_the_page_of_a_visit_shows_its_slots_and_takes_its_logs(
+    client: TestClient, client_as: Callable[[str], TestClient], studied: Any, planned: Plan
+) -> None:
+    page = {"Accept": "text/html"}
+    path = f"/visits/{studied.visit}"
+    before = client.get(path, headers=page).text
+    assert f"0 of {len(planned.items)} planned sessions found; " in before, "the day is over, and all are missing"
+    assert 'data-after-upload="/visits/' in before
+    form = before.split("data-upload ")[1].split("</form>")[0]
+    assert 'name="visit" value="2"' in form
+    answer = client.post("/participants/P1/upload", data={"visit": "2"}, files={"file": ("log.csv", log_of(planned, 1, 0))}, headers=page)
+    assert answer.status_code == 200, "without scripts the form leads to the report of the upload"
+    after = client.get(path, headers=page).text
+    assert f"1 of {len(planned.items)} planned sessions found" in after
+    assert "Confirm 1 session into its slot" in after
+    for role, takes in (("coordinator", True), ("viewer", False), ("monitor", False)):
+        seen = client_as(role).get(path, headers=page).text
+        assert ("data-drop" in seen, "Confirm 1 session" in seen) == (takes, takes), role
+        assert "upload.js" not in seen or takes
