@@ -90,8 +90,8 @@ def _bundles(db: Session, view: PlanView) -> dict[int, str]:
 
 @router.post("/visits/{visit_id}/plan/moves", responses=problems(409))
 def move_session(visit: CurrentVisit, move: Move, db: Db, caller: CurrentCaller) -> PlanOut:
-    """Let a tested session of a draft change places with the tested one before or after it."""
-    found = service.reorder(db, visit, move.position, move.earlier, caller)
+    """Move a tested session of a draft past the tested ones before or after it; cDBS stays between any two policies."""
+    found = service.reorder(db, visit, move, caller)
     db.commit()
     return plan_out(found)
 

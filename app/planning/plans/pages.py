@@ -141,10 +141,9 @@ def draft_from_ranking(request: Request, participant: CurrentParticipant, db: Db
 
 @router.post("/visits/{visit_id}/plan/move")
 def move(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
-    """Move a tested session of the draft up or down."""
+    """Move a tested session of the draft up or down, by a button or by dragging it."""
     try:
-        asked = parse(Move, values, LABELS)
-        service.reorder(db, visit, asked.position, asked.earlier, caller)
+        service.reorder(db, visit, parse(Move, values, LABELS), caller)
         db.commit()
     except BetaloopError as error:
         db.rollback()

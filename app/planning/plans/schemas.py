@@ -205,10 +205,11 @@ class KeyOpening(Model):
 
 
 class Move(Model):
-    """A tested session changes places with the tested one before or after it."""
+    """A tested session changes places with the tested one before or after it, as often as said."""
 
     position: Id
     earlier: Bool
+    places: Int = Field(1, ge=1, le=20, description="How many tested sessions it passes.")
 
 
 class Removal(Model):

@@ -22,10 +22,10 @@ from app.planning.plans.key import label_sessions
 from app.planning.plans.limits import StatedLimits, require_limits, set_limits
 from app.planning.plans.models import Plan, PlanItem
 from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
-from app.planning.plans.schemas import PlanIn, PlanOptions
+from app.planning.plans.schemas import Move, PlanIn, PlanOptions
 from app.planning.plans.sign_off import SignatureState, sign_plan
 from app.planning.plans.view import PlanView, medication_due, read_plan, refuse_withdrawn, view_of
-from app.planning.protocol.schedule import Candidate, Rules, schedule
+from app.planning.protocol.schedule import Candidate, Rules, require_controls, schedule
 from app.planning.protocol.session_order import Order
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
@@ -170,13 +170,14 @@ def count_repeats(items: Sequence[PlanItem]) -> None:
         item.repeat = seen[arm]
 
 
-def reorder(db: Session, visit: Visit, position: int, earlier: bool, caller: Caller) -> PlanView:
-    """Let two tested sessions of a draft change places; sessions of cDBS and without stimulation stay where the protocol has them.
+def reorder(db: Session, visit: Visit, move: Move, caller: Caller) -> PlanView:
+    """Move a tested session of a draft past others; sessions of cDBS and without stimulation stay where the protocol has them.
 
     Whoever moves a session has drafted the plan from then on, and signs it no more than any other drafter.
 
     Raises:
-        NotFound: no plan. Conflict: it is signed. Invalid: no tested session stands there, or none before or after it.
+        NotFound: no plan. Conflict: it is signed. Invalid: no tested session stands there, there are not so many before or after it, or
+            two policies would follow one another without a cDBS session between them.
     """
     study.require(caller, can.DRAFT_PLAN, visit.participant)
     repository.lock_visit(db, visit.id)
@@ -184,11 +185,14 @@ def reorder(db: Session, visit: Visit, position: int, earlier: bool, caller: Cal
     if plan.status != "draft":
         raise Conflict(f"Plan {plan.id} is signed.", "Draft the visit anew to change it.")
     tested = [item for item in plan.items if item.controller not in (Controller.CDBS, Controller.NO_DBS)]
-    place = next((i for i, item in enumerate(tested) if item.position == position), None)
-    other = None if place is None else place + (-1 if earlier else 1)
-    if place is None or other is None or not 0 <= other < len(tested):
-        raise Invalid(f"Session {position} cannot be moved {'up' if earlier else 'down'}.", "Move a tested session past another one.")
-    repository.swap(db, tested[place], tested[other])
+    place = next((i for i, item in enumerate(tested) if item.position == move.position), None)
+    step = -1 if move.earlier else 1
+    if place is None or not 0 <= place + step * move.places < len(tested):
+        where = "up" if move.earlier else "down"
+        raise Invalid(f"Session {move.position} cannot be moved {where} by {move.places}.", "Move a tested session past another one.")
+    for other in tested[place + step :: step][: move.places]:
+        repository.swap(db, tested[place], other)
+    require_controls([(Controller(i.controller), i.policy_id) for i in sorted(plan.items, key=lambda i: i.position)])
     plan.rules = plan.rules | {"order": Order.STATED.value}
     plan.created_by = caller.label
     db.flush()

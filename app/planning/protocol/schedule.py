@@ -159,6 +159,26 @@ def most_policies(rules: Rules) -> int:
     return count
 
 
+def require_controls(day: Sequence[tuple[Controller, int | None]]) -> None:
+    """Raise Invalid where two sessions of policies have no cDBS session between them.
+
+    Args:
+        day: controller and policy of each session, in order; sessions without a policy, as random ones, are no control.
+    """
+    waiting: int | None = None
+    for number, (controller, policy_id) in enumerate(day, start=1):
+        if controller is Controller.CDBS:
+            waiting = None
+        elif policy_id is not None:
+            if waiting is not None:
+                raise Invalid(
+                    f"Sessions {waiting} and {number} would test policies without a cDBS session between them.",
+                    "Move the session to a place on the other side of a cDBS session.",
+                    rule=Rule.CDBS_BETWEEN,
+                )
+            waiting = number
+
+
 def _check_candidates(candidates: Sequence[Candidate], rules: Rules) -> None:
     if not candidates and not rules.random_sessions:
         raise Invalid("A plan needs at least one policy or one random session.", "Choose a policy in the ranking, or add random sessions.")

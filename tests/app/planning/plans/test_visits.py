@@ -54,8 +54,27 @@ def test_tested_sessions_change_places_and_cdbs_stays_between(
     assert [s["policy_id"] for s in client.get(path).json()["sessions"]] == [1, None, 2, None, 3]
     for position, earlier in ((1, True), (2, True), (5, False), (9, False)):
         assert client.post(f"{path}/moves", json={"position": position, "earlier": earlier}).status_code == 422
+    assert client.post(f"{path}/moves", json={"position": 1, "earlier": False, "places": 3}).status_code == 422
+    far = client.post(f"{path}/moves", json={"position": 1, "earlier": False, "places": 2}).json()
+    assert [s["policy_id"] for s in far["sessions"]] == [2, None, 3, None, 1], "past both, which keep their order"
     assert sign_plan(studied.visit).status_code == 200
     assert client.post(f"{path}/moves", json={"position": 5, "earlier": True}).status_code == 409
+
+
+def test_a_move_after_which_two_policies_would_have_no_cdbs_between_them_is_refused(client: TestClient, studied: Any) -> None:
+    path = f"/api/v1/visits/{studied.visit}/plan"
+    body = {"policy_ids": list(studied.policies[:2]), "order": "stated", "random_sessions": 1}
+    for seed in range(20):
+        before = client.post(path, json=body | {"seed": seed}).json()["sessions"]
+        if [s["controller"] for s in before] == ["rl", "random", "cdbs", "rl"]:
+            break
+    else:
+        raise AssertionError("no seed puts the random session there")
+    refused = client.post(f"{path}/moves", json={"position": 4, "earlier": True})
+    assert (refused.status_code, refused.json()["rule"]) == (422, "cdbs_between_policies")
+    assert "Sessions 1 and 2 would test policies without a cDBS session between them." in refused.json()["detail"]
+    assert client.get(path).json()["sessions"] == before, "nothing was moved"
+    assert client.post(f"{path}/moves", json={"position": 1, "earlier": False}).status_code == 200
 
 
 def test_williams_order_goes_on_from_visit_to_visit(client: TestClient, studied: Any) -> None:
