@@ -43,6 +43,29 @@ class Approval:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlanCard:
+    """What the sheet of the signed plan says of the session that a bundle is for: the bundle's own sheet says the same.
+
+    Attributes:
+        head, minutes: of its title line. lines: label and text, in order. warnings: a sentence each.
+        stop_rules: those of the plan. blinded: whether only letters, the plan's common limits and the stop rules may be read.
+    """
+
+    head: str
+    minutes: str
+    lines: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+    stop_rules: str
+    blinded: bool = False
+
+    @staticmethod
+    def from_json(stored: dict[str, Any]) -> PlanCard:
+        """As JSON gives it. Raises TypeError, ValueError, KeyError for another shape."""
+        lines = tuple((str(label), str(text)) for label, text in stored["lines"])
+        return PlanCard(**stored | {"lines": lines, "warnings": tuple(map(str, stored["warnings"])), "blinded": stored["blinded"] is True})
+
+
+@dataclass(frozen=True, kw_only=True)
 class BundleManifest:
     """The contents of `manifest.json`.
 
@@ -79,6 +102,7 @@ class BundleManifest:
         public_key: Ed25519 key that the bundle is signed with, 64 hexadecimal digits; it names the signer and proves nothing by itself.
         slot: the session of the signed plan that the bundle is for; None for one taken without a plan, which runs on the bench alone.
         schedule: what is delivered where no network decides; None where one does.
+        card: what the plan's sheet says of that session; None without a plan, and in bundles made before it was taken along.
         approvals: sign-offs, in order.
         files: SHA-256 by file name of everything else in the bundle; filled in when the bundle is built.
         schema_version: of this manifest.
@@ -142,6 +166,7 @@ class BundleManifest:
     public_key: str | None = None
     slot: Slot | None = None
     schedule: Schedule | None = None
+    card: PlanCard | None = None
     approvals: tuple[Approval, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
     schema_version: int = SCHEMA_VERSION
@@ -176,6 +201,8 @@ class BundleManifest:
         """A network or a schedule runs, and versions before 4 know neither schedule nor slot."""
         if self.schema_version < SCHEMA_VERSION and (self.slot or self.schedule):
             raise BundleError(f"a manifest of version {self.schema_version} has neither slot nor schedule")
+        if self.card is not None and self.slot is None:
+            raise BundleError("a bundle without a slot has no card of a plan")
         if self.schedule is not None and (self.policy_id is not None or self.layers):
             raise BundleError("a bundle holds a network or a schedule, not both")
         if self.schedule is None and self.policy_id is None:
@@ -238,6 +265,7 @@ class BundleManifest:
         signed = tuple(Approval(**item) for item in approvals)
         values["slot"] = _nested("slot", values.get("slot"), lambda stored: Slot(**stored))
         values["schedule"] = _nested("schedule", values.get("schedule"), Schedule.from_json)
+        values["card"] = _nested("card", values.get("card"), PlanCard.from_json)
         return BundleManifest(**values, layers=tuple(layers), activations=tuple(activations), approvals=signed)
 
 

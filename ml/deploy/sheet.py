@@ -6,7 +6,7 @@ import re
 from datetime import datetime
 from html import escape
 
-from ml.deploy.manifest import BundleManifest
+from ml.deploy.manifest import BundleManifest, PlanCard
 from ml.deploy.wording import battery_words, energy_words, warning_sentences
 
 _STYLE = """
@@ -50,8 +50,11 @@ def render(manifest: BundleManifest, model_sha256: str | None) -> str:
         manifest: of the bundle, all but its files.
         model_sha256: of the ONNX file; None where a schedule runs.
     """
+    if manifest.card is not None and manifest.card.blinded:
+        return _blinded(manifest, manifest.card)
     number = "" if manifest.policy_id is None else f" · policy {manifest.policy_id}"
     what = "Network" if manifest.schedule is None else "Schedule"
+    expected = "Amplitude" if manifest.card is not None and manifest.schedule is None else "Amplitude, energy, battery"
     code = escape(manifest.participant)
     side = f" · {manifest.hemisphere} hemisphere" if manifest.hemisphere else ""
     return f"""<!doctype html>
@@ -61,6 +64,7 @@ def render(manifest: BundleManifest, model_sha256: str | None) -> str:
 <div class="kind">Closed-loop DBS controller<br>one-page sheet of the bundle</div></header>
 {_approval(manifest)}
 {_session(manifest)}
+{_planned(manifest)}
 {_warned(manifest)}
 <h2>Stimulation limits</h2>
 <div class="big"><div><small>Lowest</small><b>{manifest.min_ma:g} mA</b></div><div><small>Highest</small><b>{manifest.max_ma:g} mA</b></div>
@@ -73,7 +77,8 @@ def render(manifest: BundleManifest, model_sha256: str | None) -> str:
 </div><div>
 <h2>{what}</h2><table>{_rows(_network(manifest))}</table>
 </div></div>
-<h2>Amplitude, energy, battery</h2><table class="wide">{_rows(_expected(manifest))}</table>
+<h2>{expected}</h2>
+<table class="wide">{_rows(_expected(manifest))}</table>
 <h2>When the controller gives way</h2>
 <p style="margin:2px 0">Every {manifest.period_s:g} s it decides anew. In the same decision, and without a ramp, it returns to the cDBS
 amplitude of <b>{manifest.cdbs_ma:g}&nbsp;mA</b> when beta has not come when it was due (older than {manifest.limits().stale_after_s:g} s),
@@ -81,17 +86,53 @@ is not a number, negative, {_implausible(manifest)}or of another unit or source,
 network fails. It takes over again after
 {manifest.window} valid beta amplitudes in a row ({manifest.window * manifest.period_s:g} s), moving at most
 {manifest.ramp_ma_per_s * manifest.period_s:.3g} mA per period.</p>
-<h2>Before use</h2>
-<ol><li>Check the bundle on the tablet: <code>betaloop control --bundle FILE --key KEY --participant {code}</code> verifies signature, every
-SHA-256, the test vectors and the participant.</li>
-<li>Compare participant, hemisphere, contacts and cDBS amplitude with the stimulator. For this participant only.</li>
-<li>Keep the clinical settings at hand: the sheet replaces neither the stop rules of the protocol nor the device's own limits.</li></ol>
+{_before_use(code)}
 <h2>Where it comes from</h2><table class="wide">{_rows(_origin(manifest, model_sha256))}</table>
-<div class="lines"><div>Clinician, date: limits checked against the stimulator</div>
-<div>Engineer, date: bundle verified on the tablet</div></div>
+{_SIGNED_BY}
 <footer>{_made(manifest)} For research; betaloop is no medical device.</footer>
 </body></html>
 """
+
+
+_SIGNED_BY = """<div class="lines"><div>Clinician, date: limits checked against the stimulator</div>
+<div>Engineer, date: bundle verified on the tablet</div></div>"""
+
+
+def _blinded(m: BundleManifest, card: PlanCard) -> str:
+    """The sheet of a session of a blinded plan: its letter, common limits and stop rules, and nothing that tells what runs."""
+    code = escape(m.participant)
+    taken = f"Taken by {escape(re.sub(r'[.][0-9]{6} ', ' ', m.taken_by))}. " if m.taken_by else ""
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Controller bundle {code}, blinded</title><style>{_STYLE}</style></head><body>
+<header><div><h1>{code}</h1>{escape(card.head)}</div>
+<div class="kind">Closed-loop DBS controller<br>one-page sheet of a blinded session</div></header>
+{_approval(m)}
+{_session(m)}
+{_planned(m)}
+<h2>Stop rules</h2><p>{escape(card.stop_rules)}</p>
+{_before_use(code)}
+{_SIGNED_BY}
+<footer>{taken}Bundled by betaloop {escape(m.code_version)}. For research; betaloop is no medical device.</footer>
+</body></html>
+"""
+
+
+def _planned(m: BundleManifest) -> str:
+    """What the sheet of the signed plan says of this session, word for word."""
+    if m.card is None or m.slot is None:
+        return ""
+    warned = "".join(f'<div class="warn">{escape(text)}</div>' for text in m.card.warnings)
+    title = f"As on the sheet of plan {m.slot.plan_id}: {escape(m.card.head)}, {escape(m.card.minutes)}"
+    return f'<h2>{title}</h2><table class="wide">{_rows(list(m.card.lines))}</table>{warned}'
+
+
+def _before_use(code: str) -> str:
+    return f"""<h2>Before use</h2>
+<ol><li>Check the bundle on the tablet: <code>betaloop control --bundle FILE --key KEY --participant {code}</code> verifies signature, every
+SHA-256, the test vectors and the participant.</li>
+<li>Compare participant, hemisphere, contacts and cDBS amplitude with the stimulator. For this participant only.</li>
+<li>Keep the clinical settings at hand: the sheet replaces neither the stop rules of the protocol nor the device's own limits.</li></ol>"""
 
 
 def _approval(m: BundleManifest) -> str:
@@ -109,7 +150,8 @@ def _session(m: BundleManifest) -> str:
     if slot is None:
         return '<div class="warn">For no session of a signed plan: runs on the bench alone, with nobody connected.</div>'
     label = f" · {escape(slot.label)}" if slot.label else ""
-    repeat = f", repeat {slot.repeat}" if slot.repeat > 1 else ""
+    told = m.card is None or not m.card.blinded  # a repeat of what is not to be known is not to be known either
+    repeat = f", repeat {slot.repeat}" if slot.repeat > 1 and told else ""
     return (
         f'<div class="signed">Session {slot.position} of visit {slot.visit_number}{label}{repeat} · {slot.minutes:g} min · '
         f"<b>{escape(slot.visit_date)}</b> only, once. Plan {slot.plan_id}, signed as <code>{escape(slot.plan_sha256[:12])}</code>.</div>"
@@ -227,6 +269,8 @@ def _expected(m: BundleManifest) -> list[tuple[str, str]]:
     below = f"below {m.min_ma:g} mA (lowest) in {100 * (m.asked_below_minimum or 0):.0f} %"
     if m.logged_lower_bound is not None and m.asked_below_bound is not None:
         below += f", below {m.logged_lower_bound * m.cdbs_ma:.3g} mA (B, lowest tried at random) in {100 * m.asked_below_bound:.0f} %"
+    if m.card is not None:  # what is predicted of the session stands on its card, and no second number of it here
+        return [("Asked for", f"{asked}; {below}. On logged beta: in closed loop beta answers to the amplitude.")]
     return [
         ("Asked for", f"{asked}; {below}"),
         ("Energy", f"{battery_words(m.energy_of_cdbs, m.charge_of_cdbs)}. On logged beta: in closed loop beta answers to the amplitude."),

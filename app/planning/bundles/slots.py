@@ -11,18 +11,20 @@ from app import __version__
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import repository as learning
+from app.planning import wording
 from app.planning.bundles import repository, service
 from app.planning.plans.designs import Planned, seed_of
 from app.planning.plans.limits import device_limits
 from app.planning.plans.models import PlanItem
-from app.planning.plans.view import PlanLine, PlanView, read_plan, refuse_running
+from app.planning.plans.view import PlanLine, PlanView, read_plan, refuse_running, shown
 from app.planning.plans.visits import today
+from app.planning.sheet.content import BUNDLE, card_of
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.platform.signatures.models import Signature
 from app.study import service as study
 from app.study.models import Controller, Hemisphere, Visit
 from ml.deploy.bundle import build_scheduled_bundle, sign
-from ml.deploy.manifest import Approval, BundleError, BundleManifest
+from ml.deploy.manifest import Approval, BundleError, BundleManifest, PlanCard
 from ml.deploy.runtime.schedule import Schedule, ScheduledHold
 from ml.deploy.runtime.slot import Slot, Withdrawals, withdrawals_body
 from ml.designs import Decision, DesignSettings, lay_out
@@ -47,7 +49,9 @@ def bundle(db: Session, visit: Visit, position: int, caller: Caller) -> tuple[st
         limits = service.Limits(line.item.min_ma, line.item.max_ma, line.item.ramp_ma_per_s)
         side = Hemisphere(line.item.hemisphere) if line.item.hemisphere else None
         manifest, windows = service.manifest_of(db, visit.participant, line.policy, limits, side, caller)
-        manifest = replace(manifest, slot=slot, approvals=_approvals(view, signature), limits_stated_by=_stated_by(signature))
+        manifest = replace(
+            manifest, slot=slot, card=_card(view, line), approvals=_approvals(view, signature), limits_stated_by=_stated_by(signature)
+        )
         content = service.policy_bundle(line.policy, manifest, windows)
     else:
         manifest = _scheduled(db, view, line, slot, signature, caller)
@@ -89,6 +93,17 @@ def _slot(view: PlanView, item: PlanItem, signature: Signature) -> Slot:
         issued_at=datetime.now(UTC).isoformat(timespec="seconds"),
         label=item.label,
         repeat=item.repeat,
+    )
+
+
+def _card(view: PlanView, line: PlanLine) -> PlanCard:
+    """What the plan's sheet says of a session; while the key is sealed no more than is shown there."""
+    seen = shown(view)
+    one = next(other for other in seen.lines if other.item.position == line.item.position)
+    card = card_of(one, seen, None)
+    told = tuple((label, text) for label, text in card.lines if label != BUNDLE)
+    return PlanCard(
+        head=card.head, minutes=card.minutes, lines=told, warnings=card.warnings, stop_rules=wording.STOP_RULES, blinded=view.sealed
     )
 
 
@@ -139,6 +154,7 @@ def _scheduled(db: Session, view: PlanView, line: PlanLine, slot: Slot, signatur
             public_key=service.public_key(),
             approvals=_approvals(view, signature),
             slot=slot,
+            card=_card(view, line),
             schedule=schedule,
             **service.beta_limits(data),
         )

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from fpdf import FPDF
 
-from app.planning import wording
-from app.planning.plans.view import PlanLine, PlanView
-from app.planning.sheet.ink import INK, LINE, MUTED, clock, printed_name, printed_warning, shade
+from app.planning.plans.view import PlanView
+from app.planning.sheet.content import Card, card_of
+from app.planning.sheet.ink import INK, LINE, MUTED
 from app.planning.sheet.latin1_text import latin
 
 WIDTH = 277.0
@@ -19,46 +18,6 @@ _HEAD, _TEXT, _BLANKS = 6.4, 3.9, 10.5
 _FIELDS = (
     ("Started hh:mm", 20.0), ("Grasp Hz", 15.0), ("Rating 1-10", 17.0), ("Tremor %", 15.0), ("Medication, notes, adverse effects", 0.0),
 )  # fmt: skip
-HASH = 12
-"""Characters of a hash that are printed: enough to tell two bundles of a study apart by eye."""
-
-
-@dataclass(frozen=True)
-class Card:
-    """What stands on a card.
-
-    Attributes:
-        head, minutes: of its title line, left and right. lines: label and text. warnings: a sentence each. fill: colour of the title line.
-    """
-
-    head: str
-    minutes: str
-    lines: tuple[tuple[str, str], ...]
-    warnings: tuple[str, ...]
-    fill: tuple[int, int, int]
-
-
-def card_of(line: PlanLine, view: PlanView, bundle: str | None) -> Card:
-    """A session's card; of a sealed plan's session, which has lost its controller, letters and common limits alone."""
-    item = line.item
-    length = f"{item.minutes:g} min"
-    for minutes, what in ((item.washout_minutes, "washout"), (item.break_minutes, "break")):
-        length += f", then {minutes:g} min {what}" if minutes else ""
-    limits = f"{wording.limits_ma(item)} mA" if item.max_ma is not None else "not set"
-    limits += f", ramp {item.ramp_ma_per_s:g} mA/s" if item.ramp_ma_per_s is not None else ""
-    limits += f", {item.hemisphere} side" if item.hemisphere else ""
-    told = {
-        "Policy": printed_name(line.policy) if line.policy else "",
-        "Limits": limits,
-        "Design": wording.design_name(line.design) if line.design else "",
-        "Bundle": "" if view.sealed else bundle[:HASH] if bundle else "not taken yet",
-        "Predicted": _predicted(line),
-        "Medication": f"due before: {item.medication}" if item.medication else "",
-    }
-    mine = [w for w in view.warnings if line.policy is not None and w.policy_id == line.policy.id]
-    warnings = tuple(printed_warning(wording.warning(w), line.policy) for w in mine)
-    head = f"{item.position}  {clock(line.start_minute, view.plan.starts_at)}  {wording.session_name(item)}"
-    return Card(head, length, tuple((label, text) for label, text in told.items() if text), warnings, shade(line))
 
 
 def draw_cards(pdf: FPDF, view: PlanView, bundles: Mapping[int, str]) -> None:
@@ -72,17 +31,6 @@ def draw_cards(pdf: FPDF, view: PlanView, bundles: Mapping[int, str]) -> None:
         for i, card in enumerate(pair):
             _draw(pdf, card, pdf.l_margin + i * (_CARD + _GAP), top, height)
         pdf.set_xy(pdf.l_margin, top + height + 2.5)
-
-
-def _predicted(line: PlanLine) -> str:
-    """What is predicted of a session; empty of one that was not ranked, as cDBS, whose energy is 1 by definition."""
-    e = line.estimate
-    if e is None:
-        return ""
-    told = [] if line.predicted_energy is None else [f"energy {line.predicted_energy:.2f} of cDBS"]
-    units = (("grasp_hz", "grasp {:.2f} Hz"), ("rating", "rating {:.1f}"), ("tremor_percent", "tremor {:.0f} %"))
-    told += [words.format(e.predicted[name]) for name, words in units if name in e.predicted]
-    return ", ".join([*told, f"return {e.value:.4g} ({e.low:.4g} to {e.high:.4g})" + ("" if e.supported else " *")])
 
 
 def _wrapped(pdf: FPDF, text: str, width: float) -> Sequence[str]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import html
+import io
+import zipfile
 from collections.abc import Callable
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
@@ -13,9 +16,14 @@ from fastapi.testclient import TestClient
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
+from app.accounts.permissions import SYSTEM
+from app.planning.plans.view import read_plan
+from app.planning.sheet.content import card_of
 from app.platform.errors import Invalid
-from app.tablet.command import verified
+from app.study.models import Visit
+from app.tablet.command import control, lines, verified
 from app.tablet.live import run_live
+from app.tablet.sources import Wish
 from app.tablet.task import Task
 from ml.deploy.bundle import open_bundle
 from ml.deploy.manifest import BundleManifest
@@ -92,6 +100,55 @@ def test_each_session_of_a_signed_plan_has_its_bundle_within_the_signed_limits(
     assert all(row.plan_item_id for row in rows)
     page = client.get(f"/visits/{studied.visit}/bundles", headers={"Accept": "text/html"}).text
     assert page.count('/bundle" download') == len(signed["sessions"]) - 1
+
+
+def sheet_of(client: TestClient, visit: int, position: int) -> str:
+    with zipfile.ZipFile(io.BytesIO(taken(client, visit, position).content)) as archive:
+        return html.unescape(archive.read("sheet.html").decode())
+
+
+def test_the_sheet_of_a_bundle_says_of_its_session_what_the_sheet_of_the_plan_says(
+    client: TestClient, db: Session, studied: Any, signed: dict[str, Any], tmp_path: Path
+) -> None:
+    view = read_plan(db, db.get_one(Visit, studied.visit), SYSTEM)
+    signature = signed["signature"]["sha256"][:12]
+    for line in view.lines:
+        if line.item.controller == "no_dbs":
+            continue
+        card, sheet = card_of(line, view, None), sheet_of(client, studied.visit, line.item.position)
+        assert f"As on the sheet of plan {signed['id']}: {card.head}, {card.minutes}" in sheet
+        for label, words in card.lines:
+            assert label == "Bundle" or f"<th>{label}</th><td>{words}</td>" in sheet
+        assert all(warning in sheet for warning in card.warnings)
+        assert f"signed as <code>{signature}</code>" in sheet
+    assert any(card_of(line, view, None).warnings for line in view.lines), "a policy that is not ranked is warned of"
+
+
+def test_the_sheet_of_a_blinded_session_tells_letters_and_stop_rules_and_not_what_runs(
+    client: TestClient, db: Session, studied: Any, policies: list[int], sign_plan: Callable[..., Any], tmp_path: Path
+) -> None:
+    db.execute(text("update visit set date = :day where id = :id"), {"day": TODAY, "id": studied.visit})
+    db.commit()
+    wanted = {"policy_ids": policies, "seed": 7, "min_ma": 0.5, "random_sessions": 1, "minutes_per_session": 5, "blinded": True}
+    plan = client.post(f"/api/v1/visits/{studied.visit}/plan", json=wanted).json()
+    assert sign_plan(studied.visit, plan_id=plan["id"]).status_code == 200
+    letters = [s["label"] for s in plan["sessions"]]
+    key = client.get("/api/v1/bundle-key").text.strip()
+    common = None
+    for session in plan["sessions"]:
+        sheet = sheet_of(client, studied.visit, session["position"])
+        assert f"Session {session['label']}" in sheet
+        assert "Stop the session and return to the clinical stimulation" in sheet
+        assert not [word for word in ("net-1", "net-2", "cDBS 2", "Random", "Design", "Predicted", "Network") if word in sheet]
+        limits = sheet.split("<th>Limits</th><td>")[1].split("</td>")[0]
+        common = common or limits
+        assert limits == common, "the limits of all sessions alike"
+        bundle = tmp_path / f"{session['position']}.zip"
+        bundle.write_bytes(taken(client, studied.visit, session["position"]).content)
+        told = lines(control(bundle, None, Wish(), Task(key=key, timed=20)))
+        assert f"Session {session['label']}, blinded" in told
+        assert "net-" not in told
+    assert len(set(letters)) == len(letters)
 
 
 @pytest.mark.hazard("H23")
