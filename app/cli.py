@@ -345,6 +345,7 @@ def control_(
     ledger: Annotated[Path | None, typer.Option(help="Folder with the sessions that this tablet has run.")] = None,
     withdrawn: Annotated[Path | None, typer.Option(help="The study's list of withdrawn policies and plans.")] = None,
     timed: Annotated[int, typer.Option("--time", min=0, max=100_000, help="Time so many decisions on this machine.")] = 0,
+    begins: Annotated[datetime | None, typer.Option(help="When a session on a simulated device begins, by its own clock.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Verify a controller bundle and run it on a stream of beta, as the tablet does."""
@@ -355,7 +356,8 @@ def control_(
     if speed not in ("realtime", "fast"):
         raise typer.BadParameter(f"'{speed}' is neither realtime nor fast.", param_hint="--speed")
     wish = Wish(channel=channel, beta_source=beta_source, steps=steps, realtime=speed == "realtime")
-    task = Task(log=log, key=key, participant=participant, battery=battery, bench=bench, ledger=ledger, withdrawn=withdrawn, timed=timed)
+    files = {"log": log, "battery": battery, "ledger": ledger, "withdrawn": withdrawn}
+    task = Task(key=key, participant=participant, bench=bench, timed=timed, begins=begins, **files)
     summary = control(bundle, source, wish, task)
     _print(summary, as_json, lines(summary))
     if "wrong_signal" in summary or summary.get("failed"):

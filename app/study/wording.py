@@ -227,6 +227,10 @@ _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.BENCH: lambda f: (
         "The controller's log is of a trial on a bench, at which no participant was connected: it is no session. Drop it."
     ),
+    Kind.SIMULATED: lambda f: (
+        "The controller's log is of a simulated device: nobody was stimulated. It counts in a study of synthetic participants alone; "
+        "of a real participant drop it."
+    ),
     Kind.ABOVE_CDBS: _above_cdbs,
     Kind.AMPLITUDE: _amplitude,
     Kind.SILENT_CONTROL: _silent_control,

@@ -29,7 +29,7 @@ from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.runtime.decision_log import LogFailed, LogFile, Row
 from ml.deploy.runtime.envelope import Decision, Reason, Signal, reason_names
 from ml.deploy.runtime.live import End, LiveSession
-from ml.deploy.runtime.session import describe, latency
+from ml.deploy.runtime.session import describe, latency, latency_words
 from ml.deploy.wording import battery_words, warning_sentences
 from ml.energy import Implant, relative_energy, saving_percent
 
@@ -106,6 +106,8 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
         )
     facts: dict[str, Any] = {"bundle": bundle.name, "participant": manifest.participant, "policy_name": manifest.policy_name}
     facts |= {"policy_id": manifest.policy_id, "approved": bool(manifest.approvals), "warnings": warning_sentences(manifest)}
+    if manifest.card is not None and manifest.card.blinded:  # nobody at the tablet is told what runs
+        facts |= {"policy_name": manifest.card.head, "policy_id": None, "blinded": True, "warnings": []}
     if task.timed:
         facts["measured_us"] = latency(opened.manifest_json, opened.controller(), task.timed)
     if source is None:
@@ -259,6 +261,8 @@ def lines(summary: dict[str, Any]) -> str:
 
 def _what(summary: dict[str, Any]) -> str:
     name, number = summary["policy_name"], summary["policy_id"]
+    if summary.get("blinded"):
+        return f"session {name}, blinded"
     return f"schedule {name}" if number is None else f"policy {name} (no. {number})"
 
 
@@ -267,7 +271,7 @@ def _measured(summary: dict[str, Any]) -> list[str]:
     found = summary.get("measured_us")
     if not found:
         return []
-    return [f"measured in us   mean {found['mean']:.1f}, std {found['std']:.1f}, median {found['median']:.1f} (n = {found['n']:.0f})"]
+    return [f"on this machine  {latency_words(found)}"]
 
 
 def _public_key(key: str | None) -> Ed25519PublicKey:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 
 from app.platform.errors import Invalid
@@ -54,6 +54,8 @@ def run_live(
     Raises:
         Invalid: it may not run, the input cannot be opened, or the log cannot be begun.
     """
+    if task.begins is not None and not source.startswith(SIMULATED):
+        raise Invalid("A session with a device begins when it begins.", "Leave --begins out, or name a simulated device.")
     link, where = _link(opened.manifest, source)
     try:
         with _stopped_by_signals(link):
@@ -80,7 +82,18 @@ def _run(opened: OpenBundle, link: Link, task: Task, now: Callable[[], datetime]
             raise NotAllowed(Refusal.WITHDRAWN, "the bundle names no key to check the list of withdrawals with")
         withdrawn = read_withdrawals(task.withdrawn, bytes.fromhex(opened.manifest.public_key))
     tablet = Tablet(ledger=Ledger(task.ledger or LEDGER), withdrawn=withdrawn, now=now)
+    if isinstance(link, SimulatedDevice):
+        # on the simulation's clock, and noted apart, so that a simulated session neither uses up a real one nor sets the clock forward
+        tablet = Tablet(
+            ledger=Ledger(task.ledger or LEDGER / "simulated"), withdrawn=withdrawn, simulated=True, now=_clock(link, task, now)
+        )
     return run_slot(manifest, sha256, opened.controller(), link, Path(task.log), tablet, task.participant)
+
+
+def _clock(device: SimulatedDevice, task: Task, now: Callable[[], datetime]) -> Callable[[], datetime]:
+    """The time of day in a simulation: from the moment at which it is said to begin, as its own clock goes on."""
+    begins = (task.begins or now()).astimezone()
+    return lambda: begins + timedelta(seconds=device.now())
 
 
 def _link(manifest: BundleManifest, source: str) -> tuple[Link, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
 
@@ -18,6 +19,7 @@ class Task:
         bench: nobody is connected, so that any bundle may run with a device side, and as often as wanted.
         ledger: folder of the runs of this tablet; the one in the home folder when None. withdrawn: the study's list of withdrawals.
         timed: so many decisions are timed first.
+        begins: when a session on a simulated device begins, by the simulation's clock; now when None.
     """
 
     log: Path | None = None
@@ -28,3 +30,4 @@ class Task:
     ledger: Path | None = None
     withdrawn: Path | None = None
     timed: int = 0
+    begins: datetime | None = None

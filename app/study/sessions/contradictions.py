@@ -50,6 +50,7 @@ class Kind(StrEnum):
     NO_SLOT = "no_slot"
     """`plan`, `position`, `visit`, `visit_date`: of a session of a plan that this participant does not have, or not any more."""
     BENCH = "bench"
+    SIMULATED = "simulated"
     LAST_DOSE = "last_dose"
     """`stated`, `by_doses`: hours from the last dose to the start."""
     REPEATED = "repeated"
@@ -167,6 +168,8 @@ def _of_slot(db: Session, session: StudySession) -> Iterator[Contradiction]:
     recording = control_recording(session)
     if logged.rehearsed(recording):
         yield Contradiction(Kind.BENCH)
+    elif logged.simulated(recording):
+        yield Contradiction(Kind.SIMULATED)
     slot = logged.slot_of_recording(db, recording)
     if slot is None:
         return

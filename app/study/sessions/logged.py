@@ -95,6 +95,12 @@ def rehearsed(recording: Recording) -> bool:
     return said is not None and said.get("purpose") == "bench"
 
 
+def simulated(recording: Recording) -> bool:
+    """Whether the device side of a log was a simulation."""
+    said = limits_and_policy(recording)
+    return said is not None and bool(said.get("simulated"))
+
+
 def design_of_session(session: StudySession) -> dict[str, Any] | None:
     """How a random session's amplitudes were drawn, by the log of the schedule that ran, as members of its conditions.
 

@@ -8,7 +8,7 @@
     --withdrawn=FILE   the study's signed list of withdrawn policies and plans
     --bench            with --run: nobody is connected; any bundle runs, and lone numbers count as beta
     --replay           with --run and --bench: one line per period, as fast as they come, with no clock
-    --time=N           measure N decisions on this machine, microseconds
+    --time=N           measure N decisions on this machine (200 where N is left out): mean and SD, milliseconds
 
 The lines are those of `protocol.py`. Without --key hashes and test vectors are checked, and the signature is not.
 """
@@ -36,20 +36,20 @@ from .live import End
 from .network import MlpNetwork, Output
 from .protocol import number
 from .schedule import Schedule, ScheduledController
-from .session import Outcome, Tablet, describe, latency, parse_manifest, run_bench, run_slot
+from .session import Outcome, Tablet, describe, latency, latency_words, parse_manifest, run_bench, run_slot
 from .signature import verifies
 from .slot import NotAllowed, read_withdrawals
 
 _LIMITS = ("min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s", "window", "period_s", "max_beta_age_s")
 _OPTIONAL_LIMITS = ("beta_max", "level_low", "level_high", "frozen_after")
+_WITH_VALUE = ("--key", "--input", "--log", "--ledger", "--withdrawn", "--time")
 LEDGER = Path.home() / ".betaloop-tablet"
 ENDED_WELL = (End.COMPLETE, End.STOPPED)
 
 
 def main(arguments: list[str]) -> int:
     """Exit code 0: everything agrees, and the session came to its end; 1: something did not, said on standard error."""
-    folder = Path(next((a for a in arguments if not a.startswith("-")), "."))
-    options = {name: value for name, _, value in (a.partition("=") for a in arguments if a.startswith("--"))}
+    folder, options = _read(arguments)
     try:
         key = None if "--key" not in options else public_key(options["--key"])
         raw = (folder / "manifest.json").read_bytes()
@@ -65,8 +65,33 @@ def main(arguments: list[str]) -> int:
     controller = make_controller(manifest, network)
     if "--time" in options:
         measured = latency(manifest, controller, int(options["--time"] or 200))
-        sys.stdout.write(json.dumps({"participant": manifest["participant"], "policy": manifest["policy_name"], "us": measured}) + "\n")
+        sys.stdout.write(f"{_what(manifest)}: {latency_words(measured)}\n")
     return _run(manifest, hashlib.sha256(raw).hexdigest(), controller, options, key) if "--run" in options else 0
+
+
+def _read(arguments: list[str]) -> tuple[Path, dict[str, str]]:
+    """The folder, and the options with their values, written `--name=value` or `--name value`."""
+    folder, options, waits = Path("."), {}, ""
+    for argument in arguments:
+        name, given, value = argument.partition("=")
+        if name.startswith("--"):
+            options[name] = value
+            waits = name if name in _WITH_VALUE and not given else ""
+        elif waits and not (waits == "--time" and not argument.isdecimal()):
+            options[waits], waits = argument, ""
+        else:
+            folder, waits = Path(argument), ""
+    return folder, options
+
+
+def _what(manifest: dict[str, Any]) -> str:
+    """Whose controller it is, and of which size: the paper compares full policies with distilled ones."""
+    slot = manifest.get("slot") or {}
+    if (manifest.get("card") or {}).get("blinded"):
+        return f"{manifest['participant']}, session {manifest['card']['head']}, blinded"
+    size = f"{' x '.join(map(str, manifest['layers'][1:-1]))} units" if manifest.get("layers") else ""
+    told = [manifest["participant"], manifest["policy_name"], slot.get("controller", ""), size]
+    return ", ".join(str(text) for text in told if text)
 
 
 def public_key(text: str) -> bytes:

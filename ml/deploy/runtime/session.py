@@ -38,11 +38,13 @@ class Tablet:
 
     Attributes:
         ledger: which slots this tablet has run. withdrawn: a list that was brought along; None where none was.
+        simulated: whether the device side is a simulation; its log says so, so that it is never taken for a participant's unseen.
         now: the local time with its offset.
     """
 
     ledger: Ledger
     withdrawn: Withdrawals | None = None
+    simulated: bool = False
     now: Callable[[], datetime] = lambda: datetime.now().astimezone()
 
 
@@ -118,6 +120,7 @@ def run_slot(
         link.send(f"refused {refused.code.value}\n")
         raise
     facts = describe(manifest, manifest_sha256, controller, tablet.now(), "session")
+    facts |= {"simulated": True} if tablet.simulated else {}
     sink = LogFile(log, manifest["period_s"], facts)
     try:
         tablet.ledger.begin(manifest["participant"], slot, tablet.now(), log, manifest_sha256)
@@ -192,6 +195,12 @@ def latency(manifest: Mapping[str, Any], controller: BoundedController, decision
     values = np.array(taken)
     spread = {"mean": values.mean(), "std": values.std(), "median": np.median(values), "p99": np.quantile(values, 0.99)}
     return {"n": float(decisions)} | {name: round(float(value), 2) for name, value in spread.items()}
+
+
+def latency_words(measured: Mapping[str, float]) -> str:
+    """What `latency` measured, as the paper's table has it: mean and standard deviation in milliseconds."""
+    mean, std, median = (measured[name] / 1000.0 for name in ("mean", "std", "median"))
+    return f"a decision takes {mean:.3f} ms, SD {std:.3f} ms (median {median:.3f} ms, n = {measured['n']:.0f})"
 
 
 def battery_percent() -> float | None:

@@ -49,6 +49,7 @@ class Ran:
         purpose: `session` of a signed plan, `bench` (nobody was connected) or `replay` (of a recording or simulation).
         participant: code. manifest_sha256: of the bundle. started_at: ISO 8601 with its offset.
         plan_id, slot_id, position, repeat, controller, visit_number, visit_date: the slot.
+        simulated: whether the device side was a simulation; None where it was not.
         design, level, seed, lower_bound: of a random session. latency_us: of decisions on this tablet: `n`, `mean`, `std`, `median`, `p99`.
     """
 
@@ -70,6 +71,7 @@ class Ran:
     controller: str | None = None
     visit_number: int | None = None
     visit_date: str | None = None
+    simulated: bool | None = None
     design: str | None = None
     level: float | None = None
     seed: int | None = None
@@ -205,6 +207,7 @@ _ENTRIES: dict[str, Callable[[Any], Any]] = {
     "controller": _one_of(CONTROLLERS),
     "visit_number": _whole,
     "visit_date": lambda value: date.fromisoformat(str(value)).isoformat(),
+    "simulated": lambda value: True if value else None,
     "design": lambda value: value if value in DESIGNS else None,
     "level": _number,
     "seed": _whole,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -60,6 +61,28 @@ def test_a_whole_session_runs_in_closed_loop_and_its_log_says_whose_it_is(tmp_pa
     assert said["manifest_sha256"] == verified(of_slot(tmp_path), PUBLIC).manifest_sha256
     assert said["latency_us"]["n"] == 200
     assert recording.started_at == MORNING + timedelta(seconds=20)
+
+
+@pytest.mark.hazard("H17")
+def test_a_simulated_session_runs_on_the_simulations_clock_and_neither_uses_up_the_slot_nor_hides_what_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.tablet.live.LEDGER", tmp_path / "ledger")
+    bundle, log = of_slot(tmp_path), tmp_path / "log.csv"
+    opened, later = verified(bundle, PUBLIC), MORNING + timedelta(hours=3)
+    outcome, _ = run_live(opened, bundle.name, "simulated:P1:3", Task(log=log, begins=later), now=lambda: MORNING)
+    assert outcome.end is End.COMPLETE
+    (recording,) = decode(log).recordings
+    assert recording.settings["controller"]["simulated"] is True
+    assert recording.started_at == later + timedelta(seconds=20)
+    real = Ledger(tmp_path / "ledger")
+    real.check_unused("P1", SLOT)  # raises where the slot was used up
+    real.check_clock(MORNING)  # and where the clock has gone on to the simulation's
+    midnight = Task(log=tmp_path / "late.csv", begins=MORNING.replace(hour=23, minute=58), ledger=tmp_path / "other")
+    late, _ = run_live(opened, bundle.name, "simulated:P1:3", midnight, now=lambda: MORNING)
+    assert late.end is End.EXPIRED, "the simulated day ends, and the session with it"
+    with pytest.raises(Invalid, match="begins when it begins"):
+        run_live(opened, bundle.name, "tcp:0", Task(log=tmp_path / "no.csv", begins=later))
 
 
 @pytest.mark.hazard("H23")
@@ -323,10 +346,14 @@ def test_the_bundles_own_runner_runs_nothing_that_was_changed_or_signed_by_anoth
 
 def test_decisions_are_timed_by_both_runners(tmp_path: Path) -> None:
     unpacked(of_slot(tmp_path), tmp_path)
-    runner = own_runner(tmp_path, "--time=50")
-    out, _ = runner.communicate("", timeout=30)
-    assert '"n": 50.0' in out
-    assert '"mean"' in out
+    for asked, n in ((["--time=50"], 50), (["--time", "60"], 60), (["--time"], 200)):
+        out, _ = own_runner(tmp_path, *asked).communicate("", timeout=30)
+        found = re.fullmatch(
+            r"P1, rl-01, rl, 20 x 10 units: a decision takes ([0-9.]+) ms, SD ([0-9.]+) ms [(]median .* n = (\d+)[)]\n", out
+        )
+        assert found, out
+        assert 0 < float(found[1]) < 100, "milliseconds, and no other unit"
+        assert int(found[3]) == n
     summary = control(tmp_path / "bundle.zip", None, Wish(), Task(key=PUBLIC, timed=50))
     assert summary["measured_us"]["n"] == 50
     assert summary["measured_us"]["median"] > 0
