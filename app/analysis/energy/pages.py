@@ -19,6 +19,7 @@ from app.platform.web.csv_files import download
 from app.platform.web.forms import parse
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
+from app.study.recordings.battery import readings
 from ml.energy import Implant, Range
 
 router = APIRouter()
@@ -66,6 +67,7 @@ def energy_page(
         fields=FIELDS,
         typed=typed,
         battery=rows,
+        readings=readings(db, participant.id),
         implant=implant,
         problem=problem.problem(request.url.path) if problem else None,
     )

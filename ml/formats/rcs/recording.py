@@ -222,7 +222,17 @@ def _summary(settings: Settings, grid: Grid) -> dict[str, Any]:
         "ld0_thresholds": [number(get(settings.merged, "DetectionConfig", "Ld0", "biasTerm", i)) for i in range(2)],
         "leads": described(get(settings.merged, "SubjectInfo")),
         "sensing": sensing,
+        **({"battery": battery} if (battery := _battery(settings)) else {}),
     }
+
+
+def _battery(settings: Settings) -> dict[str, float]:
+    """Charge of the stimulator's battery in percent and its voltage in V, as its last settings of the recording told them."""
+    state = get(settings.merged, "BatteryStatus")
+    percent, millivolts = number(get(state, "batteryLevelPercent")), number(get(state, "batteryVoltage"))
+    found = {"percent": percent, "voltage_v": None if millivolts is None else millivolts / 1000.0}
+    likely = {"percent": (0.0, 100.0), "voltage_v": (0.5, 10.0)}
+    return {name: value for name, value in found.items() if value is not None and likely[name][0] <= value <= likely[name][1]}
 
 
 def _text(infos: list[dict[str, Any]], key: str) -> str | None:

@@ -141,3 +141,23 @@ def test_a_side_that_cannot_be_read_leaves_no_sum_over_sides(client: TestClient,
 def test_the_table_has_the_definition_beside_the_number(client: TestClient, add_session: Callable[..., int]) -> None:
     add_session("cdbs")
     assert "Mean over the session's steps of a²" in client.get("/participants/P1/analyses/energy.csv").text
+
+
+def test_what_the_stimulator_told_of_its_battery_stands_apart_from_assumed_days(
+    client: TestClient, db: Session, add_session: Callable[..., int]
+) -> None:
+    path = "/participants/P1/analyses/energy"
+    add_session("cdbs", fraction=1.0)
+    add_session("rl", fraction=0.5)
+    page = client.get(path).text
+    assert "Battery, measured" not in page, "nothing told it"
+    assert "Battery, assumed" in page
+    first, second = db.scalars(select(Recording).order_by(Recording.id)).all()
+    first.details = {"settings": {"battery": {"percent": 73.0, "voltage_v": 2.415}}}
+    second.details = {"settings": {"battery": {"percent": 88.0, "months_left": 31.0, "status": "OK"}}}
+    db.commit()
+    page = client.get(path).text
+    measured = page.split("Battery, measured")[1].split("Battery, assumed")[0]
+    assert "n = 2" in measured
+    assert [word in measured for word in ("73", "2.415", "88", "31")] == [True] * 4
+    assert measured.count("—") >= 2, "what a device does not tell is not made up"

@@ -133,6 +133,10 @@ def test_the_hemisphere_is_that_of_the_leads(sweep, adaptive, recordings):
     assert (montage.hemisphere, montage.settings["leads"]) == ("left", ["left STN", "", "left M1", ""])
 
 
+def test_the_battery_is_told_in_percent_and_volt(adaptive):
+    assert adaptive.settings["battery"] == {"percent": 73.0, "voltage_v": 2.415}
+
+
 def test_movement_clocks_and_errors_are_told(sweep, adaptive):
     movement = next(t for t in sweep.traces if t.stream == "acceleration")
     assert (movement.unit, movement.values.shape) == ("centiG", (222,))
