@@ -201,6 +201,11 @@ def slots_summary(planned: int, missing: Sequence[str], due: bool = True) -> str
     return found if not missing or not due else f"{found}; {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
 
 
+def of_sessions(numbers: Sequence[int], sentence: str) -> str:
+    """Of which sessions something is said."""
+    return f"{'Session' if len(numbers) == 1 else 'Sessions'} {', '.join(map(str, numbers))}: {sentence}"
+
+
 def order_words(plan: Plan) -> str:
     """How the order of a plan's policies was found."""
     order = Order(plan.rules.get("order", Order.DRAWN))

@@ -13,6 +13,7 @@ from app.ingest import repository as ingest
 from app.ingest.models import SessionProposal
 from app.ingest.proposals import service as proposals
 from app.ingest.schemas import ProposalChange
+from app.planning import wording
 from app.planning.plans import view as plans
 from app.planning.plans.view import PlanLine, PlanView
 from app.planning.slots import repository
@@ -110,7 +111,7 @@ def confirm(db: Session, visit: Visit, caller: Caller, *, other_day: bool = Fals
         other_day: whether sessions that were held on another day than the visit's are meant all the same.
 
     Returns:
-        Sentences: what speaks against a session, and what the clinic day says otherwise.
+        Sentences: what speaks against which sessions, and what the clinic day says otherwise.
 
     Raises:
         Conflict: nothing is found to confirm, the visit is locked, or sessions of another day and nobody said that they are meant.
@@ -132,11 +133,13 @@ def confirm(db: Session, visit: Visit, caller: Caller, *, other_day: bool = Fals
             "Say so and confirm again, or give these sessions to their own visit.",
             asks="other_day",
         )
-    said: list[str] = []
+    said: dict[str, list[int]] = {}
     waiting = ingest.proposals(db, [r.session.id for r in found.waiting if r.session is not None])
     for row in found.waiting:
-        said += _fill(db, row, waiting, caller)
-    return said
+        assert row.session is not None
+        for sentence in _fill(db, row, waiting, caller):
+            said.setdefault(sentence, []).append(row.session.id)
+    return [wording.of_sessions(ids, sentence) for sentence, ids in said.items()]
 
 
 def _fill(db: Session, row: Row, waiting: dict[int, SessionProposal], caller: Caller) -> list[str]:
