@@ -422,4 +422,8 @@ INTENDED: dict[str, str] = {
         ),
         "API: the clinic day of a visit at `/visits/{id}/day`, its entries at `/visits/{id}/day/entries`",
     ),
+    **dict.fromkeys(
+        ("components > schemas > DayDoseOut", "components > schemas > DoseEntry", "components > schemas > DosePayload"),
+        "API: a dose is an entry of the clinic day (kind `dose`; migration 0029)",
+    ),
 }
