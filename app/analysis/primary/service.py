@@ -69,10 +69,23 @@ def _of(held: Evidence, locked: LockedMargins, names: Mapping[int, str], picked:
     def compute() -> Primary:
         kind = comparable_beta(held.sessions, held.beta_unit, held.beta_source)
         sessions = with_comparable_beta(held.sessions, kind)
-        tested = [c for c in PLANNED if any(s.controller is c for s in sessions)]
-        return Primary(held, sessions, kind, results(sessions, names, picked), tuple(verdicts(sessions, tested, locked)), locked)
+        return Primary(held, sessions, kind, results(sessions, names, picked), _verdicts(held, locked), locked)
 
     return kept(key, compute)
+
+
+def verdicts_of(db: Session, participant: Participant, caller: Caller) -> tuple[VerdictResult, ...]:
+    """The verdicts of `primary` alone, for pages that show no comparison: those of forty policies take many times as long."""
+    return _verdicts(evidence.of_all(db, [participant], caller)[0], locked_margins(participant))
+
+
+def _verdicts(held: Evidence, locked: LockedMargins) -> tuple[VerdictResult, ...]:
+    def compute() -> tuple[VerdictResult, ...]:
+        sessions = with_comparable_beta(held.sessions, comparable_beta(held.sessions, held.beta_unit, held.beta_source))
+        tested = [c for c in PLANNED if any(s.controller is c for s in sessions)]
+        return tuple(verdicts(sessions, tested, locked))
+
+    return kept(("verdicts", held.key, locked), compute)
 
 
 def locked_margins(participant: Participant) -> LockedMargins:

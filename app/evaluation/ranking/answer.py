@@ -10,7 +10,7 @@ import numpy as np
 from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.evaluation.ranking.decisions import Decided
 from ml.ope.estimate import Estimate
-from ml.ope.posterior.verdict import outcome_draws
+from ml.ope.posterior.verdict import interval, outcome_draws
 
 ORDER = ("test", "test_with_care", "cannot_tell", "not_advised", "unsafe", "same_as_cdbs")
 """Rows by what to do with them; within a verdict as the ranking has them."""
@@ -115,8 +115,7 @@ def differences(own: Estimate | None, cdbs: Estimate | None) -> dict[str, Differ
         if ours is None or theirs is None or ours.size != theirs.size:
             continue
         apart = (ours - theirs) / np.mean(theirs) if name == "energy" else ours - theirs
-        low, high = np.quantile(apart, [0.05, 0.95])
-        found[name] = Difference(float(apart.mean()), float(low), float(high))
+        found[name] = Difference(float(apart.mean()), *interval(apart))
     return found
 
 

@@ -14,7 +14,7 @@ from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.platform.web.charts import Cell, written
 from app.platform.web.svg import Plane, apart, drawing
 from ml.ope.estimate import Estimate
-from ml.ope.posterior.verdict import outcome_draws
+from ml.ope.posterior.verdict import interval, outcome_draws
 from ml.ope.support.behaviour_map import DOSES, BehaviourMap
 
 MAP = "map"
@@ -211,8 +211,7 @@ def _predicted(estimate: Estimate | None, name: str) -> tuple[float, float, floa
     draws = outcome_draws(estimate, name) if estimate is not None else None
     if draws is None:
         return None
-    low, high = np.quantile(draws, [0.05, 0.95])
-    return float(draws.mean()), float(low), float(high)
+    return float(draws.mean()), *interval(draws)
 
 
 def _behaviour_rows(known: BehaviourMap, policies: Sequence[str], scale: Scale) -> tuple[tuple[Cell, ...], ...]:

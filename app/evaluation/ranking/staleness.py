@@ -20,9 +20,11 @@ from app.learning import repository as learning
 from app.learning.gate.service import LEARNED, gate
 from app.learning.models import BufferSnapshot, SnapshotSession
 from app.platform.errors import Invalid
+from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study.models import Participant, SettingsVersion, StudySession
+from app.study.sessions.repository import fingerprints
 from app.study.traces import Sources, sources
 from ml.ope.flags import Flag
 
@@ -45,12 +47,20 @@ def stale_reasons(db: Session, participant: Participant, evaluation: Evaluation)
     if evaluation.settings_version_id != settings.id:
         old = study_repository.settings_version(db, evaluation.settings_version_id).version
         reasons.append(Flag("settings_changed", float(settings.version), float(old)))
-    reasons += _changes(db, participant, db.get_one(BufferSnapshot, evaluation.snapshot_id))
+    reasons += _kept_changes(db, participant, db.get_one(BufferSnapshot, evaluation.snapshot_id))
     ranked = set(evaluation.diagnostics.get("candidates", []))
     missing = [p.name for p in learning.candidates(db, participant.id) if p.id not in ranked]
     if missing:
         reasons.append(Flag.of("policies_missing", float(len(missing)), None, "policies", names=tuple(missing[:NAMED])))
     return reasons
+
+
+def _kept_changes(db: Session, participant: Participant, snapshot: BufferSnapshot) -> list[Flag]:
+    """The same as `_changes`, kept by this process until a row of the participant's sessions changes, or the gate is decided on."""
+    decision = learning.newest_gate_decision(db, participant.id)
+    rows = fingerprints(db, [participant.id])[participant.id]
+    key = ("changes since", snapshot.id, snapshot.created_at, rows, decision.id if decision else None)
+    return kept(key, lambda: _changes(db, participant, snapshot))
 
 
 def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot) -> list[Flag]:

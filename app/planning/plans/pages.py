@@ -17,7 +17,7 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.evaluation import wording as evaluation_wording
-from app.evaluation.ranking.answer import Row, answer
+from app.evaluation.ranking.answer import Answer, Row, answer
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.service import current_assessment
 from app.evaluation.schemas import STANDING_NAMES
@@ -228,9 +228,10 @@ def _page(
     except NotFound:
         found = None
     defaults = rules_of(PlanOptions())
-    choices = _choices(db, participant, found)
+    answered = answer(found) if found is not None else None
+    choices = _choices(db, participant, answered)
     form = _form_values(full, values, choices)
-    suggestions = suggested(found, most_policies(defaults))
+    suggestions = suggested(found, most_policies(defaults), answered)
     return render(
         request,
         "planning/plan.html",
@@ -279,9 +280,8 @@ class Choice:
     row: Row | None
 
 
-def _choices(db: Session, participant: Participant, found: Assessment | None) -> list[Choice]:
+def _choices(db: Session, participant: Participant, answered: Answer | None) -> list[Choice]:
     """Policies that may be planned, what to test first; those that no ranking holds come last."""
-    answered = answer(found) if found is not None else None
     rows = answered.everyone() if answered is not None else {}
     places = {i: k for k, i in enumerate(rows)}
     policies = sorted(learning.candidates(db, participant.id), key=lambda p: (places.get(p.id, len(places)), p.id))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.evaluation.ranking.answer import answer
+from app.evaluation.ranking.answer import Answer, answer
 from app.evaluation.ranking.assessment import Assessment
 from app.learning.models import Policy
 from ml.ope.posterior.portfolio import Suggestion, portfolio
@@ -21,15 +21,16 @@ class Suggested:
     why: Suggestion
 
 
-def suggested(found: Assessment | None, slots: int) -> tuple[Suggested, ...]:
+def suggested(found: Assessment | None, slots: int, answered: Answer | None = None) -> tuple[Suggested, ...]:
     """The policies that teach most in a visit with so many slots, each behaviour once; none where the data cannot order policies.
 
-    Only candidates whose verdict is *test* or *test with care* are asked, and at most one of the latter is taken.
+    Only candidates whose verdict is *test* or *test with care* are asked, and at most one of the latter is taken. `answered` is what the
+    ranking says, where the caller has it already.
     """
     if found is None or not found.ordered or found.cdbs is None or found.cdbs.posterior is None:
         return ()
     theirs = np.asarray(found.cdbs.posterior.details.get("draws") or [], dtype=np.float64)
-    answered = answer(found)
+    answered = answered or answer(found)
     careful = {str(row.one.policy.id) for row in answered.of("test_with_care")}
     differences, policies = {}, {}
     for row in (*answered.of("test"), *answered.of("test_with_care")):

@@ -167,6 +167,22 @@ def outcome_draws(estimate: Estimate, name: str) -> Floats | None:
     return drawn if drawn.size >= FEWEST_DRAWS and bool(np.isfinite(drawn).all()) else None
 
 
+def interval(draws: Floats) -> tuple[float, float]:
+    """The 5 % and 95 % quantiles of draws, [draws], at least one; linear between neighbours, as NumPy has them.
+
+    A page asks for hundreds of them, and for a few hundred draws NumPy's own function takes some ten times as long.
+    """
+    ordered = np.sort(draws)
+
+    def at(share: float) -> float:
+        place = share * (ordered.size - 1)
+        below = int(place)
+        above = min(below + 1, ordered.size - 1)
+        return float(ordered[below] + (place - below) * (ordered[above] - ordered[below]))
+
+    return at(0.05), at(0.95)
+
+
 def _all_within(gaps: Mapping[str, Floats]) -> NDArray[np.bool_]:
     return np.asarray(np.min(np.stack(list(gaps.values())), axis=0) >= 0)
 

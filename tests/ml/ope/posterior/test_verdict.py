@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
-from ml.ope.posterior.verdict import HAZARDS, Levels, Verdict, verdict
+from ml.ope.posterior.verdict import HAZARDS, Levels, Verdict, interval, verdict
 from ml.qoc import Margins
 from tests.ml.ope.posterior.draws import N, cdbs, constructed, share
 
@@ -180,3 +181,9 @@ def test_draws_that_are_too_few_not_finite_or_not_aligned_tell_no_probability() 
 def test_every_hazard_is_a_reason_that_some_verdict_gives() -> None:
     each = (of(adverse_event=True), of(behaviour={"below_cdbs_20_percent": 0.5}), of(outcome_draws={"rating": [1.0] * N}))
     assert {hazard.code for found in each for hazard in found.hazards} == HAZARDS
+
+
+@pytest.mark.parametrize("n", [1, 2, 19, 200, 401])
+def test_the_interval_of_draws_is_that_of_numpy(n: int) -> None:
+    draws = np.random.default_rng(n).normal(3.0, 2.0, n)
+    assert interval(draws) == pytest.approx(tuple(np.quantile(draws, [0.05, 0.95])), rel=1e-12)
