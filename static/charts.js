@@ -68,7 +68,7 @@ async function draw(figure, onPaper = false) {
     const shown = zooms.get(figure.dataset.zoom);
     if (shown) Object.assign(layout.xaxis, { range: shown, autorange: false });
     // a sheet is narrower than most windows, and nothing tells the library how wide it is
-    if (onPaper) Object.assign(layout, { width: figure.parentElement.matches(".cards") ? PAPER_PX / 2 - 20 : PAPER_PX, height: parseFloat(plot.style.height), autosize: false });
+    if (onPaper) Object.assign(layout, { width: figure.closest(".cards") ? PAPER_PX / 2 - 24 : PAPER_PX, height: parseFloat(plot.style.height), autosize: false });
     plot.querySelector(".loading")?.remove();
     await Plotly.react(plot, data, layout, CONFIG);
     // the table below says it in words; the buttons above stay for everyone
