@@ -15,7 +15,7 @@ STANDINGS = {
     Standing.NO_SESSION_NEAR: "no session near",
     Standing.ABOVE_CDBS: "estimated above cDBS",
     Standing.NOT_ABOVE_CDBS: "not above cDBS with confidence",
-    Standing.NOT_ESTIMATED: "not estimated",
+    Standing.UNTOLD: "cannot tell",
 }
 
 

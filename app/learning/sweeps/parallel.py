@@ -15,7 +15,7 @@ from app.learning.sweeps.comparison import Candidate
 from app.platform.web.charts import Cell
 from app.platform.web.svg import Plane, apart, drawing, shown_tick
 
-W, H, TOP, BOTTOM, LEFT, RIGHT = 1120.0, 380.0, 50.0, 26.0, 96.0, 118.0
+W, H, TOP, BOTTOM, LEFT, RIGHT = 1120.0, 400.0, 66.0, 26.0, 96.0, 118.0
 LEAST = 2
 """Policies that a comparison needs."""
 
@@ -28,7 +28,8 @@ class Standing(StrEnum):
     NO_SESSION_NEAR = "no_session_near"
     ABOVE_CDBS = "above_cdbs"
     NOT_ABOVE_CDBS = "not_above_cdbs"
-    NOT_ESTIMATED = "not_estimated"
+    UNTOLD = "untold"
+    """It was not estimated, or the sessions cannot order policies."""
 
 
 LOOKS = {
@@ -37,7 +38,7 @@ LOOKS = {
     Standing.BELOW_TRIED: ("bad", "8 4"),
     Standing.NO_SESSION_NEAR: ("warn", "2 4"),
     Standing.RETIRED: ("muted", "10 3 2 3"),
-    Standing.NOT_ESTIMATED: ("muted", ""),
+    Standing.UNTOLD: ("muted", ""),
 }
 """Colour and dash of a line."""
 
@@ -77,7 +78,7 @@ def standing(candidate: Candidate) -> Standing:
     if candidate.leaves_the_logged_range:
         return Standing.BELOW_TRIED
     if candidate.gain is None or not candidate.by_posterior or not candidate.told:
-        return Standing.NOT_ESTIMATED
+        return Standing.UNTOLD
     if not candidate.supported:
         return Standing.NO_SESSION_NEAR
     return Standing.ABOVE_CDBS if candidate.gain.low > 0 else Standing.NOT_ABOVE_CDBS
@@ -152,7 +153,7 @@ def _figure(candidates: Sequence[Candidate], axes: Sequence[Axis], stands: Seque
     for k, column in enumerate(axes):
         plane.line([(k, 0.0), (k, 1.0)], "border", 1.0)
         # names stand in two heights, or those of neighbours meet
-        plane.text(plane.at_x(k), TOP - (30 if k % 2 else 14), column.name, "middle", weight=650)
+        plane.text(plane.at_x(k), TOP - (44 if k % 2 else 26), column.name, "middle", weight=650)
     # the best is drawn last and lies on top
     for which in reversed(range(len(candidates))):
         tone, dash = LOOKS[stands[which]]
