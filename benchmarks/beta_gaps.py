@@ -1,13 +1,14 @@
 """Beta amplitude through the gaps of a real recording, on signals whose amplitude without gaps is known.
 
-    python benchmarks/beta_gaps.py [--repeats N] [--quick]
+    python benchmarks/beta_gaps.py [--repeats N] [--seed N] [--quick]
 
 The gaps are those of the montage recording with packet loss (`BETALOOP_TEST_DATA`, else ../shared/data); the signals are made here: a
 beta rhythm of 5 Hz bandwidth whose amplitude waxes and wanes, on a background that falls with frequency, and noise. Each is scored whole,
 and with the recording's gaps by two rules: `present` (`ml.signals.band_rows`: predicted for the filter, measured samples scored) and
 `former` (every gap-free stretch filtered by itself, short ones left out).
 
-`kept`: share of all rows that a coverage limit keeps. `error_sd`, `bias`: standard deviation and mean of (beta with gaps - beta without)
+`kept`: share of all rows that a coverage limit keeps; the present rule takes a row that lacks one sample of it.
+`error_sd`, `bias`: standard deviation and mean of (beta with gaps - beta without)
 over the mean beta, of the rows kept. `error_over_se`: standard deviation of the error over the row's own standard error; 1 if exact.
 `most_imputed`: how many imputed betas a state of W = 10 may hold. `usable`: share of steps whose state and next state are then whole, in
 sessions of 100 steps whose rows are valid where the recording's are (patterns in random order); `imputed_error`: RMS error of an imputed
@@ -21,7 +22,7 @@ import argparse
 import json
 
 import numpy as np
-from support.gaps import OPTIONS, PERIOD, Rule, recording, scored
+from support.gaps import OPTIONS, PERIOD, Rule, gap_patterns, recording, scored
 
 from ml.trajectories import SessionTrajectory
 
@@ -57,15 +58,17 @@ def main() -> None:
     """Print a table and, as the last line, one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=20, help="signals per pattern of gaps")
+    parser.add_argument("--seed", type=int, default=0, help="of the signals")
     parser.add_argument("--quick", action="store_true", help="two signals per pattern")
     chosen = parser.parse_args()
     path = recording()
     if path is None:
         return
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(chosen.seed)
     present, former, patterns = scored(path, 2 if chosen.quick else chosen.repeats, rng)
     total = sum(rows.shape[1] for rows in present.rows)
-    missing = 1.0 - np.concatenate(present.rows, axis=1)[0].mean()
+    seconds = [(there.sum() / rate, there.size / rate) for rate, there in gap_patterns(path)]
+    missing = 1.0 - sum(held for held, _ in seconds) / sum(whole for _, whole in seconds)
     print(f"{total} rows of {PERIOD:g} s, {patterns} patterns of gaps, {100 * missing:.1f} % of samples missing")
     figures = {name: {limit: rule.at(limit) for limit in LIMITS} for name, rule in (("present", present), ("former", former))}
     print(f"{'rule':<9}{'limit':>6}{'kept, %':>9}{'error SD, %':>13}{'bias, %':>9}{'error/SE':>10}")

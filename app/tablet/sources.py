@@ -194,7 +194,7 @@ def _stream(stretches: list[Stretch], manifest: BundleManifest, count: int, stre
 
 def _offline(stretches: list[Stretch], manifest: BundleManifest, rows: int) -> NDArray[np.float64]:
     found = band_rows(stretches, rows, manifest.period_s, manifest.beta_low_hz, manifest.beta_high_hz)
-    return np.where(found.covered >= manifest.min_valid_fraction - 1e-9, found.rms, np.nan)
+    return np.where(found.reached >= manifest.min_valid_fraction - 1e-9, found.rms, np.nan)
 
 
 def _rcs_stretches(path: Path, options: DecodeOptions, recording: RecordingLog) -> dict[str, list[Stretch]]:

@@ -50,7 +50,8 @@ def scored(path: Path, repeats: int, rng: np.random.Generator) -> tuple[Rule, Ru
 
 @dataclass
 class Rule:
-    """What a rule made of all rows so far: coverage, error over the mean, standard error over the mean; and the CPU it took."""
+    """What a rule made of all rows so far: coverage (the present rule's within a sample),
+    error over the mean, standard error over the mean; and the CPU it took."""
 
     rows: list[Floats] = field(default_factory=list)
     cpu_s: float = 0.0
@@ -132,6 +133,6 @@ def score(rate: float, there: NDArray[np.bool_], rng: np.random.Generator, prese
     former.cpu_s += time.process_time() - between
     present.cpu_s += between - began
     mean = whole.mean()
-    present.rows.append(np.stack([found.covered, (found.rms - whole) / mean, found.rms_error / mean]))
+    present.rows.append(np.stack([found.reached, (found.rms - whole) / mean, found.rms_error / mean]))
     present.whole.append(whole / mean)
     former.rows.append(np.stack([covered, (rms - whole) / mean, np.zeros(rows)]))

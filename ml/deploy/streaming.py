@@ -28,7 +28,7 @@ class StreamingBeta:
     Args:
         period_s: length of a period.
         low_hz, high_hz: band edges.
-        min_valid_fraction: coverage: share of a period's samples below which it has no value.
+        min_valid_fraction: coverage: share of a period's samples below which it has no value; one sample less is enough.
 
     Raises:
         ValueError: a value outside its range.
@@ -61,7 +61,7 @@ class StreamingBeta:
         kept = [_since(piece, begin_s - CONTEXT_S) for piece in self._pieces]
         self._pieces = [piece for piece in kept if piece[2].size]
         rows = band_rows(self._pieces, 1, self._period_s, self._low_hz, self._high_hz, t0_s=begin_s)
-        enough = rows.covered[0] >= self._min_valid - 1e-9
+        enough = rows.reached[0] >= self._min_valid - 1e-9
         return float(rows.rms[0]) if enough else math.nan
 
 

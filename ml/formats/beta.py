@@ -12,6 +12,9 @@ from ml.formats.options import DecodeOptions
 from ml.formats.recording import SpectrumLog, TraceLog, TraceSource
 from ml.signals import BandRows, Stretch, band_rows, spectrum
 
+LARGEST_UV = 1e5
+"""No electrode in a brain gives a tenth of a volt: a larger sample is damage, or in another unit."""
+
 ERROR_STREAM = "beta_error"
 """Standard error of each row of `beta` for what is missing of it; there where something is."""
 
@@ -77,14 +80,14 @@ def time_domain_traces(
     }
     first = t0_s + options.period_s
     return [
-        step_trace((stream, channel, unit), "time_domain", values, found.covered, options, {**said, "measure": measure}, first)
+        step_trace((stream, channel, unit), "time_domain", values, found.reached, options, {**said, "measure": measure}, first)
         for stream, unit, measure, values in beta_streams(found, options)
     ]
 
 
 def beta_streams(found: BandRows, options: DecodeOptions) -> list[tuple[str, str, str, NDArray[np.float64]]]:
     """(stream, unit, measure, values [rows]) of samples in uV: both measures, and the error of `beta` where a valid row is not whole."""
-    valid = found.covered >= options.min_valid_fraction - 1e-9
+    valid = found.reached >= options.min_valid_fraction - 1e-9
     streams = [(stream, unit, str(measure), getattr(found, measure)) for stream, unit, measure in options.beta_streams]
     if np.any(found.rms_error[valid] > 0):
         errors = found.rms_error if options.beta_measure == "rms" else found.power_error

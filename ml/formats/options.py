@@ -27,7 +27,8 @@ class DecodeOptions:
         period_s: length of one step, s.
         beta_low_hz, beta_high_hz: edges of the beta band, Hz.
         beta_measure: what the stream `beta` is where samples give it: the RMS amplitude in the band (uV) or its power (uV2).
-        min_valid_fraction: coverage: share of a window's samples that must have been measured for it to be valid, 0..1.
+        min_valid_fraction: coverage: share of a window's samples that must have been measured for it to be valid, 0..1; one sample
+            less will do.
         table_beta_unit: unit of `beta` in a table whose header states none.
         table_lfp_unit: unit of `lfp` in a table whose header states none; such a table is refused where nobody states it.
         max_table_rows: rows a table of steps may have.

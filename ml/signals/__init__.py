@@ -9,6 +9,7 @@ from ml.signals.bands import (
     band_pass,
     band_rows,
     gap_models,
+    one_sample,
     spectrum,
 )
 from ml.signals.rows import row_means, row_of, step_means
@@ -22,6 +23,7 @@ __all__ = [
     "band_pass",
     "band_rows",
     "gap_models",
+    "one_sample",
     "row_means",
     "row_of",
     "spectrum",

@@ -6,6 +6,7 @@ were measured are scored, and a row without one is NaN.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -62,12 +63,22 @@ class BandRows:
         power: its square.
         covered: share of the row that usable samples cover, 0..1.
         rms_error: standard error of `rms` as a measure of the whole row, for what is missing of it; 0 in a whole row, NaN where `rms` is.
+        sample: share of a row that one sample covers, of the slowest rate; a number.
     """
 
     rms: NDArray[np.float64]
     power: NDArray[np.float64]
     covered: NDArray[np.float64]
     rms_error: NDArray[np.float64]
+    sample: float = 0.0
+
+    @property
+    def reached(self) -> NDArray[np.float64]:
+        """What a limit of coverage is held against: `covered`, and one sample more.
+
+        Rows begin and end between samples, so that a row of packets that fill a share of it exactly holds one sample more or one less.
+        """
+        return np.minimum(self.covered + self.sample, 1.0)
 
     @property
     def power_error(self) -> NDArray[np.float64]:
@@ -174,7 +185,12 @@ def band_rows(
         power = np.where(seconds > 0, energy / by_bin.sum(axis=1), np.nan)
     rms = np.sqrt(power)
     error = 0.5 * rms * _relative_error(by_bin, mixed.reshape(rows, bins), correlation, period_s)
-    return BandRows(rms, power, np.minimum(seconds / period_s, 1.0), error)
+    return BandRows(rms, power, np.minimum(seconds / period_s, 1.0), error, one_sample(by_rate, period_s))
+
+
+def one_sample(rates_hz: Iterable[float], period_s: float) -> float:
+    """Share of a row that one sample of the slowest of these rates covers; 0 without a rate."""
+    return 1.0 / (min(rates_hz, default=math.inf) * period_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -241,3 +241,16 @@ def test_a_rate_that_is_no_whole_number_keeps_the_grid(rate_hz):
     hz, density, _ = spectrum([(0.0, rate_hz, np.sin(2 * np.pi * 20.0 * t))])
     assert hz[np.argmax(density)] == 20.0
     assert density[17:24].sum() == pytest.approx(0.5, rel=0.05)
+
+
+@pytest.mark.parametrize("rate", [250.0, 500.0, 1000.0])
+def test_a_row_that_lacks_one_sample_of_a_limit_reaches_it_and_one_that_lacks_two_does_not(rate):
+    x = np.sin(2 * np.pi * 20 * np.arange(round(8 * rate)) / rate)
+    for lacking in (0, 1, 2):
+        held = round(0.7 * 2 * rate) - lacking
+        begin = round(2 * rate)
+        pieces = [(1 / rate, rate, x[: begin + held]), ((2 * begin + 1) / rate, rate, x[2 * begin :])]
+        rows = band_rows(pieces, 4, 2.0, 13.0, 35.0)
+        assert rows.covered[1] == pytest.approx(held / (2 * rate))
+        assert (rows.reached[1] >= 0.7 - 1e-9) == (lacking < 2)
+        assert rows.reached[0] == 1.0

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.beta import beta_streams
+from ml.formats.beta import LARGEST_UV, beta_streams
 from ml.formats.rcs.packets.streams import TimeDomain
 from ml.formats.rcs.packets.time import PacketTimes
 from ml.formats.rcs.settings import Sensing, Settings
 from ml.formats.rcs.traces import Grid
 from ml.formats.recording import SampleLog, SpectrumLog, TraceLog
-from ml.signals import BandRows, band_rows, gap_models, spectrum
+from ml.signals import BandRows, band_rows, gap_models, one_sample, spectrum
 
 UV_PER_MV = 1000.0
 ROWS_AT_ONCE = 300
@@ -32,7 +32,8 @@ Stretch = tuple[float, float, NDArray[np.float64]]
 def time_domain_stretches(data: TimeDomain, times: PacketTimes, settings: Settings) -> dict[str, list[Stretch]]:
     """Gap-free stretches by channel and contact pair, e.g. `key 0 +2-0`, in the order of the file.
 
-    Samples that are not strictly later than those before them are dropped, so overlapping packets count once.
+    Samples that are not strictly later than those before them are dropped, so overlapping packets count once; those that no electrode gives
+    are gaps.
     """
     out: dict[str, list[Stretch]] = defaultdict(list)
     for key in range(4):
@@ -68,13 +69,18 @@ def _pieces(data: TimeDomain, times: PacketTimes, key: int, packets: NDArray[np.
         x = data.samples[key][int(begin[first]) : int(begin[end - 1] + count[end - 1])]
         skip = max(0, int(np.floor((latest_ms - start_ms) / step_ms + 0.01)) + 1) if latest_ms >= start_ms - 0.01 * step_ms else 0
         latest_ms = max(latest_ms, start_ms + (x.size - 1) * step_ms)
-        for here, there in _finite_runs(x[skip:]):
+        for here, there in _true_runs(x[skip:]):
             yield start_ms + (skip + here) * step_ms, 1000.0 / step_ms, x[skip + here : skip + there]
 
 
-def _finite_runs(x: NDArray[np.float64]) -> Iterator[tuple[int, int]]:
-    """Begin and end of every run of finite samples."""
-    holes = np.flatnonzero(~np.isfinite(x)).tolist()
+def impossible_samples(data: TimeDomain) -> int:
+    """How many samples no electrode gives, of all channels."""
+    return sum(int(np.sum(np.abs(x) > LARGEST_UV / UV_PER_MV)) for x in data.samples)
+
+
+def _true_runs(x: NDArray[np.float64]) -> Iterator[tuple[int, int]]:
+    """Begin and end of every run of samples that an electrode can give."""
+    holes = np.flatnonzero(~(np.abs(x) <= LARGEST_UV / UV_PER_MV)).tolist()
     for before, hole in zip([-1, *holes], [*holes, x.size], strict=True):
         if hole - before > 1:
             yield before + 1, hole
@@ -121,7 +127,7 @@ def beta_traces(channels: dict[str, list[Stretch]], grid: Grid, notes: list[str]
             "contacts": channel[len("key 0 ") :],
         }
         for stream, unit, measure, values in beta_streams(rows, options):
-            out.append(grid.trace((stream, channel, unit), "time_domain", values, rows.covered, {**details, "measure": measure}))
+            out.append(grid.trace((stream, channel, unit), "time_domain", values, rows.reached, {**details, "measure": measure}))
     return out
 
 
@@ -145,7 +151,8 @@ def band_rows_in_blocks(stretches: list[Stretch], grid: Grid) -> BandRows:
     margin_s = MARGIN_CYCLES / (options.beta_high_hz - options.beta_low_hz) + 1.0
     begin_s = np.array([(start - grid.start_ms) / 1000.0 for start, _, _ in stretches])
     end_s = begin_s + np.array([x.size / rate for _, rate, x in stretches])
-    out = BandRows(*(np.empty(grid.rows) for _ in range(4)))
+    n, sample = grid.rows, one_sample((rate for _, rate, _ in stretches), options.period_s)
+    out = BandRows(np.empty(n), np.empty(n), np.empty(n), np.empty(n), sample)
     for first in range(0, grid.rows, ROWS_AT_ONCE):
         end = min(first + ROWS_AT_ONCE, grid.rows)
         low_s, high_s = first * options.period_s - margin_s, end * options.period_s + margin_s
