@@ -49,6 +49,16 @@ def cleaned_suffix(name: str) -> str:
     return suffix if suffix in SUFFIXES else ""
 
 
+INSIDE = "an archive inside the archive; unpack it and upload it by itself"
+
+
+def hint_of(left_out: Sequence[LeftOut], hint: str) -> str:
+    """What to do about an archive that holds nothing of use: archives inside it come first."""
+    inside = sum(one.reason == INSIDE for one in left_out)
+    several = f"{inside} other archives, which are" if inside > 1 else "another archive, which is"
+    return f"It holds {several} not opened: unpack it and upload what is inside. {hint}" if inside else hint
+
+
 def told(left_out: Sequence[LeftOut], most: int = 5) -> list[str]:
     """Sentences about what was left out: members of one ending and one reason are one sentence with their count."""
     groups: dict[tuple[str, str], list[int]] = defaultdict(list)
@@ -200,7 +210,7 @@ class ZipFiles:
                 LeftOut(number, suffix, f"{info.file_size / 1e6:.0f} MB, larger than {self._limits.member_bytes / 1e6:.0f} MB")
             )
         elif name.lower().endswith(NESTED):
-            self.left_out.append(LeftOut(number, suffix, "an archive inside the archive; unpack it and upload it by itself"))
+            self.left_out.append(LeftOut(number, suffix, INSIDE))
         elif "__MACOSX" in parts or (parts and parts[-1].startswith("._")):
             return
         elif name in self._members:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.archive import READ_ERRORS, ZipFiles, told
-from ml.formats.beta import channel_spectrum, step_trace, time_domain_traces
+from ml.formats.beta import LARGEST_UV, channel_spectrum, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
 from ml.formats.percept import details
 from ml.formats.percept.annotations import gather
@@ -50,7 +50,8 @@ class Run:
     @property
     def first_packet(self) -> datetime | None:
         """Time of the programmer at the first packet: of the samples where there are any."""
-        known = next((c.first_packet for c in self.channels if c.first_packet), None)
+        dated = [c for c in self.channels if c.first_packet]
+        known = min(dated, key=lambda c: c.begin_ms).first_packet if dated else None
         return known or (self.power.first_packet if self.power else None)
 
     @property
@@ -187,13 +188,25 @@ def pair_runs(channels: list[TimeDomain], powers: list[DevicePower], said: FileR
 
 
 def _same_run(run: Run, channel: TimeDomain) -> bool:
-    """Another channel of the run: other name, and ticks or else times that begin together."""
+    """Another channel of the run: other name, and ticks or else times that begin together, or are apart by what its first packets took.
+
+    Where the first packets of one side were lost, ticks and times of that side begin later by the same, and the two run on together.
+    """
     if any(c.channel == channel.channel for c in run.channels):
         return False
     other = run.channels[0]
-    if _apart_s(other.first_packet, channel.first_packet) > SAME_RUN_S:
+    if other.ticked != channel.ticked:
         return False
-    return other.ticked == channel.ticked and (not other.ticked or abs(other.begin_ms - channel.begin_ms) <= SAME_RUN_MS)
+    if not other.ticked:
+        return _apart_s(other.first_packet, channel.first_packet) <= SAME_RUN_S
+    later_ms = channel.begin_ms - other.begin_ms
+    if abs(later_ms) <= SAME_RUN_MS:
+        return _apart_s(other.first_packet, channel.first_packet) <= SAME_RUN_S
+    if other.first_packet is None or channel.first_packet is None:
+        return False
+    begin, end = max(channel.begin_ms, other.begin_ms), min(channel.end_ms, other.end_ms)
+    together = end - begin >= MOSTLY * min(channel.end_ms - channel.begin_ms, other.end_ms - other.begin_ms)
+    return together and abs((channel.first_packet - other.first_packet).total_seconds() - later_ms / 1000.0) <= SAME_RUN_S
 
 
 def _fits(run: Run, power: DevicePower) -> bool:
@@ -344,6 +357,9 @@ def _describe(
             said.flagged.append(
                 f"{label}, {c.channel}: {100 * c.lost / (c.lost + c.values.size):.1f} % of the samples are missing ({c.lost})"
             )
+        if c.void:
+            beyond = f"or one beyond {LARGEST_UV / 1000:g} mV, which no electrode gives"
+            said.flagged.append(f"{label}, {c.channel}: {c.void} samples hold no number, {beyond}: gaps")
         if not c.ticked:
             said.flagged.append(f"{label}, {c.channel}: no ticks, so lost samples cannot be seen")
         if not any(t.channel == c.channel and t.source == "time_domain" for t in traces):

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.formats.beta import LARGEST_UV
 from ml.formats.percept.enums import word
 from ml.formats.percept.report_json import SIDES, channel_names, entries, finite, inside, moment, packet_list, samples, side_of
 
@@ -43,7 +44,7 @@ class TimeDomain:
         begin_ms, end_ms: time before the first and of the last sample in ticks; from 0 where the file gives no ticks.
         ticked: whether the file gives ticks. Without them samples are taken to follow each other, and loss cannot be seen.
         pieces: (time of the first sample in ms, first index, end index) of every stretch between losses.
-        lost: samples that the ticks say are missing.
+        lost: samples that the ticks say are missing. void: samples that hold no number, or one that no electrode gives.
         notes: what was adapted or is doubtful, in sentences.
     """
 
@@ -58,6 +59,7 @@ class TimeDomain:
     ticked: bool = False
     pieces: list[tuple[float, int, int]] = field(default_factory=list)
     lost: int = 0
+    void: int = 0
     notes: list[str] = field(default_factory=list)
 
     def stretches(self, origin_ms: float) -> list[tuple[float, float, NDArray[np.float64]]]:
@@ -105,6 +107,7 @@ def time_domains(section: str, value: Any) -> list[TimeDomain]:
         values = samples(entry.get("TimeDomainData", entry.get("TimeDomainDatainMicroVolts")))
         if values.size == 0:
             continue
+        values[np.abs(values) > LARGEST_UV] = np.nan
         names = channel_names(entry.get("Channel"))
         rate = finite(entry.get("SampleRateInHz"))
         data = TimeDomain(
@@ -114,6 +117,7 @@ def time_domains(section: str, value: Any) -> list[TimeDomain]:
             first_packet=moment(entry.get("FirstPacketDateTime")),
             rate_hz=rate if rate is not None and 1 <= rate <= 10_000 else DEFAULT_RATE_HZ,
             values=values,
+            void=int(np.sum(np.isnan(values))),
         )
         if data.rate_hz != rate:
             data.notes.append(f"no sampling rate given, {DEFAULT_RATE_HZ:g} Hz assumed")

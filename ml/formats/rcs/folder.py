@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
-from ml.formats.archive import READ_ERRORS, Files, FolderFiles, ZipFiles, told
+from ml.formats.archive import READ_ERRORS, Files, FolderFiles, ZipFiles, hint_of, told
 from ml.formats.options import DecodeOptions
 from ml.formats.rcs.leads import leads_only
 from ml.formats.rcs.opening import HEAD, STEM_OF, Opening, group, read_opening
@@ -77,9 +77,8 @@ def decode_files(files: Files, options: DecodeOptions, name: str) -> DecodedFile
     sessions = find_sessions(files, whole)
     whole.ignored.extend(told(files.left_out))
     if not sessions:
-        raise UndecodableFile(
-            "no RC+S session in here", name, "Zip the session's Device folder with its JSON files (DeviceSettings, StimLog, RawDataTD, …)."
-        )
+        hint = hint_of(files.left_out, "Zip the session's Device folder with its JSON files (DeviceSettings, StimLog, RawDataTD, …).")
+        raise UndecodableFile("no RC+S session in here", name, hint)
     recordings: list[RecordingLog] = []
     reports = [whole]
     for session in sessions:

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.formats.beta import LARGEST_UV
 from ml.formats.options import DecodeOptions
 from ml.formats.rcs.amplitude import AmplitudeSteps, amplitude_steps
-from ml.formats.rcs.beta import Stretch, beta_traces, time_domain_samples, time_domain_spectra, time_domain_stretches
+from ml.formats.rcs.beta import Stretch, beta_traces, impossible_samples, time_domain_samples, time_domain_spectra, time_domain_stretches
 from ml.formats.rcs.events import adaptive_events, note_events, stimulation_events
 from ml.formats.rcs.leads import described, hemisphere
 from ml.formats.rcs.packets.headers import PacketHeaders
@@ -79,6 +80,8 @@ def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) 
     channels: dict[str, list[Stretch]] = {}
     if main and streams.time_domain is not None and "time_domain" in times:
         channels = time_domain_stretches(streams.time_domain, times["time_domain"], settings)
+        if absurd := impossible_samples(streams.time_domain):
+            report("RawDataTD").flagged.append(f"{absurd} samples beyond {LARGEST_UV / 1000:g} mV, which no electrode gives: gaps")
     traces, spectra = _traces(streams, settings, times, steps, grid, channels, report) if main else ([], [])
     if not main:
         report("RawDataTD").flagged.append("a recording without data: no stream holds a packet that can be placed in time")

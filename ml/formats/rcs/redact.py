@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
-from ml.formats.archive import ZipFiles, told
+from ml.formats.archive import ZipFiles, hint_of, told
 from ml.formats.options import ArchiveLimits
 from ml.formats.rcs.folder import SessionFiles, find_sessions
 from ml.formats.rcs.keys import KEYS
@@ -73,7 +73,8 @@ def redact_rcs_zip(source: Source, target: Path, key: bytes, limits: ArchiveLimi
         listing = FileReport("archive")
         sessions = find_sessions(files, listing)
         if not sessions:
-            raise UndecodableFile("no RC+S session in here", "archive", "Zip the session's Device folder with its JSON files.")
+            hint = hint_of(files.left_out, "Zip the session's Device folder with its JSON files.")
+            raise UndecodableFile("no RC+S session in here", "archive", hint)
         # in the archive that is written every recording has a folder of its own
         done = Redaction(repaired=listing.flagged, ignored=[*listing.ignored, *told(files.left_out)])
         scrub = _Scrubber(key)

@@ -33,6 +33,8 @@ PER_UNIT: dict[str, dict[str | None, float]] = {
     "amplitude_fraction": {None: 1.0, "fraction": 1.0, "%": 100.0},
 }
 """How many of the header's unit make 1 mA, or the fraction 1."""
+CLOCK_CHANGE_SPREAD_S = 600.0
+"""Dates that go back by an hour, give or take so much, are those of a clock that was changed."""
 LARGEST = {"amplitude_ma": 25.5, "amplitude_fraction": 10.0}
 """25.5 mA is the largest amplitude that a stimulator like RC+S or Percept can be set to; a fraction above 10 was meant as percent."""
 RATIO_SPREAD = 0.05
@@ -260,8 +262,21 @@ def _dates(table: TextTable, column: int, first_s: float) -> NDArray[np.float64]
             )
             raise UndecodableFile(f"{shown(cell)} is no date", where, hint, "a cell holds no date", f"line {table.lines[i]}, column t_s")
         out[i] = np.nan if moment is None else moment
+    _refuse_changed_clock(out, table, column)
     known = out[np.isfinite(out)]
     return out - known[0] + first_s
+
+
+def _refuse_changed_clock(unix_s: NDArray[np.float64], table: TextTable, column: int) -> None:
+    """Raise where dates go back by about an hour: the clocks were changed, and a date without its zone stands for two moments."""
+    back = np.flatnonzero(np.abs(np.diff(unix_s) + 3600.0) <= CLOCK_CHANGE_SPREAD_S)
+    if back.size:
+        line = f"line {table.lines[int(back[0]) + 1]}"
+        what, hint = (
+            "the times go back by an hour",
+            "Where the clocks were changed in that night, write every time with its zone, such as +01:00.",
+        )
+        raise UndecodableFile(what, f"{line}, column {table.headers[column].strip()}", hint, what, f"{line}, column t_s")
 
 
 def read_parquet(path: Source, options: DecodeOptions) -> Columns:

@@ -28,6 +28,8 @@ MOSTLY = 0.9
 MOST_TITLES = 20
 """Lines that may stand above the header."""
 
+TIME_HINT = "Give every time in seconds from the session's start, or as an ISO 8601 date and time with its zone."
+
 MAX_LINE = 1_000_000
 """Characters a line may have: a longer one is no row of a table, and is not read into memory."""
 
@@ -85,7 +87,7 @@ class TextTable:
             value = parse_number(cell, decimal)
         except NotANumber as error:
             where = f"line {line}, column {self.headers[column].strip()}"
-            hint = "Put a number there, or leave the cell empty."
+            hint = TIME_HINT if known == "column t_s" else "Put a number there, or leave the cell empty."
             what = f"{shown(cell.strip())} is text, not a number"
             raise UndecodableFile(what, where, hint, "a cell holds text, not a number", f"line {line}, {known}") from error
         return math.nan if value is None else value

@@ -21,6 +21,9 @@ MICROSECONDS = frozenset({"t_us", "time_us", "timestamp_us", "open_fist_us", "mi
 TELLING = frozenset({"open_fist_s", "open_fist_us", "open_fist"})
 """Names that no other table has for its times."""
 
+LEAST_FRAMES = 20
+"""So many intervals, nearly all under the shortest plausible one, are the frames of a hand tracker."""
+
 COUNTERS = frozenset({"", "n", "i", "index", "number", "grasp", "count", "unnamed:_0"})
 HANDS: dict[str, Hemisphere] = {"l": "left", "left": "left", "r": "right", "right": "right"}
 
@@ -95,6 +98,10 @@ def _one_hand(
         line = table.lines[rows[back[0] + 1]]
         hint = "Sort the rows by time; keep one row per open fist, and name the hand where both are in one table."
         raise UndecodableFile("times must increase", f"line {line}, column of times", hint)
+    if intervals.size >= LEAST_FRAMES and np.mean(intervals < PLAUSIBLE_INTERVAL_S[0]) > 0.9:
+        every = 1000 * float(np.median(intervals))
+        what = f"{t.size} times that follow each other every {every:.0f} ms: frames of a hand tracker, not open fists"
+        raise UndecodableFile(what, "column of times", "Upload the times at which the hand was open, one row per open fist.")
     implausible = (intervals < PLAUSIBLE_INTERVAL_S[0]) | (intervals > PLAUSIBLE_INTERVAL_S[1])
     whose = "" if hand is None else f"{hand} hand: "
     report.understood.append(f"{whose}{t.size} open fists")
@@ -102,5 +109,6 @@ def _one_hand(
         report.flagged.append(f"{whose}fewer than two open fists: the grasp frequency is undefined")
     if count := int(implausible.sum()):
         low, high = PLAUSIBLE_INTERVAL_S
-        report.flagged.append(f"{whose}{count} intervals outside {low:g} to {high:g} s: kept, look at them")
+        named, them = ("interval", "it") if count == 1 else ("intervals", "them")
+        report.flagged.append(f"{whose}{count} {named} outside {low:g} to {high:g} s: kept, look at {them}")
     return GraspLog(hand, t, implausible)

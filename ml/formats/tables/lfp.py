@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.beta import channel_spectrum, step_trace, time_domain_traces
+from ml.formats.beta import LARGEST_UV, channel_spectrum, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
 from ml.formats.tables.columns import LFP_SCALE, TIME_SCALE, Columns, check_reach, checked_amplitude, compare_amplitudes
@@ -23,9 +23,6 @@ ROUND_RATE = 0.002
 
 MAX_JITTER = 0.5
 """Samples may be this share of their distance away from an even clock; more is no evenly sampled signal."""
-
-LARGEST_UV = 1e6
-"""No electrode in a brain gives a volt."""
 
 MIN_ROWS = 8
 LARGEST_RATE_HZ = 100_000.0

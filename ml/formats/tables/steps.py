@@ -144,7 +144,8 @@ def _describe(report: FileReport, row: NDArray[np.int64], n: int, t_first: float
     before = int(np.sum(t_first + row * options.period_s <= GRID_TOLERANCE))
     report.understood.append(f"{row.size} rows of {options.period_s:g} s: {before} before the session, {row.size - before} of the session")
     if n > row.size:
-        report.repaired.append(f"{n - row.size} missing rows filled in as gaps")
+        lost = n - row.size
+        report.flagged.append(f"{lost} row{'s' if lost > 1 else ''} missing: gaps")
 
 
 def _recording(traces: tuple[TraceLog, ...], t_first: float, n: int, options: DecodeOptions) -> RecordingLog:

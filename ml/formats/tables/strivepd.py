@@ -35,7 +35,9 @@ LONGEST_S = 3600.0
 """A watch tells of minutes; an interval longer than this is no measurement."""
 
 CLASS_NAMES = ("class", "tremor_class", "tremor")
-KNOWN = frozenset({*TREMOR_CLASSES, "severity", "duration", "duration_s", "measurement_duration_ns", "stream_type_id", "measurement"})
+KNOWN = frozenset(
+    {*TREMOR_CLASSES, "severity", "duration", "duration_s", "measurement_duration_ns", "stream_type_id", "measurement", "any_tremor"}
+)
 _SHARE = re.compile(r"^(percent|fraction|share)|(percent|pct|fraction|share)$")
 WANTED = ", ".join(TREMOR_CLASSES)
 
@@ -238,7 +240,9 @@ def _in_order(
     if undivided := int((np.isnan(fractions[:, 3:]).any(axis=1)).sum()):
         report.flagged.append(f"{undivided} minutes tell only all tremor together: mild, moderate and strong are not known")
     if overlaps := int(np.sum(np.diff(start) < length[order][:-1] - 1e-6)):
+        begin = "minute begins" if overlaps == 1 else "minutes begin"
         report.flagged.append(
-            f"{overlaps} minutes begin before the one before has ended: their times may have been rounded by a spreadsheet"
+            f"{overlaps} {begin} before the one before has ended: times may have been rounded by a spreadsheet, or written without "
+            "their zone in the night in which the clocks were changed"
         )
     return TremorLog(start, length[order], fractions[order], any_tremor[order])

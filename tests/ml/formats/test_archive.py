@@ -10,6 +10,7 @@ import pytest
 
 from ml.formats import ArchiveLimits, DecodeOptions, UndecodableFile, decode
 from ml.formats.archive import FolderFiles, ZipFiles
+from ml.formats.identity import redact
 
 
 def members(path, **limits):
@@ -135,3 +136,14 @@ def test_damage_inside_one_member_leaves_the_others(rcs, pack):
     assert any(r.name == "StimLog.json" and r.understood for r in decoded.reports)
     about = next(r for r in decoded.reports if r.name == "EventLog.json")
     assert about.repaired or about.problem
+
+
+def test_an_archive_of_archives_says_what_to_do(tmp_path):
+    path = tmp_path / "visit.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("Ada Lovelace/Ada 1.zip", b"PK")
+        archive.writestr("Ada Lovelace/Ada 2.zip", b"PK")
+    with pytest.raises(UndecodableFile) as refused:
+        redact(path, tmp_path / "clean.zip", "rcs", b"a key of the clinic's own")
+    assert refused.value.hint.startswith("It holds 2 other archives, which are not opened: unpack it and upload what is inside.")
+    assert "Ada" not in str(refused.value)

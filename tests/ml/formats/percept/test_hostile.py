@@ -225,3 +225,13 @@ def test_a_damaged_member_is_told_and_the_other_reports_are_read(tmp_path):
     done = redact(path, tmp_path / "clean.zip", "percept", b"a key of the clinic's own")
     assert len(done.unreadable) == 1
     assert zipfile.ZipFile(tmp_path / "clean.zip").namelist() == ["report-2.json"]  # bad.json comes first by name
+
+
+def test_samples_without_a_number_or_beyond_any_electrode_are_gaps_and_told(write, percept):
+    report = percept.one_run()
+    report["BrainSenseTimeDomain"][0]["TimeDomainData"][100:110] = [None, "NaN", 1e7, -1e7, None] * 2
+    decoded = decode(write(report))
+    beta = trace(of_side(decoded, "right"), "beta")
+    assert beta.values[0] == pytest.approx(beta.values[4], rel=0.02)
+    assert any("10 samples hold no number, or one beyond 100 mV" in text for text in decoded.reports[0].flagged)
+    assert not any("samples hold no number" in text for text in decode(write(percept.one_run())).reports[0].flagged)

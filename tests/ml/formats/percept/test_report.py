@@ -364,3 +364,25 @@ def test_a_group_of_a_directional_lead_has_the_amplitude_of_its_cathodes():
     assert groups([group])[0]["programs"][0]["amplitude_ma"] is None, "a part of the current is no amplitude"
     program["AmplitudeInMilliAmps"] = 2.0
     assert groups([group])[0]["programs"][0]["amplitude_ma"] == 2.0
+
+
+def test_a_side_whose_first_packets_were_lost_stays_in_its_run(write, percept):
+    left = percept.time_domain(LEFT, percept.sine(60.0))
+    right = percept.time_domain(RIGHT, percept.sine(54.0, amplitude=5.0), first_tick=percept.first_tick + 6000)
+    right["FirstPacketDateTime"] = "2024-03-14T10:05:58.000Z"
+    power = percept.power(f"{LEFT},{RIGHT}", 119, left_ma=1.5)
+    for order in ([left, right], [right, left]):
+        decoded = decode(write(percept.report(BrainSenseTimeDomain=order, BrainSenseLfp=[power])))
+        assert [(r.hemisphere, r.run) for r in decoded.recordings if r.run is not None] == [("left", 0), ("right", 0)]
+        side = of_side(decoded, "right")
+        assert side.started_at == datetime(2024, 3, 14, 10, 5, 52, tzinfo=UTC), "the run begins with the side that came first"
+        assert trace(side, "beta").valid.tolist() == [False] * 3 + [True] * 27
+        assert trace(side, "amplitude").valid.all()
+
+
+def test_two_runs_one_after_the_other_are_not_taken_for_one(write, percept):
+    first = percept.time_domain(LEFT, percept.sine(20.0))
+    second = percept.time_domain(RIGHT, percept.sine(20.0), first_tick=percept.first_tick + 20_000)
+    second["FirstPacketDateTime"] = "2024-03-14T10:06:12.000Z"
+    decoded = decode(write(percept.report(BrainSenseTimeDomain=[first, second])))
+    assert {(r.hemisphere, r.run) for r in decoded.recordings if r.run is not None} == {("left", 0), ("right", 1)}

@@ -154,3 +154,16 @@ with tempfile.TemporaryDirectory() as folder:
     ingest.time_domain_file(Path(folder) / "RawDataTD.json", 100)
     print(ingest.whole_decode_peak_mb(Path(folder)))
 """
+
+
+def test_samples_that_no_electrode_gives_are_gaps_and_told(rcs, pack):
+    x = 0.003 * np.sin(2 * np.pi * 20 * np.arange(30_000) / 500)
+    whole = decode(pack(session(rcs, RawDataTD=rcs.time_domain(x))))
+    x[1100:1200] = 1e6
+    found = decode(pack(session(rcs, RawDataTD=rcs.time_domain(x))))
+    clean, spoilt = (next(t for t in d.recordings[0].traces if t.stream == "beta") for d in (whole, found))
+    assert clean.valid.all()
+    assert spoilt.valid.all(), "a tenth of a step is missing"
+    assert np.abs(spoilt.values - clean.values).max() < 0.05 * clean.values.max()
+    assert "100 samples beyond 100 mV, which no electrode gives: gaps" in [text for r in found.reports for text in r.flagged]
+    assert not any("no electrode" in text for r in whole.reports for text in r.flagged)

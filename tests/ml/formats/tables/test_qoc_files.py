@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ml.formats import UndecodableFile, decode, sniff
+from ml.formats.identity import redact
 from ml.formats.recording import TREMOR_CLASSES
 from ml.formats.tables.grasps import decode_grasps
 from ml.formats.tables.strivepd import decode_strivepd
@@ -224,3 +225,25 @@ def test_a_share_without_a_number_leaves_the_minute_undivided(write, cell):
     decoded = decode(write(f"time,unknown,none,slight,mild,moderate,strong\n1588184000,0,1,0,{cell},0,0\n"))
     assert np.isnan(decoded.tremor[0].fractions[0, TREMOR_CLASSES.index("mild")])
     assert any("not known" in text for text in decoded.reports[0].flagged)
+
+
+def test_frames_of_a_hand_tracker_are_no_open_fists(write):
+    frames = "t_s,hand,grab_strength\n" + "".join(f"{k / 60:.4f},L,0.5\n" for k in range(200))
+    with pytest.raises(UndecodableFile, match="200 times that follow each other every 17 ms: frames of a hand tracker"):
+        decode_grasps(write(frames))
+
+
+def test_a_gap_of_lost_tracking_is_flagged_as_one_interval(write):
+    fists = "t_s\n" + "".join(f"{k / 2 + 6 * (k >= 8)}\n" for k in range(1, 20))
+    assert decode_grasps(write(fists)).reports[0].flagged == ["1 interval outside 0.08 to 3 s: kept, look at it"]
+
+
+def test_minutes_of_a_night_with_a_changed_clock_name_it_and_a_stored_export_loses_no_column(write, tmp_path):
+    head = "time,unknown,none,slight,mild,moderate,strong\n"
+    minutes = [f"2026-10-25T02:{m:02d}:00,0,0.5,0.25,0.25,0,0\n" for m in (58, 59, 0, 1, 58)]
+    path = write(head + "".join(minutes))
+    flagged = decode_strivepd(path).reports[0].flagged
+    assert any("1 minute begins before" in text and "in which the clocks were changed" in text for text in flagged)
+    clean = tmp_path / "clean.csv"
+    redact(path, clean, "tremor", b"a key of the clinic's own")
+    assert decode_strivepd(clean).reports[0].removed == []

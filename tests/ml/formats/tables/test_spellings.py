@@ -149,3 +149,18 @@ def test_an_interval_of_tremor_that_ends_before_it_begins_is_refused(write):
 def test_shares_that_are_neither_fractions_nor_per_cent_are_refused(write):
     with pytest.raises(UndecodableFile, match="a fraction outside 0 to 1"):
         decode_strivepd(write(WIDE.replace("0.1,0.0,0.5", "7,0.0,0.5")))
+
+
+def test_dates_that_go_back_by_an_hour_name_the_changed_clock(write):
+    night = [f"2026-10-25T02:59:{30 + 2 * k:02d}" for k in range(15)] + [f"2026-10-25T02:00:{2 * k:02d}" for k in range(15)]
+    with pytest.raises(UndecodableFile) as refused:
+        decode(write("time,beta,amplitude_ma\n" + "".join(f"{t},1.5,1\n" for t in night)))
+    assert (refused.value.what, refused.value.where) == ("the times go back by an hour", "line 17, column time")
+    zoned = [f"{t}{'+02:00' if k < 15 else '+01:00'}" for k, t in enumerate(night)]
+    (recording,) = decode(write("time,beta,amplitude_ma\n" + "".join(f"{t},1.5,1\n" for t in zoned))).recordings
+    assert recording.duration_s == 60.0
+
+
+def test_a_time_of_day_is_refused_with_what_a_time_is(write):
+    with pytest.raises(UndecodableFile, match="seconds from the session's start, or as an ISO 8601 date"):
+        decode(write("time;beta;amplitude_ma\n10:00:02;1,5;1,0\n10:00:04;1,5;1,0\n"))

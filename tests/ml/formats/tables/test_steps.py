@@ -182,7 +182,8 @@ def test_cells_without_a_number_become_gaps_and_are_said(write, cell):
 def test_missing_rows_become_gaps_and_are_said(write):
     decoded = decode(write(HEADER + "2,1,1\n8,2,1\n"))
     assert trace(decoded, "beta").valid.tolist() == [True, False, False, True]
-    assert decoded.reports[0].repaired == ["2 missing rows filled in as gaps"]
+    assert decoded.reports[0].flagged == ["2 rows missing: gaps"]
+    assert decoded.reports[0].repaired == [], "what is lost was not repaired"
 
 
 def test_an_amplitude_above_the_cdbs_amplitude_is_kept_and_flagged(write):
