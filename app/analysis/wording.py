@@ -47,6 +47,7 @@ ADJUSTMENTS = {
     Adjustment.CARRY_OVER: "Freed from what ran just before",
     Adjustment.MEDICATION: "Freed from the time since the last dose",
     Adjustment.BRACKETED: "Only sessions between two cDBS sessions",
+    Adjustment.SKEWNESS: "Freed from skewed contrasts",
 }
 RULES = {
     FailureRule.WORST_CASE: "a stopped session of the controller counts as a failure, a stopped cDBS session as measured",

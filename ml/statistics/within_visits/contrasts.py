@@ -63,6 +63,7 @@ class Adjustment(StrEnum):
     CARRY_OVER = "carry_over"
     MEDICATION = "medication"
     BRACKETED = "bracketed"
+    SKEWNESS = "skewness"
 
 
 @dataclass(frozen=True)

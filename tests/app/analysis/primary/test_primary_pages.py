@@ -132,6 +132,19 @@ def test_a_controller_that_loses_grasp_is_inferior_in_one_sentence(client: TestC
     assert found["sentence"] == "RL is inferior to cDBS: grasp is worse by more than the margin, over 6 visits."
 
 
+def test_the_rating_is_judged_in_pairs_with_the_margin_added(client: TestClient, add_session: AddSession) -> None:
+    lock(client)
+    for visit in (1, 2, 3):
+        for rating, controller in ((7, "cdbs"), (6, "rl"), (5 + visit, "rl"), (8, "cdbs")):
+            add_session(controller, rating=rating, grasp=2.4, visit=visit)
+    rating = next(o for o in client.get(PRIMARY).json()["verdicts"][0]["outcomes"] if o["outcome"] == "rating")
+    # raised by a point, 7 ties with 7 and loses to 8; the other session is 7, 8 or 9
+    wins = [(0.5 + 0 + other) / 4 for other in (0.5 + 0, 1 + 0.5, 1 + 1)]
+    assert (rating["scale"], rating["excluded"], rating["margin"]) == ("ordinal", 0.5, 1.0)
+    assert rating["estimate"] == pytest.approx(sum(wins) / 3)
+    assert "share of pairs won" in client.get(PAGE).text
+
+
 def test_fewer_than_three_visits_conclude_nothing(client: TestClient, add_visits: AddVisits) -> None:
     lock(client)
     add_visits(2)

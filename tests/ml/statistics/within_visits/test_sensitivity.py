@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import t
 
 from ml.statistics.within_visits.contrasts import (
     Adjustment,
@@ -20,6 +21,7 @@ from ml.statistics.within_visits.sensitivity import (
     medication_adjusted,
     order_adjusted,
     sensitivities,
+    skewness_corrected,
 )
 
 VISITS, EACH = 6, 4
@@ -77,6 +79,46 @@ def test_all_of_them_answer_and_what_was_not_recorded_is_a_reason():
     bare = Measurements.of(data.value, VISIT, CDBS_FIRST)
     reasons = {s.adjustment: getattr(s.result, "reason", None) for s in sensitivities(bare)}
     assert reasons[Adjustment.BRACKETED] is reasons[Adjustment.CARRY_OVER] is Reason.NOT_RECORDED
+
+
+def contrasts_of(values):
+    """A study of visits with these contrasts."""
+    n = len(values)
+    return Measurements.of(np.c_[np.zeros(n), values].ravel(), np.repeat(np.arange(n), 2), np.tile([False, True], n))
+
+
+def test_symmetric_contrasts_are_left_as_they_are():
+    data = contrasts_of([1.0, 2.0, 3.0, 4.0, 5.0])
+    plain, found = average(visit_contrasts(data)), skewness_corrected(data)
+    assert (found.low, found.high, found.p_value) == pytest.approx((plain.low, plain.high, plain.p_value))
+    assert found.adjustment is Adjustment.SKEWNESS
+
+
+def test_a_p_of_skewed_contrasts_is_that_of_halls_ratio_and_its_interval_excludes_nothing_else():
+    values = np.array([0.1, 0.2, 0.3, 0.4, 3.0, 0.2])
+    found = skewness_corrected(contrasts_of(values))
+    spread = values.std(ddof=1)
+    g, u = np.mean((values - values.mean()) ** 3) / spread**3, values.mean() / spread
+    ratio = np.sqrt(6) * (((1 + g * u / 3) ** 3 - 1) / g + g / 36)
+    assert found.p_value == pytest.approx(2 * t.sf(abs(ratio), 5))
+    for edge in (found.low, found.high):  # moved so that the edge is nil, the p-value is 1 less the level
+        assert skewness_corrected(contrasts_of(values - edge)).p_value == pytest.approx(0.05)
+    assert found.high - values.mean() > values.mean() - found.low
+    assert skewness_corrected(contrasts_of(values[:2])) == Unavailable(Reason.TOO_FEW_VISITS, 2, 3)
+    assert skewness_corrected(contrasts_of([1.0, 1.0, 1.0])) == Unavailable(Reason.NO_VARIANCE)
+
+
+def test_the_larger_p_keeps_the_level_where_a_floor_skews_the_contrasts():
+    rng, number = np.random.default_rng(4), 3000
+    study, both = 0, 0
+    for _ in range(number):
+        values = rng.exponential(1.0, 6) - 1.0
+        data = contrasts_of(values)
+        p = average(visit_contrasts(data)).p_value
+        study += p < 0.05
+        both += max(p, skewness_corrected(data).p_value) < 0.05
+    assert study / number > 0.08  # Student's ratio of contrasts as skewed as these errs
+    assert both / number < 0.85 * study / number
 
 
 def test_no_session_between_two_of_cdbs_is_a_typed_reason():
