@@ -1,11 +1,12 @@
 """Six visits of the synthetic participants, margins locked before: how many questions are concluded, and how many conclusions are true?
 
     python benchmarks/visits_in_silico.py --quick
-    python benchmarks/visits_in_silico.py [--seeds 40] [--first-seed 1] [--visits 6] [--minutes 120] [--session-minutes 10] [--json FILE]
+    python benchmarks/visits_in_silico.py [--seeds 40] [--first-seed 1] [--visits 6] [--minutes 120] [--session-minutes 5] [--json FILE]
 
 A question is one controller of one participant in one study: is it non-inferior to cDBS on grasp, rating and tremor, and does it save
 energy? A visit is the day that the service plans (`app.planning.protocol.schedule`) with as many sessions of the controller as fit into its
-minutes, a cDBS session between any two of them: of 10 minutes, the service's default, four against three, of 5 minutes six against five.
+minutes, a cDBS session between any two of them: of 5 minutes, the protocol's shortest, six against five, of 10 minutes, the service's
+default, four against three.
 Studies whose first seeds lie apart by the number of seeds have nothing in common. The verdict is the
 service's own (`app.analysis.primary.verdict`); the truth is a large sample over other days at the same hours. Beside it, `bound` is what
 would be concluded from the same averages by somebody who knows the standard deviation of every outcome: no test of these averages at
@@ -29,7 +30,7 @@ from scipy.special import ndtr
 
 from app.analysis.evidence.facts import Facts
 from app.analysis.primary.verdict import LockedMargins, verdicts
-from app.planning.protocol.schedule import MOST_REPEATS, Candidate, Rules, most_policies, schedule
+from app.planning.protocol.schedule import MOST_REPEATS, SESSION_MINUTES, Candidate, Rules, most_policies, schedule
 from app.study.blinding import Arm
 from app.study.models import Controller
 from ml.policies.policy import ConstantPolicy
@@ -191,7 +192,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--visits", type=int, default=6)
     parser.add_argument("--minutes", type=float, default=Rules().total_minutes, help="of a visit")
-    parser.add_argument("--session-minutes", type=float, default=Rules().session_minutes)
+    parser.add_argument("--session-minutes", type=float, default=SESSION_MINUTES[0])
     parser.add_argument("--quick", action="store_true", help="four seeds")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
