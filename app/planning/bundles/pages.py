@@ -15,6 +15,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning.deps import CurrentOwnPolicy
 from app.learning.models import Policy
+from app.planning import wording
 from app.planning.bundles import repository, slots
 from app.planning.bundles import service as bundles
 from app.planning.plans.limits import device_limits
@@ -81,6 +82,7 @@ def session_bundles(request: Request, visit: CurrentVisit, db: Db, caller: Curre
         "planning/session_bundles.html",
         visit=visit,
         view=view,
+        limits_ma=wording.limits_ma,
         problem=problem,
         taken=Counter(r.plan_item_id for r in repository.releases_of_slots(db, [line.item.id for line in view.lines])),
         may_take=bundles.may_take(visit.participant, caller),

@@ -200,7 +200,7 @@ def latency(manifest: Mapping[str, Any], controller: BoundedController, decision
 def latency_words(measured: Mapping[str, float]) -> str:
     """What `latency` measured, as the paper's table has it: mean and standard deviation in milliseconds."""
     mean, std, median = (measured[name] / 1000.0 for name in ("mean", "std", "median"))
-    return f"a decision takes {mean:.3f} ms, SD {std:.3f} ms (median {median:.3f} ms, n = {measured['n']:.0f})"
+    return f"a decision takes {mean:.3g} ms, SD {std:.3g} ms (median {median:.3g} ms, n = {measured['n']:.0f})"
 
 
 def battery_percent() -> float | None:

@@ -158,3 +158,13 @@ def test_a_participant_without_policies_gets_a_visit_of_random_sessions(client: 
     plan = client.get(f"/api/v1/visits/{visit}/plan").json()
     assert [s["controller"] for s in plan["sessions"]] == ["cdbs", "random", "random", "random"]
     assert not any("ranking" in warning for warning in plan["warnings"])
+
+
+def test_a_plan_with_a_time_of_day_shows_its_sessions_by_the_clinics_clock(client: TestClient, studied: Any) -> None:
+    path, page = f"/api/v1/visits/{studied.visit}/plan", f"/visits/{studied.visit}/plan"
+    body = {"policy_ids": list(studied.policies[:2]), "order": "stated", "minutes_per_session": 5}
+    client.post(path, json=body)
+    assert ">0:10</td>" in client.get(page, headers=PAGE).text
+    client.post(path, json=body | {"starts_at": "23:55"})
+    shown = client.get(page, headers=PAGE).text
+    assert [f">{at}</td>" in shown for at in ("23:55", "0:05", "0:15", "0:10")] == [True, True, True, False]
