@@ -201,7 +201,7 @@ def _side(name: str, is_control: bool, table: StepTable | None, fraction: _Means
         return Side(name, None, 0, is_control, None, None, None, None)
     first = int(np.searchsorted(table.t_s, 0.0, side="right"))
     of_cdbs = _means(table.fraction[first:], relative_energy) if fraction is None else fraction
-    in_ma = _means(table.amplitude_ma[first:], mean_square_ma)
+    in_ma = of_cdbs.times(table.cdbs_ma) if table.cdbs_ma else _means(table.amplitude_ma[first:], mean_square_ma)
     of_trace = table.amplitude_trace
     amounts = of_cdbs.mean, of_cdbs.square, in_ma.mean, in_ma.square
     return Side(name, of_trace.recording_id, amplitude_program(of_trace), is_control, *amounts, table.cdbs_ma)
@@ -213,6 +213,10 @@ class _Means:
 
     mean: float | None
     square: float | None
+
+    def times(self, unit: float) -> _Means:
+        """The same in another unit, which a fraction is to be multiplied by."""
+        return _Means(None if self.mean is None else unit * self.mean, None if self.square is None else unit**2 * self.square)
 
 
 def _means(values: NDArray[np.float64], square: Callable[[ArrayLike], float] | None = None) -> _Means:

@@ -73,14 +73,16 @@ def opened_at(session: Facts) -> datetime:
 
 
 def verdicts(sessions: Sequence[Facts], controllers: Sequence[Controller], locked: LockedMargins) -> list[VerdictResult]:
-    """For every controller its confirmatory verdict where there is a lock, and its exploratory one where the other lacks visits."""
+    """For every controller its confirmatory verdict where there is a lock, and its exploratory one where the other lacks visits that
+    earlier sessions could add."""
     found = []
     for controller in controllers:
         confirmed = _after(sessions, locked.locked_at)
         if locked.locked_at is not None:
             found.append(_judge(sessions, confirmed, controller, locked.margins, confirmatory=True))
-        if locked.locked_at is None or len(found[-1].visits) < LEAST_VISITS:
-            found.append(_judge(sessions, sessions, controller, locked.margins, confirmatory=False))
+            if len(found[-1].visits) >= LEAST_VISITS or len(confirmed) == len(sessions):
+                continue
+        found.append(_judge(sessions, sessions, controller, locked.margins, confirmatory=False))
     return found
 
 

@@ -148,9 +148,9 @@ def test_the_rating_is_judged_in_pairs_with_the_margin_added(client: TestClient,
 def test_fewer_than_three_visits_conclude_nothing(client: TestClient, add_visits: AddVisits) -> None:
     lock(client)
     add_visits(2)
-    for found in client.get(PRIMARY).json()["verdicts"]:
-        assert found["verdict"] == "inconclusive"
-        assert "nothing is concluded from fewer than 3 visits" in found["sentence"]
+    (found,) = client.get(PRIMARY).json()["verdicts"]  # no session is from before the lock, so that there is nothing else to explore
+    assert (found["verdict"], found["confirmatory"]) == ("inconclusive", True)
+    assert "nothing is concluded from fewer than 3 visits" in found["sentence"]
 
 
 def test_a_session_stopped_for_the_patients_sake_is_a_failure(client: TestClient, add_visits: AddVisits, add_session: AddSession) -> None:
