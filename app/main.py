@@ -17,7 +17,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from starlette.concurrency import run_in_threadpool
 
 from app import __version__
-from app.accounts.deps import results_viewed
+from app.accounts.deps import judge, results_viewed
 from app.analysis.primary.outlook import outlook
 from app.planning.slots.pages import facts as slots_of_visit
 from app.platform import logs
@@ -136,7 +136,7 @@ def create_app() -> FastAPI:
     app = FastAPI(
         title="betaloop", version=__version__, openapi_url="/api/v1/openapi.json", docs_url=None, redoc_url=None, lifespan=_lifespan
     )  # fmt: skip
-    web.install(app)
+    web.install(app, judge)
     api = APIRouter(prefix="/api/v1")
     for name in API_MODULES:
         api.include_router(import_module(name).router, dependencies=_watched(name))
@@ -156,13 +156,13 @@ def leave_to_itself() -> None:
     """Take what the process has loaded by now out of garbage collection: it stays, and to search it costs large pages 0.2 s."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @asynccontextmanager
 async def _lifespan(_: FastAPI) -> AsyncIterator[None]:
     """At the start of the service: what killed processes left of incoming files goes, also so that it cannot keep a full disk full."""
-    gc.collect()
-    gc.freeze()  # what is loaded by now stays: looking through it again and again would hold up requests for 0.3 s each time
+    leave_to_itself()
     removed = await run_in_threadpool(remove_abandoned)
     if removed:
         log.info("abandoned incoming files removed", files=removed)

@@ -28,6 +28,12 @@ class Settings(BaseSettings):
     host: str = Field("127.0.0.1", description="Address the web service listens on.")
     port: int = Field(8000, description="Port the web service listens on.")
     upload_limit_mb: int = Field(2048, ge=1, description="Largest accepted upload, MiB.")
+    upload_gib_per_hour: float = Field(
+        50.0, gt=0, description="Files that one network address, and one user, may send within an hour, GiB; by each web process."
+    )
+    failed_sign_ins_per_source: int = Field(
+        100, ge=5, description="Failed sign-ins of one network address within 15 minutes, whatever the accounts; by each web process."
+    )
     session_idle_minutes: int = Field(60, ge=1, description="A browser session ends after this many idle minutes.")
     session_max_hours: int = Field(12, ge=1, description="A browser session ends after this many hours in any case.")
     cookie_secure: bool = Field(False, description="Send the session cookie over HTTPS only; switch on behind TLS.")

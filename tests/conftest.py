@@ -25,11 +25,13 @@ from sqlalchemy.orm import Session
 import app.platform.database as database
 from app.accounts import service as accounts
 from app.accounts.models import Role
+from app.accounts.pages import failed_sign_ins
 from app.platform import service_role
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.files import path_of
 from app.platform.jobs import engine as jobs_engine
 from app.platform.migrate import migrate
+from app.platform.web.body_limit import sent
 from app.settings import get_settings
 
 # Machines that are busy with other work make single examples slow; in CI the same examples are drawn every time.
@@ -140,6 +142,13 @@ def cheap_passwords() -> None:
     """Argon2 as in the service, at a cost that hundreds of tests can bear."""
     accounts._hasher = PasswordHash((Argon2Hasher(time_cost=1, memory_cost=64, parallelism=1),))
     accounts._decoy.cache_clear()
+
+
+@pytest.fixture(autouse=True)
+def new_sources() -> None:
+    """What a test has used up of the limits by source is not held against the next one."""
+    failed_sign_ins.forget()
+    sent.forget()
 
 
 @pytest.fixture

@@ -8,12 +8,13 @@ from typing import Annotated
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from sqlalchemy.orm import Session
+from starlette.concurrency import run_in_threadpool
 
 from app.accounts import service
 from app.accounts.blinded import is_open
 from app.accounts.permissions import Caller
 from app.platform.audit import record_view
-from app.platform.database import Db, set_actor
+from app.platform.database import Db, new_session, set_actor
 from app.platform.errors import Forbidden, Unauthorized
 
 COOKIE = "betaloop_session"
@@ -47,6 +48,17 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
 
 
 CurrentCaller = Annotated[Caller, Depends(get_caller)]
+
+
+async def judge(request: Request) -> str:
+    """Who sends a request, before its body is read. Raises Unauthorized as `get_caller`."""
+    bearer = await _bearer(request)
+    return await run_in_threadpool(_judged, request, bearer)
+
+
+def _judged(request: Request, bearer: HTTPAuthorizationCredentials | None) -> str:
+    with new_session() as db:
+        return f"user {get_caller(request, db, bearer).user_id}"
 
 
 def caller_now(request: Request) -> Callable[[Session], Caller | None]:

@@ -22,6 +22,7 @@ from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany
 from app.platform.web.bounded import Bounded
 from app.platform.web.forms import FormValues
 from app.platform.web.schemas import RowId
+from app.platform.web.sources import Allowance, in_words, network_address
 from app.platform.web.templates import render
 from app.settings import get_settings
 
@@ -29,6 +30,8 @@ router = APIRouter()
 
 SCOPE_NAMES = {Scope.FULL: "all that I may", Scope.READ: "read", Scope.UPLOAD: "upload and read", Scope.JOBS: "jobs and read"}
 _passwords = Bounded(2, 100)  # argon2 takes all of a core and 64 MiB each time
+failed_sign_ins = Allowance(lambda: get_settings().failed_sign_ins_per_source, service.FAILURE_WINDOW.total_seconds())
+"""By network address, whatever the accounts: who tries one password with many accounts meets no lock-out of an account."""
 
 
 @router.get("/sign-in")
@@ -43,10 +46,17 @@ def sign_in_page(request: Request, db: Db, next: str = "/") -> Response:
 @router.post("/sign-in")
 async def sign_in(request: Request, values: FormValues) -> Response:
     """Open a browser session."""
+    source = network_address(request)
     try:
-        return await _passwords.run(_sign_in, request, values)
+        # counted before it is judged, and given back where it was right: however many come at once, no more are judged
+        if wait_s := failed_sign_ins.take(source):
+            raise TooMany("Too many failed sign-ins came from here.", f"Wait {in_words(wait_s)} and try again.", wait_s)
+        answer = await _passwords.run(_sign_in, request, values)
     except TooMany as error:
         return _sign_in_refused(request, values, error)
+    if answer.status_code == 303:
+        failed_sign_ins.give_back(source)
+    return answer
 
 
 def _sign_in(request: Request, values: FormData) -> Response:
@@ -68,7 +78,8 @@ def _sign_in(request: Request, values: FormData) -> Response:
 def _sign_in_refused(request: Request, values: FormData, error: BetaloopError) -> Response:
     email, target = str(values.get("email", "")), local_path(str(values.get("next", "/")))
     page = render(request, "accounts/sign_in.html", problem=error.problem(request.url.path), email=email, next=target)
-    return HTMLResponse(page, error.status)
+    headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, TooMany) else {}
+    return HTMLResponse(page, error.status, headers)
 
 
 @router.post("/sign-out")

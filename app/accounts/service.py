@@ -167,7 +167,11 @@ def _count_attempt(db: Session, address: str) -> SignInAttempt:
     repository.prune_failures(db, FAILURE_WINDOW)
     if repository.recent_failures(db, address, FAILURE_WINDOW) >= FAILURES_ALLOWED:
         db.commit()
-        raise TooMany(f"Too many failed sign-ins for {address}.", f"Wait {FAILURE_WINDOW.seconds // 60} minutes and try again.")
+        raise TooMany(
+            f"Too many failed sign-ins for {address}.",
+            f"Wait {FAILURE_WINDOW.seconds // 60} minutes and try again.",
+            FAILURE_WINDOW.seconds,
+        )
     attempt = SignInAttempt(email=address)
     db.add(attempt)
     db.commit()

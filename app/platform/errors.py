@@ -73,10 +73,19 @@ class TooLarge(BetaloopError):
 
 
 class TooMany(BetaloopError):
-    """Too many attempts."""
+    """Too many attempts.
+
+    Args:
+        detail, hint: as everywhere.
+        retry_after_s: seconds after which another try makes sense.
+    """
 
     status = 429
     title = "Too many attempts"
+
+    def __init__(self, detail: str, hint: str = "", retry_after_s: int = 5) -> None:
+        super().__init__(detail, hint)
+        self.retry_after_s = retry_after_s
 
 
 class DatabaseAway(BetaloopError):

@@ -60,6 +60,13 @@ INTENDED: dict[str, str] = {
         ),
         "API: `POST /proposals/{id}/visit` adds a visit on the day of a recording",
     ),
+    **dict.fromkeys(
+        (
+            "paths > /api/v1/participants/{code}/policies > post > responses > 429",
+            "paths > /api/v1/uploads > post > responses > 429",
+        ),
+        "API: limits by source: failed sign-ins of a network address, and files of an address and of a user within an hour",
+    ),
     "paths > /readyz": "`GET /readyz` says whether requests can be served (the database answers and has this version's schema).",
     **dict.fromkeys(
         ("components > schemas > Problem", "components > schemas > ProblemOut"),

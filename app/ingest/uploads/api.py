@@ -34,7 +34,7 @@ class UnusableUpload(Invalid):
     title = "Nothing in this upload can be used"
 
 
-@router.post("/uploads", status_code=201, responses=problems(409, 413))
+@router.post("/uploads", status_code=201, responses=problems(409, 413, 429))
 def upload(
     db: Db,
     caller: CurrentCaller,

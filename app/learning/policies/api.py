@@ -28,7 +28,7 @@ def list_policies(participant: CurrentParticipant, db: Db, paging: PagingQuery) 
     return Page(items=[policy_out(db, p, participant) for p in rows], total=total, limit=paging.limit, offset=paging.offset)
 
 
-@router.post("/participants/{code}/policies", status_code=201, responses=problems(409, 413))
+@router.post("/participants/{code}/policies", status_code=201, responses=problems(409, 413, 429))
 def add_policy(
     participant: CurrentParticipant,
     db: Db,

@@ -1,6 +1,8 @@
-"""No request body may be larger than its kind allows, stated or not: files up to the installation's upload limit, all else 1 MiB.
+"""What is judged before the body of a request is read: how large it may be, who sends it, and how much they have sent lately.
 
-JSON and plain forms are read into memory and parsed before anybody asks who calls, hence their small limit.
+No body may be larger than its kind allows, stated or not: files up to the installation's upload limit, all else 1 MiB. Bodies beyond
+`UNJUDGED_LIMIT` are read of callers alone who have signed in, and files count against what a network address and a user may send in an
+hour. An answer to a request whose body was not read ends the connection, so that the rest of it is not received either.
 """
 
 from __future__ import annotations
@@ -12,49 +14,113 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from app.platform.errors import BetaloopError, TooMany
+from app.platform.web.sources import Allowance, in_words, network_address
 from app.settings import get_settings
 
 PLAIN_LIMIT = 1 << 20
 """Bytes of a JSON document or a plain form."""
-Refusal = Callable[[Request, str, str], Awaitable[Response]]
-"""Makes the answer to a request that is too large: what is wrong, what to do about it."""
+UNJUDGED_LIMIT = 1 << 16
+"""Bytes of a body that is read before anybody asks who sends it: a sign-in form, most documents."""
+Refusal = Callable[[Request, Exception], Awaitable[Response]]
+"""Makes the answer to a request that was refused for a reason; raises what it does not know."""
+Judge = Callable[[Request], Awaitable[str]]
+"""Tells who sends a request, as a word for a user. Raises Unauthorized where nobody is signed in."""
 _FORM_ALLOWANCE = 1 << 20  # the form fields and boundaries around a file of the largest size
+
+sent = Allowance(lambda: get_settings().upload_gib_per_hour * (1 << 30), 3600.0)
+"""Bytes of files by network address and by user."""
+
+
+class BodyTooLarge(BetaloopError):
+    """More bytes than this kind of request may have."""
+
+    status = 413
+    title = "The request is too large"
 
 
 class BodyLimit:
     """ASGI middleware: refuses by the stated length before reading, and cuts off bodies that state none."""
 
-    def __init__(self, app: ASGIApp, refusal: Refusal) -> None:
+    def __init__(self, app: ASGIApp, refusal: Refusal, judge: Judge) -> None:
         self.app = app
         self.refusal = refusal
+        self.judge = judge
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or answer 413."""
+        """Pass the request on, or answer 401, 413 or 429."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
+        body = _Body(scope, receive, send)
+        if body.may_be_large:
+            request = Request(scope)
+            try:
+                body.require_size()
+                body.count_for([f"address {network_address(request)}", await self.judge(request)])
+            except Exception as error:
+                response = await self.refusal(request, error)
+                await response(scope, receive, body.send)
+                return
+        await self.app(scope, body.receive, body.send)
+
+
+class _Body:
+    """The body of one request, as it is received."""
+
+    def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers = dict(scope["headers"])
-        has_files = headers.get(b"content-type", b"").lower().startswith(b"multipart/form-data")
-        limit = get_settings().upload_limit_mb * 1024 * 1024 + _FORM_ALLOWANCE if has_files else PLAIN_LIMIT
-        said = _said(has_files)
-        stated = headers.get(b"content-length", b"0")
-        if stated.isdigit() and int(stated) > limit:
-            response = await self.refusal(Request(scope), *said)
-            response.headers["Connection"] = "close"
-            await response(scope, receive, send)
-            return
-        seen = 0
+        stated = headers.get(b"content-length", b"")
+        self._receive, self._send = receive, send
+        self._stated = int(stated) if stated.isdigit() else None
+        self._has_files = headers.get(b"content-type", b"").lower().startswith(b"multipart/form-data")
+        self._limit = get_settings().upload_limit_mb * 1024 * 1024 + _FORM_ALLOWANCE if self._has_files else PLAIN_LIMIT
+        self.may_be_large = b"transfer-encoding" in headers or (self._stated or 0) > UNJUDGED_LIMIT
+        self._sources: list[str] = []
+        self._seen, self._whole = 0, False
 
-        async def counted() -> Message:
-            nonlocal seen
-            message = await receive()
-            seen += len(message.get("body", b""))
-            if seen > limit:
-                # those who read the body let this one through to the error handlers
-                raise HTTPException(413, said[0])
-            return message
+    def require_size(self) -> None:
+        """Raises BodyTooLarge by the stated length."""
+        if (self._stated or 0) > self._limit:
+            raise BodyTooLarge(*_said(self._has_files))
 
-        await self.app(scope, counted, send)
+    def count_for(self, sources: list[str]) -> None:
+        """Count the files that are to come for their sources. Raises TooMany where one has sent too much."""
+        if self._has_files:
+            _take(sources, self._stated or 0)
+            self._sources = sources if self._stated is None else []
+
+    async def receive(self) -> Message:
+        """The next part; beyond the limits, an HTTPException, which those who read bodies let through to the error handlers."""
+        message = await self._receive()
+        part = len(message.get("body", b""))
+        self._seen += part
+        self._whole = not message.get("more_body", False)
+        if self._seen > self._limit:
+            raise HTTPException(413, _said(self._has_files)[0])
+        try:
+            _take(self._sources, part)
+        except TooMany as error:
+            raise HTTPException(429, str(error), {"Retry-After": str(error.retry_after_s)}) from error
+        return message
+
+    async def send(self, message: Message) -> None:
+        """Pass a part of the answer on; the connection ends with the answer where the body was left unread."""
+        if message["type"] == "http.response.start" and self.may_be_large and not self._whole:
+            message["headers"] = [*message.get("headers", []), (b"connection", b"close")]
+        await self._send(message)
+
+
+def _take(sources: list[str], size: int) -> None:
+    for i, source in enumerate(sources):
+        if wait_s := sent.take(source, size):
+            for earlier in sources[:i]:
+                sent.give_back(earlier, size)
+            raise TooMany(
+                f"More than {get_settings().upload_gib_per_hour:g} GiB of files came from here within an hour.",
+                f"Wait {in_words(wait_s)} and send this again, or have BETALOOP_UPLOAD_GIB_PER_HOUR raised.",
+                wait_s,
+            )
 
 
 def _said(has_files: bool) -> tuple[str, str]:

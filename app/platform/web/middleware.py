@@ -19,8 +19,8 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 from starlette.middleware.base import RequestResponseEndpoint
 
-from app.platform.errors import BetaloopError, DatabaseAway, Forbidden, StorageFull, Unauthorized
-from app.platform.web.body_limit import BodyLimit
+from app.platform.errors import BetaloopError, DatabaseAway, Forbidden, StorageFull, TooMany, Unauthorized
+from app.platform.web.body_limit import BodyLimit, Judge
 from app.platform.web.compression import Compression
 from app.platform.web.error_pages import advised, kept_entries
 from app.platform.web.templates import render
@@ -37,9 +37,9 @@ _requests = Counter("betaloop_requests_total", "Requests by method, route and st
 _seconds = Histogram("betaloop_request_seconds", "Time to answer by route.", ["route"])
 
 
-def install(app: FastAPI) -> None:
-    """Add middleware and error handlers to the service."""
-    app.add_middleware(BodyLimit, refusal=_too_large)  # inside the other: its refusals have the headers of every answer
+def install(app: FastAPI, judge: Judge) -> None:
+    """Add middleware and error handlers to the service; `judge` tells who sends a request before its body is read."""
+    app.add_middleware(BodyLimit, refusal=_refused_unread, judge=judge)  # inside the other: its refusals have the headers of every answer
     app.middleware("http")(_around)
     app.add_middleware(Compression)  # outermost: what it shrinks is whole
     app.add_exception_handler(BetaloopError, _known_error)
@@ -99,24 +99,25 @@ def wants_page(request: Request) -> bool:
 
 async def _answer(request: Request, error: BetaloopError) -> Response:
     body = error.problem(request.url.path) | {"request_id": getattr(request.state, "request_id", None)}
+    headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, TooMany) else {}
     if not wants_page(request):
-        headers = {"WWW-Authenticate": "Bearer"} if error.status == 401 else {}
+        headers |= {"WWW-Authenticate": "Bearer"} if error.status == 401 else {}
         return JSONResponse(json.loads(json.dumps(body, default=str)), error.status, headers, "application/problem+json")
     if isinstance(error, Unauthorized) and request.method in _SAFE:
         target = request.url.path + (f"?{request.url.query}" if request.url.query else "")
         return RedirectResponse(f"/sign-in?next={quote(target, safe='/')}" if target != "/" else "/sign-in", 303)
     entries = await kept_entries(request)
     title, advice = advised(error.status, error.title, bool(entries))
-    return HTMLResponse(render(request, "error.html", problem=body, title=title, advice=advice, entries=entries), error.status)
+    return HTMLResponse(render(request, "error.html", problem=body, title=title, advice=advice, entries=entries), error.status, headers)
 
 
-async def _too_large(request: Request, detail: str, hint: str) -> Response:
-    return await _answer(request, _TooLarge(detail, hint))
-
-
-class _TooLarge(BetaloopError):
-    status = 413
-    title = "The request is too large"
+async def _refused_unread(request: Request, error: Exception) -> Response:
+    """The answer to a request whose body was not read: refusals stand outside the handlers of errors."""
+    if isinstance(error, BetaloopError):
+        return await _answer(request, error)
+    if isinstance(error, DBAPIError | PoolTimeout):
+        return await _database_error(request, error)
+    raise error
 
 
 async def _known_error(request: Request, error: Exception) -> Response:

@@ -1,0 +1,79 @@
+"""How much one source may ask for in a span of time: failed sign-ins of a network address, bytes of files of an address and of a user.
+
+Kept in the memory of one process: several web processes each count for themselves, and a restart forgets.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+
+from fastapi import Request
+
+MOST_SOURCES = 10_000
+"""Sources that are remembered; beyond them those that have asked for the least are forgotten."""
+
+
+class Allowance:
+    """What every source may use up; it comes back evenly over the span.
+
+    Args:
+        most: what a source may use up at once, asked anew at each use (a setting).
+        span_s: seconds after which all of it has come back.
+        clock: seconds.
+    """
+
+    def __init__(self, most: Callable[[], float], span_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._most, self._span_s, self._clock = most, span_s, clock
+        self._used: dict[str, tuple[float, float]] = {}
+        self._lock = threading.Lock()
+
+    def take(self, source: str, amount: float = 1.0) -> int:
+        """Use up an amount: 0 where it is allowed, else (nothing is used up) the whole seconds after which it will be.
+
+        More than a source ever has is allowed to one that has used up nothing.
+        """
+        with self._lock:
+            most, present = self._most(), self._clock()
+            used = self._left_over(source, most, present)
+            beyond = used + min(amount, most) - most
+            if beyond > 0:
+                return math.ceil(beyond * self._span_s / most)
+            self._used[source] = (used + amount, present)
+            if len(self._used) > MOST_SOURCES:
+                self._forget_small(most, present)
+            return 0
+
+    def give_back(self, source: str, amount: float = 1.0) -> None:
+        """Undo a use."""
+        with self._lock:
+            present = self._clock()
+            self._used[source] = (max(self._left_over(source, self._most(), present) - amount, 0.0), present)
+
+    def forget(self) -> None:
+        """Begin anew with every source."""
+        with self._lock:
+            self._used.clear()
+
+    def _left_over(self, source: str, most: float, present: float) -> float:
+        used, at = self._used.get(source, (0.0, present))
+        return max(used - (present - at) * most / self._span_s, 0.0)
+
+    def _forget_small(self, most: float, present: float) -> None:
+        by_use = sorted(self._used, key=lambda source: self._left_over(source, most, present))
+        for source in by_use[: MOST_SOURCES // 10]:
+            del self._used[source]
+
+
+def network_address(request: Request) -> str:
+    """Where a request comes from; behind a proxy that uvicorn trusts (FORWARDED_ALLOW_IPS) the address that the proxy names."""
+    return request.client.host if request.client else "unknown"
+
+
+def in_words(seconds: int) -> str:
+    """A wait for people."""
+    if seconds < 90:
+        return f"{seconds} seconds"
+    return f"{math.ceil(seconds / 60)} minutes"
