@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import signal
 import sys
@@ -70,10 +71,11 @@ def serve(
     tls_key: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Its private key, PEM.")] = None,
 ) -> None:
     """Serve the web pages and the REST interface. Jobs need a worker beside it (`betaloop worker`)."""
+    gc.disable()  # while everything is loaded, which then stays: a fifth of the start; `leave_to_itself` enables it
     import uvicorn
 
     from app.ingest.uploads.interrupted import keep_resuming
-    from app.main import create_app, leave_to_itself
+    from app.main import create_app
     from app.platform.audit.chain import keep_sealing
     from app.platform.jobs.children import limited
     from app.platform.migrate import migrate as bring_up_to_date
@@ -96,7 +98,6 @@ def serve(
     # beside the service, for reading what a crash left behind may take minutes
     threading.Thread(target=keep_resuming, args=("the service", threading.Event()), daemon=True).start()
     threading.Thread(target=keep_sealing, args=(threading.Event(),), daemon=True).start()
-    leave_to_itself()
     uvicorn.run(
         service, host=host or settings.host, port=port or settings.port, log_level=settings.log_level.lower(), access_log=False,
         timeout_graceful_shutdown=3, timeout_keep_alive=75, ssl_certfile=tls_certificate, ssl_keyfile=tls_key,

@@ -17,10 +17,11 @@ def loaded(code: str) -> set[str]:
     return set(subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split())
 
 
-def test_the_web_process_never_loads_torch() -> None:
+def test_the_web_process_never_loads_torch_and_starts_without_what_writes_pdf() -> None:
     modules = loaded("from app.main import create_app; create_app().openapi()")
     assert "app.pipeline.kinds" in modules
     assert "torch" not in modules
+    assert "fpdf" not in modules
     assert not {m for m in modules if m.startswith("app.") and m.endswith(".compute")}
 
 

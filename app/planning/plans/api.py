@@ -31,7 +31,6 @@ from app.planning.plans.schemas import (
 from app.planning.plans.view import PlanLine, PlanView, shown
 from app.planning.plans.view import read_plan as plan_of
 from app.planning.protocol.session_order import Order
-from app.planning.sheet import pdf
 from app.platform.audit import record
 from app.platform.database import Db, now
 from app.platform.web.schemas import problems
@@ -78,6 +77,8 @@ def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
     record(db, "download", "plan", view.plan.id)
     db.commit()
     name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
+    from app.planning.sheet import pdf  # what writes PDF takes long to load: a service that was killed is back sooner without it
+
     content = pdf.render(view, _bundles(db, view), caller.label, now())
     return Response(content, media_type="application/pdf", headers={"Content-Disposition": f'inline; filename="{name}"'})
 
