@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow check audit format lock bench clean
+.PHONY: help install demo test test-slow check audit format lock bench soak clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -51,6 +51,9 @@ bench: install ## Run every benchmark in its quick form.
 	@for script in benchmarks/*.py; do echo "== $$script"; OMP_NUM_THREADS=1 $(BIN)/python $$script --quick || exit 1; done
 	@for script in benchmarks/development/*.py; do tool=benchmarks.development.$$(basename $$script .py); \
 	  echo "== $$tool"; OMP_NUM_THREADS=1 $(BIN)/python -m $$tool --quick || exit 1; done
+
+soak: install ## Kill every process of an installation at random moments, 50 rounds (about 15 minutes), and look whether anything is lost.
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/soak.py
 
 clean: ## Remove the demo's data and everything made here (not the code).
 	rm -rf $(VENV) var build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
