@@ -26,6 +26,8 @@ MAPPING = {
     ],
 }
 Json = dict[str, Any]
+OWN = ("file_id", "event_id", "query_id", "dose_id", "mapping_id")
+"""Members of paths whose rows each route has for itself."""
 TABLE = b"t_s,beta,amplitude_fraction\n" + b"".join(b"%d,1,1\n" % (2 * k) for k in range(21))
 SAMPLES = b"t_s,lfp [uV],amplitude_ma\n" + b"".join(b"%.3f,%d,1\n" % (k / 250, k * k % 17) for k in range(-5000, 5001))
 GRASPS = b"t_s\n" + b"".join(b"%.2f\n" % (0.4 * k) for k in range(11))
@@ -254,11 +256,16 @@ class World:
         body = self.upload("t.csv", TABLE.replace(b"4,1,1", b"4,7.%d,1" % ord(name), 1), more=[("u.csv", table.encode())], visit="3")
         return next(int(f["id"]) for f in body["files"] if f["waits_for_mapping"])
 
+    def ids_of(self, method: str, path: str) -> Json:
+        """What stands in the path of a route, by name: rows that the route can work on."""
+        form = self.forms.get((method, path.removeprefix("/api/v1")), {})
+        return self.ids | {name: value for name, value in form.items() if name in self.ids or name in OWN}
+
     def call(self, client: TestClient, method: str, path: str) -> int:
         """Status of a call that is right in everything but, perhaps, who makes it."""
         form = dict(self.forms.get((method, path.removeprefix("/api/v1")), {}))
-        own = ("file_id", "event_id", "query_id", "dose_id", "mapping_id")
-        ids = self.ids | {name: form.pop(name) for name in list(form) if name in self.ids or name in own}
+        ids = self.ids_of(method, path)
+        form = {name: value for name, value in form.items() if name not in ids}
         if method == "get":
             form.pop("json", None)
         with client.stream(method, path.format(**ids), **form) as answer:
