@@ -18,6 +18,7 @@ time, and who waits longer says for what.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import random
@@ -102,14 +103,27 @@ class Soak:
         child = random.choice(found)
         killed = time.monotonic()
         try:
+            folder = child.cmdline()[-1]
             child.kill()
-        except psutil.NoSuchProcess:
+        except psutil.Error:
             return "the child ended before it was killed;", -1.0
-        running = "select 1 from job_step s join job j on j.id = s.job_id where s.status = 'running' and j.finished_at is null"
-        computing = lambda: any(self.installed.children(worker) for worker in self.installed.workers)  # noqa: E731
-        healthy = lambda: computing() or self.installed.ask(running) == []  # noqa: E731
-        self.installed.wait_until("a step to have a process again after its child was killed", healthy, PATIENCE_S)
-        return "child killed,", time.monotonic() - killed
+        if "/jobs/" not in folder:  # an upload, which its sender sends again
+            self.installed.wait_until("every web to answer after a reader of uploads was killed", self.installed.webs_are_ready, PATIENCE_S)
+            return "reader of an upload killed,", time.monotonic() - killed
+        job, step = folder.split("/")[-2:]
+        running = "select 1 from job_step where job_id = %s and replace(key, '/', '__') = %s and status = 'running'"
+        what = f"step {step} to have a process again after its child was killed"
+        healthy = lambda: self._computes(folder, child.pid) or self.installed.ask(running, job, step) == []  # noqa: E731
+        self.installed.wait_until(what, healthy, PATIENCE_S)
+        return f"child of step {step} killed,", time.monotonic() - killed
+
+    def _computes(self, folder: str, other_than: int) -> bool:
+        """Whether a step has a process, but one that was killed."""
+        for child in (c for worker in self.installed.workers for c in self.installed.children(worker)):
+            with contextlib.suppress(psutil.Error, IndexError):
+                if child.pid != other_than and child.cmdline()[-1] == folder:
+                    return True
+        return False
 
     def _postmaster(self) -> tuple[str, float]:
         since, killed = utc(), time.monotonic()
