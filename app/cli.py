@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import signal
 import sys
@@ -71,7 +70,6 @@ def serve(
     tls_key: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Its private key, PEM.")] = None,
 ) -> None:
     """Serve the web pages and the REST interface. Jobs need a worker beside it (`betaloop worker`)."""
-    gc.disable()  # while everything is loaded, which then stays: a fifth of the start; `leave_to_itself` enables it
     import uvicorn
 
     from app.ingest.uploads.interrupted import keep_resuming
