@@ -30,8 +30,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import psutil
-from support.installation import STARTED_S, Installation, TooLate, installation, utc
-from support.writers import PEOPLE, Study, Writers, live_jobs, make_study, what_is_wrong
+from installed.installation import STARTED_S, Installation, TooLate, installation, utc
+from installed.writers import PEOPLE, Study, Writers, live_jobs, make_study, what_is_wrong
 
 KINDS = ("web", "worker", "child", "postmaster")
 HEALTHY_S = 10.0

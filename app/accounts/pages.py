@@ -19,10 +19,10 @@ from app.accounts.passwords import MIN_PASSWORD
 from app.accounts.permissions import Caller
 from app.platform.database import Db, new_session, now, set_actor
 from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany
+from app.platform.sources import Allowance, in_words, network_address
 from app.platform.web.bounded import Bounded
 from app.platform.web.forms import FormValues
 from app.platform.web.schemas import RowId
-from app.platform.web.sources import Allowance, in_words, network_address
 from app.platform.web.templates import render
 from app.settings import get_settings
 

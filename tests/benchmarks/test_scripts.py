@@ -1,5 +1,5 @@
 """What `make bench` runs: every file in `benchmarks/` and `benchmarks/development/` is a script that knows `--quick`; what scripts share
-lies in `benchmarks/support`."""
+lies in `benchmarks/support` and `benchmarks/installed`."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def test_what_scripts_share_is_no_script() -> None:
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.name)
 def test_a_script_imports_only_what_is_there_when_it_is_called(script: Path) -> None:
-    """A script finds `support` beside it; a module of `benchmarks.development` is called from the root, and finds `benchmarks` there."""
+    """A script finds `support` and `installed` beside it; one of `benchmarks.development`, called from the root, finds `benchmarks`."""
     tree = ast.parse(script.read_text())
     modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
-    shared = {m for m in modules if m.split(".")[0] in ("support", "benchmarks")}
-    prefix = "benchmarks.support." if script.parent.name == "development" else "support."
-    assert all(m.startswith(prefix) for m in shared), shared
-    assert all((ROOT / "benchmarks" / "support" / f"{m.removeprefix(prefix)}.py").exists() for m in shared)
+    shared = {m for m in modules if m.split(".")[0] in ("support", "installed", "benchmarks")}
+    above = "benchmarks." if script.parent.name == "development" else ""
+    assert all(m.startswith((f"{above}support.", f"{above}installed.")) for m in shared), shared
+    assert all((ROOT / "benchmarks" / f"{m.removeprefix(above).replace('.', '/')}.py").exists() for m in shared)
 
 
 @pytest.mark.parametrize("script", ["ope", "population", "beta_gaps"])

@@ -31,7 +31,7 @@ def test_what_was_acknowledged_and_is_not_there_is_found(
     fresh_database: str, client: Any, enrolled: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    writers = importlib.import_module("support.writers")
+    writers = importlib.import_module("installed.writers")
     stated = {"participant": enrolled, "visit": "1", "controller": "random"}
     sent = client.post("/api/v1/uploads", data=stated, files={"file": ("s.csv", writers.table(np.random.default_rng(1)))}).json()
     session = sent["sessions"][0]["id"]
@@ -52,8 +52,9 @@ def test_what_was_acknowledged_and_is_not_there_is_found(
 def ran(script: str, *arguments: str) -> dict[str, Any]:
     """The figures of a run that found nothing wrong."""
     env = {k: v for k, v in os.environ.items() if not k.startswith("BETALOOP_") or k == "BETALOOP_SERVER_USER"} | {"PYTHONPATH": str(ROOT)}
-    command = [sys.executable, str(ROOT / "benchmarks" / script), *arguments]
-    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=500, check=False)
+    done = subprocess.run(
+        [sys.executable, *script.split(), *arguments], cwd=ROOT, env=env, capture_output=True, text=True, timeout=500, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
@@ -61,7 +62,7 @@ def ran(script: str, *arguments: str) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_kills_of_every_process_lose_and_double_nothing() -> None:
-    figures = ran("soak.py", "--quick")
+    figures = ran("benchmarks/soak.py", "--quick")
     assert figures["kills"] >= 3
     assert figures["acknowledged"] > 50
     assert figures["median_s"] < 10
@@ -71,7 +72,7 @@ def test_kills_of_every_process_lose_and_double_nothing() -> None:
 @pytest.mark.timeout(600)
 @pytest.mark.skipif(not sorted(Path("/usr/lib/postgresql").glob("*/bin")), reason="no PostgreSQL of the machine's own here")
 def test_two_webs_and_three_workers_on_debians_postgresql_lose_and_double_nothing() -> None:
-    figures = ran("soak.py", "--webs", "2", "--workers", "3", "--own", "--rounds", "8", "--minutes", "4")
+    figures = ran("benchmarks/soak.py", "--webs", "2", "--workers", "3", "--own", "--rounds", "8", "--minutes", "4")
     assert figures["kills"] >= 3
     assert figures["acknowledged"] > 50
 
@@ -79,6 +80,6 @@ def test_two_webs_and_three_workers_on_debians_postgresql_lose_and_double_nothin
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_under_load_no_request_fails_and_no_write_is_lost() -> None:
-    figures = ran("load.py", "--quick")
+    figures = ran("-m benchmarks.development.load", "--quick")
     assert figures["errors"] == 0
     assert figures["acknowledged_writes"] >= 3

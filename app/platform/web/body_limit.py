@@ -15,7 +15,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.platform.errors import BetaloopError, TooMany
-from app.platform.web.sources import Allowance, in_words, network_address
+from app.platform.sources import Allowance, in_words, network_address
 from app.settings import get_settings
 
 PLAIN_LIMIT = 1 << 20

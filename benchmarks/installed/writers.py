@@ -16,7 +16,8 @@ import httpx2 as httpx
 import numpy as np
 
 from app.learning.policies.baselines import constant_onnx
-from support.installation import PASSWORD, Installation, utc
+
+from .installation import PASSWORD, Installation, utc
 
 PEOPLE = {"admin@clinic.example": "admin", "signer@clinic.example": "clinician"}
 SETTINGS = {"xi_beta": 1.0, "cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"}
