@@ -289,15 +289,15 @@ def upload_s(client: httpx.Client, code: str, name: str, content: bytes) -> floa
 
 def _start_training(client: httpx.Client) -> str:
     """A training job that outlasts the uploads; returns its id once it computes."""
-    _enrol(client, "TRAINED")
+    _enrol(client, "T0")
     for i in range(6):
         content = session_table_csv(run_session("P2", "random", visit=1, hour=1.0, seed=i, steps=300, lead_steps=10))
-        fields = {"participant": "TRAINED", "visit": "1", "controller": "random"}
+        fields = {"participant": "T0", "visit": "1", "controller": "random"}
         stored = client.post("/uploads", data=fields, files={"file": (f"{i}.csv", content)})
         stored.raise_for_status()
         qoc = {"grasp_hz": 2.0 + 0.1 * i, "rating": 5 + i % 4, "tremor_percent": 10.0 + i}
         client.put(f"/sessions/{stored.json()['sessions'][0]['id']}/qoc", json=qoc).raise_for_status()
-    job = client.post("/participants/TRAINED/jobs", json={"kind": "train"})
+    job = client.post("/participants/T0/jobs", json={"kind": "train"})
     if job.status_code >= 400:
         raise SystemExit(f"the training job was refused: {job.text}")
     number = str(job.json()["id"])
@@ -310,7 +310,7 @@ def latency_figures(options: argparse.Namespace, folder: Path) -> tuple[dict[str
     """Figures and ratios of uploads; prints them."""
     name, content = device_recording()
     with service(folder) as (client, web):
-        upload_s(client, "WARM", name, content)
+        upload_s(client, "W0", name, content)
         before = _process_cpu_s(web)
         quiet = [upload_s(client, f"Q{i}", name, content) for i in range(options.uploads)]
         cpu = (_process_cpu_s(web) - before) / options.uploads

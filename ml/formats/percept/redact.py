@@ -165,7 +165,8 @@ class _Scrubber:
             self._gone["device"] += 1
             return pseudonym(item, self._key)
         if not (name in KEYS or HEMISPHERE.fullmatch(name) or moment(name) is not None):
-            self._unknown("key", name)
+            if not speaks_of(name):
+                self._unknown("key", name)
             return _GONE
         return self._clean(item, name, depth + 1)
 

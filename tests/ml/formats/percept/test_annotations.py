@@ -134,6 +134,8 @@ def test_the_redacted_report_gives_the_same_annotations_without_names(tmp_path, 
     assert kept(json.loads(again.read_text())) == kept(clean)
     sections = next(said for said in done.removed if said.startswith("sections not known"))
     assert sections.endswith("(1×: adaptive timeline of …)")
+    fields = next(said for said in done.removed if said.startswith("fields not known"))
+    assert "annotations" not in fields, "what was read is not said to be removed"
     assert next(said for said in done.removed if said.startswith("of annotations")) == (
         "of annotations and ratings: texts with other than known words (6×)"
     )
