@@ -156,7 +156,7 @@ def outlook(result: VerdictResult, sessions_per_arm: int) -> str:
 
 def judged_as(outcome: str, unit: str) -> str:
     """In what an outcome of a verdict and its margin are stated."""
-    return {"rating": "points; share of pairs won with them added", "tremor": "% points"}.get(outcome, unit)
+    return {"rating": "points, in pairs", "tremor": "% points"}.get(outcome, unit)
 
 
 def verdict_kind(result: VerdictResult, locked: LockedMargins) -> str:
