@@ -12,7 +12,8 @@ from app.accounts.permissions import Caller
 from app.ingest.models import SessionProposal, Upload, UploadFile
 from app.platform.errors import NotFound
 from app.study.models import Device, Participant, Recording, SessionSegment, StudySession, Visit
-from app.study.repository import SLACK_S, in_scope
+from app.study.repository import in_scope
+from app.study.sessions.repository import SLACK_S
 
 GRASP_KIND = "grasp"
 """Kind of a file with hand-grasp tests, which names no clock."""

@@ -17,6 +17,7 @@ from app.study import blinding, cdbs_amplitude
 from app.study import repository as study
 from app.study.models import Controller, Hemisphere, Participant, Recording, SessionSegment, StudySession, Trace, Visit
 from app.study.sessions import repeated
+from app.study.sessions import repository as session_repository
 from app.study.sessions.usable_steps import CONTROL_STREAMS
 from app.study.traces import AMPLITUDE_STREAM, pack, unpack
 from app.study.visits.service import require_unlocked
@@ -269,7 +270,7 @@ def counted_minutes(db: Session, placement: Placement) -> bool:
     if began is None:
         return False
     begin, end = (began + timedelta(seconds=s) for s in (placement.start_s, placement.stop_s))
-    return any(one.counts for one in study.same_minutes(db, placement.control, begin, end, besides=None))
+    return any(one.counts for one in session_repository.same_minutes(db, placement.control, begin, end, besides=None))
 
 
 def disagreements(db: Session, session_ids: Sequence[int], stated: StatedSession) -> list[str]:

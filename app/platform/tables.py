@@ -17,6 +17,7 @@ TABLE_MODULES = (
     "app.study.models",
     "app.study.characteristics.models",
     "app.study.doses.models",
+    "app.study.margins.models",
     "app.study.adverse_events.models",
     "app.study.data_queries.models",
     "app.study.outcomes.models",

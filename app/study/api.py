@@ -24,8 +24,6 @@ from app.study.schemas import (
     RecordedTraceOut,
     SessionChange,
     SessionOut,
-    SettingsChange,
-    SettingsOut,
     TraceOut,
     VisitChange,
     VisitIn,
@@ -36,6 +34,7 @@ from app.study.schemas import (
 from app.study.serializers import outcome_out, participant_out, recorded_trace_out, session_out, trace_out, visit_out
 from app.study.sessions import conditions
 from app.study.sessions.data import session_data
+from app.study.settings.schemas import SettingsChange, SettingsOut
 from app.study.traces import recorded_traces
 from app.study.visits import service as visits
 

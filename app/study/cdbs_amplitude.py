@@ -6,7 +6,7 @@ from typing import overload
 
 from app.platform.errors import Invalid
 from app.study.models import Hemisphere, Participant, SettingsVersion, StudySession, Visit
-from app.study.schemas import CDBS_MA
+from app.study.settings.schemas import CDBS_MA
 
 
 def stated_at(visit: Visit, hemisphere: Hemisphere | None, program: int | None = 0) -> float | None:

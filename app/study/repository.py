@@ -26,8 +26,6 @@ from app.study.models import (
     Visit,
     VisitLock,
 )
-from app.study.outcomes.models import GraspTest, TremorSeries
-from app.study.sessions.models import CountedTime
 
 CONFIRMED = StudySession.status == "confirmed"
 """Condition on `StudySession`: only what a person has confirmed counts in buffers, analyses, rankings and exports."""
@@ -207,60 +205,6 @@ def recording_by_fingerprint(db: Session, participant_id: int, fingerprint: str)
     return db.scalar(select(Recording).where(Recording.participant_id == participant_id, Recording.fingerprint == fingerprint))
 
 
-SLACK_S = 2.0
-"""Two stretches of one device are the same minutes where they share more than this: clocks of consecutive recordings are not exact."""
-
-
-@dataclass(frozen=True)
-class SameMinutes:
-    """A session that holds minutes of a device which another one holds too.
-
-    Attributes:
-        recording_id: its own recording of them. seconds: how long both are. counts: whether it is confirmed and not excluded.
-    """
-
-    session_id: int
-    recording_id: int
-    seconds: float
-    counts: bool
-
-
-def same_minutes(db: Session, recording: Recording, begin: datetime, end: datetime, besides: int | None) -> list[SameMinutes]:
-    """Sessions controlled by a recording's device and side within [begin, end], in another recording, by number.
-
-    Args:
-        recording: one of no known side is of both. besides: a session that is not asked for.
-    """
-    own_side = true() if recording.hemisphere is None else or_(Recording.hemisphere.is_(None), Recording.hemisphere == recording.hemisphere)
-    first = Recording.started_at + func.make_interval(0, 0, 0, 0, 0, 0, SessionSegment.start_s)
-    last = Recording.started_at + func.make_interval(0, 0, 0, 0, 0, 0, SessionSegment.stop_s)
-    shared = func.extract("epoch", func.least(last, end) - func.greatest(first, begin))
-    counts = CONFIRMED & StudySession.excluded_reason.is_(None)
-    query = (
-        select(StudySession.id, Recording.id, shared, counts)
-        .join(SessionSegment, SessionSegment.session_id == StudySession.id)
-        .join(Recording, Recording.id == SessionSegment.recording_id)
-        .where(Recording.device_id == recording.device_id, Recording.id != recording.id, own_side, SessionSegment.is_control)
-        .where(shared > SLACK_S, StudySession.id != (besides or 0))
-        .order_by(StudySession.id)
-    )
-    return [SameMinutes(i, r, float(seconds), bool(counting)) for i, r, seconds, counting in db.execute(query)]
-
-
-def repeated_sessions(db: Session, participant_id: int) -> set[int]:
-    """Sessions that count by a device's clock and have no place of their own in `counted_time`: another one had their minutes before."""
-    query = (
-        select(StudySession.id)
-        .join(StudySession.visit)
-        .join(SessionSegment, SessionSegment.session_id == StudySession.id)
-        .join(Recording, Recording.id == SessionSegment.recording_id)
-        .outerjoin(CountedTime, (CountedTime.session_id == StudySession.id) & (CountedTime.recording_id == Recording.id))
-        .where(Visit.participant_id == participant_id, CONFIRMED, StudySession.excluded_reason.is_(None), SessionSegment.is_control)
-        .where(Recording.started_at.is_not(None), CountedTime.session_id.is_(None))
-    )
-    return set(db.scalars(query))
-
-
 def session_ids_of_recording(db: Session, recording_id: int) -> Sequence[int]:
     """Sessions that a recording belongs to."""
     return db.scalars(select(SessionSegment.session_id).where(SessionSegment.recording_id == recording_id).distinct()).all()
@@ -284,33 +228,6 @@ def lock_session(db: Session, session: StudySession) -> None:
     """Lock a session and read its QoCs again, so that two corrections at once become two revisions and neither is lost."""
     db.execute(select(StudySession.id).where(StudySession.id == session.id).with_for_update())
     db.expire(session, ["qocs", "conditions_revisions"])
-
-
-def tremor_series(
-    db: Session, participant_id: int, start: datetime, stop: datetime, but_file_id: int | None = None
-) -> Sequence[TremorSeries]:
-    """Files of minutes of tremor that reach into a stretch of time, oldest first; one of them can be left out, for each may be a year."""
-    reaching = (TremorSeries.last_end_at > start) & (TremorSeries.first_start_at < stop)
-    own = select(TremorSeries).where(TremorSeries.participant_id == participant_id, reaching)
-    if but_file_id is not None:
-        own = own.where(TremorSeries.upload_file_id != but_file_id)
-    return db.scalars(own.order_by(TremorSeries.upload_file_id)).all()
-
-
-def tremor_series_of_file(db: Session, participant_id: int, upload_file_id: int) -> TremorSeries | None:
-    """The minutes of tremor that a file gave."""
-    own = (TremorSeries.participant_id == participant_id) & (TremorSeries.upload_file_id == upload_file_id)
-    return db.scalar(select(TremorSeries).where(own))
-
-
-def grasp_tests(db: Session, session_id: int) -> Sequence[GraspTest]:
-    """The grasp tests of a session, oldest file first."""
-    return db.scalars(select(GraspTest).where(GraspTest.session_id == session_id).order_by(GraspTest.upload_file_id, GraspTest.id)).all()
-
-
-def grasp_tests_of_file(db: Session, upload_file_id: int) -> Sequence[GraspTest]:
-    """The grasp tests that a file gave, of whatever session."""
-    return db.scalars(select(GraspTest).where(GraspTest.upload_file_id == upload_file_id)).all()
 
 
 def uploads_of_files(db: Session, upload_file_ids: Sequence[int]) -> dict[int, int]:

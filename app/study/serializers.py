@@ -11,17 +11,9 @@ from app.study.doses.since import hours_since_dose
 from app.study.models import Participant, StudySession, Visit
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
-from app.study.schemas import (
-    OutcomeOut,
-    ParticipantOut,
-    QocOut,
-    RecordedTraceOut,
-    SessionOut,
-    SettingsOut,
-    TraceOut,
-    VisitOut,
-)
+from app.study.schemas import OutcomeOut, ParticipantOut, QocOut, RecordedTraceOut, SessionOut, TraceOut, VisitOut
 from app.study.sessions.data import SessionData
+from app.study.settings.schemas import SettingsOut
 from app.study.traces import RecordedTrace
 
 

@@ -16,9 +16,10 @@ from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import blinding, repository
 from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision, SettingsVersion, StudySession, Visit
 from app.study.outcomes import service as outcomes
-from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, QocIn, SessionChange, SettingsIn, VisitChange, VisitIn
+from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, QocIn, SessionChange, VisitChange, VisitIn
 from app.study.sessions import repeated
 from app.study.sessions.repository import other_ratings
+from app.study.settings.schemas import SettingsIn
 from app.study.threshold import MDP_FIELDS
 from app.study.traces import NO_CONTROL, control_programs
 from app.study.usual import questions

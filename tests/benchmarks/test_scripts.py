@@ -4,9 +4,11 @@ lies in `benchmarks/support` and `benchmarks/installed`."""
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -42,6 +44,20 @@ def test_a_script_imports_only_what_is_there_when_it_is_called(script: Path) -> 
     above = "benchmarks." if script.parent.name == "development" else ""
     assert all(m.startswith((f"{above}support.", f"{above}installed.")) for m in shared), shared
     assert all((ROOT / "benchmarks" / f"{m.removeprefix(above).replace('.', '/')}.py").exists() for m in shared)
+
+
+def is_there(module: str, name: str) -> bool:
+    """Whether `from module import name` finds something."""
+    found = importlib.import_module(module)
+    return hasattr(found, name) or (hasattr(found, "__path__") and find_spec(f"{module}.{name}") is not None)
+
+
+def test_what_benchmarks_import_of_the_service_is_there() -> None:
+    nodes = [(p, n) for p in sorted((ROOT / "benchmarks").rglob("*.py")) for n in ast.walk(ast.parse(p.read_text()))]
+    wanted = [(p, n.module, a.name) for p, n in nodes if isinstance(n, ast.ImportFrom) and n.module and not n.level for a in n.names]
+    ours = [(p, module, name) for p, module, name in wanted if module.split(".")[0] in ("app", "ml")]
+    assert len(ours) > 100
+    assert [f"{p.name}: {module} has no {name}" for p, module, name in ours if not is_there(module, name)] == []
 
 
 @pytest.mark.parametrize("script", ["ope", "population", "beta_gaps"])

@@ -2,107 +2,28 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
-from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from playwright.sync_api import TimeoutError as NotInTime
 from playwright.sync_api import expect
 from pydantic import TypeAdapter
 from sqlalchemy import text
 
 from app.accounts import service as accounts
 from app.accounts.models import Role
-from app.planning.visit_day.record import contradictions, last_attempt, open_severe, state_of
 from app.planning.visit_day.schemas import DeviceTime
-from app.planning.visit_day.screening import rules, screen
 from app.platform.database import transaction
 from tests.browser.conftest import FLAGS, PASSWORD, Watched, kill_browser, program
+from tests.browser.day_page import KEPT, fill, once_drawn, open_day, stored, tap, wait_for, worker_ready
 from tests.clinic_day import ClinicDay, clinic_day
 
 __all__ = ["clinic_day"]
 pytestmark = pytest.mark.browser
 
 SCREENS = ((768, 1024), (1024, 768), (1280, 900))
-SMALL = """() => [...document.querySelectorAll('#day, dialog[open]')].flatMap(
-    (box) => [...box.querySelectorAll('a, button, input, textarea, summary')])
-  .filter((e) => e.checkVisibility()).map((e) => [e, e.getBoundingClientRect()]).filter(([e, b]) => b.height < 47.5 || b.width < 47.5)
-  .map(([e, b]) => `${e.tagName} "${e.textContent.trim().slice(0, 30)}" ${Math.round(b.width)}x${Math.round(b.height)}`)"""
-FAINT = """() => {
-  const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
-  const light = (c) => c.slice(0, 3).map((v) => v / 255).map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4))
-    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
-  const behind = (e) => {
-    for (; e; e = e.parentElement) {
-      const c = rgb(getComputedStyle(e).backgroundColor);
-      if (c.length < 4 || c[3] === 1) return c;
-    }
-    return [255, 255, 255];
-  };
-  const faint = [];
-  for (const e of document.querySelectorAll('#day *, dialog[open] *')) {
-    const own = [...e.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim());
-    if (!own || !e.checkVisibility() || e.closest(':disabled')) continue;
-    const style = getComputedStyle(e), [a, b] = [light(rgb(style.color)), light(behind(e))];
-    const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), size = parseFloat(style.fontSize);
-    const large = size >= 24 || (size >= 18.66 && Number(style.fontWeight) >= 700);
-    if (ratio < (large ? 3 : 4.5)) faint.push(`${e.tagName} "${e.textContent.trim().slice(0, 30)}" ${ratio.toFixed(2)}`);
-  }
-  return faint;
-}"""
-KEPT = """async () => {
-  const done = (request) => new Promise((resolve) => { request.onsuccess = () => resolve(request.result); });
-  const db = await done(indexedDB.open('betaloop-visit-day'));
-  const all = (name) => done(db.transaction(name).objectStore(name).getAll());
-  const plain = (value) => (value instanceof ArrayBuffer ? new TextDecoder('latin1').decode(value) : String(value));
-  const text = (row) => Object.entries(row).map(([name, value]) => `${name}=${plain(value)}`).join(' ');
-  const [keys, entries, days] = [await all('keys'), await all('entries'), await all('days')];
-  db.close();
-  const read = await Promise.all(keys.map((row) => crypto.subtle.exportKey('raw', row.key).then(() => 'readable', (e) => e.name)));
-  return { keys: read, entries: entries.map(text), days: days.map(text) };
-}"""
-
-
-TOO_WIDE = """() => [document.documentElement].map((e) => e.scrollWidth - e.clientWidth)
-  .filter((more) => more > 0).map((more) => `${more} px wider than the screen`)"""
-
-
-def once_drawn(watched: Watched) -> list[str]:
-    """What is too small, too faint or too wide, once the page has had time to be drawn: it may be in the middle of that after a tap."""
-    look = f"() => [{SMALL}, {FAINT}, {TOO_WIDE}].flatMap((found) => found())"
-    if found := watched.page.evaluate(look):
-        with suppress(NotInTime):
-            watched.page.wait_for_function(f"() => ({look})().length === 0", timeout=5_000)
-        found = watched.page.evaluate(look)
-    return list(found)
-
-
-def tap(watched: Watched, act: str) -> None:
-    watched.page.click(f"[data-act='{act}']")
-
-
-def open_day(watched: Watched, day: ClinicDay) -> None:
-    watched.open(f"/visit-day/{day.visit}")
-    watched.page.wait_for_selector("#day[data-ready=yes]")
-
-
-def wait_for(watched: Watched, waiting: int, status: str = "online") -> None:
-    watched.page.wait_for_selector(f".day-link[data-link={status}][data-waiting='{waiting}']", timeout=30_000)
-
-
-def stored(day: ClinicDay) -> list[str]:
-    return [e["kind"] for e in day.client.get(f"/api/v1/visits/{day.visit}/day/entries").json()["items"]]
-
-
-def worker_ready(watched: Watched) -> None:
-    """The page can be opened without network from now on."""
-    watched.page.evaluate("() => navigator.serviceWorker.ready.then(() => true)")
-    watched.page.wait_for_function("() => caches.match('/visit-day/shell').then(Boolean)")
 
 
 def test_a_cut_network_and_a_reload_without_it_lose_nothing(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
@@ -176,7 +97,7 @@ def test_a_killed_browser_sends_what_it_held_when_it_comes_back(chromium: Any, a
     context.clear_cookies()  # a browser writes them down half a minute late: whoever was signed in may have to do it again
     watched = Watched(context.new_page(), address)
     watched.open(f"/visit-day/{clinic_day.visit}")
-    _fill(watched, "admin@clinic.example")
+    fill(watched, "admin@clinic.example")
     watched.page.wait_for_selector("#day[data-ready=yes]")
     wait_for(watched, 0)
     assert stored(clinic_day) == ["start", "rating"]
@@ -216,14 +137,14 @@ def test_an_expired_sign_in_loses_nothing_and_nobody_else_can_read_it(window: Ca
     wait_for(watched, 2, "signed-out")
     assert stored(clinic_day) == []
     watched.page.click("#day a.primary")
-    _fill(watched, "ben@clinic.example")
+    fill(watched, "ben@clinic.example")
     watched.page.wait_for_selector("#day[data-ready=yes]")
     expect(watched.page.locator("#day")).to_contain_text("2 entries of somebody else wait")
     watched.page.wait_for_selector("section.day-session[data-state=waiting]")
     watched.page.click("text=Sign out")
     watched.page.wait_for_selector("[name=password]")
     watched.open(f"/sign-in?next=/visit-day/{clinic_day.visit}")
-    _fill(watched, "admin@clinic.example")
+    fill(watched, "admin@clinic.example")
     watched.page.wait_for_selector("#day[data-ready=yes]")
     wait_for(watched, 0)
     listed = clinic_day.client.get(f"/api/v1/visits/{clinic_day.visit}/day/entries").json()["items"]
@@ -382,96 +303,3 @@ def test_the_plain_form_does_it_without_scripts(chromium: Any, address: str, cli
     send("#plain button:has-text('Skip')")
     context.close()
     assert stored(clinic_day) == ["start", "rating", "grasp", "dyskinesia", "note", "stop", "session_end", "skip"]
-
-
-REFUSED = (
-    "Felt better since 3.4.26", "on the 3rd of May", "May 2026", "call 555 01 99 or a@b.c", "Ångström was dizzy", "He said O'Brien helped",
-    "Łódź", "Mr Smith", "patient 12345", "12 34",
-)  # fmt: skip
-KEEPABLE = (
-    "smith was dizzy",
-    "DBS at 2.75 mA, 130 Hz",
-    "UPDRS 3, rating 7/10 at 10:15",
-    "Sitting. Resting. Walking slower",
-    "",
-    "Zhivago sat",
-)
-
-
-def test_the_tablet_screens_notes_as_the_service_does(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
-    watched = window()
-    watched.sign_in()
-    open_day(watched, clinic_day)
-    script = """async ([notes, rules, module]) => {
-      const { screen } = await import(module);
-      return notes.map((note) => screen(note, rules, ['zhivago']));
-    }"""
-    found = watched.page.evaluate(script, [[*REFUSED, *KEEPABLE], rules(), _module(watched, "screening.js")])
-    assert found == [[{"kind": f.kind, "text": f.text} for f in screen(note, ["zhivago"])] for note in (*REFUSED, *KEEPABLE)]
-    assert [bool(f) for f in found] == [True] * len(REFUSED) + [False] * len(KEEPABLE)
-
-
-def test_the_tablet_reads_entries_as_the_service_does(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
-    days = [_drawn_day(seed) for seed in range(40)]
-    watched = window()
-    watched.sign_in()
-    open_day(watched, clinic_day)
-    script = """async ([days, module]) => {
-      const r = await import(module);
-      const first = (a, b) => (a[0] < b[0] ? -1 : 1);
-      return days.map((d) => [[1, 2].map((i) => [r.stateOf(d, i), r.lastAttempt(d, i)]),
-        r.contradictions(d).map((rows) => rows.map((e) => e.uuid).sort()).sort(first), r.openSevere(d)?.uuid ?? null]);
-    }"""
-    found = watched.page.evaluate(script, [days, _module(watched, "record.js")])
-    moment = TypeAdapter(DeviceTime).validate_python
-    for day, (states, clashes, severe) in zip(days, found, strict=True):
-        rows: list[Any] = [SimpleNamespace(**e | {"device_time": moment(e["device_time"])}) for e in day]
-        assert states == [[state_of(rows, i), last_attempt(rows, i)] for i in (1, 2)]
-        assert clashes == sorted(sorted(e.uuid for e in c.entries) for c in contradictions(rows))
-        last = open_severe(rows)
-        assert severe == (last.uuid if last else None)
-    assert any(clashes for _, clashes, _ in found)
-    assert any(severe for _, _, severe in found)
-
-
-def _drawn_day(seed: int) -> list[dict[str, Any]]:
-    """Entries as two careless tablets might make them."""
-    rng = random.Random(seed)
-    entries: list[dict[str, Any]] = []
-    payloads: dict[str, list[dict[str, Any]]] = {
-        "start": [{}],
-        "stop": [{}],
-        "session_end": [{}],
-        "rating": [{"value": 3}, {"value": 4}],
-        "gait": [{"grade": "mild"}, {"grade": "severe"}],
-        "skip": [{"reason": "a"}, {"reason": "b"}],
-        "repeat": [{"reason": "a"}],
-        "clinical_settings": [{}],
-    }
-    for number in range(rng.randint(1, 14)):
-        kind = rng.choice(list(payloads))
-        entries.append(
-            {
-                "uuid": f"{seed:03}-{number:03}",
-                "plan_item_id": rng.choice([1, 2]),
-                "attempt": rng.choice([1, 1, 2]),
-                "kind": kind,
-                "payload": rng.choice(payloads[kind]),
-                "replaces": [rng.choice(entries)["uuid"]] if entries and rng.random() < 0.25 else [],
-                "device_time": f"2026-11-22T10:{rng.randint(0, 59):02}:{rng.randint(0, 59):02}.000Z",
-                "clock_offset_ms": rng.choice([None, 0, 1500, -90_000]),
-                "entered_by": "a",
-            }
-        )
-    return entries
-
-
-def _module(watched: Watched, name: str) -> str:
-    folder: str = watched.page.get_attribute("script[src*='/visit-day/files/']", "src").rsplit("/", 1)[0]
-    return f"{folder}/{name}"
-
-
-def _fill(watched: Watched, email: str) -> None:
-    watched.page.fill("[name=email]", email)
-    watched.page.fill("[name=password]", PASSWORD)
-    watched.page.click("main button")

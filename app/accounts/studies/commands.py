@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated, Any, TypeVar
 
 import typer
@@ -16,9 +15,8 @@ from app.accounts.studies import service
 from app.accounts.studies.schemas import HINT, SiteIn, StudyIn
 from app.platform.database import transaction
 from app.platform.errors import Invalid, NotFound
+from app.platform.terminal import ACTOR, AsJson, show
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-ACTOR = "command line"
 Draft = TypeVar("Draft", bound=BaseModel)
 
 
@@ -36,7 +34,7 @@ def study_add(
         f"Added study {code}. Nobody works in it yet: give somebody a role with `betaloop user role EMAIL admin --study {code}`. "
         "The audit trail, which covers all studies, is read by who has a role with that right in each of them."
     )
-    _print({"code": code, "site": site or code}, as_json, said)
+    show({"code": code, "site": site or code}, as_json, said)
 
 
 def study_site(
@@ -49,7 +47,7 @@ def study_site(
     draft = _checked(SiteIn, code=site, name=name)
     with transaction(ACTOR) as db:
         service.add_site(db, service.study_to_manage(db, code, SYSTEM), draft)
-    _print({"study": code, "site": site}, as_json, f"Added site {site} to study {code}.")
+    show({"study": code, "site": site}, as_json, f"Added site {site} to study {code}.")
 
 
 def user_role(
@@ -69,7 +67,7 @@ def user_role(
         else:
             service.grant(db, where, email, Role(role), site, SYSTEM)
         result = {"email": email, "role": role, "study": where.code, "site": site}
-    _print(result, as_json, f"The role of {email} has ended." if role == "none" else f"{email} is now {role} in {result['study']}.")
+    show(result, as_json, f"The role of {email} has ended." if role == "none" else f"{email} is now {role} in {result['study']}.")
 
 
 def user_remove_second_factor(email: Annotated[str, typer.Argument(help="E-mail address of the user.")], as_json: AsJson = False) -> None:
@@ -80,7 +78,7 @@ def user_remove_second_factor(email: Annotated[str, typer.Argument(help="E-mail 
             raise NotFound(f"There is no user {email}.")
         had = second_factor.remove(db, user.id)
     said = f"{email} signs in with the password alone now." if had else f"{email} has no second factor."
-    _print({"email": email, "removed": had}, as_json, said)
+    show({"email": email, "removed": had}, as_json, said)
 
 
 def register(study: typer.Typer, user: typer.Typer) -> None:
@@ -99,7 +97,3 @@ def _checked(kind: type[Draft], **values: Any) -> Draft:
         first = error.errors()[0]
         where = " ".join(map(str, first["loc"]))
         raise Invalid(f"The {where}: {first['msg']}.", HINT) from error
-
-
-def _print(result: dict[str, Any], as_json: bool, said: str) -> None:
-    print(json.dumps(result) if as_json else said)  # noqa: T201

@@ -19,8 +19,9 @@ from app.accounts.permissions import Caller
 from app.ingest import encryption, repository
 from app.ingest.mappings import repository as mappings
 from app.ingest.models import PREVIEW, UploadFile
+from app.ingest.stated_beta import BetaStated
 from app.ingest.uploads import reading, service
-from app.ingest.uploads.receiving import MEDIA_TYPE, BetaStated, Receiver, StoredContent, twice
+from app.ingest.uploads.receiving import MEDIA_TYPE, Receiver, StoredContent
 from app.ingest.uploads.reports import ASIDE
 from app.ingest.uploads.service import UploadOutcome
 from app.platform import files
@@ -70,7 +71,7 @@ def read_held(db: Session, file: UploadFile, participant: Participant, reason: s
     ways = [m.as_mapping for m in known_mappings]
     with _original(file) as original:
         try:
-            found = twice(lambda: reading.clean(original, clean, options, mappings=ways))
+            found = reading.twice(lambda: reading.clean(original, clean, options, mappings=ways))
             if found.problem is not None:
                 _keep_preview(db, file, found.preview)
                 raise found.problem

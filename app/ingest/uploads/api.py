@@ -21,8 +21,8 @@ from app.platform.errors import Invalid
 from app.platform.web.schemas import Moment, RowId, Text, problems
 from app.study import repository as study
 from app.study.models import Controller, Hemisphere
-from app.study.schemas import BetaSource
 from app.study.serializers import session_out
+from app.study.settings.schemas import BetaSource
 from ml.formats.tables.numbers import unit_name
 
 router = APIRouter(route_class=UploadRoute, tags=["uploads"], responses=problems(401, 403, 404, 422))

@@ -11,9 +11,10 @@ from sqlalchemy.orm import Session
 
 from app.ingest.models import Upload
 from app.ingest.sessions import StatedSession
+from app.ingest.stated_beta import BetaStated
 from app.ingest.uploads import service
 from app.ingest.uploads.in_progress import in_progress, interrupted
-from app.ingest.uploads.receiving import BetaStated, Receiver
+from app.ingest.uploads.receiving import Receiver
 from app.ingest.uploads.service import UploadOutcome
 from app.platform.database import transaction
 from app.platform.errors import Invalid

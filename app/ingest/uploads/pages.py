@@ -29,8 +29,8 @@ from app.study import service as study_service
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
-from app.study.schemas import BetaSource
 from app.study.settings.form import SOURCES
+from app.study.settings.schemas import BetaSource
 
 router = APIRouter(route_class=UploadRoute)
 

@@ -6,7 +6,9 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import structlog
 
 from app.ingest import wording
 from app.platform import files
@@ -20,9 +22,12 @@ from ml.formats.recording import DecodedFile, UndecodableFile
 from ml.formats.redaction_record import Redaction
 from ml.formats.tables.mapping import TableMapping
 
+log = structlog.get_logger()
+
 CLEAN, DECODE = "app.ingest.uploads.compute:clean", "app.ingest.uploads.compute:decode"
 """What the children run."""
 
+_Read = TypeVar("_Read")
 Told = Callable[[float | None, str | None], None]
 """Takes progress: a share, 0 to 1, and a few words; None where it did not change."""
 
@@ -119,3 +124,18 @@ def _run(reference: str, params: Mapping[str, Any], who: str, told: Told) -> dic
         if ended.cause == "error":
             raise ReaderFault(ended.log) from None
         raise ReaderEnded(ended.cause, limits) from None
+
+
+def twice(read: Callable[[], _Read], again: Callable[[], bool] = lambda: True) -> _Read:
+    """What a child reads. One that ends it may have met a machine in need: it is read once more, where `again()` holds.
+
+    Raises:
+        ReaderEnded: it ended that child too.
+    """
+    try:
+        return read()
+    except ReaderEnded as ended:
+        log.warning("reading a file ended the reader", cause=ended.cause)
+        if not again():
+            raise
+        return read()

@@ -5,10 +5,10 @@ Which sessions come out is decided when all files of the upload are in; see `app
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import structlog
 from sqlalchemy.orm import Session
@@ -16,24 +16,24 @@ from sqlalchemy.orm import Session
 from app.ingest import encryption, repository, wording
 from app.ingest.mappings import repository as mappings
 from app.ingest.models import PREVIEW, Upload, UploadFile
+from app.ingest.stated_beta import BetaStated, name_beta
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading, recordings
 from app.ingest.uploads.in_progress import tell
 from app.ingest.uploads.incoming import Incoming
-from app.ingest.uploads.reading import ReaderEnded, ReaderFault
+from app.ingest.uploads.reading import ReaderEnded, ReaderFault, twice
 from app.ingest.uploads.reports import ASIDE, BEGUN, add_redaction, known_recordings, lasting, store_reports, stored_reports
 from app.platform import files, raw_bytes
 from app.platform.errors import TooLarge
 from app.platform.jobs.children import child
 from app.platform.raw_bytes import RawFile
 from app.settings import get_settings
-from app.study.models import Participant, Recording, SettingsVersion
+from app.study.models import Participant, Recording
 from ml.formats.archive import cleaned_suffix
 from ml.formats.options import DecodeOptions
-from ml.formats.recording import DecodedFile, FileReport, GraspLog, Problem, TraceLog, TraceSource, UndecodableFile
+from ml.formats.recording import DecodedFile, FileReport, GraspLog, Problem, UndecodableFile
 from ml.formats.redaction_record import REDACTOR_VERSION, Redaction
 from ml.formats.source import Source
-from ml.formats.tables.numbers import unit_name
 
 log = structlog.get_logger()
 
@@ -43,7 +43,6 @@ CUT_SHORT = UndecodableFile(
 )
 LETHAL = 2
 """So many times a process may end while it reads a file, or makes sessions of an upload; then that is not tried again by itself."""
-_Read = TypeVar("_Read")
 ENDED_THE_SERVICE = UndecodableFile(
     f"reading this file was cut short {LETHAL} times: the service, or what it rests on, stopped while it was read",
     "file",
@@ -52,15 +51,6 @@ ENDED_THE_SERVICE = UndecodableFile(
 RESUMED = "Reading this file was cut short; it was read from the kept bytes since, and what was removed from it is not listed again."
 TABLES = ("csv", "parquet", "control_log", "mapped")
 MEDIA_TYPE = "application/octet-stream"
-
-
-@dataclass(frozen=True)
-class BetaStated:
-    """What the sender says of a table: unit and source (as in the settings) of its beta, and the unit of its LFP."""
-
-    unit: str | None = None
-    source: str | None = None
-    lfp_unit: str | None = None
 
 
 @dataclass
@@ -261,7 +251,7 @@ class Receiver:
             if (known := self._known_meanwhile(name, row)) is not None:
                 return known
             if content.kind in TABLES:
-                decoded = self._name_beta(decoded)
+                decoded = name_beta(decoded, self.beta, self.participant.current_settings)
             stored = recordings.store(self.db, self.participant, row, decoded.recordings)
             tremor = outcomes_intake.take_tremor(self.db, row, decoded.tremor)
         except ReaderEnded as ended:
@@ -342,61 +332,6 @@ class Receiver:
         if sealed is not None:
             files.path_of(sealed).unlink(missing_ok=True)
         return FileOutcome(name, before, [report], duplicate=True, same_bytes=True, for_sender=problem.for_sender)
-
-    def _name_beta(self, decoded: DecodedFile) -> DecodedFile:
-        """A table's beta under its source, with a sentence that says who stated unit and source."""
-        return name_beta(decoded, self.beta, self.participant.current_settings)
-
-
-def twice(read: Callable[[], _Read], again: Callable[[], bool] = lambda: True) -> _Read:
-    """What a child reads. One that ends it may have met a machine in need: it is read once more, where `again()` holds.
-
-    Raises:
-        ReaderEnded: it ended that child too.
-    """
-    try:
-        return read()
-    except ReaderEnded as ended:
-        log.warning("reading a file ended the reader", cause=ended.cause)
-        if not again():
-            raise
-        return read()
-
-
-_UNITS_OF_FILES = {"header": "as the file's header says", "mapping": "as the column mapping says"}
-
-
-def name_beta(decoded: DecodedFile, beta: BetaStated, settings: SettingsVersion) -> DecodedFile:
-    """A table's own beta under its source; the report gets a sentence that says who stated unit and source.
-
-    Beta that was computed here, from a table of raw LFP, keeps the source `time_domain` and the unit it was computed in.
-    """
-    source = cast(TraceSource, beta.source or settings.beta_source or "table")
-    named = tuple(
-        replace(r, traces=tuple(replace(t, source=source) if _stated_by_a_person(t) else t for t in r.traces)) for r in decoded.recordings
-    )
-    report = decoded.reports[0]
-    source_from = _stated_by(beta.source, settings.beta_source)
-    for trace in (t for r in decoded.recordings for t in r.traces if _stated_by_a_person(t)):
-        in_header = trace.details["unit_from"] in _UNITS_OF_FILES
-        unit_from = _UNITS_OF_FILES.get(trace.details["unit_from"]) or _stated_by(beta.unit, settings.beta_unit)
-        report.understood.append(f"beta: unit '{trace.unit}' {unit_from}, source '{source}' {source_from}")
-        if in_header and beta.unit and unit_name(beta.unit) != trace.unit:
-            stated = unit_name(beta.unit)
-            report.flagged.append(f"beta is in '{trace.unit}' {unit_from}, the upload says '{stated}': the former was taken")
-    return replace(decoded, recordings=named)
-
-
-def _stated_by_a_person(trace: TraceLog) -> bool:
-    """Whether a trace is the beta column of a table, whose source nobody but a person can tell."""
-    return trace.stream == "beta" and trace.source == "table"
-
-
-def _stated_by(by_upload: str | None, by_settings: str | None) -> str:
-    """Who stated a unit or a source."""
-    if by_upload:
-        return "as stated with the upload"
-    return "as the participant's settings say" if by_settings else "because nobody stated one"
 
 
 def _harmless_name(name: str, kind: str) -> str:

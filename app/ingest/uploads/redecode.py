@@ -16,10 +16,11 @@ from sqlalchemy.orm import Session
 from app.ingest import repository
 from app.ingest.models import UploadFile
 from app.ingest.sessions import in_milliamperes
+from app.ingest.stated_beta import name_beta
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading, recordings
 from app.ingest.uploads.reading import ReaderFault
-from app.ingest.uploads.receiving import TABLES, name_beta
+from app.ingest.uploads.receiving import TABLES
 from app.ingest.uploads.service import options_of_file, stated_beta
 from app.platform import files
 from app.platform.database import transaction
@@ -27,6 +28,7 @@ from app.platform.errors import NotFound
 from app.platform.jobs.children.child import places
 from app.study import repository as study
 from app.study.models import Participant, Recording, StudySession, Trace
+from app.study.outcomes import repository as outcomes
 from app.study.traces import AMPLITUDE_STREAM, unpack
 from ml.formats.recording import DECODE_VERSION, DecodedFile, RecordingLog, UndecodableFile
 
@@ -135,9 +137,9 @@ def _outcomes_again(db: Session, file: UploadFile, decoded: DecodedFile) -> list
 
 def _outcomes(db: Session, file: UploadFile) -> list[tuple[object, ...]]:
     """All that reading an outcome file again can change: its minutes, its grasp tests, and the QoCs of the participant's sessions."""
-    series = study.tremor_series_of_file(db, file.participant_id, file.id)
+    series = outcomes.tremor_series_of_file(db, file.participant_id, file.id)
     minutes = (series.n, series.start_unix_s_f64, series.duration_s_f64, series.fractions_f32, series.any_tremor_f32) if series else ()
-    tests = [(t.session_id, t.hand, t.open_fist_s_f64, tuple(t.implausible)) for t in study.grasp_tests_of_file(db, file.id)]
+    tests = [(t.session_id, t.hand, t.open_fist_s_f64, tuple(t.implausible)) for t in outcomes.grasp_tests_of_file(db, file.id)]
     revisions = [(s.id, len(s.qocs)) for s in study.sessions_of_participant(db, file.participant_id)]
     return [minutes, *tests, *revisions]
 

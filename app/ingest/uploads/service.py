@@ -14,14 +14,15 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.ingest import repository, sessions, wording
 from app.ingest.models import Upload, UploadFile
-from app.ingest.proposals import service as proposals
+from app.ingest.proposals import making
 from app.ingest.repository import GRASP_KIND
 from app.ingest.sessions import StatedSession
+from app.ingest.stated_beta import BetaStated
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading
 from app.ingest.uploads.in_progress import in_progress, tell_file
 from app.ingest.uploads.incoming import Incoming, arrange
-from app.ingest.uploads.receiving import LETHAL, BetaStated, FileOutcome, Receiver
+from app.ingest.uploads.receiving import LETHAL, FileOutcome, Receiver
 from app.ingest.uploads.reports import alike_together, known_recordings, store_reports, stored_reports, unreadable_members
 from app.platform import files
 from app.platform.errors import BetaloopError, Conflict, Invalid, TooLarge
@@ -240,11 +241,11 @@ def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) ->
     with_recordings = [f for f in outcome.files if f.recordings]
     known = {r.id: list(study.session_ids_of_recording(db, r.id)) for f in with_recordings for r in f.recordings}
     fresh = {r.id: r for f in with_recordings for r in f.recordings if not known[r.id]}
-    created: list[proposals.NewSession] = []
+    created: list[making.NewSession] = []
     trouble = ""
     try:
         with db.begin_nested():
-            created = proposals.make_sessions(db, outcome.participant, outcome.upload, list(fresh.values()), stated)
+            created = making.make_sessions(db, outcome.participant, outcome.upload, list(fresh.values()), stated)
     except Exception as fault:
         # the recordings are stored and safe; a fault of ours must not turn a whole upload away
         log.error("sessions could not be made", upload=outcome.upload.id, places=places(fault))

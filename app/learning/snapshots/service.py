@@ -30,6 +30,7 @@ from app.study import service as study
 from app.study.characteristics.models import CharacteristicsVersion
 from app.study.doses.since import hours_since_dose
 from app.study.models import Hemisphere, Participant, SettingsVersion, StudySession
+from app.study.sessions import repository as session_repository
 from app.study.sessions.data import session_data
 from app.study.sessions.programming import Program, differences, stored
 from app.study.sessions.repeated import counts_elsewhere
@@ -136,7 +137,7 @@ def collect(db: Session, participant: Participant) -> Collection:
     suggestion = suggest_xi_beta(db, participant, SYSTEM) if version.xi_beta is None else None
     settings = mdp_settings(version, suggestion)
     sessions = [s for s in study_repository.sessions_of_participant(db, participant.id) if s.status == "confirmed"]
-    placeless = study_repository.repeated_sessions(db, participant.id)
+    placeless = session_repository.repeated_sessions(db, participant.id)
     twice = {s.id for s in sessions if s.id in placeless and counts_elsewhere(db, s)}
     traces = traces_of(db, sessions)
     read = [_read(db, s, version, traces) if s.id not in twice else Member(s, None, None, REPEATED) for s in sessions]

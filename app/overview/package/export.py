@@ -31,8 +31,8 @@ from app.study.characteristics.schemas import CharacteristicsOut
 from app.study.doses.drugs import Drug, levodopa_equivalent_mg
 from app.study.doses.since import hours_since_dose
 from app.study.models import Participant
-from app.study.schemas import SettingsOut
 from app.study.sessions.data import session_data
+from app.study.settings.schemas import SettingsOut
 from ml.statistics.within_visits.contrasts import Average
 
 

@@ -8,15 +8,14 @@ import typer
 
 from app.accounts.permissions import SYSTEM
 from app.platform.database import transaction
-
-ACTOR = "command line"
+from app.platform.terminal import ACTOR, AsJson, Code
 
 
 def next_generation(
-    code: Annotated[str, typer.Argument(help="Code of the participant, e.g. P1.")],
+    code: Code,
     preset: Annotated[Literal["full", "quick"], typer.Option(help="'full' for a study, 'quick' for a first look.")] = "full",
     wait: Annotated[bool, typer.Option(help="Show progress until the job has ended.")] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Go on from what did best in its sessions, train fresh policies beside it, distil, evaluate, rank. A worker must be running."""
     from app.pipeline.next_generation.service import start

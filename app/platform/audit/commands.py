@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
-from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from app.platform.audit.chain import Break, BreakKind, Verified, seal, verify
 from app.platform.database import new_session, transaction
+from app.platform.terminal import ACTOR, AsJson, print_line, show
 
 app = typer.Typer(no_args_is_help=True, help="The audit trail.")
-
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 @app.command("verify", epilog="Example: betaloop audit verify")
@@ -22,7 +18,7 @@ def verify_(as_json: AsJson = False) -> None:
     """Compute the hash chain of the audit trail again and hold its seals against it; exit code 1 where it is broken."""
     with new_session() as db:
         found = verify(db)
-    _print(json.dumps(asdict(found) | {"whole": found.whole}) if as_json else "\n".join(sentences(found)))
+    show(asdict(found) | {"whole": found.whole}, as_json, "\n".join(sentences(found)))
     if not found.whole:
         raise typer.Exit(1)
 
@@ -30,9 +26,9 @@ def verify_(as_json: AsJson = False) -> None:
 @app.command("seal", epilog="Example: betaloop audit seal")
 def seal_() -> None:
     """Seal the chain at its end now; the service does so once a minute."""
-    with transaction("command line") as db:
+    with transaction(ACTOR) as db:
         place = seal(db)
-    _print(f"The audit trail is sealed up to link {place}." if place else "The audit trail is empty.")
+    print_line(f"The audit trail is sealed up to link {place}." if place else "The audit trail is empty.")
 
 
 def sentences(found: Verified) -> list[str]:
@@ -54,7 +50,3 @@ def _sentence(b: Break) -> str:
         BreakKind.CUT_OFF: f"link {b.position} was sealed and is gone: the end of the trail was cut off",
         BreakKind.TRIGGER_OFF: f"table {b.table}: a trigger of the trail is missing or switched off",
     }[b.kind]
-
-
-def _print(line: str) -> None:
-    Console(soft_wrap=True, highlight=False, markup=False).print(line)

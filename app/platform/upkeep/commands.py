@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -10,13 +9,13 @@ import typer
 
 from app.platform.database import database_place
 from app.platform.migrate import migrate as bring_up_to_date
+from app.platform.terminal import AsJson, print_line, show
 from app.platform.upkeep import backup as backups
 from app.platform.upkeep.doctor import examine
 from app.settings import get_settings
 
 app = typer.Typer(no_args_is_help=True)
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 KeyFile = Annotated[
     Path, typer.Option(help="File with the key of the backup (`betaloop backup-key`); neither beside it nor in the data folder.")
 ]
@@ -26,7 +25,7 @@ KeyFile = Annotated[
 def migrate() -> None:
     """Bring the database to the newest schema."""
     bring_up_to_date()
-    _print("The database is up to date.")
+    print_line("The database is up to date.")
 
 
 @app.command(epilog="Example: betaloop where")
@@ -35,14 +34,14 @@ def where(as_json: AsJson = False) -> None:
     data_dir = get_settings().data_dir.resolve()
     result = {"data_folder": str(data_dir), "database": database_place()}
     result |= {"files": str(data_dir / "files"), "keys": str(data_dir / "secrets")}
-    _print(json.dumps(result) if as_json else "\n".join(f"{name.replace('_', ' ')}: {value}" for name, value in result.items()))
+    show(result, as_json, "\n".join(f"{name.replace('_', ' ')}: {value}" for name, value in result.items()))
 
 
 @app.command("backup-key", epilog="Example: betaloop backup-key /media/key/betaloop.key")
 def backup_key(path: Annotated[Path, typer.Argument(help="New file for the key.")]) -> None:
     """Make a key for backups. Without it no backup can be opened: keep a second copy of it."""
     backups.make_key(path)
-    _print(f"{path}: keep it apart from the backups, and a second copy of it elsewhere.")
+    print_line(f"{path}: keep it apart from the backups, and a second copy of it elsewhere.")
 
 
 @app.command(epilog="Example: betaloop backup /mnt/backups/2026-11-22 --key-file /media/key/betaloop.key")
@@ -50,7 +49,7 @@ def backup(folder: Annotated[Path, typer.Argument(help="New folder for the backu
     """Back up database, stored files and keys, encrypted; the service may go on meanwhile."""
     manifest = backups.backup(folder, key_file)
     size = sum(part["bytes"] for part in manifest["parts"].values())
-    _print(json.dumps(manifest) if as_json else f"{folder}: {manifest['files']} stored files, {size / (1 << 20):.1f} MiB, encrypted.")
+    show(manifest, as_json, f"{folder}: {manifest['files']} stored files, {size / (1 << 20):.1f} MiB, encrypted.")
 
 
 @app.command(epilog="Example: betaloop restore /mnt/backups/2026-11-22 --key-file /media/key/betaloop.key")
@@ -58,9 +57,7 @@ def restore(folder: Annotated[Path, typer.Argument(help="Folder of the backup.")
     """Bring a backup back into an empty installation, and check every stored file. Stop the service first."""
     done = backups.restore(folder, key_file)
     result = {"made_at": done.made_at, "files": done.files, "rows": done.tables}
-    _print(
-        json.dumps(result) if as_json else f"Restored the backup of {done.made_at}: {sum(done.tables.values())} rows, {done.files} files."
-    )
+    show(result, as_json, f"Restored the backup of {done.made_at}: {sum(done.tables.values())} rows, {done.files} files.")
 
 
 @app.command(epilog="Example: betaloop doctor --hashes")
@@ -70,13 +67,7 @@ def doctor(
 ) -> None:
     """Look whether the installation is in order: database, files, jobs, disk, clock. Exit code 1 where something is not."""
     findings = examine(hashes)
-    if as_json:
-        _print(json.dumps([vars(f) for f in findings]))
-    else:
-        _print("\n".join(f"{'ok  ' if f.ok else 'FAIL'} {f.name}: {f.detail}{'. ' + f.hint if f.hint else ''}" for f in findings))
+    lines = (f"{'ok  ' if f.ok else 'FAIL'} {f.name}: {f.detail}{'. ' + f.hint if f.hint else ''}" for f in findings)
+    show([vars(f) for f in findings], as_json, "\n".join(lines))
     if not all(f.ok for f in findings):
         raise typer.Exit(1)
-
-
-def _print(text: str) -> None:
-    print(text)  # noqa: T201

@@ -17,8 +17,8 @@ from app.platform.web.templates import render
 from app.study import repository
 from app.study.enrolment import service
 from app.study.enrolment.schemas import ParticipantIn
-from app.study.schemas import SettingsIn
 from app.study.settings import form
+from app.study.settings.schemas import SettingsIn
 
 router = APIRouter()
 

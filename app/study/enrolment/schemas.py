@@ -7,7 +7,8 @@ from typing import Literal
 from pydantic import Field
 
 from app.platform.web.schemas import Bool, Model, Text
-from app.study.schemas import Code, SettingsIn
+from app.study.schemas import Code
+from app.study.settings.schemas import SettingsIn
 from app.study.usual.values import SURE
 
 

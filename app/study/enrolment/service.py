@@ -13,8 +13,9 @@ from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import repository, wording
 from app.study.enrolment import codes
 from app.study.enrolment.schemas import ParticipantIn
+from app.study.margins.models import MarginsVersion
 from app.study.margins.schemas import MarginsFields
-from app.study.models import MarginsVersion, Participant
+from app.study.models import Participant
 from app.study.service import add_settings
 from app.study.usual.questions import require_sure
 

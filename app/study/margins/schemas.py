@@ -7,7 +7,7 @@ from datetime import datetime
 from pydantic import ConfigDict, Field, ValidationInfo, field_validator
 
 from app.platform.web.schemas import Int, Model, Number, Text
-from app.study.schemas import Bound, published
+from app.study.settings.schemas import Bound, published
 
 BOUNDS = {
     "grasp_share": Bound(0.01, 0.5, "of the grasp frequency under cDBS"),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from app.study.margins.models import MarginsLock
 from app.study.margins.schemas import MarginsLockOut
-from app.study.models import MarginsLock
 
 
 def lock_out(lock: MarginsLock) -> MarginsLockOut:

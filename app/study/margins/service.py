@@ -10,8 +10,9 @@ from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import service as study
+from app.study.margins.models import MarginsLock, MarginsVersion
 from app.study.margins.schemas import MarginsIn
-from app.study.models import MarginsLock, MarginsVersion, Participant
+from app.study.models import Participant
 from ml.qoc import Margins
 
 

@@ -19,6 +19,7 @@ from app.platform.database import set_reason
 from app.platform.errors import Invalid
 from app.study import repository
 from app.study.models import Hemisphere, QocRevision, StudySession
+from app.study.outcomes import repository as of_files
 from app.study.outcomes import tremor
 from app.study.outcomes import values as outcome_values
 from app.study.outcomes.models import GraspTest, TremorSeries
@@ -70,7 +71,7 @@ def store_tremor(
         ValueError: shapes that do not agree, a minute without time or length.
     """
     minutes = _in_order(start_unix_s, duration_s, fractions, any_tremor)
-    before = repository.tremor_series_of_file(db, participant_id, upload_file_id)
+    before = of_files.tremor_series_of_file(db, participant_id, upload_file_id)
     spans = [(before.first_start_at, before.last_end_at)] if before else []
     if minutes.start_unix_s.size == 0:
         if before is not None:
@@ -83,7 +84,7 @@ def store_tremor(
     db.flush()
     spans.append((row.first_start_at, row.last_end_at))
     said = [f"{row.n} minutes of tremor from {_when(row.first_start_at)} to {_when(row.last_end_at)} UTC are kept."]
-    others = repository.tremor_series(db, participant_id, row.first_start_at, row.last_end_at, but_file_id=upload_file_id)
+    others = of_files.tremor_series(db, participant_id, row.first_start_at, row.last_end_at, but_file_id=upload_file_id)
     same, different = tremor.compare(minutes, others)
     if same or different:
         said.append(
@@ -125,7 +126,7 @@ def store_grasp(
         raise ValueError("times of open fists must be numbers that increase")
     said = _take_from_other_sessions(db, session, upload_file_id)
     side = Hemisphere(hand) if hand else None
-    known = (t for t in repository.grasp_tests(db, session.id) if t.upload_file_id == upload_file_id and t.hand == side)
+    known = (t for t in of_files.grasp_tests(db, session.id) if t.upload_file_id == upload_file_id and t.hand == side)
     row = next(known, None) or GraspTest(session_id=session.id, upload_file_id=upload_file_id, hand=side)
     row.n, row.open_fist_s_f64, row.implausible = times.size, times.astype("<f8").tobytes(), marks.tolist()
     db.add(row)
@@ -243,7 +244,7 @@ def _add_revision(db: Session, session: StudySession, changed: Sequence[Derived]
 def _take_from_other_sessions(db: Session, session: StudySession, upload_file_id: int) -> list[str]:
     """A file that was attached to the wrong session leaves no value behind there."""
     said = []
-    elsewhere = [t for t in repository.grasp_tests_of_file(db, upload_file_id) if t.session_id != session.id]
+    elsewhere = [t for t in of_files.grasp_tests_of_file(db, upload_file_id) if t.session_id != session.id]
     for row in elsewhere:
         db.delete(row)
     db.flush()

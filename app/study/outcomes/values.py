@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 from app.study import repository
 from app.study.characteristics.models import CharacteristicsVersion
 from app.study.models import Hemisphere, StudySession
+from app.study.outcomes import repository as of_files
 from app.study.outcomes import tremor
 from app.study.outcomes.models import GraspTest
 from app.study.outcomes.tremor import SessionMinutes
@@ -116,7 +117,7 @@ def tremor_outcome(db: Session, session: StudySession) -> TremorOutcome | None:
         return None
     start = session.started_at.timestamp()
     stop_at = session.started_at + timedelta(seconds=session.duration_s)
-    series = repository.tremor_series(db, session.visit.participant_id, session.started_at, stop_at)
+    series = of_files.tremor_series(db, session.visit.participant_id, session.started_at, stop_at)
     uploads = repository.uploads_of_files(db, [s.upload_file_id for s in series])
     names = {file: f"upload {upload}" for file, upload in uploads.items()}
     chosen = tremor.within(series, start, start + session.duration_s, names)
@@ -153,7 +154,7 @@ def grasp_outcome(db: Session, session: StudySession) -> GraspOutcome | None:
     with the symptoms, as in the paper. A test of the other hand alone gives no value until a person enters it. Only where nobody has
     stated the hand, the one contralateral to the session's hemisphere is taken, else the mean of both.
     """
-    rows = repository.grasp_tests(db, session.id)
+    rows = of_files.grasp_tests(db, session.id)
     if not rows:
         return None
     newest = {row.hand: row for row in rows}

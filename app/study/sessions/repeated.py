@@ -7,9 +7,9 @@ from datetime import datetime, timedelta
 from sqlalchemy.orm import Session
 
 from app.platform.errors import Conflict
-from app.study import repository
 from app.study.models import SessionSegment, StudySession
-from app.study.repository import SameMinutes
+from app.study.sessions import repository
+from app.study.sessions.repository import SameMinutes
 
 
 def others(db: Session, session: StudySession) -> list[SameMinutes]:

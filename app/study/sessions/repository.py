@@ -1,16 +1,19 @@
-"""Queries of sessions: which rows what they hold is made of, in which version; and which session of a plan they are."""
+"""Queries of sessions: which rows what they hold is made of, in which version; which session of a plan they are; repeated minutes."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
+from datetime import datetime
 from typing import Any, NamedTuple
 
-from sqlalchemy import Select, String, cast, column, func, literal, literal_column, select, table, union_all
+from sqlalchemy import Select, String, cast, column, func, literal, literal_column, or_, select, table, true, union_all
 from sqlalchemy.dialects.postgresql import aggregate_order_by
 from sqlalchemy.orm import Session
 
 from app.study.models import CdbsAmplitude, QocRevision, Recording, SessionSegment, SettingsVersion, StudySession, Trace, Visit
-from app.study.sessions.models import SessionConditions
+from app.study.repository import CONFIRMED
+from app.study.sessions.models import CountedTime, SessionConditions
 
 
 def fingerprints(db: Session, participant_ids: Collection[int]) -> dict[int, str]:
@@ -84,3 +87,57 @@ def other_ratings(db: Session, session: StudySession) -> list[float]:
     revisions = select(QocRevision.session_id, QocRevision.rating).join(StudySession, StudySession.id == QocRevision.session_id).where(mine)
     newest = {row.session_id: row.rating for row in db.execute(revisions.order_by(QocRevision.revision))}
     return [float(rating) for rating in newest.values() if rating is not None]
+
+
+SLACK_S = 2.0
+"""Two stretches of one device are the same minutes where they share more than this: clocks of consecutive recordings are not exact."""
+
+
+@dataclass(frozen=True)
+class SameMinutes:
+    """A session that holds minutes of a device which another one holds too.
+
+    Attributes:
+        recording_id: its own recording of them. seconds: how long both are. counts: whether it is confirmed and not excluded.
+    """
+
+    session_id: int
+    recording_id: int
+    seconds: float
+    counts: bool
+
+
+def same_minutes(db: Session, recording: Recording, begin: datetime, end: datetime, besides: int | None) -> list[SameMinutes]:
+    """Sessions controlled by a recording's device and side within [begin, end], in another recording, by number.
+
+    Args:
+        recording: one of no known side is of both. besides: a session that is not asked for.
+    """
+    own_side = true() if recording.hemisphere is None else or_(Recording.hemisphere.is_(None), Recording.hemisphere == recording.hemisphere)
+    first = Recording.started_at + func.make_interval(0, 0, 0, 0, 0, 0, SessionSegment.start_s)
+    last = Recording.started_at + func.make_interval(0, 0, 0, 0, 0, 0, SessionSegment.stop_s)
+    shared = func.extract("epoch", func.least(last, end) - func.greatest(first, begin))
+    counts = CONFIRMED & StudySession.excluded_reason.is_(None)
+    query = (
+        select(StudySession.id, Recording.id, shared, counts)
+        .join(SessionSegment, SessionSegment.session_id == StudySession.id)
+        .join(Recording, Recording.id == SessionSegment.recording_id)
+        .where(Recording.device_id == recording.device_id, Recording.id != recording.id, own_side, SessionSegment.is_control)
+        .where(shared > SLACK_S, StudySession.id != (besides or 0))
+        .order_by(StudySession.id)
+    )
+    return [SameMinutes(i, r, float(seconds), bool(counting)) for i, r, seconds, counting in db.execute(query)]
+
+
+def repeated_sessions(db: Session, participant_id: int) -> set[int]:
+    """Sessions that count by a device's clock and have no place of their own in `counted_time`: another one had their minutes before."""
+    query = (
+        select(StudySession.id)
+        .join(StudySession.visit)
+        .join(SessionSegment, SessionSegment.session_id == StudySession.id)
+        .join(Recording, Recording.id == SessionSegment.recording_id)
+        .outerjoin(CountedTime, (CountedTime.session_id == StudySession.id) & (CountedTime.recording_id == Recording.id))
+        .where(Visit.participant_id == participant_id, CONFIRMED, StudySession.excluded_reason.is_(None), SessionSegment.is_control)
+        .where(Recording.started_at.is_not(None), CountedTime.session_id.is_(None))
+    )
+    return set(db.scalars(query))

@@ -15,7 +15,8 @@ from app.study import blinding, repository, service
 from app.study.enrolment import service as enrolment
 from app.study.enrolment.schemas import ParticipantIn
 from app.study.models import Controller, Device, Hemisphere, Recording, SessionSegment, StudySession, Trace
-from app.study.schemas import SettingsIn, VisitIn
+from app.study.schemas import VisitIn
+from app.study.settings.schemas import SettingsIn
 from app.study.traces import pack
 
 START = datetime(2026, 3, 2, 9, 0, tzinfo=UTC)

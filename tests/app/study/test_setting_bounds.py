@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.database import transaction
 from app.study.models import CdbsAmplitude, Participant, SettingsVersion
-from app.study.schemas import SETTING_BOUNDS, SettingsFields
+from app.study.settings.schemas import SETTING_BOUNDS, SettingsFields
 from tests.app.conftest import Upload
 
 HTML = {"Accept": "text/html", "Sec-Fetch-Site": "same-origin"}

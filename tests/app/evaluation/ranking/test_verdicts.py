@@ -11,7 +11,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.evaluation.ranking.decisions import Circumstances, decide
-from app.study.models import MarginsVersion
+from app.study.margins.models import MarginsVersion
 from tests.app.evaluations import judged
 from tests.app.words import above_fold, methods_named
 from tests.ml.ope.posterior.draws import N, cdbs, share
