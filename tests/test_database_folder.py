@@ -1,0 +1,37 @@
+"""Where the databases of the tests lie: in memory where there is room, and nothing of a killed run stays there."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import tests.conftest as suite
+
+
+def test_databases_lie_in_memory_where_there_is_room(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(suite, "ROOM_IN_MEMORY", 1)
+    folder = suite.database_folder(tmp_path_factory, tmp_path)
+    assert folder.parent == tmp_path
+    assert folder.stat().st_mode & 0o777 == 0o711
+    monkeypatch.setattr(suite, "ROOM_IN_MEMORY", 1 << 60)
+    assert suite.database_folder(tmp_path_factory, tmp_path).parent != tmp_path
+    assert suite.database_folder(tmp_path_factory, tmp_path / "nowhere").is_dir()
+
+
+def test_what_a_killed_run_left_in_memory_goes(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(suite, "ROOM_IN_MEMORY", 1)
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    left, used = (tmp_path / f"betaloop-tests-{pid}-x" for pid in (ended.pid, os.getpid()))
+    for folder in (left, used):
+        (folder / "postgres").mkdir(parents=True)
+    suite.database_folder(tmp_path_factory, tmp_path)
+    assert not left.exists()
+    assert used.exists()
