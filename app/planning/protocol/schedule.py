@@ -105,11 +105,6 @@ class PlannedSession:
     washout_minutes: float
     break_minutes: float = 0.0
 
-    @property
-    def end_minute(self) -> float:
-        """When it ends, before its washout."""
-        return self.start_minute + self.minutes
-
 
 def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[PlannedSession]:
     """Lay out a visit day: the policies in the order that the rules ask for, a cDBS session between any two of their sessions.

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.planning.plans.models import Plan, PlanItem
 from app.planning.visit_day.models import DayEntry
-from app.planning.visit_day.record import SlotOutcome, SlotTimes, outcomes_of, times_of
+from app.planning.visit_day.record import SlotTimes, times_of
 from app.study.repository import count
 
 
@@ -49,8 +49,3 @@ def lock_plan(db: Session, plan_id: int) -> None:
 def slot_times(db: Session, plan_id: int) -> dict[int, SlotTimes]:
     """When each session of a plan ran, by its id in the plan; sessions of which nothing was entered are left out."""
     return times_of(entries(db, plan_id))
-
-
-def slot_outcomes(db: Session, plan_id: int) -> dict[int, SlotOutcome]:
-    """What was entered about the last attempt of each session of a plan, by its id in the plan."""
-    return outcomes_of(entries(db, plan_id))

@@ -16,8 +16,6 @@ from app.study.characteristics.schemas import PlannedDose
 from app.study.doses.drugs import Drug
 
 MOST_TAPS = 200
-TEST_S = 10.0
-"""Length of the grasp test, s."""
 _LONGEST_OFFSET_MS = 10**13  # a tablet whose battery was empty may wake in 1970, and what it holds must be taken all the same
 
 

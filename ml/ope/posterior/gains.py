@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ml.ope.compare.gain import gain_over
-from ml.ope.compare.selection import surest
 from ml.ope.posterior.estimator import build
 from ml.policies.policy import ConstantPolicy, Policy
 from ml.progress import Report, silent
@@ -51,8 +50,3 @@ def gains_over_cdbs(
             found[name] = PosteriorGain(gain_over(one, cdbs), one.supported, bool(one.details["skill"]["told"]))
         report(len(found) / len(names), "estimating gains over cDBS")
     return found
-
-
-def preferred(gains: Mapping[str, PosteriorGain]) -> str | None:
-    """Name of the supported policy with the largest lower bound of its gain; None where none lies above 0, or no order can be told."""
-    return surest({name: one.gain for name, one in gains.items() if one.told and one.supported})

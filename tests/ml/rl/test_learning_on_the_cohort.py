@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from ml.ope.compare.selection import surest
 from ml.ope.fqe.score import fqe_value
 from ml.ope.posterior.gains import gains_over_cdbs
-from ml.ope.posterior.gains import preferred as preferred_policy
 from ml.policies.from_buffer import best_constant
 from ml.policies.logged_range import stays_in_range
 from ml.policies.policy import ConstantPolicy
@@ -110,7 +110,7 @@ def test_the_best_of_six_against_continuous_random_and_constant_stimulation(part
     level = max(constants, key=lambda a: constants[a].mean())
     chosen_constant = best_constant(score, CONSTANTS).policy.amplitude
     gains = gains_over_cdbs(buffer, {str(k): one.training.policy for k, one in enumerate(six)})
-    name = preferred_policy(gains)
+    name = surest({key: one.gain for key, one in gains.items() if one.told and one.supported})
     preferred = None if name is None else six[int(name)]
     best = max(six, key=lambda one: one.returns.mean())
 

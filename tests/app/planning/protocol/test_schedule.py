@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.planning.protocol.schedule import Candidate, Rule, Rules, most_policies, schedule, total_minutes
+from app.planning.protocol.schedule import Candidate, PlannedSession, Rule, Rules, most_policies, schedule, total_minutes
 from app.planning.protocol.session_order import Order
 from app.platform.errors import Invalid
 from app.study.models import Controller
@@ -33,6 +33,11 @@ rules = st.builds(
 )
 
 
+def end_minute(session: PlannedSession) -> float:
+    """When it ends, before its washout."""
+    return session.start_minute + session.minutes
+
+
 @given(candidates, rules, st.integers(0, 2**31 - 1))
 def test_every_day_that_is_laid_out_keeps_every_rule(chosen: list[Candidate], rules: Rules, seed: int) -> None:
     if most_policies(rules) < len(chosen):
@@ -52,13 +57,13 @@ def test_every_day_that_is_laid_out_keeps_every_rule(chosen: list[Candidate], ru
     assert not rules.no_dbs or day[-1].controller is Controller.NO_DBS
     assert day[0].start_minute == 0
     for one, two in pairwise(day):
-        assert two.start_minute == pytest.approx(one.end_minute + rules.washout_minutes + one.break_minutes)
+        assert two.start_minute == pytest.approx(end_minute(one) + rules.washout_minutes + one.break_minutes)
     assert sum(s.break_minutes for s in day) == (rules.break_minutes if len(day) > 1 else 0)
     assert day[-1].break_minutes == 0
     assert all(5 <= s.minutes <= 20 for s in day)
     assert day[-1].washout_minutes == 0
-    assert day[-1].end_minute <= rules.total_minutes + 1e-6
-    assert day[-1].end_minute == pytest.approx(total_minutes(len(chosen), rules))
+    assert end_minute(day[-1]) <= rules.total_minutes + 1e-6
+    assert end_minute(day[-1]) == pytest.approx(total_minutes(len(chosen), rules))
     assert schedule(chosen, rules, seed) == day
 
 
@@ -66,7 +71,7 @@ def test_four_policies_as_in_the_paper_take_a_hundred_minutes() -> None:
     day = schedule([Candidate(i, Controller.RL) for i in range(4)], Rules(), seed=7)
     assert [s.controller for s in day] == ["rl", "cdbs", "rl", "cdbs", "rl", "cdbs", "rl"]
     assert [s.start_minute for s in day] == [0, 15, 30, 45, 60, 75, 90]
-    assert day[-1].end_minute == 100
+    assert end_minute(day[-1]) == 100
 
 
 def test_a_single_policy_has_its_cdbs_control_too() -> None:
@@ -104,7 +109,7 @@ def test_the_same_policy_twice_and_none_at_all_are_refused() -> None:
 def test_an_early_visit_without_policies_is_random_sessions_after_one_of_cdbs() -> None:
     day = schedule([], Rules(random_sessions=3, no_dbs=True), seed=3)
     assert [s.controller for s in day] == ["cdbs", "random", "random", "random", "no_dbs"]
-    assert day[-1].end_minute == pytest.approx(total_minutes(0, Rules(random_sessions=3, no_dbs=True)))
+    assert end_minute(day[-1]) == pytest.approx(total_minutes(0, Rules(random_sessions=3, no_dbs=True)))
     with pytest.raises(Invalid, match=r"The random sessions .* take 130 minutes") as refusal:
         schedule([], Rules(random_sessions=8), seed=3)
     assert refusal.value.hint.startswith("Plan fewer random sessions, or shorten sessions or washout")
@@ -137,4 +142,4 @@ def test_policies_are_repeated_within_a_visit_in_whole_rounds() -> None:
     assert sorted(tested[:2]) == sorted(tested[2:]) == [1, 2]
     assert tested[:2] != tested[2:], "the second round takes the square's next row"
     assert [s.break_minutes for s in day] == [0, 0, 0, 15, 0, 0, 0]
-    assert day[-1].end_minute == total_minutes(2, Rules(repeats=2, break_minutes=15)) == 7 * 10 + 6 * 5 + 15
+    assert end_minute(day[-1]) == total_minutes(2, Rules(repeats=2, break_minutes=15)) == 7 * 10 + 6 * 5 + 15

@@ -11,7 +11,8 @@ from sqlalchemy import text
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
-from app.planning.visit_day.repository import slot_outcomes, slot_times
+from app.planning.visit_day.record import SlotOutcome, outcomes_of
+from app.planning.visit_day.repository import entries, slot_times
 
 TAPS = {
     "method": "taps",
@@ -20,6 +21,11 @@ TAPS = {
     "began_at": "2026-11-22T10:10:00Z",
     "ended_at": "2026-11-22T10:10:10Z",
 }
+
+
+def slot_outcomes(db: Session, plan_id: int) -> dict[int, SlotOutcome]:
+    """What was entered about the last attempt of each session of a plan, by its id in the plan."""
+    return outcomes_of(entries(db, plan_id))
 
 
 def at(second: float) -> str:
