@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support.null_worlds import METRICS, MINUTES, WORLDS, World, latent, layout, measure, metric_average
+from support.null_worlds import METRICS, MINUTES, WORLDS, Tally, World, latent, layout, measure, metric_average
 
 from ml.statistics.association import within_visits
 from ml.statistics.effects import cliffs_delta, energy_saving
@@ -51,48 +51,6 @@ def naive(data: Measurements) -> tuple[bool | None, bool | None]:
     if isinstance(result, Unavailable):
         return None, None
     return result.p_value < ALPHA, result.low <= 0 <= result.high
-
-
-class Tally:
-    """Shares of studies, each with its number."""
-
-    def __init__(self) -> None:
-        self.counts: dict[tuple[str, ...], list[int]] = {}
-
-    def add(self, key: tuple[str, ...], hit: bool | None) -> None:
-        if hit is not None:
-            cell = self.counts.setdefault(key, [0, 0])
-            cell[0] += int(hit)
-            cell[1] += 1
-
-    def merge(self, other: Tally) -> None:
-        for key, (hits, number) in other.counts.items():
-            cell = self.counts.setdefault(key, [0, 0])
-            cell[0] += hits
-            cell[1] += number
-
-    def write(self, path: Path) -> None:
-        """Whole or not at all."""
-        draft = path.with_suffix(".part")
-        draft.write_text(json.dumps([[*key, *counts] for key, counts in self.counts.items()]))
-        draft.replace(path)
-
-    @classmethod
-    def read(cls, path: Path) -> Tally:
-        """What `write` wrote."""
-        tally = cls()
-        tally.counts = {tuple(row[:-2]): row[-2:] for row in json.loads(path.read_text())}
-        return tally
-
-    def share(self, *key: str) -> tuple[float, int]:
-        hits, number = self.counts.get(key, [0, 0])
-        return (hits / number if number else float("nan")), number
-
-    def pooled(self, name: str, metrics: tuple[str, ...], label: str) -> tuple[float, int]:
-        """Over metrics that follow the same law."""
-        cells = [self.counts.get((name, m, label), [0, 0]) for m in metrics]
-        number = sum(c[1] for c in cells)
-        return (sum(c[0] for c in cells) / number if number else float("nan")), number
 
 
 def error(number: int, level: float = ALPHA) -> float:

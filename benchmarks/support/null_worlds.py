@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -121,3 +123,45 @@ def metric_average(world: World, metric: str, visits: int = 20_000, seed: int = 
     value = measure(metric, latent(many, 0.0, rng, design), design, many, rng).value
     means = [np.bincount(visit, value * arm) / np.bincount(visit, arm) for arm in (tested.astype(float), (~tested).astype(float))]
     return float(np.mean(means[0] - means[1]))
+
+
+class Tally:
+    """Shares of studies, each with its number."""
+
+    def __init__(self) -> None:
+        self.counts: dict[tuple[str, ...], list[int]] = {}
+
+    def add(self, key: tuple[str, ...], hit: bool | None) -> None:
+        if hit is not None:
+            cell = self.counts.setdefault(key, [0, 0])
+            cell[0] += int(hit)
+            cell[1] += 1
+
+    def merge(self, other: Tally) -> None:
+        for key, (hits, number) in other.counts.items():
+            cell = self.counts.setdefault(key, [0, 0])
+            cell[0] += hits
+            cell[1] += number
+
+    def write(self, path: Path) -> None:
+        """Whole or not at all."""
+        draft = path.with_suffix(".part")
+        draft.write_text(json.dumps([[*key, *counts] for key, counts in self.counts.items()]))
+        draft.replace(path)
+
+    @classmethod
+    def read(cls, path: Path) -> Tally:
+        """What `write` wrote."""
+        tally = cls()
+        tally.counts = {tuple(row[:-2]): row[-2:] for row in json.loads(path.read_text())}
+        return tally
+
+    def share(self, *key: str) -> tuple[float, int]:
+        hits, number = self.counts.get(key, [0, 0])
+        return (hits / number if number else float("nan")), number
+
+    def pooled(self, name: str, metrics: tuple[str, ...], label: str) -> tuple[float, int]:
+        """Over metrics that follow the same law."""
+        cells = [self.counts.get((name, m, label), [0, 0]) for m in metrics]
+        number = sum(c[1] for c in cells)
+        return (sum(c[0] for c in cells) / number if number else float("nan")), number
