@@ -225,11 +225,13 @@ class Installation:
         return found
 
     def left(self) -> list[str]:
-        """Processes that name the data folder, in words."""
+        """Processes that name the data folder, in words; a PostgreSQL of one's own is meant to go on."""
         found = []
         for process in psutil.process_iter():
             with contextlib.suppress(psutil.Error):
                 if process.pid == os.getpid() or process.status() == psutil.STATUS_ZOMBIE:
+                    continue
+                if self.own and process.name().startswith("postgres"):
                     continue
                 words = " ".join([*process.cmdline(), process.environ().get("BETALOOP_DATA_DIR", "")])
                 if str(self.folder) in words or (self.own is None and str(self._embedded().data) in words):
