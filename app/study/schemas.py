@@ -42,7 +42,9 @@ class CdbsAmplitudeModel(CdbsAmplitudeOut):
     amplitude_ma: Annotated[
         Number, AfterValidator(CDBS_MA.check), Field(json_schema_extra={"minimum": CDBS_MA.low, "maximum": CDBS_MA.high})
     ]
-    sure: Bool = Field(False, description="A person has looked at an amplitude outside the usual: it is right.")
+    sure: Bool | None = Field(
+        None, description="True: a person has looked at an amplitude outside the usual. False: ask about one (422). Left out: keep it."
+    )
 
 
 class VisitIn(Model):
@@ -81,7 +83,7 @@ class QocIn(Model):
     rating: Int | None = Field(None, ge=1, le=10, description="The participant's rating, 1-10.")
     tremor_percent: Number | None = Field(None, ge=0, le=100, description="Share of the session with mild or worse tremor, %.")
     reason: Text | None = Field(None, max_length=1000, description="Why, when values are corrected.")
-    sure: list[Literal["grasp_hz", "rating", "tremor_percent"]] = Field(default_factory=list, max_length=3, description=SURE)
+    sure: list[Literal["grasp_hz", "rating", "tremor_percent"]] | None = Field(None, max_length=3, description=SURE)
 
 
 class QocOut(Model):

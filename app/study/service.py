@@ -39,11 +39,11 @@ POLICY_CONTROLLERS = {Controller.RL, Controller.DISTILLED, Controller.OTHER}
 
 
 def change_settings(
-    db: Session, participant: Participant, change: SettingsIn, reason: str | None, caller: Caller, sure: Collection[str] = ()
+    db: Session, participant: Participant, change: SettingsIn, reason: str | None, caller: Caller, sure: Collection[str] | None = None
 ) -> SettingsVersion:
     """Make a new settings version of what the change names; old results keep theirs. No change, no version.
 
-    Raises Unusual for a value outside the usual whose name is not among `sure`.
+    Raises Unusual for a value outside the usual whose name is not among `sure`; without a `sure` nothing is asked.
     """
     require(caller, can.WRITE_SETTINGS, participant)
     current = participant.current_settings
@@ -103,9 +103,9 @@ def _each_once(amplitudes: Sequence[CdbsAmplitudeModel]) -> None:
 
 
 def _asked(amplitude: CdbsAmplitudeModel) -> Question | None:
-    """What there is to ask about an amplitude of a visit; None where it is usual."""
+    """What there is to ask about an amplitude of a visit; None where it is usual, or nobody can be asked."""
     asked = question("cdbs_amplitude_ma", amplitude.amplitude_ma)
-    if asked is None:
+    if asked is None or amplitude.sure is None:
         return None
     side, program = amplitude.hemisphere.value, amplitude.program
     return replace(asked, field="cdbs_amplitudes", hemisphere=side, program=program, confirmed=amplitude.sure)

@@ -77,6 +77,15 @@ def stored(day: ClinicDay) -> list[str]:
     return [e["kind"] for e in day.client.get(f"/api/v1/visits/{day.visit}/day/entries").json()["items"]]
 
 
+def wait_until_stored(watched: Watched, day: ClinicDay, entries: int) -> None:
+    """Wait for so many entries in the record: that none waits on the tablet is true before a tap is taken too."""
+    for _ in range(120):
+        if len(stored(day)) >= entries:
+            return
+        watched.page.wait_for_timeout(250)
+    raise AssertionError(f"{len(stored(day))} of {entries} entries arrived within 30 s")
+
+
 def worker_ready(watched: Watched) -> None:
     """The page can be opened without network from now on."""
     watched.page.evaluate("() => navigator.serviceWorker.ready.then(() => true)")

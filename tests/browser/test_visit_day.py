@@ -17,7 +17,7 @@ from app.accounts.models import Role
 from app.planning.visit_day.schemas import DeviceTime
 from app.platform.database import transaction
 from tests.browser.conftest import FLAGS, PASSWORD, Watched, kill_browser, program
-from tests.browser.day_page import KEPT, fill, once_drawn, open_day, stored, tap, wait_for, worker_ready
+from tests.browser.day_page import KEPT, fill, once_drawn, open_day, stored, tap, wait_for, wait_until_stored, worker_ready
 from tests.clinic_day import ClinicDay, clinic_day
 
 __all__ = ["clinic_day"]
@@ -32,6 +32,7 @@ def test_a_cut_network_and_a_reload_without_it_lose_nothing(window: Callable[...
     open_day(watched, clinic_day)
     worker_ready(watched)
     tap(watched, "start")
+    wait_until_stored(watched, clinic_day, 1)
     wait_for(watched, 0)
     watched.page.context.set_offline(True)
     tap(watched, "rating-7")
@@ -202,6 +203,7 @@ def test_a_tap_is_not_lost_when_something_arrives_under_the_finger(window: Calla
     watched.sign_in()
     open_day(watched, clinic_day)
     tap(watched, "start")
+    wait_until_stored(watched, clinic_day, 1)
     wait_for(watched, 0)
     watched.page.locator("[data-act=stop]").hover()  # waits until the page is drawn, also when it is drawn anew meanwhile
     watched.page.mouse.down()

@@ -21,4 +21,4 @@ class ParticipantIn(Model):
     )
     site: Text | None = Field(None, max_length=40, description="Code of the site; needed when there are several.")
     settings: SettingsIn = Field(default_factory=SettingsIn)
-    sure: list[Literal["cdbs_amplitude_ma"]] = Field(default_factory=list, max_length=1, description=SURE)
+    sure: list[Literal["cdbs_amplitude_ma"]] | None = Field(None, max_length=1, description=SURE)

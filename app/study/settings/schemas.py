@@ -139,4 +139,4 @@ class SettingsChange(Model):
 
     settings: SettingsIn
     reason: Text | None = Field(None, max_length=1000)
-    sure: list[Literal["cdbs_amplitude_ma"]] = Field(default_factory=list, max_length=1, description=SURE)
+    sure: list[Literal["cdbs_amplitude_ma"]] | None = Field(None, max_length=1, description=SURE)

@@ -20,14 +20,17 @@ class Unusual(Invalid):
 
 
 def require_sure(
-    given: Mapping[str, Any], sure: Collection[str], known: object = None, others: Mapping[str, Sequence[float]] | None = None
+    given: Mapping[str, Any], sure: Collection[str] | None, known: object = None, others: Mapping[str, Sequence[float]] | None = None
 ) -> None:
     """Raises Unusual for values outside the usual that nobody has confirmed; those that stand already are not asked about again.
 
     Args:
-        given: name to value. sure: names that a person has confirmed. known: the row with the present values.
+        given: name to value. known: the row with the present values.
+        sure: names that a person has confirmed; None where no person can be asked, as of a program's call: nothing is asked then.
         others: by name, values of the visit's other sessions.
     """
+    if sure is None:
+        return
     asked = [
         question(name, value, (others or {}).get(name, ()))
         for name, value in given.items()

@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-SURE = "Values outside the usual that a person has looked at: they are right."
+SURE = (
+    "Values outside the usual that a person has looked at: they are right. Where it is given, an empty list too, other unusual values are"
+    " refused with `questions` (422); left out, as by a program that can ask nobody, values are kept as they are."
+)
 
 
 class Why(StrEnum):

@@ -39,7 +39,9 @@ COUNTED = {"ErrorLog": "errors", "DiagnosticsLog": "diagnostics"}
 KEY_OF = {stem: key for key, stem in STEM_OF.items()}
 KNOWN = {name.lower(): name for name in (*NEEDED, *KEY_OF, *COUNTED)}
 MIXED = "the files of one folder name {} implants or sessions: each was taken as a recording of its own, for two are never mixed"
-NEEDED_SETTINGS = ("RecordInfo", "UtcOffset", "GeneralData", "SensingConfig", "SenseState", "AdaptiveConfig", "DetectionConfig")
+NEEDED_SETTINGS = (
+    "RecordInfo", "UtcOffset", "GeneralData", "SensingConfig", "SenseState", "AdaptiveConfig", "DetectionConfig", "BatteryStatus"
+)  # fmt: skip
 SLOW_BATCH = 256
 MAX_PACKETS = 2_000_000
 MAX_NUMBERS = 64_000_000

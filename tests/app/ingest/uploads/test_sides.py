@@ -185,11 +185,11 @@ def test_a_recording_belongs_to_the_visit_of_its_local_day(send: Any, client: Te
     assert not any("Recorded on" in n for n in notes)
 
 
-def test_the_control_channel_is_the_one_of_the_deep_target_with_the_most_valid_steps(
+def test_the_control_channel_is_one_of_the_deep_target_that_can_teach_most(
     send: Any, client: TestClient, recordings: Path
 ) -> None:
     montage = ("m.zip", (recordings / "rcs" / "montage_packet_loss.zip").read_bytes())
     (session,) = send(montage, visit=1, controller="other").json()["sessions"]
     trace = client.get(f"/api/v1/sessions/{session['id']}/trace").json()
-    assert session["control_channel"] == "key 1 +3-1", "a channel of motor cortex has 35 valid steps"
-    assert sum(b is not None for b, t in zip(trace["beta"], trace["t_s"], strict=True) if t > 0) == 33
+    assert session["control_channel"] == "key 0 +1-0", "channels of motor cortex have more"
+    assert sum(b is not None for b, t in zip(trace["beta"], trace["t_s"], strict=True) if t > 0) == 19

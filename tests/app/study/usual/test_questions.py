@@ -62,7 +62,7 @@ def test_every_question_has_its_sentence_and_no_decision_rests_on_it(monkeypatch
 def test_the_interface_asks_and_takes_a_persons_word(client: TestClient, upload: Any) -> None:
     url = f"/api/v1/sessions/{upload('cdbs', qoc={})}/qoc"
     both = {"grasp_hz": 7.2, "tremor_percent": 0.3, "rating": 7}
-    refused = client.put(url, json=both)
+    refused = client.put(url, json=both | {"sure": []})
     assert asked(refused) == [("grasp_hz", "above_usual", False), ("tremor_percent", "share_not_percent", False)]
     first = refused.json()["questions"][0]
     assert (first["value"], first["low"], first["high"], first["unit"]) == (7.2, 0.3, 6.0, "Hz")
@@ -72,20 +72,29 @@ def test_the_interface_asks_and_takes_a_persons_word(client: TestClient, upload:
     ]  # fmt: skip
     assert client.put(url, json=both | {"sure": ["grasp_hz", "tremor_percent"]}).status_code == 200
     # what stands is not asked about again when another value is corrected
-    assert client.put(url, json={"grasp_hz": 7.2, "rating": 6}).json()["rating"] == 6
+    assert client.put(url, json={"grasp_hz": 7.2, "rating": 6, "sure": []}).json()["rating"] == 6
+
+
+def test_a_program_that_can_ask_nobody_is_not_asked(client: TestClient, enrolled: str, upload: Any) -> None:
+    unusual = {"grasp_hz": 7.2, "tremor_percent": 0.3}
+    assert client.put(f"/api/v1/sessions/{upload('cdbs', qoc={})}/qoc", json=unusual).status_code == 200
+    high = [{"hemisphere": "left", "amplitude_ma": 8.0}]
+    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 2, "cdbs_amplitudes": high}).status_code == 201
+    assert client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"cdbs_amplitude_ma": 9}}).status_code == 200
+    assert client.post("/api/v1/participants", json={"code": "P7", "settings": {"cdbs_amplitude_ma": 9}}).status_code == 201
 
 
 def test_a_rating_is_held_against_the_newest_ones_of_its_visit(client: TestClient, upload: Any) -> None:
     others = [upload("random", qoc={"rating": r}) for r in (8, 9, 3)]
     url = f"/api/v1/sessions/{upload('cdbs', qoc={})}/qoc"
-    assert client.put(url, json={"rating": 2}).status_code == 200
+    assert client.put(url, json={"rating": 2, "sure": []}).status_code == 200
     assert client.put(f"/api/v1/sessions/{others[2]}/qoc", json={"rating": 8, "reason": "read upside down"}).status_code == 200
-    assert asked(client.put(url, json={"rating": 1})) == [("rating", "far_from_visit", False)]
+    assert asked(client.put(url, json={"rating": 1, "sure": []})) == [("rating", "far_from_visit", False)]
 
 
 def test_amplitudes_of_visits_settings_and_enrolments_are_asked_about(client: TestClient, enrolled: str) -> None:
     visits = f"/api/v1/participants/{enrolled}/visits"
-    high = {"hemisphere": "left", "amplitude_ma": 8.0}
+    high = {"hemisphere": "left", "amplitude_ma": 8.0, "sure": False}
     refused = client.post(visits, json={"number": 2, "cdbs_amplitudes": [high]})
     assert asked(refused) == [("cdbs_amplitudes", "above_usual", False)]
     assert (refused.json()["questions"][0]["hemisphere"], refused.json()["questions"][0]["program"]) == ("left", 0)
@@ -95,10 +104,10 @@ def test_amplitudes_of_visits_settings_and_enrolments_are_asked_about(client: Te
     # the standing amplitude is not asked about beside a new one
     two = [high, {"hemisphere": "right", "amplitude_ma": 2.5}]
     assert client.patch(visit, json={"cdbs_amplitudes": two, "reason": "both sides"}).status_code == 200
-    settings = {"settings": {"cdbs_amplitude_ma": 0.2}}
+    settings = {"settings": {"cdbs_amplitude_ma": 0.2}, "sure": []}
     assert asked(client.put(f"/api/v1/participants/{enrolled}/settings", json=settings)) == [("cdbs_amplitude_ma", "below_usual", False)]
     assert client.put(f"/api/v1/participants/{enrolled}/settings", json=settings | {"sure": ["cdbs_amplitude_ma"]}).status_code == 200
-    new = {"code": "P7", "settings": {"cdbs_amplitude_ma": 9}}
+    new = {"code": "P7", "settings": {"cdbs_amplitude_ma": 9}, "sure": []}
     assert asked(client.post("/api/v1/participants", json=new)) == [("cdbs_amplitude_ma", "above_usual", False)]
     assert client.post("/api/v1/participants", json=new | {"sure": ["cdbs_amplitude_ma"]}).status_code == 201
 
