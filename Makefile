@@ -26,7 +26,7 @@ demo: install ## Start betaloop with a synthetic study at http://127.0.0.1:8000.
 test: install ## Run the test suite.
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow"
 
-test-slow: install ## Run learning curves and fault rounds (about 25 minutes on two cores).
+test-slow: install ## Run learning curves and fault rounds (about 35 minutes on two cores).
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow
 
 check: install ## Lint, types and the import contract.

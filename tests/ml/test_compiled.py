@@ -43,6 +43,7 @@ def said(process: subprocess.Popen[str]) -> str:
     return out.strip()
 
 
+@pytest.mark.slow
 def test_two_processes_that_compile_at_once_do_not_mix_their_code(tmp_path: Path) -> None:
     (tmp_path / "kernel.py").write_text(KERNEL)
     first = call(tmp_path, SLOWLY + CALL, "int", "2.0", "3.0")

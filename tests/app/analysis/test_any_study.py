@@ -126,6 +126,7 @@ def problems(client: TestClient, expected: dict[str, int]) -> dict[str, str]:
     return found
 
 
+@pytest.mark.slow
 def test_any_study_gets_sentences(client: TestClient, db: Session, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
     numbers = count(1)
     really = db.commit

@@ -152,6 +152,7 @@ def test_programs_are_copied_out_of_a_closed_folder_once(tmp_path: Path, unknown
         copy.parent.rmdir()
 
 
+@pytest.mark.slow
 def test_two_test_runs_at_once_make_their_template_databases(tmp_path: Path, unknown: str) -> None:
     test = "tests/app/platform/test_first_start.py::test_the_tests_own_database_works"
     runs = [

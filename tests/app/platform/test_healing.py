@@ -23,6 +23,7 @@ from tests.app.platform.test_stops import free_port, start, wait_for
 HEALTHY_WITHIN_S = 10.0
 
 
+@pytest.mark.slow
 def test_a_service_whose_database_was_killed_heals_by_itself(data: Path) -> None:
     port = free_port()
     service = start(data, "serve", "--port", str(port))
@@ -98,6 +99,7 @@ def test_what_fails_beneath_is_told_in_true_words(
     assert "select 1" not in answer.text
 
 
+@pytest.mark.slow
 def test_a_worker_whose_database_was_killed_goes_on(data: Path) -> None:
     worker = start(data, "worker")
     try:

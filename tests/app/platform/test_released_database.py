@@ -14,6 +14,7 @@ from itertools import product
 from typing import Any
 
 import psycopg
+import pytest
 from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 from sqlalchemy import text
@@ -179,6 +180,7 @@ def test_every_page_of_a_released_study_opens(released_database: str) -> None:
         assert unexpected(client, pages) == {}
 
 
+@pytest.mark.slow
 def test_every_route_of_the_interface_reads_a_released_study(released_database: str) -> None:
     app = create_app()
     with database.transaction("test") as db:

@@ -87,6 +87,7 @@ def test_a_stopped_service_leaves_nothing_behind(data: Path, command: str, runni
     assert_nothing_left(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_stopped_demo_leaves_nothing_behind(data: Path, number: int) -> None:
     process = start(data, "demo", "--port", str(free_port()))
@@ -96,6 +97,7 @@ def test_a_stopped_demo_leaves_nothing_behind(data: Path, number: int) -> None:
     assert_nothing_left(data)
 
 
+@pytest.mark.slow
 def test_a_stop_during_the_start_leaves_nothing_behind(data: Path) -> None:
     process = start(data, "serve", "--port", str(free_port()))
     deadline = time.monotonic() + 120

@@ -27,6 +27,7 @@ def test_qocs_follow_the_papers_formulas_over_what_was_measured(constant_session
         assert session.rating in range(1, 11)
 
 
+@pytest.mark.slow
 def test_more_stimulation_means_faster_grasps_and_less_tremor(constant_sessions):
     for code in ("P1", "P2", "P3", "P4"):
         grasps = [np.mean([o.qoc.grasp_hz for o in constant_sessions(code, a).outcomes]) for a in (0, 0.25, 0.5, 1)]

@@ -86,6 +86,7 @@ def test_a_file_whose_reading_ended_the_service_once_is_resumed(client: TestClie
     assert len(client.get("/api/v1/participants/P1/proposals").json()) == 1
 
 
+@pytest.mark.slow
 def test_sessions_that_end_the_service_twice_are_not_made_a_third_time(client: TestClient, enrolled: str, db: Session) -> None:
     killed("send", "make_sessions")
     killed("resume", "make_sessions")
@@ -144,6 +145,7 @@ def test_when_the_process_that_forks_readers_is_killed_the_next_file_starts_anot
     assert limited.server_pid() != first
 
 
+@pytest.mark.slow
 def test_readers_die_with_the_service(enrolled: str) -> None:
     with subprocess.Popen([sys.executable, "-c", LETHAL, "send", "slowly", steady(1).decode()], cwd=ROOT) as service:
         try:

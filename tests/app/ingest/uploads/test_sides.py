@@ -185,9 +185,7 @@ def test_a_recording_belongs_to_the_visit_of_its_local_day(send: Any, client: Te
     assert not any("Recorded on" in n for n in notes)
 
 
-def test_the_control_channel_is_one_of_the_deep_target_that_can_teach_most(
-    send: Any, client: TestClient, recordings: Path
-) -> None:
+def test_the_control_channel_is_one_of_the_deep_target_that_can_teach_most(send: Any, client: TestClient, recordings: Path) -> None:
     montage = ("m.zip", (recordings / "rcs" / "montage_packet_loss.zip").read_bytes())
     (session,) = send(montage, visit=1, controller="other").json()["sessions"]
     trace = client.get(f"/api/v1/sessions/{session['id']}/trace").json()

@@ -100,6 +100,7 @@ def post(client: TestClient, content: bytes) -> Any:
     return client.post("/api/v1/participants/P1/policies", data={"name": "theirs"}, files={"file": ("theirs.onnx", content)})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "words"),
     [

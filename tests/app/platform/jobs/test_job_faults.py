@@ -59,6 +59,7 @@ def test_a_killed_worker_takes_its_children_along_and_the_next_one_finishes_the_
         assert len(jobs.numbers(job_id, part)) <= 31
 
 
+@pytest.mark.slow
 def test_an_orderly_stop_kills_the_children_and_another_worker_takes_over_at_once(jobs):
     workers = _two_workers(jobs)  # stale after 60 s: the other one must not have to wait for that
     job_id = jobs.submit(parts=2, numbers=40, pause_s=0.1)
@@ -76,6 +77,7 @@ def test_an_orderly_stop_kills_the_children_and_another_worker_takes_over_at_onc
         assert db.scalar(text("select recovery_attempts from dbos.workflow_status where workflow_uuid = :id"), {"id": job_id}) == 1
 
 
+@pytest.mark.slow
 def test_a_live_worker_takes_the_jobs_of_one_that_fell_silent(jobs):
     workers = _two_workers(jobs, stale_s=3.0)
     job_id = jobs.submit(parts=2, numbers=40, pause_s=0.1)
@@ -105,6 +107,7 @@ def test_a_worker_that_was_frozen_drops_the_jobs_that_another_took_over(jobs):
     assert (first.poll(), second.poll()) == (None, None)
 
 
+@pytest.mark.slow
 def test_two_workers_share_the_queue(jobs):
     jobs.start_worker(slots=1)
     jobs.start_worker(slots=1)
@@ -116,6 +119,7 @@ def test_two_workers_share_the_queue(jobs):
     assert all(jobs.counted(i) == [0] for i in ids)
 
 
+@pytest.mark.slow
 def test_a_job_that_nobody_runs_any_more_is_cancelled_at_once(jobs):
     worker = jobs.start_worker()
     job_id = jobs.submit(parts=1, numbers=1000, pause_s=0.1)
@@ -148,6 +152,7 @@ def test_jobs_of_an_older_protocol_are_moved_and_their_finished_steps_kept(jobs)
     assert version == engine.PROTOCOL
 
 
+@pytest.mark.slow
 def test_broken_database_connections_fail_no_job_and_stop_no_worker(jobs):
     worker = jobs.start_worker()
     job_id = jobs.submit(parts=2, numbers=40, pause_s=0.1)

@@ -89,6 +89,7 @@ def test_a_step_that_fails_fails_its_job_with_its_message_and_nothing_else(jobs)
     assert worker.poll() is None
 
 
+@pytest.mark.slow
 def test_a_step_whose_process_was_killed_is_tried_once_more(jobs):
     jobs.start_worker()
     once, always = jobs.submit("fail", how="killed once"), jobs.submit("fail", how="killed")
@@ -129,6 +130,7 @@ def test_a_waiting_job_is_cancelled_at_once_and_never_starts(jobs):
         service.cancel(db, repository.get(db, first), "test")
 
 
+@pytest.mark.slow
 def test_retry_makes_a_new_job_with_the_same_params(jobs):
     jobs.start_worker()
     old = jobs.ended(jobs.submit(parts=2, numbers=1))

@@ -79,6 +79,7 @@ def made(place: Path) -> tuple[Path, Path]:
     return place / "backup", key
 
 
+@pytest.mark.slow
 def test_a_backup_comes_back_in_a_new_data_folder(place: Path, filled: dict[str, int]) -> None:
     folder, key = made(place)
     for part in folder.iterdir():
@@ -146,6 +147,7 @@ def older_server(place: Path) -> Iterator[str]:
         run("pg_ctl", "-D", str(data / "db"), "-m", "immediate", "-w", "stop")
 
 
+@pytest.mark.slow
 def test_a_backup_comes_back_in_an_older_postgresql_of_another_make(place: Path, filled: dict[str, int], older_server: str) -> None:
     folder, key = made(place)
     new = place / "new"

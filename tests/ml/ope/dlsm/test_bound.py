@@ -109,6 +109,7 @@ def test_the_bound_equals_the_exact_log_likelihood_where_the_filtering_encoder_i
     assert value == pytest.approx(exact, abs=max(5 * error, 1e-6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_the_bound_lies_below_the_exact_log_likelihood_and_the_gap_of_the_filtering_encoder_remains(seed):
     states, actions, rewards = data(seed)

@@ -59,6 +59,7 @@ def test_a_resumed_training_ends_exactly_where_an_uninterrupted_one_does(small_b
         assert torch.equal(a, b)
 
 
+@pytest.mark.slow
 def test_a_finished_fit_is_taken_from_its_checkpoints(small_buffer, tmp_path):
     first = Dlsm(TINY).fit(small_buffer, checkpoint_dir=tmp_path)
     reports = []
