@@ -85,15 +85,23 @@ def _survey(facts: Mapping[str, Any]) -> str:
     )
 
 
+NAMED = 3
+"""Channels that were passed over and are named, those with the most usable steps; the table of steps has them all."""
+
+
 def _channel(facts: Mapping[str, Any]) -> str:
     name = f"{facts['stream'].replace('_', ' ')} {facts['channel']}".strip()
     lead = facts["lead"]
     said = f"{name} of the {lead}" if lead else f"{name}, whose target the recording does not tell"
     said += f", with {_steps(facts)}" if _steps(facts) else ""
     why = {"shorted": "one contact against itself"}
-    passed = [(p["channel"], ", ".join(filter(None, (why.get(p["why"], p["why"]), _steps(p))))) for p in facts["passed"]]
+    most = sorted(facts["passed"], key=lambda p: -(p.get("usable") or 0))
+    passed = [(p["channel"], ", ".join(filter(None, (why.get(p["why"], p["why"]), _steps(p))))) for p in most]
     named = [f"{channel} ({reason})" for channel, reason in passed if reason]
-    return f"{said}; not {', '.join(named)}" if named else said
+    if not named:
+        return said
+    rest = len(named) - NAMED
+    return f"{said}; not {', '.join(named[:NAMED])}" + (f" or {rest} other{'' if rest == 1 else 's'}" if rest > 0 else "")
 
 
 def _steps(facts: Mapping[str, Any]) -> str:
