@@ -76,6 +76,11 @@ class Participant(Base):
         return self.margins[-1]
 
     @property
+    def margins_in_force(self) -> MarginsVersion:
+        """The margins that verdicts go by, of rankings and analyses alike: those of the newest lock, else the newest."""
+        return self.margins_locks[-1].margins if self.margins_locks else self.current_margins
+
+    @property
     def current_settings(self) -> SettingsVersion:
         """The newest settings version; a participant always has one."""
         return self.settings[-1]

@@ -140,6 +140,7 @@ def assess(
     given = Circumstances(
         evaluation.id,
         evaluation.created_at,
+        participant.margins_in_force,
         participant.current_margins,
         coverage_failed(evaluation),
         session_noise(evaluation),

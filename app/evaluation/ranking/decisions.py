@@ -28,7 +28,8 @@ class Circumstances:
     """What verdicts of one evaluation share.
 
     Attributes:
-        evaluation_id, evaluated_at: of the evaluation. margins: of the participant, in force now.
+        evaluation_id, evaluated_at: of the evaluation.
+        margins: of the participant, in force now: those of the newest lock, else the newest. levels: the newest version, locked or not.
         unchecked: why what the data cover could not be checked; None where it was.
         noise: of a session, by outcome. lowest_dose: B, below which no further session is asked for.
         cdbs_ma: the cDBS amplitude, mA; None where it is not known.
@@ -37,6 +38,7 @@ class Circumstances:
     evaluation_id: int
     evaluated_at: datetime
     margins: MarginsVersion
+    levels: MarginsVersion
     unchecked: str | None
     noise: Mapping[str, float]
     lowest_dose: float
@@ -103,7 +105,7 @@ def decide(
     if own is None:
         known = _without_posterior(estimates.get(method), cdbs.get(method))
         return Decided("unsafe", (*happened, *known.reasons)) if happened else known
-    reference, levels = cdbs.get(POSTERIOR), levels_of(given.margins)
+    reference, levels = cdbs.get(POSTERIOR), levels_of(given.levels)
     found = verdict(own, reference, margins_of(given.margins), levels, adverse_event=adverse_event, unchecked=given.unchecked)
     more = _further(own, reference, given, levels, policy_id) if found.code == "cannot_tell" and not found.hazards else ()
     return Decided(found.code, (*found.reasons, *more), found)
@@ -134,8 +136,8 @@ def _without_posterior(own: Estimate | None, reference: Estimate | None) -> Deci
     return Decided("cannot_tell", (unknown,))
 
 
-_needed: OrderedDict[tuple[int, datetime, int, int], int | None] = OrderedDict()
-"""Simulated numbers of sessions by evaluation, policy and margins version, none of which ever changes."""
+_needed: OrderedDict[tuple[int, datetime, int, int, int], int | None] = OrderedDict()
+"""Simulated numbers of sessions by evaluation, policy and versions of margins and levels, none of which ever changes."""
 _KEPT = 5000
 
 
@@ -145,7 +147,7 @@ def _further(own: Estimate, cdbs: Estimate | None, given: Circumstances, levels:
     dose = support.get("dose")
     if cdbs is None or dose is None:
         return ()
-    key = (given.evaluation_id, given.evaluated_at, policy_id, given.margins.id)
+    key = (given.evaluation_id, given.evaluated_at, policy_id, given.margins.id, given.levels.id)
     if key not in _needed:
         gaps = slacks(own, cdbs, margins_of(given.margins))
         near = int(support.get("near_sessions") or 0)

@@ -66,6 +66,22 @@ def test_a_change_of_margins_changes_the_verdict_at_once(client: TestClient, pol
     assert body["stale_reasons"] == before["stale_reasons"], "margins are asked of the stored posterior: nothing has to be evaluated again"
 
 
+def test_locked_margins_hold_in_the_ranking_too_and_newer_levels_count_at_once(
+    client: TestClient, policies: list[int], judge: Judge
+) -> None:
+    judge({policies[0]: judged(50.0, outcome_draws={"tremor_percent": [26.0] * N})})
+    margins = "/api/v1/participants/P1/margins"
+    assert client.post(f"{margins}/locks", json={"version": 1, "reason": "protocol"}).status_code == 201
+    assert client.put(margins, json={"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}).status_code == 200
+    assert ranked(client)["policies"][0]["decision"] == "test", "the analyses go by the locked margins as well"
+    page = client.get("/participants/P1/ranking", headers={"Accept": "text/html"}).text
+    assert "tremor at most 10 percentage points more" in page
+    assert client.put(margins, json={"margins": {"test_saves": 0.95}, "reason": "longer battery"}).status_code == 200
+    assert "at least 95 % likely to use less energy" in client.get("/participants/P1/ranking", headers={"Accept": "text/html"}).text
+    assert client.post(f"{margins}/locks", json={"version": 3, "reason": "amended"}).status_code == 201
+    assert ranked(client)["policies"][0]["decision"] == "unsafe"
+
+
 def test_without_ordering_skill_there_are_no_ranks_and_nothing_is_proposed(client: TestClient, policies: list[int], judge: Judge) -> None:
     a, b, c = policies
     judge({a: judged(50.0, told=False), b: judged(99.0, told=False), c: judged(70.0, told=False, **NEARLY_OFF)}, cdbs(told=False).to_json())
@@ -159,7 +175,7 @@ def test_another_method_can_order_the_fold_and_the_verdicts_stay(client: TestCli
 
 
 def test_a_serious_event_is_unsafe_without_a_posterior_and_of_a_retired_policy_too() -> None:
-    given = Circumstances(1, datetime(2026, 1, 1, tzinfo=UTC), MarginsVersion(), None, {}, 0.3, None)
+    given = Circumstances(1, datetime(2026, 1, 1, tzinfo=UTC), MarginsVersion(), MarginsVersion(), None, {}, 0.3, None)
     found = decide({}, {}, "dlsm", given, 7, adverse_event=True)
     assert (found.decision, found.reasons[0].code) == ("unsafe", "adverse_event")
     retired = decide({}, {}, "dlsm", given, 7, retired_reason="replaced", adverse_event=True)
