@@ -54,12 +54,6 @@ WIDER: Final = 1.4
 shapes than these, of which Laplace's approximation knows nothing. On part A of the virtual population 90 % intervals of differences to cDBS
 given true sessions then hold 89 % (paper's design) and 86 % of them; without it 76 and 73 %."""
 
-EARLIER: Final = 5.0
-"""By how much a dose shape is likelier beforehand the earlier it saturates: log odds per unit of its half-effect amplitude. Sessions hold
-doses near cDBS and none, so that they hardly say what lies between; with equal odds low doses got too little r_end. Set on the even worlds
-of part A; on the odd ones errors of differences between candidates fall by 1.0 +- 0.3 % of the range (stratified design; 13 worlds with
-r_end) and 0.7 +- 0.6 % (paper's)."""
-
 KEPT: Final = 0.01
 """Members whose weight is less than this share of the largest are left out."""
 
@@ -196,8 +190,7 @@ def fit(
         np.concatenate([np.tile(deviation**-2.0, (len(grid), 1)), np.repeat(day[:, None] ** -2.0, v, axis=1)], axis=1),
     )
     found = solve(problem)
-    log_weights = found.log_evidence + np.array([shape_log_prior(k) for k, _ in grid])
-    weights = np.exp(log_weights - log_weights.max())
+    weights = np.exp(found.log_evidence - found.log_evidence.max())
     weights = np.where(weights < KEPT * weights.max(), 0.0, weights)
     weights /= weights.sum()
 
@@ -210,12 +203,6 @@ def fit(
     noise = found.dispersion * (np.pi**2 / 3 / np.mean(size) if outcome == "tremor" else 1.0)
     share = float(weights @ (day**2 / (day**2 + noise)))
     return Regression(outcome, names, members, weights[kept], drawn, found.left_out(problem, weights), known, share)
-
-
-def shape_log_prior(shape: int) -> float:
-    """Log prior of one of `SHAPES`, up to a constant; the line counts as an effect that is half reached at half the amplitude."""
-    half, _ = SHAPES[shape]
-    return EARLIER * (0.5 - half) if half > 0 else 0.0
 
 
 def _drawn(found: Solved, weights: Floats, draws: int, wider: float, rng: np.random.Generator) -> list[tuple[int, Floats]]:

@@ -145,6 +145,8 @@ def test_a_killed_workers_evaluation_goes_on_where_it_was_and_gives_the_same_num
     undisturbed = ended(client.post(JOBS, json=body).json()["id"], 300)
     assert undisturbed["status"] == "succeeded", undisturbed
     expected = client.get("/api/v1/participants/P1/ranking").json()
+    first = undisturbed["id"]
+    whole = [max(points(db, first, f"fit/{k}")) for k in range(2)]
 
     job = client.post(JOBS, json=body).json()["id"]
     # first in the middle of both members, later in the middle of DualDICE, when the members have long been stored
@@ -168,8 +170,8 @@ def test_a_killed_workers_evaluation_goes_on_where_it_was_and_gives_the_same_num
     for k in range(2):
         # a member goes on from its last check, not from the start
         later = points(db, job, f"fit/{k}")[seen[k] :]
-        assert later
-        assert min(later) > 0.3 * reached[k]
+        assert later or reached[k] == whole[k], "a member that was at its last check when it was killed has nothing left to tell"
+        assert min(later, default=reached[k]) > 0.3 * reached[k]
     found = client.get("/api/v1/participants/P1/ranking").json()
     assert (found["evaluation_id"], found["snapshot"]["id"]) == (done["result"]["evaluation_id"], expected["snapshot"]["id"])
     for ours, theirs in zip(found["policies"] + found["references"], expected["policies"] + expected["references"], strict=True):

@@ -11,7 +11,6 @@ from scipy.special import expit
 from ml.mdp import MdpSettings
 from ml.ope.outcomes.minutes import Minutes, by_minute
 from ml.ope.outcomes.model import fit_end_model
-from ml.ope.outcomes.regressions import shape_log_prior
 from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
@@ -192,21 +191,3 @@ def test_draws_are_spread_as_far_as_asked_around_the_same_mean():
     assert 1.15 < other.std() / one.std() < 1.5  # shapes are drawn alike
     assert other.mean() == pytest.approx(one.mean(), abs=0.05)
     np.testing.assert_array_equal(narrow.predict(at(0.3)), wide.predict(at(0.3)))
-
-
-def test_what_lies_between_no_stimulation_and_the_held_doses_is_taken_to_saturate_early_until_sessions_say_otherwise():
-    # Without doses between, every shape fits a difference between 0 and cDBS; a session there decides, also for a late one.
-    rng = np.random.default_rng(5)
-    far = np.tile([0.0, 0.95, 1.0], 8)
-    late = (1 + 0.9**4) * far**4 / (far**4 + 0.9**4)
-    visits = np.tile([1, 2, 3, 4], 6)
-    open_ = fit_end_model(buffer_of(far, 1.0 + late + 0.02 * rng.standard_normal(24), visits))
-    low, middle, full = open_.predict(at(0.0, 0.4, 1.0))[:, 1]
-    assert (middle - low) / (full - low) > 0.35
-    doses = np.concatenate([far, np.linspace(0.3, 0.8, 24)])
-    truth = (1 + 0.9**4) * doses**4 / (doses**4 + 0.9**4)
-    told = fit_end_model(buffer_of(doses, 1.0 + truth + 0.02 * rng.standard_normal(48), np.tile(visits, 2)))
-    low, middle, full = told.predict(at(0.0, 0.4, 1.0))[:, 1]
-    assert (middle - low) / (full - low) == pytest.approx((1 + 0.9**4) * 0.4**4 / (0.4**4 + 0.9**4), abs=0.08)
-    assert shape_log_prior(0) == 0.0
-    assert [shape_log_prior(k) for k in (1, 3, 5, 7)] == pytest.approx([1.0, 0.0, -1.0, -2.0])
