@@ -152,6 +152,7 @@ def test_an_expired_sign_in_loses_nothing_and_nobody_else_can_read_it(window: Ca
     assert [(e["kind"], e["entered_by"]) for e in listed] == [("start", "admin@clinic.example"), ("rating", "admin@clinic.example")]
 
 
+@pytest.mark.slow
 def test_two_tablets_that_say_different_things_ask_which_one_counts(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     one, other = window(768, 1024), window(768, 1024)
     for watched in (one, other):

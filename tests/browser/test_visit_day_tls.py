@@ -56,6 +56,7 @@ def _listens(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
+@pytest.mark.slow
 def test_over_tls_a_tablet_keeps_entries_and_opens_without_network(chromium: Any, clinic_day: ClinicDay, tmp_path: Path) -> None:
     certificate, key, pin = _certificate(tmp_path)
     flags = [*FLAGS, f"--host-resolver-rules=MAP {HOST} 127.0.0.1", f"--ignore-certificate-errors-spki-list={pin}"]

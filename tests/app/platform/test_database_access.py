@@ -132,6 +132,7 @@ def test_the_service_is_no_superuser_and_can_migrate(data: Path) -> None:
     get_engine().dispose()
 
 
+@pytest.mark.slow
 def test_a_data_folder_of_0_1_0_opens_with_its_rows_and_is_closed_to_others(data: Path) -> None:
     old_data_folder(data)
     migrate()

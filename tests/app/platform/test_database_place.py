@@ -119,6 +119,7 @@ def test_a_database_of_another_user_is_explained(folder: Path) -> None:
     os.chown(data, owner.st_uid, owner.st_gid)
 
 
+@pytest.mark.slow
 def test_a_data_folder_made_anew_does_not_find_the_old_rows(folder: Path) -> None:
     folder.parent.chmod(0o700)
     outside = started_with(folder, "study")

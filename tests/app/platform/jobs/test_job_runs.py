@@ -60,6 +60,7 @@ def _logs(job_id):
         return "".join(e.data["text"] for e in repository.events_after(db, job_id, 0) if e.kind == "log")
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_fails_its_job_with_its_message_and_nothing_else(jobs):
     memory = "The step needs more memory than its limit of 512 MiB. Make the job smaller or raise BETALOOP_JOB_MEMORY_MB for the worker."
     messages = {
@@ -99,6 +100,7 @@ def test_a_step_whose_process_was_killed_is_tried_once_more(jobs):
     assert (job.status, [s.attempts for s in job.steps]) == ("failed", [2])
 
 
+@pytest.mark.slow
 def test_cancelling_kills_the_children_within_two_seconds(jobs):
     worker = jobs.start_worker(beat_s=5.0)
     job_id = jobs.submit(parts=3, numbers=1000, pause_s=0.1)

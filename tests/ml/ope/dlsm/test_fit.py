@@ -68,6 +68,7 @@ def test_a_finished_fit_is_taken_from_its_checkpoints(small_buffer, tmp_path):
     assert first.evaluate(POLICIES, 20) == again.evaluate(POLICIES, 20)
 
 
+@pytest.mark.slow
 def test_members_trained_on_their_own_are_the_members_of_the_ensemble(small_buffer, tmp_path):
     for k in (1, 0):
         Dlsm(TINY).fit_member(small_buffer, k, checkpoint_dir=tmp_path)
