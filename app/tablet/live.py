@@ -24,7 +24,9 @@ from ml.deploy.runtime.slot import NotAllowed, Refusal, read_withdrawals
 
 BENCH_MINUTES = 10.0
 """Length of a bench session on a simulated device, of a bundle that states none."""
-SIMULATED = "simulated:"
+_SIMULATED = "simulated:"
+_SCHEMES = ("tcp:", "tail:", _SIMULATED)
+"""How the command's input argument names a device side; what follows the colon is the port, the file, or the simulated brain."""
 _MEND = {
     Refusal.NO_SLOT: "Have the visit plan signed and take the session's bundle from it, or add --bench where nobody is connected.",
     Refusal.NOT_SIGNED: "Have the visit plan signed and take the bundle anew, or add --bench where nobody is connected.",
@@ -40,7 +42,12 @@ _MEND = {
 
 def is_live(source: str, wish: Wish) -> bool:
     """Whether a source is a device side, which amplitudes go out to."""
-    return (source == "-" and wish.realtime) or source.startswith(("tcp:", "tail:", SIMULATED))
+    return (source == "-" and wish.realtime) or source.startswith(_SCHEMES)
+
+
+def _simulated_brain(source: str) -> str | None:
+    """Which brain a simulated device is asked for; None where the source is no simulated device."""
+    return source.removeprefix(_SIMULATED) if source.startswith(_SIMULATED) else None
 
 
 def run_live(
@@ -54,7 +61,7 @@ def run_live(
     Raises:
         Invalid: it may not run, the input cannot be opened, or the log cannot be begun.
     """
-    if task.begins is not None and not source.startswith(SIMULATED):
+    if task.begins is not None and _simulated_brain(source) is None:
         raise Invalid("A session with a device begins when it begins.", "Leave --begins out, or name a simulated device.")
     link, where = _link(opened.manifest, source)
     try:
@@ -97,10 +104,11 @@ def _clock(device: SimulatedDevice, task: Task, now: Callable[[], datetime]) -> 
 
 
 def _link(manifest: BundleManifest, source: str) -> tuple[Link, str]:
-    if source.startswith(SIMULATED):
+    wanted = _simulated_brain(source)
+    if wanted is not None:
         minutes = manifest.slot.minutes if manifest.slot else BENCH_MINUTES
         steps = int((60 * minutes + LEAD_S) / manifest.period_s) + 2
-        brain = brain_of(source.removeprefix(SIMULATED), manifest, steps)
+        brain = brain_of(wanted, manifest, steps)
         return SimulatedDevice(brain, manifest), f"simulated device, {brain.description}"
     try:
         link = open_link(source)

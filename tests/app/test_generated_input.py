@@ -79,4 +79,6 @@ def test_generated_input_on_rows_that_exist_is_answered_as_described(world: Worl
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("number", range(100, 103))
 def test_much_generated_input_on_rows_that_exist_is_answered_as_described(world: World, number: int) -> None:
-    round_of(world, EXAMPLES, number)
+    answered = round_of(world, EXAMPLES, number)
+    assert len(answered) >= EXAMPLES * len(operations(world)) // 2
+    assert sum(status < 300 for status in answered) >= 40, "the rows are there"
