@@ -29,11 +29,16 @@ from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.runtime.decision_log import LogFailed, LogFile, Row
 from ml.deploy.runtime.envelope import Decision, Reason, Signal, reason_names
 from ml.deploy.runtime.live import End, LiveSession
-from ml.deploy.runtime.session import describe, latency, latency_words
+from ml.deploy.runtime.session import describe, is_blinded, latency, latency_words
 from ml.deploy.wording import battery_words, warning_sentences
 from ml.energy import Implant, relative_energy, saving_percent
 
 _KEY = "bundle-signing"
+_TELLING = frozenset({
+    "latency_us", "mean_amplitude_ma", "energy_of_cdbs", "energy_saved_percent", "battery", "battery_life_of_cdbs", "battery_life",
+    "battery_days", "battery_life_on_cdbs", "battery_days_on_cdbs",
+})  # fmt: skip
+"""Entries of a summary that tell which controller a blinded session ran."""
 
 
 Sink = Callable[[Row], None]
@@ -108,7 +113,7 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
     facts |= {"policy_id": manifest.policy_id, "approved": bool(manifest.approvals), "warnings": warning_sentences(manifest)}
     if manifest.card is not None and manifest.card.blinded:  # nobody at the tablet is told what runs
         facts |= {"policy_name": manifest.card.head, "policy_id": None, "blinded": True, "warnings": []}
-    if task.timed:
+    if task.timed and not is_blinded(opened.manifest_json):  # which would tell the network's size
         facts["measured_us"] = latency(opened.manifest_json, opened.controller(), task.timed)
     if source is None:
         return facts | {"verified": True, "files": len(manifest.files)}
@@ -126,7 +131,8 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
                 f"The bundle is of participant {manifest.participant}, the source is synthetic participant {stream.participant}."
             )
         facts |= _replayed(opened, stream, run, wish, task)
-    return facts | run.summary(stream) | _battery(run, implant) | _foreign(run, manifest)
+    found = facts | run.summary(stream) | _battery(run, implant) | _foreign(run, manifest)
+    return {name: None if name in _TELLING else value for name, value in found.items()} if facts.get("blinded") else found
 
 
 def _no_rows() -> Rows:
@@ -245,9 +251,9 @@ def lines(summary: dict[str, Any]) -> str:
     if summary["mean_amplitude_ma"] is not None:
         out.append(f"mean amplitude   {summary['mean_amplitude_ma']:.3f} mA")
         out.append(f"energy           {summary['energy_of_cdbs']:.3f} of cDBS: {summary['energy_saved_percent']:.1f} % saved")
-    if "battery" in summary:
+    if summary.get("battery"):
         out.append(f"battery          {summary['battery']}")
-    if "battery_life" in summary:
+    if summary.get("battery_life"):
         out += [f"battery life     {summary['battery_life']}", f"  on cDBS        {summary['battery_life_on_cdbs']}"]
     if "streaming_correlation" in summary:
         out.append(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Callable, Iterable
+from typing import Protocol
 
 import numpy as np
 
@@ -30,7 +31,16 @@ def as_sent(_number: int, line: str) -> Iterable[Sent]:
     return [(0.0, Event.LINE, line)]
 
 
-class Brain:
+class Brain(Protocol):
+    """What a simulated device measures: beta in a unit, as from a source."""
+
+    signal: Signal
+
+    def beta(self, amplitude_ma: float) -> float:
+        """Beta of the next period, in which an amplitude is in force."""
+
+
+class SyntheticBrain:
     """A synthetic participant: the window before a session first, recorded under cDBS, then one period after the other.
 
     Args:
@@ -57,14 +67,14 @@ class Brain:
         return float(info["beta"])
 
 
-def brain_of(text: str, manifest: BundleManifest, steps: int) -> Brain:
+def brain_of(text: str, manifest: BundleManifest, steps: int) -> SyntheticBrain:
     """The synthetic participant named `P1` or `P1:SEED`. Raises NotFound where there is none."""
     from ml.population import PARTICIPANTS
 
     found = _NAME.fullmatch(text)
     if found is None or found[1] not in PARTICIPANTS:
         raise NotFound(f"There is no synthetic participant '{text}'.", f"Name one of {', '.join(PARTICIPANTS)}, with :SEED.")
-    return Brain(found[1], int(found[2] or 0), manifest, steps)
+    return SyntheticBrain(found[1], int(found[2] or 0), manifest, steps)
 
 
 class SimulatedDevice:

@@ -8,6 +8,7 @@
     weights.f32, controller/      the reference runner: `python -m controller`, Python and numpy alone
     betaloop_controller.h         the whole controller in C99, float32; selftest.c checks it
     betaloop_controller_int8.h    the same in whole numbers, for small networks; selftest_int8.c checks it
+  of a blinded session there are sheet, manifest, signature and runner, and one sealed file with the rest (`ml.deploy.blinding`)
 
 The bytes of a bundle depend on its contents alone: no times, fixed order, no compression (its output differs between zlib versions).
 """
@@ -38,6 +39,7 @@ from ml.deploy.runtime.controller import BoundedController, WindowNetwork
 from ml.deploy.runtime.envelope import Signal
 from ml.deploy.runtime.network import MlpNetwork
 from ml.deploy.runtime.schedule import ScheduledController
+from ml.deploy.runtime.slot import SEALED, same_session, unseal
 from ml.deploy.sheet import render
 from ml.deploy.windows import PolicyWindow
 from ml.policies.onnx_policy import MAX_FILE_BYTES, OnnxPolicy, PolicyFileError, PolicyOutputError
@@ -52,7 +54,7 @@ _OLDEST_RUNNER = {f"controller/{name}.py" for name in ("__init__", "__main__", "
 _REQUIRED = {SHEET, VECTORS}
 _OF_NETWORKS = {WEIGHTS, HEADER, SELF_TEST}
 _OF_SMALL_NETWORKS = {HEADER_INT8, SELF_TEST_INT8}
-_ORDER = (SHEET, MANIFEST, SIGNATURE, MODEL, VECTORS, WEIGHTS, HEADER, SELF_TEST, HEADER_INT8, SELF_TEST_INT8, *RUNNER)
+_ORDER = (SHEET, MANIFEST, SIGNATURE, MODEL, VECTORS, WEIGHTS, HEADER, SELF_TEST, HEADER_INT8, SELF_TEST_INT8, SEALED, *RUNNER)
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a ZIP can hold
 
 
@@ -144,7 +146,11 @@ def _runner_files() -> dict[str, bytes]:
 
 def _whole(manifest: BundleManifest, files: dict[str, bytes], sheet: str) -> bytes:
     """The ZIP of all files with their manifest."""
-    files = files | {SHEET: sheet.encode()}
+    return pack_whole(manifest, files | {SHEET: sheet.encode()})
+
+
+def pack_whole(manifest: BundleManifest, files: dict[str, bytes]) -> bytes:
+    """The ZIP of files with a manifest that names them."""
     full = replace(manifest, files={name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
     return _pack(files | {MANIFEST: full.to_bytes()})
 
@@ -214,7 +220,7 @@ def open_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) -> O
     Raises:
         BundleError: whatever is not as it should be; the message names it.
     """
-    files = _unpack(content)
+    files = unpack(content)
     signature = files.pop(SIGNATURE, None)
     raw = files.pop(MANIFEST, None)
     if raw is None:
@@ -228,12 +234,34 @@ def open_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) -> O
         if found != digest:
             raise BundleError(f"{name} is not the file that the manifest names: SHA-256 {found[:12]}... instead of {digest[:12]}...")
     digest = hashlib.sha256(raw).hexdigest()
+    if manifest.sealed is not None:
+        manifest, raw, files = _opened(manifest, files[SEALED], manifest.sealed)
+    return _loaded(manifest, raw, files, digest)
+
+
+def _opened(outer: BundleManifest, sealed: bytes, nonce: str) -> tuple[BundleManifest, bytes, dict[str, bytes]]:
+    """Manifest and files that a blinded bundle keeps to itself."""
+    try:
+        files = unseal(sealed, nonce)
+        raw = files.pop(MANIFEST)
+        inner = BundleManifest.from_bytes(raw)
+        same_session(json.loads(outer.to_bytes()), json.loads(raw))
+    except (ValueError, KeyError) as error:
+        raise BundleError(f"{SEALED} cannot be used: {error}") from error
+    if VECTORS not in files or (inner.schedule is None and not files.keys() & {WEIGHTS, MODEL}):
+        raise BundleError(f"{SEALED} lacks {VECTORS} or the network")
+    return inner, raw, files
+
+
+def _loaded(manifest: BundleManifest, raw: bytes, files: dict[str, bytes], digest: str) -> OpenBundle:
+    """The network of a bundle, which answers its test vectors. `raw`: of the manifest. `digest`: by which logs name the bundle."""
     if manifest.schedule is not None:
         _check_decisions(raw, None, files[VECTORS], "the schedule")
         return OpenBundle(manifest, None, digest)
-    policy = _check_vectors(files[MODEL], files[VECTORS], manifest.window)
-    if WEIGHTS not in files:
-        return OpenBundle(manifest, PolicyWindow(policy, manifest.window), digest)
+    if MODEL in files:
+        policy = _check_vectors(files[MODEL], files[VECTORS], manifest.window)
+        if WEIGHTS not in files:
+            return OpenBundle(manifest, PolicyWindow(policy, manifest.window), digest)
     mean, std = manifest.normalisation_mean, manifest.normalisation_std
     if mean is None or std is None:
         raise BundleError(f"the manifest must state the normalisation of {WEIGHTS}")
@@ -258,11 +286,18 @@ def _check_decisions(raw: bytes, network: MlpNetwork | None, stated: bytes, what
 def _check_names(manifest: BundleManifest, present: set[str]) -> None:
     """The files named, and those inside, are one of the four sets that a bundle can be."""
     named = set(manifest.files)
+    if manifest.sealed is not None:
+        _compare_names(named, {SHEET, SEALED, *RUNNER}, present)
+        return
     wanted = _REQUIRED | ({MODEL} if manifest.schedule is None else set())
     wanted |= (_OF_NETWORKS if manifest.layers else set()) | (_OF_SMALL_NETWORKS if manifest.int8_bound is not None else set())
     if manifest.layers or manifest.schedule:
         older = manifest.schema_version < SCHEMA_VERSION and named >= _OLDEST_RUNNER
         wanted |= named & set(RUNNER) if older else set(RUNNER)
+    _compare_names(named, wanted, present)
+
+
+def _compare_names(named: set[str], wanted: set[str], present: set[str]) -> None:
     if named != wanted:
         raise BundleError(f"the manifest must name {', '.join(sorted(wanted))}; it names {', '.join(sorted(named)) or 'nothing'}")
     for name in sorted(present ^ named):
@@ -278,7 +313,7 @@ def sign(content: bytes, private_key: Ed25519PrivateKey) -> bytes:
     named = verify_bundle(content).public_key
     if named is not None and named != private_key.public_key().public_bytes_raw().hex():
         raise BundleError("the manifest names another key than the one to sign with")
-    files = _unpack(content)
+    files = unpack(content)
     return _pack(files | {SIGNATURE: private_key.sign(files[MANIFEST])})
 
 
@@ -324,7 +359,8 @@ def _pack(files: dict[str, bytes]) -> bytes:
     return sink.getvalue()
 
 
-def _unpack(content: bytes) -> dict[str, bytes]:
+def unpack(content: bytes) -> dict[str, bytes]:
+    """The files of a bundle. Raises BundleError for other bytes."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = archive.infolist()

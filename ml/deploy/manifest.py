@@ -104,6 +104,7 @@ class BundleManifest:
         schedule: what is delivered where no network decides; None where one does.
         card: what the plan's sheet says of that session; None without a plan, and in bundles made before it was taken along.
         approvals: sign-offs, in order.
+        sealed: 32 hexadecimal digits by which what a blinded bundle keeps to itself is masked (`runtime.slot`); None where nothing is.
         files: SHA-256 by file name of everything else in the bundle; filled in when the bundle is built.
         schema_version: of this manifest.
 
@@ -167,6 +168,7 @@ class BundleManifest:
     slot: Slot | None = None
     schedule: Schedule | None = None
     card: PlanCard | None = None
+    sealed: str | None = None
     approvals: tuple[Approval, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
     schema_version: int = SCHEMA_VERSION
@@ -198,15 +200,26 @@ class BundleManifest:
         self._check_device_limits()
 
     def _check_kind(self) -> None:
-        """A network or a schedule runs, and versions before 4 know neither schedule nor slot."""
+        """A network or a schedule runs, and versions before 4 know neither schedule nor slot; what is sealed is not told."""
         if self.schema_version < SCHEMA_VERSION and (self.slot or self.schedule):
             raise BundleError(f"a manifest of version {self.schema_version} has neither slot nor schedule")
         if self.card is not None and self.slot is None:
             raise BundleError("a bundle without a slot has no card of a plan")
         if self.schedule is not None and (self.policy_id is not None or self.layers):
             raise BundleError("a bundle holds a network or a schedule, not both")
-        if self.schedule is None and self.policy_id is None:
+        if self.sealed is not None:
+            self._check_sealed(self.sealed)
+        elif self.schedule is None and self.policy_id is None:
             raise BundleError("the manifest needs a policy_id or a schedule")
+
+    def _check_sealed(self, nonce: str) -> None:
+        """The manifest of a blinded bundle tells its session, and nothing of its controller."""
+        if not re.fullmatch(r"[0-9a-f]{32}", nonce):
+            raise BundleError(f"sealed must be 32 hexadecimal digits, not '{nonce}'")
+        if self.slot is None or self.card is None or not self.card.blinded:
+            raise BundleError("only the bundle of a blinded session is sealed")
+        if self.schedule is not None or self.policy_id is not None or self.layers:
+            raise BundleError("a sealed bundle names neither network nor schedule")
 
     def _check_device_limits(self) -> None:
         """The clinician's limits lie within what the stimulator was set to allow."""

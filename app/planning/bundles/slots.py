@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import secrets
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 
 from sqlalchemy.orm import Session
 
@@ -14,15 +15,18 @@ from app.learning import repository as learning
 from app.planning import wording
 from app.planning.bundles import repository, service
 from app.planning.plans.designs import Planned, seed_of
+from app.planning.plans.key import common_limits
 from app.planning.plans.limits import device_limits
 from app.planning.plans.models import PlanItem
 from app.planning.plans.view import PlanLine, PlanView, read_plan, refuse_running, shown
 from app.planning.plans.visits import today
 from app.planning.sheet.content import BUNDLE, card_of
+from app.platform import files
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.platform.signatures.models import Signature
 from app.study import service as study
 from app.study.models import Controller, Hemisphere, Visit
+from ml.deploy.blinding import Common, blind, room_for
 from ml.deploy.bundle import build_scheduled_bundle, sign
 from ml.deploy.manifest import Approval, BundleError, BundleManifest, PlanCard
 from ml.deploy.runtime.schedule import Schedule, ScheduledHold
@@ -30,8 +34,11 @@ from ml.deploy.runtime.slot import Slot, Withdrawals, withdrawals_body
 from ml.designs import Decision, DesignSettings, lay_out
 
 
-def bundle(db: Session, visit: Visit, position: int, caller: Caller) -> tuple[str, bytes]:
+def bundle(db: Session, visit: Visit, position: int, caller: Caller, at: datetime | None = None) -> tuple[str, bytes]:
     """The signed bundle of one session of a visit's signed plan, and its file name. It is stored, and its release is recorded.
+
+    Args:
+        at: when it is taken; now, but in the study in silico, whose calendar lies in the past.
 
     Raises:
         NotFound: no plan, or no such session. Conflict: the plan may not run, the visit has no date or is past, or the session has no
@@ -39,12 +46,12 @@ def bundle(db: Session, visit: Visit, position: int, caller: Caller) -> tuple[st
     """
     study.require(caller, can.TAKE_BUNDLES, visit.participant)
     view = read_plan(db, visit, caller)
-    signature = runnable(view)
+    signature = runnable(view, at.date() if at else None)
     line = next((line for line in view.lines if line.item.position == position), None)
     if line is None:
         raise NotFound(f"Plan {view.plan.id} has no session {position}.", f"Name one from 1 to {len(view.lines)}.")
     code = visit.participant.code
-    slot = _slot(view, line.item, signature)
+    slot = _slot(view, line.item, signature, at or datetime.now(UTC))
     if line.policy is not None:
         limits = service.Limits(line.item.min_ma, line.item.max_ma, line.item.ramp_ma_per_s)
         side = Hemisphere(line.item.hemisphere) if line.item.hemisphere else None
@@ -56,16 +63,28 @@ def bundle(db: Session, visit: Visit, position: int, caller: Caller) -> tuple[st
     else:
         manifest = _scheduled(db, view, line, slot, signature, caller)
         content = sign(build_scheduled_bundle(manifest), service.signing_key())
+    if view.sealed:
+        content = _blinded(view, content)
     service.store(db, visit.participant, content, manifest, caller, line.item.id)
     return f"{code}-visit-{visit.number}-session-{position}.zip", content
 
 
-def runnable(view: PlanView) -> Signature:
-    """The signature under which a plan may run. Raises Conflict, Invalid where it may not."""
+def _blinded(view: PlanView, content: bytes) -> bytes:
+    """The bundle of a blinded plan, of which all sessions look alike."""
+    limits, settings = common_limits(view.plan.items), view.visit.participant.current_settings
+    if limits is None:
+        raise Conflict(f"Plan {view.plan.id} has no limits in mA.", "Draft the visit anew.")
+    common = Common(limits.min_ma, limits.max_ma, limits.ramp_ma_per_s, settings.window, settings.period_s)
+    room = room_for(max((len(files.read(line.policy.onnx_sha256)) for line in view.lines if line.policy), default=0))
+    return sign(blind(content, common, secrets.token_hex(16), room), service.signing_key())
+
+
+def runnable(view: PlanView, day: date | None = None) -> Signature:
+    """The signature under which a plan may run on a day, today where none is named. Raises Conflict, Invalid where it may not."""
     refuse_running(view)
     if view.visit.date is None:
         raise Conflict(f"Visit {view.visit.number} has no date, and a bundle runs on the day of its visit alone.", "Date the visit.")
-    if view.visit.date < today():
+    if view.visit.date < (day or today()):
         raise Conflict(f"Visit {view.visit.number} was on {view.visit.date}; its bundles have expired.", "Plan another visit.")
     if view.signature is None:
         raise Conflict(f"Plan {view.plan.id} is not signed.", "Have a clinician sign it.")
@@ -80,7 +99,7 @@ def withdrawals(db: Session) -> bytes:
     return body + b"\n" + service.signing_key().sign(body).hex().encode() + b"\n"
 
 
-def _slot(view: PlanView, item: PlanItem, signature: Signature) -> Slot:
+def _slot(view: PlanView, item: PlanItem, signature: Signature, at: datetime) -> Slot:
     return Slot(
         plan_id=view.plan.id,
         slot_id=item.id,
@@ -90,7 +109,7 @@ def _slot(view: PlanView, item: PlanItem, signature: Signature) -> Slot:
         controller=str(item.controller),
         minutes=item.minutes,
         plan_sha256=signature.sha256,
-        issued_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        issued_at=at.isoformat(timespec="seconds"),
         label=item.label,
         repeat=item.repeat,
     )

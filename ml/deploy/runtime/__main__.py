@@ -36,9 +36,9 @@ from .live import End
 from .network import MlpNetwork, Output
 from .protocol import number
 from .schedule import Schedule, ScheduledController
-from .session import Outcome, Tablet, describe, latency, latency_words, parse_manifest, run_bench, run_slot
+from .session import Outcome, Tablet, describe, is_blinded, latency, latency_words, parse_manifest, run_bench, run_slot
 from .signature import verifies
-from .slot import NotAllowed, read_withdrawals
+from .slot import SEALED, NotAllowed, opened, read_withdrawals
 
 _LIMITS = ("min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s", "window", "period_s", "max_beta_age_s")
 _OPTIONAL_LIMITS = ("beta_max", "level_low", "level_high", "frozen_after")
@@ -55,8 +55,12 @@ def main(arguments: list[str]) -> int:
         raw = (folder / "manifest.json").read_bytes()
         manifest = parse_manifest(raw)
         check_files(folder, manifest, raw, key)
-        network = None if manifest.get("schedule") else _network(folder, manifest)
-        worst, worst_ma = check(manifest, network, json.loads((folder / "test_vectors.json").read_bytes()))
+        files = {name: folder / name for name in ("test_vectors.json", "weights.f32")}
+        read = {name: path.read_bytes() for name, path in files.items() if path.exists()}
+        if manifest.get("sealed"):
+            manifest, read = opened(manifest, (folder / SEALED).read_bytes())
+        network = None if manifest.get("schedule") else _network(read, manifest)
+        worst, worst_ma = check(manifest, network, json.loads(read["test_vectors.json"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         sys.stderr.write(f"this bundle cannot be used: {error}\n")
         return 1
@@ -64,9 +68,16 @@ def main(arguments: list[str]) -> int:
     sys.stderr.write(f"{said}test vectors agree: worst difference {worst:.3g} of a fraction, {worst_ma:.3g} mA\n")
     controller = make_controller(manifest, network)
     if "--time" in options:
-        measured = latency(manifest, controller, int(options["--time"] or 200))
-        sys.stdout.write(f"{_what(manifest)}: {latency_words(measured)}\n")
+        _tell_time(manifest, controller, int(options["--time"] or 200))
     return _run(manifest, hashlib.sha256(raw).hexdigest(), controller, options, key) if "--run" in options else 0
+
+
+def _tell_time(manifest: dict[str, Any], controller: BoundedController, decisions: int) -> None:
+    """Measure and tell what a decision takes; of a blinded session it stands in the log alone, for it tells the network's size."""
+    if is_blinded(manifest):
+        sys.stdout.write(f"{_what(manifest)}: what a decision takes stands masked in its log\n")
+        return
+    sys.stdout.write(f"{_what(manifest)}: {latency_words(latency(manifest, controller, decisions))}\n")
 
 
 def _read(arguments: list[str]) -> tuple[Path, dict[str, str]]:
@@ -87,7 +98,7 @@ def _read(arguments: list[str]) -> tuple[Path, dict[str, str]]:
 def _what(manifest: dict[str, Any]) -> str:
     """Whose controller it is, and of which size: the paper compares full policies with distilled ones."""
     slot = manifest.get("slot") or {}
-    if (manifest.get("card") or {}).get("blinded"):
+    if is_blinded(manifest):
         return f"{manifest['participant']}, session {manifest['card']['head']}, blinded"
     size = f"{' x '.join(map(str, manifest['layers'][1:-1]))} units" if manifest.get("layers") else ""
     told = [manifest["participant"], manifest["policy_name"], slot.get("controller", ""), size]
@@ -144,9 +155,11 @@ def make_controller(manifest: dict[str, Any], network: MlpNetwork | None) -> Bou
     return BoundedController(network, limits, said)
 
 
-def _network(folder: Path, manifest: dict[str, Any]) -> MlpNetwork:
+def _network(files: dict[str, bytes], manifest: dict[str, Any]) -> MlpNetwork:
+    if "weights.f32" not in files:
+        raise ValueError("it has no layers that this runner can run; `betaloop control` runs it")
     return MlpNetwork.from_bytes(
-        (folder / "weights.f32").read_bytes(),
+        files["weights.f32"],
         manifest["layers"],
         manifest["normalisation_mean"],
         manifest["normalisation_std"],

@@ -9,16 +9,24 @@ from __future__ import annotations
 
 import csv
 import json
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from .envelope import BetaSample, Decision, reason_names
+from .slot import mask
 
 VERSION = 3
+NONCE_DIGITS = 32
+"""Hexadecimal digits that the masked text of a blinded log begins with."""
+FACTS_BYTES = 2048
+"""The facts of a blinded log take this much, whatever they are."""
+_ROW = struct.Struct(">id")
 COLUMNS = (
     "t_s", "due_s", "beta", "unit", "source", "valid", "window", "fraction", "requested_ma", "amplitude_ma", "action", "reasons",
     "latency_us", "signal_us", "late_ms", "missed", "hold", "log_density", "battery_percent", "ended", "detail",
+    "sealed",
 )  # fmt: skip
 
 
@@ -88,7 +96,28 @@ def cells(row: Row) -> list[Any]:
         "" if row.battery_percent is None else f"{row.battery_percent:g}",
         row.ended or "",
         decision.detail,
+        "",
     ]
+
+
+def seal_facts(facts: Mapping[str, Any], nonce: str) -> str:
+    """What the head of a blinded log says, as text that tells nothing by its look or length."""
+    plain = json.dumps(facts, sort_keys=True, allow_nan=False).encode().ljust(FACTS_BYTES)
+    return nonce + mask(plain, nonce, "facts").hex()
+
+
+def seal_row(number: int, drawn: tuple[int, float | None] | None, nonce: str) -> str:
+    """Hold and log density of a row, as text of one length; -1 and NaN where nothing was drawn."""
+    hold, density = drawn or (-1, None)
+    plain = _ROW.pack(hold, float("nan") if density is None else density)
+    return f"{number}:{mask(plain, nonce, f'row {number}').hex()}"
+
+
+def masked(row: Row, number: int, nonce: str) -> list[Any]:
+    """A row of a blinded session: no draws, no timing, no request, which tell a network from a schedule. The amplitude is as it was."""
+    told = dict(zip(COLUMNS, cells(row), strict=True))
+    hidden = dict.fromkeys(("fraction", "requested_ma", "latency_us", "signal_us", "hold", "log_density"), "")
+    return list((told | hidden | {"sealed": seal_row(number, row.drawn, nonce)}).values())
 
 
 class LogFile:
@@ -103,6 +132,8 @@ class LogFile:
 
     def __init__(self, path: Path, period_s: float, facts: Mapping[str, Any]) -> None:
         self._path = path
+        self._nonce = str(facts.get("sealed") or "")[:NONCE_DIGITS]
+        self._rows = 0
         try:
             if path.is_file() and path.stat().st_size:
                 raise LogFailed(f"the log {path} is there already: name a new file, no decision is written over")
@@ -115,7 +146,8 @@ class LogFile:
 
     def write(self, row: Row) -> None:
         """Add a row. Raises LogFailed."""
-        self._row(cells(row))
+        self._row(masked(row, self._rows, self._nonce) if self._nonce else cells(row))
+        self._rows += 1
 
     def close(self) -> None:
         """Raises LogFailed where what was written cannot be kept."""

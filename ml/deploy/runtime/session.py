@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .controller import BoundedController
-from .decision_log import LogFile
+from .decision_log import LogFile, seal_facts
 from .envelope import BetaSample, Signal
 from .inputs import Link
 from .ledger import Ledger
@@ -30,6 +31,11 @@ OF_LOG = (
     "participant", "hemisphere", "policy_id", "policy_name", "cdbs_ma", "min_ma", "max_ma", "ramp_ma_per_s", "window", "period_s",
 )  # fmt: skip
 """Entries of the manifest that a log repeats."""
+OF_BLINDED_LOG = (
+    "participant", "hemisphere", "cdbs_ma", "period_s", "plan_id", "slot_id", "position", "visit_number", "visit_date", "minutes",
+    "label", "plan_sha256", "issued_at", "purpose", "manifest_sha256", "started_at",
+)  # fmt: skip
+"""What the log of a blinded session says for all to read: which session it is, and not what ran."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,7 +169,7 @@ def describe(
     slot = dict(manifest.get("slot") or {})
     schedule = manifest.get("schedule") or {}
     design = {name: schedule[name] for name in ("design", "level", "seed", "lower_bound") if name in schedule}
-    return {
+    facts = {
         **{name: manifest.get(name) for name in OF_LOG},
         **slot,
         **design,
@@ -173,6 +179,16 @@ def describe(
         "latency_us": latency(manifest, controller) if purpose != "replay" else None,
         "network_sha256": manifest["files"].get(NETWORK),
     }
+    if not is_blinded(manifest):
+        return facts
+    told = {name: facts[name] for name in OF_BLINDED_LOG if name in facts}
+    kept = {name: value for name, value in facts.items() if name not in told}
+    return told | {"sealed": seal_facts(kept, os.urandom(16).hex())}
+
+
+def is_blinded(manifest: Mapping[str, Any]) -> bool:
+    """Whether nobody at the tablet is to know what runs."""
+    return bool((manifest.get("card") or {}).get("blinded"))
 
 
 def latency(manifest: Mapping[str, Any], controller: BoundedController, decisions: int = TIMED_DECISIONS) -> dict[str, float]:

@@ -1,15 +1,27 @@
-"""The session slot that a bundle is for, and whether it may run now: on its day, once, while nothing of it has been withdrawn."""
+"""The session slot that a bundle is for, and whether it may run now: on its day, once, while nothing of it has been withdrawn.
+
+What a blinded slot runs is masked, and padded to one size for all sessions of a plan. That keeps people from learning by looking, and no
+more: the tablet must run what is inside, so that whoever writes a program can read it.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import date, datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from .signature import verifies
+
+SEALED = "session.bin"
+"""The file of a blinded bundle that holds manifest, test vectors, and network or schedule."""
 
 
 class Refusal(StrEnum):
@@ -101,7 +113,8 @@ class Withdrawals:
     def check(self, slot: Slot, policy_id: int | None) -> None:
         """Raise NotAllowed for a slot of a plan, or with a policy, that was taken back."""
         if policy_id is not None and policy_id in self.policies:
-            raise NotAllowed(Refusal.WITHDRAWN, f"policy {policy_id} was withdrawn; have the plan changed and signed anew")
+            which = f"policy {policy_id}" if slot.label is None else f"what session {slot.label} was to run"  # a blinded one is not told
+            raise NotAllowed(Refusal.WITHDRAWN, f"{which} was withdrawn; have the plan changed and signed anew")
         if slot.plan_id in self.plans:
             raise NotAllowed(Refusal.WITHDRAWN, f"plan {slot.plan_id} was replaced or withdrawn; take a bundle of the present plan")
 
@@ -133,3 +146,49 @@ def withdrawals_body(withdrawn: Withdrawals) -> bytes:
     """The JSON line that is signed."""
     facts = {"kind": "betaloop withdrawals", "issued_at": withdrawn.issued_at}
     return json.dumps(facts | {"policies": sorted(withdrawn.policies), "plans": sorted(withdrawn.plans)}, sort_keys=True).encode()
+
+
+def mask(content: bytes, nonce: str, part: str = "") -> bytes:
+    """Masked, or masked again and so as it was. `nonce`: hexadecimal digits. `part`: of what."""
+    stream = hashlib.shake_256(bytes.fromhex(nonce) + part.encode()).digest(len(content))
+    return (np.frombuffer(content, dtype=np.uint8) ^ np.frombuffer(stream, dtype=np.uint8)).tobytes()
+
+
+def seal(files: Mapping[str, bytes], nonce: str, room: int) -> bytes:
+    """Files in one, filled up to `room` bytes, or to the next power of two where they need more."""
+    head = json.dumps([[name, len(content)] for name, content in files.items()]).encode()
+    whole = struct.pack(">Q", len(head)) + head + b"".join(files.values())
+    while room < len(whole):
+        room *= 2
+    return mask(whole.ljust(room, b"\0"), nonce)
+
+
+def unseal(content: bytes, nonce: str) -> dict[str, bytes]:
+    """The inverse of `seal`. Raises ValueError for other bytes."""
+    plain = mask(content, nonce)
+    try:
+        (length,) = struct.unpack(">Q", plain[:8])
+        at, files = 8 + length, {}
+        for name, size in json.loads(plain[8:at]):
+            files[str(name)] = plain[at : at + size]
+            at += size
+    except (struct.error, ValueError, TypeError) as error:
+        raise ValueError(f"{SEALED} cannot be read") from error
+    if at > len(plain):
+        raise ValueError(f"{SEALED} is cut")
+    return files
+
+
+def same_session(outer: Mapping[str, Any], inner: Mapping[str, Any]) -> None:
+    """Raise ValueError where what is sealed is of another session than the manifest outside says."""
+    told = [(m["participant"], m["cdbs_ma"], m["slot"]["plan_id"], m["slot"]["slot_id"], m["slot"]["visit_date"]) for m in (outer, inner)]
+    if told[0] != told[1]:
+        raise ValueError("what is sealed is of another session than the manifest says")
+
+
+def opened(outer: dict[str, Any], content: bytes) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """The manifest and the files that a blinded bundle keeps to itself. Raises ValueError, KeyError, TypeError for other bytes."""
+    files = unseal(content, outer["sealed"])
+    inner = json.loads(files.pop("manifest.json"))
+    same_session(outer, inner)
+    return inner, files

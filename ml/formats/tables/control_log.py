@@ -25,12 +25,13 @@ from ml.formats.redaction_record import Redaction
 from ml.formats.source import Source
 from ml.formats.tables.columns import Columns
 from ml.formats.tables.log_head import ENDS, MEND, Ran, read_head
+from ml.formats.tables.masked import row_of
 from ml.formats.tables.numbers import NotANumber, known_unit, parse_number, shown
 from ml.formats.tables.steps import GRID_TOLERANCE, decode_columns
 
 MARK = b"# betaloop controller log"
 NEEDED = ("t_s", "beta", "unit", "amplitude_ma")
-OPTIONAL = ("due_s", "source", "reasons", "action", "hold", "log_density", "ended", "battery_percent")
+OPTIONAL = ("due_s", "source", "reasons", "action", "hold", "log_density", "ended", "battery_percent", "sealed")
 NO_BETA = frozenset({"no_beta", "invalid_beta", "wrong_signal", "late_sample"})
 """Reasons of a decision whose beta amplitude is not one of the period that ended."""
 UNKNOWN_START = 0.05
@@ -189,7 +190,7 @@ def _opened(path: Source) -> Iterator[Iterator[str]]:
 
 def _read(path: Source, options: DecodeOptions) -> Log:
     with _opened(path) as lines:
-        period_s, ran, head = read_head(lines, options)
+        period_s, ran, head, nonce = read_head(lines, options)
         before = head.count("\n") + 1
         reader = csv.reader(lines)
         headers = [h.strip() for h in next(reader, [])]
@@ -207,7 +208,7 @@ def _read(path: Source, options: DecodeOptions) -> Log:
                 raise UndecodableFile(f"{len(row)} cells where the header has {len(headers)}", f"line {line}", MEND)
             if len(found) >= options.max_table_rows:
                 raise UndecodableFile(f"more than {options.max_table_rows} rows", f"line {line}", "Upload one session per log.")
-            found.append(_row(row, at, line))
+            found.append(_row(row, at, line, nonce))
     if not found:
         raise UndecodableFile("the log has no decision", f"after line {before + 1}", "Upload the log of a session.")
     times = np.array([row.t_s for row in found])
@@ -251,7 +252,7 @@ class _Cells(NamedTuple):
     ended: str
 
 
-def _row(row: list[str], at: dict[str, int], line: int) -> _Cells:
+def _row(row: list[str], at: dict[str, int], line: int, nonce: str | None) -> _Cells:
     def text(name: str) -> str:
         return row[at[name]].strip() if name in at else ""
 
@@ -268,6 +269,11 @@ def _row(row: list[str], at: dict[str, int], line: int) -> _Cells:
         raise UndecodableFile("a decision without its time or its amplitude", f"line {line}", MEND)
     beta = None if set(text("reasons").split()) & NO_BETA else number("beta")
     hold, density, battery = number("hold"), number("log_density"), number("battery_percent")
+    if nonce is not None and text("sealed"):
+        try:
+            hold, density = row_of(text("sealed"), nonce)
+        except ValueError as error:
+            raise UndecodableFile("a masked cell of this blinded log is not whole", f"line {line}, column sealed", MEND) from error
     return _Cells(
         line=line,
         t_s=t_s,

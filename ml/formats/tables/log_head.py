@@ -16,6 +16,7 @@ from typing import Any, cast
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import Hemisphere, UndecodableFile
 from ml.formats.tables.columns import LARGEST, LOG_KIND_LINE
+from ml.formats.tables.masked import facts_of
 from ml.formats.tables.steps import GRID_TOLERANCE
 
 NEWEST = 3
@@ -35,7 +36,7 @@ _RAN = re.compile(
 )
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _CODE = re.compile(r"[A-Za-z0-9_.-]{1,40}")
-_LONGEST = 4000
+_LONGEST = 8000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +90,8 @@ class Ran:
         return self.purpose in ("session", "bench")
 
 
-def read_head(lines: Iterator[str], options: DecodeOptions) -> tuple[float, Ran | None, str]:
-    """The period, s, what ran, and the head as it may be stored, from the lines of a file.
+def read_head(lines: Iterator[str], options: DecodeOptions) -> tuple[float, Ran | None, str, str | None]:
+    """The period, s, what ran, the head as it may be stored, and the nonce of a blinded log, from the lines of a file.
 
     Raises:
         UndecodableFile: the head is cut, or of another version or period.
@@ -111,28 +112,33 @@ def read_head(lines: Iterator[str], options: DecodeOptions) -> tuple[float, Ran 
         limits: dict[str, Any] = {name: float(said[name]) for name in ("min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s")}
         side = cast("Hemisphere | None", said["side"])
         ran = Ran(policy_id=int(said["policy_id"]), network_sha256=said["network_sha256"], side=side, **limits)
-        return options.period_s, ran, first
+        return options.period_s, ran, first, None
     if version == 2 or kind["ran"]:
         raise _cut("line 1")
     if version == 1:
-        return options.period_s, None, first
-    ran = _described(next(lines, "").strip().removeprefix('"').removesuffix('"'))
+        return options.period_s, None, first, None
+    ran, nonce = _described(next(lines, "").strip().removeprefix('"').removesuffix('"'))
     kept = {_SAID_AS.get(name, name): value for name, value in asdict(ran).items() if value is not None}
-    return options.period_s, ran, f"{first}\n# {json.dumps(kept, sort_keys=True)}"
+    return options.period_s, ran, f"{first}\n# {json.dumps(kept, sort_keys=True)}", nonce
 
 
 def _cut(where: str) -> UndecodableFile:
     return UndecodableFile("the first line of this controller's log is not whole", where, MEND)
 
 
-def _described(line: str) -> Ran:
-    """The JSON line of version 3, entry by entry: what is not of its kind is no entry of a log that a runner wrote."""
+def _described(line: str) -> tuple[Ran, str | None]:
+    """The JSON line of version 3, entry by entry: what is not of its kind is no entry of a log that a runner wrote. And the nonce of a
+    blinded one."""
     try:
         said = json.loads(line.removeprefix("# ")) if line.startswith("# ") and len(line) <= _LONGEST else None
     except ValueError:
         said = None
     if not isinstance(said, Mapping):
         raise _cut("line 2")
+    nonce = None
+    if said.get("sealed") is not None:
+        nonce, kept = _unsealed(said["sealed"])
+        said = {**kept, **{name: value for name, value in said.items() if name != "sealed"}}
     found: dict[str, Any] = {}
     for name, kind in _ENTRIES.items():
         written = _SAID_AS.get(name, name)
@@ -144,7 +150,14 @@ def _described(line: str) -> Ran:
         except (TypeError, ValueError, KeyError) as error:
             what = f"the entry {written} of this controller's log is missing, or of another kind"
             raise UndecodableFile(what, "line 2", MEND) from error
-    return Ran(**{"policy_id": None, "network_sha256": None, "side": None} | found)
+    return Ran(**{"policy_id": None, "network_sha256": None, "side": None} | found), nonce
+
+
+def _unsealed(text: Any) -> tuple[str, dict[str, Any]]:
+    try:
+        return facts_of(str(text))
+    except ValueError as error:
+        raise UndecodableFile("the masked entry of this blinded log is not whole", "line 2", MEND) from error
 
 
 _SAID_AS = {"side": "hemisphere"}

@@ -1,0 +1,206 @@
+"""The bundles of a blinded plan look alike, run as the open ones do, and their logs come back by their slots."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import re
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from fastapi.testclient import TestClient
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+
+from app.platform.errors import Invalid
+from app.tablet.command import control, lines
+from app.tablet.sources import Wish
+from app.tablet.task import Task
+from ml.deploy.bundle import BundleError, open_bundle
+from ml.deploy.manifest import BundleManifest
+from ml.deploy.runtime.slot import SEALED
+from ml.rl import MlpPolicy
+
+TODAY = datetime.now(UTC).date()
+TELLING = ("net-", "rl", "distilled", "random", "paper", "stratified", "relu", "constant")
+
+
+@pytest.fixture
+def policies(client: TestClient, studied: Any) -> list[int]:
+    """A small network and a large one."""
+    made = []
+    for name, layers in (("net-small", (8,)), ("net-large", (96, 96))):
+        content = MlpPolicy(10, layers, mean=1.0, std=0.5, seed=1).to_onnx()
+        posted = client.post("/api/v1/participants/P1/policies", data={"name": name}, files={"file": ("x.onnx", content)})
+        made.append(int(posted.json()["id"]))
+    return made
+
+
+@pytest.fixture
+def plan(client: TestClient, db: Session, studied: Any, policies: list[int], sign_plan: Callable[..., Any]) -> dict[str, Any]:
+    """A blinded plan of today: two policies, cDBS between, a random session; who may see it all knows what is what."""
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"design": "stratified"}})
+    db.execute(text("update visit set date = :day where id = :id"), {"day": TODAY, "id": studied.visit})
+    db.commit()
+    wanted = {"policy_ids": policies, "seed": 7, "min_ma": 0.5, "random_sessions": 1, "minutes_per_session": 5, "blinded": True}
+    drafted = client.post(f"/api/v1/visits/{studied.visit}/plan", json=wanted)
+    assert drafted.status_code == 201, drafted.text
+    assert sign_plan(studied.visit, plan_id=drafted.json()["id"]).status_code == 200
+    return dict(drafted.json())
+
+
+@pytest.fixture
+def bundles(client: TestClient, studied: Any, plan: dict[str, Any]) -> dict[int, bytes]:
+    """By position."""
+    found = {}
+    for session in plan["sessions"]:
+        answer = client.get(f"/api/v1/visits/{studied.visit}/plan/sessions/{session['position']}/bundle")
+        assert answer.status_code == 200, answer.text
+        assert re.fullmatch(r'attachment; filename="P1-visit-\d+-session-\d+.zip"', answer.headers["content-disposition"])
+        found[session["position"]] = answer.content
+    return found
+
+
+def files_of(content: bytes) -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def words_of(content: bytes) -> set[str]:
+    return set(re.findall(r"[a-z]+-?", content.decode().lower()))
+
+
+@pytest.mark.hazard("H19")
+def test_nobody_tells_from_a_blinded_bundle_what_it_runs(bundles: dict[int, bytes], db: Session) -> None:
+    assert set(db.execute(text("select controller from plan_item")).scalars()) >= {"cdbs", "random"}
+    opened = {position: files_of(content) for position, content in bundles.items()}
+    assert len({tuple(files) for files in opened.values()}) == 1, "the same files"
+    for name in next(iter(opened.values())):
+        sizes = {len(files[name]) for files in opened.values()}
+        assert max(sizes) - min(sizes) <= 40, f"{name} has one size but for letters, numbers and the last washout: {sizes}"
+    common = []
+    for files in opened.values():
+        manifest = json.loads(files["manifest.json"])
+        assert (manifest["policy_id"], manifest["schedule"], manifest["layers"]) == (None, None, [])
+        assert manifest["slot"].pop("controller") == "blinded"
+        for name in ("taken_by", "files", "sealed", "card", "policy_name", "slot", "approvals"):
+            manifest.pop(name)
+        common.append(manifest)
+        for name in ("manifest.json", "sheet.html"):
+            assert not words_of(files[name]) & set(TELLING), name
+        zeros = np.frombuffer(files[SEALED], dtype=np.uint8) == 0
+        assert 0.002 < zeros.mean() < 0.006, "neither its filling nor its text is seen: every byte is as frequent as any other"
+    assert all(manifest == common[0] for manifest in common), "what the manifests say of limits and signal is the same"
+
+
+def test_a_sealed_part_that_was_exchanged_or_cut_is_no_bundle(client: TestClient, bundles: dict[int, bytes]) -> None:
+    key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(client.get("/api/v1/bundle-key").text.strip()))
+    first, second = (files_of(bundles[p]) for p in (1, 2))
+    outer = BundleManifest.from_bytes(first["manifest.json"])
+    assert open_bundle(bundles[1], key).manifest.slot.position == 1  # type: ignore[union-attr]
+    for sealed, words in ((second[SEALED], "is not the file that the manifest names"), (first[SEALED][:-1], "is not the file")):
+        with pytest.raises(BundleError, match=words):
+            open_bundle(packed(first | {SEALED: sealed}), key)
+    # whoever signs could exchange it: it is held against the manifest all the same
+    other = dataclasses.replace(
+        outer,
+        sealed=json.loads(second["manifest.json"])["sealed"],
+        files=outer.files | {SEALED: hashlib.sha256(second[SEALED]).hexdigest()},
+    )
+    with pytest.raises(BundleError, match="of another session"):
+        open_bundle(packed(first | {SEALED: second[SEALED], "manifest.json": other.to_bytes()}))
+
+
+def packed(files: dict[str, bytes]) -> bytes:
+    sink = io.BytesIO()
+    with zipfile.ZipFile(sink, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return sink.getvalue()
+
+
+def test_a_blinded_day_runs_without_telling_and_comes_back_by_its_slots(
+    client: TestClient, db: Session, studied: Any, plan: dict[str, Any], bundles: dict[int, bytes], tmp_path: Path
+) -> None:
+    key = client.get("/api/v1/bundle-key").text.strip()
+    items = {row.position: row for row in db.execute(text("select * from plan_item")).all()}
+    heads, now = set(), datetime.now(UTC)
+    if (now + timedelta(hours=1)).date() != now.date():
+        pytest.skip("the sessions of this day would run into the next one, on which no bundle of today runs")
+    for position, content in bundles.items():
+        bundle, log = tmp_path / f"{position}.zip", tmp_path / f"{position}.csv"
+        bundle.write_bytes(content)
+        task = Task(log=log, key=key, ledger=tmp_path / "ledger", participant="P1", timed=20, begins=now + timedelta(minutes=10 * position))
+        told = lines(control(bundle, f"simulated:P1:{position}", Wish(), task))
+        assert "blinded" in told
+        assert not [w for w in (*TELLING, "mA", "energy", "decision in us", "battery") if re.search(rf"\b{w}\b", told)], told
+        head, described, header, *rows = log.read_text().splitlines()
+        assert not words_of(described.encode()) & {*TELLING, "latency", "design", "seed"}
+        heads.add((head, len(described) - len(str(position)), header))
+        for name in ("fraction", "requested_ma", "latency_us", "hold", "log_density"):
+            assert {row.split(",")[header.split(",").index(name)] for row in rows} == {""}, name
+        sent = client.post("/api/v1/uploads", data={"participant": "P1"}, files={"file": ("log.csv", log.read_bytes())})
+        assert sent.status_code == 201, sent.text
+    assert len(heads) == 1, "one log looks like another but for its amplitudes"
+    path = f"/api/v1/visits/{studied.visit}/slots"
+    done = client.post(f"{path}/confirm", json={})
+    assert done.status_code == 200, done.text
+    for row in client.get(path).json()["rows"]:
+        item = items[row["position"]]
+        assert (row["confirmed"], row["deviations"]) == (True, [])
+        found = db.execute(text("select controller, policy_id from session where id = :id"), {"id": row["session_id"]}).one()
+        assert tuple(found) == (item.controller, item.policy_id)
+        conditions = client.get(f"/api/v1/sessions/{row['session_id']}/conditions").json()
+        assert (conditions["min_ma"], conditions["max_ma"]) == (item.min_ma, item.max_ma), "the limits of the slot, not the common ones"
+        if item.controller == "random":
+            drawn = [(h["start"], h["steps"], h["log_density"]) for h in item.design["holds"]]
+            kept = [(h["start"], h["steps"], h["log_density"]) for h in conditions["design_parameters"]["holds"]]
+            np.testing.assert_allclose(kept, drawn)
+            assert (conditions["design"], conditions["seed"]) == (item.design["design"], item.design["seed"])
+
+
+def test_the_bundles_own_runner_runs_a_blinded_session_and_refuses_it_a_second_time(
+    client: TestClient, bundles: dict[int, bytes], tmp_path: Path
+) -> None:
+    key = client.get("/api/v1/bundle-key").text.strip()
+    with zipfile.ZipFile(io.BytesIO(bundles[1])) as archive:
+        archive.extractall(tmp_path)
+    call = [sys.executable, "-m", "controller", f"--key={key}", "--time=20", "--run", "--log=log.csv", f"--ledger={tmp_path / 'ledger'}"]
+    m = json.loads((tmp_path / "manifest.json").read_bytes())
+    hello = f"hello 1 P1 - {m['beta_unit']} {m['beta_source']} {1000 * m['period_s']:g}\n"
+    first = subprocess.run(call, cwd=tmp_path, input=hello + "stop\n", capture_output=True, text=True, check=False)
+    assert first.returncode == 0, first.stderr
+    assert "test vectors agree" in first.stderr
+    assert "blinded: what a decision takes stands masked in its log" in first.stdout
+    again = subprocess.run([*call[:-2], "--log=b.csv", call[-1]], cwd=tmp_path, input=hello, capture_output=True, text=True, check=False)
+    assert (again.returncode, "a slot runs once" in again.stderr) == (1, True)
+
+
+@pytest.mark.hazard("H20")
+def test_a_withdrawn_policy_and_another_participant_are_refused_to_a_blinded_bundle(
+    client: TestClient, db: Session, bundles: dict[int, bytes], policies: list[int], tmp_path: Path
+) -> None:
+    key, bundle = client.get("/api/v1/bundle-key").text.strip(), tmp_path / "b.zip"
+    position = db.execute(text("select position from plan_item where policy_id = :id"), {"id": policies[0]}).scalar_one()
+    bundle.write_bytes(bundles[position])
+    with pytest.raises(Invalid, match="of participant P1, not P2"):
+        control(bundle, "simulated:P1", Wish(), Task(key=key, participant="P2", log=tmp_path / "a.csv", ledger=tmp_path / "l"))
+    tomorrow = Task(key=key, log=tmp_path / "a.csv", ledger=tmp_path / "l", begins=datetime(2099, 1, 1, 9, tzinfo=UTC))
+    with pytest.raises(Invalid, match="expired that night"):
+        control(bundle, "simulated:P1", Wish(), tomorrow)
+    assert client.patch(f"/api/v1/policies/{policies[0]}", json={"retired_reason": "a fault"}).status_code in (200, 204)
+    listed = tmp_path / "withdrawn.txt"
+    listed.write_bytes(client.get("/api/v1/bundle-withdrawals").content)
+    with pytest.raises(Invalid, match="was withdrawn") as refused:
+        control(bundle, "simulated:P1", Wish(), Task(key=key, log=tmp_path / "a.csv", ledger=tmp_path / "l", withdrawn=listed))
+    assert f"policy {policies[0]}" not in str(refused.value), "a refusal does not tell whose session it was"
