@@ -12,13 +12,13 @@ from typing import Any, Final
 from app.learning.schemas import DEFAULT_SWEEP
 from app.platform.errors import Conflict, Invalid
 from ml.population import PARTICIPANTS
-from ml.population.clinic import PlannedSession, plan_day
 
 BETWEEN_VISITS: Final = dt.timedelta(days=28)
 SINCE_LAST_VISIT: Final = dt.timedelta(days=14)
 MORNING: Final = dt.time(9, 5, tzinfo=dt.UTC)
-STEPS_PER_MINUTE: Final = 30
 STATE_FILE: Final = "simulated-study.json"
+VERSION: Final = 2
+"""Of how a study is run; 1: visits that collect had no plan, and no session a bundle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class Preset:
 
     Attributes:
         visits: visits when none are asked for. random_visits: the first ones, which only collect, with the random controller.
-        random_sessions: of such a visit, each between two cDBS sessions.
+        random_sessions: of such a visit, after one of cDBS.
         session_minutes: of every session but no-DBS (5 minutes). The paper's lasted 5-20.
         policies_per_kind: full-sized and distilled policies that a visit tests, of each; together the paper's 2-4.
         pipeline: params of the between-visit pipeline.
@@ -69,7 +69,7 @@ class Design:
     def expected_sessions(self, visit: int) -> int:
         """Sessions of a visit's day, as it will be planned."""
         if visit <= self.preset.random_visits:
-            return len(collecting_day(self.preset))
+            return self.preset.random_sessions + 2  # a cDBS session before them, one without stimulation after
         return 4 * self.preset.policies_per_kind  # n policies, n - 1 cDBS sessions between them, one without stimulation
 
     def fine_tunes(self, visit: int) -> bool:
@@ -96,11 +96,6 @@ def design(participants: Sequence[str], visits: int | None, seed: int, preset: s
     return Design(participants=tuple(participants), visits=count, seed=seed, preset=PRESETS[preset])
 
 
-def collecting_day(preset: Preset) -> list[PlannedSession]:
-    """A day of the first visits: random sessions, each between two cDBS sessions, and a short one without stimulation."""
-    return plan_day([], steps=preset.session_minutes * STEPS_PER_MINUTE, random_sessions=preset.random_sessions)
-
-
 def visit_day(begun: dt.date, visits: int, number: int) -> dt.date:
     """The date of a visit: a month apart, the last of `visits` two weeks before the study was begun."""
     return begun - SINCE_LAST_VISIT - (visits - number) * BETWEEN_VISITS
@@ -124,6 +119,11 @@ def remember(path: Path, wanted: Design, today: dt.date) -> Remembered:
     size = asdict(wanted.preset)
     if path.exists():
         stored = json.loads(path.read_text("utf-8"))
+        if stored.get("version") != VERSION:
+            raise Conflict(
+                "The simulated study in this data folder was begun by another version of betaloop, which ran its sessions in another way.",
+                "Choose another folder (BETALOOP_DATA_DIR); what it holds stays as it is.",
+            )
         if (stored["seed"], stored["preset"]) != (wanted.seed, json.loads(json.dumps(size))):
             other = "" if stored["seed"] != wanted.seed else " and another preset"
             raise Conflict(
@@ -134,6 +134,6 @@ def remember(path: Path, wanted: Design, today: dt.date) -> Remembered:
     first = visit_day(today, wanted.visits, 1)
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(".part")
-    draft.write_text(json.dumps({"seed": wanted.seed, "preset": size, "first": first.isoformat()}), "utf-8")
+    draft.write_text(json.dumps({"version": VERSION, "seed": wanted.seed, "preset": size, "first": first.isoformat()}), "utf-8")
     draft.replace(path)
     return Remembered(wanted.seed, size, first)

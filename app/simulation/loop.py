@@ -5,7 +5,9 @@ from __future__ import annotations
 import datetime as dt
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Protocol
 
 from sqlalchemy.orm import Session
@@ -13,13 +15,12 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.evaluation.ranking.service import current_assessment
 from app.learning import repository as learning
-from app.learning.models import Policy
 from app.pipeline.service import start_job
 from app.planning.plans import repository as plans
 from app.planning.plans import service as planning
 from app.planning.plans import view as plan_view
-from app.planning.plans.designs import planned_sessions
 from app.planning.plans.schemas import OverrideIn, PlanIn
+from app.planning.plans.view import PlanLine
 from app.planning.protocol.schedule import total_minutes
 from app.planning.slots import service as slots
 from app.platform.database import new_session, set_actor
@@ -27,10 +28,9 @@ from app.platform.errors import BetaloopError, Conflict, NotFound
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.models import JobStatus
 from app.platform.jobs.watch import POLL_S, look
-from app.simulation import sessions
 from app.simulation.demo_study import participant_body
-from app.simulation.design import BETWEEN_VISITS, MORNING, STEPS_PER_MINUTE, Design, Remembered, collecting_day
-from app.simulation.sessions import PlacedSession
+from app.simulation.design import BETWEEN_VISITS, MORNING, Design, Remembered
+from app.simulation.sessions import VisitDay, actual_return
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.blinding import CONTROLLER_NAMES, arm
@@ -119,6 +119,7 @@ class ParticipantLoop:
 
     def _visit(self, number: int) -> None:
         day = self.remembered.first + (number - 1) * BETWEEN_VISITS
+        collects = number <= self.design.preset.random_visits
         with self._transaction() as db:
             person = self._participant(db)
             visit = study_repository.visit_by_number(db, person.id, number)
@@ -126,21 +127,38 @@ class ParticipantLoop:
                 note = "Simulated: the participant is synthetic and not fitted to a patient."
                 visit = study.add_visit(db, person, VisitIn(number=number, date=day, note=note), self.caller)
                 db.commit()
-            if number > self.design.preset.random_visits:
-                if plans.live_plan(db, visit.id) is None:
+            if plans.live_plan(db, visit.id) is None:
+                if not collects:
                     self._learn(db, person, number)
-                    self._draft(db, person, visit)
+                self._draft(db, person, visit, collects)
+            if not collects:
                 self.progress.job(self.code, 1.0)
-                self._approve(db, visit)
-                placed = self._planned(db, visit, day)
-            else:
-                placed = self._collecting(person, number, day)
-            for one in placed:
-                self.progress.say(self.code, f"visit {number}: {_name(one)}")
-                sessions.hold(db, person, visit, one, self.design.seed, self.caller)
-                self.progress.session_held(self.code)
-            if number > self.design.preset.random_visits:
-                self._fill(db, visit)
+            self._approve(db, visit)
+            with TemporaryDirectory(prefix="betaloop-tablet-") as tablet:
+                self._hold(db, visit, day, Path(tablet))
+
+    def _hold(self, db: Session, visit: Visit, day: dt.date, tablet: Path) -> None:
+        """Hold the sessions of the signed plan that have no recording yet, and confirm all into their slots in one step.
+
+        Raises:
+            BetaloopError: a planned session is missing although the day is over, which would be a fault of the simulator.
+        """
+        the_day = VisitDay(visit, self.design.seed, dt.datetime.combine(day, MORNING), tablet, self.caller)
+        rows = slots.compare(db, visit, self.caller).rows
+        lines = [row.line for row in rows if row.line is not None]
+        waiting = {row.line.item.id for row in rows if row.line is not None and row.session is None}
+        for line in lines:
+            if line.item.id in waiting:
+                self.progress.say(self.code, f"visit {visit.number}: {_name(line)}")
+                the_day.hold(db, line.item, line.start_minute)
+            self.progress.session_held(self.code)
+        the_day.end(db, lines[0].item.plan_id)
+        self._fill(db, visit)
+        db.expire_all()
+        for row in slots.compare(db, visit, self.caller).rows:
+            if row.line is not None and row.session is not None:
+                the_day.tremor(db, row.session, row.line.item, row.line.start_minute)
+                db.commit()
 
     def _learn(self, db: Session, person: Participant, number: int) -> None:
         """The pipeline before a visit: the one that was begun for it, or a new one; waits for its end."""
@@ -170,15 +188,34 @@ class ParticipantLoop:
         returns: dict[int, list[float]] = {}
         for session in study_repository.sessions_of_participant(db, person.id):
             assigned = arm(session, self.caller)
-            value = sessions.actual_return(db, session) if assigned.controller is Controller.RL else None
+            value = actual_return(db, session) if assigned.controller is Controller.RL else None
             if assigned.policy_id is not None and value is not None:
                 returns.setdefault(assigned.policy_id, []).append(value)
         usable = {p.id for p in learning.candidates(db, person.id) if p.kind == "trained"}
         ordered = sorted(usable & returns.keys(), key=lambda i: (-sum(returns[i]) / len(returns[i]), i))
         return ordered[: self.design.preset.policies_per_kind]
 
-    def _draft(self, db: Session, person: Participant, visit: Visit) -> None:
-        """Draft the visit from the first policies of each kind in the ranking, and with one test with care at most.
+    def _draft(self, db: Session, person: Participant, visit: Visit, collects: bool) -> None:
+        """Draft the visit: random sessions alone at first, then policies. A session without stimulation ends each day."""
+        size = self.design.preset
+        chosen, overrides = ([], []) if collects else self._chosen(db, person)
+        draft = PlanIn(
+            policy_ids=chosen,
+            overrides=overrides,
+            random_sessions=size.random_sessions if collects else 0,
+            minutes_per_session=float(size.session_minutes),
+            washout_minutes=_WASHOUT_MINUTES,
+            no_dbs=True,
+            seed=(self.design.seed + visit.number) % planning.MAX_SEED,
+            note="Drafted by the simulated study"
+            + (", to collect." if collects else " from the first policies of each kind in the ranking."),
+        )
+        needed = total_minutes(len(chosen), planning.rules_of(draft))
+        planning.draft_plan(db, visit, draft.model_copy(update={"total_minutes": max(needed, draft.total_minutes)}), self.caller)
+        db.commit()
+
+    def _chosen(self, db: Session, person: Participant) -> tuple[list[int], list[OverrideIn]]:
+        """The first policies of each kind in the ranking, with one to test with care at most.
 
         Unsafe ones fill what would stay empty, with a reason: nobody is harmed here, and an arm without sessions measures nothing.
         """
@@ -190,43 +227,13 @@ class ParticipantLoop:
         each = self.design.preset.policies_per_kind
         chosen = [a.policy.id for kind in LEARNED_KINDS for a in [a for a in fit if a.policy.kind == kind][:each]]
         unsafe = [a.policy.id for a in fit if a.policy.id in chosen and a.decided and a.decided.needs_override]
-        minutes = float(self.design.preset.session_minutes)
-        draft = PlanIn(
-            policy_ids=chosen,
-            overrides=[OverrideIn(policy_id=i, reason="a simulated participant: its arm would be empty without it") for i in unsafe],
-            minutes_per_session=minutes,
-            washout_minutes=_WASHOUT_MINUTES,
-            no_dbs=True,
-            seed=(self.design.seed + visit.number) % planning.MAX_SEED,
-            note="Drafted by the simulated study from the first policies of each kind in the ranking.",
-        )
-        needed = total_minutes(len(chosen), planning.rules_of(draft))
-        planning.draft_plan(db, visit, draft.model_copy(update={"total_minutes": max(needed, draft.total_minutes)}), self.caller)
-        db.commit()
+        return chosen, [OverrideIn(policy_id=i, reason="a simulated participant: its arm would be empty without it") for i in unsafe]
 
     def _approve(self, db: Session, visit: Visit) -> None:
         plan = plan_view.read_plan(db, visit, self.caller).plan
         if plan.status == "draft":
             planning.approve_plan(db, visit, self.signer.caller, self.signer.password, plan.id)
             db.commit()
-
-    def _planned(self, db: Session, visit: Visit, day: dt.date) -> list[PlacedSession]:
-        """The sessions of the approved plan."""
-        lines = plan_view.read_plan(db, visit, self.caller).lines
-        policies: dict[int, Policy] = {
-            p.id: p for p in learning.policies_named(db, visit.participant_id, [i.item.policy_id for i in lines if i.item.policy_id])
-        }
-        return [
-            _placed(
-                line.item.position,
-                Controller(line.item.controller),
-                policies[line.item.policy_id] if line.item.policy_id else None,
-                day,
-                line.start_minute / 60,
-                round(line.item.minutes * STEPS_PER_MINUTE),
-            )
-            for line in lines
-        ]
 
     def _fill(self, db: Session, visit: Visit) -> None:
         """Confirm the visit's sessions into the slots of its signed plan.
@@ -242,23 +249,8 @@ class ParticipantLoop:
             slots.confirm(db, visit, self.caller)
             db.commit()
 
-    def _collecting(self, person: Participant, number: int, day: dt.date) -> list[PlacedSession]:
-        """The sessions of a visit that only collects; what its random ones try is by the design in the participant's settings."""
-        size = self.design.preset
-        to_try = iter(planned_sessions(person.current_settings, self.code, number - 1, size.random_sessions, float(size.session_minutes)))
-        placed = []
-        for i, row in enumerate(collecting_day(size), start=1):
-            design = next(to_try) if row.controller == Controller.RANDOM else None
-            held = design if design is not None and design.holds else None
-            placed.append(replace(_placed(i, Controller(row.controller), None, day, row.hour, row.steps), design=held))
-        return placed
 
-
-def _placed(position: int, controller: Controller, policy: Policy | None, day: dt.date, hour: float, steps: int) -> PlacedSession:
-    begins = dt.datetime.combine(day, MORNING) + dt.timedelta(hours=hour)
-    begins = begins.replace(microsecond=0)
-    return PlacedSession(position=position, controller=controller, policy=policy, begins=begins, hour=hour, steps=steps)
-
-
-def _name(one: PlacedSession) -> str:
-    return f"session {one.position}, {CONTROLLER_NAMES[one.controller]}" + (f" ({one.policy.name})" if one.policy else "")
+def _name(line: PlanLine) -> str:
+    return f"session {line.item.position}, {CONTROLLER_NAMES[Controller(line.item.controller)]}" + (
+        f" ({line.policy.name})" if line.policy else ""
+    )

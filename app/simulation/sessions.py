@@ -1,117 +1,153 @@
-"""One session of the study in silico: simulated, uploaded as a patient's file would be, and rated."""
+"""One planned session of the study in silico: run from its bundle, entered on the clinic day, and uploaded into its slot."""
 
 from __future__ import annotations
 
 import datetime as dt
 import io
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from uuid import NAMESPACE_URL, UUID, uuid5
 
 import numpy as np
+from pydantic import TypeAdapter
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.ingest.uploads import service as ingest
-from app.learning.models import Policy
-from app.planning.plans.designs import Planned
-from app.platform import files
+from app.planning.plans.models import PlanItem
+from app.planning.visit_day import service as clinic_day
+from app.planning.visit_day.schemas import EntryIn
 from app.platform.errors import BetaloopError
 from app.simulation.demo_study import device_session, session_file
-from app.study import repository as study_repository
+from app.simulation.tablet import Moment, run_slot_of
 from app.study import service as study
 from app.study.models import Controller, Participant, StudySession, Visit
-from app.study.schemas import ConditionsChange, DesignParameters, QocIn
-from app.study.sessions import conditions
+from app.study.schemas import QocIn
 from app.study.sessions.data import qoc_of, session_data
 from app.study.threshold import mdp_settings
 from ml.mdp import end_reward, step_reward
-from ml.policies.onnx_policy import OnnxPolicy
 from ml.population import SimulatedSession, run_session
-from ml.population.controllers import Controller as CohortController
+from ml.population.outcomes import GRASP_TEST_S, Outcomes
 from ml.returns import ActualReturn, step_return
 
 RESOLUTION_MA = 0.1
 """What an RC+S delivers."""
+STEPS_PER_MINUTE = 30
+_BETWEEN_ENTRIES = dt.timedelta(seconds=10)
+_ENTRY: TypeAdapter[Any] = TypeAdapter(EntryIn)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlacedSession:
-    """A session of a visit day: `position` counts from 1, `hour` from the day's first session; `design`: of a random one of held draws."""
+@dataclass(frozen=True)
+class Held:
+    """A session that was run, again or for the first time: the file that is uploaded, when it ended, what was measured."""
 
-    position: int
-    controller: Controller
-    policy: Policy | None
-    begins: dt.datetime
-    hour: float
-    steps: int
-    design: Planned | None = None
+    file: tuple[str, bytes]
+    ended: dt.datetime
+    outcomes: Outcomes
 
 
-def simulate(participant: Participant, visit: Visit, placed: PlacedSession, seed: int) -> SimulatedSession:
-    """The session's numbers: the same whenever it is asked for."""
-    settings = mdp_settings(participant.current_settings)
-    controller: CohortController
-    if placed.policy is not None:
-        controller = OnnxPolicy(files.read(placed.policy.onnx_sha256), settings.window)
-    elif placed.design is not None:
-        controller = placed.design.first_steps(placed.steps)
-    else:
-        controller = placed.controller.value  # type: ignore[assignment]
-    return run_session(
-        participant.code,
-        controller,
-        visit=visit.number,
-        hour=placed.hour,
-        seed=int(np.random.default_rng([seed, visit.number, placed.position]).integers(0, 2**63)),
-        steps=placed.steps,
-        lead_steps=settings.window,
-        lower_bound=settings.lower_bound,
-        resolution_ma=RESOLUTION_MA,
-        study_seed=seed,
-        name=placed.controller.value,
-    )
+@dataclass(frozen=True)
+class VisitDay:
+    """The sessions of one visit.
 
-
-def hold(db: Session, participant: Participant, visit: Visit, placed: PlacedSession, seed: int, caller: Caller) -> None:
-    """Hold a session: upload its file and enter its QoCs; what is there already is left as it is. Commits.
-
-    Raises:
-        BetaloopError: the file was not understood, which would be a fault of the decoder or of the simulator.
+    Args:
+        seed: of the study. first: when the first session begins. tablet: folder of the day's tablet; a new one after a kill, so that a
+            session which was cut is run again from its beginning, with the same numbers. caller: who runs the day.
     """
-    held = _session_at(db, visit, placed.position)
-    if held is not None and held.qoc is not None:
-        return
-    simulated = simulate(participant, visit, placed, seed)
-    if held is None:
-        name, content = session_file(f"{participant.code}-visit{visit.number}-session{placed.position}", simulated, placed.begins)
+
+    visit: Visit
+    seed: int
+    first: dt.datetime
+    tablet: Path
+    caller: Caller
+    _held: dict[int, Held] = field(default_factory=dict)
+
+    def hold(self, db: Session, item: PlanItem, start_minute: float) -> None:
+        """Run a session, enter its outcomes and upload its file, without confirming it into its slot. Commits.
+
+        Raises:
+            BetaloopError: it may not run, or its file was not understood: a fault of the decoder or of the simulator.
+        """
+        held = self._run(db, item, start_minute, self.tablet)
+        begins = self._moment(item, start_minute).begins
+        self._send(db, item.plan_id, _entries(self.visit.participant.code, item, begins, held.ended, held.outcomes))
+        log = item.controller != Controller.NO_DBS
         stated = ingest.state_session(
             db,
-            participant,
-            visit.number,
-            placed.controller,
-            None if placed.policy is None else str(placed.policy.id),
-            placed.begins if device_session(participant.code) else None,
+            self.visit.participant,
+            self.visit.number,
+            None if log else Controller.NO_DBS,  # a log says itself which session it is of
+            started_at=begins if not log and device_session(self.visit.participant.code) else None,
         )
-        outcome = ingest.receive(db, participant, stated, [ingest.Incoming(name, io.BytesIO(content))], caller)
+        name, content = held.file
+        outcome = ingest.receive(db, self.visit.participant, stated, [ingest.Incoming(name, io.BytesIO(content))], self.caller)
         if not outcome.usable:
             problems = "; ".join(str(r.problem) for f in outcome.files for r in f.reports if r.problem)
             raise BetaloopError(f"The simulated file {name} was not understood: {problems}.")
-        held = _session_at(db, visit, placed.position)
-        if held is None:
-            raise BetaloopError(f"The simulated file {name} made no session at place {placed.position} of visit {visit.number}.")
-    if placed.design is not None:
-        conditions.change(db, held, _stated(placed.design), caller)
-    qoc = simulated.qoc
-    values = {"grasp_hz": qoc.grasp_hz, "rating": simulated.rating, "tremor_percent": qoc.tremor_percent}
-    study.record_qoc(db, held, QocIn.model_validate(values | {"sure": list(values)}), caller)
-    db.commit()
+
+    def end(self, db: Session, plan_id: int) -> None:
+        """Enter that the stimulator is back on clinical settings."""
+        at = self.first + dt.timedelta(hours=12)
+        entry = {"uuid": str(_named(f"plan {plan_id}", "clinical_settings")), "kind": "clinical_settings", "device_time": at.isoformat()}
+        self._send(db, plan_id, [entry])
+
+    def tremor(self, db: Session, session: StudySession, item: PlanItem, start_minute: float) -> None:
+        """Enter the tremor of a confirmed session, as the watch gave it; what is known already stays."""
+        if session.qoc is not None and session.qoc.tremor_percent is not None:
+            return
+        # what was held before a stop is run again, on a tablet of its own: its time lies before that of the day's
+        percent = self._run(db, item, start_minute, self.tablet / f"again-{item.position}").outcomes.qoc.tremor_percent
+        values = {"tremor_percent": percent, "sure": ["tremor_percent"], "reason": "as the simulated watch gave it"}
+        study.record_qoc(db, session, QocIn.model_validate(values), self.caller)
+
+    def _run(self, db: Session, item: PlanItem, start_minute: float, tablet: Path) -> Held:
+        """The session's numbers, the same whenever they are asked for."""
+        if item.position not in self._held:
+            at = self._moment(item, start_minute)
+            off = item.controller == Controller.NO_DBS
+            self._held[item.position] = self._switched_off(item, at) if off else self._on_tablet(db, item, at, tablet)
+        return self._held[item.position]
+
+    def _on_tablet(self, db: Session, item: PlanItem, at: Moment, tablet: Path) -> Held:
+        ran = run_slot_of(db, self.visit, item.position, at, tablet, self.caller)
+        db.commit()
+        return Held((f"{_stem(self.visit, item)}.csv", ran.log), ran.ended, ran.outcomes)
+
+    def _switched_off(self, item: PlanItem, at: Moment) -> Held:
+        """A session without stimulation has no bundle: it is recorded by the device alone."""
+        simulated = without_stimulation(self.visit.participant, at, round(item.minutes * STEPS_PER_MINUTE))
+        file = session_file(_stem(self.visit, item), simulated, at.begins)
+        return Held(file, at.begins + dt.timedelta(minutes=item.minutes), simulated.outcomes)
+
+    def _moment(self, item: PlanItem, start_minute: float) -> Moment:
+        noise = int(np.random.default_rng([self.seed, self.visit.number, item.position]).integers(0, 2**63))
+        begins = (self.first + dt.timedelta(minutes=start_minute)).replace(microsecond=0)
+        return Moment(begins=begins, hour=start_minute / 60, visit=self.visit.number, seed=noise, study_seed=self.seed)
+
+    def _send(self, db: Session, plan_id: int, entries: list[dict[str, Any]]) -> None:
+        """What the day's page sends; what is there already stays. Commits. Raises BetaloopError for a refused entry."""
+        results = clinic_day.add_entries(db, self.visit, plan_id, [_ENTRY.validate_python(e) for e in entries], self.caller)
+        refused = [f"{r.detail} {r.hint}" for r in results if r.outcome == "refused"]
+        if refused:
+            raise BetaloopError(f"The clinic day of visit {self.visit.number} refused an entry: {refused[0]}")
+        db.commit()
 
 
-def _stated(design: Planned) -> ConditionsChange:
-    return ConditionsChange(
-        design=design.design,
-        seed=design.seed,
-        design_parameters=DesignParameters.model_validate({"level": design.level, "holds": design.as_json()["holds"]}),
-        reason="laid out by the simulated study",
+def without_stimulation(participant: Participant, at: Moment, steps: int) -> SimulatedSession:
+    """A session without stimulation, as the stimulator records it."""
+    return run_session(
+        participant.code,
+        "no_dbs",
+        visit=at.visit,
+        hour=at.hour,
+        seed=at.seed,
+        steps=steps,
+        lead_steps=mdp_settings(participant.current_settings).window,
+        resolution_ma=RESOLUTION_MA,
+        study_seed=at.study_seed,
+        name="no_dbs",
     )
 
 
@@ -124,6 +160,43 @@ def actual_return(db: Session, session: StudySession) -> float | None:
     return ActualReturn(step_return(rewards, settings.gamma, rewards.size), end_reward(settings, qoc_of(session))).value
 
 
-def _session_at(db: Session, visit: Visit, position: int) -> StudySession | None:
-    db.expire_all()
-    return next((s for s in study_repository.sessions_of_visit(db, visit.id)[0] if s.ordinal == position), None)
+def _stem(visit: Visit, item: PlanItem) -> str:
+    return f"{visit.participant.code}-visit{visit.number}-session{item.position}"
+
+
+def _named(of: str, kind: str) -> UUID:
+    """The identifier of an entry, the same when the study goes on after a stop."""
+    return uuid5(NAMESPACE_URL, f"betaloop simulated study, {of}, {kind}")
+
+
+def _entries(code: str, item: PlanItem, begins: dt.datetime, ended: dt.datetime, outcomes: Outcomes) -> list[dict[str, Any]]:
+    """What is tapped on the clinic day about one session: its times, rating and grasp test, and no side effects."""
+    asked: list[tuple[str, Mapping[str, Any]]] = [
+        ("rating", {"value": outcomes.rating}),
+        ("grasp", _grasps(ended, outcomes)),
+        *((kind, {"grade": "none"}) for kind in ("dyskinesia", "speech", "gait")),
+        ("session_end", {}),
+    ]
+    times: list[tuple[str, Mapping[str, Any], dt.datetime]] = [("start", {}, begins), ("stop", {}, ended)]
+    times += [(kind, payload, ended + (k + 1) * _BETWEEN_ENTRIES) for k, (kind, payload) in enumerate(asked)]
+    of = f"{code}, session {item.id}"
+    return [
+        {
+            "uuid": str(_named(of, kind)),
+            "plan_item_id": item.id,
+            "kind": kind,
+            "payload": payload,
+            "device_time": at.isoformat(),
+            "clock_offset_ms": 0,
+        }
+        for kind, payload, at in times
+    ]
+
+
+def _grasps(ended: dt.datetime, outcomes: Outcomes) -> dict[str, Any]:
+    """The grasp test of the session's last seconds, tapped; typed where too few fists were opened to count."""
+    taps = [round(float(t), 3) for t in outcomes.open_fist_s]
+    if len(taps) < 2:
+        return {"method": "typed", "hz": outcomes.qoc.grasp_hz}
+    began = ended - dt.timedelta(seconds=GRASP_TEST_S)
+    return {"method": "taps", "taps_s": taps, "began_at": began.isoformat(), "ended_at": ended.isoformat()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import json
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from app.planning.protocol.schedule import SESSION_MINUTES
 from app.platform.errors import Conflict, Invalid
 from app.simulation.demo_study import demo_visits
-from app.simulation.design import PRESETS, collecting_day, design, remember, visit_day
+from app.simulation.design import PRESETS, design, remember, visit_day
 from app.study.schemas import ConditionsChange
 from ml.population import PARTICIPANTS
 
@@ -23,11 +24,6 @@ def test_every_preset_keeps_to_the_papers_session_rules(preset):
     size = PRESETS[preset]
     assert 2 <= 2 * size.policies_per_kind <= 4
     assert SESSION_MINUTES[0] <= size.session_minutes <= SESSION_MINUTES[1]
-    day = collecting_day(size)
-    assert [s.steps for s in day if s.controller == "no_dbs"] == [150]
-    random = [i for i, s in enumerate(day) if s.controller == "random"]
-    assert len(random) == size.random_sessions
-    assert all("cdbs" in [s.controller for s in day[i:j]] for i, j in pairwise(random))
 
 
 def test_the_full_preset_spends_about_the_minutes_of_the_papers_table():
@@ -61,6 +57,15 @@ def test_a_study_goes_on_under_its_first_date_and_another_one_is_refused_in_its_
     for other in (design(["P1"], 3, 6, "quick"), design(["P1"], 3, 5, "full")):
         with pytest.raises(Conflict, match="seed 5"):
             remember(path, other, TODAY)
+
+
+def test_a_study_of_another_version_is_left_alone(tmp_path):
+    path = tmp_path / "state.json"
+    remember(path, design(["P1"], 3, 5, "quick"), TODAY)
+    stored = json.loads(path.read_text())
+    path.write_text(json.dumps({name: value for name, value in stored.items() if name != "version"}))
+    with pytest.raises(Conflict, match="another version of betaloop"):
+        remember(path, design(["P1"], 3, 5, "quick"), TODAY)
 
 
 def test_the_demos_random_sessions_follow_one_stratified_design_that_is_stated_with_them():
