@@ -34,6 +34,8 @@ class Deviation(StrEnum):
     OTHER_DAY = "other_day"
     OTHER_PLAN = "other_plan"
     """A controller's log of a session of another plan."""
+    SECOND_RUN = "second_run"
+    """A controller's log of a slot that another session fills: two tablets ran it, or one whose notes were lost."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,9 @@ def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) 
 
 def _beside(session: Done, known: Collection[int]) -> Deviation:
     """Why a session stands beside the plan."""
-    return Deviation.OTHER_PLAN if session.logged is not None and session.logged not in known else Deviation.UNPLANNED
+    if session.logged is None:
+        return Deviation.UNPLANNED
+    return Deviation.SECOND_RUN if session.logged in known else Deviation.OTHER_PLAN
 
 
 def _passed(slots: Sequence[Planned], sessions: Sequence[Done], pairs: Mapping[int, Done]) -> set[int]:

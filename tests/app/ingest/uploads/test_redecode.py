@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import func, select
+from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
@@ -18,7 +18,7 @@ from app.ingest.uploads import reading, recordings
 from app.ingest.uploads import redecode as module
 from app.ingest.uploads.redecode import redecode
 from app.platform import files
-from app.study.models import Trace
+from app.study.models import Recording, Trace
 from ml import formats
 from ml.formats.recording import DECODE_VERSION, DecodedFile
 from tests.app.ingest.conftest import device_zip, steady
@@ -78,6 +78,26 @@ def test_delivered_milliamperes_stay_what_they_were(send: Any, client: TestClien
     all_of()
     assert trace_of(client, session)["amplitude_ma"] == before
     assert before[-1] == pytest.approx(1.5)
+
+
+def test_a_recording_that_was_stored_before_batteries_were_read_tells_its_battery_afterwards(
+    send: Any, client: TestClient, db: Session
+) -> None:
+    send(("s.zip", device_zip()), visit=1, controller="cdbs")
+    page = "/participants/P1/analyses/energy"
+    (recording,) = db.scalars(select(Recording))
+    told = recording.details["settings"]["battery"]
+    recording.details = recording.details | {"settings": {k: v for k, v in recording.details["settings"].items() if k != "battery"}}
+    db.execute(update(Trace).values(decode_version=6))
+    db.commit()
+    assert "Battery, measured" not in client.get(page).text
+    done = CliRunner().invoke(app, ["ingest", "redecode", "--participant", "P1"])
+    assert done.exit_code == 0, done.output
+    assert "the same numbers" in done.output
+    db.expire_all()
+    assert recording.details["settings"]["battery"] == told == {"percent": 80.0, "voltage_v": 2.43}
+    measured = client.get(page).text.split("Battery, measured")[1].split("Battery, assumed")[0]
+    assert [word in measured for word in ("80", "2.43")] == [True] * 2
 
 
 def test_a_second_run_changes_nothing(send: Any, monkeypatch: pytest.MonkeyPatch, db: Session) -> None:

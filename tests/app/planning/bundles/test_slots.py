@@ -6,7 +6,7 @@ import html
 import io
 import zipfile
 from collections.abc import Callable
-from datetime import UTC, date, datetime, timedelta
+from datetime import UTC, date, datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -187,7 +187,9 @@ def test_no_bundle_leaves_for_a_plan_that_may_not_run(
     sign_plan(studied.visit)
     assert taken(client, studied.visit, 1).status_code == 200
     assert taken(client, studied.visit, 99).status_code == 404
-    dated(TODAY - timedelta(days=1))
+    dated(datetime.now(UTC).astimezone(timezone(timedelta(hours=-12))).date())
+    assert taken(client, studied.visit, 1).status_code == 200, "there the day of the visit has not ended; the tablet goes by its own date"
+    dated(TODAY - timedelta(days=2))
     refused("its bundles have expired")
     dated(None)
     refused("has no date")

@@ -146,6 +146,20 @@ def test_a_log_that_names_no_session_here_fills_none_by_its_name(
     assert client.post(f"{path}/confirm", json={}).status_code == 409, "there is nothing to confirm into a slot"
 
 
+@pytest.mark.hazard("H17")
+def test_a_slot_that_two_tablets_ran_is_filled_once_and_the_second_log_is_told(client: TestClient, studied: Any, planned: Plan) -> None:
+    for number, minute in ((1, 0), (2, 40)):
+        send(client, log_of(planned, 1, minute, number=number))
+    path = f"/api/v1/visits/{studied.visit}/slots"
+    found = [(r["position"], r["deviations"]) for r in client.get(path).json()["rows"] if r["session_id"]]
+    assert found == [(1, []), (None, ["second_run"])]
+    page = client.get(f"/visits/{studied.visit}/slots", headers={"Accept": "text/html"}).text
+    assert "it was run twice" in page
+    assert client.post(f"{path}/confirm", json={}).status_code == 200
+    found = [(r["position"], r["confirmed"], r["deviations"]) for r in client.get(path).json()["rows"] if r["session_id"]]
+    assert found == [(1, True, []), (None, False, ["second_run"])], "the second one counts nowhere unless somebody confirms it"
+
+
 def test_the_log_of_a_simulated_device_is_said_to_be_one(client: TestClient, studied: Any, planned: Plan) -> None:
     body = send(client, log_of(planned, 1, 0, simulated=True))
     assert "is of a simulated device: nobody was stimulated" in " ".join(body["report"][0]["flagged"])
