@@ -69,6 +69,7 @@ def serve(
     """Serve the web pages and the REST interface. Jobs need a worker beside it (`betaloop worker`)."""
     import uvicorn
 
+    from app.accounts.sign_on.provider import configured, provider
     from app.ingest.uploads.interrupted import keep_resuming
     from app.main import create_app
     from app.platform.audit.chain import keep_sealing
@@ -88,6 +89,8 @@ def serve(
         structlog.get_logger().warning(
             "other machines reach this service without TLS: give --tls-certificate, or use a TLS proxy and set BETALOOP_COOKIE_SECURE"
         )
+    if configured():
+        provider()  # settings that do not fit are said now, not to the first person who signs on
     service = create_app()
     limited.prepare()  # before the first upload, which would wait for it
     # beside the service, for reading what a crash left behind may take minutes

@@ -70,6 +70,7 @@ API_MODULES = (
 )
 PAGE_MODULES = (
     "app.accounts.pages",
+    "app.accounts.sign_on.pages",
     "app.accounts.studies.pages",
     "app.study.enrolment.pages",
     "app.study.settings.pages",

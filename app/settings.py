@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
-from pydantic import Field
+from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
@@ -37,6 +37,16 @@ class Settings(BaseSettings):
     session_idle_minutes: int = Field(60, ge=1, description="A browser session ends after this many idle minutes.")
     session_max_hours: int = Field(12, ge=1, description="A browser session ends after this many hours in any case.")
     cookie_secure: bool = Field(False, description="Send the session cookie over HTTPS only; switch on behind TLS.")
+    public_url: str | None = Field(None, description="Address at which browsers reach this service; needed for a sign-on.")
+    oidc_issuer: str | None = Field(
+        None, description="Address of a hospital's identity provider (OpenID Connect); without one there is no sign-on."
+    )
+    oidc_client_id: str | None = Field(None, description="Name of this service at the provider.")
+    oidc_client_secret: SecretStr | None = Field(None, description="Its secret there; none for a public client.")
+    oidc_claim: str = Field(
+        "email", description="Claim that names a user's address here; `email` counts only where the provider says that it is verified."
+    )
+    oidc_name: str = Field("Hospital sign-on", description="What the sign-on is called on pages.")
     worker_slots: int = Field(2, ge=1, description="Compute steps that one worker runs side by side.")
     job_memory_mb: int = Field(8192, ge=512, description="Memory limit of one compute step, MiB.")
     decode_slots: int = Field(2, ge=1, description="Uploaded files that one process has read side by side.")

@@ -100,6 +100,24 @@ class SignIn(Base):
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     last_seen_at: Mapped[datetime] = mapped_column(server_default=func.now())
     ended_at: Mapped[datetime | None]
+    issuer: Mapped[str | None] = mapped_column(String(500))
+    """The identity provider that opened it; none where a password did."""
+    confirmed_at: Mapped[datetime | None]
+    """When the user last showed at the provider who they are, to sign something; taken back by the signature that used it."""
+    user: Mapped[User] = relationship()
+
+
+class SignOnLink(Base):
+    """Who a user is at an identity provider; made at the first sign-on of an account that exists."""
+
+    __tablename__ = "sign_on_link"
+    __table_args__ = (UniqueConstraint("issuer", "subject"), UniqueConstraint("user_id", "issuer"))
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    user_id: Mapped[int] = mapped_column(ForeignKey("app_user.id", ondelete="CASCADE"))
+    issuer: Mapped[str] = mapped_column(String(500))
+    subject: Mapped[str] = mapped_column(String(255))
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     user: Mapped[User] = relationship()
 
 

@@ -13,13 +13,13 @@ from starlette.datastructures import FormData
 from app.accounts import permissions as can
 from app.accounts import repository, second_factor, service, totp
 from app.accounts.addresses import normal_address
+from app.accounts.browser import SIGNED_OUT, count_try, failed_sign_ins, local_path, signed_in
 from app.accounts.deps import COOKIE, CurrentCaller
 from app.accounts.models import Role, Scope, User
 from app.accounts.passwords import MIN_PASSWORD
 from app.accounts.permissions import Caller
 from app.platform.database import Db, new_session, now, set_actor
 from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany
-from app.platform.sources import Allowance, in_words, network_address
 from app.platform.web.bounded import Bounded
 from app.platform.web.forms import FormValues
 from app.platform.web.schemas import RowId
@@ -29,9 +29,8 @@ from app.settings import get_settings
 router = APIRouter()
 
 SCOPE_NAMES = {Scope.FULL: "all that I may", Scope.READ: "read", Scope.UPLOAD: "upload and read", Scope.JOBS: "jobs and read"}
+_A_DAY_S = 86_400
 _passwords = Bounded(2, 100)  # argon2 takes all of a core and 64 MiB each time
-failed_sign_ins = Allowance(lambda: get_settings().failed_sign_ins_per_source, service.FAILURE_WINDOW.total_seconds())
-"""By network address, whatever the accounts: who tries one password with many accounts meets no lock-out of an account."""
 
 
 @router.get("/sign-in")
@@ -46,11 +45,8 @@ def sign_in_page(request: Request, db: Db, next: str = "/") -> Response:
 @router.post("/sign-in")
 async def sign_in(request: Request, values: FormValues) -> Response:
     """Open a browser session."""
-    source = network_address(request)
     try:
-        # counted before it is judged, and given back where it was right: however many come at once, no more are judged
-        if wait_s := failed_sign_ins.take(source):
-            raise TooMany("Too many failed sign-ins came from here.", f"Wait {in_words(wait_s)} and try again.", wait_s)
+        source = count_try(request)
         answer = await _passwords.run(_sign_in, request, values)
     except TooMany as error:
         return _sign_in_refused(request, values, error)
@@ -68,11 +64,7 @@ def _sign_in(request: Request, values: FormData) -> Response:
         except BetaloopError as error:
             return _sign_in_refused(request, values, error)
         db.commit()
-    settings, answer = get_settings(), RedirectResponse(target, 303)
-    answer.set_cookie(
-        COOKIE, token, max_age=3600 * settings.session_max_hours, httponly=True, samesite="lax", secure=settings.cookie_secure
-    )
-    return answer
+    return signed_in(token, target)
 
 
 def _sign_in_refused(request: Request, values: FormData, error: BetaloopError) -> Response:
@@ -92,6 +84,9 @@ def sign_out(request: Request, db: Db) -> Response:
         db.commit()
     answer = RedirectResponse("/sign-in?done=out", 303)
     answer.delete_cookie(COOKIE, httponly=True, samesite="lax", secure=get_settings().cookie_secure)
+    if get_settings().oidc_issuer:
+        secure = get_settings().cookie_secure
+        answer.set_cookie(SIGNED_OUT, "yes", max_age=_A_DAY_S, path="/sign-on", httponly=True, samesite="lax", secure=secure)
     return answer
 
 
@@ -230,15 +225,6 @@ def set_active(user_id: RowId, db: Db, caller: CurrentCaller, values: FormValues
     return RedirectResponse(f"/accounts?done={'opened' if active else 'closed'}", 303)
 
 
-def local_path(target: str) -> str:
-    """A path of this service, or `/`: nobody is sent to another site after signing in.
-
-    Browsers read a backslash as a slash and drop tabs and line ends, hence the strict look at every character.
-    """
-    ok = target.startswith("/") and not target.startswith("//") and "\\" not in target and all(" " < c < "\x7f" for c in target)
-    return target if ok else "/"
-
-
 def _scope(values: FormData) -> Scope:
     scope = str(values.get("scope", Scope.FULL))
     if scope not in set(Scope):
@@ -287,6 +273,7 @@ def _account_page(
     user = db.get_one(User, _own_id(caller))
     values = {"user": user, "tokens": repository.tokens_of(db, user.id), "token": token, "min_password": MIN_PASSWORD}
     values |= {"factor": _factor(db, user), "codes": codes}
+    values |= {"sign_on_links": repository.sign_on_links(db, user.id)}
     values |= {"scopes": SCOPE_NAMES, "days": service.TOKEN_DAYS, "most_days": service.MOST_TOKEN_DAYS, "now": now()}
     problem = error.problem(request.url.path) if error else None
     return HTMLResponse(render(request, "accounts/account.html", problem=problem, **values), error.status if error else 200)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime
 
 from app.accounts.models import Role, Scope
 from app.platform.errors import Forbidden, NotFound
@@ -70,6 +71,10 @@ class Caller:
     is_system: bool = False
     token_scope: Scope | None = None
     """Of the API token that the request came with; None for a browser session."""
+    sign_in_id: int | None = None
+    """Of the browser session; None for a token."""
+    confirmed_at: datetime | None = None
+    """When the user showed at the sign-on, in this browser session, who they are, to sign something with it."""
 
     def may(self, permission: str, study_id: int | None = None, site_id: int | None = None) -> bool:
         """Whether some grant that covers the site holds the permission; without a study: whether any grant does."""

@@ -9,7 +9,7 @@ from sqlalchemy import delete, func, select, text
 from sqlalchemy.orm import Session, selectinload
 
 from app.accounts.addresses import normal_address
-from app.accounts.models import ApiToken, SignIn, SignInAttempt, Study, User
+from app.accounts.models import ApiToken, SignIn, SignInAttempt, SignOnLink, Study, User
 from app.platform.database import now
 
 
@@ -71,6 +71,11 @@ def tokens_of(db: Session, user_id: int) -> Sequence[ApiToken]:
 def token_by_name(db: Session, user_id: int, name: str) -> ApiToken | None:
     """A user's token by its name, revoked or not."""
     return db.scalar(select(ApiToken).where(ApiToken.user_id == user_id, ApiToken.name == name))
+
+
+def sign_on_links(db: Session, user_id: int) -> Sequence[SignOnLink]:
+    """Who a user is at identity providers, oldest first."""
+    return db.scalars(select(SignOnLink).where(SignOnLink.user_id == user_id).order_by(SignOnLink.id)).all()
 
 
 def recent_failures(db: Session, email: str, within: timedelta) -> int:

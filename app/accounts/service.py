@@ -156,8 +156,13 @@ def sign_in(db: Session, email: str, password: str, code: str = "") -> str:
             "If you have set up a second factor, its code is needed too.",
         )
     repository.forget_failures(db, attempt)
+    return open_session(db, user)
+
+
+def open_session(db: Session, user: User, issuer: str | None = None) -> str:
+    """Open a browser session of somebody who has shown who they are, to us or to an identity provider; returns the cookie's token."""
     token = secrets.token_urlsafe(32)
-    db.add(SignIn(token_sha256=_hash(token), user_id=user.id))
+    db.add(SignIn(token_sha256=_hash(token), user_id=user.id, issuer=issuer))
     return token
 
 
@@ -196,7 +201,7 @@ def caller_of_cookie(db: Session, token: str, used: bool = True) -> Caller | Non
     if used and now() - row.last_seen_at > _SEEN_RESOLUTION:
         row.last_seen_at = now()
         db.commit()
-    return caller_of(row.user)
+    return replace(caller_of(row.user), sign_in_id=row.id, confirmed_at=row.confirmed_at)
 
 
 def caller_of_token(db: Session, token: str) -> Caller | None:

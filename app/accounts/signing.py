@@ -1,4 +1,8 @@
-"""Signing something: the password is asked for again, and what is signed is kept (`app.platform.signatures`)."""
+"""Signing something: the signer shows anew who they are, and what is signed is kept (`app.platform.signatures`).
+
+They give the password again (with the code of a second factor), or were asked again by the hospital's sign-on at most five minutes ago,
+in this browser session, for this one signature.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.accounts.service import confirm_password
+from app.accounts.sign_on.service import use_confirmation
 from app.platform.errors import Forbidden
 from app.platform.signatures.models import Signature
 from app.platform.signatures.service import Signer, record
@@ -17,16 +22,22 @@ from app.platform.signatures.service import Signer, record
 def sign(
     db: Session, caller: Caller, password: str, *, kind: str, subject_id: int, meaning: str, content: Mapping[str, Any], code: str = ""
 ) -> Signature:
-    """Sign something with one's password. Whether the caller may sign it at all is the caller's question; the transaction is not committed.
+    """Sign something with one's password or, where it is empty, a fresh sign-on. The transaction is not committed.
+
+    Whether the caller may sign it at all is for whoever calls this.
 
     Args:
         kind: what is signed, e.g. `plan`. subject_id: which. meaning: what the signature says, e.g. "approved for use in this participant".
         content: all that is signed; kept with its hash. code: of the second factor, where the signer has one.
 
     Raises:
-        Forbidden: the system, which is no person, or a wrong password or code. TooMany: too many wrong passwords lately.
+        Forbidden: the system, which is no person, a wrong password or code, or a confirmation that is too old. TooMany: too many wrong
+            passwords lately.
     """
     if caller.user_id is None:
         raise Forbidden("Only a person can sign.", "Sign in as the person who signs.")
-    confirm_password(caller.user_id, password, code)
+    if password or caller.confirmed_at is None:
+        confirm_password(caller.user_id, password, code)
+    else:
+        use_confirmation(db, caller)
     return record(db, Signer(caller.user_id, caller.label), kind=kind, subject_id=subject_id, meaning=meaning, content=content)

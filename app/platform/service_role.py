@@ -34,6 +34,7 @@ DELETED_FROM = frozenset(
         "session",
         "session_segment",
         "sign_in_attempt",
+        "sign_on_link",
         "stored_file",
         "tremor_series",
         "upload_file",

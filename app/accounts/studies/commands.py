@@ -11,6 +11,7 @@ from app.accounts import repository, second_factor
 from app.accounts import service as accounts
 from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM
+from app.accounts.sign_on.repository import remove_links
 from app.accounts.studies import service
 from app.accounts.studies.schemas import HINT, SiteIn, StudyIn
 from app.platform.database import transaction
@@ -81,6 +82,17 @@ def user_remove_second_factor(email: Annotated[str, typer.Argument(help="E-mail 
     show({"email": email, "removed": had}, as_json, said)
 
 
+def user_remove_sign_on(email: Annotated[str, typer.Argument(help="E-mail address of the user.")], as_json: AsJson = False) -> None:
+    """Forget who a user is at the hospital's sign-on, where the hospital has given them another identity. Make sure who asks."""
+    with transaction(ACTOR) as db:
+        user = repository.user_by_email(db, email)
+        if user is None:
+            raise NotFound(f"There is no user {email}.")
+        had = remove_links(db, user.id)
+    said = f"The next sign-on that vouches for {email} is linked." if had else f"{email} is linked with no sign-on."
+    show({"email": email, "removed": had}, as_json, said)
+
+
 def register(study: typer.Typer, user: typer.Typer) -> None:
     """Put the commands where people look for them."""
     study.command("add", epilog="Example: betaloop study add ADAPT --name 'Adaptive DBS' --site north")(study_add)
@@ -88,6 +100,7 @@ def register(study: typer.Typer, user: typer.Typer) -> None:
     user.command("role", epilog="Example: betaloop user role ada@clinic.example coordinator --study ADAPT --site north")(user_role)
     example = "Example: betaloop user remove-second-factor ada@clinic.example"
     user.command("remove-second-factor", epilog=example)(user_remove_second_factor)
+    user.command("remove-sign-on", epilog="Example: betaloop user remove-sign-on ada@clinic.example")(user_remove_sign_on)
 
 
 def _checked(kind: type[Draft], **values: Any) -> Draft:

@@ -15,6 +15,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 
 from app.platform.database import now
 from app.platform.web.charts import written
+from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -109,7 +110,13 @@ def when(value: datetime | date | None) -> str:
     return value.strftime("%Y-%m-%d %H:%M UTC") if isinstance(value, datetime) else value.isoformat()
 
 
+def sign_on_name() -> str:
+    """What the hospital's sign-on is called; empty where there is none."""
+    settings = get_settings()
+    return settings.oidc_name if settings.oidc_issuer else ""
+
+
 _environment.filters.update(
     written=written, number=number, fixed=fixed, p=p_text, minutes=minutes, minutes_left=minutes_left, size=size, when=when
 )
-_environment.globals.update(static_url=static_url, plotly_url=plotly_url, now=now)
+_environment.globals.update(static_url=static_url, plotly_url=plotly_url, now=now, sign_on_name=sign_on_name)

@@ -1,0 +1,76 @@
+"""Rules of a sign-on: whose account somebody from a provider has, and what a sign-on confirms. The caller commits."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+from sqlalchemy.orm import Session
+
+from app.accounts import repository as accounts
+from app.accounts.models import SignIn, SignOnLink
+from app.accounts.permissions import Caller
+from app.accounts.service import open_session
+from app.accounts.sign_on import repository
+from app.accounts.sign_on.provider import Identity, Refused
+from app.platform.audit import record
+from app.platform.database import now, set_actor
+from app.platform.errors import Forbidden
+
+CONFIRMED_FOR = timedelta(minutes=5)
+"""A confirmation that is older signs nothing."""
+
+
+def sign_on(db: Session, identity: Identity) -> str:
+    """Open a browser session of the account that belongs to somebody; returns the cookie's token. Refusals are committed to the trail.
+
+    An account belongs to whom it was linked with at their first sign-on, by an address that the provider vouches for; none is made here.
+
+    Raises:
+        Refused: there is none, it is closed, or it belongs to somebody else at the provider.
+    """
+    link = repository.link_of(db, identity.issuer, identity.subject)
+    user = link.user if link else accounts.user_by_email(db, identity.address) if identity.address else None
+    if user is None:
+        raise _refused(db, "unknown account", "There is no account here of an address that the sign-on vouches for.")
+    if not user.active:
+        raise _refused(db, user.email, "Your account here is closed.")
+    set_actor(db, user.email, user.id, db.info.get("actor", {}).get("request_id"))
+    if link is None:
+        if repository.link_of_user(db, user.id, identity.issuer):
+            raise _refused(db, user.email, "The account of your address belongs to somebody else at the sign-on.")
+        db.add(SignOnLink(user_id=user.id, issuer=identity.issuer, subject=identity.subject))
+    return open_session(db, user, identity.issuer)
+
+
+def confirm(db: Session, caller: Caller, identity: Identity) -> None:
+    """Note that the user of a browser session has shown, just now, who they are: it stands for the password of one signature.
+
+    Raises:
+        Refused: it was somebody else.
+    """
+    link = repository.link_of(db, identity.issuer, identity.subject)
+    row = db.get(SignIn, caller.sign_in_id) if caller.sign_in_id is not None else None
+    if row is None or link is None or link.user_id != caller.user_id:
+        raise _refused(db, caller.label, "Somebody else has signed on at the provider than the user of this page.")
+    row.confirmed_at = now()
+
+
+def use_confirmation(db: Session, caller: Caller) -> None:
+    """Use up the confirmation of the caller's browser session. Raises Forbidden where there is none, or an old one."""
+    since = now() - CONFIRMED_FOR
+    if (
+        caller.sign_in_id is None
+        or caller.user_id is None
+        or not repository.take_confirmation(db, caller.sign_in_id, caller.user_id, since)
+    ):
+        raise Forbidden(
+            "You have not confirmed who you are.",
+            f"Give your password, or confirm with the sign-on and sign within {CONFIRMED_FOR.seconds // 60} minutes.",
+        )
+
+
+def _refused(db: Session, whose: str, detail: str) -> Refused:
+    db.rollback()
+    record(db, "refuse", "sign_on", whose)
+    db.commit()
+    return Refused(detail, "Ask an administrator of the study.")
