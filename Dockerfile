@@ -1,8 +1,8 @@
-FROM python:3.11-slim
+FROM --platform=linux/amd64 python:3.11-slim
 RUN useradd --create-home --uid 10001 betaloop
 WORKDIR /srv/betaloop
 COPY requirements-service.lock ./
-RUN pip install --no-cache-dir -r requirements-service.lock
+RUN pip install --no-cache-dir --require-hashes --no-deps -r requirements-service.lock
 COPY pyproject.toml README.md alembic.ini ./
 COPY app app
 COPY ml ml

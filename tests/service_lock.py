@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Iterator
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-EXTRAS = ("", "nwb")
+LOCK = ROOT / "requirements-service.lock"
+TORCH_INDEX = "https://download.pytorch.org/whl/cpu"
+EXTRAS = ("", "nwb", "s3")
 
 
 def pinned() -> dict[str, str]:
@@ -20,11 +28,20 @@ def pinned() -> dict[str, str]:
     return {canonicalize_name(re.split(r"[=@ \[]", line)[0]): line for line in lines if line and line[0] not in "#-"}
 
 
+def _wanted(name: str) -> list[str]:
+    """What a package asks for; betaloop itself by its `pyproject.toml`, for what is installed may be of another day."""
+    if name != "betaloop":
+        return requires(name) or []
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = {extra: project["optional-dependencies"][extra] for extra in EXTRAS if extra}
+    return [*project["dependencies"], *(text for of in extras.values() for text in of)]
+
+
 def needed(name: str = "betaloop", extras: tuple[str, ...] = EXTRAS, seen: set[tuple[str, tuple[str, ...]]] | None = None) -> Iterator[str]:
     """Names of the packages that a package needs on this platform, and of what those need."""
     seen = set() if seen is None else seen
     try:
-        wanted = [Requirement(text) for text in requires(name) or ()]
+        wanted = [Requirement(text) for text in _wanted(name)]
     except PackageNotFoundError:
         return
     for one in wanted:
@@ -37,13 +54,55 @@ def needed(name: str = "betaloop", extras: tuple[str, ...] = EXTRAS, seen: set[t
             yield from needed(one.name, key[1], seen)
 
 
-def service_lock() -> str:
-    """The text of `requirements-service.lock`."""
+def service_packages() -> list[str]:
+    """The lines `name==version` of what the image holds."""
     lines = pinned()
     # what builds the package is part of the image, for it is installed there without the build's isolation
     names = sorted({*needed(), "setuptools"} & set(lines))
-    return "".join(f"{lines[name]}\n" for name in names)
+    return [lines[name] + ("+cpu" if name == "torch" else "") for name in names]
+
+
+def held() -> dict[str, list[str]]:
+    """Hashes by line `name==version` of `requirements-service.lock`."""
+    text = LOCK.read_text().replace("\\\n", " ")
+    return {
+        line.split()[0]: re.findall(r"--hash=(sha256:[0-9a-f]{64})", line) for line in text.splitlines() if line and line[0] not in "#-"
+    }
+
+
+def hashes(packages: list[str]) -> dict[str, str]:
+    """SHA-256 of the file that pip installs for each package, asked of the package index without installing anything."""
+    torch = [line for line in packages if line.startswith("torch==")]
+    # apart, for the index of torch has nothing else
+    return _asked([line for line in packages if line not in torch]) | _asked(torch, "--retries=1", "--extra-index-url", TORCH_INDEX)
+
+
+def _asked(packages: list[str], *options: str) -> dict[str, str]:
+    with tempfile.TemporaryDirectory() as folder:
+        wanted, report = Path(folder, "wanted.txt"), Path(folder, "report.json")
+        wanted.write_text("\n".join(packages))
+        call = ["install", "--dry-run", "--quiet", "--no-deps", "--ignore-installed", "--only-binary=:all:", *options]
+        call += ["--report", str(report), "-r", str(wanted)]
+        subprocess.run([sys.executable, "-m", "pip", "--disable-pip-version-check", *call], check=True)
+        return {
+            _line(found): found["download_info"]["archive_info"]["hashes"]["sha256"] for found in json.loads(report.read_text())["install"]
+        }
+
+
+def _line(found: dict[str, Any]) -> str:
+    return _normal(f"{found['metadata']['name']}=={found['metadata']['version']}")
+
+
+def _normal(line: str) -> str:
+    name, _, version = line.partition("==")
+    return f"{canonicalize_name(name)}=={version}"
+
+
+def service_lock(known: Mapping[str, str]) -> str:
+    """The text of `requirements-service.lock`."""
+    head = f"# Written by `make lock` for the image: Linux on x86-64, Python 3.11; torch without CUDA.\n--extra-index-url {TORCH_INDEX}\n"
+    return head + "".join(f"{line} \\\n    --hash=sha256:{known[_normal(line)]}\n" for line in service_packages())
 
 
 if __name__ == "__main__":
-    (ROOT / "requirements-service.lock").write_text(service_lock())
+    LOCK.write_text(service_lock(hashes(service_packages())))
