@@ -7,7 +7,7 @@ from datetime import datetime
 from typing import Any
 
 from sqlalchemy import Select, or_, select, text
-from sqlalchemy.orm import Session, selectinload
+from sqlalchemy.orm import Session, defer, selectinload
 
 from app.evaluation.models import Evaluation
 from app.learning.models import Policy
@@ -41,8 +41,9 @@ def evaluation_times(db: Session, participant_id: int) -> dict[int, datetime]:
 
 
 def policies_by_id(db: Session, ids: Sequence[int]) -> dict[int, Policy]:
-    """Policies by their number."""
-    return {p.id: p for p in db.scalars(select(Policy).where(Policy.id.in_(ids)))}
+    """Policies by their number; their curves and other metrics are read when something asks for them."""
+    query = select(Policy).where(Policy.id.in_(ids)).options(defer(Policy.metrics))
+    return {p.id: p for p in db.scalars(query)}
 
 
 def changed_since(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import func, or_, select
+from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.orm import Session, selectinload
 
@@ -100,11 +100,17 @@ def policies_named(db: Session, participant_id: int, ids: Sequence[int]) -> list
 
 def candidates(db: Session, participant_id: int) -> Sequence[Policy]:
     """Policies that a ranking should hold: trained, distilled or made elsewhere, and not retired; oldest first."""
-    return db.scalars(
-        select(Policy)
-        .where(Policy.participant_id == participant_id, Policy.kind != "baseline", Policy.retired_reason.is_(None))
-        .order_by(Policy.id)
-    ).all()
+    return db.scalars(select(Policy).where(*_ranked(participant_id)).order_by(Policy.id)).all()
+
+
+def candidate_names(db: Session, participant_id: int) -> dict[int, str]:
+    """Names of the same policies by their number, oldest first."""
+    query = select(Policy.id, Policy.name).where(*_ranked(participant_id)).order_by(Policy.id)
+    return {row.id: row.name for row in db.execute(query)}
+
+
+def _ranked(participant_id: int) -> tuple[ColumnElement[bool], ...]:
+    return Policy.participant_id == participant_id, Policy.kind != "baseline", Policy.retired_reason.is_(None)
 
 
 def policy_by_name(db: Session, participant_id: int, name: str) -> Policy | None:

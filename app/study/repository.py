@@ -326,8 +326,8 @@ def _sessions() -> Select[StudySession]:
         .join(StudySession.visit)
         .join(Visit.participant)
         .options(
-            joinedload(StudySession.visit).joinedload(Visit.participant).joinedload(Participant.site),
-            joinedload(StudySession.visit).selectinload(Visit.cdbs_amplitudes),
+            contains_eager(StudySession.visit).contains_eager(Visit.participant).joinedload(Participant.site),
+            contains_eager(StudySession.visit).selectinload(Visit.cdbs_amplitudes),
             selectinload(StudySession.qocs),
             selectinload(StudySession.conditions_revisions),
             selectinload(StudySession.segments).joinedload(SessionSegment.recording),

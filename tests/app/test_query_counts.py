@@ -9,6 +9,10 @@ from fastapi.testclient import TestClient
 from sqlalchemy import event
 
 from app.platform.database import get_engine
+from app.platform.kept import forget
+from tests.app.evaluations import judge as judge
+from tests.app.evaluations import judged
+from tests.app.evaluations import policies as policies
 
 PAGES = (
     "/",
@@ -57,3 +61,22 @@ def test_more_visits_and_sessions_ask_no_more_queries(
         for controller in ("random", "cdbs"):
             upload(controller, steps=20, visit=visit)
     assert {path: queries(path) for path in PAGES} == few
+
+
+def test_a_page_of_a_ranking_reads_the_sessions_once(
+    client: TestClient, upload: Callable[..., int], policies: list[int], judge: Callable[..., int]
+) -> None:
+    judge({policies[0]: judged(50.0)})
+    asked: list[str] = []
+
+    def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        asked.append(statement)
+
+    forget()
+    event.listen(get_engine(), "before_cursor_execute", note)
+    try:
+        assert client.get("/participants/P1/ranking").status_code == 200
+    finally:
+        event.remove(get_engine(), "before_cursor_execute", note)
+    assert sum("session.excluded_reason" in s and "session.ordinal" in s.split("ORDER BY")[-1] for s in asked) == 1
+    assert sum("session_conditions.xmin" in s for s in asked) == 1, "nor is what they are made of looked at twice"

@@ -7,14 +7,15 @@ from collections.abc import Sequence
 from sqlalchemy import select
 from sqlalchemy.orm import Session, selectinload
 
-from app.evaluation.models import Evaluation
+from app.evaluation.models import EstimateRow, Evaluation
 from app.learning.models import SnapshotSession
 
 
 def evaluations(db: Session, participant_id: int) -> Sequence[Evaluation]:
-    """A participant's evaluations with their estimates, oldest first."""
+    """A participant's evaluations with their estimates less the details of these, oldest first."""
     query = select(Evaluation).where(Evaluation.participant_id == participant_id).order_by(Evaluation.id)
-    return db.scalars(query.options(selectinload(Evaluation.estimates))).all()
+    wanted = selectinload(Evaluation.estimates).load_only(EstimateRow.policy_id, EstimateRow.method, EstimateRow.value)
+    return db.scalars(query.options(wanted)).all()
 
 
 def sessions_of_snapshot(db: Session, snapshot_id: int) -> set[int]:

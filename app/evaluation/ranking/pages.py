@@ -16,7 +16,7 @@ from app.evaluation.estimates import coverage, held_out
 from app.evaluation.estimates.methods import names
 from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
-from app.evaluation.ranking.answer import Answer, answer
+from app.evaluation.ranking.answer import OFF_SHARE, Answer, answer
 from app.evaluation.ranking.export import csv_of
 from app.evaluation.ranking.picture import Picture, picture
 from app.evaluation.schemas import RANKING_KINDS, STANDING_NAMES, RankingFilter, RankingOut
@@ -31,6 +31,7 @@ from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.service import may
+from app.study.sessions.repository import ReadOnce
 from ml.ope import registry as estimators
 
 router = APIRouter()
@@ -58,9 +59,10 @@ def ranking_page(
     weights: Mapping[str, float] = {}
     correlation: float | None = None
     missing: dict[str, Any] | None = None
+    sessions = ReadOnce(db, participant.id)
     try:
-        assessment = ranking.current_assessment(db, participant, caller, method or None)
-        found, answered = ranking.ranking_of(db, assessment, shown), answer(assessment)
+        assessment = ranking.current_assessment(db, participant, caller, method or None, sessions)
+        found, answered = ranking.ranking_of(db, assessment, shown, sessions), answer(assessment)
         drawn = picture(
             assessment, [*answered.rows, *answered.like_off], found.snapshot.beta_unit, participant.current_settings.lower_bound
         )
@@ -83,6 +85,7 @@ def ranking_page(
         signed=wording.signed,
         chance=wording.chance,
         further=wording.further_sessions,
+        off_share=OFF_SHARE,
         weights=weights,
         correlation=correlation,
         unfolded=bool(method or shown != RankingFilter()),

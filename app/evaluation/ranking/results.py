@@ -21,7 +21,7 @@ from app.study import blinding
 from app.study import repository as study_repository
 from app.study.blinding import Arm
 from app.study.models import Controller, Participant, SettingsVersion, StudySession
-from app.study.sessions.repository import fingerprints
+from app.study.sessions.repository import ReadOnce
 from app.study.threshold import mdp_settings
 from app.study.traces import TracesOf, laid_out, traces_of
 from ml.mdp import MdpSettings
@@ -47,16 +47,18 @@ class DrivenSession:
     left_out: str | None
 
 
-def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller) -> list[DrivenSession]:
+def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller, sessions: ReadOnce | None = None) -> list[DrivenSession]:
     """Every confirmed session of a policy or of cDBS, by visit and order, under a snapshot's settings, unit and source of beta.
 
     The buffer's gate does not matter here: it guards what is learnt from, and these sessions are only looked at.
 
     Args:
         db: the session. snapshot: what the estimates rest on. caller: decides which arms may be known.
+        sessions: of the participant, where somebody else reads them too.
     """
+    sessions = sessions or ReadOnce(db, snapshot.participant_id)
     version = study_repository.settings_version(db, snapshot.settings_version_id)
-    arms = [(s, blinding.arm(s, caller)) for s in study_repository.sessions_of_participant(db, snapshot.participant_id)]
+    arms = [(s, blinding.arm(s, caller)) for s in sessions.rows]
     driven = [(s, arm) for s, arm in arms if arm.policy_id is not None or arm.controller is Controller.CDBS]
     traces = traces_of(db, [s for s, _ in driven])
     found = []
@@ -92,20 +94,21 @@ def results_by_policy(ran: list[DrivenSession], settings: MdpSettings, horizon_s
 
 
 def tested_before(
-    db: Session, evaluation: Evaluation, participant: Participant, caller: Caller, cdbs: int | None
+    db: Session, evaluation: Evaluation, participant: Participant, caller: Caller, cdbs: int | None, sessions: ReadOnce | None
 ) -> dict[int, TestedBefore]:
     """The same of all sessions so far, kept by this process until a row of the participant's sessions changes.
 
     Args:
         db: the session. evaluation: whose settings, horizon and discount count. participant: whose.
         caller: decides which arms may be known. cdbs: id of the cDBS reference.
+        sessions: of the participant, where somebody else reads them too.
     """
-    rows = fingerprints(db, [participant.id])[participant.id]
-    key = ("tested before", evaluation.id, evaluation.created_at, rows, cdbs, blinding.sight(db, participant, caller))
+    sessions = sessions or ReadOnce(db, participant.id)
+    key = ("tested before", evaluation.id, evaluation.created_at, sessions.fingerprint, cdbs, blinding.sight(db, participant, caller))
 
     def read() -> dict[int, TestedBefore]:
         settings = mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))
-        ran = driven_sessions(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller)
+        ran = driven_sessions(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller, sessions)
         return results_by_policy(ran, settings, evaluation.horizon_steps, cdbs)
 
     return kept(key, read)

@@ -22,6 +22,7 @@ from app.study import service as study
 from app.study.adverse_events.repository import events_of_participant
 from app.study.adverse_events.service import blocked_policies
 from app.study.models import Participant
+from app.study.sessions.repository import ReadOnce
 from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate
 from ml.ope.flags import distinct
@@ -42,11 +43,18 @@ def current_ranking(
     Raises:
         NotFound: nothing was evaluated yet. Invalid: the method is not in this evaluation.
     """
-    return ranking_of(db, current_assessment(db, participant, caller, method), shown)
+    sessions = ReadOnce(db, participant.id)
+    return ranking_of(db, current_assessment(db, participant, caller, method, sessions), shown, sessions)
 
 
-def current_assessment(db: Session, participant: Participant, caller: Caller, method: str | None = None) -> Assessment:
-    """What the newest evaluation says of every policy, with the verdicts by the margins in force now. Raises as `current_ranking`."""
+def current_assessment(
+    db: Session, participant: Participant, caller: Caller, method: str | None = None, sessions: ReadOnce | None = None
+) -> Assessment:
+    """What the newest evaluation says of every policy, with the verdicts by the margins in force now. Raises as `current_ranking`.
+
+    Args:
+        db, participant, caller, method: as there. sessions: of the participant, where somebody else reads them too.
+    """
     study.require(caller, can.READ, participant)
     evaluation = repository.newest_evaluation(db, participant.id)
     if evaluation is None:
@@ -54,7 +62,7 @@ def current_assessment(db: Session, participant: Participant, caller: Caller, me
             f"Participant {participant.code} has no ranking yet.", "Start a job of kind 'pipeline', or 'evaluate' where there are policies."
         )
     found = assessment_of(db, participant, evaluation, method)
-    return found.with_tests(tested_before(db, evaluation, participant, caller, found.cdbs_id))
+    return found.with_tests(tested_before(db, evaluation, participant, caller, found.cdbs_id, sessions))
 
 
 def assessment_of(db: Session, participant: Participant, evaluation: Evaluation, method: str | None = None) -> Assessment:
@@ -75,11 +83,16 @@ def assessment_of(db: Session, participant: Participant, evaluation: Evaluation,
     return assess(evaluation, policies, chosen, participant, version, harmful)
 
 
-def ranking_of(db: Session, found: Assessment, shown: RankingFilter | None = None) -> RankingOut:
-    """An assessment as the interface has it."""
+def ranking_of(db: Session, found: Assessment, shown: RankingFilter | None = None, sessions: ReadOnce | None = None) -> RankingOut:
+    """An assessment as the interface has it.
+
+    Args:
+        db: the session. found: the assessment. shown: which candidates to give; all where not given.
+        sessions: of the participant, where somebody else reads them too.
+    """
     evaluation, participant = found.evaluation, found.participant
     candidates, references = [_ranked(found, a) for a in found.candidates], [_ranked(found, a) for a in found.references]
-    reasons = [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation)]
+    reasons = [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation, sessions)]
     return RankingOut(
         participant=participant.code,
         evaluation_id=evaluation.id,

@@ -24,7 +24,7 @@ from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study.models import Participant, SettingsVersion, StudySession
-from app.study.sessions.repository import fingerprints
+from app.study.sessions.repository import ReadOnce
 from app.study.traces import Sources, sources
 from ml.ope.flags import Flag
 
@@ -38,8 +38,13 @@ STOPPED = "stopped_reason"
 """Column that makes the session a failure in a buffer, whatever the reason."""
 
 
-def stale_reasons(db: Session, participant: Participant, evaluation: Evaluation) -> list[Flag]:
-    """Why the ranking no longer speaks about the study as it is; empty when it does."""
+def stale_reasons(db: Session, participant: Participant, evaluation: Evaluation, sessions: ReadOnce | None = None) -> list[Flag]:
+    """Why the ranking no longer speaks about the study as it is; empty when it does.
+
+    Args:
+        db: the session. participant: whose. evaluation: the ranking's.
+        sessions: of the participant, where somebody else reads them too.
+    """
     reasons: list[Flag] = []
     settings = participant.current_settings
     if settings.xi_beta is None:
@@ -47,25 +52,24 @@ def stale_reasons(db: Session, participant: Participant, evaluation: Evaluation)
     if evaluation.settings_version_id != settings.id:
         old = study_repository.settings_version(db, evaluation.settings_version_id).version
         reasons.append(Flag("settings_changed", float(settings.version), float(old)))
-    reasons += _kept_changes(db, participant, db.get_one(BufferSnapshot, evaluation.snapshot_id))
+    sessions = sessions or ReadOnce(db, participant.id)
+    reasons += _kept_changes(db, participant, db.get_one(BufferSnapshot, evaluation.snapshot_id), sessions)
     ranked = set(evaluation.diagnostics.get("candidates", []))
-    missing = [p.name for p in learning.candidates(db, participant.id) if p.id not in ranked]
+    missing = [name for number, name in learning.candidate_names(db, participant.id).items() if number not in ranked]
     if missing:
         reasons.append(Flag.of("policies_missing", float(len(missing)), None, "policies", names=tuple(missing[:NAMED])))
     return reasons
 
 
-def _kept_changes(db: Session, participant: Participant, snapshot: BufferSnapshot) -> list[Flag]:
+def _kept_changes(db: Session, participant: Participant, snapshot: BufferSnapshot, sessions: ReadOnce) -> list[Flag]:
     """The same as `_changes`, kept by this process until a row of the participant's sessions changes, or the gate is decided on."""
     decision = learning.newest_gate_decision(db, participant.id)
-    rows = fingerprints(db, [participant.id])[participant.id]
-    key = ("changes since", snapshot.id, snapshot.created_at, rows, decision.id if decision else None)
-    return kept(key, lambda: _changes(db, participant, snapshot))
+    key = ("changes since", snapshot.id, snapshot.created_at, sessions.fingerprint, decision.id if decision else None)
+    return kept(key, lambda: _changes(db, participant, snapshot, sessions.rows))
 
 
-def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot) -> list[Flag]:
+def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot, sessions: Sequence[StudySession]) -> list[Flag]:
     """What happened to the sessions since a snapshot."""
-    sessions = study_repository.sessions_of_participant(db, participant.id)
     before = {m.session_id: m for m in learning.snapshot_members(db, snapshot.id)}
     now = {s.id: s for s in sessions}
     added = [s for s in sessions if s.id not in before]

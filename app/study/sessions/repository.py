@@ -1,10 +1,11 @@
-"""Queries of sessions: which rows what they hold is made of, in which version; which session of a plan they are; repeated minutes."""
+"""Queries of sessions: which rows they are made of, in which version; what a request reads once; slots of plans; repeated minutes."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from sqlalchemy import Select, String, cast, column, func, literal, literal_column, or_, select, table, true, union_all
@@ -12,7 +13,7 @@ from sqlalchemy.dialects.postgresql import aggregate_order_by
 from sqlalchemy.orm import Session
 
 from app.study.models import CdbsAmplitude, QocRevision, Recording, SessionSegment, SettingsVersion, StudySession, Trace, Visit
-from app.study.repository import CONFIRMED
+from app.study.repository import CONFIRMED, sessions_of_participant
 from app.study.sessions.models import CountedTime, SessionConditions
 
 
@@ -54,6 +55,24 @@ def _versions(name: str, key: Any, owner: Any, *joins: Any) -> tuple[Select[Any]
     for join in joins:
         query = query.join(*join) if isinstance(join, tuple) else query.join(join)
     return query, owner
+
+
+@dataclass
+class ReadOnce:
+    """What several parts of a page ask of a participant's confirmed sessions, read when one of them asks first; of one request."""
+
+    db: Session
+    participant_id: int
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Changes with any row that the sessions are made of: for the key of what is kept of them, and to be asked before `rows`."""
+        return fingerprints(self.db, [self.participant_id])[self.participant_id]
+
+    @cached_property
+    def rows(self) -> Sequence[StudySession]:
+        """The sessions by visit and order."""
+        return sessions_of_participant(self.db, self.participant_id)
 
 
 class SlotHead(NamedTuple):
