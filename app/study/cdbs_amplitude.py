@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from datetime import date
 from typing import overload
 
 from app.platform.errors import Invalid
@@ -56,10 +58,12 @@ def of_session(session: StudySession, settings: SettingsVersion, program: int = 
 def in_force_now(participant: Participant, hemisphere: Hemisphere | None) -> float:
     """The cDBS amplitude of the newest visit that states one (of this hemisphere), mA, else the settings' shorthand.
 
+    The newest is that of the latest date: an earlier day that was entered late has a higher number.
+
     Raises:
         Invalid: as `stated_at`, or nobody has stated one.
     """
-    for visit in sorted(participant.visits, key=lambda v: v.number, reverse=True):
+    for visit in _newest_first(participant.visits):
         stated = stated_at(visit, hemisphere, None)
         if stated is not None:
             return stated
@@ -67,6 +71,16 @@ def in_force_now(participant: Participant, hemisphere: Hemisphere | None) -> flo
     if shorthand is None:
         raise Invalid("The cDBS amplitude is not known.", "Set cdbs_amplitude_ma in the participant's settings or at a visit.")
     return shorthand
+
+
+def _newest_first(visits: Iterable[Visit]) -> list[Visit]:
+    """Visits by date, the latest first; one without a date stands where its number puts it."""
+    day, found = date.min, []
+    for visit in sorted(visits, key=lambda v: v.number):
+        # a day before that of a lower number is its own, and not that of the visits after it
+        day = max(day, visit.date or day)
+        found.append((visit.date or day, visit.number, visit))
+    return [visit for _, _, visit in sorted(found, key=lambda row: row[:2], reverse=True)]
 
 
 @overload

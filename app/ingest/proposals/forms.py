@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from markupsafe import Markup
@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.ingest.models import SessionProposal
+from app.ingest.proposals.visit_of_recording import VisitToAdd
 from app.ingest.schemas import PartIn, ProposalChange
 from app.platform.errors import Invalid
 from app.platform.web.forms import parse
@@ -43,7 +44,7 @@ class ProposalForm:
         programs: that the control recording has an amplitude of.
         thumbnail: beta and amplitude at a glance, None where neither is known.
         problem: why the form was refused.
-        day_to_add: on which a visit can be made of the recording.
+        to_add: the visit that can be made of the recording.
     """
 
     session: StudySession
@@ -60,7 +61,7 @@ class ProposalForm:
     thumbnail: Markup | None = None
     reason: str = ""
     problem: dict[str, Any] | None = None
-    day_to_add: date | None = None
+    to_add: VisitToAdd | None = None
 
     @property
     def seen(self) -> str:

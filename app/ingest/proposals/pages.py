@@ -18,7 +18,7 @@ from app.ingest.models import SessionProposal
 from app.ingest.proposals import service as proposals
 from app.ingest.proposals.forms import ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
 from app.ingest.proposals.thumbnail import thumbnail
-from app.ingest.proposals.visit_of_recording import add_visit_of_recording, day_to_add
+from app.ingest.proposals.visit_of_recording import add_visit_of_recording, visit_to_add
 from app.ingest.uploads import service
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
@@ -216,7 +216,7 @@ def _form(
         thumbnail(data) if data else None,
         sent.get(f"reason-{session.id}", "") if error else "",
         error.problem(request.url.path) if error else None,
-        day_to_add(session, proposal, visits),
+        visit_to_add(session, proposal, visits),
     )
 
 

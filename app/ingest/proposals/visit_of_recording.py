@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import date
 
 from sqlalchemy.orm import Session
@@ -29,10 +30,46 @@ def day_to_add(session: StudySession, proposal: SessionProposal, visits: Sequenc
     return None if any(v.date == day for v in visits) else day
 
 
+@dataclass(frozen=True)
+class VisitToAdd:
+    """The visit that a recording would make.
+
+    Attributes:
+        day: on which it was recorded. number: of the visit.
+        later: the visit of the latest day among those with a lower number and a later date; None where numbers go on following dates.
+    """
+
+    day: date
+    number: int
+    later: Visit | None
+
+
+def visit_to_add(session: StudySession, proposal: SessionProposal, visits: Sequence[Visit]) -> VisitToAdd | None:
+    """The visit of a proposal's day, as the page announces it; None as `day_to_add`."""
+    day = day_to_add(session, proposal, visits)
+    return None if day is None else _numbered(day, visits)
+
+
+def _numbered(day: date, visits: Sequence[Visit]) -> VisitToAdd:
+    """A number that keeps numbers in the order of dates, where one is free there; else the one after the highest.
+
+    Numbers in use stay as they are: plans, exports and analyses name visits by them.
+    """
+    before = max((v.number for v in visits if v.date is not None and v.date < day), default=0)
+    after = min((v.number for v in visits if v.date is not None and v.date > day), default=None)
+    taken = {v.number for v in visits}
+    if after is not None:
+        free = next((n for n in range(before + 1, after) if n not in taken), None)
+        if free is not None:
+            return VisitToAdd(day, free, None)
+    later = [v for v in visits if v.date is not None and v.date > day]
+    return VisitToAdd(day, max(taken, default=0) + 1, max(later, key=lambda v: (v.date or day, v.number), default=None))
+
+
 def add_visit_of_recording(db: Session, session: StudySession, version: int, caller: Caller) -> tuple[Visit, list[StudySession]]:
     """Add the visit on whose day a proposal was recorded, and give it to every proposal of that day whose visit is open.
 
-    Its number follows the highest one of the participant.
+    Its number is the one that `visit_to_add` names.
 
     Returns:
         The visit, and the proposals that belong to it now.
@@ -52,7 +89,7 @@ def add_visit_of_recording(db: Session, session: StudySession, version: int, cal
     day = day_to_add(session, proposal, visits)
     if day is None:
         raise Conflict("A visit on the day of this recording is there already.", "Choose it in the proposal.")
-    visit = study_service.add_visit(db, participant, VisitIn(number=max(v.number for v in visits) + 1, date=day), caller)
+    visit = study_service.add_visit(db, participant, VisitIn(number=_numbered(day, visits).number, date=day), caller)
     why = Evidence(Source.RECORDING, Reason.DAY_OF_VISIT, {"day": str(day), "visit": visit.number}).as_json()
     waiting = study.proposals_of_participant(db, participant.id)
     behind = repository.proposals(db, [s.id for s in waiting])

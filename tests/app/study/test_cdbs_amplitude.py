@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from datetime import date
+
 import pytest
 
 from app.platform.errors import Invalid
@@ -11,8 +13,8 @@ from app.study.models import CdbsAmplitude, Hemisphere, Participant, SettingsVer
 LEFT, RIGHT = Hemisphere.LEFT, Hemisphere.RIGHT
 
 
-def visit(number: int, *stated: tuple[Hemisphere, int, float]) -> Visit:
-    return Visit(number=number, cdbs_amplitudes=[CdbsAmplitude(hemisphere=h, program=p, amplitude_ma=ma) for h, p, ma in stated])
+def visit(number: int, *stated: tuple[Hemisphere, int, float], day: date | None = None) -> Visit:
+    return Visit(number=number, date=day, cdbs_amplitudes=[CdbsAmplitude(hemisphere=h, program=p, amplitude_ma=ma) for h, p, ma in stated])
 
 
 def settings(cdbs: float | None = 2.0) -> SettingsVersion:
@@ -38,6 +40,18 @@ def test_the_newest_visit_that_states_the_side_is_in_force_now() -> None:
     person = Participant(settings=[settings()], visits=[visit(2, (LEFT, 0, 3.0)), visit(3, (RIGHT, 0, 2.5)), visit(1, (LEFT, 0, 9.0))])
     assert cdbs_amplitude.in_force_now(person, LEFT) == 3.0
     assert cdbs_amplitude.in_force_now(person, None) == 2.5
+
+
+def test_an_earlier_day_that_was_entered_late_is_not_the_newest_visit() -> None:
+    march, april = date(2026, 3, 2), date(2026, 4, 6)
+    late = visit(3, (LEFT, 0, 4.0), day=march)
+    person = Participant(settings=[settings()], visits=[visit(1), visit(2, (LEFT, 0, 3.0), day=april), late])
+    assert cdbs_amplitude.in_force_now(person, LEFT) == 3.0
+    person.visits.append(visit(4, (LEFT, 0, 2.5)))
+    assert cdbs_amplitude.in_force_now(person, LEFT) == 2.5, "one without a date stands where its number puts it"
+
+
+def test_without_a_visit_that_states_one_the_settings_are_in_force_now() -> None:
     assert cdbs_amplitude.in_force_now(Participant(settings=[settings()], visits=[visit(1)]), LEFT) == 2.0
     with pytest.raises(Invalid, match="not known"):
         cdbs_amplitude.in_force_now(Participant(settings=[settings(None)], visits=[]), LEFT)

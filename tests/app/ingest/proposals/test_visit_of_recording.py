@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from fastapi.testclient import TestClient
 
 from tests.app.ingest.conftest import device_zip, steady
@@ -51,3 +52,23 @@ def test_a_day_that_got_its_visit_meanwhile_makes_no_second_one(client: TestClie
     (open_one,) = send(("b.zip", device_zip(("cdbs",), minute=NOON_NEXT_DAY))).json()["proposals"]
     assert client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": "2026-03-03"}).status_code == 201
     assert add(client, open_one).status_code == 409
+
+
+@pytest.mark.parametrize(
+    ("others", "number", "says"),
+    [
+        ({3: "2026-03-30"}, 2, "It gets number 2."),
+        ({2: "2026-03-30", 3: "2026-04-27"}, 4, "It gets number 4, though visit 3 is of 2026-04-27: numbers in use are not changed."),
+        ({2: None, 4: "2026-03-30"}, 3, "It gets number 3."),
+        ({2: "2026-03-02"}, 3, "It gets number 3."),
+    ],
+)
+def test_the_number_follows_the_dates_where_one_is_free_and_else_the_page_says_what_happens(
+    client: TestClient, send: Any, others: dict[int, str | None], number: int, says: str
+) -> None:
+    for other, day in others.items():
+        assert client.post("/api/v1/participants/P1/visits", json={"number": other, "date": day}).status_code == 201
+    (open_one,) = send(("b.zip", device_zip(("cdbs",), minute=NOON_NEXT_DAY))).json()["proposals"]
+    assert says in client.get("/participants/P1/proposals", headers={"Accept": "text/html"}).text
+    made = add(client, open_one).json()["visit"]
+    assert (made["number"], made["date"]) == (number, "2026-03-03")
