@@ -62,12 +62,14 @@ class Answer:
 
     Attributes:
         rows: distinct behaviours, what to test first. like_cdbs, like_off: folded away.
+        ordered: whether the data can order policies. under_cdbs: what is expected under cDBS itself, by quantity, less energy.
     """
 
     rows: tuple[Row, ...]
     like_cdbs: tuple[Row, ...]
     like_off: tuple[Row, ...]
     ordered: bool
+    under_cdbs: dict[str, float]
 
     def of(self, code: str) -> list[Row]:
         """Rows that stand so and are not retired."""
@@ -75,8 +77,23 @@ class Answer:
 
     @property
     def hazards(self) -> list[Row]:
-        """What is not to be run without a clinician's word, whatever its verdict."""
-        return [r for r in (*self.rows, *self.like_off) if r.decided.needs_override and not r.one.policy.retired_reason]
+        """What is not to be run without a clinician's word, whatever its verdict; less what `off` holds."""
+        return [r for r in (*self.rows, *self.like_off) if _held_back(r) and r not in self.off]
+
+    @property
+    def off(self) -> list[Row]:
+        """What is not to be run without a clinician's word because it is no stimulation by another name, and for nothing that happened."""
+        return [r for r in self.like_off if _held_back(r) and all(reason.code != "adverse_event" for reason in r.decided.reasons)]
+
+    @property
+    def undecided(self) -> list[Row]:
+        """What may be run and yet is not worth a visit now."""
+        return [r for r in self.rows if r.decided.standing == "cannot_tell" and r.one.policy.retired_reason is None]
+
+    @property
+    def pickable(self) -> bool:
+        """Whether there is a candidate that a visit may be planned with, without a clinician's reason."""
+        return any(may_be_picked(r) for r in (*self.rows, *self.like_cdbs, *self.like_off))
 
     @property
     def tested(self) -> bool:
@@ -90,10 +107,16 @@ class Answer:
         return {a.policy.id: r for r in rows for a in (r.one, *r.twins)}
 
     @property
-    def cheapest(self) -> Row | None:
-        """The row that the fewest further sessions would tell."""
+    def cheapest(self) -> list[Row]:
+        """The rows that the fewest further sessions would tell, the likeliest within the margins first."""
         told = [(n, r) for r in self.rows for n in [_needed(r)] if n is not None]
-        return min(told, key=lambda pair: pair[0])[1] if told else None
+        fewest = min((n for n, _ in told), default=None)
+        return sorted((r for n, r in told if n == fewest), key=lambda r: -(r.within or 0.0))
+
+
+def may_be_picked(row: Row) -> bool:
+    """Whether a visit may be planned with it, without a clinician's reason, and would show anything."""
+    return row.decided.standing not in ("unsafe", "not_advised", "same_as_cdbs") and row.one.policy.retired_reason is None
 
 
 def answer(found: Assessment) -> Answer:
@@ -102,7 +125,7 @@ def answer(found: Assessment) -> Answer:
     rows.sort(key=lambda r: ORDER.index(r.decided.standing))  # stable: within a verdict as ranked
     off = [r for r in rows if _like_off(r.one.posterior)]
     same = [r for r in rows if r.decided.decision == "same_as_cdbs" and r not in off]
-    return Answer(tuple(r for r in rows if r not in off and r not in same), tuple(same), tuple(off), found.ordered)
+    return Answer(tuple(r for r in rows if r not in off and r not in same), tuple(same), tuple(off), found.ordered, _under_cdbs(found))
 
 
 def differences(own: Estimate | None, cdbs: Estimate | None) -> dict[str, Difference]:
@@ -161,6 +184,16 @@ def _behaviour(estimate: Estimate | None) -> tuple[float, ...]:
 def _like_off(estimate: Estimate | None) -> bool:
     known = (estimate.details.get("behaviour") or {}) if estimate is not None else {}
     return float(known.get("below_cdbs_20_percent") or 0.0) > OFF_SHARE
+
+
+def _held_back(row: Row) -> bool:
+    return row.decided.needs_override and row.one.policy.retired_reason is None
+
+
+def _under_cdbs(found: Assessment) -> dict[str, float]:
+    own = found.cdbs.posterior if found.cdbs else None
+    drawn = {name: outcome_draws(own, name) for name in QUANTITIES[1:]} if own is not None else {}
+    return {name: float(draws.mean()) for name, draws in drawn.items() if draws is not None}
 
 
 def _needed(row: Row) -> float | None:

@@ -137,7 +137,8 @@ class Plane:
         """Words at a place of the figure, not of the axes."""
         bold = f' font-weight="{weight}"' if weight != 400 else ""
         look = f'text-anchor="{anchor}" fill="{token(colour)}" font-size="{LABEL:g}"{bold}'
-        self.parts.append(f'<text x="{x:.1f}" y="{y:.1f}" {look}>{escape(words)}</text>')
+        halo = f'paint-order="stroke" stroke="{token("surface")}" stroke-width="3"'  # words stay readable over cells and lines
+        self.parts.append(f'<text x="{x:.1f}" y="{y:.1f}" {look} {halo}>{escape(words)}</text>')
 
 
 def apart(wanted: Sequence[float], gap: float = LABEL + 2, low: float = -math.inf, high: float = math.inf) -> list[float]:

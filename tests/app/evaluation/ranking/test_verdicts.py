@@ -144,6 +144,40 @@ def test_behaviours_that_are_cdbs_or_no_stimulation_by_another_name_are_folded(
     assert {i: f'/policies/{i}"' in table for i in policies} == {a: True, b: False, c: False}
 
 
+def test_a_ranking_with_nothing_to_test_says_so_why_and_what_to_do(client: TestClient, policies: list[int], judge: Judge) -> None:
+    a, b, c = policies
+    off = {"behaviour": {"below_cdbs_20_percent": 0.95}}
+    judge({a: judged(50.0, **WORSE), b: judged(60.0, behaviour={"closeness_to_cdbs": 0.01}), c: judged(9.0, **off)})
+    words = first_screen(client)
+    assert (
+        "No policy is worth a visit yet. 1 acts like cDBS, so that a session would show nothing new; the rest is not advised. "
+        "Further policies are needed: train some . Another visit of random and cDBS sessions" in words
+    )
+    assert "p0 : unsafe, > 99 % likely beyond a margin, most often that of tremor; to expect: energy \N{MINUS SIGN}40 %" in words
+    assert "tremor +25 points" in words, "what it would cost the patient"
+    assert "p2 : acts like no stimulation, nearly off more than 80 % of the time" in words
+    assert "To expect under cDBS itself: grasp 2.0 Hz, rating 7.0, tremor 20 % of the time." in words
+    page = client.get(PAGE).text
+    assert not re.search("tick policies|ticked policies|Skip to the candidates", page), "there is nothing to tick"
+
+
+def test_every_policy_that_as_few_sessions_would_tell_is_named(client: TestClient, policies: list[int], judge: Judge) -> None:
+    noise = {"coverage": {"policies": {}, "session_noise": {"tremor_percent": 4.0}}}
+    open_still, likelier = ([low + 0.03 * i for i in range(N)] for low in (10.0, 9.0))
+    support = {"dose": 0.6}
+    judge(
+        {
+            policies[0]: judged(50.0, outcome_draws={"tremor_percent": open_still}, support=support),
+            policies[1]: judged(50.0, outcome_draws={"tremor_percent": likelier}, support=support),
+        },
+        **noise,
+    )
+    found = {p["name"]: {r["code"]: r["value"] for r in p["decision_reasons"]} for p in ranked(client)["policies"]}
+    assert found["p0"]["sessions_needed"] == found["p1"]["sessions_needed"], "the same number would tell of both"
+    named = re.findall(r"would tell whether (p\d) is worth it: energy", first_screen(client))
+    assert named == ["p1", "p0"]
+
+
 def test_how_many_sessions_near_which_amplitude_would_tell_is_said(client: TestClient, policies: list[int], judge: Judge) -> None:
     noise = {"coverage": {"policies": {}, "session_noise": {"tremor_percent": 4.0}}}
     judge(
