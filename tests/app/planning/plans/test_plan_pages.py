@@ -22,7 +22,7 @@ def _post(client: TestClient, path: str, **fields: Any) -> Any:
 def test_the_page_of_a_visit_without_a_plan_offers_the_ranked_policies(client: TestClient, studied: Any) -> None:
     page = client.get(f"/visits/{studied.visit}/plan", headers=PAGE)
     assert page.status_code == 200
-    assert "<b>Not enough data.</b> Needed: a plan." in page.text
+    assert "has no plan yet.</b> Draft one below." in page.text
     assert page.text.index("rl-01<") < page.text.index("rl-02<") < page.text.index("rl-01-small<")
     assert "rl-00<" not in page.text  # retired
     assert page.text.count('name="policy_ids"') == 4
@@ -129,7 +129,7 @@ def test_a_visit_with_sessions_is_not_open_for_planning(client: TestClient, stud
 
 def test_the_list_shows_every_plan_and_the_open_visits(client: TestClient, studied: Any) -> None:
     empty = client.get("/participants/P1/plans", headers=PAGE).text
-    assert "Nothing is planned for this participant. The next visit would be number 3." in empty
+    assert "No visit is planned for this participant.</b> The next visit would be number 3." in empty
     for _ in range(2):
         client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
     page = client.get("/participants/P1/plans", headers=PAGE).text
