@@ -119,23 +119,45 @@ def _administer(server: EmbeddedPostgres, statement: str) -> None:
         _administrators[conninfo].execute(statement)
 
 
-@contextmanager
-def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.MonkeyPatch, template: str) -> Iterator[str]:
-    """A database and data folder of one test, named in the environment too, so that child processes find them."""
-    name = f"test_{os.getpid()}_{next(_counter)}"
+def copy_database(server: EmbeddedPostgres, name: str, template: str) -> None:
+    """A new database with what another one has, to which nobody is connected."""
     _administer(server, f"create database {name} template {template} owner betaloop strategy file_copy")
+
+
+def drop_database(server: EmbeddedPostgres, name: str) -> None:
+    """Remove a database, whoever is connected to it."""
+    _administer(server, f"drop database {name} with (force)")
+
+
+def close_connections() -> None:
+    """Close this process's connections to the database in use, so that it can be copied."""
+    for engine in database._engines.values():
+        engine.dispose()
+    database._engines.clear()
+
+
+@contextmanager
+def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.MonkeyPatch, template: str, keep: str = "") -> Iterator[str]:
+    """A database and data folder of one test, named in the environment too, so that child processes find them.
+
+    Args:
+        keep: the name of a copy that is left at the end, a template for other tests; `data` is left with it.
+    """
+    name = f"test_{os.getpid()}_{next(_counter)}"
+    copy_database(server, name, template)
     url = server.url(name)
     monkeypatch.setenv("BETALOOP_DATABASE_URL", url)
     monkeypatch.setenv("BETALOOP_OWNER_URL", server.owner_url(name))
     monkeypatch.setenv("BETALOOP_DATA_DIR", str(data))
     get_settings.cache_clear()
     yield url
-    for engine in database._engines.values():
-        engine.dispose()
-    database._engines.clear()
+    close_connections()
     get_settings.cache_clear()
-    _administer(server, f"drop database {name} with (force)")
-    shutil.rmtree(data, ignore_errors=True)
+    if keep:
+        copy_database(server, keep, name)
+    else:
+        shutil.rmtree(data, ignore_errors=True)
+    drop_database(server, name)
 
 
 @pytest.fixture
@@ -145,10 +167,15 @@ def fresh_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest
         yield url
 
 
-@pytest.fixture
-def released_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+Template = tuple[str, Path]
+"""A database that nobody is connected to, and its data folder; tests work on copies."""
+
+
+@pytest.fixture(scope="session")
+def released_template(server: EmbeddedPostgres, tmp_path_factory: pytest.TempPathFactory) -> Template:
     """The database that release 0.1.0 filled (see test_released_database.py), with its small files, migrated to the newest schema."""
-    with own_database(server, tmp_path / "data", monkeypatch, "template0") as url:
+    data = tmp_path_factory.mktemp("released") / "data"
+    with pytest.MonkeyPatch.context() as patch, own_database(server, data, patch, "template0", keep="released"):
         with psycopg.connect(database.owner_url().replace("+psycopg", ""), autocommit=True) as connection:
             connection.execute(lzma.decompress(RELEASED_DUMP.read_bytes()).decode())
         with zipfile.ZipFile(RELEASED_FILES) as archive:
@@ -156,6 +183,23 @@ def released_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pyt
                 path_of(sha256).parent.mkdir(parents=True, exist_ok=True)
                 path_of(sha256).write_bytes(archive.read(sha256))
         migrate()
+    return "released", data
+
+
+@contextmanager
+def copy_of(template: Template, server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A copy of a template, for one test."""
+    shutil.copytree(template[1], tmp_path / "data")
+    with own_database(server, tmp_path / "data", monkeypatch, template[0]) as url:
+        yield url
+
+
+@pytest.fixture
+def released_database(
+    released_template: Template, server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[str]:
+    """The study of release 0.1.0, in the newest schema."""
+    with copy_of(released_template, server, tmp_path, monkeypatch) as url:
         yield url
 
 
@@ -205,7 +249,7 @@ def make_token(fresh_database: str) -> Callable[[str], str]:
 
 
 @pytest.fixture(scope="session")
-def _application():  # type: ignore[no-untyped-def]
+def application():  # type: ignore[no-untyped-def]
     """The web service, built once: it holds no state, and building it with its first request costs half a second of a processor."""
     from app.main import create_app
 
@@ -213,9 +257,9 @@ def _application():  # type: ignore[no-untyped-def]
 
 
 @pytest.fixture
-def service_app(_application, fresh_database: str):  # type: ignore[no-untyped-def]
+def service_app(application, fresh_database: str):  # type: ignore[no-untyped-def]
     """The web service on the test's database."""
-    return _application
+    return application
 
 
 @pytest.fixture

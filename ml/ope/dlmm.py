@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 from torch import Tensor, nn
 
 from ml.mdp import step_reward
@@ -255,7 +255,7 @@ class FittedDlmm:
         level = self.end.residual[0] ** 2 / len(self.buffer.sessions) if with_end else 0.0
         spread = float(values.var(ddof=1)) if len(runs) > 1 else 0.0
         error = float(np.sqrt(spread + monte_carlo + level))
-        reach = float(norm.ppf((1 + LEVEL) / 2)) * error
+        reach = float(ndtri((1 + LEVEL) / 2)) * error
         every = max(1, horizon // 50)
         logged, simulated = support.of_policy(policy), support.look(np.concatenate([r.actions[i][:, ::every] for r in runs]))
         flags = list(flags_of(logged, simulated))

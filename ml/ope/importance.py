@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Literal, cast
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from ml.ope.behaviour import Key, clones, controller_key, rule_of_thumb_bandwidth
 from ml.ope.estimate import LEVEL, Estimate, checked_horizon
@@ -97,8 +97,8 @@ def consistent_weighted_per_decision(log_ratio: Floats, mask: Mask, rewards: Flo
 
 def kernel_log_density(amplitude: Floats, centre: Floats, bandwidth: float) -> Floats:
     """Log density at `amplitude` of a Gaussian around `centre` truncated to [0, 1], elementwise (broadcasting)."""
-    inside = norm.cdf((1 - centre) / bandwidth) - norm.cdf(-centre / bandwidth)
-    density = norm.logpdf((amplitude - centre) / bandwidth) - np.log(bandwidth) - np.log(inside)
+    inside = scipy.stats.norm.cdf((1 - centre) / bandwidth) - scipy.stats.norm.cdf(-centre / bandwidth)
+    density = scipy.stats.norm.logpdf((amplitude - centre) / bandwidth) - np.log(bandwidth) - np.log(inside)
     return np.asarray(np.where((amplitude >= 0) & (amplitude <= 1), density, -np.inf), dtype=np.float64)
 
 

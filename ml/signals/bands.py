@@ -13,10 +13,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft
-from scipy.linalg import toeplitz
-from scipy.signal import butter, fftconvolve, sosfiltfilt, welch
 
 from ml.signals.prediction import Model, fit, predict, unsaid
 from ml.signals.rows import row_of
@@ -104,14 +102,14 @@ def band_pass(samples: NDArray[np.float64], rate_hz: float, low_hz: float, high_
         raise ValueError(f"a band of {low_hz:g} to {high_hz:g} Hz does not fit below half of {rate_hz:g} Hz")
     sections = _sections(rate_hz, low_hz, high_hz)
     pad = min(samples.size - 1, round(EDGE_CYCLES * rate_hz / low_hz))
-    return np.asarray(sosfiltfilt(sections, samples, padlen=pad), dtype=np.float64)
+    return np.asarray(scipy.signal.sosfiltfilt(sections, samples, padlen=pad), dtype=np.float64)
 
 
 @lru_cache(maxsize=64)
 def _sections(rate_hz: float, low_hz: float, high_hz: float) -> NDArray[np.float64]:
     """Second-order sections of one pass; kept, because a lossy recording has hundreds of stretches and one filter."""
     edges = _edges_of_one_pass(rate_hz, low_hz, high_hz)
-    return np.asarray(butter(FILTER_ORDER, edges, btype="bandpass", fs=rate_hz, output="sos"))
+    return np.asarray(scipy.signal.butter(FILTER_ORDER, edges, btype="bandpass", fs=rate_hz, output="sos"))
 
 
 def _edges_of_one_pass(rate_hz: float, low_hz: float, high_hz: float) -> tuple[float, float]:
@@ -299,7 +297,7 @@ def _passed(run: _Run, low_hz: float, high_hz: float) -> NDArray[np.float64]:
         return np.clip(1.0 - unsaid(run.model, run.measured, impulse)[run.measured], LEAST_PASSED, 1.0)
     response = impulse**2 / np.sum(impulse**2)
     around = np.pad(run.measured.astype(np.float64), response.size // 2, constant_values=1.0)
-    return np.clip(fftconvolve(around, response, mode="valid")[run.measured], LEAST_PASSED, 1.0)
+    return np.clip(scipy.signal.fftconvolve(around, response, mode="valid")[run.measured], LEAST_PASSED, 1.0)
 
 
 @lru_cache(maxsize=64)
@@ -314,10 +312,10 @@ def _impulse_response(rate_hz: float, low_hz: float, high_hz: float) -> NDArray[
 def _squared_correlation(run: _Run, filtered: NDArray[np.float64], lags_s: NDArray[np.float64]) -> NDArray[np.float64]:
     """Square of the measured samples' autocorrelation, averaged over the lags around each of `lags_s`; shape as that."""
     most = min(int(MAX_LAG_S * run.rate_hz), run.measured.size - 1)
-    length = next_fast_len(run.measured.size + most + 1, real=True)
+    length = scipy.fft.next_fast_len(run.measured.size + most + 1, real=True)
     signal, mask = np.zeros(run.measured.size), run.measured.astype(np.float64)
     signal[run.measured] = filtered
-    products, pairs = (irfft(np.abs(rfft(x, length)) ** 2, length)[: most + 1] for x in (signal, mask))
+    products, pairs = (scipy.fft.irfft(np.abs(scipy.fft.rfft(x, length)) ** 2, length)[: most + 1] for x in (signal, mask))
     if products[0] <= 0:
         return np.zeros(lags_s.size)
     # the same denominator at every lag but for the pairs that gaps leave: an estimate from few pairs is drawn to 0
@@ -342,7 +340,7 @@ def _relative_error(
         squared: rho^2 by the distance of two pieces, [bins].
         period_s: length of a row, s.
     """
-    covariance = 2.0 * toeplitz(squared)
+    covariance = 2.0 * scipy.linalg.toeplitz(squared)
     in_row = passed.sum(axis=1)
     out = np.where(in_row > 0, 0.0, np.nan)
     partly = np.flatnonzero((in_row > 0) & (in_row < period_s * (1 - 1e-6)))
@@ -386,7 +384,7 @@ def spectrum(
         for first in range(0, count, SEGMENTS_AT_ONCE):
             here = min(SEGMENTS_AT_ONCE, count - first)
             block = samples[first * hop : (first + here - 1) * hop + width]
-            hz, density = welch(block, rate_hz, nperseg=width, noverlap=width - hop)
+            hz, density = scipy.signal.welch(block, rate_hz, nperseg=width, noverlap=width - hop)
             reached = grid <= hz[-1] + 1e-9
             # a rate that gives no whole number of samples per segment has its frequencies a little beside the grid
             total[reached] += here * np.interp(grid[reached], hz, density)

@@ -12,10 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len, rfft
-from scipy.linalg import LinAlgError, cholesky, solve_toeplitz, solve_triangular, solveh_banded, toeplitz
-from scipy.signal import fftconvolve
 
 MEMORY_S = 0.1
 """How far back a sample is predicted from: two to three cycles of beta."""
@@ -78,8 +76,8 @@ def fit(pieces: Sequence[tuple[int, Floats]], rate_hz: float) -> Model | None:
         return None
     r[0] *= 1.0 + RIDGE
     try:
-        a = np.concatenate(([1.0], -solve_toeplitz(r[:-1], r[1:])))
-    except LinAlgError:
+        a = np.concatenate(([1.0], -scipy.linalg.solve_toeplitz(r[:-1], r[1:])))
+    except np.linalg.LinAlgError:
         return None
     residual = float(a @ r)
     # gaps can make an autocovariance that no signal has
@@ -121,7 +119,7 @@ def predict(model: Model, x: Floats, measured: NDArray[np.bool_]) -> Floats:
     beyond = BEYOND * order
     there = np.pad(measured, beyond)
     known = np.where(there, np.pad(x, beyond) - model.mean, 0.0)
-    right = -fftconvolve(known, np.concatenate((model.b[:0:-1], model.b)), mode="same")
+    right = -scipy.signal.fftconvolve(known, np.concatenate((model.b[:0:-1], model.b)), mode="same")
     missing = np.flatnonzero(~there)
     out = known.copy()
     # gaps further apart than the model remembers have nothing to do with each other
@@ -144,7 +142,7 @@ def _solve(b: Floats, missing: NDArray[np.int64], right: Floats) -> Floats:
     for d in range(order + 1):
         distance = missing[d:] - missing[: missing.size - d]
         banded[d, : distance.size] = np.where(distance < b.size, b[np.minimum(distance, b.size - 1)], 0.0)
-    return np.asarray(solveh_banded(banded, right, lower=True))
+    return np.asarray(scipy.linalg.solveh_banded(banded, right, lower=True))
 
 
 def unsaid(model: Model, measured: NDArray[np.bool_], impulse: Floats) -> Floats:
@@ -182,18 +180,18 @@ def _profile(model: Model, size: int, impulse: Floats) -> tuple[Floats, Floats]:
     b = np.zeros(size)
     b[: min(size, model.b.size)] = model.b[:size]
     # y = h * e with e of covariance residual * inv(B) and B = L L': its variance is residual times the squares of the columns of inv(L) h
-    lower = cholesky(toeplitz(b), lower=True)
+    lower = scipy.linalg.cholesky(scipy.linalg.toeplitz(b), lower=True)
     places = np.concatenate((np.arange(-half, 0), np.arange(size, size + half)))
     distance = np.abs(places[:, None] - np.arange(size))
     weights = np.where(distance <= half, impulse[half + np.minimum(distance, half)], 0.0)
-    lacking = model.residual * np.sum(solve_triangular(lower, weights.T, lower=True) ** 2, axis=0)
+    lacking = model.residual * np.sum(scipy.linalg.solve_triangular(lower, weights.T, lower=True) ** 2, axis=0)
     return lacking[:half], lacking[half:]
 
 
 def _power(model: Model, impulse: Floats) -> float:
     """Power of the filter's output, of a signal of this model."""
-    length = next_fast_len(4 * max(impulse.size, model.coefficients.size), real=True)
-    density = model.residual / np.abs(rfft(model.coefficients, length)) ** 2
-    weight = np.abs(rfft(impulse, length)) ** 2 * density
+    length = scipy.fft.next_fast_len(4 * max(impulse.size, model.coefficients.size), real=True)
+    density = model.residual / np.abs(scipy.fft.rfft(model.coefficients, length)) ** 2
+    weight = np.abs(scipy.fft.rfft(impulse, length)) ** 2 * density
     whole = np.concatenate((weight, weight[1 : length - weight.size + 1]))
     return float(whole.mean())

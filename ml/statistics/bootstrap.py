@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -111,7 +111,7 @@ def bca_interval(values: NDArray[Any], estimate: float, jackknife: NDArray[Any],
     # Half of the ties count, so that a discrete statistic is not taken for a biased one.
     share = (np.sum(values < estimate) + 0.5 * np.sum(values == estimate)) / values.size
     share = float(np.clip(share, 0.5 / values.size, 1 - 0.5 / values.size))
-    bias = float(norm.ppf(share))
+    bias = float(ndtri(share))
     # The acceleration has no unit: values near the largest number are scaled down before their powers are taken.
     scaled, _ = _scaled(jackknife)
     centred = scaled.mean() - scaled
@@ -119,10 +119,10 @@ def bca_interval(values: NDArray[Any], estimate: float, jackknife: NDArray[Any],
     acceleration = float(np.sum(centred**3) / (6 * spread)) if spread > 0 else 0.0
     ends = []
     for tail in ((1 - level) / 2, (1 + level) / 2):
-        z = bias + float(norm.ppf(tail))
+        z = bias + float(ndtri(tail))
         if acceleration * z >= 1:
             return percentile_interval(values, level)
-        ends.append(float(norm.cdf(bias + z / (1 - acceleration * z))))
+        ends.append(float(ndtr(bias + z / (1 - acceleration * z))))
     low, high = _quantiles(values, ends)
     return Interval(float(low), float(high), level, _spread(values), "bca")
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.special import bdtr, stdtr, stdtrit
 
 from ml.statistics.within_visits.contrasts import Average, Reason, Unavailable
@@ -108,7 +108,7 @@ def paule_mandel(estimates: Floats, errors: Floats) -> float:
     if excess(0.0) <= 0:
         return 0.0
     top = float(np.ptp(estimates)) ** 2 + float(errors.max()) ** 2
-    return float(brentq(excess, 0.0, top * estimates.size, xtol=1e-14 * top))
+    return float(scipy.optimize.brentq(excess, 0.0, top * estimates.size, xtol=1e-14 * top))
 
 
 def sign_test(values: Floats) -> float:

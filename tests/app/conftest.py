@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import io
+import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from copy import deepcopy
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +17,13 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 from numpy.typing import NDArray
+from sqlalchemy import make_url
 
+from app.platform.database import database_url
+from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
+from tests.app.every_route import World
+from tests.conftest import Template, close_connections, copy_database, copy_of, drop_database, own_database
 
 ROOT = Path(__file__).resolve().parents[2]
 Upload = Callable[..., int]
@@ -35,10 +43,88 @@ def table(amplitude: NDArray[np.float64], rng: np.random.Generator, lead: int = 
     return sink.getvalue()
 
 
+@pytest.fixture(scope="session")
+def full_study(
+    released_template: Template, server: EmbeddedPostgres, application: Any, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Template, World]:
+    """The released study with a row for every route, made once."""
+    data = tmp_path_factory.mktemp("full") / "data"
+    shutil.copytree(released_template[1], data)
+    with pytest.MonkeyPatch.context() as patch, own_database(server, data, patch, released_template[0], keep="filled"):
+        world = World(application)
+    return ("filled", data), world
+
+
 @pytest.fixture
-def upload(client: TestClient, enrolled: str) -> Upload:
+def world(full_study: tuple[Template, World], server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    """The study, with calls for every route."""
+    template, world = full_study
+    with copy_of(template, server, tmp_path, monkeypatch):
+        yield world
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """A study as several tests begin with it.
+
+    Attributes:
+        template: its database and files. token: of the administrator. state: of the numbers that are drawn next. made: what its maker gave.
+    """
+
+    template: Template
+    token: str
+    state: Any
+    made: Any
+
+
+@pytest.fixture(scope="session")
+def beginnings() -> dict[str, Beginning]:
+    """By name, those that this process has made."""
+    return {}
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """What uploads draw from."""
+    return np.random.default_rng(20)
+
+
+@pytest.fixture
+def begin_with(
+    server: EmbeddedPostgres,
+    client: TestClient,
+    rng: np.random.Generator,
+    beginnings: dict[str, Beginning],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[str, Callable[[], Any]], Any]:
+    """Make a study, or copy the one that an earlier test of this process made under the same name: a tenth of the time."""
+
+    def begin(name: str, make: Callable[[], Any]) -> Any:
+        own, data = make_url(database_url()).database, get_settings().data_dir
+        assert own is not None
+        if name not in beginnings:
+            made = make()
+            kept = tmp_path_factory.mktemp(name) / "data"
+            close_connections()
+            copy_database(server, name, own)
+            shutil.copytree(data, kept)
+            beginnings[name] = Beginning((name, kept), client.headers["authorization"], rng.bit_generator.state, made)
+        else:
+            close_connections()
+            drop_database(server, own)
+            copy_database(server, own, name)
+            shutil.rmtree(data, ignore_errors=True)
+            shutil.copytree(beginnings[name].template[1], data)
+            client.headers["authorization"] = beginnings[name].token
+            rng.bit_generator.state = beginnings[name].state
+        return deepcopy(beginnings[name].made)
+
+    return begin
+
+
+@pytest.fixture
+def upload(client: TestClient, enrolled: str, rng: np.random.Generator) -> Upload:
     """Upload a session of P1 and enter its QoCs; returns its id."""
-    rng = np.random.default_rng(20)
 
     def send(
         controller: str = "random",

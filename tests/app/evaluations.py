@@ -46,17 +46,17 @@ def judged(value: float, **changed: Any) -> dict[str, Any]:
 
 
 @pytest.fixture
-def policies(client: TestClient, upload: Upload) -> list[int]:
+def policies(client: TestClient, upload: Upload, begin_with: Callable[[str, Callable[[], list[int]]], list[int]]) -> list[int]:
     """Ids of three policies made elsewhere, for a participant with four sessions."""
-    for controller in ("random", "random", "cdbs", "random"):
-        upload(controller)
-    ids = []
-    for k in range(3):
-        answer = client.post(
-            "/api/v1/participants/P1/policies", data={"name": f"p{k}"}, files={"file": (f"p{k}.onnx", constant_onnx(0.4 + 0.2 * k, 10))}
-        )
-        ids.append(int(answer.json()["id"]))
-    return ids
+
+    def make() -> list[int]:
+        for controller in ("random", "random", "cdbs", "random"):
+            upload(controller)
+        files = {f"p{k}": {"file": (f"p{k}.onnx", constant_onnx(0.4 + 0.2 * k, 10))} for k in range(3)}
+        answers = [client.post("/api/v1/participants/P1/policies", data={"name": n}, files=file) for n, file in files.items()]
+        return [int(answer.json()["id"]) for answer in answers]
+
+    return begin_with("three_policies", make)
 
 
 @pytest.fixture

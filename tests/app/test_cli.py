@@ -5,16 +5,22 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
+import signal
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import NamedTuple
 
 import psycopg
 import pytest
+import structlog
+from typer.testing import CliRunner
 
 from app.accounts.permissions import SYSTEM
+from app.cli import app, main
 from app.overview.package.export import export_participant
 from app.platform.database import owner_url, transaction
 from app.study.models import CdbsAmplitude, Hemisphere, StudySession
@@ -28,16 +34,34 @@ COMMANDS = (
 TABLE = "t_s,beta,amplitude_fraction\n0,1,1\n2,1,0.5\n4,2,0.5\n"
 
 
-def betaloop(*arguments: str, stdin: str = "") -> subprocess.CompletedProcess[str]:
-    """Run the command in a process of its own, on the database that the environment names."""
-    return subprocess.run(
-        [sys.executable, "-m", "app.cli", *arguments],
-        capture_output=True,
-        text=True,
-        input=stdin,
-        env=os.environ | {"COLUMNS": "200"},
-        check=False,
-    )
+Betaloop = Callable[..., "Ended"]
+
+
+class Ended(NamedTuple):
+    """How a command ended, and what it said."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def betaloop(monkeypatch: pytest.MonkeyPatch) -> Iterator[Betaloop]:
+    """Run the command in this process, from its arguments to its exit code: to start an interpreter for each takes seconds."""
+    logs, signals = structlog.get_config(), {n: signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGHUP)}
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(*arguments: str, stdin: str = "") -> Ended:
+        monkeypatch.setattr(sys, "argv", ["betaloop", *arguments])
+        monkeypatch.setattr(sys, "stdin", io.StringIO(stdin))
+        with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err, pytest.raises(SystemExit) as ended:
+            main()
+        return Ended(int(ended.value.code or 0), out.getvalue(), err.getvalue())
+
+    yield run
+    structlog.configure(**logs)
+    for number, handler in signals.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture
@@ -47,16 +71,12 @@ def study(fresh_database: str, enrolled: str) -> str:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_an_example(command: str) -> None:
-    from typer.testing import CliRunner
-
-    from app.cli import app
-
     result = CliRunner().invoke(app, [*command.split(), "--help"])
     assert result.exit_code == 0
     assert "Example: betaloop" in result.output
 
 
-def test_a_user_and_a_token_are_made_and_the_token_is_printed_once(fresh_database: str) -> None:
+def test_a_user_and_a_token_are_made_and_the_token_is_printed_once(fresh_database: str, betaloop: Betaloop) -> None:
     added = betaloop(
         "user", "add", "ada@clinic.example", "--role", "clinician", "--password-file", "-", "--json", stdin="a long password\n"
     )
@@ -71,7 +91,7 @@ def test_a_user_and_a_token_are_made_and_the_token_is_printed_once(fresh_databas
     assert "Traceback" not in again.stderr
 
 
-def test_import_and_export_carry_a_session_round(study: str, tmp_path: Path) -> None:
+def test_import_and_export_carry_a_session_round(study: str, tmp_path: Path, betaloop: Betaloop) -> None:
     table = tmp_path / "session.csv"
     table.write_text(TABLE)
     done = betaloop("import", str(table), "--participant", study, "--visit", "1", "--controller", "random", "--json")
@@ -99,14 +119,22 @@ def test_import_and_export_carry_a_session_round(study: str, tmp_path: Path) -> 
         (["warp"], 2, "warp"),
     ],
 )
-def test_what_cannot_be_done_is_said_in_a_line(fresh_database: str, arguments: list[str], code: int, named: str) -> None:
+def test_what_cannot_be_done_is_said_in_a_line(
+    fresh_database: str, arguments: list[str], code: int, named: str, betaloop: Betaloop
+) -> None:
     result = betaloop(*arguments)
     assert result.returncode == code
     assert named in result.stderr
     assert "Traceback" not in result.stderr
 
 
-def test_a_file_of_no_use_is_exit_code_1_with_the_hint(study: str, tmp_path: Path) -> None:
+def test_a_process_of_its_own_ends_like_that_too(fresh_database: str) -> None:
+    result = subprocess.run([sys.executable, "-m", "app.cli", "export", "P404"], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout, len(result.stderr.splitlines())) == (1, "", 1)
+    assert "P404" in result.stderr
+
+
+def test_a_file_of_no_use_is_exit_code_1_with_the_hint(study: str, tmp_path: Path, betaloop: Betaloop) -> None:
     table = tmp_path / "wrong.csv"
     table.write_text("a,b\n1,2\n")
     result = betaloop("import", str(table), "--participant", study, "--visit", "1", "--controller", "cdbs")
@@ -115,7 +143,7 @@ def test_a_file_of_no_use_is_exit_code_1_with_the_hint(study: str, tmp_path: Pat
     assert "amplitude_fraction" in result.stderr
 
 
-def test_a_database_without_tables_is_said_in_a_line(fresh_database: str) -> None:
+def test_a_database_without_tables_is_said_in_a_line(fresh_database: str, betaloop: Betaloop) -> None:
     with psycopg.connect(owner_url().replace("+psycopg", ""), autocommit=True) as connection:
         connection.execute("drop owned by current_user cascade")
     done = betaloop("user", "add", "ada@clinic.example", "--role", "admin", "--password-file", "-", stdin="correct horse battery")
@@ -123,7 +151,7 @@ def test_a_database_without_tables_is_said_in_a_line(fresh_database: str) -> Non
     assert done.stderr.strip() == "betaloop: the database does not have the tables of this version: run `betaloop migrate` first"
 
 
-def test_migrating_twice_is_harmless(fresh_database: str) -> None:
+def test_migrating_twice_is_harmless(fresh_database: str, betaloop: Betaloop) -> None:
     for _ in range(2):
         result = betaloop("migrate")
         assert result.returncode == 0, result.stderr
@@ -137,7 +165,7 @@ def test_migrating_twice_is_harmless(fresh_database: str) -> None:
         (["export", "P1", "--to", "."], 2, "is a folder"),
     ],
 )
-def test_a_path_of_no_use_is_one_line_and_exit_code_2(study: str, arguments: list[str], code: int, named: str) -> None:
+def test_a_path_of_no_use_is_one_line_and_exit_code_2(study: str, arguments: list[str], code: int, named: str, betaloop: Betaloop) -> None:
     result = betaloop(*arguments)
     assert result.returncode == code
     assert named in result.stderr
@@ -145,7 +173,7 @@ def test_a_path_of_no_use_is_one_line_and_exit_code_2(study: str, arguments: lis
 
 
 @pytest.mark.slow
-def test_a_session_that_cannot_be_read_does_not_stop_the_export(study: str, tmp_path: Path) -> None:
+def test_a_session_that_cannot_be_read_does_not_stop_the_export(study: str, tmp_path: Path, betaloop: Betaloop) -> None:
     table = tmp_path / "session.csv"
     table.write_text(TABLE)
     done = betaloop("import", str(table), "--participant", study, "--visit", "1", "--controller", "random", "--json")

@@ -9,7 +9,6 @@ import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
-from app.main import create_app
 from tests.app.every_route import World
 from tests.app.test_routes import CHECKS
 
@@ -17,12 +16,6 @@ SECONDS = 12.0
 """After which the fast form begins no further round over all operations."""
 EXAMPLES = 10
 """Of every operation, in each part of the slow form."""
-
-
-@pytest.fixture
-def world(released_database: str) -> World:
-    """The study, with calls for every route."""
-    return World(create_app())
 
 
 def operations(world: World) -> list[Any]:

@@ -1,4 +1,4 @@
-"""The web process loads none of the learners: compute modules are named by strings and imported by the processes that compute."""
+"""What starts without the learners: compute modules are named by strings, and `scipy` loads its parts where they are first used."""
 
 from __future__ import annotations
 
@@ -17,12 +17,26 @@ def loaded(code: str) -> set[str]:
     return set(subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split())
 
 
-def test_the_web_process_never_loads_torch_and_starts_without_what_writes_pdf() -> None:
+SLOW_TO_LOAD = {"torch", "numba", "scipy.stats", "scipy.signal", "scipy.optimize", "scipy.spatial", "fpdf"}
+"""Each takes a third of a second or more of every start, for what few of the processes do."""
+
+
+def test_the_web_process_never_loads_torch_and_starts_without_what_it_may_never_need() -> None:
     modules = loaded("from app.main import create_app; create_app().openapi()")
     assert "app.pipeline.kinds" in modules
-    assert "torch" not in modules
-    assert "fpdf" not in modules
+    assert modules & SLOW_TO_LOAD == set()
     assert not {m for m in modules if m.startswith("app.") and m.endswith(".compute")}
+
+
+def test_a_command_starts_without_what_it_may_never_need() -> None:
+    modules = loaded("from app.cli import app, load_tables; load_tables()")
+    assert "ml.formats.rcs" in modules
+    assert modules & SLOW_TO_LOAD == set()
+
+
+def test_the_process_whose_forks_decode_has_loaded_what_decoders_need() -> None:
+    modules = loaded("from app.ingest.uploads.compute import prepare; prepare()")
+    assert modules >= {"numba", "scipy.signal", "scipy.ndimage", "scipy.linalg"}
 
 
 def test_the_table_of_algorithms_is_read_without_torch() -> None:

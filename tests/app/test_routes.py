@@ -10,16 +10,9 @@ from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, Phase, given, settings
 
 from app.accounts.models import Site, Study
-from app.main import create_app
 from app.platform.database import transaction
 from tests.app.every_route import TABLE, World, routes, token_of
 from tests.app.route_roles import BLINDED, ROLES
-
-
-@pytest.fixture
-def world(released_database: str) -> World:
-    """The study, with calls for every route."""
-    return World(create_app())
 
 
 def success(app: Any, method: str, path: str) -> int:

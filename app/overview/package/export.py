@@ -21,7 +21,6 @@ from app.evaluation.estimates.coverage import coverage_by_policy
 from app.evaluation.estimates.rows import estimate_of
 from app.learning.models import Policy
 from app.overview import repository
-from app.overview.package import recompute
 from app.overview.package.dictionary import FIELDS, TITLES, Days, descriptor
 from app.platform.audit import record
 from app.platform.errors import BetaloopError
@@ -71,7 +70,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
         "characteristics.json": json.dumps(stated, indent=2),
         "datapackage.json": json.dumps(descriptor(participant.code, contents), indent=2, ensure_ascii=False),
         "settings.json": json.dumps(settings, indent=2),
-        "recompute.py": Path(recompute.__file__).read_text("utf-8"),
+        "recompute.py": Path(__file__).with_name("recompute.py").read_text("utf-8"),
         "README.txt": _readme(participant),
     }
     sink = io.BytesIO()

@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 SPIKE_MADS: Final = 6.0
 """Robust standard deviations (1.4826 MAD of the residuals) of log power above the running median that make a spike."""
@@ -33,7 +33,7 @@ MEDIAN_SPANS: Final = 4.0
 
 def _running_median(x: NDArray[np.float64], width: int) -> NDArray[np.float64]:
     """Median of the odd number of values around each, [n]; near an end that of the first or last whole window."""
-    out = np.asarray(median_filter(x, size=width, mode="nearest"), dtype=np.float64)
+    out = np.asarray(scipy.ndimage.median_filter(x, size=width, mode="nearest"), dtype=np.float64)
     half = width // 2
     out[:half], out[x.size - half :] = out[half], out[x.size - 1 - half]
     return out

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from ml.ope.estimate import LEVEL, Estimate
 from ml.ope.flags import distinct
@@ -61,7 +61,7 @@ def convex_weights(errors: Floats) -> Floats:
     root = np.sqrt(np.maximum(values, 1e-9 * size))[:, None] * vectors.T / np.sqrt(size)
     # One heavy row asks for a sum of 1; dividing by the sum afterwards makes it exact.
     heavy = 1e4
-    weights, _ = nnls(np.vstack([root, np.full((1, len(errors)), heavy)]), np.append(np.zeros(len(errors)), heavy))
+    weights, _ = scipy.optimize.nnls(np.vstack([root, np.full((1, len(errors)), heavy)]), np.append(np.zeros(len(errors)), heavy))
     return np.asarray(weights / weights.sum(), dtype=np.float64)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from ml.ope.compare.skill import reach_with
 from ml.ope.estimate import Estimate
@@ -27,5 +27,5 @@ def gain_over(policy: Estimate, reference: Estimate) -> Gain:
         error = math.hypot(drawn.standard_error, unseen)
         return Gain(value, value - reach_with(below, unseen), error, value + reach_with(above, unseen), policy.level)
     errors = [math.sqrt(max(0.0, e.standard_error**2 - e.details.get("held_out_error", 0.0) ** 2)) for e in (policy, reference)]
-    reach = reach_with(float(norm.ppf(1 - tail)) * math.hypot(*errors), unseen)
+    reach = reach_with(float(ndtri(1 - tail)) * math.hypot(*errors), unseen)
     return Gain(value, value - reach, math.hypot(*errors, unseen), value + reach, policy.level)

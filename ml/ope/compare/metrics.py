@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import rankdata
 
 EXACT_PERMUTATIONS_UP_TO = 8
 """Policies up to which every permutation is counted (8! = 40 320)."""
@@ -93,5 +93,5 @@ def spearman_p(x: ArrayLike, y: ArrayLike, *, draws: int = 20_000, seed: int = 0
 
 
 def _centred_ranks(values: ArrayLike) -> NDArray[np.float64]:
-    ranks = rankdata(np.asarray(values, dtype=np.float64))
+    ranks = scipy.stats.rankdata(np.asarray(values, dtype=np.float64))
     return np.asarray(ranks - ranks.mean(), dtype=np.float64)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from ml.ope.behaviour import controller_key
 from ml.ope.dlsm.batches import Batch, make_batch
@@ -282,7 +282,7 @@ class FittedDlsm:
         horizon: int,
     ) -> Estimate:
         value = float(values[:, i].mean())
-        reach = float(norm.ppf((1 + LEVEL) / 2)) * error
+        reach = float(ndtri((1 + LEVEL) / 2)) * error
         seen = self.scale.outcome_seen
         logged, simulated = coverage
         flags = list(flags_of(logged, simulated))

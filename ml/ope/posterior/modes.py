@@ -20,8 +20,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from ml.ope.fqe.steps import after_doses, held_amplitude, lead_dose, lead_doses
 from ml.ope.linear.dynamics import autoregression, innovations_of, level_model, level_sums, log_noise_weights, split_coefficients
@@ -95,7 +95,7 @@ def columns_of(a: Floats, first: float) -> Floats:
     p, start = dose_functions(a), dose_functions(np.array(first))
     passed = np.empty((a.size, len(TIMES), SHAPES))
     for m, keep in enumerate(KEEP):
-        passed[:, m], _ = lfilter([1 - keep], [1, -keep], p, axis=0, zi=keep * start[None])
+        passed[:, m], _ = scipy.signal.lfilter([1 - keep], [1, -keep], p, axis=0, zi=keep * start[None])
     sided = np.empty((a.size, len(ONE_SIDED)))
     now = np.full(len(ONE_SIDED), first)
     for t, value in enumerate(a):
@@ -103,7 +103,7 @@ def columns_of(a: Floats, first: float) -> Floats:
         now = now + np.where(gap > 0, RISE, FALL) * gap
         sided[t] = now
     fall = FALL_UNIT * np.maximum(-np.diff(a, prepend=first), 0.0)
-    falls = np.stack([lfilter([1 - keep], [1, -keep], fall) for keep in FALL_KEEP], axis=1)
+    falls = np.stack([scipy.signal.lfilter([1 - keep], [1, -keep], fall) for keep in FALL_KEEP], axis=1)
     return np.concatenate([passed.reshape(a.size, -1), sided, falls], axis=1)
 
 

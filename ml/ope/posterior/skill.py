@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student_t
+from scipy.special import stdtr
 
 from ml.ope.behaviour import controllers
 from ml.ope.fqe.steps import held_amplitude
@@ -118,7 +118,7 @@ def _follow_dose(buffer: ReplayBuffer, levels: Floats) -> bool:
         level[visits == v] -= level[visits == v].mean()
     freedom, size = len(random) - np.unique(visits).size - 1, float(np.sqrt((dose @ dose) * (level @ level)))
     r = float(dose @ level) / size if size > 1e-12 else 0.0
-    return bool(2 * student_t.sf(abs(r) * np.sqrt(freedom / max(1 - r**2, 1e-12)), freedom) < CHANCE)
+    return bool(2 * stdtr(freedom, -abs(r) * np.sqrt(freedom / max(1 - r**2, 1e-12))) < CHANCE)
 
 
 def _contradicted(buffer: ReplayBuffer, predicted: Floats, seen: Floats) -> bool:

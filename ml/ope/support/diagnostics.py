@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ml.ope.estimate import checked_horizon
 from ml.ope.flags import Flag
@@ -212,7 +212,8 @@ class _Neighbours:
         self._points = np.column_stack([levels, table.actions[keep]]) / self._spread
         self._levels_kept = levels
         self._trees = {
-            int(i): (cKDTree(self._points[self._session != i]) if np.any(self._session != i) else None) for i in np.unique(self._session)
+            int(i): (scipy.spatial.cKDTree(self._points[self._session != i]) if np.any(self._session != i) else None)
+            for i in np.unique(self._session)
         }
         self._table, self._doses = table, np.sort(table.memory[:, 1])
         usual = float(np.quantile(self._distances(self._points), 0.95))

@@ -22,6 +22,7 @@ from functools import cache
 from typing import Any, Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from ml.compiled import compiled
@@ -219,6 +220,4 @@ def constants_of(participant: ParticipantModel, log_gain: NDArray[np.float64]) -
 @cache
 def beta_filter() -> NDArray[np.float64]:
     """Second-order sections of the causal Butterworth band-pass 13-35 Hz at 250 Hz (order 4 per edge), shape [4, 6]."""
-    from scipy.signal import butter
-
-    return np.ascontiguousarray(butter(4, BETA_BAND_HZ, btype="bandpass", fs=LFP_RATE_HZ, output="sos"))
+    return np.ascontiguousarray(scipy.signal.butter(4, BETA_BAND_HZ, btype="bandpass", fs=LFP_RATE_HZ, output="sos"))

@@ -10,6 +10,7 @@ from functools import cache
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from ml.population.participants import Regimen
@@ -26,8 +27,6 @@ GRID_HOURS: Final = 24
 @cache
 def effect_site_curve() -> NDArray[np.float64]:
     """Effect-site concentration (mg/L) after one tablet, every 30 s for 24 h, by the exact propagator of the linear system."""
-    from scipy.linalg import expm
-
     k_e0 = math.log(2) / EFFECT_HALF_LIFE_H
     rates = np.array(
         [  # amounts in gut, central and peripheral compartment (mg), concentration at the effect site (mg/L)
@@ -37,7 +36,7 @@ def effect_site_curve() -> NDArray[np.float64]:
             [0.0, k_e0 / CENTRAL_L, 0.0, -k_e0],
         ]
     )
-    propagator = expm(rates / GRID_PER_H)
+    propagator = scipy.linalg.expm(rates / GRID_PER_H)
     amounts = np.array([DOSE_MG * BIOAVAILABILITY, 0.0, 0.0, 0.0])
     curve = np.empty(GRID_HOURS * GRID_PER_H + 1)
     for n in range(curve.size):

@@ -22,7 +22,6 @@ from sqlalchemy import text
 import app.platform.database as database
 from app.accounts import repository as accounts_repository
 from app.accounts import service as accounts
-from app.main import create_app
 from app.platform.database import Base
 from app.platform.files import path_of
 from app.platform.tables import load_tables
@@ -167,10 +166,9 @@ def test_every_table_of_the_release_has_rows(released_database: str) -> None:
     assert empty == set()
 
 
-def test_every_page_of_a_released_study_opens(released_database: str) -> None:
-    app = create_app()
-    pages = {path for path in readable(app) if not path.startswith("/api/")}
-    with TestClient(app, base_url="http://testserver") as client:
+def test_every_page_of_a_released_study_opens(released_database: str, application: Any) -> None:
+    pages = {path for path in readable(application) if not path.startswith("/api/")}
+    with TestClient(application, base_url="http://testserver") as client:
         with database.transaction("test") as db:
             person = accounts_repository.user_by_email(db, PERSON)
             assert person is not None
@@ -181,9 +179,8 @@ def test_every_page_of_a_released_study_opens(released_database: str) -> None:
 
 
 @pytest.mark.slow
-def test_every_route_of_the_interface_reads_a_released_study(released_database: str) -> None:
-    app = create_app()
+def test_every_route_of_the_interface_reads_a_released_study(released_database: str, application: Any) -> None:
     with database.transaction("test") as db:
         token = accounts.create_token(db, PERSON, "tests")
-    with TestClient(app, headers={"Authorization": f"Bearer {token}"}) as client:
-        assert unexpected(client, {path for path in readable(app) if path.startswith("/api/")}) == {}
+    with TestClient(application, headers={"Authorization": f"Bearer {token}"}) as client:
+        assert unexpected(client, {path for path in readable(application) if path.startswith("/api/")}) == {}

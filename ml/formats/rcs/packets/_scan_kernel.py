@@ -11,22 +11,13 @@ from typing import Any, Final, TypeVar, cast
 import numpy as np
 from numba import njit
 
+from ml.formats.rcs.packets.scan import ARRAYS, SCALARS
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 _PACKET, _HEADER, _TIMESTAMP, _CHANNEL, _CHANNELS = range(5)  # where in a packet a name stands
 _NUMBER, _FLAG, _OBJECT, _ARRAY, _LIST, _TEXT = range(6)  # what kind of value belongs to it
 
-SCALARS: Final = (
-    "dataTypeSequence", "systemTick", "seconds", "PacketGenTime", "PacketRxUnixTime", "SampleRate", "FftSize", "ValidDataMask",
-    "IsPowerChannelOverrange", "Channel", "LatencyMilliseconds",
-)  # fmt: skip
-"""Numbers and flags kept per packet, in the order of the columns of `Batch.scalars`."""
-
-ARRAYS: Final = ("key 0", "key 1", "key 2", "key 3", "XSamples", "YSamples", "ZSamples", "Bands", "FftOutput")
-"""Arrays kept per packet, in the order of `Batch.starts` and `Batch.lengths`; the first four are time-domain channels."""
-
-PADDING: Final = b"\0" * 64
-"""Put after the text so that the scanner may look ahead of its end without asking."""
 _WORDS: Final = ("millivolts", "centiG")
 _FIELDS: Final = (
     (_PACKET, _OBJECT, "Header"),

@@ -17,11 +17,21 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.rcs.packets._scan_kernel import ARRAYS, PADDING, SCALARS, copy_runs, read_packets
 from ml.formats.rcs.settings import get, number
 
 __all__ = ["ARRAYS", "PADDING", "SCALARS", "Batch", "batch_of", "join", "scan"]
 
+SCALARS: Final = (
+    "dataTypeSequence", "systemTick", "seconds", "PacketGenTime", "PacketRxUnixTime", "SampleRate", "FftSize", "ValidDataMask",
+    "IsPowerChannelOverrange", "Channel", "LatencyMilliseconds",
+)  # fmt: skip
+"""Numbers and flags kept per packet, in the order of the columns of `Batch.scalars`."""
+
+ARRAYS: Final = ("key 0", "key 1", "key 2", "key 3", "XSamples", "YSamples", "ZSamples", "Bands", "FftOutput")
+"""Arrays kept per packet, in the order of `Batch.starts` and `Batch.lengths`; the first four are time-domain channels."""
+
+PADDING: Final = b"\0" * 64
+"""Put after the text so that the scanner may look ahead of its end without asking."""
 _PATHS: Final[dict[str, tuple[str, ...]]] = {
     "dataTypeSequence": ("Header", "dataTypeSequence"),
     "systemTick": ("Header", "systemTick"),
@@ -69,6 +79,8 @@ def scan(text: bytes, at: int) -> tuple[Batch, int, bool]:
     Returns:
         The packets (perhaps none), where the last of them ends, and whether the next one may only be cut by the end of the text.
     """
+    from ml.formats.rcs.packets._scan_kernel import read_packets  # numba takes a third of a second of every process that starts
+
     raw = np.frombuffer(text, dtype=np.uint8)
     end = raw.size - len(PADDING)
     capacity = min(_MAX_BATCH, (end - at) // _SHORTEST_PACKET + 1)
@@ -132,6 +144,8 @@ def _arrays(packet: Any) -> Iterable[tuple[int, Any]]:
 
 def join(batch: Batch, name: str, rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """One array of the given packets, one after another, shape [sum of lengths]; packets without it add nothing."""
+    from ml.formats.rcs.packets._scan_kernel import copy_runs
+
     slot = ARRAYS.index(name)
     lengths = np.maximum(batch.lengths[rows, slot], 0)
     out = np.empty(int(lengths.sum()))
