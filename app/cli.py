@@ -22,6 +22,7 @@ from app.overview.package import commands as package
 from app.pipeline.next_generation import commands as next_generation
 from app.platform import logs
 from app.platform.audit.commands import app as audit_app
+from app.platform.bucket import bucket
 from app.platform.database import database_place, supervise_database, transaction
 from app.platform.errors import BetaloopError
 from app.platform.tables import load_tables
@@ -83,6 +84,8 @@ def serve(
     settings = get_settings()
     if tls_certificate is not None:
         settings.cookie_secure = True
+    if (store := bucket()) is not None:
+        store.check_keys(settings)
     supervise_database()
     structlog.get_logger().info("database", lies_in=database_place())
     if (host or settings.host) not in LOOPBACK and not settings.cookie_secure:
@@ -110,6 +113,8 @@ def worker(slots: Annotated[int | None, typer.Option(min=1, help="Compute steps 
 
     logs.configure()
     bring_up_to_date()
+    if (store := bucket()) is not None:
+        store.check_keys(get_settings())
     stop = threading.Event()
     _stop_on_signals(stop)
     supervise_database(stop)

@@ -56,9 +56,16 @@ class Settings(BaseSettings):
     development: bool = Field(False, description="Show pages for those who build on betaloop, such as /styleguide.")
     log_json: bool = Field(False, description="Log lines as JSON.")
 
+    files_url: str | None = Field(
+        None,
+        description="Bucket of the stored files, s3://BUCKET/PREFIX, for all machines; without one they lie in the data folder.",
+    )
+    files_endpoint: str | None = Field(None, description="Address of the bucket's server, where it is not Amazon's.")
+    files_cache_gib: float = Field(20.0, gt=0, description="Room for copies of the bucket's files on this machine, GiB.")
+
     @property
     def files_dir(self) -> Path:
-        """Content-addressed store of uploads, snapshots and policies."""
+        """Content-addressed store of uploads, snapshots and policies; with a bucket, this machine's copies of it."""
         return self.data_dir / "files"
 
     @property

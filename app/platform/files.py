@@ -1,4 +1,7 @@
-"""Files by content: a folder `sha256[:2]/sha256`, written once, fsynced, never changed, readable by the service's user alone."""
+"""Files by content: a folder `sha256[:2]/sha256`, written once, fsynced, never changed, readable by the service's user alone.
+
+With a bucket (`app.platform.bucket`) that holds the files, and the folder this machine's copies of what it has read or written lately.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import os
 import secrets
 import shutil
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -18,6 +22,7 @@ from sqlalchemy import BigInteger, CheckConstraint, String, func
 from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
+from app.platform.bucket import Bucket, bucket
 from app.platform.database import Base
 from app.platform.errors import BetaloopError
 from app.settings import get_settings, private_folder
@@ -25,6 +30,7 @@ from app.settings import get_settings, private_folder
 CHUNK = 1 << 20
 _LOCK = ".lock"
 _OPEN_FILES = Path("/proc")
+_LATELY_S = 3600.0
 
 
 class StoredFile(Base):
@@ -50,8 +56,84 @@ class MissingFile(BetaloopError):
 
 
 def path_of(sha256: str) -> Path:
-    """Where bytes of this hash live."""
+    """Where bytes of this hash can be read on this machine; with a bucket, they are copied here first. No such file: they are missing."""
+    path = _place(sha256)
+    store = bucket()
+    if store is None:
+        return path
+    try:
+        os.utime(path)  # what was used lately stays
+    except FileNotFoundError:
+        _copy_here(store, sha256, path)
+    return path
+
+
+def _place(sha256: str) -> Path:
     return get_settings().files_dir / sha256[:2] / sha256
+
+
+def _copy_here(store: Bucket, sha256: str, path: Path) -> None:
+    """Copy an object to its place on this machine; one that is damaged is not believed, and not kept."""
+    draft = draft_path()
+    try:
+        if not store.fetch(sha256, draft):
+            return
+        if hash_file(draft)[0] != sha256:
+            raise MissingFile(f"The stored file {sha256} is damaged: its bytes have another hash.")
+        private_folder(path.parent)
+        draft.rename(path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+@contextmanager
+def borrowed(sha256: str) -> Iterator[Path]:
+    """Bytes of this hash for as long as the context lasts: with a bucket, no copy of them stays on this machine."""
+    store = bucket()
+    if store is None:
+        yield _place(sha256)
+        return
+    draft = draft_path()
+    try:
+        if not store.fetch(sha256, draft):
+            draft.unlink()
+        yield draft
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def remove(sha256: str) -> None:
+    """Remove bytes for good; those of a bucket were kept with `copy=False`, so that no machine has a copy."""
+    _place(sha256).unlink(missing_ok=True)
+    if (store := bucket()) is not None:
+        store.remove(sha256)
+
+
+def is_whole(sha256: str, size: int | None = None, hashes: bool = True) -> bool:
+    """Whether the store has the bytes of a hash: of this size, where one is given, and with this hash, where they are to be read."""
+    store = bucket()
+    if store is not None:
+        has = store.size(sha256)
+        return has is not None and size in (None, has) and (not hashes or store.hash_of(sha256) == sha256)
+    path = _place(sha256)
+    if not path.is_file() or (size is not None and path.stat().st_size != size):
+        return False
+    return not hashes or hash_file(path)[0] == sha256
+
+
+def prune_copies() -> int:
+    """Remove copies of a bucket's files that were used longest ago, beyond the room for them; how many. Those of the last hour stay."""
+    settings = get_settings()
+    if bucket() is None or not settings.files_dir.is_dir():
+        return 0
+    copies = [(p.stat().st_mtime, p.stat().st_size, p) for p in settings.files_dir.glob("??/*")]
+    beyond, removed = sum(size for _, size, _ in copies) - settings.files_cache_gib * (1 << 30), 0
+    for used, size, path in sorted(copies):
+        if beyond <= 0 or used > time.time() - _LATELY_S:
+            break
+        path.unlink(missing_ok=True)
+        beyond, removed = beyond - size, removed + 1
+    return removed
 
 
 _own_folder: list[tuple[Path, int]] = []
@@ -179,17 +261,20 @@ def _path_of_open(file: BinaryIO) -> Path:
     return _OPEN_FILES / str(os.getpid()) / "fd" / str(file.fileno())
 
 
-def store(db: Session, content: bytes | Path, media_type: str) -> StoredFile:
+def store(db: Session, content: bytes | Path, media_type: str, *, copy: bool = True) -> StoredFile:
     """Keep bytes (or a draft file, which is moved) and return their row; the same bytes twice are one file.
 
-    The bytes are on disk, fsynced, before the row exists, so that a committed row always has its file.
+    The bytes are on disk, fsynced, or in the bucket, before the row exists, so that a committed row always has its file.
+
+    Args:
+        copy: as of `keep`.
     """
     draft = content if isinstance(content, Path) else draft_path()
     try:
         if isinstance(content, bytes):
             draft.write_bytes(content)
         size = draft.stat().st_size
-        sha256 = keep(draft)
+        sha256 = keep(draft, copy=copy)
     finally:
         # also where the disk is full: what cannot be stored must not keep it full
         draft.unlink(missing_ok=True)
@@ -197,11 +282,17 @@ def store(db: Session, content: bytes | Path, media_type: str) -> StoredFile:
     return db.get_one(StoredFile, sha256)
 
 
-def keep(draft: Path) -> str:
-    """Move a draft to where its bytes live, on disk when this returns, and give their hash; bytes that are there already stay."""
+def keep(draft: Path, *, copy: bool = True) -> str:
+    """Move a draft to where its bytes live, on disk or in the bucket when this returns, and give their hash; what is there already stays.
+
+    Args:
+        copy: whether this machine keeps a copy of what is in the bucket; not of what is to be removed for good one day.
+    """
     sha256, _ = hash_file(draft)
-    target = path_of(sha256)
-    if target.exists():
+    target = _place(sha256)
+    if (store := bucket()) is not None:
+        store.put(draft, sha256)
+    if target.exists() or (store is not None and not copy):
         draft.unlink()
     else:
         draft.chmod(0o600)

@@ -17,7 +17,7 @@ def loaded(code: str) -> set[str]:
     return set(subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split())
 
 
-SLOW_TO_LOAD = {"torch", "numba", "scipy.stats", "scipy.signal", "scipy.optimize", "scipy.spatial", "fpdf"}
+SLOW_TO_LOAD = {"torch", "numba", "scipy.stats", "scipy.signal", "scipy.optimize", "scipy.spatial", "fpdf", "authlib", "fsspec"}
 """Each takes a third of a second or more of every start, for what few of the processes do."""
 
 

@@ -168,8 +168,9 @@ def _original(file: UploadFile) -> Iterator[RawFile]:
     assert file.quarantine_sha256 is not None
     with raw_file() as (out, raw):
         try:
-            for chunk in encryption.decrypt(files.path_of(file.quarantine_sha256)):
-                out.write(chunk)
+            with files.borrowed(file.quarantine_sha256) as sealed:
+                for chunk in encryption.decrypt(sealed):
+                    out.write(chunk)
         except (InvalidToken, OSError) as error:
             hint = "Restore the data folder, with its keys, from a backup."
             raise Conflict(f"The encrypted bytes of file {file.id} are missing or damaged.", hint) from error
@@ -189,4 +190,4 @@ def _erase(db: Session, file: UploadFile) -> None:
     db.flush()
     db.delete(db.get_one(files.StoredFile, sealed))
     db.commit()
-    files.path_of(sealed).unlink(missing_ok=True)
+    files.remove(sealed)

@@ -235,7 +235,7 @@ class Receiver:
         return StoredContent("unreadable", sealed, sealed, redaction or Redaction(), problem, preview=preview)
 
     def _seal(self, raw: Source) -> str:
-        return files.store(self.db, encryption.encrypt(raw), MEDIA_TYPE).sha256
+        return files.store(self.db, encryption.encrypt(raw), MEDIA_TYPE, copy=False).sha256
 
     def decode(self, name: str, row: UploadFile, content: StoredContent) -> FileOutcome:
         """Decode a stored file; whatever is wrong with it becomes its report."""
@@ -330,7 +330,7 @@ class Receiver:
         store_reports(before, [report])
         self.db.commit()
         if sealed is not None:
-            files.path_of(sealed).unlink(missing_ok=True)
+            files.remove(sealed)
         return FileOutcome(name, before, [report], duplicate=True, same_bytes=True, for_sender=problem.for_sender)
 
 

@@ -7,7 +7,6 @@ the files are copied after it. Passwords of the embedded server stay out: a rest
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import re
@@ -28,6 +27,7 @@ from sqlalchemy import Engine, func, inspect, make_url, select, table, text
 from app import __version__
 from app.platform import files
 from app.platform.audit.chain import seal
+from app.platform.bucket import bucket
 from app.platform.database import get_engine, now, owner_url, transaction
 from app.platform.embedded.server import wheel_binaries
 from app.platform.errors import BetaloopError
@@ -110,7 +110,8 @@ def backup(folder: Path, key_file: Path) -> dict[str, Any]:
     names = _stored()
     with _sealed(folder / FILES, key) as out, tarfile.open(fileobj=out, mode="w|") as archive:
         for sha256 in names:
-            archive.add(files.path_of(sha256), arcname=sha256, recursive=False)
+            with files.borrowed(sha256) as path:
+                archive.add(path, arcname=sha256, recursive=False)
     with _sealed(folder / KEYS, key) as out, tarfile.open(fileobj=out, mode="w|") as archive:
         for path in sorted((settings.data_dir / "secrets").glob("*")):
             if path.is_file() and path.name not in SERVER_PASSWORDS:
@@ -140,7 +141,7 @@ def restore(folder: Path, key_file: Path) -> Restored:
     with (folder / DATABASE).open("rb") as source:
         _load(SealedReader(source, key))
     migrate()
-    missing = [sha256 for sha256 in _stored() if not _whole(sha256)]
+    missing = [sha256 for sha256 in _stored() if not files.is_whole(sha256)]
     if missing:
         raise BackupError(f"{len(missing)} of the stored files are missing or damaged, the first {missing[0]}.", "Use another backup.")
     return Restored(_rows(get_engine()), count, manifest["made_at"])
@@ -289,9 +290,11 @@ def _require(process: subprocess.Popen[bytes], said: IO[bytes], done: str) -> No
 def _require_empty(engine: Engine) -> None:
     tables = inspect(engine).get_table_names()
     held = get_settings().files_dir
-    if tables or (held.is_dir() and any(p for p in held.iterdir() if p.name != "incoming")):
+    store = bucket()
+    if tables or (held.is_dir() and any(p for p in held.iterdir() if p.name != "incoming")) or (store is not None and not store.empty()):
         raise BackupError(
-            "This installation holds data already.", "Restore into a new data folder and, with a PostgreSQL of your own, an empty database."
+            "This installation holds data already.",
+            "Restore into a new data folder and, with a PostgreSQL or a bucket of your own, an empty database and prefix.",
         )
 
 
@@ -319,7 +322,7 @@ def _restore_files(path: Path, key: bytes) -> int:
             draft = files.draft_path()
             with draft.open("wb") as out:
                 shutil.copyfileobj(extracted, out, CHUNK)
-            if files.keep(draft) != member.name:
+            if files.keep(draft, copy=False) != member.name:
                 raise BackupError(f"The stored file {member.name} is damaged in the backup.", "Use another backup.")
             count += 1
     return count
@@ -333,14 +336,6 @@ def _content(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
 def _stored() -> list[str]:
     with get_engine().connect() as connection:
         return list(connection.scalars(text("select sha256 from stored_file order by sha256")))
-
-
-def _whole(sha256: str) -> bool:
-    path = files.path_of(sha256)
-    if not path.is_file():
-        return False
-    with path.open("rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest() == sha256
 
 
 def _rows(engine: Engine) -> dict[str, int]:

@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 
 from app.platform import files
 from app.platform.audit.chain import verify
+from app.platform.bucket import StoreAway, bucket
 from app.platform.database import new_session, now
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.service import STALE_S
@@ -99,19 +100,17 @@ def _clock(db: Session) -> Finding:
 
 def _files(db: Session, hashes: bool) -> Finding:
     rows = db.execute(text("select sha256, size from stored_file order by sha256")).all()
-    bad = [row.sha256 for row in rows if not _has(row.sha256, row.size, hashes)]
+    try:
+        if (store := bucket()) is not None:
+            store.check_keys(get_settings())
+    except (StoreAway, RuntimeError) as error:
+        return Finding("files", False, str(error), "Check BETALOOP_FILES_URL, the bucket's rights, and the folder secrets.")
+    bad = [row.sha256 for row in rows if not files.is_whole(row.sha256, row.size, hashes)]
     checked = "hashes" if hashes else "sizes"
     if bad:
         detail = f"{len(bad)} of {len(rows)} stored files are missing or damaged, the first {bad[0]}"
         return Finding("files", False, detail, "Restore them from a backup (`betaloop restore`).")
     return Finding("files", True, f"{len(rows)} stored files, {checked} checked")
-
-
-def _has(sha256: str, size: int, hashes: bool) -> bool:
-    path = files.path_of(sha256)
-    if not path.is_file() or path.stat().st_size != size:
-        return False
-    return not hashes or files.hash_file(path)[0] == sha256
 
 
 def _jobs(db: Session) -> Iterator[Finding]:

@@ -1,0 +1,159 @@
+"""Stored files in a bucket (S3) that web and workers on any number of machines share; each machine holds copies of what it reads.
+
+The bucket holds an object `files/ab/abcd…` for each file, named by its hash as in the folder, and `keys/NAME` with a fingerprint of each
+key in `secrets/`: machines with other keys would encrypt what no other machine can open, so they do not start.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+import structlog
+
+from app.platform.errors import BetaloopError
+from app.settings import Settings, get_settings
+
+log = structlog.get_logger()
+
+T = TypeVar("T")
+CHUNK = 1 << 20
+SHARED_KEYS = ("quarantine", "pseudonyms", "second-factor", "sign-on", "bundle-signing", "audit-seals")
+"""Keys that every machine of an installation must have alike."""
+_FINGERPRINT = b"betaloop key fingerprint 1\0"
+
+
+class StoreAway(BetaloopError):
+    """The bucket does not answer, or refuses."""
+
+    status = 503
+    title = "The store of files is not available"
+
+
+def bucket() -> Bucket | None:
+    """The bucket of this installation; None where files lie in the data folder."""
+    settings = get_settings()
+    return _bucket(settings.files_url, settings.files_endpoint, os.getpid()) if settings.files_url else None
+
+
+@lru_cache(maxsize=2)
+def _bucket(url: str, endpoint: str | None, _process: int) -> Bucket:
+    """One for each process: what a parent has opened, its children cannot use."""
+    return Bucket(url, endpoint)
+
+
+class Bucket:
+    """Objects named by the hash of their bytes; used by many threads.
+
+    Args:
+        url: `s3://BUCKET/PREFIX`. endpoint: address of a server that is not Amazon's.
+    """
+
+    def __init__(self, url: str, endpoint: str | None = None) -> None:
+        import fsspec  # loaded where there is a bucket alone
+
+        if not url.startswith("s3://") or len(url) < 6:
+            raise RuntimeError(f"BETALOOP_FILES_URL is {url}: give s3://BUCKET or s3://BUCKET/PREFIX.")
+        self._root = url.removeprefix("s3://").rstrip("/")
+        waits = {"connect_timeout": 10, "read_timeout": 60, "retries": {"max_attempts": 3, "mode": "standard"}}
+        try:
+            # listings are not kept: other machines write too
+            self._fs: Any = fsspec.filesystem(
+                "s3", endpoint_url=endpoint, config_kwargs=waits, use_listings_cache=False, skip_instance_cache=True
+            )
+        except ImportError as error:
+            raise RuntimeError("Files in a bucket need the packages of betaloop[s3].") from error
+
+    def size(self, sha256: str) -> int | None:
+        """Bytes of an object; None where there is none."""
+        try:
+            return int(self._asked(lambda: self._fs.info(self._name(sha256)))["size"])
+        except FileNotFoundError:
+            return None
+
+    def put(self, path: Path, sha256: str) -> None:
+        """Store a file; there is no object until all of it has arrived. What is there already stays."""
+        size = path.stat().st_size
+        if self.size(sha256) == size:
+            return
+        self._asked(lambda: self._fs.put_file(str(path), self._name(sha256)))
+        if self.size(sha256) != size:
+            raise StoreAway(f"The bucket has not taken all of {sha256}.", "Try again; nothing that was stored before is lost.")
+
+    def fetch(self, sha256: str, target: Path) -> bool:
+        """Copy an object into a file; whether there was one. The bytes are not judged here."""
+        try:
+            with self.opened(sha256) as source, target.open("wb") as out:
+                self._asked(lambda: shutil.copyfileobj(source, out, CHUNK))
+        except FileNotFoundError:
+            return False
+        return True
+
+    def hash_of(self, sha256: str) -> str | None:
+        """SHA-256 of the bytes that an object really has, read whole; None where there is none."""
+        try:
+            with self.opened(sha256) as source:
+                return self._asked(lambda: hashlib.file_digest(source, "sha256").hexdigest())  # type: ignore[arg-type]
+        except FileNotFoundError:
+            return None
+
+    @contextmanager
+    def opened(self, sha256: str) -> Iterator[BinaryIO]:
+        """An object to read from its begin on. Raises FileNotFoundError."""
+        source = self._asked(lambda: self._fs.open(self._name(sha256), "rb", cache_type="readahead", block_size=8 * CHUNK))
+        with source:
+            yield source
+
+    def remove(self, sha256: str) -> None:
+        """Remove an object, if it is there."""
+        try:
+            self._asked(lambda: self._fs.rm_file(self._name(sha256)))
+        except FileNotFoundError:
+            return
+
+    def empty(self) -> bool:
+        """Whether there is no object at all under the prefix."""
+        return not self._asked(lambda: self._fs.find(self._root, maxdepth=3))
+
+    def check_keys(self, settings: Settings) -> None:
+        """Hold this machine's keys against those of the other machines; the first machine makes them, and leaves their fingerprints.
+
+        Raises:
+            RuntimeError: a key is missing here, or another one.
+        """
+        folder = settings.data_dir / "secrets"
+        known = {name.rsplit("/", 1)[-1] for name in self._asked(lambda: self._fs.find(f"{self._root}/keys"))}
+        for name in SHARED_KEYS:
+            place = f"{self._root}/keys/{name}"
+            if name in known and not (folder / name).exists():
+                raise RuntimeError(
+                    f"{folder / name} is missing, and the other machines of this installation have it. Copy their folder `secrets` here."
+                )
+            said = hashlib.sha256(_FINGERPRINT + settings.secret(name)).hexdigest().encode()
+            if name not in known:
+                self._asked(lambda place=place, said=said: self._fs.pipe_file(place, said))  # type: ignore[misc]
+            elif self._asked(lambda place=place: self._fs.cat_file(place)) != said:  # type: ignore[misc]
+                raise RuntimeError(
+                    f"{folder / name} is not the key that the other machines of this installation have. Copy their folder `secrets` here."
+                )
+
+    def _name(self, sha256: str) -> str:
+        return f"{self._root}/files/{sha256[:2]}/{sha256}"
+
+    def _asked(self, ask: Callable[[], T]) -> T:
+        """What the bucket says. Raises FileNotFoundError, or StoreAway for all else that goes wrong there."""
+        from botocore.exceptions import BotoCoreError, ClientError
+
+        try:
+            return ask()
+        except FileNotFoundError:
+            raise
+        except (BotoCoreError, ClientError, OSError, TimeoutError) as error:
+            log.error("the bucket cannot be used", error=type(error).__name__, what=str(error)[:200])
+            raise StoreAway("The store of files does not answer.", "Nothing is lost. Try again in a while.") from error
