@@ -81,15 +81,7 @@ class TestedBefore(Model):
 
 
 Decision = Literal["test", "test_with_care", "same_as_cdbs", "unsafe", "cannot_tell"]
-DECISION_NAMES: dict[str, str] = {
-    "test": "test",
-    "test_with_care": "test with care",
-    "same_as_cdbs": "same as cDBS",
-    "unsafe": "unsafe",
-    "cannot_tell": "cannot tell",
-}
 Standing = Literal["test", "test_with_care", "same_as_cdbs", "unsafe", "not_advised", "cannot_tell"]
-STANDING_NAMES: dict[str, str] = DECISION_NAMES | {"not_advised": "not advised"}
 
 
 class GainOut(Model):

@@ -21,46 +21,14 @@ def joined(flags: Sequence[Flag]) -> str:
     return "; ".join(sentence(flag) for flag in flags)
 
 
-def decision(reasons: Sequence[Flag]) -> str:
-    """The reasons of a verdict in one line.
-
-    Args:
-        reasons: as `app.evaluation.ranking.decisions.decide` gives them.
-    """
-    told = [reason for reason in reasons if reason.code not in ("sessions_needed", "near_amplitude")]
-    more = further_sessions(reasons)
-    return "; ".join([*map(sentence, told), *([more] if more else [])])
-
-
-def plainly(reasons: Sequence[Flag], limit: float | None = None, limit_ma: float | None = None) -> str:
-    """A verdict's reason for a reader in a hurry: the deciding finding in plain words, without methods.
-
-    Args:
-        reasons: of the verdict. limit, limit_ma: lowest amplitude of a test with care, fraction of cDBS and mA.
-    """
-    if limit is not None:
-        return f"lower than two sessions ever held: not below {amplitude(limit, limit_ma)}"
-    more = further_sessions(reasons)
-    found = [_PLAINLY[r.code](r) for r in reasons if r.code in _PLAINLY]
-    return "; ".join([*found[:2], *([more] if more else [])])
-
-
 def amplitude(fraction: float, ma: float | None) -> str:
     """An amplitude in mA; as a share of cDBS where that is not known in mA."""
-    return f"{ma:.1f} mA" if ma is not None else f"{_percent(fraction)} of the cDBS amplitude"
+    return f"{ma:.1f} mA" if ma is not None else f"{percent(fraction)} of the cDBS amplitude"
 
 
 def chance(share: float) -> str:
     """A probability from some hundred draws: they can show none of 0 and none of 1."""
-    return "> 99 %" if share > 0.99 else "< 1 %" if share < 0.01 else _percent(share)
-
-
-def further_sessions(reasons: Sequence[Flag]) -> str:
-    """How many further sessions near which amplitude would tell; empty where none is named."""
-    by_code = {reason.code: reason for reason in reasons}
-    if not {"sessions_needed", "near_amplitude"} <= by_code.keys():
-        return ""
-    return f"{sentence(by_code['sessions_needed'])} {sentence(by_code['near_amplitude'])} would tell"
+    return "> 99 %" if share > 0.99 else "< 1 %" if share < 0.01 else percent(share)
 
 
 def method_name(key: str) -> str:
@@ -79,11 +47,13 @@ def count(n: int, one: str, many: str) -> str:
     return f"{n} {one if n == 1 else many}"
 
 
-def _percent(share: float | None) -> str:
+def percent(share: float | None) -> str:
+    """A share in whole per cent."""
     return f"{100 * (share or 0.0):.0f} %"
 
 
-def _value(flag: Flag) -> float:
+def number(flag: Flag) -> float:
+    """The number that a flag is about."""
     return flag.value if flag.value is not None else float("nan")
 
 
@@ -95,9 +65,7 @@ def _refusal(flag: Flag) -> str:
 def _thin(flag: Flag) -> str:
     span = dict(flag.facts)
     logged = f" (logged steps span {span['low']:.2f} to {span['high']:.2f})" if span else ""
-    return (
-        f"{_refusal(flag)}in {_percent(flag.value)} of steps the policy asks for amplitudes with hardly any logged step near them{logged}"
-    )
+    return f"{_refusal(flag)}in {percent(flag.value)} of steps the policy asks for amplitudes with hardly any logged step near them{logged}"
 
 
 OUTCOME_NAMES = {"grasp_hz": "grasp", "rating": "rating", "tremor_percent": "tremor"}
@@ -119,7 +87,7 @@ def _no_ordering_skill(flag: Flag) -> str:
 def _difference_error(flag: Flag) -> str:
     return (
         f"{method_name(flag.fact('method'))} predicted the differences between {flag.fact('controllers'):.0f} left-out controllers with a "
-        f"mean error of {_percent(flag.value)} of their range (least of all: {_percent(flag.limit)})"
+        f"mean error of {percent(flag.value)} of their range (least of all: {percent(flag.limit)})"
     )
 
 
@@ -135,11 +103,11 @@ def _sessions_changed(flag: Flag) -> str:
         "cdbs": "with another cDBS amplitude",
         "moved": "whose times, control channel, controller or stop were corrected",
     }
-    return f"{count(int(_value(flag)), 'session', 'sessions')} {what[flag.fact('change')]}"
+    return f"{count(int(number(flag)), 'session', 'sessions')} {what[flag.fact('change')]}"
 
 
 def _policies_missing(flag: Flag) -> str:
-    names, n = flag.fact("names"), int(_value(flag))
+    names, n = flag.fact("names"), int(number(flag))
     listed = ", ".join(names) + (f" and {n - len(names)} more" if n > len(names) else "")
     return f"{count(n, 'policy', 'policies')} not in it: {listed}"
 
@@ -151,91 +119,69 @@ def _reference(flag: Flag) -> str:
 def _cdbs_above(flag: Flag) -> str:
     which = "candidate" if flag.fact("above_all") else "supported candidate"
     return (
-        f"{_reference(flag)} is estimated at {flag.limit:.1f}, above every {which} (best: {flag.fact('best')}, {_value(flag):.1f}): "
+        f"{_reference(flag)} is estimated at {flag.limit:.1f}, above every {which} (best: {flag.fact('best')}, {number(flag):.1f}): "
         f"by this estimate no {which} improves on cDBS in return.{' The intervals overlap.' if flag.fact('overlap') else ''}"
     )
 
-
-_PLAINLY: dict[str, Callable[[Flag], str]] = {
-    "retired": lambda f: f"retired: {f.fact('text')}",
-    "no_posterior": lambda f: "evaluated by an earlier betaloop: evaluate again",
-    "adverse_event": lambda f: "serious adverse event, not cleared by a clinician",
-    "nearly_off": lambda f: f"nearly off {_percent(f.value)} of the time",
-    "beyond_margin": lambda f: f"{chance(_value(f))} likely beyond a margin, most often that of {OUTCOME_NAMES[f.fact('outcome')]}",
-    "all_below_zero": lambda f: "its whole expected gain lies below that of cDBS",
-    "few_near_sessions": lambda f: "hardly any session came near what it does",
-    "few_near_visits": lambda f: "only one visit came near what it does",
-    "outside_range": lambda f: "it asks for amplitudes that nobody has tried",
-    "thin": lambda f: "it asks for amplitudes that were hardly ever tried",
-    "far": lambda f: "it does what no session has shown",
-    "no_ordering_skill": lambda f: "the recordings so far cannot tell policies apart",
-    "coverage_unchecked": lambda f: "what the recordings cover could not be checked",
-    "reference_missing": lambda f: "there is no estimate of cDBS to hold it against",
-    "reference_unsupported": lambda f: "too few sessions of cDBS to hold it against",
-    "outcomes_unknown": lambda f: "no session has grasp, rating or tremor",
-    "undecided": lambda f: "within the margins or beyond: still open",
-}
-"""For the first screen of the ranking, by code; what is not here is told further down alone."""
 
 _SENTENCES: dict[str, Callable[[Flag], str]] = {
     TEXT: lambda f: str(f.fact("text")),
     # of estimates and of what the data cover
     "thin": _thin,
     "outside_range": lambda f: (
-        f"{_refusal(f)}in {_percent(f.value)} of steps the policy leaves the logged amplitudes "
-        f"({f.fact('low'):.2f} to {f.fact('high'):.2f})"
+        f"{_refusal(f)}in {percent(f.value)} of steps the policy leaves the logged amplitudes ({f.fact('low'):.2f} to {f.fact('high'):.2f})"
     ),
     "far": lambda f: (
-        f"{_refusal(f)}{_percent(f.value)} of the policy's state-amplitude pairs lie further from any logged pair than "
+        f"{_refusal(f)}{percent(f.value)} of the policy's state-amplitude pairs lie further from any logged pair than "
         f"{f.fact('times'):.0f} times the distance that holds 95 % of the logged ones"
     ),
-    "no_closed_loop": lambda f: f"{_refusal(f)}no closed loop: about {_percent(f.value)} of the cDBS amplitude whatever beta does",
+    "no_closed_loop": lambda f: f"{_refusal(f)}no closed loop: about {percent(f.value)} of the cDBS amplitude whatever beta does",
     "as_good_as_off": lambda f: (
-        f"{_refusal(f)}as good as no stimulation in {_percent(f.value)} of steps (below {_percent(f.fact('below'))} of cDBS)"
+        f"{_refusal(f)}as good as no stimulation in {percent(f.value)} of steps (below {percent(f.fact('below'))} of cDBS)"
     ),
     "below_random_bound": lambda f: (
-        f"in {_percent(f.value)} of steps the policy asks for less than {f.fact('bound'):.2f}, the least that the random controller gave: "
+        f"in {percent(f.value)} of steps the policy asks for less than {f.fact('bound'):.2f}, the least that the random controller gave: "
         "only sessions of other controllers speak there"
     ),
     "unseen_dose": lambda f: (
-        f"in {_percent(f.value)} of steps the policy's average amplitude over the last minute is one that no session held: what it does "
+        f"in {percent(f.value)} of steps the policy's average amplitude over the last minute is one that no session held: what it does "
         "there is a model's guess"
     ),
     "few_near_sessions": lambda f: (
-        f"{_refusal(f)}{count(int(_value(f)), 'session', 'sessions')} came near what it would do; {f.limit:.0f} on two visits are needed"
+        f"{_refusal(f)}{count(int(number(f)), 'session', 'sessions')} came near what it would do; {f.limit:.0f} on two visits are needed"
     ),
     "few_near_visits": lambda f: (
-        f"{_refusal(f)}all sessions that came near what it would do are of {count(int(_value(f)), 'visit', 'visits')}, "
+        f"{_refusal(f)}all sessions that came near what it would do are of {count(int(number(f)), 'visit', 'visits')}, "
         f"and {f.limit:.0f} are needed"
     ),
     "not_converged": lambda f: (
-        f"{_refusal(f)}not converged: its ratios break the equation that defines them by {_value(f):.2f} standard deviations "
+        f"{_refusal(f)}not converged: its ratios break the equation that defines them by {number(f):.2f} standard deviations "
         f"(limit {f.limit:.2f})"
     ),
-    "few_effective_sessions": lambda f: f"{_refusal(f)}the weights rest on {_value(f):.1f} effective sessions of {f.fact('sessions'):.0f}",
+    "few_effective_sessions": lambda f: f"{_refusal(f)}the weights rest on {number(f):.1f} effective sessions of {f.fact('sessions'):.0f}",
     "acts_within_hold": lambda f: (
         f"{_refusal(f)}the policy acts within amplitudes that were drawn once and held, in "
-        f"{count(round(_value(f)), 'session', 'sessions')}: importance weights cannot tell what it would have done"
+        f"{count(round(number(f)), 'session', 'sessions')}: importance weights cannot tell what it would have done"
     ),
     "hold_density_unknown": lambda f: (
-        f"{_refusal(f)}the held amplitudes of {count(round(_value(f)), 'session', 'sessions')} were drawn by no stated design, "
+        f"{_refusal(f)}the held amplitudes of {count(round(number(f)), 'session', 'sessions')} were drawn by no stated design, "
         "so that they have no weight"
     ),
     "few_sessions_behind_correction": lambda f: (
-        f"the correction of the value function rests on {_value(f):.1f} effective sessions of {f.fact('sessions'):.0f}"
+        f"the correction of the value function rests on {number(f):.1f} effective sessions of {f.fact('sessions'):.0f}"
     ),
     "weights_need_sessions": lambda f: (
-        f"importance weights rest on {_value(f):.1f} effective sessions of {f.fact('sessions'):.0f}; {f.limit:.0f} are needed"
+        f"importance weights rest on {number(f):.1f} effective sessions of {f.fact('sessions'):.0f}; {f.limit:.0f} are needed"
     ),
     "few_end_rewards": lambda f: "fewer than three sessions have an end-of-session reward: the estimate is the step return alone",
     "no_end_reward": lambda f: "no session has an end-of-session reward: the estimate is the step return alone",
     "days_unknown": lambda f: "how returns differ from day to day cannot be told from these sessions: the intervals leave it out",
     "stopped_sessions": lambda f: (
-        f"{count(int(_value(f)), 'session', 'sessions')} stopped for the participant's sake: counted as failures with the worst outcomes. "
+        f"{count(int(number(f)), 'session', 'sessions')} stopped for the participant's sake: counted as failures with the worst outcomes. "
         f"Counted as measured, the end-of-session reward would be {f.fact('measured'):.1f} instead of {f.fact('counted'):.1f}"
     ),
     "no_better_than_mean": lambda f: (
-        f"left-out sessions are predicted no better than by the mean of the others (error {_value(f):.2f} of that one's)"
+        f"left-out sessions are predicted no better than by the mean of the others (error {number(f):.2f} of that one's)"
     ),
     "no_answer_to_amplitude": lambda f: (
         "the model's answer to the amplitude is no better than none: in left-out sessions it misses how controllers differ"
@@ -252,30 +198,30 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "no_ordering_skill": _no_ordering_skill,
     "undecided": lambda f: "neither likely enough to be within the margins nor likely enough to be beyond one",
     "adverse_event": lambda f: "a serious adverse event under it has not been cleared by a clinician",
-    "nearly_off": lambda f: f"nearly off, below 20 % of the cDBS amplitude, {_percent(f.value)} of the time (at most {_percent(f.limit)})",
+    "nearly_off": lambda f: f"nearly off, below 20 % of the cDBS amplitude, {percent(f.value)} of the time (at most {percent(f.limit)})",
     "beyond_margin": lambda f: (
-        f"{chance(_value(f))} likely beyond a margin of grasp, rating or tremor, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
-        f"(unsafe from {_percent(f.limit)})"
+        f"{chance(number(f))} likely beyond a margin of grasp, rating or tremor, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
+        f"(unsafe from {percent(f.limit)})"
     ),
     "extrapolates": lambda f: (
-        f"it would hold {_percent(f.value)} of the cDBS amplitude on average; the lowest that two sessions held is {_percent(f.limit)}"
+        f"it would hold {percent(f.value)} of the cDBS amplitude on average; the lowest that two sessions held is {percent(f.limit)}"
     ),
-    "acts_like_cdbs": lambda f: f"acts like cDBS: {_percent(f.value)} of its amplitude away from it on average",
+    "acts_like_cdbs": lambda f: f"acts like cDBS: {percent(f.value)} of its amplitude away from it on average",
     "within_margins": lambda f: (
-        f"{chance(_value(f))} likely within the margins of grasp, rating and tremor (a test asks for {_percent(f.limit)})"
+        f"{chance(number(f))} likely within the margins of grasp, rating and tremor (a test asks for {percent(f.limit)})"
     ),
-    "saves_energy": lambda f: f"{chance(_value(f))} likely to use less energy (a test asks for {_percent(f.limit)})",
-    "sessions_needed": lambda f: count(int(_value(f)), "session", "sessions"),
-    "near_amplitude": lambda f: f"held near {f.value:.1f} mA" if f.unit == "mA" else f"held near {_percent(f.value)} of the cDBS amplitude",
+    "saves_energy": lambda f: f"{chance(number(f))} likely to use less energy (a test asks for {percent(f.limit)})",
+    "sessions_needed": lambda f: count(int(number(f)), "session", "sessions"),
+    "near_amplitude": lambda f: f"held near {f.value:.1f} mA" if f.unit == "mA" else f"held near {percent(f.value)} of the cDBS amplitude",
     # of the choice of a method
     "difference_error": _difference_error,
     "beats_usual_order": lambda f: (
         f"by more than a standard error better than {method_name(f.fact('method'))}, the first of the usual order"
     ),
     "not_beaten": lambda f: "none was better by more than a standard error than this first of the usual order",
-    "too_few_controllers": lambda f: f"the data cannot choose: {_value(f):.0f} controllers could be left out, {f.limit:.0f} are needed",
+    "too_few_controllers": lambda f: f"the data cannot choose: {number(f):.0f} controllers could be left out, {f.limit:.0f} are needed",
     # of a ranking that the study has left behind
-    "settings_changed": lambda f: f"settings version {_value(f):.0f} is in force; this ranking used version {f.limit:.0f}",
+    "settings_changed": lambda f: f"settings version {number(f):.0f} is in force; this ranking used version {f.limit:.0f}",
     "sessions_changed": _sessions_changed,
     "no_threshold": lambda f: "the participant has no beta threshold xi_beta any more",
     "policies_missing": _policies_missing,
@@ -283,7 +229,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "none_supported": lambda f: "No candidate is supported by the data: these estimates cannot say whether one improves on cDBS.",
     "cdbs_above": _cdbs_above,
     "cdbs_overlaps": lambda f: (
-        f"{_reference(f)} is estimated at {f.limit:.1f}, the best candidate, {f.fact('best')}, at {_value(f):.1f}; the intervals overlap: "
+        f"{_reference(f)} is estimated at {f.limit:.1f}, the best candidate, {f.fact('best')}, at {number(f):.1f}; the intervals overlap: "
         "whether it improves on cDBS in return is open."
     ),
     "placed_below": lambda f: (

@@ -10,12 +10,11 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
-from app.evaluation import wording
+from app.evaluation import verdict_wording
 from app.evaluation.ranking.answer import Row, answer
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.picture import Picture, picture
 from app.evaluation.ranking.service import current_assessment
-from app.evaluation.schemas import STANDING_NAMES
 from app.learning.deps import CurrentOwnPolicy
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies.curves import curve_charts
@@ -52,8 +51,8 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
         config={k: v for k, v in policy.config.items() if not k.endswith("_every")},
         row=row,
         picture=_picture(db, assessment, row, participant.current_settings.lower_bound) if assessment and row else None,
-        plainly=wording.plainly,
-        standing_names=STANDING_NAMES,
+        plainly=verdict_wording.plainly,
+        standing_names=verdict_wording.STANDING_NAMES,
         may_write=may(caller, can.WRITE_POLICIES, participant),
     )
     return HTMLResponse(page)

@@ -47,7 +47,7 @@ class Circumstances:
 
 @dataclass(frozen=True)
 class Decided:
-    """A verdict with its reasons, in the order in which they count; `wording.decision` makes a sentence of them."""
+    """A verdict with its reasons, in the order in which they count; `verdict_wording.decision` makes a sentence of them."""
 
     decision: Decision
     reasons: tuple[Flag, ...]

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
-from app.evaluation import wording
+from app.evaluation import verdict_wording, wording
 from app.evaluation.estimates import coverage, held_out
 from app.evaluation.estimates.methods import names
 from app.evaluation.ranking import charts
@@ -19,7 +19,7 @@ from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.answer import OFF_SHARE, Answer, answer
 from app.evaluation.ranking.export import csv_of
 from app.evaluation.ranking.picture import Picture, picture
-from app.evaluation.schemas import RANKING_KINDS, STANDING_NAMES, RankingFilter, RankingOut
+from app.evaluation.schemas import RANKING_KINDS, RankingFilter, RankingOut
 from app.learning.snapshots.service import not_ready
 from app.platform.database import Db
 from app.platform.errors import NotFound
@@ -80,11 +80,11 @@ def ranking_page(
         answer=answered,
         picture=drawn,
         held=held,
-        plainly=wording.plainly,
+        plainly=verdict_wording.plainly,
         amplitude=wording.amplitude,
         signed=wording.signed,
         chance=wording.chance,
-        further=wording.further_sessions,
+        further=verdict_wording.further_sessions,
         off_share=OFF_SHARE,
         weights=weights,
         correlation=correlation,
@@ -97,7 +97,7 @@ def ranking_page(
         label=charts.label,
         method_names=names(),
         method_short={m.key: m.short for m in estimators.methods()},
-        standing_names=STANDING_NAMES,
+        standing_names=verdict_wording.STANDING_NAMES,
         standings={number: row.decided.standing for number, row in answered.everyone().items()} if answered else {},
         coverage=coverage,
         shown=shown,

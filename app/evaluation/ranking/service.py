@@ -6,7 +6,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
-from app.evaluation import repository, wording
+from app.evaluation import repository, verdict_wording, wording
 from app.evaluation.estimates.coverage import coverage_failed
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.assessment import Assessed, Assessment, assess
@@ -152,7 +152,7 @@ def _ranked(found: Assessment, one: Assessed) -> RankedPolicy:
         gain=GainOut.model_validate(gain) if gain else None,
         decision=decided.decision if decided else None,
         decision_reasons=[reason_out(r) for r in decided.reasons] if decided else [],
-        decision_reason=wording.decision(decided.reasons) if decided else "",
+        decision_reason=verdict_wording.decision(decided.reasons) if decided else "",
     )
 
 

@@ -16,11 +16,11 @@ from starlette.datastructures import FormData
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
+from app.evaluation import verdict_wording
 from app.evaluation import wording as evaluation_wording
 from app.evaluation.ranking.answer import Answer, Row, answer
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.service import current_assessment
-from app.evaluation.schemas import STANDING_NAMES
 from app.evaluation.wording import method_name, sentence
 from app.learning import repository as learning
 from app.learning.models import Policy
@@ -240,8 +240,8 @@ def _page(
         site=participant.site,
         view=view,
         ranking=found,
-        standing_names=STANDING_NAMES,
-        plainly=evaluation_wording.plainly,
+        standing_names=verdict_wording.STANDING_NAMES,
+        plainly=verdict_wording.plainly,
         amplitude=evaluation_wording.amplitude,
         signed=evaluation_wording.signed,
         chance=evaluation_wording.chance,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from app.evaluation import wording
+from app.evaluation import verdict_wording
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.decisions import Decided
 from app.learning.models import Policy
@@ -126,7 +126,7 @@ def _decided(found: Assessment | None, policy_id: int) -> Decided | None:
 
 
 def _why(decided: Decided) -> str:
-    return wording.plainly(decided.hazards or decided.reasons)
+    return verdict_wording.plainly(decided.hazards or decided.reasons)
 
 
 def _names(policies: Sequence[Policy]) -> str:

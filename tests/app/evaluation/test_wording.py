@@ -12,7 +12,7 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
-from app.evaluation import wording
+from app.evaluation import verdict_wording, wording
 from app.evaluation.estimates.rows import row_of
 from app.evaluation.models import EstimateRow, Evaluation
 from ml.ope.estimate import Estimate
@@ -40,11 +40,11 @@ def test_reworded_sentences_change_no_rank_support_or_decision(
     before = client.get(RANKING).json()
     assert [p["decision"] for p in before["policies"]] == ["test", "cannot_tell", "unsafe"]
     page = client.get("/participants/P1/ranking").text
-    for name, made in inspect.getmembers(wording, inspect.isfunction):
-        if made.__module__ == wording.__name__:
-            monkeypatch.setattr(wording, name, lambda *_: "x")
+    for words in (wording, verdict_wording):
+        for name, _ in inspect.getmembers(words, inspect.isfunction):
+            monkeypatch.setattr(words, name, lambda *_: "x")
     monkeypatch.setattr(wording, "_SENTENCES", {})
-    monkeypatch.setattr(wording, "_PLAINLY", {})
+    monkeypatch.setattr(verdict_wording, "_PLAINLY", {})
     after = client.get(RANKING).json()
     assert {f["text"] for p in after["policies"] for f in p["flags"]} == {p["decision_reason"] for p in after["policies"]} == {"x"}
     assert without_words(after) == without_words(before)
@@ -102,14 +102,15 @@ def test_flags_survive_their_stored_form_and_are_told_once() -> None:
 def test_the_reasons_of_a_verdict_read_as_one_sentence_and_plainly() -> None:
     reasons = [Flag("undecided"), Flag("within_margins", 0.7, 0.8, "probability"), Flag("sessions_needed", 3.0, None, "sessions")]
     reasons.append(Flag("near_amplitude", 1.8, None, "mA"))
-    assert wording.decision(reasons) == (
+    assert verdict_wording.decision(reasons) == (
         "neither likely enough to be within the margins nor likely enough to be beyond one; 70 % likely within the "
         "margins of grasp, rating and tremor (a test asks for 80 %); 3 sessions held near 1.8 mA would tell"
     )
-    assert wording.plainly(reasons) == "within the margins or beyond: still open; 3 sessions held near 1.8 mA would tell"
-    assert wording.plainly([Flag("extrapolates", 0.4, 0.5)], 0.5, 1.5) == "lower than two sessions ever held: not below 1.5 mA"
+    assert verdict_wording.plainly(reasons) == "within the margins or beyond: still open; 3 sessions held near 1.8 mA would tell"
+    assert verdict_wording.plainly([Flag("extrapolates", 0.4, 0.5)], 0.5, 1.5) == "lower than two sessions ever held: not below 1.5 mA"
     assert (
-        wording.plainly([Flag("extrapolates", 0.4, 0.5)], 0.5) == "lower than two sessions ever held: not below 50 % of the cDBS amplitude"
+        verdict_wording.plainly([Flag("extrapolates", 0.4, 0.5)], 0.5)
+        == "lower than two sessions ever held: not below 50 % of the cDBS amplitude"
     )
 
 
@@ -119,4 +120,4 @@ def test_draws_show_no_probability_of_nothing_or_of_certainty() -> None:
 
 def test_every_plain_reason_is_a_code_that_has_a_sentence_too() -> None:
     later = {"few_near_visits"}  # of `ml.ope.posterior.support`
-    assert set(wording._PLAINLY) - later <= set(wording._SENTENCES)
+    assert set(verdict_wording._PLAINLY) - later <= set(wording._SENTENCES)

@@ -1,0 +1,72 @@
+"""The words of a ranking's verdicts: what each is called, and its reasons in a line, in full and for a first look."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from app.evaluation.schemas import Standing
+from app.evaluation.wording import OUTCOME_NAMES, amplitude, chance, number, percent, sentence
+from ml.ope.flags import Flag
+
+STANDING_NAMES: dict[Standing, str] = {
+    "test": "test",
+    "test_with_care": "test with care",
+    "same_as_cdbs": "same as cDBS",
+    "unsafe": "unsafe",
+    "not_advised": "not advised",
+    "cannot_tell": "cannot tell",
+}
+
+
+def decision(reasons: Sequence[Flag]) -> str:
+    """The reasons of a verdict in one line.
+
+    Args:
+        reasons: as `app.evaluation.ranking.decisions.decide` gives them.
+    """
+    told = [reason for reason in reasons if reason.code not in ("sessions_needed", "near_amplitude")]
+    more = further_sessions(reasons)
+    return "; ".join([*map(sentence, told), *([more] if more else [])])
+
+
+def plainly(reasons: Sequence[Flag], limit: float | None = None, limit_ma: float | None = None) -> str:
+    """A verdict's reason for a reader in a hurry: the deciding finding in plain words, without methods.
+
+    Args:
+        reasons: of the verdict. limit, limit_ma: lowest amplitude of a test with care, fraction of cDBS and mA.
+    """
+    if limit is not None:
+        return f"lower than two sessions ever held: not below {amplitude(limit, limit_ma)}"
+    more = further_sessions(reasons)
+    found = [_PLAINLY[r.code](r) for r in reasons if r.code in _PLAINLY]
+    return "; ".join([*found[:2], *([more] if more else [])])
+
+
+def further_sessions(reasons: Sequence[Flag]) -> str:
+    """How many further sessions near which amplitude would tell; empty where none is named."""
+    by_code = {reason.code: reason for reason in reasons}
+    if not {"sessions_needed", "near_amplitude"} <= by_code.keys():
+        return ""
+    return f"{sentence(by_code['sessions_needed'])} {sentence(by_code['near_amplitude'])} would tell"
+
+
+_PLAINLY: dict[str, Callable[[Flag], str]] = {
+    "retired": lambda f: f"retired: {f.fact('text')}",
+    "no_posterior": lambda f: "evaluated by an earlier betaloop: evaluate again",
+    "adverse_event": lambda f: "serious adverse event, not cleared by a clinician",
+    "nearly_off": lambda f: f"nearly off {percent(f.value)} of the time",
+    "beyond_margin": lambda f: f"{chance(number(f))} likely beyond a margin, most often that of {OUTCOME_NAMES[f.fact('outcome')]}",
+    "all_below_zero": lambda f: "its whole expected gain lies below that of cDBS",
+    "few_near_sessions": lambda f: "hardly any session came near what it does",
+    "few_near_visits": lambda f: "only one visit came near what it does",
+    "outside_range": lambda f: "it asks for amplitudes that nobody has tried",
+    "thin": lambda f: "it asks for amplitudes that were hardly ever tried",
+    "far": lambda f: "it does what no session has shown",
+    "no_ordering_skill": lambda f: "the recordings so far cannot tell policies apart",
+    "coverage_unchecked": lambda f: "what the recordings cover could not be checked",
+    "reference_missing": lambda f: "there is no estimate of cDBS to hold it against",
+    "reference_unsupported": lambda f: "too few sessions of cDBS to hold it against",
+    "outcomes_unknown": lambda f: "no session has grasp, rating or tremor",
+    "undecided": lambda f: "within the margins or beyond: still open",
+}
+"""For the first screen of the ranking, by code; what is not here is told further down alone."""
