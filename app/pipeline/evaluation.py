@@ -24,7 +24,6 @@ COVERAGE_STEP = "coverage"
 COVERAGE_WEIGHT = 1.0
 SKILL_STEP = "choose-method"
 SKILL_WEIGHT = 2.0
-_TORCH_FILE = "application/x-pytorch"
 
 
 def run_evaluate(job: JobContext) -> dict[str, Any]:
@@ -70,7 +69,7 @@ def store_members(job: JobContext, results: Sequence[dict[str, Any]]) -> dict[st
         if reasons:
             return {"failed": reasons[0]}
         contents = [(job.workdir(f"fit/{k}") / compute.member_file(k)).read_bytes() for k in range(len(results))]
-        return {"members": [files.store(db, content, _TORCH_FILE).sha256 for content in contents]}
+        return {"members": [files.store(db, content).sha256 for content in contents]}
 
     return job.transact("store-models", store)
 

@@ -41,7 +41,6 @@ class StoredFile(Base):
 
     sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
     size: Mapped[int] = mapped_column(BigInteger)
-    media_type: Mapped[str] = mapped_column(String(100))
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
 
 
@@ -261,7 +260,7 @@ def _path_of_open(file: BinaryIO) -> Path:
     return _OPEN_FILES / str(os.getpid()) / "fd" / str(file.fileno())
 
 
-def store(db: Session, content: bytes | Path, media_type: str, *, copy: bool = True) -> StoredFile:
+def store(db: Session, content: bytes | Path, *, copy: bool = True) -> StoredFile:
     """Keep bytes (or a draft file, which is moved) and return their row; the same bytes twice are one file.
 
     The bytes are on disk, fsynced, or in the bucket, before the row exists, so that a committed row always has its file.
@@ -278,7 +277,7 @@ def store(db: Session, content: bytes | Path, media_type: str, *, copy: bool = T
     finally:
         # also where the disk is full: what cannot be stored must not keep it full
         draft.unlink(missing_ok=True)
-    db.execute(insert(StoredFile).values(sha256=sha256, size=size, media_type=media_type).on_conflict_do_nothing())
+    db.execute(insert(StoredFile).values(sha256=sha256, size=size).on_conflict_do_nothing())
     return db.get_one(StoredFile, sha256)
 
 

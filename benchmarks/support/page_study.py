@@ -19,7 +19,7 @@ from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM
 from app.evaluation.service import store_evaluation
 from app.learning.models import BufferSnapshot, Policy, Sweep
-from app.learning.policies.baselines import ONNX, constant_onnx, ensure_baselines
+from app.learning.policies.baselines import constant_onnx, ensure_baselines
 from app.learning.snapshots.service import collect, take_snapshot
 from app.platform import files
 from app.platform.jobs.models import Job, JobEvent, JobStatus, JobStep
@@ -147,7 +147,7 @@ def _rows_of_session(session: StudySession, recording: Recording, name: str, rng
 
 
 def _policy_file(db: Session, i: int) -> str:
-    return str(files.store(db, constant_onnx(round(0.3 + 0.015 * i, 4), 10), ONNX).sha256)
+    return str(files.store(db, constant_onnx(round(0.3 + 0.015 * i, 4), 10)).sha256)
 
 
 def _add_policies(

@@ -21,7 +21,7 @@ from app.ingest.mappings import repository as mappings
 from app.ingest.models import PREVIEW, UploadFile
 from app.ingest.stated_beta import BetaStated
 from app.ingest.uploads import reading, service
-from app.ingest.uploads.receiving import MEDIA_TYPE, Receiver, StoredContent
+from app.ingest.uploads.receiving import Receiver, StoredContent
 from app.ingest.uploads.reports import ASIDE
 from app.ingest.uploads.service import UploadOutcome
 from app.platform import files
@@ -81,7 +81,7 @@ def read_held(db: Session, file: UploadFile, participant: Participant, reason: s
                 raise
             raise Invalid(f"It still cannot be read: {error.stored_what} ({error.stored_where}).", error.hint) from error
     kind, redaction, sealed = found.kind, found.redaction, file.quarantine_sha256
-    stored = files.store(db, clean, MEDIA_TYPE).sha256
+    stored = files.store(db, clean).sha256
     file.kind, file.stored_sha256, file.redactor_version = kind, stored, REDACTOR_VERSION
     file.column_mapping = known_mappings[found.mapping] if found.mapping is not None else None
     _decide(db, file, reason, caller)
@@ -116,7 +116,7 @@ def release_as_is(db: Session, file_id: int, reason: str, caller: Caller) -> Upl
         try:
             with original.open() as source, draft.open("wb") as out:
                 shutil.copyfileobj(source, out, files.CHUNK)
-            file.released_sha256 = files.store(db, draft, MEDIA_TYPE).sha256
+            file.released_sha256 = files.store(db, draft).sha256
         finally:
             draft.unlink(missing_ok=True)
     file.status = "released" if file.status == "failed" else file.status

@@ -50,7 +50,6 @@ ENDED_THE_SERVICE = UndecodableFile(
 )
 RESUMED = "Reading this file was cut short; it was read from the kept bytes since, and what was removed from it is not listed again."
 TABLES = ("csv", "parquet", "control_log", "mapped")
-MEDIA_TYPE = "application/octet-stream"
 
 
 @dataclass
@@ -220,7 +219,7 @@ class Receiver:
             return self._quarantined(raw, clean, found.problem, found.redaction, found.preview)
         sealed = self._seal(raw) if found.redaction.unreadable else None
         by = known[found.mapping].id if found.mapping is not None else None
-        return StoredContent(found.kind, files.store(self.db, clean, MEDIA_TYPE).sha256, sealed, found.redaction, None, by)
+        return StoredContent(found.kind, files.store(self.db, clean).sha256, sealed, found.redaction, None, by)
 
     def _quarantined(
         self,
@@ -235,7 +234,7 @@ class Receiver:
         return StoredContent("unreadable", sealed, sealed, redaction or Redaction(), problem, preview=preview)
 
     def _seal(self, raw: Source) -> str:
-        return files.store(self.db, encryption.encrypt(raw), MEDIA_TYPE, copy=False).sha256
+        return files.store(self.db, encryption.encrypt(raw), copy=False).sha256
 
     def decode(self, name: str, row: UploadFile, content: StoredContent) -> FileOutcome:
         """Decode a stored file; whatever is wrong with it becomes its report."""

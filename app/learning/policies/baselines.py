@@ -22,7 +22,6 @@ from ml.policies.from_buffer import proportional_from_buffer
 from ml.policies.policy import ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 
-ONNX = "application/onnx"
 CONSTANTS = (1.0, 0.85, 0.7, 0.55, 0.4)
 """Amplitude fractions held constant: cDBS, and a grid from which a ranking names the best."""
 
@@ -127,7 +126,7 @@ def _add(
         snapshot_id=snapshot.id if algorithm == "proportional" else None,
         settings_version_id=snapshot.settings_version_id,
         config=config,
-        onnx_sha256=files.store(db, content, ONNX).sha256,
+        onnx_sha256=files.store(db, content).sha256,
         metrics={},
         code_version=__version__,
         created_by=created_by,

@@ -17,7 +17,6 @@ from app.accounts.permissions import Caller
 from app.learning import repository
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies import foreign
-from app.learning.policies.baselines import ONNX
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.training.results import POLICY
 from app.platform import files
@@ -87,7 +86,7 @@ def add_external(db: Session, participant: Participant, name: str, content: byte
         algorithm="external",
         settings_version_id=settings.id,
         config={"window": settings.window},
-        onnx_sha256=files.store(db, content, ONNX).sha256,
+        onnx_sha256=files.store(db, content).sha256,
         metrics={"bytes": len(content)},
         code_version=__version__,
         created_by=caller.label,
@@ -129,7 +128,7 @@ def store_students(
         if row is None:
             row = _student_row(job_id, created_by, snapshot, key, result)
             row.teacher_id = teacher_id
-            row.onnx_sha256 = files.store(db, (workdir / POLICY).read_bytes(), ONNX).sha256
+            row.onnx_sha256 = files.store(db, (workdir / POLICY).read_bytes()).sha256
             row.name = free_name(db, snapshot.participant_id, f"{db.get_one(Policy, teacher_id).name[:80]}-small")
             db.add(row)
             db.flush()

@@ -39,7 +39,6 @@ from app.study.traces import StepTable, TracesOf, traces_of
 from ml.mdp import MdpSettings
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
 
-PARQUET = "application/vnd.apache.parquet"
 PINS_VERSION = 2
 REPEATED = "its minutes of this device stand in another session that counts: exclude one of the two"
 
@@ -178,7 +177,7 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
     known = repository.snapshot_by_pins(db, participant.id, found.pins_sha256)
     if known is not None:
         return known
-    stored = files.store(db, to_parquet(found.buffer), PARQUET)
+    stored = files.store(db, to_parquet(found.buffer))
     row_id = repository.add_snapshot(
         db,
         participant_id=participant.id,

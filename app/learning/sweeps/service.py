@@ -10,7 +10,6 @@ from sqlalchemy.orm import Session
 
 from app.learning import repository
 from app.learning.models import BufferSnapshot, Policy, Sweep
-from app.learning.policies.baselines import ONNX
 from app.learning.policies.service import free_name
 from app.learning.training.results import CLONE, policy_file, training_file
 from app.platform import files
@@ -89,8 +88,8 @@ def _policy(
         config=result["config"],
         seed=result["config"]["seed"],
         metrics=result["metrics"],
-        onnx_sha256=files.store(db, (workdir / policy_file(member)).read_bytes(), ONNX).sha256,
-        checkpoint_sha256=files.store(db, (workdir / training_file(member)).read_bytes(), "application/x-pytorch").sha256,
+        onnx_sha256=files.store(db, (workdir / policy_file(member)).read_bytes()).sha256,
+        checkpoint_sha256=files.store(db, (workdir / training_file(member)).read_bytes()).sha256,
         code_version=code_version(),
         created_by=sweep.created_by,
     )
@@ -115,7 +114,7 @@ def _store_clone(db: Session, sweep: Sweep, snapshot: BufferSnapshot, workdir: P
             settings_version_id=snapshot.settings_version_id,
             config={"controller": "cloning", "window": window},
             metrics={},
-            onnx_sha256=files.store(db, (workdir / CLONE).read_bytes(), ONNX).sha256,
+            onnx_sha256=files.store(db, (workdir / CLONE).read_bytes()).sha256,
             code_version=code_version(),
             created_by=sweep.created_by,
         )

@@ -43,7 +43,6 @@ MAKE = "app.planning.bundles.compute:make"
 """What a child runs."""
 FOREIGN = "external"
 """The kind of policies that were made elsewhere."""
-_ZIP = "application/zip"
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def store(
         participant_id=participant.id,
         policy_id=manifest.policy_id,
         plan_item_id=plan_item_id,
-        sha256=files.store(db, signed, _ZIP).sha256,
+        sha256=files.store(db, signed).sha256,
         hemisphere=Hemisphere(manifest.hemisphere) if manifest.hemisphere else None,
         min_ma=manifest.min_ma,
         max_ma=manifest.max_ma,

@@ -57,7 +57,6 @@ class Job(Base):
     finished_at: Mapped[datetime | None]
     updated_at: Mapped[datetime] = mapped_column(server_default=func.now())
     cancel_requested_at: Mapped[datetime | None]
-    cancel_requested_by: Mapped[str | None] = mapped_column(String(254))
     steps: Mapped[list[JobStep]] = relationship(back_populates="job", order_by="JobStep.position")
 
     def seconds_left(self, present: datetime) -> float | None:

@@ -83,7 +83,7 @@ def cancel(db: Session, job: Job, by: str) -> Job:
     if JobStatus(job.status).ended:
         raise Conflict(f"Job {job.id} has already {job.status}: there is nothing left to cancel.")
     if job.cancel_requested_at is None:
-        job.cancel_requested_at, job.cancel_requested_by = now(), by
+        job.cancel_requested_at = now()
         repository.add_event(db, job.id, "cancel", {"by": by})
     if job.status == JobStatus.QUEUED or not repository.live_workers(db, STALE_S):
         repository.end_job(db, job, JobStatus.CANCELLED)

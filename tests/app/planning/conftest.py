@@ -77,7 +77,7 @@ def _policy(
         snapshot_id=snapshot.id if snapshot else None,
         settings_version_id=participant.current_settings.id,
         config={},
-        onnx_sha256=files.store(db, name.encode(), "application/octet-stream").sha256,
+        onnx_sha256=files.store(db, name.encode()).sha256,
         metrics={},
         code_version="test",
         created_by="test",

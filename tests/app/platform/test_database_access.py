@@ -173,7 +173,7 @@ def test_lost_secrets_are_made_anew_by_the_owner_of_the_data_folder(data: Path) 
 
 
 def test_stored_files_are_the_services_alone(db: Session) -> None:
-    row = files.store(db, b"a recording", "text/plain")
+    row = files.store(db, b"a recording")
     path = files.path_of(row.sha256)
     assert path.stat().st_mode & 0o777 == 0o600
     for folder in (path.parent, path.parent.parent, path.parent.parent / "incoming"):

@@ -41,8 +41,8 @@ def sessions(lead: float = 1.0) -> tuple[SessionTrajectory, ...]:
 
 def call(db: Session, buffer: ReplayBuffer, **more: Any) -> dict[str, Any]:
     """Params of a compute function on a stored buffer, with one policy that holds 0.6."""
-    stored = files.store(db, to_parquet(buffer), "application/vnd.apache.parquet").sha256
-    policy = files.store(db, constant_onnx(0.6, 10), "application/onnx").sha256
+    stored = files.store(db, to_parquet(buffer)).sha256
+    policy = files.store(db, constant_onnx(0.6, 10)).sha256
     return {
         "snapshot_sha256": stored, "preset": "quick", "seed": 0, "horizon_steps": 50, "policies": [{"id": 7, "sha256": policy}]
     } | more  # fmt: skip

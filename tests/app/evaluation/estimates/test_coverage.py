@@ -87,7 +87,7 @@ def store(db: Session, policies: list[int]) -> Callable[..., Evaluation]:
 
 def test_the_compute_step_gives_what_the_science_finds(db: Session, tmp_path: Path) -> None:
     params = call(db, buffer_of(sessions()))
-    off = files.store(db, constant_onnx(0.0, 10), "application/onnx").sha256
+    off = files.store(db, constant_onnx(0.0, 10)).sha256
     params["policies"].append({"id": 8, "sha256": off})
     told: list[dict[str, Any]] = []
     found = json.loads(json.dumps(check_coverage(params, tmp_path, StepReport(told.append, interval_s=0.0))))["policies"]

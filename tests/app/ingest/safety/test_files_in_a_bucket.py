@@ -127,7 +127,7 @@ def test_a_file_that_one_machine_stored_is_read_by_another_and_by_its_children(
 
 
 def test_what_is_damaged_or_missing_in_the_bucket_is_never_believed(shared: str, s3_server: Server, db: Session) -> None:
-    sha256 = files.store(db, b"a recording", "text/plain").sha256
+    sha256 = files.store(db, b"a recording").sha256
     db.commit()
     files.path_of(sha256).unlink()
     key = f"{shared}/files/{sha256[:2]}/{sha256}"
@@ -225,7 +225,7 @@ def test_a_bucket_that_is_away_is_said_and_loses_nothing(
 
 
 def test_copies_that_were_used_longest_ago_make_room(shared: str, db: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = [files.store(db, bytes([k]) * 1000, "text/plain").sha256 for k in range(4)]
+    kept = [files.store(db, bytes([k]) * 1000).sha256 for k in range(4)]
     for age, sha256 in enumerate(kept):
         os.utime(files.path_of(sha256), (time.time() - 7200 * age,) * 2)
     monkeypatch.setenv("BETALOOP_FILES_CACHE_GIB", str(1500 / (1 << 30)))
@@ -238,7 +238,7 @@ def test_copies_that_were_used_longest_ago_make_room(shared: str, db: Session, m
 
 def test_a_large_file_arrives_whole(shared: str, db: Session) -> None:
     content = os.urandom(1 << 20) * 70  # more than one part
-    row = files.store(db, content, "application/octet-stream")
+    row = files.store(db, content)
     files.path_of(row.sha256).unlink()
     assert files.read(row.sha256) == content
 

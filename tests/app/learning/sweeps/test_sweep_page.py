@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.learning import wording
 from app.learning.models import Policy, Sweep
-from app.learning.policies.baselines import ONNX, constant_onnx
+from app.learning.policies.baselines import constant_onnx
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.snapshots.service import take_snapshot
 from app.learning.sweeps import parallel
@@ -81,7 +81,7 @@ def store(upload: Upload, db: Session) -> Store:
                     seed=k,
                     metrics=told,
                     code_version="0",
-                    onnx_sha256=files.store(db, constant_onnx(0.5, 10), ONNX).sha256,
+                    onnx_sha256=files.store(db, constant_onnx(0.5, 10)).sha256,
                     created_by="ada",
                 )
             )
