@@ -145,6 +145,7 @@ def test_a_clinic_day_from_the_signed_plan_to_the_next_generation(
     client: TestClient,
     enrolled: str,
     ranked: list[int],
+    ended: Callable[..., dict[str, Any]],
     tmp_path: Path,
 ) -> None:
     now = datetime.now(UTC)
@@ -265,7 +266,8 @@ def test_a_clinic_day_from_the_signed_plan_to_the_next_generation(
     assert "Controller on the tablet" in engineer.page.content()
     engineer.page.click("text=Train the next generation")
     engineer.page.select_option("[name=preset]", "quick")
-    engineer.page.fill("[name=count]", "1")
+    for name in ("parents", "tuned", "count"):
+        engineer.page.fill(f"[name={name}]", "1")
     engineer.page.click("form button.primary")
     engineer.page.wait_for_url("**/jobs/*")
     shot(engineer, "8-next-generation")
@@ -275,7 +277,24 @@ def test_a_clinic_day_from_the_signed_plan_to_the_next_generation(
     steps = {s["key"]: s for s in job["steps"]}
     assert steps["choose-parents"]["status"] == "succeeded"
     assert "Fine-tune" in steps["train/0"]["title"], "it goes on from what was tested that day"
-    client.post(f"/api/v1/jobs/{number}/cancel")
+
+    # trained, distilled, evaluated and ranked by that one action; the next visit is planned from it
+    done = ended(number, 900)
+    assert done["status"] == "succeeded", done
+    made = set(done["result"]["policy_ids"])
+    engineer.page.goto(f"{address}/jobs/{number}")
+    engineer.page.wait_for_selector("text=Succeeded")
+    shot(engineer, "9-generation-done")
+    kinds = [p["kind"] for p in client.get(f"/api/v1/participants/{enrolled}/policies?limit=200").json()["items"] if p["id"] in made]
+    assert {"trained", "distilled"} <= set(kinds), kinds
+    found = client.get(f"/api/v1/participants/{enrolled}/ranking").json()
+    assert made <= {p["policy_id"] for p in found["policies"]}, "every policy of the generation was judged"
+    engineer.open(f"/participants/{enrolled}/next-generation")
+    assert "The next generation is trained" in engineer.page.content()
+    engineer.page.click("text=its ranking")
+    engineer.page.wait_for_selector("h1")
+    names = [p["name"] for p in found["policies"] if p["policy_id"] in made]
+    assert all(name in engineer.page.content() for name in names), names
     assert engineer.errors + clinician.errors + coordinator.errors == []
 
 

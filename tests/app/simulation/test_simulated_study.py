@@ -99,7 +99,7 @@ def test_a_simulated_study_that_is_killed_goes_on_with_nothing_lost_and_nothing_
         assert all(s.duration_s == 300 for s in held)
         assert (held[3].visit.date - held[0].visit.date).days == 28
 
-        assert db.scalar(select(func.count()).select_from(Recording)) == 8
+        assert db.scalar(select(func.count()).select_from(Recording)) == 7
         assert db.scalar(select(func.count()).select_from(UploadFile).where(UploadFile.status == "decoded")) == 7
         # rating and grasp from the clinic day, then tremor from the watch
         assert sorted(db.scalars(select(QocRevision.revision))) == [1] * 7 + [2] * 7
