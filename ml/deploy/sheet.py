@@ -169,6 +169,8 @@ def _implausible(m: BundleManifest) -> str:
 
 def _made(m: BundleManifest) -> str:
     taken = f"Taken by {escape(re.sub(r'[.][0-9]{6} ', ' ', m.taken_by))}. " if m.taken_by else ""
+    if m.schedule is not None:
+        return f"{taken}Bundled by betaloop {escape(m.code_version)}."
     return f"{taken}Trained by betaloop {escape(m.policy_code_version)}, bundled by betaloop {escape(m.code_version)}."
 
 
@@ -228,7 +230,7 @@ def _signal(m: BundleManifest) -> list[tuple[str, str]]:
         ("Band", f"{m.beta_low_hz:g} to {m.beta_high_hz:g} Hz"),
         ("Window", f"{m.window} values, one per {m.period_s:g} s"),
         ("Valid share", f"{100 * m.min_valid_fraction:g} % of a period's samples"),
-        ("Scaling", scale),
+        *([("Scaling", scale)] if m.schedule is None else []),
     ]
 
 

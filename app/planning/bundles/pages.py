@@ -18,6 +18,7 @@ from app.learning.models import Policy
 from app.planning import wording
 from app.planning.bundles import repository, slots
 from app.planning.bundles import service as bundles
+from app.planning.plans.key import common_limits
 from app.planning.plans.limits import device_limits
 from app.planning.plans.view import read_plan
 from app.platform.database import Db
@@ -83,6 +84,7 @@ def session_bundles(request: Request, visit: CurrentVisit, db: Db, caller: Curre
         visit=visit,
         view=view,
         limits_ma=wording.limits_ma,
+        common=common_limits(view.plan.items) if view.sealed else None,  # the limits of one session tell what it runs
         problem=problem,
         taken=Counter(r.plan_item_id for r in repository.releases_of_slots(db, [line.item.id for line in view.lines])),
         may_take=bundles.may_take(visit.participant, caller),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from app.planning import wording
 from app.planning.plans.view import PlanLine, PlanView
 from app.planning.sheet.ink import clock, printed_name, printed_warning, shade
+from app.study.models import Controller
 
 BUNDLE = "Bundle"
 HASH = 12
@@ -41,7 +42,7 @@ def card_of(line: PlanLine, view: PlanView, bundle: str | None) -> Card:
         "Policy": printed_name(line.policy) if line.policy else "",
         "Limits": limits,
         "Design": wording.design_name(line.design) if line.design else "",
-        BUNDLE: "" if view.sealed else bundle[:HASH] if bundle else "not taken yet",
+        BUNDLE: "" if view.sealed else _bundle(line, bundle),
         "Predicted": _predicted(line),
         "Medication": f"due before: {item.medication}" if item.medication else "",
     }
@@ -49,6 +50,12 @@ def card_of(line: PlanLine, view: PlanView, bundle: str | None) -> Card:
     warnings = tuple(printed_warning(wording.warning(w), line.policy) for w in mine)
     head = f"{item.position}  {clock(line.start_minute, view.plan.starts_at)}  {wording.session_name(item)}"
     return Card(head, length, tuple((label, text) for label, text in told.items() if text), warnings, shade(line))
+
+
+def _bundle(line: PlanLine, sha256: str | None) -> str:
+    if line.item.controller == Controller.NO_DBS:
+        return "none: off, and on again, by the programmer"
+    return sha256[:HASH] if sha256 else "not taken yet"
 
 
 def _predicted(line: PlanLine) -> str:

@@ -74,4 +74,4 @@ def _slot(item: PlanItem, day: Day, limits: LimitsOut | None, blinded: bool) -> 
 
 
 def _label(item: PlanItem) -> str:
-    return f"Controller {item.label}" if item.label else f"Session {item.position}"
+    return f"Session {item.label}" if item.label else f"Session {item.position}"

@@ -103,6 +103,23 @@ def test_nobody_tells_from_a_blinded_bundle_what_it_runs(bundles: dict[int, byte
     assert all(manifest == common[0] for manifest in common), "what the manifests say of limits and signal is the same"
 
 
+def test_the_page_of_bundles_tells_the_limits_of_all_sessions_alike_until_the_key_is_opened(
+    client: TestClient, studied: Any, plan: dict[str, Any]
+) -> None:
+    def rows() -> list[str]:
+        page = client.get(f"/visits/{studied.visit}/bundles", headers={"Accept": "text/html"}).text
+        found = page.split("<tbody>")[1].split("</tbody>")[0].split("<tr>")[1:]
+        return [re.sub(r"<[^>]*>", " ", row) for row in found]
+
+    sealed = rows()
+    assert len(sealed) == len(plan["sessions"])
+    assert all("0.5 to 3 mA, cDBS 3 mA" in row and "blinded" in row for row in sealed), sealed
+    opened = client.post(f"/api/v1/visits/{studied.visit}/plan/key", json={"reason": "the visit is over"})
+    assert opened.status_code == 200, opened.text
+    assert [("cDBS 3 mA" in row, "blinded" in row) for row in rows()] == [(True, False)] * len(sealed)
+    assert any(re.search(r"\s3 mA, cDBS", row) for row in rows()), "a session of cDBS has one amplitude"
+
+
 def test_a_sealed_part_that_was_exchanged_or_cut_is_no_bundle(client: TestClient, bundles: dict[int, bytes]) -> None:
     key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(client.get("/api/v1/bundle-key").text.strip()))
     first, second = (files_of(bundles[p]) for p in (1, 2))

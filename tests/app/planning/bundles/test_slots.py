@@ -114,6 +114,7 @@ def test_the_sheet_of_a_bundle_says_of_its_session_what_the_sheet_of_the_plan_sa
     signature = signed["signature"]["sha256"][:12]
     for line in view.lines:
         if line.item.controller == "no_dbs":
+            assert ("Bundle", "none: off, and on again, by the programmer") in card_of(line, view, None).lines
             continue
         card, sheet = card_of(line, view, None), sheet_of(client, studied.visit, line.item.position)
         assert f"As on the sheet of plan {signed['id']}: {card.head}, {card.minutes}" in sheet
@@ -121,6 +122,7 @@ def test_the_sheet_of_a_bundle_says_of_its_session_what_the_sheet_of_the_plan_sa
             assert label == "Bundle" or f"<th>{label}</th><td>{words}</td>" in sheet
         assert all(warning in sheet for warning in card.warnings)
         assert f"signed as <code>{signature}</code>" in sheet
+        assert ("Trained by" in sheet, "<th>Scaling</th>" in sheet) == (line.policy is not None,) * 2, "a schedule has no training"
     assert any(card_of(line, view, None).warnings for line in view.lines), "a policy that is not ranked is warned of"
 
 

@@ -233,7 +233,7 @@ def test_a_sealed_plan_shows_its_letters_and_common_limits_to_everybody(client: 
     assert sign_plan(visit).status_code == 200
     day = client.get(f"/api/v1/visits/{visit}/day").json()
     assert day["blinded"] is True
-    assert sorted(s["label"] for s in day["slots"]) == ["Controller A", "Controller B", "Controller C"]
+    assert sorted(s["label"] for s in day["slots"]) == ["Session A", "Session B", "Session C"]
     assert {(s["controller"], s["detail"], str(s["limits"])) for s in day["slots"]} == {(None, "", str(day["slots"][0]["limits"]))}
     assert day["slots"][0]["limits"]["min_ma"] < day["slots"][0]["limits"]["max_ma"]
     page = client.get(f"/visit-day/{visit}", headers={"Accept": "text/html"}).text
