@@ -134,9 +134,13 @@ def sessions_of_visit(db: Session, visit_id: int, limit: int = 500, offset: int 
     return rows, count(db, select(StudySession.id).where(mine))
 
 
-def sessions_of_participant(db: Session, participant_id: int, with_proposals: bool = False) -> Sequence[StudySession]:
-    """Confirmed sessions of a participant by visit and order, with QoCs, segments and recordings; proposals only where asked for."""
+def sessions_of_participant(db: Session, participant_id: int, with_proposals: bool = False, afresh: bool = False) -> Sequence[StudySession]:
+    """Confirmed sessions of a participant by visit and order, with QoCs, segments and recordings; proposals only where asked for.
+
+    `afresh`: what this transaction has read of them before is read again, for what is kept under the rows' present versions.
+    """
     query = _sessions().where(Visit.participant_id == participant_id, true() if with_proposals else CONFIRMED)
+    query = query.execution_options(populate_existing=afresh)
     return db.scalars(query.order_by(Visit.number, StudySession.ordinal)).all()
 
 

@@ -35,6 +35,7 @@ def sessions_of(db: Session, participant_ids: Collection[int]) -> dict[int, list
             selectinload(StudySession.segments),
         )
         .order_by(Visit.number, StudySession.ordinal)
+        .execution_options(populate_existing=True)  # what was read before may be older than the key of what is kept
     )
     found: dict[int, list[StudySession]] = {}
     for session in db.scalars(query):

@@ -62,10 +62,19 @@ def stale_reasons(db: Session, participant: Participant, evaluation: Evaluation,
 
 
 def _kept_changes(db: Session, participant: Participant, snapshot: BufferSnapshot, sessions: ReadOnce) -> list[Flag]:
-    """The same as `_changes`, kept by this process until a row of the participant's sessions changes, or the gate is decided on."""
+    """The same as `_changes`, kept by this process until a row of the participant's sessions changes, or the gate is decided on.
+
+    What this transaction has read before may be older than the key says, so that settings are read again, as `sessions` are.
+    """
     decision = learning.newest_gate_decision(db, participant.id)
     key = ("changes since", snapshot.id, snapshot.created_at, sessions.fingerprint, decision.id if decision else None)
-    return kept(key, lambda: _changes(db, participant, snapshot, sessions.rows))
+
+    def read() -> list[Flag]:
+        rows = sessions.rows
+        db.refresh(participant, ["settings"])
+        return _changes(db, participant, snapshot, rows)
+
+    return kept(key, read)
 
 
 def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot, sessions: Sequence[StudySession]) -> list[Flag]:

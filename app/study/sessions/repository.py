@@ -71,8 +71,8 @@ class ReadOnce:
 
     @cached_property
     def rows(self) -> Sequence[StudySession]:
-        """The sessions by visit and order."""
-        return sessions_of_participant(self.db, self.participant_id)
+        """The sessions by visit and order, read anew: what the transaction read before may be older than `fingerprint`."""
+        return sessions_of_participant(self.db, self.participant_id, afresh=True)
 
 
 class SlotHead(NamedTuple):

@@ -13,8 +13,9 @@ from app.evaluation import repository, wording
 from app.evaluation.ranking.staleness import stale_reasons
 from app.learning.gate.service import decide
 from app.learning.models import GateChoice
-from app.study.models import StudySession, Trace
+from app.study.models import CdbsAmplitude, Hemisphere, StudySession, Trace
 from app.study.repository import participant_by_code, sessions_of_participant
+from app.study.sessions.models import SessionConditions
 from tests.app.evaluations import estimate
 
 Upload = Callable[..., int]
@@ -104,3 +105,79 @@ def test_a_gate_that_opens_lets_sessions_in_and_one_that_shuts_leaves_them_out(
     decide(db, participant_by_code(db, "P1", SYSTEM), GateChoice.SHUT, "an adverse event", SYSTEM)
     db.commit()
     assert stale(db) == ["1 session newly left out"]
+
+
+def decoded_again(db: Session, session: StudySession) -> None:
+    for old in list(session.segments[0].recording.traces):
+        db.expunge(old)
+        columns = {c.name: getattr(old, c.name) for c in Trace.__table__.columns if c.name != "id"}
+        db.add(Trace(**columns | {"decode_version": old.decode_version + 1}))
+
+
+def stated_anew(db: Session, session: StudySession) -> None:
+    old = session.conditions
+    assert old is not None
+    columns = {c.name: getattr(old, c.name) for c in SessionConditions.__table__.columns if c.name not in ("id", "created_at")}
+    db.add(SessionConditions(**columns | {"revision": old.revision + 1}))
+
+
+def amplitude_stated(db: Session, session: StudySession) -> None:
+    db.add(CdbsAmplitude(visit_id=session.visit_id, hemisphere=Hemisphere.LEFT, program=0, amplitude_ma=2.2))
+
+
+def renumbered(_: Session, session: StudySession) -> None:
+    session.visit.number = 9
+
+
+def another_controller(_: Session, session: StudySession) -> None:
+    session._controller = "other"
+
+
+def another_channel(_: Session, session: StudySession) -> None:
+    session.control_channel = "no such channel"
+
+
+def proposed_again(_: Session, session: StudySession) -> None:
+    session.status = "proposed"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [decoded_again, stated_anew, amplitude_stated, renumbered, another_controller, another_channel, proposed_again],
+)
+def test_a_reading_that_was_kept_gives_way_to_every_kind_of_change(
+    change: Callable[[Session, StudySession], None], evaluated: int, db: Session
+) -> None:
+    """With QoCs, exclusions, stops, settings, policies, new sessions and the gate (`test_ranking`, above) all that `_changes` reads."""
+    assert stale(db) == []
+    assert stale(db) == []  # the second reading is the kept one
+    change(db, sessions_of_participant(db, participant_by_code(db, "P1", SYSTEM).id)[0])
+    db.commit()
+    assert stale(db) != [], change.__name__
+
+
+def test_what_a_transaction_read_before_a_change_does_not_hide_it(client: TestClient, evaluated: int, db: Session) -> None:
+    participant = participant_by_code(db, "P1", SYSTEM)
+    evaluation = repository.newest_evaluation(db, participant.id)
+    assert evaluation is not None
+    read = sessions_of_participant(db, participant.id)  # a page reads sessions, and meanwhile somebody else excludes one
+    assert not any(s.excluded_reason for s in read)
+    client.patch("/api/v1/sessions/1", json={"excluded_reason": "tablet froze"})
+    here = [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation)]
+    assert here == ["1 session newly left out"]
+    assert stale(db) == ["1 session newly left out"]
+
+
+def test_a_policy_that_is_retired_is_no_candidate_any_more_and_taken_back_it_is(
+    client: TestClient, policies: list[int], evaluate: Callable[..., int], db: Session
+) -> None:
+    """Verdicts, margins and retirement are read live: nothing is to be evaluated again for them."""
+    evaluate({i: estimate("dlsm", 50.0) for i in policies[:2]})
+    assert stale(db) == ["1 policy not in it: p2"]
+    client.patch(f"/api/v1/policies/{policies[2]}", json={"retired_reason": "unstable"})
+    assert stale(db) == []
+    client.patch(f"/api/v1/policies/{policies[0]}", json={"retired_reason": "an adverse event"})
+    ranked = client.get("/api/v1/participants/P1/ranking").json()["policies"]
+    assert {p["policy_id"]: p["retired"] for p in ranked} == {policies[0]: True, policies[1]: False}
+    client.patch(f"/api/v1/policies/{policies[2]}", json={"retired_reason": None})
+    assert stale(db) == ["1 policy not in it: p2"]
