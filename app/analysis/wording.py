@@ -104,14 +104,16 @@ def verdict(result: VerdictResult) -> str:
     """The verdict in one sentence that a clinician can quote."""
     name = CONTROLLER_NAMES[result.controller]
     if result.assessment is None:
+        if result.no_verdict is NoVerdict.NO_VISIT_AFTER_LOCK and result.locked.until is not None:
+            return f"No verdict on {name}: no visit began while these margins were locked."
         if result.no_verdict is NoVerdict.NO_VISIT_AFTER_LOCK:
             return f"No verdict on {name} yet: no visit was recorded after the margins were locked."
         return f"No verdict on {name}: no cDBS session has a grasp frequency of which the margin would be a share."
-    return verdict_sentence(name, result.assessment.verdict, len(result.visits))
+    return verdict_sentence(name, result.assessment.verdict, len(result.visits), planned=result.locked.until is None)
 
 
-def verdict_sentence(name: str, found: Verdict, visits: int) -> str:
-    """A verdict over so many visits, in one sentence."""
+def verdict_sentence(name: str, found: Verdict, visits: int, *, planned: bool) -> str:
+    """A verdict over so many visits, in one sentence. `planned`: whether it was asked how many further visits would settle it."""
     over = f"over {_n(visits, 'visit')}"
     if isinstance(found, NonInferiorAndSaving):
         return (
@@ -123,7 +125,8 @@ def verdict_sentence(name: str, found: Verdict, visits: int) -> str:
     open_ = f"{name} is not shown to be non-inferior on {_listed(found.open)}"
     if found.open == (ENERGY,):
         open_ = f"{name} is non-inferior on grasp, rating and tremor, but a saving of energy is not shown"
-    return f"Inconclusive {over}: {open_}; {_more(found)}."
+    more = _more(found) if planned or found.reason is not None else ""
+    return f"Inconclusive {over}: {open_}{f'; {more}' if more else ''}."
 
 
 def _more(found: Inconclusive) -> str:
@@ -159,17 +162,35 @@ def judged_as(outcome: str, unit: str) -> str:
     return {"rating": "points, in pairs", "tremor": "% points"}.get(outcome, unit)
 
 
-def verdict_kind(result: VerdictResult, locked: LockedMargins) -> str:
+def verdict_kind(result: VerdictResult) -> str:
     """Whether a verdict confirms, and why not."""
+    locked = result.locked
     if result.confirmatory:
         left = f" Visits before the lock ({_numbers(result.left_to_exploration)}) are left out." if result.left_to_exploration else ""
         return (
             f"Confirmatory: the margins (version {locked.version}) were locked on {locked.locked_at:%Y-%m-%d %H:%M} UTC by "
-            f"{locked.locked_by}, before every session that counts here.{left}"
+            f"{locked.locked_by}, before every session that counts here.{_superseded(locked)}{left}"
         )
     if locked.locked_at is None:
         return "Exploratory: nobody has locked the margins, so that they could still be chosen by the data."
     return "Exploratory: this takes in visits from before the margins were locked; it does not confirm."
+
+
+def _superseded(locked: LockedMargins) -> str:
+    """When a newer lock followed."""
+    if locked.until is None:
+        return ""
+    return f" A newer lock followed on {locked.until:%Y-%m-%d %H:%M} UTC; visits that began after it are judged by that one."
+
+
+def margins(found: LockedMargins) -> str:
+    """Margins in a line."""
+    m = found.margins
+    return f"grasp {100 * m.grasp_share:g} % of cDBS, rating {_n_points(m.rating_points)}, tremor {m.tremor_points:g} % points"
+
+
+def _n_points(points: float) -> str:
+    return f"{points:g} point{'' if points == 1 else 's'}"
 
 
 def disagreement(found: Comparison) -> str:

@@ -78,7 +78,12 @@ class Participant(Base):
     @property
     def margins_in_force(self) -> MarginsVersion:
         """The margins that verdicts go by, of rankings and analyses alike: those of the newest lock, else the newest."""
-        return self.margins_locks[-1].margins if self.margins_locks else self.current_margins
+        return self.margins_lock.margins if self.margins_lock else self.current_margins
+
+    @property
+    def margins_lock(self) -> MarginsLock | None:
+        """The lock in force, which is the newest; None where nobody locked any margins."""
+        return self.margins_locks[-1] if self.margins_locks else None
 
     @property
     def current_settings(self) -> SettingsVersion:

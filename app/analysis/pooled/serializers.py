@@ -25,7 +25,7 @@ def pooled_out(found: Pooled, times: Sequence[StepTime]) -> PooledOut:
     """Everything of the page."""
     return PooledOut(
         verdicts=[
-            ParticipantVerdictsOut(participant=p.evidence.participant, verdicts=[verdict_out(v, p) for v in p.verdicts])
+            ParticipantVerdictsOut(participant=p.evidence.participant, verdicts=[verdict_out(v) for v in p.verdicts])
             for p in found.participants
         ],
         metrics=[

@@ -88,6 +88,18 @@ class OutcomeVerdictOut(Model):
     text: str
 
 
+class MarginsLockedOut(Model):
+    """The margins that a verdict goes by."""
+
+    version: int
+    grasp_share: float
+    rating_points: float
+    tremor_points: float
+    locked_at: datetime | None
+    locked_by: str | None
+    superseded_at: datetime | None = Field(description="When a newer lock followed.")
+
+
 class VerdictOut(Model):
     """The verdict on one controller."""
 
@@ -96,22 +108,12 @@ class VerdictOut(Model):
     verdict: str = Field(description="non_inferior_and_saving, inferior, inconclusive or not_available.")
     sentence: str
     basis: str
+    margins: MarginsLockedOut
     visits: list[int]
     more_visits: int | None
     outcomes: list[OutcomeVerdictOut]
     energy_saving_percent: AverageOut | None
     stopped_session_ids: list[int]
-
-
-class MarginsLockedOut(Model):
-    """The margins that the verdicts go by."""
-
-    version: int
-    grasp_share: float
-    rating_points: float
-    tremor_points: float
-    locked_at: datetime | None
-    locked_by: str | None
 
 
 class PrimaryOut(Model):
@@ -122,4 +124,7 @@ class PrimaryOut(Model):
     family: str
     margins: MarginsLockedOut
     verdicts: list[VerdictOut]
+    earlier_verdicts: list[VerdictOut] = Field(
+        description="Under locks that a newer one followed, oldest first: of the visits that began between the two."
+    )
     results: list[TestedOut]

@@ -16,7 +16,7 @@ from app.analysis.primary.schemas import (
     VisitRowOut,
 )
 from app.analysis.primary.service import Primary
-from app.analysis.primary.verdict import SCALE, VerdictResult
+from app.analysis.primary.verdict import SCALE, LockedMargins, VerdictResult
 from ml.statistics.effects import Saving
 from ml.statistics.noninferiority import Inconclusive, Inferior, NonInferiorAndSaving
 from ml.statistics.ranksum import RankSum
@@ -33,21 +33,27 @@ VERDICT_NAMES = {NonInferiorAndSaving: "non_inferior_and_saving", Inferior: "inf
 
 def primary_out(found: Primary) -> PrimaryOut:
     """Everything of one participant."""
-    margins, locked = found.locked.margins, found.locked
     return PrimaryOut(
         participant=found.evidence.participant,
         level=LEVEL,
         family=wording.FAMILY,
-        margins=MarginsLockedOut(
-            version=locked.version,
-            grasp_share=margins.grasp_share,
-            rating_points=margins.rating_points,
-            tremor_points=margins.tremor_points,
-            locked_at=locked.locked_at,
-            locked_by=locked.locked_by,
-        ),
-        verdicts=[verdict_out(v, found) for v in found.verdicts],
+        margins=margins_out(found.locked),
+        verdicts=[verdict_out(v) for v in found.verdicts],
+        earlier_verdicts=[verdict_out(v) for v in found.earlier],
         results=[_tested(r, found) for r in found.results],
+    )
+
+
+def margins_out(locked: LockedMargins) -> MarginsLockedOut:
+    """Margins with their lock."""
+    return MarginsLockedOut(
+        version=locked.version,
+        grasp_share=locked.margins.grasp_share,
+        rating_points=locked.margins.rating_points,
+        tremor_points=locked.margins.tremor_points,
+        locked_at=locked.locked_at,
+        locked_by=locked.locked_by,
+        superseded_at=locked.until,
     )
 
 
@@ -92,7 +98,7 @@ def saving_out(found: Saving | Unavailable) -> AverageOut:
     )
 
 
-def verdict_out(result: VerdictResult, found: Primary) -> VerdictOut:
+def verdict_out(result: VerdictResult) -> VerdictOut:
     """A verdict with what is behind it."""
     a = result.assessment
     outcomes = []
@@ -118,7 +124,8 @@ def verdict_out(result: VerdictResult, found: Primary) -> VerdictOut:
         confirmatory=result.confirmatory,
         verdict=VERDICT_NAMES[type(a.verdict)] if a else "not_available",
         sentence=wording.verdict(result),
-        basis=wording.verdict_kind(result, found.locked),
+        basis=wording.verdict_kind(result),
+        margins=margins_out(result.locked),
         visits=list(result.visits),
         more_visits=a.verdict.more_visits if a and isinstance(a.verdict, Inconclusive) else None,
         outcomes=outcomes,

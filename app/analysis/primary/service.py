@@ -16,7 +16,7 @@ from app.analysis.evidence.measurements import choose, comparable_beta, of_contr
 from app.analysis.evidence.service import Evidence
 from app.analysis.primary import repository
 from app.analysis.primary.results import PLANNED, ControllerResult, results
-from app.analysis.primary.verdict import LockedMargins, VerdictResult, verdicts
+from app.analysis.primary.verdict import LockedMargins, VerdictResult, earlier_verdicts, verdicts
 from app.platform.errors import NotFound
 from app.platform.kept import kept
 from app.study.margins.service import margins_of
@@ -33,6 +33,7 @@ class Primary:
     Attributes:
         evidence: the sessions, and those left out. sessions: those that count, with comparable beta. beta_kind: which beta that is.
         results: controllers, then policies. verdicts: of the learned controllers. locked: the margins that they go by.
+        earlier: verdicts under the locks before, oldest first.
     """
 
     evidence: Evidence
@@ -41,6 +42,7 @@ class Primary:
     results: tuple[ControllerResult, ...]
     verdicts: tuple[VerdictResult, ...]
     locked: LockedMargins
+    earlier: tuple[VerdictResult, ...]
 
     @property
     def controllers(self) -> tuple[ControllerResult, ...]:
@@ -63,38 +65,46 @@ def of_all(db: Session, participants: Sequence[Participant], held: Sequence[Evid
     return [_of(h, locked_margins(p), names[p.id], picked[p.id]) for p, h in zip(participants, held, strict=True)]
 
 
-def _of(held: Evidence, locked: LockedMargins, names: Mapping[int, str], picked: Mapping[int, datetime]) -> Primary:
-    key = ("primary", held.key, locked, tuple(sorted(names.items())), tuple(sorted(picked.items())))
+def _of(held: Evidence, locks: Sequence[LockedMargins], names: Mapping[int, str], picked: Mapping[int, datetime]) -> Primary:
+    *before, locked = locks
+    key = ("primary", held.key, tuple(locks), tuple(sorted(names.items())), tuple(sorted(picked.items())))
 
     def compute() -> Primary:
         kind = comparable_beta(held.sessions, held.beta_unit, held.beta_source)
         sessions = with_comparable_beta(held.sessions, kind)
-        return Primary(held, sessions, kind, results(sessions, names, picked), _verdicts(held, locked), locked)
+        earlier = tuple(earlier_verdicts(sessions, _tested(sessions), before))
+        return Primary(held, sessions, kind, results(sessions, names, picked), _verdicts(held, locked), locked, earlier)
 
     return kept(key, compute)
 
 
 def verdicts_of(db: Session, participant: Participant, caller: Caller) -> tuple[VerdictResult, ...]:
     """The verdicts of `primary` alone, for pages that show no comparison: those of forty policies take many times as long."""
-    return _verdicts(evidence.of_all(db, [participant], caller)[0], locked_margins(participant))
+    return _verdicts(evidence.of_all(db, [participant], caller)[0], locked_margins(participant)[-1])
 
 
 def _verdicts(held: Evidence, locked: LockedMargins) -> tuple[VerdictResult, ...]:
     def compute() -> tuple[VerdictResult, ...]:
         sessions = with_comparable_beta(held.sessions, comparable_beta(held.sessions, held.beta_unit, held.beta_source))
-        tested = [c for c in PLANNED if any(s.controller is c for s in sessions)]
-        return tuple(verdicts(sessions, tested, locked))
+        return tuple(verdicts(sessions, _tested(sessions), locked))
 
     return kept(("verdicts", held.key, locked), compute)
 
 
-def locked_margins(participant: Participant) -> LockedMargins:
-    """The margins of the newest lock, else the present ones."""
-    if participant.margins_locks:
-        lock = participant.margins_locks[-1]
-        return LockedMargins(margins_of(lock.margins), lock.margins.version, lock.created_at, lock.created_by)
-    present = participant.current_margins
-    return LockedMargins(margins_of(present), present.version, None, None)
+def _tested(sessions: Sequence[Facts]) -> list[Controller]:
+    """Controllers that have a verdict."""
+    return [c for c in PLANNED if any(s.controller is c for s in sessions)]
+
+
+def locked_margins(participant: Participant) -> tuple[LockedMargins, ...]:
+    """The margins of every lock, oldest first; those in force come last, locked or not."""
+    if not participant.margins_locks:
+        return (LockedMargins(margins_of(participant.margins_in_force), participant.margins_in_force.version, None, None),)
+    until = [*(lock.created_at for lock in participant.margins_locks[1:]), None]
+    return tuple(
+        LockedMargins(margins_of(lock.margins), lock.margins.version, lock.created_at, lock.created_by, lock.reason, end)
+        for lock, end in zip(participant.margins_locks, until, strict=True)
+    )
 
 
 def result_of(found: Primary, key: str) -> ControllerResult:

@@ -1,9 +1,10 @@
 """Is energy saved without loss? Non-inferiority on the participant's margins, then the saving. No database.
 
-A verdict confirms where the margins were locked before every session that it rests on; else it explores. The margin of grasp is a share of
-the frequency under cDBS: the cDBS values are lowered by it, so that what is tested is "no slower than 1 - share of the same visit's cDBS",
-with the spread of that reference in the error. A rating has no equal steps: made better by its margin it must win at least half of the
-pairs with the same visit's cDBS ratings.
+A verdict confirms where the margins were locked before every session that it rests on; else it explores. A newer lock does not undo an
+older one: the visits that began between the two keep their verdict under the older, so that each is judged by the margins in force at its
+time. The margin of grasp is a share of the frequency under cDBS: the cDBS values are lowered by it, so that what is tested is "no slower
+than 1 - share of the same visit's cDBS", with the spread of that reference in the error. A rating has no equal steps: made better by its
+margin it must win at least half of the pairs with the same visit's cDBS ratings.
 """
 
 from __future__ import annotations
@@ -36,12 +37,18 @@ class NoVerdict(StrEnum):
 
 @dataclass(frozen=True)
 class LockedMargins:
-    """Margins as they were locked, or the present ones where nobody locked any."""
+    """Margins as they were locked, or the present ones where nobody locked any.
+
+    Attributes:
+        reason: of the lock. until: when a newer lock followed; None of the lock in force.
+    """
 
     margins: Margins
     version: int
     locked_at: datetime | None
     locked_by: str | None
+    reason: str | None = None
+    until: datetime | None = None
 
 
 @dataclass(frozen=True)
@@ -49,7 +56,7 @@ class VerdictResult:
     """The verdict on one controller.
 
     Attributes:
-        confirmatory: every session that it rests on began, and was recorded, after the lock.
+        locked: the margins that it goes by. confirmatory: every session that it rests on began, and was recorded, after their lock.
         assessment: of those sessions; None for the reason in `no_verdict`.
         visits: with both arms, among the sessions that it rests on. drawn_from: all visits of these sessions.
         left_to_exploration: visits of before the lock.
@@ -57,6 +64,7 @@ class VerdictResult:
     """
 
     controller: Controller
+    locked: LockedMargins
     confirmatory: bool
     assessment: Assessment | None
     no_verdict: NoVerdict | None
@@ -79,10 +87,25 @@ def verdicts(sessions: Sequence[Facts], controllers: Sequence[Controller], locke
     for controller in controllers:
         confirmed = _after(sessions, locked.locked_at)
         if locked.locked_at is not None:
-            found.append(_judge(sessions, confirmed, controller, locked.margins, confirmatory=True))
+            found.append(_judge(sessions, confirmed, controller, locked, confirmatory=True))
             if len(found[-1].visits) >= LEAST_VISITS or len(confirmed) == len(sessions):
                 continue
-        found.append(_judge(sessions, sessions, controller, locked.margins, confirmatory=False))
+        found.append(_judge(sessions, sessions, controller, locked, confirmatory=False))
+    return found
+
+
+def earlier_verdicts(sessions: Sequence[Facts], controllers: Sequence[Controller], locks: Sequence[LockedMargins]) -> list[VerdictResult]:
+    """What earlier locks concluded, by lock and controller: of the visits that began under each, by its margins; without planning.
+
+    Args:
+        locks: that a newer one followed, oldest first.
+    """
+    found = []
+    for lock in locks:
+        later = {s.visit for s in _after(sessions, lock.until)}
+        mine = [s for s in _after(sessions, lock.locked_at) if s.visit not in later]
+        before = [s for s in sessions if s.visit not in later]
+        found += [_judge(before, mine, controller, lock, confirmatory=True, plan=False) for controller in controllers]
     return found
 
 
@@ -95,18 +118,25 @@ def _after(sessions: Sequence[Facts], moment: datetime | None) -> list[Facts]:
 
 
 def _judge(
-    everything: Sequence[Facts], sessions: Sequence[Facts], controller: Controller, margins: Margins, confirmatory: bool
+    everything: Sequence[Facts],
+    sessions: Sequence[Facts],
+    controller: Controller,
+    locked: LockedMargins,
+    *,
+    confirmatory: bool,
+    plan: bool = True,
 ) -> VerdictResult:
     tested = of_controller(controller)
     chosen = choose_each(sessions, ("energy", *FAILURE), tested)
-    energy, outcomes = chosen["energy"], [_outcome(chosen[name], name, margins) for name in FAILURE]
+    energy, outcomes = chosen["energy"], [_outcome(chosen[name], name, locked.margins) for name in FAILURE]
     used = {s.visit for s in sessions}
     seen = {s.visit for s in sessions if tested(s)} & {s.visit for s in sessions if s.controller is Controller.CDBS}
     result, lacking = None, NoVerdict.NO_GRASP_REFERENCE if used else NoVerdict.NO_VISIT_AFTER_LOCK
     if all(o is not None for o in outcomes):
-        result = assess([o for o in outcomes if o is not None], energy.data, energy.stopped)
+        result = assess([o for o in outcomes if o is not None], energy.data, energy.stopped, plan=plan)
     return VerdictResult(
         controller,
+        locked,
         confirmatory,
         result,
         lacking if result is None else None,

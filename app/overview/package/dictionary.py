@@ -172,6 +172,9 @@ FIELDS: dict[str, tuple[Field, ...]] = {
     "noninferiority": _fields("""
         controller string Controller.
         confirmatory boolean Whether the margins were locked before every session that it rests on.
+        margins_version integer Version of the margins that it goes by, in margins.csv.
+        locked_day number When these margins were locked, days since enrolment; empty where nobody locked them.
+        superseded_day number When a newer lock followed, days since enrolment; empty of the margins in force.
         outcome string grasp, rating or tremor.
         margin number Largest loss that is accepted, in the unit of the outcome.
         grasp_share number The margin of grasp as a share of the frequency under cDBS.

@@ -56,7 +56,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
         "margins": _margin_rows(participant, day),
         "doses": _dose_rows(participant, day),
         "primary": [row[1:] for row in csv_rows(found)],
-        "noninferiority": _noninferiority_rows(found),
+        "noninferiority": _noninferiority_rows(found, day),
     }
     settings = [SettingsOut.model_validate(s).model_dump(mode="json", exclude={"created_at"}) for s in participant.settings]
     contents = {
@@ -122,14 +122,15 @@ def _dose_rows(participant: Participant, day: Days) -> list[tuple[Any, ...]]:
     ]
 
 
-def _noninferiority_rows(found: Primary) -> list[tuple[Any, ...]]:
+def _noninferiority_rows(found: Primary, day: Days) -> list[tuple[Any, ...]]:
     rows = []
-    for v in found.verdicts:
+    for v in (*found.earlier, *found.verdicts):
+        lock, drawn = v.locked, " ".join(map(str, v.drawn_from))
+        under = lock.version, day.of(lock.locked_at), day.of(lock.until)
         for o in v.assessment.outcomes if v.assessment else ():
             estimate = o.average.estimate if isinstance(o.average, Average) else None
-            drawn = " ".join(map(str, v.drawn_from))
-            share = found.locked.margins.grasp_share
-            rows.append((v.controller.value, v.confirmatory, o.name, o.margin, share, estimate, o.p_non_inferior, o.failures, drawn))
+            judged = o.name, o.margin, lock.margins.grasp_share, estimate, o.p_non_inferior, o.failures
+            rows.append((v.controller.value, v.confirmatory, *under, *judged, drawn))
     return rows
 
 

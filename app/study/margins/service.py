@@ -61,7 +61,7 @@ def lock_margins(db: Session, participant: Participant, version: int, reason: st
     current = participant.current_margins
     if current.version != version:
         raise Conflict(f"The present margins are version {current.version}, not {version}.", "Look at them and lock again.")
-    if participant.margins_locks and participant.margins_locks[-1].margins_version_id == current.id:
+    if participant.margins_lock and participant.margins_lock.margins_version_id == current.id:
         raise Conflict(f"Version {version} is locked already.", "A new lock would only take away evidence.")
     if not reason.strip():
         raise Invalid("A lock needs a reason.", "Say what the margins rest on, in a sentence.")

@@ -109,7 +109,63 @@ def test_the_lock_holds_what_was_locked_and_new_margins_need_a_new_one(client: T
     add_visits(4)
     assert client.get(PRIMARY).json()["margins"] | {"locked_at": 0} == {
         "version": 1, "grasp_share": 0.1, "rating_points": 1.0, "tremor_points": 10.0, "locked_at": 0, "locked_by": "admin@clinic.example",
+        "superseded_at": None,
     }  # fmt: skip
+
+
+def relock(client: TestClient, **margins: float) -> None:
+    """New margins, locked."""
+    change = client.put("/api/v1/participants/P1/margins", json={"margins": margins, "reason": "after the interim look"}).json()
+    body = {"version": change["version"], "reason": "protocol 4"}
+    assert client.post("/api/v1/participants/P1/margins/locks", json=body).status_code == 201
+
+
+def test_a_second_lock_keeps_the_verdict_of_the_first_under_the_margins_of_the_first(
+    client: TestClient, add_visits: AddVisits, add_session: AddSession
+) -> None:
+    lock(client)
+    add_visits(4, grasp=-1.2)
+    (first,) = client.get(PRIMARY).json()["verdicts"]
+    assert first["verdict"] == "inferior"
+    relock(client, grasp_share=0.5)
+    add_visits(6, first=5, seed=8)
+    answer = client.get(PRIMARY).json()
+    (now,), (before,) = answer["verdicts"], answer["earlier_verdicts"]
+    assert (now["verdict"], now["visits"], now["margins"]["version"]) == ("non_inferior_and_saving", [5, 6, 7, 8, 9, 10], 2)
+    assert now["margins"]["superseded_at"] is None
+    assert (before["verdict"], before["visits"], before["sentence"]) == ("inferior", [1, 2, 3, 4], first["sentence"])
+    assert (before["margins"]["version"], before["margins"]["grasp_share"], before["confirmatory"]) == (1, 0.1, True)
+    assert before["margins"]["superseded_at"] > before["margins"]["locked_at"]
+    assert before["outcomes"][0]["p_non_inferior"] == first["outcomes"][0]["p_non_inferior"]
+    page = client.get(PAGE).text
+    assert before["sentence"] in page
+    assert "grasp 10 % of cDBS, rating 1 point, tremor 10 % points" in page
+    locks = client.get("/participants/P1/margins").text
+    assert locks.index("protocol 4") < locks.index("protocol 3.2")
+
+
+def test_a_visit_that_began_under_the_first_lock_stays_with_it(client: TestClient, add_visits: AddVisits, add_session: AddSession) -> None:
+    lock(client)
+    add_visits(3)
+    relock(client, rating_points=2)
+    add_session("rl", visit=3, grasp=2.0, rating=7, tremor=10.0)
+    answer = client.get(PRIMARY).json()
+    assert [v["visits"] for v in answer["verdicts"] if v["confirmatory"]] == [[]]
+    (before,) = answer["earlier_verdicts"]
+    assert before["visits"] == [1, 2, 3]
+    assert before["outcomes"][1]["margin"] == 1.0
+
+
+def test_a_lock_without_a_visit_and_one_with_too_few_promise_no_number_of_visits(client: TestClient, add_visits: AddVisits) -> None:
+    lock(client)
+    relock(client, rating_points=2)
+    add_visits(2)
+    relock(client, rating_points=3)
+    none, few = client.get(PRIMARY).json()["earlier_verdicts"]
+    assert none["sentence"] == "No verdict on RL: no visit began while these margins were locked."
+    assert few["sentence"].endswith("nothing is concluded from fewer than 3 visits with both arms.")
+    assert "more visit" not in few["sentence"]
+    assert "would not settle" not in client.get(PAGE).text
 
 
 def test_a_constant_amplitude_saves_though_its_energy_never_varies(client: TestClient, add_session: AddSession) -> None:
