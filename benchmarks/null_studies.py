@@ -1,14 +1,16 @@
 """Simulated studies in which nothing is to be found, and studies at the margin: do the tests keep their level, do the intervals cover?
 
     python benchmarks/null_studies.py --quick
-    python benchmarks/null_studies.py [--studies 2000] [--workers 2] [--keep FOLDER] [--json FILE]
+    python benchmarks/null_studies.py --only level [--seed 1]
+    python benchmarks/null_studies.py [--studies 2000] [--seed 0] [--workers 2] [--keep FOLDER] [--json FILE]
 
 A study is one participant's visits with sessions of one controller and of cDBS. Every scenario adds to the noise of sessions what visits
 bring: days that differ, a controller that does better on some days and worse on others (its average effect being what is tested), drift
 over the day, ties, arms of different size, missing values, arms on different visits. The paper's test (all sessions as independent) is
-printed beside the primary one. Where the controller's effect differs between days, the same studies are made again with an effect that has
-no average in the latent value alone: of rating and tremor, which saturate, that is no null, and how often the primary test then errs is
-printed, for information. CPU seconds of one thread.
+printed beside the primary one, and so is Student's t of the visits' contrasts alone, which the primary test is for metrics without a floor
+or a ceiling. Where the controller's effect differs between days, the same studies are made again with an effect that has no average in
+the latent value alone; of rating and tremor, which saturate, that is no null of the metric's average, and how often the interval misses
+that average is printed too. CPU seconds of one thread.
 """
 
 from __future__ import annotations
@@ -26,15 +28,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support.null_worlds import METRICS, MINUTES, WORLDS, Tally, World, latent, layout, measure, metric_average
+from support.null_worlds import BOUNDED, METRICS, MINUTES, WORLDS, Tally, World, latent, layout, measure, metric_average, nothing_to_test
 
 from ml.statistics.association import within_visits
 from ml.statistics.effects import cliffs_delta, energy_saving
 from ml.statistics.noninferiority import Inconclusive, NonInferiorAndSaving, Outcome, assess
 from ml.statistics.ranksum import as_in_the_paper
-from ml.statistics.within_visits.contrasts import Average, Measurements, Unavailable, average, primary, visit_contrasts
+from ml.statistics.within_visits.averages import primary
+from ml.statistics.within_visits.contrasts import Average, Measurements, Unavailable, average, visit_contrasts
 from ml.statistics.within_visits.mixed_models import linear_comparison, rating_comparison, tremor_comparison
-from ml.statistics.within_visits.sensitivity import skewness_corrected
 from ml.statistics.within_visits.stratified import aligned_rank_test, shift_interval, van_elteren
 
 out = sys.stdout.write
@@ -58,9 +60,19 @@ def error(number: int, level: float = ALPHA) -> float:
     return float(np.sqrt(level * (1 - level) / number))
 
 
-def drawn(name: str, studies: int, either: bool) -> Iterator[tuple[int, str, Measurements]]:
+def student(data: Measurements) -> Average | Unavailable:
+    """Student's t of the visits' contrasts alone, whatever the metric: the primary test of before."""
+    return primary(replace(data, bounded=False), LEVEL)
+
+
+def rejects(found: Average | Unavailable) -> bool:
+    """A study that gives no evidence rejects nothing."""
+    return isinstance(found, Average) and found.p_value < ALPHA
+
+
+def drawn(name: str, studies: int, either: bool, seed: int) -> Iterator[tuple[int, str, Measurements]]:
     """Number, metric and data of the studies of one scenario; `either` as in `latent`."""
-    world, rng = WORLDS[name], np.random.default_rng(sum(map(ord, name)))
+    world, rng = WORLDS[name], np.random.default_rng(sum(map(ord, name)) + 1_000_000 * seed)
     for study in range(studies):
         design = layout(world, rng)
         for metric in METRICS:
@@ -69,41 +81,45 @@ def drawn(name: str, studies: int, either: bool) -> Iterator[tuple[int, str, Mea
             yield study, metric, measure(metric, latent(mine, 0.0, rng, design, either), design, world, rng)
 
 
-def null_studies(name: str, studies: int) -> Tally:
+def null_studies(name: str, studies: int, seed: int) -> Tally:
     """One scenario with no average effect. The slower analyses are made in every twentieth study, the paper's test in every fourth."""
     tally = Tally()
-    for study, metric, data in drawn(name, studies, either=True):
+    for study, metric, data in drawn(name, studies, True, seed):
         one_null(name, metric, data, tally, study)
     return tally
 
 
-def skewed_studies(name: str, studies: int) -> Tally:
+def skewed_studies(name: str, studies: int, seed: int) -> Tally:
     """One scenario whose effect has no average in the latent value: rating and tremor held against none, and against their own average."""
-    tally, own = Tally(), {metric: metric_average(WORLDS[name], metric) for metric in ("rating", "tremor")}
-    for _, metric, data in drawn(name, studies, either=False):
+    tally, own = Tally(), {metric: metric_average(WORLDS[name], metric) for metric in BOUNDED}
+    for _, metric, data in drawn(name, studies, False, seed):
         if metric in own:
-            found = primary(data, LEVEL)
-            shown = isinstance(found, Average)
-            tally.add((name, metric, "latent null"), shown and found.p_value < ALPHA)
-            tally.add((name, metric, "both"), larger_p(data) < ALPHA)
-            tally.add((name, metric, "misses its average"), shown and not found.low <= own[metric] <= found.high)
+            for label, found in (("primary", primary(data, LEVEL)), ("student", student(data))):
+                tally.add((name, metric, f"latent null {label}"), rejects(found))
+                missed = isinstance(found, Average) and not found.low <= own[metric] <= found.high
+                tally.add((name, metric, f"own average {label}"), missed)
     return tally
 
 
-def larger_p(data: Measurements) -> float:
-    """The larger of the primary p-value and that freed from skewness; 1 where there is none."""
-    found = primary(data, LEVEL), skewness_corrected(data, LEVEL)
-    return max(f.p_value if isinstance(f, Average) else 1.0 for f in found)
+def levels(name: str, studies: int, seed: int) -> Tally:
+    """The primary test of `null_studies` alone, of the same studies."""
+    tally = Tally()
+    for _, metric, data in drawn(name, studies, True, seed):
+        add_primary(name, metric, data, tally)
+    return tally
+
+
+def add_primary(name: str, metric: str, data: Measurements, tally: Tally) -> None:
+    """The primary test, and Student's t alone where that is another one."""
+    found = primary(data, LEVEL)
+    tally.add((name, metric, "primary"), rejects(found))
+    tally.add((name, metric, "student"), rejects(student(data) if metric in BOUNDED else found))
+    tally.add((name, metric, "primary cover"), found.low <= 0 <= found.high if isinstance(found, Average) else None)
 
 
 def one_null(name: str, metric: str, data: Measurements, tally: Tally, study: int) -> None:
     """All tests of one metric of one study."""
-    found = primary(data, LEVEL)
-    shown = isinstance(found, Average)
-    tally.add((name, metric, "available"), shown)
-    # A study that gives no evidence rejects nothing.
-    tally.add((name, metric, "primary"), shown and found.p_value < ALPHA)
-    tally.add((name, metric, "primary cover"), found.low <= 0 <= found.high if shown else None)
+    add_primary(name, metric, data, tally)
     if study % 4 == 0:
         plain, plain_cover = naive(data)
         tally.add((name, metric, "naive"), plain)
@@ -142,13 +158,13 @@ MARGINS = {"grasp": 0.2, "rating": 0.2, "tremor": 15.0}
 """Hz; probability; per cent."""
 
 
-def margin_studies(visits: int, studies: int) -> Tally:
+def margin_studies(visits: int, studies: int, seed: int) -> Tally:
     """Grasp exactly at its margin, or everything equal to cDBS; energy saved by a third."""
     tally = Tally()
     for slope, stops in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.05), (0.5, 0.05)):
         world = World(visits=visits, each=4, slope=slope)
         for kind, number in (("at margin", studies), ("equal", studies // 4)):
-            rng = np.random.default_rng(visits)
+            rng = np.random.default_rng(visits + 1_000_000 * seed)
             for study in range(number):
                 shown, saving = judged(world, kind == "at margin", stops, rng, study)
                 key = (f"{visits} visits", f"day x dose {slope:g}", f"stopped {stops:.0%}", kind)
@@ -179,29 +195,36 @@ def judged(world: World, at_margin: bool, stops: float, rng: np.random.Generator
     return shown, saving
 
 
-def power_studies(visits: int, studies: int) -> Tally:
-    """Power of the primary test, the exact one within visits and the paper's for an effect of one standard deviation of a session."""
+def power_studies(visits: int, studies: int, seed: int) -> Tally:
+    """Power of the primary test, of Student's t alone, of the exact one within visits and of the paper's, for an effect of one standard
+    deviation of a session."""
     tally = Tally()
     for slope in (0.0, 0.5):
-        world, rng = World(visits=visits, each=4, slope=slope), np.random.default_rng(visits)
+        world, rng = World(visits=visits, each=4, slope=slope), np.random.default_rng(visits + 1_000_000 * seed)
         for _ in range(studies):
             design = layout(world, rng)
-            data = measure("grasp", latent(world, 1.0, rng, design), design, world, rng)
-            key = f"{visits} visits, day x dose {slope:g}"
-            found, exact = primary(data, LEVEL), van_elteren(data)
-            tally.add((key, "primary"), isinstance(found, Average) and found.p_value < ALPHA)
-            tally.add((key, "both"), larger_p(data) < ALPHA)
-            tally.add((key, "van elteren"), not isinstance(exact, Unavailable) and exact.p_value < ALPHA)
-            tally.add((key, "naive"), naive(data)[0])
+            z = latent(world, 1.0, rng, design)
+            for metric in ("grasp", *BOUNDED):
+                data = measure(metric, z, design, world, rng)
+                key = f"{visits} visits, day x dose {slope:g}, {metric}"
+                tally.add((key, "primary"), rejects(primary(data, LEVEL)))
+                tally.add((key, "student"), rejects(student(data)))
+                if metric == "grasp":
+                    exact = van_elteren(data)
+                    tally.add((key, "van elteren"), not isinstance(exact, Unavailable) and exact.p_value < ALPHA)
+                    tally.add((key, "naive"), naive(data)[0])
     return tally
 
 
-def cell(work: Callable[[Any, int], Tally], argument: str | int, studies: int, folder: Path | None) -> Tally:
+Part = Callable[[Any, int, int], Tally]
+
+
+def cell(work: Part, argument: str | int, studies: int, seed: int, folder: Path | None) -> Tally:
     """One part of the benchmark; read where the folder has it from an earlier run of as many studies."""
-    path = folder / f"{work.__name__}-{re.sub('[^a-z0-9]+', '-', str(argument).lower())}-{studies}.json" if folder else None
+    path = folder / f"{work.__name__}-{re.sub('[^a-z0-9]+', '-', str(argument).lower())}-{studies}-{seed}.json" if folder else None
     if path and path.exists():
         return Tally.read(path)
-    tally = work(argument, studies)
+    tally = work(argument, studies, seed)
     if path:
         tally.write(path)
     return tally
@@ -209,19 +232,8 @@ def cell(work: Callable[[Any, int], Tally], argument: str | int, studies: int, f
 
 def degenerate() -> int:
     """Studies that hold nothing to test: how many got an answer other than a typed one. Any crash ends the benchmark."""
-    visit, arms = np.repeat(np.arange(5), 4), np.tile([False, True], 10)
-    nan = np.full(20, np.nan)
-    cases = {
-        "all tied": Measurements.of(np.ones(20), visit, arms),
-        "one session": Measurements.of([1.0], [1], [True]),
-        "nothing": Measurements.of([], [], []),
-        "no value": Measurements.of(nan, visit, arms),
-        "one visit": Measurements.of(np.arange(20.0), np.zeros(20), arms),
-        "one arm": Measurements.of(np.arange(20.0), visit, np.zeros(20)),
-        "arms apart": Measurements.of(np.arange(20.0), visit, visit % 2 == 0),
-    }
     wrong = 0
-    for data in cases.values():
+    for data in nothing_to_test().values():
         answers = [average(visit_contrasts(data)), primary(data), cliffs_delta(data), energy_saving(data), linear_comparison(data)]
         typed = isinstance(answers[1], Unavailable) and isinstance(answers[4], Unavailable)
         wrong += not typed
@@ -264,16 +276,18 @@ def speed() -> dict[str, float]:
 def show_null(tally: Tally, studies: int) -> dict[str, float]:
     """The table of null studies and its worst cells; a cell is a scenario and metrics of one law (the continuous ones, rating, tremor)."""
     out(f"null studies, {studies} of each scenario; share rejected at {ALPHA:g} (worst cell), intervals of {LEVEL:g} (range of cells)\n")
-    labels, intervals = ("primary", "van elteren", "aligned", "naive"), ("primary", "delta", "saving", "slope", "mixed", "shift", "naive")
+    labels = ("primary", "student", "van elteren", "aligned", "naive")
+    intervals = ("primary", "delta", "saving", "slope", "mixed", "shift", "naive")
     out(f"{'':<22}" + "".join(f"{label:>12}" for label in labels) + "".join(f"{label:>13}" for label in intervals) + "\n")
     for name in WORLDS:
-        rates = [max(tally.pooled(name, law, label)[0] for law in LAWS) for label in labels]
+        rates = [max(tally.pooled(name, law, label)[0] for law in LAWS) for label in labels]  # NaN of what was not made
         out(f"{name:<22}" + "".join(f"{r:>12.3f}" for r in rates))
         for label in intervals:
             shares = [share for law in LAWS for share, n in [tally.pooled(name, law, f"{label} cover")] if n]
             out(f"{f'{min(shares):.3f}-{max(shares):.3f}' if shares else '-':>13}")
         out("\n")
     rejected = [(name, law, *tally.pooled(name, law, "primary")) for name in WORLDS for law in LAWS]
+    rejected += [(f"{n}, latent", (m,), *tally.share(n, m, "latent null primary")) for n in SKEWED for m in BOUNDED]
     above = [(n, law, r) for n, law, r, number in rejected if r > ALPHA + 2 * error(number)]
     out(f"cells of the primary test above its level by more than two errors: {len(above)} of {len(rejected)}")
     out(f" (chance alone: {0.0228 * len(rejected):.1f}) {', '.join(f'{n}/{law[0]} {r:.4f}' for n, law, r in above)}\n\n")
@@ -294,14 +308,15 @@ def show_null(tally: Tally, studies: int) -> dict[str, float]:
 
 
 def show_skewed(tally: Tally) -> None:
-    """Studies whose null is one of the latent value alone; for information, not among the figures."""
-    out("the effect differs between days, without an average in the latent value; rating, tremor: their own average | share rejected |")
-    out(" the larger p, of it and of that freed from skewness | share of intervals that miss their own average\n")
+    """Studies whose null is one of the latent value alone."""
+    out("the effect differs between days, without an average in the latent value: average in the metric | share rejected, primary and t |")
+    out(" share of intervals that miss the average in the metric, primary and t\n")
     for name in SKEWED:
-        for metric in ("rating", "tremor"):
-            rejected, both, missed = (tally.share(name, metric, label)[0] for label in ("latent null", "both", "misses its average"))
+        for metric in BOUNDED:
+            labels = [f"{kind} {test}" for kind in ("latent null", "own average") for test in ("primary", "student")]
+            shares = [tally.share(name, metric, label)[0] for label in labels]
             own = metric_average(WORLDS[name], metric)
-            out(f"{name:<22}{metric:<8}{own:>8.2f} |{rejected:>8.4f} |{both:>8.4f} |{missed:>8.4f}\n")
+            out(f"{name:<22}{metric:<8}{own:>8.2f} |{shares[0]:>8.4f}{shares[1]:>8.4f} |{shares[2]:>8.4f}{shares[3]:>8.4f}\n")
     out("\n")
 
 
@@ -323,33 +338,50 @@ def show_margin(tally: Tally) -> dict[str, float]:
     return {"non_inferior_at_margin": max(pooled), "non_inferior_at_margin_worst_cell": worst, "non_inferior_below_three_visits": few}
 
 
+def show_power(tally: Tally) -> None:
+    """What is found of an effect."""
+    out("\npower for an effect of one standard deviation of a session, 4 sessions of either arm a visit:")
+    out(" primary, t alone, van Elteren, the paper's\n")
+    for key in dict.fromkeys(k[0] for k in tally.counts if len(k) == 2):
+        labels = ("primary", "student", "van elteren", "naive")
+        out(f"  {key:<36}" + "".join(f"{tally.share(key, label)[0]:>8.3f}" for label in labels) + "\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="150 studies of each scenario")
+    parser.add_argument("--only", choices=("level", "margin", "power"), help="level: the primary test alone in the null studies")
     parser.add_argument("--studies", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0, help="of the studies; those of two seeds have nothing in common")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--keep", type=Path, help="a folder for finished parts, which a later run of the same code reads")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     studies = 150 if arguments.quick else arguments.studies
     tally = Tally()
-    parts: list[tuple[Callable[[Any, int], Tally], str | int, int]] = [(null_studies, name, studies) for name in WORLDS]
-    parts += [(skewed_studies, name, studies) for name in SKEWED]
-    parts += [(margin_studies, v, studies // 2 if v > 2 else studies // 20) for v in (12, 8, 6, 4, 3, 2, 1)]
-    parts += [(power_studies, v, studies // 4) for v in (3, 4, 6, 8)]
+    only, parts = arguments.only, list[tuple[Part, str | int, int]]()
+    if only in (None, "level"):
+        parts += [(levels if only else null_studies, name, studies) for name in WORLDS]
+        parts += [(skewed_studies, name, studies) for name in SKEWED]
+    if only in (None, "margin"):
+        parts += [(margin_studies, v, studies // 2 if v > 2 else studies // 20) for v in (12, 8, 6, 4, 3, 2, 1)]
+    if only in (None, "power"):
+        parts += [(power_studies, v, studies // 4) for v in (3, 4, 6, 8)]
     if arguments.keep:
         arguments.keep.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(arguments.workers) as pool:
-        for part in [pool.submit(cell, *p, arguments.keep) for p in parts]:
+        for part in [pool.submit(cell, *p, arguments.seed, arguments.keep) for p in parts]:
             tally.merge(part.result())
-    figures = show_null(tally, studies)
-    show_skewed(tally)
-    figures |= show_margin(tally) | {"degenerate_answers_wrong": float(degenerate())}
-    out("\npower for an effect of one standard deviation of a session, 4 sessions of either arm a visit:")
-    out(" primary, van Elteren, the paper's, the larger p\n")
-    for key in dict.fromkeys(k[0] for k in tally.counts if len(k) == 2):
-        out(f"  {key:<28}" + "".join(f"{tally.share(key, label)[0]:>8.3f}" for label in ("primary", "van elteren", "naive", "both")) + "\n")
-    figures |= speed()
+    figures: dict[str, float] = {}
+    if only in (None, "level"):
+        figures |= show_null(tally, studies)
+        show_skewed(tally)
+    if only in (None, "margin"):
+        figures |= show_margin(tally)
+    if only in (None, "power"):
+        show_power(tally)
+    if only is None:
+        figures |= {"degenerate_answers_wrong": float(degenerate())} | speed()
     figures["cpu_s"] = sum(os.times()[:4])
     out(json.dumps(figures, indent=1) + "\n")
     if arguments.json:

@@ -13,6 +13,8 @@ from ml.statistics.within_visits.contrasts import Measurements
 MINUTES = 10
 METRICS = ("grasp", "beta", "rating", "tremor", "energy")
 RESOLUTION = {"rating": 1.0, "tremor": 100 / MINUTES}
+BOUNDED = ("rating", "tremor")
+"""Metrics with a floor or a ceiling."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def measure(metric: str, z: np.ndarray, design: tuple[np.ndarray, np.ndarray, np
         "energy": lambda: 1.0 + 0.05 * z,
     }[metric]()
     value = np.where(rng.random(value.size) < world.missing, np.nan, value)
-    return Measurements.of(value, visit, tested, order=order, resolution=RESOLUTION.get(metric, 0.0))
+    return Measurements.of(value, visit, tested, order=order, resolution=RESOLUTION.get(metric, 0.0), bounded=metric in BOUNDED)
 
 
 def metric_average(world: World, metric: str, visits: int = 20_000, seed: int = 0) -> float:
@@ -123,6 +125,21 @@ def metric_average(world: World, metric: str, visits: int = 20_000, seed: int = 
     value = measure(metric, latent(many, 0.0, rng, design), design, many, rng).value
     means = [np.bincount(visit, value * arm) / np.bincount(visit, arm) for arm in (tested.astype(float), (~tested).astype(float))]
     return float(np.mean(means[0] - means[1]))
+
+
+def nothing_to_test() -> dict[str, Measurements]:
+    """Studies that hold nothing to test."""
+    visit, arms = np.repeat(np.arange(5), 4), np.tile([False, True], 10)
+    nan = np.full(20, np.nan)
+    return {
+        "all tied": Measurements.of(np.ones(20), visit, arms),
+        "one session": Measurements.of([1.0], [1], [True]),
+        "nothing": Measurements.of([], [], []),
+        "no value": Measurements.of(nan, visit, arms),
+        "one visit": Measurements.of(np.arange(20.0), np.zeros(20), arms),
+        "one arm": Measurements.of(np.arange(20.0), visit, np.zeros(20)),
+        "arms apart": Measurements.of(np.arange(20.0), visit, visit % 2 == 0),
+    }
 
 
 class Tally:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.statistics.bootstrap import resamples
+from ml.statistics.within_visits.averages import primary
 from ml.statistics.within_visits.contrasts import (
     Average,
     Measurements,
@@ -16,7 +17,6 @@ from ml.statistics.within_visits.contrasts import (
     Unavailable,
     VisitContrasts,
     average,
-    primary,
     visit_contrasts,
 )
 
@@ -59,7 +59,7 @@ def cliffs_delta(data: Measurements, level: float = 0.95) -> Average | Unavailab
     Returns:
         The average over visits, between -1 and 1 with its interval cut there; or why there is none, as in `visits.primary`.
     """
-    wins = primary(data, level, "win_probability")
+    wins = primary(replace(data, bounded=True), level, "win_probability")  # a share of pairs ends at 0 and 1, whatever the metric
     if isinstance(wins, Unavailable):
         return wins
     low, high = max(-1.0, 2 * wins.low - 1), min(1.0, 2 * wins.high - 1)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ml.statistics.effects import Saving, energy_saving, saving_contrasts
 from ml.statistics.multiplicity import hommel
 from ml.statistics.power import MOST_VISITS, Posterior, Target, first_reaching, posterior, success
+from ml.statistics.within_visits.averages import primary
 from ml.statistics.within_visits.contrasts import (
     Adjustment,
     Average,
@@ -26,7 +27,6 @@ from ml.statistics.within_visits.contrasts import (
     Scale,
     Unavailable,
     average,
-    primary,
     visit_contrasts,
 )
 
@@ -88,7 +88,10 @@ class Outcome:
             raise ValueError(f"`stopped` of {self.name} has the shape {self.stopped.shape}, its values {self.data.value.shape}")
 
     def counted(self, rule: FailureRule) -> Measurements:
-        """The sessions with failures filled in, turned so that higher is better; `ordinal` values with the margin added."""
+        """The sessions with failures filled in, turned so that higher is better; `ordinal` values with the margin added.
+
+        They count as unbounded: one-sided, to free Student's ratio from skewness mends little of its error and costs conclusions.
+        """
         sign = 1.0 if self.higher_is_better else -1.0
         value = sign * self.data.value
         if self.scale == "ordinal":
@@ -98,7 +101,7 @@ class Outcome:
             known = sign * self.data.value[np.isfinite(self.data.value)]
             worst = sign * self.failure if self.failure is not None else float(known.min()) if known.size else np.nan
             value = np.where(rows, worst, value)
-        return replace(self.data, value=value)
+        return replace(self.data, value=value, bounded=False)
 
     @property
     def loss(self) -> float:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from ml.statistics.within_visits.contrasts import (
+    LEAST_FOR_SKEWNESS,
     Measurements,
     Reason,
     Scale,
@@ -23,6 +24,7 @@ from ml.statistics.within_visits.contrasts import (
     VisitContrasts,
     pairs,
     step_of,
+    unskewed,
     visit_contrasts,
 )
 
@@ -129,6 +131,11 @@ def success(of: Posterior, target: Target, sessions_per_arm: float, *, seed: int
     t = (mean[:, -most:] - target.value) / error
     tail = target.alpha / 2 if target.alternative == "two_sided" else target.alpha
     critical = stdtrit(np.maximum(n - 1, 1), 1 - tail)
+    if of.contrasts.bounded:  # the smaller ratio counts, as in the test itself
+        third = np.cumsum(values**3, axis=1) / count - 3 * mean * np.cumsum(values**2, axis=1) / count + 2 * mean**3
+        skewness = np.where(n >= LEAST_FOR_SKEWNESS, third[:, -most:] / (error * np.sqrt(n)) ** 3, 0.0)
+        other = unskewed(t, skewness, n)
+        t = np.minimum(np.abs(t), np.abs(other)) if target.alternative == "two_sided" else np.minimum(t, other)
     shown = (np.abs(t) if target.alternative == "two_sided" else t) > critical
     return np.asarray(shown & (n >= max(target.least_visits, 2)), dtype=np.bool_)
 

@@ -18,6 +18,9 @@ RESOLUTION = {"rating": 1.0, "energy": 0.05}
 """Step between neighbouring values of a metric; 0 where it is continuous. Stimulators deliver steps of 0.1 mA: at cDBS of 4 mA, 0.05 of its
 energy. Without it, a controller of one constant amplitude would save the same at every visit, and no test could say so."""
 
+BOUNDED = frozenset({"rating", "tremor"})
+"""Metrics that end at a floor or a ceiling which sessions reach: a rating of 1 to 10, a share of the time."""
+
 
 @dataclass(frozen=True)
 class Chosen:
@@ -55,7 +58,8 @@ def choose_each(sessions: Sequence[Facts], metrics: Sequence[str], is_tested: Ca
     found = {}
     for metric in metrics:
         value = np.array([s.values.get(metric, nothing) for s in taken], dtype=np.float64)
-        found[metric] = Chosen(replace(plain, value=value, resolution=RESOLUTION.get(metric, 0.0)), taken, stopped, policy)
+        data = replace(plain, value=value, resolution=RESOLUTION.get(metric, 0.0), bounded=metric in BOUNDED)
+        found[metric] = Chosen(data, taken, stopped, policy)
     return found
 
 

@@ -18,13 +18,12 @@ from app.study.models import Controller
 from ml.statistics.effects import Saving, cliffs_delta, energy_saving
 from ml.statistics.multiplicity import benjamini_hochberg, holm
 from ml.statistics.ranksum import RankSum, as_in_the_paper
+from ml.statistics.within_visits.averages import order_imbalance, primary
 from ml.statistics.within_visits.contrasts import (
     Average,
     Measurements,
     Unavailable,
     VisitContrasts,
-    order_imbalance,
-    primary,
     visit_contrasts,
 )
 from ml.statistics.within_visits.sensitivity import Sensitivity, sensitivities

@@ -13,7 +13,7 @@ import math
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import rankdata, t
@@ -22,6 +22,7 @@ Row = dict[str, str]
 KNOWN_SHARE = 0.5
 UNBALANCED = 0.5
 RESOLUTION = {"rating": 1.0, "energy": 0.05}
+BOUNDED = ("rating", "tremor")
 COLUMNS = {"grasp": "grasp_hz", "rating": "rating_1_10", "tremor": "tremor_percent"}
 WORST = {"rating": 1.0, "tremor": 100.0}
 HIGHER_IS_BETTER = {"grasp": True, "rating": True, "tremor": False}
@@ -112,8 +113,43 @@ class Contrasts:
         return float(np.mean([resolution**2 / 12 * (1 / one.size + 1 / two.size) for one, two in self.arms]))
 
 
-def average(c: Contrasts, resolution: float, adjust: bool, ordinal: bool = False) -> tuple[float, float, int] | None:
-    """Average over visits, its standard error and degrees of freedom; freed from a linear drift where `adjust`.
+class Average(NamedTuple):
+    """Average over visits, its standard error, the number of visits, and the skewness of their contrasts.
+
+    Of a metric with a floor or a ceiling the larger p counts of Student's ratio and of the same freed from skewness (Hall 1992), and the
+    interval holds both; of others the skewness is 0.
+    """
+
+    estimate: float
+    error: float
+    visits: int
+    skewness: float
+
+    def ratios(self, value: float) -> tuple[float, float]:
+        """Student's ratio against a value, and the same freed from skewness."""
+        n, g, ratio = self.visits, self.skewness, (self.estimate - value) / self.error
+        u = ratio / math.sqrt(n)
+        return ratio, ratio + math.sqrt(n) * (g * u**2 / 3 + g**2 * u**3 / 27 + g / (6 * n))
+
+    def p_above(self, value: float) -> float:
+        """One-sided p of an average of `value` or less."""
+        return float(t.sf(min(self.ratios(value)), self.visits - 1))
+
+    def p_value(self) -> float:
+        """Two-sided p of no difference."""
+        return 2 * float(t.sf(min(abs(r) for r in self.ratios(0.0)), self.visits - 1))
+
+    def interval(self) -> tuple[float, float]:
+        """Of 95 %."""
+        n, g, q = self.visits, self.skewness, float(t.ppf(0.975, self.visits - 1))
+        ends = [-q, q]
+        if abs(g) >= 1e-6:
+            ends += [float(3 / g * (np.cbrt(1 + g * (end / math.sqrt(n) - g / (6 * n))) - 1)) * math.sqrt(n) for end in (-q, q)]
+        return self.estimate - max(ends) * self.error, self.estimate - min(ends) * self.error
+
+
+def average(c: Contrasts, resolution: float, adjust: bool, bounded: bool, ordinal: bool = False) -> Average | None:
+    """Average over visits; freed from a linear drift where `adjust`.
 
     The drift's slope is common to all visits, so that its error is that of leaving out one visit at a time. `ordinal`: of shares of pairs.
     """
@@ -128,25 +164,26 @@ def average(c: Contrasts, resolution: float, adjust: bool, ordinal: bool = False
         if not np.isfinite(slopes).all():
             return None
         freed = [contrast(c.value - slope * c.order) for slope in slopes]
-        estimate = float(np.mean(freed[0]))
+        estimate, used = float(np.mean(freed[0])), freed[0]
         without = [float(np.mean(np.delete(freed[1 + k], k))) for k in range(n)]
         variance = (n - 1) / n * float(np.sum((np.array(without) - np.mean(without)) ** 2))
         variance = variance + floor / n if ordinal else max(variance, floor / n)
     else:
-        spread = float(plain.var(ddof=1))
+        spread, used = float(plain.var(ddof=1)), plain
         estimate, variance = float(plain.mean()), (spread + floor if ordinal else max(spread, floor)) / n
     if math.sqrt(variance) <= 1e-12 * max(1.0, float(np.abs(plain).max())):
         return None
-    return estimate, math.sqrt(variance), n - 1
+    skewness = float(np.mean((used - used.mean()) ** 3)) / (n * variance) ** 1.5 if n > 2 and bounded else 0.0
+    return Average(estimate, math.sqrt(variance), n, skewness)
 
 
-def primary(c: Contrasts, resolution: float, ordinal: bool = False) -> tuple[float, float, int] | None:
+def primary(c: Contrasts, resolution: float, bounded: bool, ordinal: bool = False) -> Average | None:
     """The average, freed from the order where one arm stands later than the other by more than half a standard deviation."""
     if abs(c.imbalance()) > UNBALANCED:
-        adjusted = average(c, resolution, True, ordinal)
+        adjusted = average(c, resolution, True, bounded, ordinal)
         if adjusted is not None:
             return adjusted
-    return average(c, resolution, False, ordinal)
+    return average(c, resolution, False, bounded, ordinal)
 
 
 def rank_sum_p(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> float:
@@ -179,12 +216,10 @@ def primary_table(sessions: Sequence[dict[str, Any]], controllers: Sequence[str]
             tested = [s["controller"] == controller for s in taken]
             c = Contrasts([s[metric] for s in taken], [s["visit"] for s in taken], tested, [s["order"] for s in taken])
             row: dict[str, float] = {}
-            result = primary(c, RESOLUTION.get(metric, 0.0))
+            result = primary(c, RESOLUTION.get(metric, 0.0), metric in BOUNDED)
             if result is not None:
-                estimate, error, degrees = result
-                half = float(t.ppf(0.975, degrees)) * error
-                row = {"estimate": estimate, "low": estimate - half, "high": estimate + half}
-                row["p"] = 2 * float(t.sf(abs(estimate) / error, degrees))
+                low, high = result.interval()
+                row = {"estimate": result.estimate, "low": low, "high": high, "p": result.p_value()}
             x = np.array([s[metric] for s in taken if s["controller"] == controller])
             y = np.array([s[metric] for s in taken if s["controller"] == "cdbs"])
             x, y = x[np.isfinite(x)], y[np.isfinite(y)]
@@ -222,11 +257,11 @@ def noninferiority(sessions: Sequence[dict[str, Any]], row: Row, grasp_share: fl
     if len(c.arms) < 3:
         return {}
     resolution = RESOLUTION.get(outcome, 0.0)
-    candidates = [primary(c, resolution, ordinal)]
+    candidates = [primary(c, resolution, False, ordinal)]
     if failed.any():
-        candidates.append(average(c, resolution, False, ordinal))  # a drift must not explain a failure away
+        candidates.append(average(c, resolution, False, False, ordinal))  # a drift must not explain a failure away
     loss = 0.5 if ordinal else -margin
-    found = [(estimate, float(t.cdf((loss - estimate) / error, degrees))) for estimate, error, degrees in filter(None, candidates)]
+    found = [(one.estimate, one.p_above(loss)) for one in filter(None, candidates)]
     if not found:
         return {}
     estimate, p = max(found, key=lambda pair: pair[1])

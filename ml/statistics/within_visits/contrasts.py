@@ -5,6 +5,10 @@ of freedom fewer than visits. Days that differ, days on which the controller doe
 size all end up in that spread, so that sessions of one visit never count as independent evidence. The test keeps its level for contrasts
 that are normal with unequal variances (Bakirov and Szekely 2005; Ibragimov and Mueller 2010): two-sided up to 8.3 %, one-sided up to 5 %
 for 2 to 14 visits.
+
+A metric with a floor or a ceiling has skewed contrasts where the effect differs between visits, and Student's ratio then errs. Of such a
+metric the larger p counts of Student's ratio and of the same freed from its skewness (Hall 1992), and the
+interval holds both. The rule looks at the metric alone, never at what was measured.
 """
 
 from __future__ import annotations
@@ -12,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,9 +28,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Scale = Literal["difference", "win_probability", "ordinal"]
 
-UNBALANCED = 0.5
-"""Arms whose mean places in the order differ by more than this many standard deviations of the place, on average over visits, are compared
-with an adjustment for the order. The rule looks at the design alone, never at what was measured."""
+LEAST_FOR_SKEWNESS = 3
+"""Visits below which contrasts tell no skewness: two are always symmetric."""
 
 
 class Reason(StrEnum):
@@ -77,6 +80,7 @@ class Measurements:
         order: place or start time of the session in its visit (any unit), [n]; None where it is not known.
         medication_h: hours since the last dose, [n], NaN where not known; None where none is known.
         resolution: step between neighbouring values (1 for a rating in whole points), 0 for a continuous metric.
+        bounded: whether the metric ends at a floor or a ceiling that sessions reach (a rating of 1 to 10, a share of the time).
 
     Raises:
         ValueError: shapes that differ, an infinite value, or a resolution below zero.
@@ -88,6 +92,7 @@ class Measurements:
     order: Floats | None = None
     medication_h: Floats | None = None
     resolution: float = 0.0
+    bounded: bool = False
 
     def __post_init__(self) -> None:
         shape = self.value.shape
@@ -110,6 +115,7 @@ class Measurements:
         order: ArrayLike | None = None,
         medication_h: ArrayLike | None = None,
         resolution: float = 0.0,
+        bounded: bool = False,
     ) -> Measurements:
         """From anything that numpy can read; errors as in the class."""
         return cls(
@@ -119,6 +125,7 @@ class Measurements:
             None if order is None else np.asarray(order, dtype=np.float64).ravel(),
             None if medication_h is None else np.asarray(medication_h, dtype=np.float64).ravel(),
             resolution,
+            bounded,
         )
 
     def take(self, rows: NDArray[np.bool_] | Integers) -> Measurements:
@@ -130,6 +137,7 @@ class Measurements:
             None if self.order is None else self.order[rows],
             None if self.medication_h is None else self.medication_h[rows],
             self.resolution,
+            self.bounded,
         )
 
     @cached_property
@@ -165,7 +173,7 @@ class VisitContrasts:
         visit: visit numbers, [V]. contrast: controller less cDBS (or the win probability), [V].
         n_tested, n_cdbs: measured sessions of either arm, [V].
         floor: smallest variance that a contrast can have given the steps in which the metric is measured, [V]; 0 for a continuous one.
-        null: value of the contrast where the arms do not differ.
+        null: value of the contrast where the arms do not differ. bounded: whether a contrast ends at a floor or a ceiling.
     """
 
     visit: Integers
@@ -174,6 +182,7 @@ class VisitContrasts:
     n_cdbs: Integers
     floor: Floats
     null: float
+    bounded: bool = False
 
     @property
     def visits(self) -> int:
@@ -195,6 +204,7 @@ class Average:
         p_value: two-sided, of no average difference.
         standard_error, degrees: of the t distribution behind both. null: value of no difference.
         visits: number of visits. n_tested, n_cdbs: sessions in them. adjustment: what the contrasts were freed from.
+        skewness: of the contrasts; 0 where Student's ratio counts alone. Else the larger p counts and the interval holds both.
     """
 
     estimate: float
@@ -209,14 +219,20 @@ class Average:
     n_tested: int
     n_cdbs: int
     adjustment: Adjustment
+    skewness: float = 0.0
 
     def p_above(self, value: float) -> float:
         """One-sided p of the hypothesis that the average is `value` or less."""
-        return float(stdtr(self.degrees, (value - self.estimate) / self.standard_error))
+        return float(stdtr(self.degrees, -min(self._ratios(value))))
 
     def p_below(self, value: float) -> float:
         """One-sided p of the hypothesis that the average is `value` or more."""
-        return float(stdtr(self.degrees, (self.estimate - value) / self.standard_error))
+        return float(stdtr(self.degrees, max(self._ratios(value))))
+
+    def _ratios(self, value: float) -> tuple[float, float]:
+        """Student's ratio against a value, and the same freed from skewness."""
+        ratio = (self.estimate - value) / self.standard_error
+        return ratio, float(unskewed(ratio, self.skewness, self.visits))
 
 
 def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitContrasts | Unavailable:
@@ -246,7 +262,7 @@ def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitCon
         contrast = np.array([win_probability(data.value[one], data.value[two], step) for _, one, two in data.arms])
         # A visit resolves the probability no finer than by half a pair.
         floor = (0.5 / (n_tested * n_cdbs)) ** 2
-    return VisitContrasts(cells.visit, contrast, n_tested, n_cdbs, floor, 0.0 if scale == "difference" else 0.5)
+    return VisitContrasts(cells.visit, contrast, n_tested, n_cdbs, floor, 0.0 if scale == "difference" else 0.5, data.bounded)
 
 
 def win_probability(x: Floats, y: Floats, step: float = 0.0) -> float:
@@ -281,116 +297,53 @@ def average(contrasts: VisitContrasts | Unavailable, level: float = 0.95) -> Ave
     return student(float(contrasts.contrast.mean()), contrasts.variance / contrasts.visits, contrasts, level, Adjustment.NONE)
 
 
+def unskewed(ratio: Any, skewness: Any, visits: Any) -> Any:
+    """Student's ratio freed from the skewness of its contrasts by Hall's cubic transformation (Hall 1992), which is monotone.
+
+    Numbers or arrays: the ratio, the third central moment in cubes of the standard deviation, and the number of visits.
+    """
+    u = ratio / np.sqrt(visits)
+    return ratio + np.sqrt(visits) * (skewness * u**2 / 3 + skewness**2 * u**3 / 27 + skewness / (6 * visits))
+
+
+def skewed(quantile: float, skewness: float, visits: int) -> float:
+    """The ratio that `unskewed` takes to a quantile."""
+    if abs(skewness) < 1e-6:
+        return quantile
+    shifted = quantile / np.sqrt(visits) - skewness / (6 * visits)
+    return float(3 / skewness * (np.cbrt(1 + skewness * shifted) - 1) * np.sqrt(visits))
+
+
+def skewness_of(contrasts: Floats, variance: float) -> float:
+    """Third central moment of contrasts [V] in cubes of the standard deviation; 0 of fewer than three, which tell none."""
+    if contrasts.size < LEAST_FOR_SKEWNESS or variance <= 0:
+        return 0.0
+    return float(np.mean((contrasts - contrasts.mean()) ** 3) / variance**1.5)
+
+
 def student(
-    estimate: float, variance: float, of: VisitContrasts, level: float, adjustment: Adjustment, at_most: float = np.inf
+    estimate: float,
+    variance: float,
+    of: VisitContrasts,
+    level: float,
+    adjustment: Adjustment,
+    at_most: float = np.inf,
+    freed: Floats | None = None,
 ) -> Average | Unavailable:
-    """An average with its variance, on t with one degree of freedom fewer than visits, or `at_most` so many."""
+    """An average with its variance, on t with one degree of freedom fewer than visits, or `at_most` so many.
+
+    `freed`: the contrasts that it is the average of, [V], where they are not those of `of`.
+    """
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")
     scale = 1e-12 * max(1.0, float(np.abs(of.contrast).max()))
     error, degrees = float(np.sqrt(variance)), min(of.visits - 1, at_most)
     if error <= scale:
         return Unavailable(Reason.NO_VARIANCE)
-    half = float(stdtrit(degrees, (1 + level) / 2)) * error
-    p = 2 * float(stdtr(degrees, -abs(estimate - of.null) / error))
+    skewness = skewness_of(of.contrast if freed is None else freed, variance * of.visits) if of.bounded else 0.0
+    ratio, quantile = (estimate - of.null) / error, float(stdtrit(degrees, (1 + level) / 2))
+    p = 2 * float(stdtr(degrees, -min(abs(ratio), abs(float(unskewed(ratio, skewness, of.visits))))))
+    low = estimate - error * max(quantile, skewed(quantile, skewness, of.visits))
+    high = estimate - error * min(-quantile, skewed(-quantile, skewness, of.visits))
     counts = int(of.n_tested.sum()), int(of.n_cdbs.sum())
-    return Average(estimate, estimate - half, estimate + half, level, p, error, degrees, of.null, of.visits, *counts, adjustment)
-
-
-def order_imbalance(data: Measurements) -> float | None:
-    """How much later the controller's sessions come than cDBS, on average over visits, in standard deviations of the place in the visit.
-
-    None where no order is known or no visit has both arms.
-    """
-    cells = data.cells
-    if data.order is None or not cells.visit.size:
-        return None
-    order = data.order[cells.rows]
-    if not np.isfinite(order).all():
-        return None
-    sums, of_visit = cells.sums(order), cells.cell // 2
-    n = cells.counts.sum(1)
-    away = order - (sums.sum(1) / n)[of_visit]
-    spread = np.sqrt(np.bincount(of_visit, weights=away**2, minlength=n.size) / n)
-    later = sums[:, 0] / cells.counts[:, 0] - sums[:, 1] / cells.counts[:, 1]
-    return float(np.mean(np.divide(later, spread, out=np.zeros_like(later), where=spread > 0)))
-
-
-def primary(data: Measurements, level: float = 0.95, scale: Scale = "difference") -> Average | Unavailable:
-    """The primary comparison: the average over visits, adjusted for the order where the design puts one arm later than the other.
-
-    Returns:
-        The average with its `adjustment`. Where the order is unbalanced and cannot be told apart from the controller it is unadjusted, and
-        `order_imbalance` says so.
-    """
-    imbalance = order_imbalance(data)
-    if imbalance is not None and abs(imbalance) > UNBALANCED:
-        adjusted = adjusted_average(data, [np.asarray(data.order)], Adjustment.ORDER, level, scale)
-        if isinstance(adjusted, Average):
-            return adjusted
-    return average(visit_contrasts(data, scale), level)
-
-
-def adjusted_average(
-    data: Measurements, covariates: list[Floats], adjustment: Adjustment, level: float = 0.95, scale: Scale = "difference"
-) -> Average | Unavailable:
-    """Average over visits of contrasts freed from covariates whose slopes are common to all visits and arms.
-
-    The slopes come from what varies within one arm of one visit. They tie the contrasts of the visits together, so that the variance is
-    that of leaving out one visit at a time, slopes included (the cluster jackknife, CV3 of MacKinnon, Nielsen and Webb 2023).
-
-    Args:
-        data: sessions of both arms. covariates: each [n], as `data`; sessions with an unknown one are left out.
-        scale: as in `visit_contrasts`, of the values less what the covariates explain.
-
-    Returns:
-        The average, or why there is none: as in `average`, or slopes that the sessions do not identify.
-    """
-    known = np.isfinite(data.value) & np.all(np.isfinite(covariates), axis=0)
-    table = np.column_stack([c[known] for c in covariates])
-    kept = data.take(known)
-    contrasts = visit_contrasts(kept, scale)
-    if isinstance(contrasts, Unavailable):
-        return contrasts
-    n = contrasts.visits
-    if n < 2:
-        return Unavailable(Reason.TOO_FEW_VISITS, n, 2)
-    slopes = _common_slopes(kept, table)
-    if slopes is None:
-        return Unavailable(Reason.NOT_IDENTIFIED)
-    # Contrasts [V + 1, V]: with the slopes of all visits, and with those of all but one.
-    if scale == "difference":
-        shift = np.array([table[one].mean(0) - table[two].mean(0) for _, one, two in kept.arms])
-        freed = contrasts.contrast - slopes @ shift.T
-    else:
-        values = kept.value - slopes @ table.T
-        step = step_of(kept, scale)
-        freed = np.array([[win_probability(row[one], row[two], step) for _, one, two in kept.arms] for row in values])
-    estimate = float(freed[0].mean())
-    without = (freed[1:].sum(1) - np.diag(freed[1:])) / (n - 1)
-    variance = (n - 1) / n * float(np.sum((without - without.mean()) ** 2))
-    floor = float(contrasts.floor.mean()) / n
-    return student(estimate, variance + floor if contrasts.null else max(variance, floor), contrasts, level, adjustment)
-
-
-def _common_slopes(data: Measurements, table: Floats) -> Floats | None:
-    """Slopes on covariates [n, c] within arms of visits, of all visits and without each, [V + 1, c]; None where they are not identified."""
-    grams, moments = [], []
-    for _, one, two in data.arms:
-        centred = np.concatenate([table[arm] - table[arm].mean(0) for arm in (one, two)])
-        values = np.concatenate([data.value[arm] - data.value[arm].mean() for arm in (one, two)])
-        grams.append(centred.T @ centred)
-        moments.append(centred.T @ values)
-    gram, moment = np.array(grams), np.array(moments)
-    totals = np.concatenate([gram.sum(0)[None], gram.sum(0) - gram])
-    if min(_smallest_share(g, totals[0]) for g in totals) < 1e-6:
-        return None
-    return np.asarray(np.linalg.solve(totals, np.concatenate([moment.sum(0)[None], moment.sum(0) - moment])[..., None])[..., 0])
-
-
-def _smallest_share(gram: Floats, whole: Floats) -> float:
-    """Smallest eigenvalue of a gram matrix whose columns are scaled by those of another."""
-    scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
-    if not np.diag(whole).all():
-        return 0.0
-    return float(np.linalg.eigvalsh(gram / np.outer(scale, scale))[0])
+    return Average(estimate, low, high, level, p, error, degrees, of.null, of.visits, *counts, adjustment, skewness)

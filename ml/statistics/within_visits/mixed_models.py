@@ -10,7 +10,7 @@ session because the minutes of one session resemble each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,4 +193,6 @@ def _prepare(data: Measurements, policy: Integers | None) -> _Prepared | Unavail
             policies = found.astype(np.int64)
             columns.append(((policy[rows][:, None] == policies) & used.tested[:, None]).astype(np.float64))
             groups["policy"] = range(2 + 2 * v, 2 + 2 * v + policies.size)
+    # the effect of a model is no average of contrasts, so that their skewness says nothing of its error
+    contrasts = replace(contrasts, bounded=False)
     return _Prepared(used, rows.astype(np.int64), contrasts, np.concatenate(columns, axis=1), groups, policies)

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtr, stdtrit
 
+from ml.statistics.within_visits.averages import adjusted_average
 from ml.statistics.within_visits.contrasts import (
+    LEAST_FOR_SKEWNESS,
     Adjustment,
     Average,
     Floats,
@@ -16,8 +18,10 @@ from ml.statistics.within_visits.contrasts import (
     Reason,
     Unavailable,
     VisitContrasts,
-    adjusted_average,
     average,
+    skewed,
+    skewness_of,
+    unskewed,
     visit_contrasts,
 )
 
@@ -89,40 +93,27 @@ def bracketed(data: Measurements, level: float = 0.95) -> Average | Unavailable:
         return Unavailable(Reason.NO_BRACKETED_SESSION, 0, 1)
     sizes = np.array(n_tested, dtype=np.int64), np.array(n_cdbs, dtype=np.int64)
     floor = data.resolution**2 / 12 * (1 / sizes[0] + 1 / sizes[1])
-    result = average(VisitContrasts(np.array(visits, dtype=np.int64), np.array(found), *sizes, floor, 0.0), level)
+    result = average(VisitContrasts(np.array(visits, dtype=np.int64), np.array(found), *sizes, floor, 0.0, data.bounded), level)
     return result if isinstance(result, Unavailable) else replace(result, adjustment=Adjustment.BRACKETED)
 
 
 def skewness_corrected(data: Measurements, level: float = 0.95) -> Average | Unavailable:
-    """Student's ratio of the visits' contrasts freed from their skewness by Hall's cubic transformation (Hall 1992), which is monotone.
-
-    A metric with a floor or a ceiling has skewed contrasts where the effect differs much between visits, and Student's ratio then errs. The
-    transformation has its own error, so that the larger of the two p-values is the safe one.
-    """
+    """Student's ratio of the visits' contrasts freed from their skewness, whatever the metric (`contrasts.unskewed`)."""
     contrasts = visit_contrasts(data)
     if isinstance(contrasts, Unavailable):
         return contrasts
     plain, n = average(contrasts, level), contrasts.visits
     if isinstance(plain, Unavailable):
         return plain
-    if n < 3:
-        return Unavailable(Reason.TOO_FEW_VISITS, n, 3)
-    root = float(np.sqrt(n))
-    spread = plain.standard_error * root
-    g = float(np.mean((contrasts.contrast - plain.estimate) ** 3)) / spread**3
-    u = plain.estimate / spread
-    ratio = root * (u + g * u**2 / 3 + g**2 * u**3 / 27 + g / (6 * n))
-
-    def end(q: float) -> float:
-        """Distance of the value whose transformed ratio is q, in standard deviations of a contrast."""
-        shifted = q / root - g / (6 * n)
-        return float(3 / g * (np.cbrt(1 + g * shifted) - 1)) if abs(g) > 1e-6 else shifted
-
-    q = float(stdtrit(n - 1, (1 + level) / 2))
+    if n < LEAST_FOR_SKEWNESS:
+        return Unavailable(Reason.TOO_FEW_VISITS, n, LEAST_FOR_SKEWNESS)
+    error, quantile = plain.standard_error, float(stdtrit(n - 1, (1 + level) / 2))
+    skewness = skewness_of(contrasts.contrast, n * error**2)
+    ratio = float(unskewed(plain.estimate / error, skewness, n))
     return replace(
         plain,
-        low=plain.estimate - spread * end(q),
-        high=plain.estimate - spread * end(-q),
+        low=plain.estimate - error * skewed(quantile, skewness, n),
+        high=plain.estimate - error * skewed(-quantile, skewness, n),
         p_value=2 * float(stdtr(n - 1, -abs(ratio))),
         adjustment=Adjustment.SKEWNESS,
     )

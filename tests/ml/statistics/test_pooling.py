@@ -7,7 +7,8 @@ import pytest
 from scipy.stats import binomtest, t
 
 from ml.statistics.pooling import paule_mandel, pool, pool_estimates, sign_test
-from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavailable, primary
+from ml.statistics.within_visits.averages import primary
+from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavailable
 
 
 def test_equal_errors_give_the_t_interval_of_the_estimates():

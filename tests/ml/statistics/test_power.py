@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import nct, t
 
 from ml.statistics.power import MOST_VISITS, Posterior, Target, posterior, power, success
+from ml.statistics.within_visits.averages import primary
 from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavailable, VisitContrasts
 
 
@@ -44,6 +45,22 @@ def test_known_deviations_and_no_visit_yet_give_the_power_of_the_t_test():
         critical = t.ppf(0.95, visits - 1)
         assert found[visits - 1] == pytest.approx(nct.sf(critical, visits - 1, np.sqrt(visits) / sd), abs=0.012)
     assert found[0] == 0.0
+
+
+@pytest.mark.parametrize("alternative", ["greater", "two_sided"])
+def test_of_a_bounded_metric_the_power_is_that_of_the_larger_p(alternative):
+    seen, effects = np.array([0.9, 1.0, 1.1, -0.3]), np.linspace(0.0, 1.5, 61)
+    ones, floor, shown = np.ones(4, dtype=np.int64), np.zeros(4), {}
+    for bounded in (True, False):
+        of = Posterior(effects, np.zeros(61), np.zeros(61), VisitContrasts(np.arange(4), seen, ones, ones, floor, 0.0, bounded))
+        shown[bounded] = success(of, Target(0.1, alternative, 0.05, 2), 3)
+        for effect, row in zip(effects, shown[bounded], strict=True):
+            for k in (1, 5):  # further visits show just the effect
+                value = np.c_[np.zeros(4 + k), [*(seen - 0.1), *np.full(k, effect - 0.1)]].ravel()
+                found = primary(Measurements.of(value, np.repeat(np.arange(4 + k), 2), [0, 1] * (4 + k), bounded=bounded))
+                assert row[k - 1] == ((found.p_above(0.0) if alternative == "greater" else found.p_value) < 0.05)
+    assert (shown[False] & ~shown[True]).any(), "the larger p is to cost something here"
+    assert not (shown[True] & ~shown[False]).any()
 
 
 def test_sessions_do_not_replace_visits_where_visits_differ():

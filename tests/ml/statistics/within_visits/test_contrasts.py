@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp
 
+from ml.statistics.effects import cliffs_delta
 from ml.statistics.ranksum import rank_sum
+from ml.statistics.within_visits.averages import adjusted_average, order_imbalance, primary
 from ml.statistics.within_visits.contrasts import (
     Adjustment,
     Average,
     Measurements,
     Reason,
     Unavailable,
-    adjusted_average,
     average,
-    order_imbalance,
-    primary,
     visit_contrasts,
     win_probability,
 )
+from ml.statistics.within_visits.sensitivity import skewness_corrected
 
 
 def study(seed=0, visits=5, each=3, effect=0.0, drift=0.0, first_cdbs=False):
@@ -156,3 +156,78 @@ def test_inputs_that_do_not_fit_together_are_refused_in_words():
         Measurements.of([1.0], [1], [0], resolution=-1)
     with pytest.raises(ValueError, match="lies between 0 and 1"):
         average(visit_contrasts(study()), 1.0)
+
+
+SKEWED = np.array([0.1, 0.2, 0.3, 0.4, 3.0, 0.2])
+
+
+def of_contrasts(values, bounded, order=None):
+    """A study of visits with these contrasts, one session of either arm."""
+    n = len(values)
+    value, visit = np.c_[np.zeros(n), values].ravel(), np.repeat(np.arange(n), 2)
+    return Measurements.of(value, visit, np.tile([False, True], n), order=order, bounded=bounded)
+
+
+def test_of_a_metric_with_a_floor_the_larger_p_counts_and_the_interval_holds_both():
+    plain, found = primary(of_contrasts(SKEWED, False)), primary(of_contrasts(SKEWED, True))
+    freed = skewness_corrected(of_contrasts(SKEWED, False))
+    assert plain.skewness == 0.0
+    assert found.skewness > 0.3
+    assert (found.estimate, found.standard_error) == (plain.estimate, plain.standard_error)
+    assert found.p_value == max(plain.p_value, freed.p_value)
+    assert (found.low, found.high) == pytest.approx((plain.low, freed.high))
+    assert plain.low < freed.low
+    assert plain.high < freed.high
+    # turned round, nothing changes but the sign
+    turned = primary(of_contrasts(-SKEWED, True))
+    assert (turned.low, turned.high, turned.p_value) == pytest.approx((-found.high, -found.low, found.p_value))
+
+
+def test_the_one_sided_p_values_are_those_of_the_interval_of_twice_their_error():
+    found = primary(of_contrasts(SKEWED, True), 0.9)
+    assert found.p_above(found.low) == pytest.approx(0.05)
+    assert found.p_below(found.high) == pytest.approx(0.05)
+    plain = primary(of_contrasts(SKEWED, False), 0.9)
+    assert found.p_below(1.5) > plain.p_below(1.5)
+    assert found.p_above(-0.5) >= plain.p_above(-0.5)
+
+
+def test_symmetric_contrasts_and_two_visits_have_students_p_whatever_the_metric():
+    for values in ([1.0, 2.0, 3.0, 4.0, 5.0], [1.0, 2.5]):
+        one, two = primary(of_contrasts(values, True)), primary(of_contrasts(values, False))
+        assert (one.low, one.high, one.p_value) == pytest.approx((two.low, two.high, two.p_value))
+
+
+def test_cliffs_delta_is_bounded_whatever_the_metric():
+    data = study(3, visits=6, effect=1.5)
+    wins = primary(data, 0.95, "win_probability")
+    delta = cliffs_delta(data)
+    assert wins.skewness == 0.0
+    assert delta.skewness != 0.0
+    assert delta.p_value >= wins.p_value
+    assert delta.high >= 2 * wins.high - 1 or delta.high == 1.0
+
+
+def test_contrasts_freed_from_the_order_have_their_own_skewness():
+    data = study(2, visits=6, effect=0.3, drift=0.8, first_cdbs=True)
+    bounded = Measurements.of(data.value, data.visit, data.tested, order=data.order, bounded=True)
+    plain, found = primary(data), primary(bounded)
+    assert found.adjustment is plain.adjustment is Adjustment.ORDER
+    slope = adjusted_average(data, [data.order], Adjustment.ORDER)
+    later = np.array([data.order[one].mean() - data.order[two].mean() for _, one, two in data.arms])
+    drift = (visit_contrasts(data).contrast.mean() - slope.estimate) / later.mean()
+    freed = visit_contrasts(data).contrast - drift * later
+    spread = found.standard_error * np.sqrt(6)
+    assert found.skewness == pytest.approx(np.mean((freed - freed.mean()) ** 3) / spread**3)
+    assert found.p_value >= plain.p_value
+
+
+def test_where_a_floor_skews_the_contrasts_the_primary_test_errs_less_often_than_students():
+    rng, number = np.random.default_rng(5), 2000
+    errs = {True: 0, False: 0}
+    for _ in range(number):
+        values = rng.exponential(1.0, 6) - 1.0
+        for bounded in errs:
+            errs[bounded] += primary(of_contrasts(values, bounded)).p_value < 0.05
+    assert errs[False] / number > 0.08
+    assert errs[True] < 0.85 * errs[False]
