@@ -52,8 +52,9 @@ class Watched:
         self.page.wait_for_selector("a.who")
 
     def charts_drawn(self) -> int:
-        """Scroll every chart into view and wait until it is drawn; how many there are."""
-        charts = self.page.query_selector_all("figure[data-chart]")
+        """Scroll every chart into view and wait until it is drawn; how many there are, less those in a closed fold, which are not drawn."""
+        found = self.page.query_selector_all("figure[data-chart]")
+        charts = [chart for chart in found if chart.evaluate("(e) => !e.closest('details:not([open])')")]
         for chart in charts:
             chart.scroll_into_view_if_needed()
             self.page.wait_for_selector(f"#{chart.get_attribute('id')}[data-drawn=yes] .main-svg", timeout=60_000)

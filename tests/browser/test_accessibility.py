@@ -5,10 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from fastapi.testclient import TestClient
 
+from app.learning.policies.baselines import constant_onnx
 from app.settings import get_settings
+from ml.ope.support.behaviour_map import COLUMNS, DOSES, BehaviourMap, Curve
+from tests.app.evaluations import judge as judge
+from tests.app.evaluations import judged
+from tests.ml.ope.posterior.draws import N, constructed
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -37,6 +45,14 @@ PAGES = {
     "interface": "/api-reference",
     "style-guide": "/styleguide",
 }
+RANKED = {
+    "ranking": "/participants/P1/ranking",
+    "policy": "/participants/P1/policies/{policy}",
+    "compare": "/participants/P1/compare",
+    "plan": "/visits/{visit}/plan",
+    "day": "/visits/{visit}",
+}
+"""Of a participant who has a ranking, and a draft of a plan with its best policy."""
 RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]}
 SHIFTS = """() => new Promise((done) => {
   let sum = 0;
@@ -68,7 +84,10 @@ def test_on_paper_nothing_runs_past_its_card(window: Callable, studied: list[int
     assert found == []
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (1280, "dark"), (768, "light"), (768, "dark")])
+WINDOWS = pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (1280, "dark"), (768, "light"), (768, "dark")])
+
+
+@WINDOWS
 def test_no_page_breaks_a_rule_of_accessibility_or_moves(
     window: Callable,
     studied: list[int],
@@ -76,14 +95,36 @@ def test_no_page_breaks_a_rule_of_accessibility_or_moves(
     width: int,
     scheme: str,  # type: ignore[type-arg]
 ) -> None:
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     monkeypatch.setattr(get_settings(), "development", True)
-    pictures = os.environ.get("BETALOOP_TOUR") if (width, scheme) == (1280, "light") else None
+    addresses = {name: path.format(session=studied[0]) for name, path in PAGES.items()}
+    assert looked_at(window(width, 900, scheme), addresses, (width, scheme) == (1280, "light")) == []
+
+
+@WINDOWS
+def test_the_pages_of_a_ranking_break_no_rule_either(
+    ranked: dict[str, int],
+    window: Callable,
+    width: int,
+    scheme: str,  # type: ignore[type-arg]
+) -> None:
     watched = window(width, 900, scheme)
+    addresses = {name: path.format(**ranked) for name, path in RANKED.items()}
+    assert looked_at(watched, addresses, (width, scheme) == (1280, "light")) == []
+    watched.page.emulate_media(media="print")
+    watched.page.set_viewport_size({"width": SHEET, "height": 900})
+    for path in addresses.values():
+        watched.open(path)
+        assert watched.page.evaluate(PAST_THE_CARD) == [], path
+
+
+def looked_at(watched: Any, addresses: dict[str, str], for_the_tour: bool) -> list[str]:
+    """What axe-core and the eye for shifts find on pages; pictures of them where they are asked for."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    pictures = os.environ.get("BETALOOP_TOUR") if for_the_tour else None
     watched.sign_in()
     found: list[str] = []
-    for name, path in PAGES.items():
-        watched.open(path.format(session=studied[0]))
+    for name, path in addresses.items():
+        watched.open(path)
         watched.charts_drawn()
         watched.page.evaluate("() => scrollTo(0, 0)")
         if (moved := watched.page.evaluate(SHIFTS)) > MOST_SHIFT:
@@ -92,4 +133,39 @@ def test_no_page_breaks_a_rule_of_accessibility_or_moves(
         found += [f"{name}: {v['id']} {v['nodes'][0]['html'][:120]}" for v in broken]
         if pictures:
             watched.page.screenshot(path=Path(pictures) / f"{name}.png", scale="css")
-    assert found == []
+    return found
+
+
+@pytest.fixture
+def policies(client: TestClient, studied: list[int]) -> list[int]:
+    """Ids of four policies made elsewhere, for the participant whom `studied` made."""
+    files = [(f"rl-0{k}", {"file": (f"rl-0{k}.onnx", constant_onnx(0.8 - 0.15 * k, 10))}) for k in range(1, 5)]
+    answers = [client.post("/api/v1/participants/P1/policies", data={"name": name}, files=file) for name, file in files]
+    return [int(answer.json()["id"]) for answer in answers]
+
+
+@pytest.fixture
+def ranked(client: TestClient, policies: list[int], judge: Callable[..., int]) -> dict[str, int]:
+    """A ranking of which one policy is worth a test, one with care, one is unsafe and one nearly off; a draft with the best."""
+    rng = np.random.default_rng(5)
+    doses = dict(zip(policies, (0.82, 0.68, 0.45, 0.04), strict=True))
+
+    def of(dose: float) -> dict[str, Any]:
+        middle = {"energy": dose**2, "grasp_hz": 2.4 - 0.9 * (1 - dose) ** 2, "rating": 7.2 - 2 * (1 - dose) ** 2}
+        middle["tremor_percent"] = 8 + 60 * (1 - dose) ** 2
+        spread = {"energy": 0.02, "grasp_hz": 0.05, "rating": 0.3, "tremor_percent": 2.0}
+        return {
+            "outcome_draws": {k: np.abs(rng.normal(m, spread[k], N)).round(3).tolist() for k, m in middle.items()},
+            "behaviour": {"mean_amplitude": dose, "closeness_to_cdbs": 1 - dose, "below_cdbs_20_percent": float(dose < 0.2)},
+        }
+
+    centre = [1.0 + 0.1 * k for k in range(COLUMNS)]
+    tried = tuple(tuple(int(30 * (row % 4 == 0 and row > 6) / (1 + k)) for row in range(DOSES)) for k in range(COLUMNS))
+    curves = {str(i): [float(np.clip(d + 0.1 * (b - 2.0), 0, 1)) for b in centre] for i, d in doses.items()}
+    shapes = {i: Curve(tuple(c), tuple(v - 0.05 for v in c), tuple(v + 0.05 for v in c)) for i, c in curves.items()}
+    held = BehaviourMap((*centre, centre[-1] + 0.1), tried, shapes)
+    posterior = {i: judged(50.0 * d, supported=d != 0.68, **of(d)) for i, d in doses.items()}
+    judge(posterior, constructed("cdbs", **of(1.0)).to_json(), coverage={"policies": {}, "map": held.to_json()})
+    visit = client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": "2046-04-06"}).json()["id"]
+    assert client.post(f"/api/v1/visits/{visit}/plan", json={"policy_ids": policies[:1]}).status_code == 201
+    return {"policy": policies[0], "visit": visit}

@@ -7,6 +7,7 @@ from typing import Any
 from markupsafe import Markup
 
 from app.evaluation.replay.schemas import ReplayOut
+from app.platform.web.charts import written
 from app.platform.web.svg import Plane, drawing
 
 LOOKS = (("rl", ""), ("accent", "7 3"), ("distilled", "2 3"))
@@ -28,7 +29,7 @@ def figure(found: ReplayOut, step: int) -> Markup:
     span = (0.0, minutes[-1] + found.period_s / 60)
     beta = [v for v in found.beta if v is not None]
     above = Plane(LEFT, TOP, W - LEFT - RIGHT, BETA_H, span, (min(0.0, *beta), 1.05 * max(beta)) if beta else (0.0, 1.0))
-    above.axes("", f"Beta ({found.beta_unit})", y_ticks=3)
+    above.axes("", f"Beta ({written(found.beta_unit)})", y_ticks=3)
     above.line(list(zip(minutes, found.beta, strict=True)), "muted", 1.2)
     top = TOP + BETA_H + BETWEEN
     known = [v for v in found.recorded_fraction if v is not None]
