@@ -111,7 +111,8 @@ def without_files() -> set[int]:
 def readable(app: Any) -> set[str]:
     """Paths of every route that answers GET, pages and interface, but those of files."""
     found = {c.path for c in iter_route_contexts(app.routes) if c.path and "GET" in (getattr(c, "methods", None) or ())}
-    return {path for path in found if not path.endswith(":path}") and path != "/styleguide"}  # of development alone
+    elsewhere = {path for path in found if path.startswith("/sign-on")}  # lead to a hospital's sign-on, where there is one
+    return {path for path in found - elsewhere if not path.endswith(":path}") and path != "/styleguide"}  # of development alone
 
 
 def calls(path: str, ids: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:
