@@ -22,9 +22,9 @@ from app.study.models import Visit
 from app.tablet.command import verified
 from app.tablet.simulated import SimulatedDevice
 from ml.deploy.manifest import BundleManifest
+from ml.deploy.runtime.control_loop import LEAD_S, End
 from ml.deploy.runtime.envelope import Signal
 from ml.deploy.runtime.ledger import Ledger
-from ml.deploy.runtime.live import LEAD_S, End
 from ml.deploy.runtime.session import Tablet, run_slot
 from ml.deploy.runtime.slot import read_withdrawals
 from ml.population import PARTICIPANTS

@@ -1,4 +1,4 @@
-"""The beta threshold: in the settings of the MDP, and suggested from what sessions had."""
+"""The beta threshold: whether it can be held against a session's beta, in the settings of the MDP, and suggested from what sessions had."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.platform.errors import Invalid
 from app.study import blinding, repository
-from app.study.models import Controller, Participant, SettingsVersion
+from app.study.models import Controller, Participant, SettingsVersion, Trace
 from app.study.traces import laid_out, traces_of
 from ml.mdp import MdpSettings
 
@@ -27,6 +27,28 @@ class SuggestedThreshold:
     value: float
     unit: str
     source: str
+
+
+def mismatch(settings: SettingsVersion, trace: Trace | None) -> str:
+    """Why a threshold says nothing about a trace of beta; empty where it does, or where there is no threshold or trace.
+
+    Units and sources are never mixed.
+    """
+    if trace is None or settings.xi_beta is None:
+        return ""
+    unstated = [name for name, value in (("unit", settings.beta_unit), ("source", settings.beta_source)) if not value]
+    if unstated:
+        return (
+            f"Nobody has stated the {' and the '.join(unstated)} of the threshold of {settings.xi_beta:g}; this trace is in "
+            f"{trace.unit} from {trace.source}. State unit and source in the participant's settings."
+        )
+    wanted = (settings.beta_unit, settings.beta_source)
+    if (trace.unit, trace.source) == wanted:
+        return ""
+    return (
+        f"The threshold of {settings.xi_beta:g} is in {wanted[0]} from {wanted[1]}; this trace is in {trace.unit} from {trace.source}. "
+        "They are not comparable."
+    )
 
 
 def mdp_settings(settings: SettingsVersion, suggestion: SuggestedThreshold | None = None) -> MdpSettings:

@@ -26,9 +26,9 @@ from app.tablet.task import Task
 from ml.deploy.appraisal import battery_gain
 from ml.deploy.bundle import OpenBundle, open_bundle
 from ml.deploy.manifest import BundleError, BundleManifest
+from ml.deploy.runtime.control_loop import End, LiveSession
 from ml.deploy.runtime.decision_log import LogFailed, LogFile, Row
 from ml.deploy.runtime.envelope import Decision, Reason, Signal, reason_names
-from ml.deploy.runtime.live import End, LiveSession
 from ml.deploy.runtime.session import describe, is_blinded, latency, latency_words
 from ml.deploy.wording import battery_words, warning_sentences
 from ml.energy import Implant, relative_energy, saving_percent

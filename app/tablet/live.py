@@ -15,10 +15,10 @@ from app.tablet.task import Task
 from ml.deploy.bundle import OpenBundle
 from ml.deploy.manifest import BundleManifest
 from ml.deploy.runtime.__main__ import LEDGER, open_link
+from ml.deploy.runtime.control_loop import LEAD_S, End
 from ml.deploy.runtime.decision_log import LogFailed
 from ml.deploy.runtime.inputs import Event, Link, QueueLink, give_up_standard_output
 from ml.deploy.runtime.ledger import Ledger
-from ml.deploy.runtime.live import LEAD_S, End
 from ml.deploy.runtime.session import Outcome, Tablet, run_bench, run_slot
 from ml.deploy.runtime.slot import NotAllowed, Refusal, read_withdrawals
 

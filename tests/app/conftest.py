@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 from numpy.typing import NDArray
-from sqlalchemy import make_url
+from sqlalchemy import make_url, text
 
-from app.platform.database import database_url
+from app.platform.database import database_url, new_session
 from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
 from tests.app.every_route import World
@@ -69,12 +69,14 @@ class Beginning:
 
     Attributes:
         template: its database and files. token: of the administrator. state: of the numbers that are drawn next. made: what its maker gave.
+        written: what had been written before it was made, as (entity, action).
     """
 
     template: Template
     token: str
     state: Any
     made: Any
+    written: list[tuple[str, str]]
 
 
 @pytest.fixture(scope="session")
@@ -89,6 +91,12 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20)
 
 
+def _written() -> list[tuple[str, str]]:
+    """Every change of the database in use so far."""
+    with new_session() as db:
+        return [(entity, action) for entity, action in db.execute(text("select entity, action from audit_event order by id"))]
+
+
 @pytest.fixture
 def begin_with(
     server: EmbeddedPostgres,
@@ -97,19 +105,25 @@ def begin_with(
     beginnings: dict[str, Beginning],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Callable[[str, Callable[[], Any]], Any]:
-    """Make a study, or copy the one that an earlier test of this process made under the same name: a tenth of the time."""
+    """Make a study, or copy the one that an earlier test of this process made under the same name: a tenth of the time.
+
+    What a test writes before it would be lost by the copy, or kept for every later test, so it is refused.
+    """
 
     def begin(name: str, make: Callable[[], Any]) -> Any:
         own, data = make_url(database_url()).database, get_settings().data_dir
         assert own is not None
+        written = _written()
         if name not in beginnings:
             made = make()
             kept = tmp_path_factory.mktemp(name) / "data"
             close_connections()
             copy_database(server, name, own)
             shutil.copytree(data, kept)
-            beginnings[name] = Beginning((name, kept), client.headers["authorization"], rng.bit_generator.state, made)
+            beginnings[name] = Beginning((name, kept), client.headers["authorization"], rng.bit_generator.state, made, written)
         else:
+            before = beginnings[name].written
+            assert written == before, f"ask for {name} before anything else is written: {written}, where it was made {before}"
             close_connections()
             drop_database(server, own)
             copy_database(server, own, name)

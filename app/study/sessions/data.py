@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from sqlalchemy.orm import Session
 
 from app.study.models import SettingsVersion, StudySession
+from app.study.threshold import mismatch
 from app.study.traces import StepTable, TracesOf, laid_out, step_table
 from ml.qoc import Qoc
 
@@ -21,23 +22,8 @@ class SessionData:
 
     @property
     def threshold_mismatch(self) -> str:
-        """Why the participant's threshold says nothing about this trace; empty where it does. Units and sources are never mixed."""
-        trace, settings = self.table.beta_trace, self.settings
-        if trace is None or settings.xi_beta is None:
-            return ""
-        unstated = [name for name, value in (("unit", settings.beta_unit), ("source", settings.beta_source)) if not value]
-        if unstated:
-            return (
-                f"Nobody has stated the {' and the '.join(unstated)} of the threshold of {settings.xi_beta:g}; this trace is in "
-                f"{trace.unit} from {trace.source}. State unit and source in the participant's settings."
-            )
-        wanted = (settings.beta_unit, settings.beta_source)
-        if (trace.unit, trace.source) == wanted:
-            return ""
-        return (
-            f"The threshold of {settings.xi_beta:g} is in {wanted[0]} from {wanted[1]}; this trace is in {trace.unit} from {trace.source}. "
-            "They are not comparable."
-        )
+        """Why the participant's threshold says nothing about this trace; empty where it does."""
+        return mismatch(self.settings, self.table.beta_trace)
 
     @property
     def threshold(self) -> float | None:

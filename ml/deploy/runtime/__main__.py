@@ -27,12 +27,12 @@ from typing import Any
 
 import numpy as np
 
+from .control_loop import End
 from .controller import BoundedController
 from .decision_log import LogFile, Row
 from .envelope import BetaSample, EnvelopeLimits, Signal, reason_names
 from .inputs import Event, LoopbackLink, QueueLink, from_growing_file, from_lines, give_up_standard_output
 from .ledger import Ledger
-from .live import End
 from .network import MlpNetwork, Output
 from .protocol import number
 from .schedule import Schedule, ScheduledController

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from .control_loop import End, LiveSession
 from .controller import BoundedController
 from .decision_log import LogFile, seal_facts
 from .envelope import BetaSample, Signal
 from .inputs import Link
 from .ledger import Ledger
-from .live import End, LiveSession
 from .protocol import Peer
 from .slot import NotAllowed, Refusal, Slot, Withdrawals
 

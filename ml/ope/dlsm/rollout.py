@@ -1,4 +1,4 @@
-"""Roll-outs of a fitted DLSM under many policies at once (eq:decoder)."""
+"""Free runs of a fitted DLSM under many policies at once, along the decoder alone (eq:decoder, Algorithm 1)."""
 
 from __future__ import annotations
 

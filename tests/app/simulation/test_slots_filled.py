@@ -24,7 +24,7 @@ from app.study.blinding import arm
 from app.study.models import Controller, Recording, StudySession
 from app.study.sessions import logged
 from app.study.sessions.data import session_data
-from ml.deploy.runtime.live import End
+from ml.deploy.runtime.control_loop import End
 from ml.deploy.runtime.session import run_slot
 
 DAY = dt.date(2024, 3, 4)

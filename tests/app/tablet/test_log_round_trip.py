@@ -18,9 +18,9 @@ from fastapi.testclient import TestClient
 
 from app.tablet.command import Run, drive, verified
 from app.tablet.sources import Row, Source
+from ml.deploy.runtime.control_loop import End
 from ml.deploy.runtime.decision_log import COLUMNS, LogFile, kind_line
 from ml.deploy.runtime.envelope import BetaSample, Signal
-from ml.deploy.runtime.live import End
 from ml.deploy.runtime.session import describe
 from ml.formats import DecodeOptions, UndecodableFile, decode, redact, sniff
 from ml.formats.recording import DecodedFile

@@ -25,10 +25,10 @@ from app.tablet.live import run_live
 from app.tablet.simulated import Sent, SimulatedDevice, brain_of
 from app.tablet.sources import Wish
 from app.tablet.task import Task
+from ml.deploy.runtime.control_loop import End
 from ml.deploy.runtime.device import DeviceSide
 from ml.deploy.runtime.inputs import Event
 from ml.deploy.runtime.ledger import Ledger
-from ml.deploy.runtime.live import End
 from ml.deploy.runtime.session import Outcome, Tablet, run_slot
 from ml.deploy.runtime.signature import verifies
 from ml.deploy.runtime.slot import NotAllowed, Refusal, Slot, Withdrawals, withdrawals_body

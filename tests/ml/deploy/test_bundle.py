@@ -90,7 +90,7 @@ def test_a_bundle_of_0_1_0_is_read_and_one_without_its_network_is_not(network, m
     opened = open_bundle(pack(files | {"manifest.json": json.dumps(stated).encode()})).manifest
     assert (opened.schema_version, opened.slot, opened.frozen_after) == (3, None, None)
     newer = {**stated, "schema_version": 4}
-    with pytest.raises(BundleError, match=r"the manifest must name .*controller/live\.py"):
+    with pytest.raises(BundleError, match=r"the manifest must name .*controller/control_loop\.py"):
         open_bundle(pack(files | {"manifest.json": json.dumps(newer).encode()}))
     older = {**stated, "schema_version": 2}
     with pytest.raises(BundleError, match="manifest version 2; this betaloop reads 3 to 4"):

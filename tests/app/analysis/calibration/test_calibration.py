@@ -23,9 +23,9 @@ QOC = {"grasp_hz": 2.0, "rating": 8, "tremor_percent": 20.0}
 
 
 @pytest.fixture(autouse=True)
-def second_visit(client: TestClient, enrolled: str) -> None:
+def second_visit(client: TestClient, policies: list[int]) -> None:
     """A visit after the one whose sessions the estimates rest on."""
-    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 2, "date": "2026-03-02"}).status_code == 201
+    assert client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": "2026-03-02"}).status_code == 201
 
 
 def calibration(client: TestClient) -> dict[str, Any]:

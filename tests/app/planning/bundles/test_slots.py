@@ -27,7 +27,7 @@ from app.tablet.sources import Wish
 from app.tablet.task import Task
 from ml.deploy.bundle import open_bundle
 from ml.deploy.manifest import BundleManifest
-from ml.deploy.runtime.live import End
+from ml.deploy.runtime.control_loop import End
 from ml.deploy.runtime.slot import read_withdrawals
 from ml.rl import MlpPolicy
 

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from ml.deploy.runtime.control_loop import End, LiveSession
 from ml.deploy.runtime.controller import BoundedController
 from ml.deploy.runtime.decision_log import Row
 from ml.deploy.runtime.envelope import EnvelopeLimits, Signal
 from ml.deploy.runtime.inputs import Arrival, DeviceGone, Event
-from ml.deploy.runtime.live import End, LiveSession
 from ml.deploy.runtime.network import MlpNetwork
 from ml.deploy.runtime.protocol import Peer
 

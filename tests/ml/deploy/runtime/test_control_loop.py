@@ -7,12 +7,12 @@ from itertools import pairwise
 
 import pytest
 
+from ml.deploy.runtime.control_loop import End
 from ml.deploy.runtime.controller import BoundedController
 from ml.deploy.runtime.decision_log import LogFailed, Row
 from ml.deploy.runtime.device import DeviceSide
 from ml.deploy.runtime.envelope import Reason
 from ml.deploy.runtime.inputs import Event
-from ml.deploy.runtime.live import End
 from tests.ml.deploy.runtime.links import (
     CDBS,
     HELLO,
