@@ -11,8 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 from app.accounts.permissions import SYSTEM
+from app.platform.bucket import bucket
 from app.platform.database import transaction
 from app.platform.terminal import ACTOR, AsJson, show
+from app.settings import get_settings
 
 ingest_app = typer.Typer(no_args_is_help=True, help="Stored uploads.")
 
@@ -38,6 +40,8 @@ def import_(
 
     if controller is not None and controller not in set(Controller):
         raise typer.BadParameter(f"'{controller}' is none of {', '.join(Controller)}.", param_hint="--controller")
+    if (store := bucket()) is not None:
+        store.check_keys(get_settings())
     with transaction(ACTOR) as db, path.open("rb") as stream:
         person = study.participant_by_code(db, participant, SYSTEM)
         arm = Controller(controller) if controller is not None else None

@@ -202,7 +202,9 @@ _SAID: dict[str, Callable[[Row, Row, Names], str]] = {
     "plan": _plan,
     "visit_lock": lambda b, a, n: f"{'locked' if a.get('locked') else 'unlocked'} {n.visit(a['visit_id'])}",
     "margins_lock": lambda b, a, n: f"locked the margins of {n.participant(a['participant_id'])}",
-    "bundle_release": lambda b, a, n: f"took the bundle of {n.policy(a['policy_id'])}",
+    "bundle_release": lambda b, a, n: (
+        f"took the bundle of {n.policy(a['policy_id'])}" if a["policy_id"] is not None else "took the bundle of a session without a policy"
+    ),
     "buffer_gate_decision": _decided,
     "participant": _participant,
     "settings_version": _version("settings"),

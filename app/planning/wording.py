@@ -192,7 +192,7 @@ DEVIATIONS: dict[Deviation, str] = {
     Deviation.LONGER: "longer than planned",
     Deviation.OTHER_DAY: "held on another day than the visit's",
     Deviation.OTHER_PLAN: "its log is of a session of another plan",
-    Deviation.SECOND_RUN: "its log is of a slot that another session fills: it was run twice",
+    Deviation.SECOND_RUN: "its log is of a slot that another session fills: a second run, or a second record of the same one",
 }
 
 

@@ -24,7 +24,7 @@ log = structlog.get_logger()
 
 T = TypeVar("T")
 CHUNK = 1 << 20
-SHARED_KEYS = ("quarantine", "pseudonyms", "second-factor", "sign-on", "bundle-signing", "audit-seals")
+SHARED_KEYS = ("quarantine", "pseudonyms", "second-factor", "sign-on", "bundle-signing", "audit-seals", "visit-day")
 """Keys that every machine of an installation must have alike."""
 _FINGERPRINT = b"betaloop key fingerprint 1\0"
 

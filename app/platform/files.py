@@ -5,6 +5,7 @@ With a bucket (`app.platform.bucket`) that holds the files, and the folder this 
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import hashlib
 import os
@@ -22,7 +23,7 @@ from sqlalchemy import BigInteger, CheckConstraint, String, func
 from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from app.platform.bucket import Bucket, bucket
+from app.platform.bucket import Bucket, StoreAway, bucket
 from app.platform.database import Base
 from app.platform.errors import BetaloopError
 from app.settings import get_settings, private_folder
@@ -79,8 +80,10 @@ def _copy_here(store: Bucket, sha256: str, path: Path) -> None:
             return
         if hash_file(draft)[0] != sha256:
             raise MissingFile(f"The stored file {sha256} is damaged: its bytes have another hash.")
+        _sync(draft)
         private_folder(path.parent)
         draft.rename(path)
+        _sync(path.parent)
     finally:
         draft.unlink(missing_ok=True)
 
@@ -121,14 +124,28 @@ def is_whole(sha256: str, size: int | None = None, hashes: bool = True) -> bool:
 
 
 def prune_copies() -> int:
-    """Remove copies of a bucket's files that were used longest ago, beyond the room for them; how many. Those of the last hour stay."""
-    settings = get_settings()
-    if bucket() is None or not settings.files_dir.is_dir():
+    """Remove copies of a bucket's files that were used longest ago, beyond the room for them; how many.
+
+    Those of the last hour stay, and those that the bucket does not have: files of before there was a bucket are no copies.
+    """
+    settings, store = get_settings(), bucket()
+    if store is None or not settings.files_dir.is_dir():
         return 0
-    copies = [(p.stat().st_mtime, p.stat().st_size, p) for p in settings.files_dir.glob("??/*")]
+    copies: list[tuple[float, int, Path]] = []
+    for path in settings.files_dir.glob("??/*"):
+        with contextlib.suppress(FileNotFoundError):  # other processes of this machine make room too
+            found = path.stat()
+            copies.append((found.st_mtime, found.st_size, path))
     beyond, removed = sum(size for _, size, _ in copies) - settings.files_cache_gib * (1 << 30), 0
     for used, size, path in sorted(copies):
         if beyond <= 0 or used > time.time() - _LATELY_S:
+            break
+        try:
+            if store.size(path.name) != size or path.stat().st_mtime != used:
+                continue
+        except FileNotFoundError:
+            continue
+        except StoreAway:
             break
         path.unlink(missing_ok=True)
         beyond, removed = beyond - size, removed + 1

@@ -35,8 +35,8 @@ from ml.energy import Implant, relative_energy, saving_percent
 
 _KEY = "bundle-signing"
 _TELLING = frozenset({
-    "latency_us", "mean_amplitude_ma", "energy_of_cdbs", "energy_saved_percent", "battery", "battery_life_of_cdbs", "battery_life",
-    "battery_days", "battery_life_on_cdbs", "battery_days_on_cdbs",
+    "latency_us", "worst_late_ms", "mean_amplitude_ma", "energy_of_cdbs", "energy_saved_percent", "battery", "battery_life_of_cdbs",
+    "battery_life", "battery_days", "battery_life_on_cdbs", "battery_days_on_cdbs",
 })  # fmt: skip
 """Entries of a summary that tell which controller a blinded session ran."""
 
@@ -116,7 +116,8 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
     if task.timed and not is_blinded(opened.manifest_json):  # which would tell the network's size
         facts["measured_us"] = latency(opened.manifest_json, opened.controller(), task.timed)
     if source is None:
-        return facts | {"verified": True, "files": len(manifest.files)}
+        # how many files are inside tells a network from a schedule
+        return facts | {"verified": True, "files": None if facts.get("blinded") else len(manifest.files)}
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(errors="replace")  # bytes that are no text are no number either, and no reason to stop
     if is_live(source, wish):
@@ -230,7 +231,8 @@ def lines(summary: dict[str, Any]) -> str:
     who = f"participant {summary['participant']}, {_what(summary)}, {use}"
     warned = [f"warning          {text}" for text in summary["warnings"]]
     if summary.get("verified"):
-        said = f"{summary['bundle']}: signature, {summary['files']} files and test vectors are right. {who}."
+        files = "files" if summary["files"] is None else f"{summary['files']} files"
+        said = f"{summary['bundle']}: signature, {files} and test vectors are right. {who}."
         return "\n".join([said, *warned, *_measured(summary)])
     latency = summary["latency_us"]
     reasons = ", ".join(f"{name} {count}" for name, count in summary["reasons"].items()) or "none"
@@ -242,7 +244,8 @@ def lines(summary: dict[str, Any]) -> str:
         f"reasons          {reasons}",
         *([f"ended            {summary['ended']}"] if "ended" in summary else []),
         *_measured(summary),
-        f"deadline misses  {summary['deadline_misses']} (worst {summary['worst_late_ms']:.3g} ms after the window's end)",
+        f"deadline misses  {summary['deadline_misses']}"
+        + ("" if summary["worst_late_ms"] is None else f" (worst {summary['worst_late_ms']:.3g} ms after the window's end)"),
     ]
     for name, spread in (("decision", latency), ("P_beta", summary["signal_us"])):
         if spread:

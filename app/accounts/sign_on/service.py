@@ -7,7 +7,7 @@ from datetime import timedelta
 from sqlalchemy.orm import Session
 
 from app.accounts import repository as accounts
-from app.accounts.models import SignIn, SignOnLink
+from app.accounts.models import SignIn, SignOnLink, User
 from app.accounts.permissions import Caller
 from app.accounts.service import open_session
 from app.accounts.sign_on import repository
@@ -29,7 +29,7 @@ def sign_on(db: Session, identity: Identity) -> str:
         Refused: there is none, it is closed, or it belongs to somebody else at the provider.
     """
     link = repository.link_of(db, identity.issuer, identity.subject)
-    user = link.user if link else accounts.user_by_email(db, identity.address) if identity.address else None
+    user = link.user if link else _user_of(db, identity.address)
     if user is None:
         raise _refused(db, "unknown account", "There is no account here of an address that the sign-on vouches for.")
     if not user.active:
@@ -50,7 +50,11 @@ def confirm(db: Session, caller: Caller, identity: Identity) -> None:
     """
     link = repository.link_of(db, identity.issuer, identity.subject)
     row = db.get(SignIn, caller.sign_in_id) if caller.sign_in_id is not None else None
-    if row is None or link is None or link.user_id != caller.user_id:
+    if link is None:
+        raise _refused(
+            db, caller.label, "This sign-on is linked with no account yet: sign out and sign on with it once, or give your password."
+        )
+    if row is None or link.user_id != caller.user_id:
         raise _refused(db, caller.label, "Somebody else has signed on at the provider than the user of this page.")
     row.confirmed_at = now()
 
@@ -67,6 +71,12 @@ def use_confirmation(db: Session, caller: Caller) -> None:
             "You have not confirmed who you are.",
             f"Give your password, or confirm with the sign-on and sign within {CONFIRMED_FOR.seconds // 60} minutes.",
         )
+
+
+def _user_of(db: Session, address: str | None) -> User | None:
+    """The user of exactly this address. What only looks alike (NFKC, ß and ss) may be another mailbox, which the provider vouches for."""
+    user = accounts.user_by_email(db, address) if address else None
+    return user if user is not None and address is not None and user.email == address.strip().lower() else None
 
 
 def _refused(db: Session, whose: str, detail: str) -> Refused:

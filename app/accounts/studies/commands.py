@@ -14,7 +14,7 @@ from app.accounts.permissions import SYSTEM
 from app.accounts.sign_on.repository import remove_links
 from app.accounts.studies import service
 from app.accounts.studies.schemas import HINT, SiteIn, StudyIn
-from app.platform.database import transaction
+from app.platform.database import now, transaction
 from app.platform.errors import Invalid, NotFound
 from app.platform.terminal import ACTOR, AsJson, show
 
@@ -89,6 +89,10 @@ def user_remove_sign_on(email: Annotated[str, typer.Argument(help="E-mail addres
         if user is None:
             raise NotFound(f"There is no user {email}.")
         had = remove_links(db, user.id)
+        for opened in repository.open_sign_ins(db, user.id):
+            opened.confirmed_at = None
+            if opened.issuer is not None:
+                opened.ended_at = now()
     said = f"The next sign-on that vouches for {email} is linked." if had else f"{email} is linked with no sign-on."
     show({"email": email, "removed": had}, as_json, said)
 

@@ -128,8 +128,10 @@ def release_as_is(db: Session, file_id: int, reason: str, caller: Caller) -> Upl
 def discard(db: Session, file_id: int, reason: str, caller: Caller) -> UploadFile:
     """Erase the bytes for good; the row says what there was. Raises Conflict: not in quarantine."""
     file, _ = _held(db, file_id, caller)
+    assert file.quarantine_sha256 is not None
     file.status = "discarded" if file.status == "failed" else file.status
     _decide(db, file, reason, caller)
+    files.remove(file.quarantine_sha256)  # first: where the store is away nothing is decided, and the decision can be made again
     _erase(db, file)
     return file
 

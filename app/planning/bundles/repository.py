@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sqlalchemy import select
+from sqlalchemy import or_, select
 from sqlalchemy.orm import Session
 
 from app.learning.models import Policy
@@ -14,8 +14,14 @@ from app.study.models import Visit
 
 
 def releases(db: Session, policy_id: int) -> Sequence[BundleRelease]:
-    """The bundles of a policy that left so far, newest first."""
-    return db.scalars(select(BundleRelease).where(BundleRelease.policy_id == policy_id).order_by(BundleRelease.id.desc())).all()
+    """The bundles of a policy that left so far, newest first; without those of sealed plans (`plans.key`), whose time tells what ran."""
+    sealed = (
+        select(PlanItem.id)
+        .join(Plan, Plan.id == PlanItem.plan_id)
+        .where(Plan.blinded, Plan.approved_at.is_not(None), Plan.key_opened_at.is_(None))
+    )
+    told = or_(BundleRelease.plan_item_id.is_(None), BundleRelease.plan_item_id.not_in(sealed))
+    return db.scalars(select(BundleRelease).where(BundleRelease.policy_id == policy_id, told).order_by(BundleRelease.id.desc())).all()
 
 
 def releases_of_slots(db: Session, item_ids: Sequence[int]) -> Sequence[BundleRelease]:

@@ -33,5 +33,6 @@ def _row(row: Row, names: dict[int, str], sealed: bool) -> SlotRowOut:
         confirmed=row.confirmed,
         deviations=list(row.deviations),
         predicted=row.predicted if known else {},
-        done=row.done,
+        # 100 % of cDBS would name the cDBS sessions
+        done={name: value for name, value in row.done.items() if name != "energy"} if sealed else row.done,
     )

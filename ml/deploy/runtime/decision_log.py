@@ -116,7 +116,7 @@ def seal_row(number: int, drawn: tuple[int, float | None] | None, nonce: str) ->
 def masked(row: Row, number: int, nonce: str) -> list[Any]:
     """A row of a blinded session: no draws, no timing, no request, which tell a network from a schedule. The amplitude is as it was."""
     told = dict(zip(COLUMNS, cells(row), strict=True))
-    hidden = dict.fromkeys(("fraction", "requested_ma", "latency_us", "signal_us", "hold", "log_density"), "")
+    hidden = dict.fromkeys(("fraction", "requested_ma", "latency_us", "signal_us", "late_ms", "hold", "log_density"), "")
     return list((told | hidden | {"sealed": seal_row(number, row.drawn, nonce)}).values())
 
 

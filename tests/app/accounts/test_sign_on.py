@@ -123,8 +123,10 @@ def test_an_address_that_was_given_to_somebody_else_opens_no_account(
     hospital.present, hospital.person = None, theirs.Person("new-colleague", ADA.email)
     assert "somebody else" in signed_on(browser).text
     assert trail(db, "sign_on") == [("refuse", ADA.email)]
+    first = browser.get("/account").status_code
     done = CliRunner().invoke(cli.app, ["user", "remove-sign-on", ADA.email])
     assert done.exit_code == 0, done.output
+    assert (first, browser.get("/account").status_code) == (200, 303), "sessions of the old identity have ended"
     assert signed_on(browser).status_code == 303, "linked anew once an administrator has let go of the old one"
 
 

@@ -179,9 +179,10 @@ def test_machines_with_other_keys_do_not_start(shared: str, s3_server: Server, m
 
 def test_every_key_that_machines_must_share_is_checked() -> None:
     from app.planning.bundles.service import KEY
+    from app.planning.visit_day.service import _KEY as VISIT_DAY
     from app.platform.audit.chain import SECRET as SEALS
 
-    assert {KEY, SEALS} <= set(buckets.SHARED_KEYS)
+    assert {KEY, SEALS, VISIT_DAY} <= set(buckets.SHARED_KEYS)
     asked = subprocess.run(["grep", "-rhoE", r"\.secret\(\"[a-z-]+\"\)", "app"], capture_output=True, text=True, check=True).stdout
     assert {line.split('"')[1] for line in asked.splitlines()} <= set(buckets.SHARED_KEYS)
 
@@ -234,6 +235,18 @@ def test_copies_that_were_used_longest_ago_make_room(shared: str, db: Session, m
     assert [p.name for p in on_this_machine()] == kept[:1]
     assert all(files.read(sha256) == bytes([k]) * 1000 for k, sha256 in enumerate(kept)), "they are in the bucket"
     assert files.prune_copies() == 0, "used within the last hour"
+
+
+def test_files_of_before_there_was_a_bucket_are_no_copies(shared: str, db: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    sha256 = files.store(db, b"made before" * 100).sha256
+    os.utime(files.path_of(sha256), (time.time() - 7200,) * 2)
+    store = buckets.bucket()
+    assert store is not None
+    store.remove(sha256)
+    monkeypatch.setenv("BETALOOP_FILES_CACHE_GIB", str(1 / (1 << 30)))
+    get_settings.cache_clear()
+    assert files.prune_copies() == 0
+    assert [p.name for p in on_this_machine()] == [sha256]
 
 
 def test_a_large_file_arrives_whole(shared: str, db: Session) -> None:

@@ -158,13 +158,15 @@ def test_a_blinded_day_runs_without_telling_and_comes_back_by_its_slots(
         bundle, log = tmp_path / f"{position}.zip", tmp_path / f"{position}.csv"
         bundle.write_bytes(content)
         task = Task(log=log, key=key, ledger=tmp_path / "ledger", participant="P1", timed=20, begins=now + timedelta(minutes=10 * position))
+        checked = lines(control(bundle, None, Wish(), Task(key=key, participant="P1")))
+        assert "signature, files and test vectors are right" in checked, "how many files there are tells a network from a schedule"
         told = lines(control(bundle, f"simulated:P1:{position}", Wish(), task))
         assert "blinded" in told
         assert not [w for w in (*TELLING, "mA", "energy", "decision in us", "battery") if re.search(rf"\b{w}\b", told)], told
         head, described, header, *rows = log.read_text().splitlines()
         assert not words_of(described.encode()) & {*TELLING, "latency", "design", "seed"}
         heads.add((head, len(described) - len(str(position)), header))
-        for name in ("fraction", "requested_ma", "latency_us", "hold", "log_density"):
+        for name in ("fraction", "requested_ma", "latency_us", "late_ms", "hold", "log_density"):
             assert {row.split(",")[header.split(",").index(name)] for row in rows} == {""}, name
         sent = client.post("/api/v1/uploads", data={"participant": "P1"}, files={"file": ("log.csv", log.read_bytes())})
         assert sent.status_code == 201, sent.text
@@ -198,6 +200,7 @@ def test_the_bundles_own_runner_runs_a_blinded_session_and_refuses_it_a_second_t
     first = subprocess.run(call, cwd=tmp_path, input=hello + "stop\n", capture_output=True, text=True, check=False)
     assert first.returncode == 0, first.stderr
     assert "test vectors agree" in first.stderr
+    assert "worst difference" not in first.stderr, "0 of a fraction is that of a schedule"
     assert "blinded: what a decision takes stands masked in its log" in first.stdout
     again = subprocess.run([*call[:-2], "--log=b.csv", call[-1]], cwd=tmp_path, input=hello, capture_output=True, text=True, check=False)
     assert (again.returncode, "a slot runs once" in again.stderr) == (1, True)
