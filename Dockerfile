@@ -1,6 +1,8 @@
 FROM --platform=linux/amd64 python:3.11-slim
 RUN useradd --create-home --uid 10001 betaloop
 WORKDIR /srv/betaloop
+# the package index that has torch's builds without CUDA
+ARG PIP_EXTRA_INDEX_URL
 COPY requirements-service.lock ./
 RUN pip install --no-cache-dir --require-hashes --no-deps -r requirements-service.lock
 COPY pyproject.toml README.md alembic.ini ./

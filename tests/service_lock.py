@@ -18,7 +18,6 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 LOCK = ROOT / "requirements-service.lock"
-TORCH_INDEX = "https://download.pytorch.org/whl/cpu"
 EXTRAS = ("", "nwb", "s3")
 
 
@@ -71,17 +70,11 @@ def held() -> dict[str, list[str]]:
 
 
 def hashes(packages: list[str]) -> dict[str, str]:
-    """SHA-256 of the file that pip installs for each package, asked of the package index without installing anything."""
-    torch = [line for line in packages if line.startswith("torch==")]
-    # apart, for the index of torch has nothing else
-    return _asked([line for line in packages if line not in torch]) | _asked(torch, "--retries=1", "--extra-index-url", TORCH_INDEX)
-
-
-def _asked(packages: list[str], *options: str) -> dict[str, str]:
+    """SHA-256 of the file that pip installs for each package, asked of pip's package indexes without installing anything."""
     with tempfile.TemporaryDirectory() as folder:
         wanted, report = Path(folder, "wanted.txt"), Path(folder, "report.json")
         wanted.write_text("\n".join(packages))
-        call = ["install", "--dry-run", "--quiet", "--no-deps", "--ignore-installed", "--only-binary=:all:", *options]
+        call = ["install", "--dry-run", "--quiet", "--no-deps", "--ignore-installed", "--only-binary=:all:"]
         call += ["--report", str(report), "-r", str(wanted)]
         subprocess.run([sys.executable, "-m", "pip", "--disable-pip-version-check", *call], check=True)
         return {
@@ -100,7 +93,10 @@ def _normal(line: str) -> str:
 
 def service_lock(known: Mapping[str, str]) -> str:
     """The text of `requirements-service.lock`."""
-    head = f"# Written by `make lock` for the image: Linux on x86-64, Python 3.11; torch without CUDA.\n--extra-index-url {TORCH_INDEX}\n"
+    head = (
+        "# Written by `make lock` for the image: Linux on x86-64, Python 3.11."
+        " The index that PIP_EXTRA_INDEX_URL names has torch without CUDA.\n"
+    )
     return head + "".join(f"{line} \\\n    --hash=sha256:{known[_normal(line)]}\n" for line in service_packages())
 
 

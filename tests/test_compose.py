@@ -49,10 +49,11 @@ def test_every_name_in_it_exists() -> None:
         assert set(service.get("depends_on", {})) <= set(SERVICES), name
         assert {mount.split(":")[0] for mount in service["volumes"]} <= set(COMPOSE["volumes"]), name
         if name in OURS:
+            assert set(service["build"]["args"]) <= set(re.findall(r"^ARG (\w+)$", IMAGE, re.MULTILINE)), name
             assert set(service["environment"]) <= fields, name
             assert "files:/data" in service["volumes"], "every service of ours reads and writes the same files and keys"
     asked = set(re.findall(r"\$\{(\w+):\?", (ROOT / "docker-compose.yml").read_text()))
-    assert asked == {"POSTGRES_PASSWORD", "SERVICE_PASSWORD"}
+    assert asked == {"POSTGRES_PASSWORD", "SERVICE_PASSWORD", "TORCH_INDEX"}
     told = (ROOT / "docker-compose.yml").read_text().split("services:")[0]
     assert all(name in told for name in asked), "the head of the file says what to put into .env"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.service_lock import held, service_packages
+from tests.service_lock import LOCK, held, service_packages
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -22,3 +22,10 @@ def test_the_image_installs_that_lock_alone() -> None:
     image = (ROOT / "Dockerfile").read_text()
     assert "pip install --no-cache-dir --require-hashes --no-deps -r requirements-service.lock" in image
     assert "requirements.lock" not in image
+
+
+def test_where_packages_come_from_is_named_by_who_builds_the_image() -> None:
+    for path in (LOCK, ROOT / "requirements.lock"):
+        assert [line for line in path.read_text().splitlines() if line.startswith("-") or "://" in line] == [], path.name
+    image = (ROOT / "Dockerfile").read_text()
+    assert image.index("ARG PIP_EXTRA_INDEX_URL") < image.index("pip install")
