@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timedelta
+from enum import StrEnum
 from pathlib import Path
 
 from app.platform.errors import Invalid
@@ -24,9 +25,16 @@ from ml.deploy.runtime.slot import NotAllowed, Refusal, read_withdrawals
 
 BENCH_MINUTES = 10.0
 """Length of a bench session on a simulated device, of a bundle that states none."""
-_SIMULATED = "simulated:"
-_SCHEMES = ("tcp:", "tail:", _SIMULATED)
-"""How the command's input argument names a device side; what follows the colon is the port, the file, or the simulated brain."""
+
+
+class DeviceSide(StrEnum):
+    """How the command's input argument `SCHEME:REST` names a device side; the rest is the port, the file, or the simulated brain."""
+
+    TCP = "tcp"
+    TAIL = "tail"
+    SIMULATED = "simulated"
+
+
 _MEND = {
     Refusal.NO_SLOT: "Have the visit plan signed and take the session's bundle from it, or add --bench where nobody is connected.",
     Refusal.NOT_SIGNED: "Have the visit plan signed and take the bundle anew, or add --bench where nobody is connected.",
@@ -42,12 +50,22 @@ _MEND = {
 
 def is_live(source: str, wish: Wish) -> bool:
     """Whether a source is a device side, which amplitudes go out to."""
-    return (source == "-" and wish.realtime) or source.startswith(_SCHEMES)
+    return (source == "-" and wish.realtime) or _device_side(source) is not None
+
+
+def _device_side(source: str) -> tuple[DeviceSide, str] | None:
+    """The scheme of a source and what follows its colon; None for a file of recorded input."""
+    scheme, colon, rest = source.partition(":")
+    return (DeviceSide(scheme), rest) if colon and scheme in set(DeviceSide) else None
 
 
 def _simulated_brain(source: str) -> str | None:
     """Which brain a simulated device is asked for; None where the source is no simulated device."""
-    return source.removeprefix(_SIMULATED) if source.startswith(_SIMULATED) else None
+    match _device_side(source):
+        case DeviceSide.SIMULATED, brain:
+            return brain
+        case _:
+            return None
 
 
 def run_live(
