@@ -2,6 +2,7 @@
 
     python -m benchmarks.development.portfolio --quick                    two worlds of part A
     python -m benchmarks.development.portfolio --worlds 40 --out FOLDER   40 worlds; resumable
+    python -m benchmarks.development.portfolio --part B ...               patients to report on; each run is counted
     python -m benchmarks.development.portfolio --dlsm ...                 the order of the DLSM too, which costs a minute per world
 
 Every virtual patient has three visits of data by the stratified design. Three more visits test up to four policies each: 60 minutes, two
@@ -39,6 +40,7 @@ from ml.ope.posterior.verdict import Levels, verdict
 from ml.ope.registry import estimators
 from ml.policies.policy import Policy
 from ml.population.virtual import WORLDS_PER_PART, World, visit_days, world
+from ml.population.virtual.world import Part
 from ml.qoc import Margins
 from ml.statistics.bootstrap import percentile_interval
 
@@ -130,9 +132,9 @@ def in_order(clinic: Clinic, order: list[str]) -> Found:
     return Found(tested, kept)
 
 
-def arms(index: int, truth_sessions: int, dlsm: bool) -> dict[str, Any] | None:
+def arms(part: Part, index: int, truth_sessions: int, dlsm: bool) -> dict[str, Any] | None:
     """Shares of the best gain by arm and visit; None where no candidate gains more than two standard errors."""
-    case, w = virtual_case("A", index, truth_sessions), world("A", index)
+    case, w = virtual_case(part, index, truth_sessions), world(part, index)
     clinic, buffer = Clinic(w, {**case.candidates, CDBS: case.probes[CDBS]}), case.data("stratified")
     true = {n: case.truth["policies"][n]["total"] for n in clinic.policies}
     gains = {n: true[n][0] - true[CDBS][0] for n in clinic.policies}
@@ -173,13 +175,14 @@ def main() -> None:
     """Print the curve as a table and, as the last line, one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_WORLDS} worlds, few simulated sessions")
+    parser.add_argument("--part", default="A", choices=("A", "B"), help="A to develop on, B to report on")
     parser.add_argument("--worlds", type=int, default=WORLDS_PER_PART)
     parser.add_argument("--dlsm", action="store_true", help="the order of the DLSM as well")
     parser.add_argument("--minutes", type=float, default=1e9, help="start no further world after so many minutes")
     parser.add_argument("--out", type=Path, help="folder of the finished worlds; a temporary one by default")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    look("A", " ".join(["portfolio", *sys.argv[1:]]), None)
+    look(chosen.part, " ".join(["portfolio", *sys.argv[1:]]), None)
     out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-portfolio-"))
     out.mkdir(parents=True, exist_ok=True)
     cells = Cells(out / f"portfolio{'-quick' if chosen.quick else ''}{'-dlsm' if chosen.dlsm else ''}.jsonl")
@@ -187,11 +190,11 @@ def main() -> None:
     for index in range(min(chosen.worlds, QUICK_WORLDS) if chosen.quick else chosen.worlds):
         if time.monotonic() - begun > 60 * chosen.minutes:
             break
-        if cells.get(f"A{index:02d}") is None:
+        if cells.get(f"{chosen.part}{index:02d}") is None:
             start = time.process_time()
-            found = arms(index, QUICK_TRUTH if chosen.quick else TRUTH, chosen.dlsm)
-            cells.add(f"A{index:02d}", arms=found, seconds=time.process_time() - start)
-    rows = [cell["arms"] for cell in cells.all("A") if cell["arms"] is not None]
+            found = arms(chosen.part, index, QUICK_TRUTH if chosen.quick else TRUTH, chosen.dlsm)
+            cells.add(f"{chosen.part}{index:02d}", arms=found, seconds=time.process_time() - start)
+    rows = [cell["arms"] for cell in cells.all(chosen.part) if cell["arms"] is not None]
     shares = {arm: [row[arm] for row in rows] for arm in (rows[0] if rows else ())}
     sys.stdout.writelines(
         [f"{len(rows)} virtual patients, share of the best candidate's true gain over cDBS, 90 % intervals\n", *lines(shares)]
@@ -201,7 +204,7 @@ def main() -> None:
         for arm, of in shares.items()
         for figure in ("tested", "kept")
     }
-    figures |= {"n_worlds": len(rows), "cpu_seconds_per_world": float(np.mean([c["seconds"] for c in cells.all("A")]))}
+    figures |= {"n_worlds": len(rows), "cpu_seconds_per_world": float(np.mean([c["seconds"] for c in cells.all(chosen.part)]))}
     sys.stdout.write(json.dumps({"name": "portfolio", "figures": figures, "ratios": {}, "baseline": "linear model alone"}) + "\n")
 
 
