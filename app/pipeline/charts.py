@@ -22,6 +22,8 @@ JOB_CURVES = {
     "loss": ("Distillation: loss", "mean squared difference from the teacher, fraction squared"),
     "dlsm_loss": ("DLSM: training loss", "negative objective"),
     "dlsm_held_out_score": ("DLSM: score on held-out sessions", "lower is better"),
+    "dlsm_paper_loss": ("DLSM (paper): training loss", "negative evidence bound"),
+    "dlsm_paper_held_out_score": ("DLSM (paper): score on held-out sessions", "lower is better; it stops nothing here"),
     "dlmm_loss": ("DLMM: training loss", "negative evidence bound"),
     "dlmm_held_out_bound": ("DLMM: evidence bound on held-out sessions", "higher is better"),
     "dual_dice_dice_objective": ("DualDICE: objective", "saddle point; it need not fall"),
@@ -29,7 +31,7 @@ JOB_CURVES = {
 """Learning curves by the name that the computations give them: title and unit."""
 
 
-SHARE_CURVES = {"dlmm_loss", "dlmm_held_out_bound", "dual_dice_dice_objective"}
+SHARE_CURVES = {"dlsm_paper_loss", "dlsm_paper_held_out_score", "dlmm_loss", "dlmm_held_out_bound", "dual_dice_dice_objective"}
 """Curves that methods draw while they estimate, over the share of their work instead of their updates."""
 
 

@@ -40,6 +40,7 @@ class Method:
         factory: `module:attribute` of a `Factory`; None for the combination.
         held_out: whether it is fitted within seconds, so that it can be refitted without each controller and held against its sessions.
         quick: whether the preset `quick` runs it where nothing is said: one method of every family.
+        on_request: only run where it is named: no preset has it, and it is never taken by default.
         preference: place in the usual order where the data choose no method; None for a method that is never taken by default.
         weight: share of a job's progress that its step takes.
         colour, symbol: of its marks in charts: a colour token of the pages, and a plotly symbol that has an open form.
@@ -53,6 +54,7 @@ class Method:
     factory: str | None
     held_out: bool = False
     quick: bool = False
+    on_request: bool = False
     preference: int | None = None
     weight: float = 1.0
     colour: str = "other"
@@ -84,6 +86,7 @@ def unregister(key: str) -> None:
 # fmt: off
 for _method in (
     Method(key="dlsm", name="DLSM", short="DLSM", family="model", needs="four sessions", factory="ml.ope.dlsm.estimator:build", quick=True, preference=2, weight=6.0, colour="rl", symbol="diamond"),  # noqa: E501
+    Method(key="dlsm_paper", name="DLSM (paper)", short="DLSM (paper)", family="model", needs="four sessions", factory="ml.ope.dlsm.estimator:build_paper", on_request=True, weight=8.0, colour="rl", symbol="diamond-wide"),  # noqa: E501
     Method(key="linear", name="Linear model", short="Linear", family="model", needs="two sessions", factory="ml.ope.linear.estimator:build", held_out=True, quick=True, preference=1, weight=2.0, colour="distilled", symbol="square"),  # noqa: E501
     Method(key="impulse", name="Impulse-response model", short="Impulse", family="model", needs="two sessions", factory="ml.ope.impulse.estimator:build", weight=2.0, colour="good", symbol="hourglass"),  # noqa: E501
     Method(key="dlmm", name="DLMM", short="DLMM", family="model", needs="two sessions", factory="ml.ope.dlmm:build", weight=3.0, colour="accent", symbol="hexagram"),  # noqa: E501

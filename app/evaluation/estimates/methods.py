@@ -36,7 +36,7 @@ def quick_methods() -> list[str]:
 
 def methods_of(preset: str) -> list[str]:
     """What a preset runs where no methods are named."""
-    return quick_methods() if preset == "quick" else list(registry.method_keys())
+    return quick_methods() if preset == "quick" else [m.key for m in registry.methods() if not m.on_request]
 
 
 def names() -> dict[str, str]:
@@ -55,13 +55,16 @@ def _of_preset(values: Mapping[str, Any]) -> list[str]:
     return methods_of(str(values.get("preset", "full")))
 
 
+_ON_REQUEST = [m.key for m in registry.methods() if m.on_request]
+
 Methods = Annotated[
     list[Method],
     Field(
         default_factory=_of_preset,
         min_length=1,
         max_length=20,
-        description=f"Estimators to run; where not given, all for `full` and for `quick` {', '.join(quick_methods())}.",
+        description=f"Estimators to run; where not given, for `full` all but {', '.join(_ON_REQUEST)}"
+        f" and for `quick` {', '.join(quick_methods())}.",
     ),
     AfterValidator(_checked),
 ]

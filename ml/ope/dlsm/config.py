@@ -30,11 +30,14 @@ class DlsmConfig:
         action_emission: heads of steps see a_{t-1} beside z_t, so that beta and reward answer to the action.
         end_features: outcomes from z_T (`final`, paper) or from z_T and the mean of z (`pooled`).
         start: roll-outs from `observed` s_0 through q(z_0 | s_0), or from the `prior` (paper).
+        skip: a linear path from z_{t-1} and the inputs to the mean of z_t past the LSTM; without it z_t is drawn given h_t alone (paper).
+        qoc_terms: the QoCs shape the latent state as r_end does; without it they are only read from it (paper).
         kl_weight, end_weight: weights in the objective; 1 and 1 is the bound.
         members: ensemble size, one seed each.
         steps: gradient steps at most. batch: sessions per step. learning_rate: of Adam, falling to a tenth along a half cosine.
         clip_norm: largest norm of the gradient. weight_decay: decoupled.
         check_every: steps between held-out checks; `patience`: checks without improvement before stopping.
+        keep: the weights of the `best` held-out check, or of the `last` step, whatever the checks say (paper).
         held_out: share of the sessions that a member does not learn from.
         replay_draws: free runs per held-out session in a check.
         rollouts: trajectories per policy and member. block: trajectories advanced together.
@@ -58,6 +61,8 @@ class DlsmConfig:
     action_emission: bool = True
     end_features: Literal["final", "pooled"] = "pooled"
     start: Literal["observed", "prior"] = "observed"
+    skip: bool = True
+    qoc_terms: bool = True
     kl_weight: float = 1.0
     end_weight: float = 1.0
     members: int = 5
@@ -68,6 +73,7 @@ class DlsmConfig:
     weight_decay: float = 1e-3
     check_every: int = 25
     patience: int = 4
+    keep: Literal["best", "last"] = "best"
     held_out: float = 0.2
     replay_draws: int = 16
     rollouts: int = 256
@@ -99,6 +105,29 @@ class DlsmConfig:
     def of_size(cls, size: Size, seed: int = 0) -> DlsmConfig:
         """Settings at a size of `ml.ope.registry`."""
         return cls.demo(seed) if size == "demo" else cls(seed=seed)
+
+    @classmethod
+    def paper(cls, size: Size = "full", seed: int = 0) -> DlsmConfig:
+        """The plain form: theorem 5.1 as the objective, eq:encoder and eq:decoder without additions, roll-outs by the decoder alone.
+
+        Every roll-out starts from z_0 ~ N(0, I), draws all of s_t from z_t, takes rewards from the reward head and r_end from z_T;
+        training runs to its last step. Sizes and rates, of which the paper says nothing, are those of `of_size`.
+        """
+        return replace(
+            cls.of_size(size, seed),
+            objective="posterior",
+            state_terms="window",
+            action_emission=False,
+            end_features="final",
+            start="prior",
+            skip=False,
+            qoc_terms=False,
+            weight_decay=0.0,
+            keep="last",
+            reward_source="head",
+            end_source="latent",
+            decode_all_window=True,
+        )
 
     def candidates(self) -> tuple[DlsmConfig, ...]:
         """What `select` chooses among: these settings with each objective, the own one first."""

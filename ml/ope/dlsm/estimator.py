@@ -61,6 +61,11 @@ class Dlsm:
     config: DlsmConfig = field(default_factory=DlsmConfig)
     method: str = "dlsm"
 
+    @property
+    def successive_members(self) -> int:
+        """Members that learn one after the other in `fit`."""
+        return self.config.members
+
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedDlsm:
         """Train every member; what a checkpoint in `checkpoint_dir` calls finished is not trained again.
 
@@ -350,3 +355,8 @@ def _warnings(skill: dict[str, Any]) -> list[Flag]:
 def build(key: str, seed: int, size: Size) -> Dlsm:
     """The estimator at a size of `ml.ope.registry`."""
     return Dlsm(DlsmConfig.of_size(size, seed), key)
+
+
+def build_paper(key: str, seed: int, size: Size) -> Dlsm:
+    """The paper's plain form at a size of `ml.ope.registry`."""
+    return Dlsm(DlsmConfig.paper(size, seed), key)

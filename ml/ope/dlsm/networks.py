@@ -25,7 +25,7 @@ class LatentRecurrence(nn.Module):
     The encoder has x_t = (a_{t-1}, s_t), the decoder x_t = a_{t-1}.
     """
 
-    def __init__(self, n_exogenous: int, latent: int, hidden: int) -> None:
+    def __init__(self, n_exogenous: int, latent: int, hidden: int, skip: bool = True) -> None:
         super().__init__()
         self.latent, self.hidden = latent, hidden
         bound = 1 / math.sqrt(hidden)
@@ -38,6 +38,8 @@ class LatentRecurrence(nn.Module):
         with torch.no_grad():
             self.bias[2 * hidden : 3 * hidden] = 1.0  # an LSTM that starts by remembering
         self.a_x, self.a_z = weight(n_exogenous, latent), nn.Parameter(0.5 * torch.eye(latent))
+        if not skip:  # the kernels add the path in any case: with zeros that are not learnt it adds nothing
+            self.a_x, self.a_z = (nn.Parameter(torch.zeros_like(w), requires_grad=False) for w in (self.a_x, self.a_z))
         self.w_out, self.b_out = weight(hidden, 2 * latent), nn.Parameter(torch.zeros(2 * latent))
 
     def run(self, x: Tensor, z0: Tensor, eps: Tensor, fast: bool = True) -> tuple[Tensor, Tensor, Tensor]:
@@ -100,8 +102,8 @@ class DlsmNetworks(nn.Module):
         self.state_width = window if config.state_terms == "window" else 1
         extra = 1 if config.action_emission else 0
         self.first = GaussianHead(window, z, heads)
-        self.encoder = LatentRecurrence(1 + window, z, hidden)
-        self.decoder = LatentRecurrence(1, z, hidden)
+        self.encoder = LatentRecurrence(1 + window, z, hidden, config.skip)
+        self.decoder = LatentRecurrence(1, z, hidden, config.skip)
         self.first_state = GaussianHead(z, window, heads)
         self.state = GaussianHead(z + extra, self.state_width, heads)
         self.reward = GaussianHead(z + extra, 1, heads)
@@ -164,8 +166,17 @@ class DlsmNetworks(nn.Module):
         seen = self.head_input(z, batch.actions)
         states = self.state.log_prob(seen, batch.states[1:, :, -self.state_width :], fast)
         rewards = self.reward.log_prob(seen, batch.rewards.unsqueeze(2), fast)
-        outcomes = gaussian_log_prob(batch.outcomes, *self.outcome(self.end_input(z, batch.lengths, batch.alive))) * batch.outcome_mask
+        outcomes = self._outcome_terms(batch, z)
         return (states * batch.usable).sum(0), (rewards * batch.usable).sum(0), outcomes.sum(1)
+
+    def _outcome_terms(self, batch: Batch, z: Tensor) -> Tensor:
+        """log p of the measured outcomes, [B, 4]; without `qoc_terms` the QoCs leave no gradient in z."""
+        given = self.end_input(z, batch.lengths, batch.alive)
+        terms = gaussian_log_prob(batch.outcomes, *self.outcome(given))
+        if not self.config.qoc_terms:
+            aside = gaussian_log_prob(batch.outcomes, *self.outcome(given.detach()))
+            terms = torch.cat([terms[:, :1], aside[:, 1:]], dim=1)
+        return terms * batch.outcome_mask
 
     def end_input(self, z: Tensor, lengths: Tensor, alive: Tensor) -> Tensor:
         """z_T of each session, with `pooled` also the mean of z_1 ... z_T; z is [T, B, Z]."""

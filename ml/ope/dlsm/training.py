@@ -24,7 +24,7 @@ from ml.trajectories import ReplayBuffer
 
 @dataclass(frozen=True)
 class Member:
-    """A trained ensemble member: its networks at the best check, that check, and the course of training as (step, loss, score)."""
+    """A trained ensemble member: its networks at the check that `keep` names, that check, and the course as (step, loss, score)."""
 
     networks: DlsmNetworks
     check: FreeRuns
@@ -78,7 +78,7 @@ class MemberTraining:
         return self.step >= self.config.steps or self.stale >= self.config.patience
 
     def run(self, checkpoint: Path | None = None, report: Report = silent) -> Member:
-        """Train to the end, going on from the checkpoint where there is one, and return the member as it was at its best check."""
+        """Train to the end, going on from a checkpoint where there is one; the member is that of the check that `keep` names."""
         if checkpoint is not None and checkpoint.exists():
             self.load(checkpoint)
         while not self.finished:
@@ -119,7 +119,8 @@ class MemberTraining:
         scored = self.score(self.held_batch, self.held)
         self.course.append((self.step, self.loss_sum / steps_since, scored.score))
         self.loss_sum = 0.0
-        if math.isfinite(scored.score) and (self.best is None or scored.score < self.best.score):
+        last = self.config.keep == "last"
+        if math.isfinite(scored.score) and (last or self.best is None or scored.score < self.best.score):
             self.best, self.stale = scored, 0
             self.best_weights = {k: v.detach().clone() for k, v in self.networks.state_dict().items()}
         else:

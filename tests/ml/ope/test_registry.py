@@ -15,7 +15,7 @@ def test_every_method_but_the_combination_is_built_under_its_key_at_every_size()
     for method in methods():
         for size in get_args(Size):
             if method.factory is None:
-                with pytest.raises(ValueError, match="'aggregate' is no method that can be fitted; these can: dlsm, linear"):
+                with pytest.raises(ValueError, match="'aggregate' is no method that can be fitted; these can: dlsm, dlsm_paper, linear"):
                     build(method.key, 0, size)
             else:
                 assert build(method.key, 3, size).method == method.key
@@ -31,6 +31,11 @@ def test_a_demonstration_is_smaller_than_a_study_and_a_seed_arrives() -> None:
 
 def test_the_usual_order_is_that_of_the_records() -> None:
     assert preference() == ("linear", "dlsm", "fqe", "wdr", "cwpdis", "wis", "dual_dice", "pdis")
+
+
+def test_the_form_of_the_paper_runs_where_it_is_named_and_nowhere_else() -> None:
+    asked = [m for m in methods() if m.on_request]
+    assert [(m.key, m.name, m.preference, m.quick, m.held_out) for m in asked] == [("dlsm_paper", "DLSM (paper)", None, False, False)]
 
 
 def test_marks_are_told_apart_and_keys_are_taken_once() -> None:

@@ -115,7 +115,7 @@ def test_without_a_record_its_estimates_stand_under_their_key(
 def test_the_published_interface_lists_the_methods_and_refuses_others(client: TestClient) -> None:
     schemas = cast(FastAPI, client.app).openapi()["components"]["schemas"]
     assert schemas["EvaluateJob"]["properties"]["methods"]["items"]["enum"] == list(registry.method_keys())
-    with pytest.raises(ValidationError, match="'nonsense' is no method of evaluation; choose among dlsm, linear"):
+    with pytest.raises(ValidationError, match="'nonsense' is no method of evaluation; choose among dlsm, dlsm_paper, linear"):
         EvaluateParams(methods=["nonsense", "fqe"])
 
 

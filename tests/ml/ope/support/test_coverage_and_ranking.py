@@ -74,7 +74,8 @@ def test_the_ranking_rests_on_the_first_method_that_supports_a_policy():
 
 def test_the_panel_names_its_methods_by_the_keys_of_the_ranking():
     panel = estimators(demo=True)
-    assert list(panel) == ["dlsm", "linear", "impulse", "dlmm", "fqe", "wdr", "dual_dice", "wis", "pdis", "cwpdis", "posterior"]
+    models = ["dlsm", "dlsm_paper", "linear", "impulse", "dlmm"]
+    assert list(panel) == [*models, "fqe", "wdr", "dual_dice", "wis", "pdis", "cwpdis", "posterior"]
     assert all(e.method == key for key, e in panel.items())
 
 
