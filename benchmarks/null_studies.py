@@ -28,11 +28,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support.null_worlds import BOUNDED, METRICS, MINUTES, WORLDS, Tally, World, latent, layout, measure, metric_average, nothing_to_test
+from support.null_worlds import (
+    BOUNDED,
+    MARGINS,
+    METRICS,
+    MINUTES,
+    WORLDS,
+    Tally,
+    World,
+    latent,
+    layout,
+    margin_studies,
+    measure,
+    metric_average,
+    nothing_to_test,
+    show_margin,
+)
 
+from app.analysis.primary.verdict import FAILURE, outcome_of
 from ml.statistics.association import within_visits
 from ml.statistics.effects import cliffs_delta, energy_saving
-from ml.statistics.noninferiority import Inconclusive, NonInferiorAndSaving, Outcome, assess
+from ml.statistics.noninferiority import assess
 from ml.statistics.ranksum import as_in_the_paper
 from ml.statistics.within_visits.averages import primary
 from ml.statistics.within_visits.contrasts import Average, Measurements, Unavailable, average, visit_contrasts
@@ -154,47 +170,6 @@ def mixed(metric: str, data: Measurements) -> Average | None:
     return None if isinstance(found, Unavailable) else found.effect
 
 
-MARGINS = {"grasp": 0.2, "rating": 0.2, "tremor": 15.0}
-"""Hz; probability; per cent."""
-
-
-def margin_studies(visits: int, studies: int, seed: int) -> Tally:
-    """Grasp exactly at its margin, or everything equal to cDBS; energy saved by a third."""
-    tally = Tally()
-    for slope, stops in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.05), (0.5, 0.05)):
-        world = World(visits=visits, each=4, slope=slope)
-        for kind, number in (("at margin", studies), ("equal", studies // 4)):
-            rng = np.random.default_rng(visits + 1_000_000 * seed)
-            for study in range(number):
-                shown, saving = judged(world, kind == "at margin", stops, rng, study)
-                key = (f"{visits} visits", f"day x dose {slope:g}", f"stopped {stops:.0%}", kind)
-                tally.add((*key, "non-inferior"), shown)
-                tally.add((*key, "and saving"), saving)
-    return tally
-
-
-def judged(world: World, at_margin: bool, stops: float, rng: np.random.Generator, seed: int) -> tuple[bool, bool]:
-    """Whether non-inferiority is shown, and whether the saving is shown too."""
-    design = layout(world, rng)
-    visit, tested, order = design
-    stopped = (rng.random(visit.size) < stops) & tested
-    small = World(visits=world.visits, each=world.each, day=1.0, slope=world.slope)
-    data = {m: measure(m, latent(small, 0.0, rng, design), design, small, rng) for m in MARGINS}
-    if at_margin:
-        moved = data["grasp"].value - MARGINS["grasp"] * tested
-        data["grasp"] = Measurements.of(moved, visit, tested, order=order)
-    outcomes = [
-        Outcome("grasp", data["grasp"], stopped, MARGINS["grasp"], True),
-        Outcome("rating", data["rating"], stopped, MARGINS["rating"], True, "win_probability", 1.0),
-        Outcome("tremor", data["tremor"], stopped, MARGINS["tremor"], False, "difference", 100.0),
-    ]
-    energy = np.where(tested, 0.65, 1.0) + np.where(tested, 0.05, 0.01) * rng.standard_normal(visit.size)
-    result = assess(outcomes, Measurements.of(energy, visit, tested), stopped, alpha=ALPHA, seed=seed, plan=False)
-    saving = isinstance(result.verdict, NonInferiorAndSaving)
-    shown = saving or (isinstance(result.verdict, Inconclusive) and result.verdict.open == ("energy",))
-    return shown, saving
-
-
 def power_studies(visits: int, studies: int, seed: int) -> Tally:
     """Power of the primary test, of Student's t alone, of the exact one within visits and of the paper's, for an effect of one standard
     deviation of a session."""
@@ -253,7 +228,7 @@ def speed() -> dict[str, float]:
             design = visit[rows], controller[rows] == tested, np.tile(np.arange(20.0), 10)[rows]
             data = {m: measure(m, z[k][rows], design, World(), rng) for k, m in enumerate(METRICS)}
             stopped = np.zeros(rows.sum(), dtype=bool)
-            outcomes = [Outcome(m, data[m], stopped, margin, m != "tremor") for m, margin in MARGINS.items()]
+            outcomes = [o for m in FAILURE if (o := outcome_of(m, data[m], stopped, MARGINS)) is not None]
             for label, work in (
                 ("paper", lambda d=data: [naive(v) for v in d.values()]),
                 ("primary", lambda d=data: [(primary(v), cliffs_delta(v)) for v in d.values()]),
@@ -318,24 +293,6 @@ def show_skewed(tally: Tally) -> None:
             own = metric_average(WORLDS[name], metric)
             out(f"{name:<22}{metric:<8}{own:>8.2f} |{shares[0]:>8.4f}{shares[1]:>8.4f} |{shares[2]:>8.4f}{shares[3]:>8.4f}\n")
     out("\n")
-
-
-def show_margin(tally: Tally) -> dict[str, float]:
-    """Non-inferiority at the margin and where nothing is lost."""
-    out("non-inferiority shown: grasp exactly at its margin (an error) | nothing lost (power), of it with the saving shown\n")
-    worst, few = 0.0, 0.0
-    for key in sorted({k[:3] for k in tally.counts if k[0].endswith("visits") and len(k) == 5}, key=lambda k: (int(k[0].split()[0]), k)):
-        wrong = tally.share(*key, "at margin", "non-inferior")[0]
-        right, saving = (tally.share(*key, "equal", label)[0] for label in ("non-inferior", "and saving"))
-        worst = max(worst, wrong)
-        if int(key[0].split()[0]) < 3:
-            few = max(few, wrong, right)
-        out(f"  {', '.join(key):<42}{wrong:>8.3f} |{right:>8.3f}{saving:>8.3f}\n")
-    pooled = []
-    for visits in {k[0] for k in tally.counts if len(k) == 5}:
-        cells = [c for k, c in tally.counts.items() if len(k) == 5 and k[0] == visits and k[3:] == ("at margin", "non-inferior")]
-        pooled.append(sum(c[0] for c in cells) / sum(c[1] for c in cells))
-    return {"non_inferior_at_margin": max(pooled), "non_inferior_at_margin_worst_cell": worst, "non_inferior_below_three_visits": few}
 
 
 def show_power(tally: Tally) -> None:

@@ -1,20 +1,33 @@
-"""Worlds of the null studies, and how a study is drawn from one: who was tested when, and what a metric then shows."""
+"""Worlds of the null studies, and how a study is drawn from one: who was tested when, and what a metric then shows; and studies of
+controllers that lose nothing, or exactly what is accepted of one outcome.
+
+Steps and bounds of metrics, margins, scales and values of failures are those of the service (`app.analysis.primary.verdict.outcome_of`).
+"""
 
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import expit
 
+from app.analysis.evidence import measurements
+from app.analysis.primary.verdict import FAILURE, outcome_of
+from ml.qoc import Margins
+from ml.statistics.noninferiority import LEAST_VISITS, Inconclusive, NonInferiorAndSaving, assess
 from ml.statistics.within_visits.contrasts import Measurements
 
+out = sys.stdout.write
+
+RESOLUTION = measurements.RESOLUTION
+BOUNDED = tuple(sorted(measurements.BOUNDED))
 MINUTES = 10
+GRASP_HZ = 2.3
 METRICS = ("grasp", "beta", "rating", "tremor", "energy")
-RESOLUTION = {"rating": 1.0, "tremor": 100 / MINUTES}
-BOUNDED = ("rating", "tremor")
-"""Metrics with a floor or a ceiling."""
 
 
 @dataclass(frozen=True)
@@ -104,10 +117,10 @@ def measure(metric: str, z: np.ndarray, design: tuple[np.ndarray, np.ndarray, np
     """A metric of the study from its latent value."""
     visit, tested, order = design
     value = {
-        "grasp": lambda: 2.3 + 0.15 * z,
+        "grasp": lambda: GRASP_HZ + 0.15 * z,
         "beta": lambda: 1.0 + 0.12 * z,
         "rating": lambda: np.clip(np.round(7 + 0.8 * z), 1, 10),
-        "tremor": lambda: 100 * rng.binomial(MINUTES, 1 / (1 + np.exp(1.5 - 0.8 * z))) / MINUTES,
+        "tremor": lambda: 100 * rng.binomial(MINUTES, expit(0.8 * z - 1.5)) / MINUTES,
         "energy": lambda: 1.0 + 0.05 * z,
     }[metric]()
     value = np.where(rng.random(value.size) < world.missing, np.nan, value)
@@ -125,6 +138,17 @@ def metric_average(world: World, metric: str, visits: int = 20_000, seed: int = 
     value = measure(metric, latent(many, 0.0, rng, design), design, many, rng).value
     means = [np.bincount(visit, value * arm) / np.bincount(visit, arm) for arm in (tested.astype(float), (~tested).astype(float))]
     return float(np.mean(means[0] - means[1]))
+
+
+def tremor_effect(world: World, points: float) -> float:
+    """The average effect in the latent value that brings so many more percentage points of tremor on average over sessions and visits."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(60)
+
+    def tremor(effect: float, spread: float) -> float:
+        return 100 * float(weights @ expit(0.8 * (effect + spread * nodes) - 1.5)) / float(weights.sum())
+
+    alone = float(np.hypot(world.day, 1.0))
+    return float(brentq(lambda e: tremor(e, float(np.hypot(alone, world.slope))) - tremor(0.0, alone) - points, -20.0, 20.0))
 
 
 def nothing_to_test() -> dict[str, Measurements]:
@@ -182,3 +206,81 @@ class Tally:
         cells = [self.counts.get((name, m, label), [0, 0]) for m in metrics]
         number = sum(c[1] for c in cells)
         return (sum(c[0] for c in cells) / number if number else float("nan")), number
+
+
+MARGINS = Margins()
+"""As a study begins with them."""
+
+EVERYWHERE = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.05), (0.5, 0.05))
+"""Standard deviation of every outcome's effect between days, and share of the controller's sessions that are stopped."""
+
+TREMOR_ALONE = (1.0, 2.0, 3.0)
+"""Standard deviations of tremor's effect between days where that of the others is the same on all: what its test finds hardest."""
+
+
+def margin_studies(visits: int, studies: int, seed: int) -> Tally:
+    """One outcome exactly at its margin, or everything equal to cDBS; energy saved by a third."""
+    tally = Tally()
+    cells = [(at, slope, slope, stops, studies) for slope, stops in EVERYWHERE for at in FAILURE]
+    cells += [("nothing", slope, slope, stops, studies // 4) for slope, stops in EVERYWHERE]
+    cells += [("tremor", 0.0, slope, 0.0, studies) for slope in TREMOR_ALONE]
+    for number, (at, slope, of_tremor, stops, count) in enumerate(cells):
+        rng = np.random.default_rng([visits, seed, number])
+        where = f"day x dose {slope:g}" if slope == of_tremor else f"day x dose of tremor {of_tremor:g}"
+        for study in range(count):
+            small = World(visits=visits, each=4, day=1.0, slope=slope)
+            shown, saving = judged({m: replace(small, slope=of_tremor if m == "tremor" else slope) for m in FAILURE}, at, stops, rng, study)
+            key = (f"{visits} visits", where, f"stopped {stops:.0%}", at)
+            tally.add((*key, "non-inferior"), shown)
+            tally.add((*key, "and saving"), saving)
+    return tally
+
+
+def judged(worlds: dict[str, World], at: str, stops: float, rng: np.random.Generator, seed: int) -> tuple[bool, bool]:
+    """Whether non-inferiority is shown by the service's rule, and whether the saving is shown too; `at`: the outcome at its margin."""
+    design = layout(worlds["grasp"], rng)
+    visit, tested, order = design
+    stopped = (rng.random(visit.size) < stops) & tested
+    outcomes = []
+    for name, world in worlds.items():
+        effect = tremor_effect(world, MARGINS.tremor_points) if name == at == "tremor" else 0.0
+        data = measure(name, latent(world, effect, rng, design), design, world, rng)
+        if name == at != "tremor":
+            lost = {"grasp": MARGINS.grasp_share * GRASP_HZ, "rating": MARGINS.rating_points}[name]
+            data = replace(data, value=data.value - lost * tested)
+        judged_as = outcome_of(name, data, stopped, MARGINS)
+        assert judged_as is not None, "cDBS has a grasp frequency in every study"
+        outcomes.append(judged_as)
+    energy = np.where(tested, 0.65, 1.0) + np.where(tested, 0.05, 0.01) * rng.standard_normal(visit.size)
+    spent = Measurements.of(energy, visit, tested, order=order, resolution=RESOLUTION["energy"])
+    result = assess(outcomes, spent, stopped, seed=seed, plan=False)
+    saving = isinstance(result.verdict, NonInferiorAndSaving)
+    shown = saving or (isinstance(result.verdict, Inconclusive) and result.verdict.open == ("energy",))
+    return shown, saving
+
+
+def _share(share: float) -> str:
+    return f"{'-' if np.isnan(share) else f'{share:.3f}':>8}"
+
+
+def show_margin(tally: Tally) -> dict[str, float]:
+    """Non-inferiority at the margin and where nothing is lost."""
+    out("non-inferiority shown: grasp, rating, tremor exactly at its margin (an error)")
+    out(" | nothing lost (power), of it with the saving shown\n")
+    asked = {k: c for k, c in tally.counts.items() if len(k) == 5}
+    for key in sorted(dict.fromkeys(k[:3] for k in asked), key=lambda k: (int(k[0].split()[0]), k)):
+        wrong = [tally.share(*key, at, "non-inferior")[0] for at in FAILURE]
+        right = [tally.share(*key, "nothing", label)[0] for label in ("non-inferior", "and saving")]
+        out(f"  {', '.join(key):<50}{' |'.join(''.join(map(_share, shares)) for shares in (wrong, right))}\n")
+    errors = {k: c for k, c in asked.items() if k[3] != "nothing" and k[4] == "non-inferior"}
+    cases: dict[tuple[str, str, bool], list[list[int]]] = {}  # of one number of visits and outcome, the same for all outcomes or of tremor
+    for (visits, where, _, at, _), count in errors.items():
+        cases.setdefault((visits, at, "of tremor" in where), []).append(count)
+    pooled = {case: sum(c[0] for c in counts) / sum(c[1] for c in counts) for case, counts in cases.items()}
+    few = [c[0] for k, c in asked.items() if k[4] == "non-inferior" and int(k[0].split()[0]) < LEAST_VISITS]
+    return {
+        "non_inferior_at_margin": max(share for (_, _, alone), share in pooled.items() if not alone),
+        "non_inferior_at_margin_tremor_alone": max(share for (_, _, alone), share in pooled.items() if alone),
+        "non_inferior_at_margin_worst_cell": max(hits / number for hits, number in errors.values()),
+        "non_inferior_below_three_visits": float(sum(few)),
+    }

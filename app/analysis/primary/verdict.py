@@ -15,13 +15,14 @@ from datetime import datetime
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from app.analysis.evidence.facts import Facts
-from app.analysis.evidence.measurements import HIGHER_IS_BETTER, Chosen, choose_each, of_controller
+from app.analysis.evidence.measurements import HIGHER_IS_BETTER, choose_each, of_controller
 from app.study.models import Controller
 from ml.qoc import Margins
 from ml.statistics.noninferiority import LEAST_VISITS, Assessment, Outcome, assess
-from ml.statistics.within_visits.contrasts import Scale
+from ml.statistics.within_visits.contrasts import Measurements, Scale
 
 SCALE: dict[str, Scale] = {"grasp": "difference", "rating": "ordinal", "tremor": "difference"}
 FAILURE = {"grasp": None, "rating": 1.0, "tremor": 100.0}
@@ -128,7 +129,8 @@ def _judge(
 ) -> VerdictResult:
     tested = of_controller(controller)
     chosen = choose_each(sessions, ("energy", *FAILURE), tested)
-    energy, outcomes = chosen["energy"], [_outcome(chosen[name], name, locked.margins) for name in FAILURE]
+    energy = chosen["energy"]
+    outcomes = [outcome_of(name, chosen[name].data, chosen[name].stopped, locked.margins) for name in FAILURE]
     used = {s.visit for s in sessions}
     seen = {s.visit for s in sessions if tested(s)} & {s.visit for s in sessions if s.controller is Controller.CDBS}
     result, lacking = None, NoVerdict.NO_GRASP_REFERENCE if used else NoVerdict.NO_VISIT_AFTER_LOCK
@@ -148,9 +150,13 @@ def _judge(
     )
 
 
-def _outcome(chosen: Chosen, name: str, margins: Margins) -> Outcome | None:
-    """An outcome with its margin; None where no cDBS session tells what a share of the grasp frequency is."""
-    data, margin = chosen.data, {"rating": margins.rating_points, "tremor": margins.tremor_points}.get(name)
+def outcome_of(name: str, data: Measurements, stopped: NDArray[np.bool_], margins: Margins) -> Outcome | None:
+    """An outcome as verdicts judge it, with its margin; None where no cDBS session tells what a share of the grasp frequency is.
+
+    Args:
+        name: grasp, rating or tremor. data: its values in both arms, n sessions. stopped: for the patient's sake, [n].
+    """
+    margin = {"rating": margins.rating_points, "tremor": margins.tremor_points}.get(name)
     if margin is None:
         cells = data.cells
         by_visit = cells.means(data.value[cells.rows])[:, 1]
@@ -161,4 +167,4 @@ def _outcome(chosen: Chosen, name: str, margins: Margins) -> Outcome | None:
         margin = margins.grasp_share * reference
         # lowered by the share and lifted by the margin: the average contrast stays, its spread gains that of the reference
         data = replace(data, value=np.where(data.tested, data.value, (1 - margins.grasp_share) * data.value + margin))
-    return Outcome(name, data, chosen.stopped, margin, HIGHER_IS_BETTER[name], SCALE[name], FAILURE[name])
+    return Outcome(name, data, stopped, margin, HIGHER_IS_BETTER[name], SCALE[name], FAILURE[name])
