@@ -70,7 +70,11 @@ def unavailable(why: Unavailable, what: str = "the controller") -> str:
         Reason.NO_VISIT_WITH_BOTH_ARMS: f"No visit has both {what} and cDBS with this metric: no primary evidence.",
         Reason.TOO_FEW_VISITS: f"{_n(why.found, 'visit')} with both arms; it takes {why.needed}.",
         Reason.TOO_FEW_PARTICIPANTS: f"{_n(why.found, 'participant')} with a result; it takes {why.needed}.",
-        Reason.NO_VARIANCE: "All values are equal, or too few to tell their spread: nothing can be tested.",
+        Reason.TOO_FEW_SESSIONS: "One session of either arm at one visit does not tell how much sessions differ.",
+        Reason.ALL_EQUAL: "Every session has the same value, which does not tell how far another could differ: nothing can be tested.",
+        Reason.NO_VARIANCE: f"{_upper(what)} differs from cDBS by the same at every visit, which does not tell how far another visit could "
+        "be off: nothing can be tested.",
+        Reason.ONE_VISIT: "All that varies, varies in one visit alone.",
         Reason.NOT_IDENTIFIED: "The sessions do not tell this apart from the controller.",
         Reason.NOT_RECORDED: "What it takes was not recorded.",
         Reason.NO_BRACKETED_SESSION: "No session stands between two cDBS sessions of its visit.",
@@ -108,7 +112,7 @@ def verdict(result: VerdictResult) -> str:
             return f"No verdict on {name}: no visit began while these margins were locked."
         if result.no_verdict is NoVerdict.NO_VISIT_AFTER_LOCK:
             return f"No verdict on {name} yet: no visit was recorded after the margins were locked."
-        return f"No verdict on {name}: no cDBS session has a grasp frequency of which the margin would be a share."
+        return f"No verdict on {name}: no cDBS session has a grasp frequency above 0, of which the margin would be a share."
     return verdict_sentence(name, result.assessment.verdict, len(result.visits), planned=result.locked.until is None)
 
 
@@ -125,20 +129,39 @@ def verdict_sentence(name: str, found: Verdict, visits: int, *, planned: bool) -
     open_ = f"{name} is not shown to be non-inferior on {_listed(found.open)}"
     if found.open == (ENERGY,):
         open_ = f"{name} is non-inferior on grasp, rating and tremor, but a saving of energy is not shown"
-    more = _more(found) if planned or found.reason is not None else ""
+    more = _more(found, planned=planned)
     return f"Inconclusive {over}: {open_}{f'; {more}' if more else ''}."
 
 
-def _more(found: Inconclusive) -> str:
-    few = f"nothing is concluded from fewer than {LEAST_VISITS} visits with both arms" if found.reason is Reason.TOO_FEW_VISITS else ""
+def _more(found: Inconclusive, *, planned: bool = True) -> str:
+    short = [name for name, why in found.untested if why is Reason.TOO_FEW_VISITS]
+    with_ = "both arms" if {*short, ENERGY} >= OUTCOMES.keys() else f"{_listed(short)} in both arms" if short else ""
+    few = f"nothing is concluded from fewer than {LEAST_VISITS} visits with {with_}" if short else ""
     if found.more_visits is not None:
         more = f"{_n(found.more_visits, 'more visit')} with both arms would settle it with a probability of 80 %, if what was seen holds"
         return f"{few}; {more}" if few else more
     if few:
         return few
-    if found.reason is not None:
-        return "too little was measured to say how many visits it takes"
+    if why := found.untested or found.unplanned:
+        return "; ".join(_not_told(reason, [name for name, r in why if r is reason]) for reason in dict.fromkeys(r for _, r in why))
+    if not planned:
+        return ""
     return f"by what was seen so far, even {MOST_VISITS} more visits would not settle it"
+
+
+def _not_told(why: Reason, names: Sequence[str]) -> str:
+    """Why outcomes of a verdict could not be tested, or why no number of further visits follows from them."""
+    what, are = _listed(names), _are(names)
+    unknown = "which does not tell how far another could be off"
+    sentences = {
+        Reason.NO_SESSION: f"no session of it, or none of cDBS, has {what}",
+        Reason.NO_VISIT_WITH_BOTH_ARMS: f"no visit has {what} of both arms",
+        Reason.TOO_FEW_SESSIONS: f"one session of either arm at one visit does not tell how much {what} {_differ(names)} between sessions",
+        Reason.ALL_EQUAL: f"{what} {are} the same in every session, {unknown}",
+        Reason.NO_VARIANCE: f"{what} {are} better or worse than under cDBS by the same at every visit, {unknown}",
+        Reason.NOT_IDENTIFIED: f"at a visit cDBS has no stimulation energy of which {what} would be a share",
+    }
+    return sentences.get(why) or f"{what}: {unavailable(Unavailable(why)).rstrip('.')}"
 
 
 def outlook(result: VerdictResult, sessions_per_arm: int) -> str:
@@ -231,7 +254,12 @@ def no_association(why: Unavailable) -> str:
     """Why two measurements are not set against each other."""
     if why.reason is Reason.TOO_FEW_VISITS:
         return f"{_n(why.found, 'visit')} with what it takes; {why.needed} are needed."
-    return "One of the two hardly varies, or one visit alone carries it." if why.reason is Reason.NO_VARIANCE else unavailable(why)
+    sentences = {
+        Reason.ALL_EQUAL: "One of the two does not vary.",
+        Reason.ONE_VISIT: "One visit alone carries it: without that visit one of the two does not vary.",
+        Reason.NO_VARIANCE: "Every visit shows the same slope, which does not tell how far another could be off.",
+    }
+    return sentences.get(why.reason) or unavailable(why)
 
 
 def no_population_claim(found: Summary) -> str:
@@ -250,6 +278,14 @@ def _listed(names: Sequence[str]) -> str:
 
 def _are(names: Sequence[str]) -> str:
     return "is" if len(names) == 1 else "are"
+
+
+def _differ(names: Sequence[str]) -> str:
+    return "differs" if len(names) == 1 else "differ"
+
+
+def _upper(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _numbers(numbers: Iterable[int]) -> str:

@@ -65,7 +65,7 @@ def within_visits(x: Floats, y: Floats, visit: Integers, level: float = 0.95) ->
         return Unavailable(Reason.TOO_FEW_VISITS, n, LEAST_VISITS)
     parts = np.array(sums)
     if not _varies(x[known], parts[:, 0]) or not _varies(y[known], parts[:, 2]):
-        return Unavailable(Reason.NO_VARIANCE)
+        return Unavailable(Reason.ALL_EQUAL)
     return _jackknifed(parts.sum(0), parts.sum(0) - parts, n, sessions, level)
 
 
@@ -82,7 +82,7 @@ def between_visits(x: Floats, y: Floats, visit: Integers, level: float = 0.95) -
     a, b = a - a.mean(), b - b.mean()
     xx, xy, yy = float(a @ a), float(a @ b), float(b @ b)
     if not _varies(x[known], np.array([xx])) or not _varies(y[known], np.array([yy])):
-        return Unavailable(Reason.NO_VARIANCE)
+        return Unavailable(Reason.ALL_EQUAL)
     slope, r = xy / xx, xy / np.sqrt(xx * yy)
     error = float(np.sqrt(max(yy - slope * xy, 1e-15 * yy) / (n - 2) / xx))
     q = float(stdtrit(n - 2, (1 + level) / 2))
@@ -95,7 +95,7 @@ def between_visits(x: Floats, y: Floats, visit: Integers, level: float = 0.95) -
 def _jackknifed(total: Floats, without: Floats, visits: int, sessions: int, level: float) -> Association | Unavailable:
     """Slope and correlation of sums (xx, xy, yy), with intervals from the sums without each visit."""
     if (without[:, [0, 2]] <= 1e-12 * total[[0, 2]]).any():
-        return Unavailable(Reason.NO_VARIANCE)
+        return Unavailable(Reason.ONE_VISIT)
     slope, slopes = total[1] / total[0], without[:, 1] / without[:, 0]
     z = _fisher(total[1] / np.sqrt(total[0] * total[2]))
     zs = _fisher(without[:, 1] / np.sqrt(without[:, 0] * without[:, 2]))

@@ -37,6 +37,8 @@ WANTED_POWER = 0.8
 PLANNED_SESSIONS = 3
 """Sessions of either arm in a further visit, where nobody states another number."""
 ENERGY = "energy"
+Reasons = tuple[tuple[str, Reason], ...]
+"""Outcomes (or `energy`), each with the reason why something cannot be told of it."""
 
 
 class FailureRule(StrEnum):
@@ -152,15 +154,18 @@ class Inconclusive:
 
     Attributes:
         open: outcomes (or `energy`) that are not shown yet.
-        more_visits: further visits after which a conclusion has a probability of `WANTED_POWER`; None where `MOST_VISITS` are not enough.
+        more_visits: further visits after which a conclusion has a probability of `WANTED_POWER`; None where `MOST_VISITS` are not enough,
+            or where `unplanned` says why it cannot be told.
+        untested: of `open`, what could not be tested, with the reason.
         fewest_visits: the same with any number of sessions in each of them: what sessions cannot replace.
-        reason: why nothing could be tested; None where the tests were made.
+        unplanned: outcomes (or `energy`) without which no number of further visits can be told, with the reason.
     """
 
     open: tuple[str, ...]
     more_visits: int | None
-    reason: Reason | None = None
+    untested: Reasons = ()
     fewest_visits: int | None = None
+    unplanned: Reasons = ()
 
 
 Verdict = NonInferiorAndSaving | Inferior | Inconclusive
@@ -217,8 +222,7 @@ def assess(
     saving = energy_saving(spent, level, seed=seed)
     verdict = _verdict(results, saving, alpha)
     if plan and isinstance(verdict, Inconclusive):
-        more, fewest = _more_visits(outcomes, spent, alpha, sessions_per_arm, seed)
-        verdict = replace(verdict, more_visits=more, fewest_visits=fewest)
+        verdict = _planned(verdict, outcomes, spent, alpha, sessions_per_arm, seed)
     others = []
     failed = bool(stopped.any()) or any(o.stopped.any() for o in outcomes)
     for other in (FailureRule.BOTH_ARMS, FailureRule.AS_MEASURED):
@@ -282,35 +286,34 @@ def _verdict(results: Sequence[OutcomeResult], saving: Saving | Unavailable, alp
         return Inferior(worse)
     unshown = tuple(r.name for r in results if r.p_non_inferior is None or not r.p_non_inferior < alpha)
     if unshown:
-        reasons = [r.average.reason for r in results if isinstance(r.average, Unavailable)]
-        return Inconclusive(unshown, None, reasons[0] if reasons else None)
+        return Inconclusive(unshown, None, tuple((r.name, r.average.reason) for r in results if isinstance(r.average, Unavailable)))
     if isinstance(saving, Unavailable):
-        return Inconclusive((ENERGY,), None, saving.reason)
+        return Inconclusive((ENERGY,), None, ((ENERGY, saving.reason),))
     if len(saving.visits) < LEAST_VISITS:
-        return Inconclusive((ENERGY,), None, Reason.TOO_FEW_VISITS)
+        return Inconclusive((ENERGY,), None, ((ENERGY, Reason.TOO_FEW_VISITS),))
     if not saving.p_value < alpha:
         return Inconclusive((ENERGY,), None)
     return NonInferiorAndSaving(saving.percent, saving.low, saving.high)
 
 
-def _more_visits(
-    outcomes: Sequence[Outcome], energy: Measurements, alpha: float, sessions: int, seed: int
-) -> tuple[int | None, int | None]:
-    """Fewest further visits after which all is shown with the wanted probability, outcomes taken as independent.
-
-    Returns:
-        With so many sessions of either arm at each, and with any number of them.
-    """
+def _planned(
+    verdict: Inconclusive, outcomes: Sequence[Outcome], energy: Measurements, alpha: float, sessions: int, seed: int
+) -> Inconclusive:
+    """With the fewest further visits after which all is shown with the wanted probability, outcomes taken as independent: with so many
+    sessions of either arm at each, and with any number of them."""
     chances, limit = np.ones(MOST_VISITS), np.ones(MOST_VISITS)
     shares = _energy_posterior(energy, seed)
-    posteriors = [(posterior(o.counted(FailureRule.WORST_CASE), o.scale, seed=seed + i), o.loss) for i, o in enumerate(outcomes)]
-    for i, (found, value) in enumerate([*posteriors, (shares, 0.0)]):
+    wanted = [(o.name, posterior(o.counted(FailureRule.WORST_CASE), o.scale, seed=seed + i), o.loss) for i, o in enumerate(outcomes)] + [
+        (ENERGY, shares, 0.0)
+    ]
+    unplanned = tuple((name, found.reason) for name, found, _ in wanted if isinstance(found, Unavailable))
+    for i, (_, found, value) in enumerate(wanted):
         if isinstance(found, Unavailable):
-            return None, None
+            return replace(verdict, unplanned=unplanned)
         target = Target(value, "greater", alpha, LEAST_VISITS)
         chances *= success(found, target, sessions, seed=seed + 100 + i).mean(0)
         limit *= success(found, target, np.inf, seed=seed + 100 + i).mean(0)
-    return first_reaching(chances, WANTED_POWER), first_reaching(limit, WANTED_POWER)
+    return replace(verdict, more_visits=first_reaching(chances, WANTED_POWER), fewest_visits=first_reaching(limit, WANTED_POWER))
 
 
 def _energy_posterior(energy: Measurements, seed: int) -> Posterior | Unavailable:

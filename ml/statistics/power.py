@@ -92,14 +92,14 @@ def posterior(data: Measurements, scale: Scale = "difference", *, draws: int = 1
     squares, degrees = _within(data, contrasts, scale)
     total = degrees + contrasts.visits - 1
     if total < 1:
-        return Unavailable(Reason.NO_VARIANCE)
+        return Unavailable(Reason.TOO_FEW_SESSIONS)
     d = contrasts.contrast
     precision = 1 / (RATIOS[:, None] ** 2 + spread)
     weight = precision.sum(1)
     mean = precision @ d / weight
     residual = squares + np.sum(precision * (d - mean[:, None]) ** 2, axis=1) + float(contrasts.floor.mean())
     if residual.max() <= 1e-24 * max(1.0, float(np.abs(d).max()) ** 2):
-        return Unavailable(Reason.NO_VARIANCE)
+        return Unavailable(Reason.ALL_EQUAL if contrasts.tied else Reason.NO_VARIANCE)
     logs = 0.5 * np.log(precision).sum(1) - 0.5 * np.log(weight) - 0.5 * total * np.log(residual) + np.log(RATIOS / (1 + RATIOS**2))
     chances = np.exp(logs - logs.max())
     rng = np.random.default_rng(seed)

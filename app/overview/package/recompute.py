@@ -21,7 +21,7 @@ from scipy.stats import rankdata, t
 Row = dict[str, str]
 KNOWN_SHARE = 0.5
 UNBALANCED = 0.5
-RESOLUTION = {"rating": 1.0, "energy": 0.05}
+RESOLUTION = {"rating": 1.0, "tremor": 1.0, "energy": 0.05}
 BOUNDED = ("rating", "tremor")
 COLUMNS = {"grasp": "grasp_hz", "rating": "rating_1_10", "tremor": "tremor_percent"}
 WORST = {"rating": 1.0, "tremor": 100.0}

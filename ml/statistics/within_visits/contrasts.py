@@ -32,14 +32,25 @@ LEAST_FOR_SKEWNESS = 3
 """Visits below which contrasts tell no skewness: two are always symmetric."""
 
 
+NEGLIGIBLE = 1e-12
+"""Differences below this share of the largest value (or of 1) are rounding of the computer."""
+
+
 class Reason(StrEnum):
-    """Why a number is not given."""
+    """Why a number is not given.
+
+    ALL_EQUAL: every session has the same value. NO_VARIANCE: sessions may differ, but what is averaged over visits is the same at each.
+    TOO_FEW_SESSIONS: no arm of a visit has two sessions, and no visit another to differ from. ONE_VISIT: all that varies, varies in one.
+    """
 
     NO_SESSION = "no_session"
     NO_VISIT_WITH_BOTH_ARMS = "no_visit_with_both_arms"
     TOO_FEW_VISITS = "too_few_visits"
     TOO_FEW_PARTICIPANTS = "too_few_participants"
+    TOO_FEW_SESSIONS = "too_few_sessions"
+    ALL_EQUAL = "all_equal"
     NO_VARIANCE = "no_variance"
+    ONE_VISIT = "one_visit"
     NOT_IDENTIFIED = "not_identified"
     NOT_RECORDED = "not_recorded"
     NO_BRACKETED_SESSION = "no_bracketed_session"
@@ -174,6 +185,7 @@ class VisitContrasts:
         n_tested, n_cdbs: measured sessions of either arm, [V].
         floor: smallest variance that a contrast can have given the steps in which the metric is measured, [V]; 0 for a continuous one.
         null: value of the contrast where the arms do not differ. bounded: whether a contrast ends at a floor or a ceiling.
+        tied: whether all sessions behind the contrasts have the same value.
     """
 
     visit: Integers
@@ -183,6 +195,7 @@ class VisitContrasts:
     floor: Floats
     null: float
     bounded: bool = False
+    tied: bool = False
 
     @property
     def visits(self) -> int:
@@ -252,8 +265,10 @@ def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitCon
     if not cells.visit.size:
         return data.no_evidence()
     n_tested, n_cdbs = cells.counts.T
+    values = data.value[cells.rows]
+    tied = bool(np.ptp(values) <= NEGLIGIBLE * max(1.0, float(np.abs(values).max())))
     if scale == "difference":
-        means = cells.means(data.value[cells.rows])
+        means = cells.means(values)
         contrast = means[:, 0] - means[:, 1]
         # Rounding to steps of r adds a variance of r^2 / 12 to every session (Sheppard 1898).
         floor = data.resolution**2 / 12 * (1 / n_tested + 1 / n_cdbs)
@@ -262,7 +277,7 @@ def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitCon
         contrast = np.array([win_probability(data.value[one], data.value[two], step) for _, one, two in data.arms])
         # A visit resolves the probability no finer than by half a pair.
         floor = (0.5 / (n_tested * n_cdbs)) ** 2
-    return VisitContrasts(cells.visit, contrast, n_tested, n_cdbs, floor, 0.0 if scale == "difference" else 0.5, data.bounded)
+    return VisitContrasts(cells.visit, contrast, n_tested, n_cdbs, floor, 0.0 if scale == "difference" else 0.5, data.bounded, tied)
 
 
 def win_probability(x: Floats, y: Floats, step: float = 0.0) -> float:
@@ -336,10 +351,10 @@ def student(
     """
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")
-    scale = 1e-12 * max(1.0, float(np.abs(of.contrast).max()))
+    scale = NEGLIGIBLE * max(1.0, float(np.abs(of.contrast).max()))
     error, degrees = float(np.sqrt(variance)), min(of.visits - 1, at_most)
     if error <= scale:
-        return Unavailable(Reason.NO_VARIANCE)
+        return Unavailable(Reason.ALL_EQUAL if of.tied else Reason.NO_VARIANCE)
     skewness = skewness_of(of.contrast if freed is None else freed, variance * of.visits) if of.bounded else 0.0
     ratio, quantile = (estimate - of.null) / error, float(stdtrit(degrees, (1 + level) / 2))
     p = 2 * float(stdtr(degrees, -min(abs(ratio), abs(float(unskewed(ratio, skewness, of.visits))))))

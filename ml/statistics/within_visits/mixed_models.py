@@ -77,7 +77,7 @@ def linear_comparison(data: Measurements, policy: Integers | None = None, level:
     y = prepared.data.value - prepared.data.value.mean()
     scale = float(y.std())
     if scale <= 1e-12 * max(1.0, float(np.abs(prepared.data.value).max())):
-        return Unavailable(Reason.NO_VARIANCE)
+        return Unavailable(Reason.ALL_EQUAL)
     found = MixedModel(design.shape[1], prepared.groups, {}).restricted(Sums.of(design, y / scale))
     estimate, variance = scale * float(found.coefficients[EFFECT]), scale**2 * float(found.covariance[EFFECT, EFFECT])
     effect = student(estimate, variance, prepared.contrasts, level, Adjustment.NONE, max(float(found.degrees[EFFECT]), 1.0))
@@ -97,7 +97,7 @@ def rating_comparison(data: Measurements, policy: Integers | None = None, level:
     category = np.unique(prepared.data.value, return_inverse=True)[1].astype(np.int64)
     steps = int(category.max())
     if steps == 0:
-        return Unavailable(Reason.NO_VARIANCE)
+        return Unavailable(Reason.ALL_EQUAL)
     design = prepared.design[:, 1:]  # the thresholds are the intercepts
     below = (np.cumsum(np.bincount(category))[:-1] / category.size).clip(0.02, 0.98)
     start = np.concatenate([np.log(below / (1 - below)) + 1e-6 * np.arange(steps), np.zeros(design.shape[1])])
@@ -124,7 +124,7 @@ def tremor_comparison(
     total = minutes[watched][prepared.rows]
     count = prepared.data.value
     if (count == 0).all() or (count == total).all():
-        return Unavailable(Reason.NO_VARIANCE)
+        return Unavailable(Reason.ALL_EQUAL)
     q = prepared.design.shape[1]
     design = np.concatenate([prepared.design, np.eye(count.size)], axis=1)
     sessions = {"session": range(q, q + count.size)}

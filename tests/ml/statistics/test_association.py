@@ -55,9 +55,15 @@ def test_slopes_that_differ_between_visits_do_not_make_the_interval_too_narrow()
 def test_nothing_to_relate_has_a_typed_reason(function):
     visit = np.repeat(np.arange(5), 3)
     x = np.random.default_rng(4).standard_normal(15)
-    assert function(x, np.ones(15), visit).reason is Reason.NO_VARIANCE
+    assert function(x, np.ones(15), visit).reason is Reason.ALL_EQUAL
     assert function(x, np.full(15, np.nan), visit).reason is Reason.TOO_FEW_VISITS
     assert isinstance(function(x[:3], x[:3], visit[:3]), Unavailable)
     assert isinstance(function(x, x, visit), Unavailable) == (function is within_visits)
     with pytest.raises(ValueError, match="one entry per session"):
         function(x, x[:3], visit)
+
+
+def test_what_one_visit_carries_and_what_is_alike_at_every_visit_are_told_apart():
+    visit, place = np.repeat(np.arange(5), 3), np.tile(np.arange(3.0), 5)
+    assert within_visits(np.where(visit == 2, place, 1.0), place, visit).reason is Reason.ONE_VISIT
+    assert within_visits(place, 2 * place, visit).reason is Reason.NO_VARIANCE

@@ -96,7 +96,7 @@ def test_fewer_than_three_visits_with_both_arms_conclude_nothing(visits):
     for loss in (0.0, 5.0):
         found = assess(*study(visits=visits, noise=1e-6, loss=loss)).verdict
         assert isinstance(found, Inconclusive)
-        assert found.reason is Reason.TOO_FEW_VISITS
+        assert found.untested == tuple((name, Reason.TOO_FEW_VISITS) for name in ("grasp", "rating", "tremor"))
         assert found.more_visits is None or found.more_visits + visits >= 3
 
 
@@ -219,7 +219,9 @@ def test_no_values_or_all_the_same_are_a_typed_answer(value):
     data = Measurements.of(np.full(visit.size, value), visit, arms)
     found = assess([Outcome("grasp", data, flags, 0.3, True)], data, flags)
     assert isinstance(found.verdict, Inconclusive)
-    assert found.verdict.reason is (Reason.NO_VARIANCE if value == 1.0 else Reason.NO_SESSION)
+    why = Reason.ALL_EQUAL if value == 1.0 else Reason.NO_SESSION
+    assert found.verdict.untested == (("grasp", why),)
+    assert found.verdict.unplanned == (("grasp", why), ("energy", why))
     assert found.p_non_inferior is None
 
 

@@ -86,9 +86,11 @@ def test_no_test_is_counted_on_before_there_are_enough_visits():
 
 
 def test_nothing_to_plan_from_is_a_typed_reason():
-    assert power(Measurements.of([1, 2], [1, 1], [0, 1]), Target()) == Unavailable(Reason.NO_VARIANCE)
+    assert power(Measurements.of([1, 2], [1, 1], [0, 1]), Target()) == Unavailable(Reason.TOO_FEW_SESSIONS)
     assert power(Measurements.of([], [], []), Target()).reason is Reason.NO_SESSION
     same = Measurements.of(np.ones(8), np.repeat([1, 2], 4), [0, 1] * 4)
-    assert power(same, Target()).reason is Reason.NO_VARIANCE
+    assert power(same, Target()).reason is Reason.ALL_EQUAL
+    days_differ = Measurements.of(np.repeat([1.0, 2.0], 4), np.repeat([1, 2], 4), [0, 1] * 4)
+    assert power(days_differ, Target()).reason is Reason.NO_VARIANCE
     with pytest.raises(ValueError, match="at least one session"):
         power(study(), Target(), sessions_per_arm=0)

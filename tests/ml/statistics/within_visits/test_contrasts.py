@@ -71,17 +71,23 @@ def test_missing_values_and_visits_without_both_arms_are_left_out():
         (Measurements.of([np.nan] * 4, [1, 1, 2, 2], [0, 1, 0, 1]), Reason.NO_SESSION),
         (Measurements.of([1, 2, 3, 4], [1, 1, 2, 2], [0, 0, 1, 1]), Reason.NO_VISIT_WITH_BOTH_ARMS),
         (Measurements.of([1, 2, 3, 4], [1, 1, 1, 1], [0, 0, 1, 1]), Reason.TOO_FEW_VISITS),
-        (Measurements.of([1.0] * 8, np.repeat([1, 2], 4), [0, 1] * 4), Reason.NO_VARIANCE),
+        (Measurements.of([1.0] * 8, np.repeat([1, 2], 4), [0, 1] * 4), Reason.ALL_EQUAL),
+        (Measurements.of([1, 1, 2, 2], [1, 1, 2, 2], [0, 1] * 2), Reason.NO_VARIANCE),
     ],
 )
 @pytest.mark.parametrize("scale", ["difference", "win_probability"])
 def test_what_cannot_be_averaged_has_a_typed_reason(data, reason, scale):
     found = primary(data, scale=scale)
-    if reason is Reason.NO_VARIANCE and scale == "win_probability":
+    if reason in (Reason.ALL_EQUAL, Reason.NO_VARIANCE) and scale == "win_probability":
         assert found.p_value == pytest.approx(1.0)  # a share of pairs has a known smallest variance
     else:
         assert isinstance(found, Unavailable)
         assert found.reason is reason
+
+
+def test_what_only_rounding_of_the_computer_tells_apart_is_equal():
+    rounded = Measurements.of([0.1 + 0.2, 0.3] * 4, np.repeat([1, 2], 4), [0, 1] * 4)
+    assert primary(rounded) == Unavailable(Reason.ALL_EQUAL)
 
 
 def test_ratings_that_agree_at_every_visit_are_no_infinite_evidence():

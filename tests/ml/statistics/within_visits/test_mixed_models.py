@@ -111,7 +111,7 @@ def test_an_arm_wholly_above_the_other_keeps_a_finite_effect():
 @pytest.mark.parametrize("model", [linear_comparison, rating_comparison, lambda d: tremor_comparison(d, np.full(d.value.size, 5.0))])
 def test_nothing_to_fit_is_a_typed_reason(model):
     visit, arms = layout(3, 2)
-    assert model(Measurements.of(np.zeros(12), visit, arms)) == Unavailable(Reason.NO_VARIANCE)
+    assert model(Measurements.of(np.zeros(12), visit, arms)) == Unavailable(Reason.ALL_EQUAL)
     assert model(Measurements.of(np.full(12, np.nan), visit, arms)).reason is Reason.NO_SESSION
     assert model(Measurements.of(np.arange(12) % 4, np.zeros(12), arms)).reason is Reason.TOO_FEW_VISITS
     assert model(Measurements.of([1, 2, 1, 2], [1, 1, 2, 2], [0, 0, 1, 1])).reason is Reason.NO_VISIT_WITH_BOTH_ARMS
