@@ -1,7 +1,8 @@
 """Six visits of the synthetic participants, margins locked before: how many questions are concluded, and how many conclusions are true?
 
     python benchmarks/visits_in_silico.py --quick
-    python benchmarks/visits_in_silico.py [--seeds 40] [--first-seed 1] [--visits 6] [--minutes 120] [--session-minutes 5] [--json FILE]
+    python benchmarks/visits_in_silico.py [--seeds 40] [--first-seed 1] [--visits 6] [--minutes 120] [--session-minutes 5]
+        [--only P1] [--keep FOLDER] [--json FILE]
 
 A question is one controller of one participant in one study: is it non-inferior to cDBS on grasp, rating and tremor, and does it save
 energy? A visit is the day that the service plans (`app.planning.protocol.schedule`) with as many sessions of the controller as fit into its
@@ -21,7 +22,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -83,6 +84,21 @@ class Question:
     concluded: str
     bound: str
     true: bool | None
+
+
+def kept(code: str, day: Day, seeds: range, visits: int, folder: Path | None) -> list[Question]:
+    """Every question of one participant; read where the folder has them from an earlier run of the same studies."""
+    name = f"visits-{code}-{seeds.start}-{len(seeds)}-{visits}-{day.steps}-{len(day.places[True])}.json"
+    path = folder / name if folder else None
+    if path and path.exists():
+        return [Question(**row) for row in json.loads(path.read_text())]
+    asked = questions(code, day, seeds, visits)
+    if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft = path.with_suffix(".part")
+        draft.write_text(json.dumps([asdict(q) for q in asked]))
+        draft.replace(path)
+    return asked
 
 
 def simulate(
@@ -194,15 +210,18 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=Rules().total_minutes, help="of a visit")
     parser.add_argument("--session-minutes", type=float, default=SESSION_MINUTES[0])
     parser.add_argument("--quick", action="store_true", help="four seeds")
+    parser.add_argument("--only", choices=PARTICIPANTS, help="one participant")
+    parser.add_argument("--keep", type=Path, help="a folder for finished participants, which a later run of the same code reads")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     day = Day.planned(Rules(session_minutes=asked.session_minutes, total_minutes=asked.minutes))
     seeds, started = range(asked.first_seed, asked.first_seed + (4 if asked.quick else asked.seeds)), time.process_time()
-    asks = [q for code in PARTICIPANTS for q in questions(code, day, seeds, asked.visits)]
+    codes = [asked.only] if asked.only else list(PARTICIPANTS)
+    asks = [q for code in codes for q in kept(code, day, seeds, asked.visits, asked.keep)]
     concluded = [q for q in asks if q.concluded]
     out(f"{asked.visits} visits of {len(day.places[True])} sessions of the controller and {len(day.places[False])} of cDBS, ")
     out(f"{asked.session_minutes:g} minutes each\nparticipant  level  non-inferior and saving  inferior  inconclusive  false  bound\n")
-    for code in PARTICIPANTS:
+    for code in codes:
         for level in LEVELS:
             mine = [q for q in asks if (q.participant, q.level) == (code, level)]
             count, known = Counter(q.concluded for q in mine), sum(bool(q.bound) for q in mine)

@@ -82,12 +82,14 @@ async function draw(figure, onPaper = false) {
   }
 }
 
-// a point that names a page of ours opens it
+// a point that names a page of ours opens it; a number is one of the pages below its trace's `meta`
 function follow(plot) {
   if (plot.dataset.follows) return;
   plot.dataset.follows = "yes";
   plot.on("plotly_click", ({ points }) => {
-    const place = points[0]?.customdata;
+    const point = points[0];
+    const base = point?.data?.meta;
+    const place = typeof point?.customdata === "number" && base ? `${base}${point.customdata}` : point?.customdata;
     if (typeof place === "string" && /^\/[a-z]/.test(place)) location.assign(place);
   });
 }

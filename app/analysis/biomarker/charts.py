@@ -37,6 +37,7 @@ def scatter(pair: Pairing, beta_unit: str) -> Chart:
         {
             "type": "scatter", "mode": "markers", "x": [p[2] for p in pair.points], "y": [p[3] for p in pair.points],
             "marker": {"size": 8, "color": visits, "colorscale": SCALE, "showscale": len(set(visits)) > 1, "colorbar": bar},
+            "customdata": [p[0] for p in pair.points], "meta": "/sessions/",
             "text": [f"Session {p[0]}, visit {p[1]}" for p in pair.points], "hovertemplate": "%{text}<br>%{x:.3g}, %{y:.3g}<extra></extra>",
         }
     ]  # fmt: skip

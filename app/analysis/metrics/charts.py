@@ -76,7 +76,8 @@ def points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
         "type": "scatter", "mode": "markers", "x": [round(at + s, 3) for s in _spread(g.values)],
         "y": [float(f"{v:.4g}") for v in g.values], "cliponaxis": False,
         "marker": marker(g.controller, 7, opacity=0.8), "name": g.label,
-        "customdata": list(g.session_ids), "hovertemplate": f"{g.label}, session %{{customdata}}<br>%{{y:.4g}} {unit}<extra></extra>",
+        "customdata": list(g.session_ids), "meta": "/sessions/",
+        "hovertemplate": f"{g.label}, session %{{customdata}}<br>%{{y:.4g}} {unit}<extra></extra>",
     }  # fmt: skip
 
 

@@ -78,6 +78,7 @@ class ControllerSummary:
 
     Attributes:
         energy_saving_percent: against the mean energy of the cDBS sessions; None without both, and for cDBS itself.
+        session_ids: of its sessions that count.
     """
 
     controller: Controller
@@ -85,6 +86,7 @@ class ControllerSummary:
     sessions: int
     minutes: float
     energy_saving_percent: float | None
+    session_ids: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -227,7 +229,8 @@ def _summary(controller: Controller, sessions: Sequence[Facts], energy: MetricRe
     if controller is not Controller.CDBS and controller in means and reference > 0:
         saving = saving_percent(means[controller], reference)
     seconds = sum(s.duration_s for s in sessions)
-    return ControllerSummary(controller, CONTROLLER_NAMES[controller], len(sessions), seconds / 60, saving)
+    of_these = tuple(s.session_id for s in sessions)
+    return ControllerSummary(controller, CONTROLLER_NAMES[controller], len(sessions), seconds / 60, saving, of_these)
 
 
 def _sessions(count: int) -> str:
