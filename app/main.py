@@ -23,7 +23,7 @@ from app.planning.slots.pages import facts as slots_of_visit
 from app.platform import logs
 from app.platform.database import Db, check_connection
 from app.platform.errors import DatabaseAway
-from app.platform.files import prune_copies, remove_abandoned
+from app.platform.files import prune_copies_beside, remove_abandoned
 from app.platform.tables import load_tables
 from app.platform.upkeep.doctor import newest_revision, revision
 from app.platform.web import middleware as web
@@ -172,7 +172,7 @@ async def _lifespan(_: FastAPI) -> AsyncIterator[None]:
     """At the start of the service: what killed processes left of incoming files goes, also so that it cannot keep a full disk full."""
     leave_to_itself()
     removed = await run_in_threadpool(remove_abandoned)
-    await run_in_threadpool(prune_copies)
+    prune_copies_beside()
     if removed:
         log.info("abandoned incoming files removed", files=removed)
     yield

@@ -152,6 +152,19 @@ def prune_copies() -> int:
     return removed
 
 
+def prune_copies_beside() -> None:
+    """Prune in a thread of its own, one at a time: a bucket that hangs must hold nobody up."""
+    if not get_settings().files_url:
+        return
+    with _pruning_guard:
+        if not any(thread.is_alive() for thread in _pruning):
+            _pruning[:] = [threading.Thread(target=prune_copies, name="prune-copies", daemon=True)]
+            _pruning[0].start()
+
+
+_pruning: list[threading.Thread] = []
+_pruning_guard = threading.Lock()
+
 _own_folder: list[tuple[Path, int]] = []
 """This process's folder of drafts, once it has one, and the descriptor that holds its lock until the process ends."""
 _folder_guard = threading.Lock()

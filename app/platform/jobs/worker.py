@@ -15,7 +15,7 @@ from sqlalchemy import Connection, text
 from sqlalchemy.exc import DBAPIError
 
 from app.platform.database import database_url, get_engine, new_session, set_actor, transaction
-from app.platform.files import prune_copies
+from app.platform.files import prune_copies_beside
 from app.platform.jobs import engine, repository
 from app.platform.jobs.models import JobStatus
 from app.platform.jobs.steps import JobRunner
@@ -120,7 +120,7 @@ class WorkerMonitor:
             if time.monotonic() >= self._next_housekeeping:
                 self._next_housekeeping = time.monotonic() + self._pace.housekeeping_s
                 self.tidy()
-                prune_copies()
+                prune_copies_beside()
         except DBAPIError as error:
             log.warning("the database is away: %s", type(error.orig).__name__)
 

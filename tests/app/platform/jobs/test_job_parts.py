@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from rich.console import Console
 from sqlalchemy import text
 
+from app.platform import files
 from app.platform.database import new_session, transaction
 from app.platform.errors import NotFound
 from app.platform.jobs import JobContext, StepFailed, StepReport, registry, repository, stream, write_atomically
@@ -330,6 +331,29 @@ def test_folders_of_jobs_that_ended_long_ago_are_removed_and_others_kept(jobs):
     identity.claim()
     WorkerMonitor(identity, runner, Pace()).tidy()
     assert {p.name for p in get_settings().jobs_dir.iterdir()} == {recent, running}
+    runner.stop(1.0)
+    identity.release()
+
+
+def test_a_bucket_that_hangs_does_not_make_a_worker_silent(jobs, monkeypatch):
+    answers, begun = threading.Event(), []
+
+    def hangs():
+        begun.append(threading.current_thread())
+        answers.wait(60)
+
+    monkeypatch.setattr(files, "prune_copies", hangs)
+    monkeypatch.setattr(get_settings(), "files_url", "s3://clinic")
+    identity, runner = Identity(), JobRunner("w", 1)
+    identity.claim()
+    monitor = WorkerMonitor(identity, runner, Pace(beat_s=0.0, housekeeping_s=0.0))
+    for _ in range(3):
+        monitor.look()
+    with new_session() as db:
+        assert [w.id for w in repository.live_workers(db, 60.0)] == [identity.id]
+    answers.set()
+    begun[0].join(5)
+    assert len(begun) == 1, "one at a time"
     runner.stop(1.0)
     identity.release()
 
