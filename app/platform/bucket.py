@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -87,10 +86,11 @@ class Bucket:
             raise StoreAway(f"The bucket has not taken all of {sha256}.", "Try again; nothing that was stored before is lost.")
 
     def fetch(self, sha256: str, target: Path) -> bool:
-        """Copy an object into a file; whether there was one. The bytes are not judged here."""
+        """Copy an object into a file; whether there was one. The bytes are not judged here. Raises OSError where the disk is full."""
         try:
             with self.opened(sha256) as source, target.open("wb") as out:
-                self._asked(lambda: shutil.copyfileobj(source, out, CHUNK))
+                while piece := self._asked(lambda: source.read(CHUNK)):
+                    out.write(piece)
         except FileNotFoundError:
             return False
         return True

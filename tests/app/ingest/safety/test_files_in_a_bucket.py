@@ -225,6 +225,13 @@ def test_a_bucket_that_is_away_is_said_and_loses_nothing(
     assert send(("t.csv", steady(1)), visit=1, controller="random").status_code == 201
 
 
+def test_a_full_disk_here_is_not_taken_for_a_bucket_that_is_away(shared: str, db: Session) -> None:
+    sha256, store = files.store(db, bytes(3 << 20)).sha256, buckets.bucket()
+    assert store is not None
+    with pytest.raises(OSError, match="No space left"):
+        store.fetch(sha256, Path("/dev/full"))
+
+
 def test_copies_that_were_used_longest_ago_make_room(shared: str, db: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = [files.store(db, bytes([k]) * 1000).sha256 for k in range(4)]
     for age, sha256 in enumerate(kept):
