@@ -93,6 +93,7 @@ def read_held(db: Session, file: UploadFile, participant: Participant, reason: s
         service.make_sessions(db, outcome, stated)
         service.attach_grasps_of(db, outcome, stated)
         upload.status = "decoded"
+        db.commit()  # what was read is safe before the original goes
         if not redaction.unreadable:
             _erase(db, file)
     db.commit()
@@ -121,6 +122,7 @@ def release_as_is(db: Session, file_id: int, reason: str, caller: Caller) -> Upl
             draft.unlink(missing_ok=True)
     file.status = "released" if file.status == "failed" else file.status
     _decide(db, file, reason, caller)
+    db.commit()  # what is released is safe before the original goes
     _erase(db, file)
     return file
 
@@ -128,10 +130,8 @@ def release_as_is(db: Session, file_id: int, reason: str, caller: Caller) -> Upl
 def discard(db: Session, file_id: int, reason: str, caller: Caller) -> UploadFile:
     """Erase the bytes for good; the row says what there was. Raises Conflict: not in quarantine."""
     file, _ = _held(db, file_id, caller)
-    assert file.quarantine_sha256 is not None
     file.status = "discarded" if file.status == "failed" else file.status
     _decide(db, file, reason, caller)
-    files.remove(file.quarantine_sha256)  # first: where the store is away nothing is decided, and the decision can be made again
     _erase(db, file)
     return file
 
@@ -182,9 +182,16 @@ def _original(file: UploadFile) -> Iterator[RawFile]:
 
 
 def _erase(db: Session, file: UploadFile) -> None:
-    """Forget the encrypted bytes, and remove them once that is safe."""
+    """Remove the encrypted bytes, then forget them. Commits.
+
+    In this order, for where the store is away the row still names them, and the decision can be made again; the other way round nobody
+    would ever remove them. What was made of them is committed before.
+    """
+    db.refresh(file, ["quarantine_sha256"], with_for_update=True)
     sealed = file.quarantine_sha256
-    assert sealed is not None
+    if sealed is None:
+        return  # somebody has decided as well since that commit
+    files.remove(sealed)
     file.quarantine_sha256 = None
     file.report = {name: value for name, value in file.report.items() if name != PREVIEW}
     if file.stored_sha256 == sealed:
@@ -192,4 +199,3 @@ def _erase(db: Session, file: UploadFile) -> None:
     db.flush()
     db.delete(db.get_one(files.StoredFile, sealed))
     db.commit()
-    files.remove(sealed)

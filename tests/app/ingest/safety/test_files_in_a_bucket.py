@@ -158,6 +158,36 @@ def test_quarantined_bytes_are_encrypted_there_and_gone_everywhere_once_decided(
     assert on_this_machine() == []
 
 
+def away_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bucket takes no removal, the first time that it is asked for one."""
+    real = buckets.Bucket.remove
+    refused: list[str] = []
+
+    def remove(store: buckets.Bucket, sha256: str) -> None:
+        if not refused:
+            refused.append(sha256)
+            raise buckets.StoreAway("The store of files does not answer.", "Try again.")
+        real(store, sha256)
+
+    monkeypatch.setattr(buckets.Bucket, "remove", remove)
+
+
+@pytest.mark.parametrize("how", ["release", "discard"])
+def test_what_a_bucket_that_was_away_did_not_remove_is_removed_when_the_decision_is_made_again(
+    how: str, send: Any, client: TestClient, shared: str, s3_server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = next(f for f in send(("noise.bin", SECRET), ("t.csv", steady(1)), visit=1).json()["files"] if f["quarantined"])
+    path, decision = f"/api/v1/uploaded-files/{held['id']}", {"reason": "no name in it"}
+    assert client.post(f"{path}/review").status_code == 200
+    decision |= {"how": "as_is"} if how == "release" else {}
+    away_once(monkeypatch)
+    assert client.post(f"{path}/{how}", json=decision).status_code == 503
+    assert any(held["stored_sha256"] in name for name in s3_server.objects(shared))
+    assert client.post(f"{path}/{how}", json=decision).status_code == 200
+    assert not any(held["stored_sha256"] in name for name in s3_server.objects(shared))
+    assert (SECRET in s3_server.objects(shared).values()) == (how == "release")
+
+
 def test_machines_with_other_keys_do_not_start(shared: str, s3_server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     store = buckets.bucket()
     assert store is not None
