@@ -278,10 +278,12 @@ class Receiver:
         return FileOutcome(name, row, reports, all_known, recordings=[*stored.known, *stored.fresh], grasps=decoded.grasps)
 
     def _known_meanwhile(self, name: str, row: UploadFile) -> FileOutcome | None:
-        """The outcome for a file whose bytes another upload has brought since; the row goes then."""
-        if (known := self._known(name, row.original_sha256)) is not None:
-            self.db.delete(row)
-            self.db.commit()
+        """The outcome for a file whose bytes another upload has brought since; the row goes then. It is no other itself."""
+        known = self._known(name, row.original_sha256)
+        if known is None or known.row.id == row.id:
+            return None
+        self.db.delete(row)
+        self.db.commit()
         return known
 
     def _decoded(self, row: UploadFile, content: StoredContent) -> DecodedFile:

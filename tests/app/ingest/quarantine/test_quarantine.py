@@ -133,15 +133,27 @@ def test_tampered_bytes_are_refused_in_words(held: dict[str, Any], client: TestC
     assert "missing or damaged" in decide(client, held, "review").json()["detail"]
 
 
-def test_a_part_that_could_not_be_read_is_decided_on_without_touching_the_rest(send: Any, client: TestClient) -> None:
+def with_a_broken_part(content: bytes) -> bytes:
     sink = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(device_zip())) as source, zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as target:
+    with zipfile.ZipFile(io.BytesIO(content)) as source, zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as target:
         for name in source.namelist():
             target.writestr(name, b"\xff\xfe not json" if name.endswith("EventLog.json") else source.read(name))
-    (file,) = send(("s.zip", sink.getvalue())).json()["files"]
+    return sink.getvalue()
+
+
+def test_a_part_that_could_not_be_read_is_decided_on_without_touching_the_rest(send: Any, client: TestClient) -> None:
+    (file,) = send(("s.zip", with_a_broken_part(device_zip()))).json()["files"]
     assert (file["status"], file["quarantined"]) == ("decoded", True)
     assert decide(client, file, "discard", reason="the log is broken").json()["status"] == "decoded"
     assert files.path_of(file["stored_sha256"]).exists()
+
+
+def test_a_part_that_still_cannot_be_read_leaves_what_was_read_as_it_was(send: Any, client: TestClient, proposals: Any) -> None:
+    (file,) = send(("s.zip", with_a_broken_part(device_zip()))).json()["files"]
+    (before,) = proposals()
+    answer = decide(client, file, "release", how="read", reason="a newer decoder").json()
+    assert (answer["status"], answer["held"]) == ("decoded", True)
+    assert [p["session"]["id"] for p in proposals()] == [before["session"]["id"]]
 
 
 def test_only_a_clinician_or_an_administrator_decides(held: dict[str, Any], client_as: Any) -> None:
