@@ -247,6 +247,7 @@ def left_out(excluded: Excluded) -> str:
         LeftOut.NOT_CONFIRMED: "not confirmed yet",
         LeftOut.UNREADABLE: f"cannot be read: {excluded.detail}",
         LeftOut.HIDDEN: "hidden from you until its visit is locked",
+        LeftOut.SEALED: "the key of its visit's blinded plan is sealed",
     }[excluded.why]
 
 

@@ -283,9 +283,10 @@ def disagreements(db: Session, session_ids: Sequence[int], stated: StatedSession
         differs = []
         if stated.visit is not None and session.visit_id != stated.visit.id:
             differs.append(f"it stands in visit {session.visit.number}, not {stated.visit.number}")
-        if stated.controller is not None and controller != stated.controller:
+        told = not session.visit.sealed
+        if told and stated.controller is not None and controller != stated.controller:
             differs.append(f"its controller is {controller or 'still open'}, not {stated.controller}")
-        if stated.policy_id is not None and policy_id != stated.policy_id:
+        if told and stated.policy_id is not None and policy_id != stated.policy_id:
             differs.append(f"its policy is {policy_id or 'none'}, not {stated.policy_id}")
         if stated.hemisphere is not None and session.hemisphere != stated.hemisphere:
             differs.append(f"it is controlled on the {session.hemisphere or 'unknown'} side, not the {stated.hemisphere}")

@@ -10,10 +10,15 @@ from app.ingest.proposals.evidence import Evidence, Reason, Source, stored_cours
 from app.study.models import Recording
 from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern
 
+_TELLING = ("controller", "program")
+HIDDEN = "controller hidden"
+SEALED = "hidden while the key of the blinded plan is sealed; kept as it is when the session is confirmed"
 
-def reasons(evidence: Mapping[str, Any]) -> dict[str, str]:
-    """The stored evidence of a proposal, by field, in words."""
-    return {name: reason(Evidence.from_json(stored)) for name, stored in evidence.items()}
+
+def reasons(evidence: Mapping[str, Any], sealed: bool = False) -> dict[str, str]:
+    """The stored evidence of a proposal, by field, in words; without what tells what ran where the key of its plan is `sealed`."""
+    said = {name: reason(Evidence.from_json(stored)) for name, stored in evidence.items()}
+    return said | {name: SEALED for name in said if sealed and name in _TELLING}
 
 
 def reason(evidence: Evidence) -> str:

@@ -34,6 +34,7 @@ class Task(StrEnum):
     SET_THRESHOLD = "set_threshold"
     WAIT_FOR_RANKING = "wait_for_ranking"
     RANK = "rank"
+    OPEN_KEY = "open_key"
     RANK_AGAIN = "rank_again"
     TRAIN_NEXT = "train_next"
     DRAFT_PLAN = "draft_plan"
@@ -86,6 +87,9 @@ def _steps(participant: Participant, state: State) -> Iterator[NextStep]:
         yield NextStep(Task.WAIT_FOR_RANKING, Actor.SERVICE, f"/jobs/{state.ranking_job.id}", urgent=False)
     elif state.sessions and state.evaluated_at is None:
         yield NextStep(Task.RANK, engineer, f"{home}/jobs", urgent=False)
+    for visit in state.planned_visits:
+        if visit.sealed and visit.held == visit.planned:
+            yield NextStep(Task.OPEN_KEY, clinician, f"/visits/{visit.visit_id}/plan", blocks_visit=False)
     if state.grown and any(visit.tested for visit in state.planned_visits):
         yield NextStep(Task.TRAIN_NEXT, engineer, f"{home}/next-generation")
     elif state.grown:

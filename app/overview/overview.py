@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import groupby
@@ -33,6 +33,19 @@ router = APIRouter()
 REFRESH_S = 5
 _ARM_COLUMNS = ("controller", "policy_id")
 _HIDDEN = "hidden from you"
+_KEPT = {
+    "session": frozenset(
+        {"id", "visit_id", "ordinal", "status", "plan_item_id", "hemisphere", "started_at", "duration_s", "excluded_reason"}
+    ),
+    "plan_item": frozenset(
+        {"id", "plan_id", "position", "minutes", "washout_minutes", "break_minutes", "label", "medication", "hemisphere"}
+    ),
+    "session_proposal": frozenset({"session_id", "upload_id", "visit_open", "changed_by", "version"}),
+    "session_conditions": frozenset({"id", "session_id", "revision", "entered_by", "reason", "created_at"}),
+    "bundle_release": frozenset({"id", "participant_id", "plan_item_id", "created_at", "created_by"}),
+    "adverse_event": frozenset({"id", "participant_id", "visit_id", "session_id", "entry_key", "created_at"}),
+}
+"""Columns that tell nobody what ran, of tables that would: all that is shown of their rows while the key of a blinded plan is sealed."""
 
 
 @router.get("/")
@@ -107,19 +120,29 @@ class Act:
 def acts(db: Session, events: Sequence[AuditEvent], caller: Caller) -> list[Act]:
     """The events of a page, those of one request together; newest first."""
     names = repository.audit_names(db, events)
+    sealed = repository.sealed_events(db, events) if not caller.is_system else frozenset()
     found = []
     for _, group in groupby(events, key=lambda e: (e.actor, e.request_id or e.id)):
         rows = list(group)
         telling = headline(rows)
-        found.append(Act(telling, sentence(telling, names), [(e, changes(db, e, caller)) for e in rows]))
+        said = wording.SEALED_ACT if telling.id in sealed and telling.entity == "bundle_release" else sentence(telling, names)
+        found.append(Act(telling, said, [(e, changes(db, e, caller, e.id in sealed)) for e in rows]))
     return found
 
 
-def changes(db: Session, event: AuditEvent, caller: Caller) -> list[tuple[str, str | None, str | None]]:
-    """Column, value before, value after of what an event changed; arms only through the blinding gate."""
+def changes(db: Session, event: AuditEvent, caller: Caller, sealed: bool) -> list[tuple[str, str | None, str | None]]:
+    """Column, value before, value after of what an event changed; arms only through the blinding gate.
+
+    Args:
+        sealed: whether the row is one of a blinded plan whose key is sealed, or of its sessions.
+    """
     before, after = event.before or {}, event.after or {}
     names = [n for n in dict.fromkeys([*before, *after]) if before.get(n) != after.get(n)]
-    hidden = _ARM_COLUMNS if event.entity == "session" and not _may_know_arm(db, event.entity_id, caller) else ()
+    hidden: Collection[str] = ()
+    if sealed:
+        hidden = set(names) - _KEPT[event.entity]
+    elif event.entity == "session" and not _may_know_arm(db, event.entity_id, caller):
+        hidden = _ARM_COLUMNS
     return [
         (name, _HIDDEN if name in hidden else _short(before.get(name)), _HIDDEN if name in hidden else _short(after.get(name)))
         for name in names

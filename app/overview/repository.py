@@ -14,7 +14,7 @@ from app.evaluation.models import EstimateRow, Evaluation
 from app.evaluation.schemas import RANKING_KINDS
 from app.learning.models import BufferSnapshot, Policy
 from app.overview.audit_words import Names
-from app.planning.plans.models import Plan
+from app.planning.plans.models import SEALED, Plan, PlanItem
 from app.platform.audit import AuditEvent
 from app.platform.jobs.models import Job, JobStatus
 from app.study.models import Participant, QocRevision, StudySession, Visit
@@ -61,6 +61,32 @@ def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
     return Names(codes, visits, sessions, plans, policies)
 
 
+def sealed_events(db: Session, events: Sequence[AuditEvent]) -> frozenset[int]:
+    """Those of the events that changed a row of a blinded plan whose key is sealed, or of the sessions of its visit."""
+    plans = set(db.scalars(select(Plan.id).where(SEALED)))
+    if not plans:
+        return frozenset()
+    items = set(db.scalars(select(PlanItem.id).where(PlanItem.plan_id.in_(plans))))
+    visits = set(db.scalars(select(Visit.id).where(Visit.sealed)))
+    named = {row["session_id"] for e in events for row in (e.before, e.after) if row and row.get("session_id") is not None}
+    open_to_all = StudySession.id.in_(named) & StudySession.visit_id.not_in(visits)
+    sessions = named - set(db.scalars(select(StudySession.id).where(open_to_all)))  # a proposal that is gone may have been of any visit
+    within = {
+        "session": ("visit_id", visits),
+        "plan_item": ("plan_id", plans),
+        "session_proposal": ("session_id", sessions),
+        "session_conditions": ("session_id", sessions),
+        "bundle_release": ("plan_item_id", items),
+        "adverse_event": ("visit_id", visits),
+    }
+
+    def tells(event: AuditEvent) -> bool:
+        column, sealed = within.get(event.entity, ("", set()))
+        return any((row or {}).get(column) in sealed for row in (event.before, event.after))
+
+    return frozenset(e.id for e in events if tells(e))
+
+
 def visit_days(db: Session, ids: Sequence[int], today: dt.date) -> Iterable[Row[int, int, dt.date | None, dt.date | None]]:
     """By participant: number of visits, the last one up to today, the first from today on."""
     return db.execute(
@@ -76,7 +102,8 @@ def visit_days(db: Session, ids: Sequence[int], today: dt.date) -> Iterable[Row[
 
 
 def session_counts(db: Session, ids: Sequence[int]) -> Iterable[Row[int, int, int, int, int, dt.datetime | None]]:
-    """By participant: confirmed sessions, excluded and without QoCs, proposed ones, and when the newest one was entered."""
+    """By participant: confirmed sessions, excluded and without QoCs, proposed ones, and when the newest one could be learned from: it was
+    entered, or the key of its blinded plan was opened."""
     confirmed = StudySession.status == "confirmed"
     counts = confirmed & StudySession.excluded_reason.is_(None)
     has_qoc = select(QocRevision.id).where(QocRevision.session_id == StudySession.id).exists()
@@ -87,7 +114,7 @@ def session_counts(db: Session, ids: Sequence[int]) -> Iterable[Row[int, int, in
             func.count().filter(confirmed & ~counts),
             func.count().filter(counts & ~has_qoc),
             func.count().filter(~confirmed),
-            func.max(StudySession.created_at).filter(confirmed),
+            func.max(func.greatest(StudySession.created_at, Visit.unsealed_at)).filter(confirmed & ~Visit.sealed),
         )
         .join(Visit, Visit.id == StudySession.visit_id)
         .where(Visit.participant_id.in_(ids))

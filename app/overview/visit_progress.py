@@ -19,7 +19,7 @@ class VisitProgress:
         planned: sessions of the plan. held: those that a confirmed session fills.
         logs_missing: those that none fills although the day is past; 0 before it, of a visit without a date, and of a
             locked one, which takes no data any more.
-        tested: those held that ran a policy.
+        tested: those held that ran a policy, which nobody is told while the key is sealed (0). sealed: whether it is.
     """
 
     visit_id: int
@@ -29,6 +29,7 @@ class VisitProgress:
     held: int
     logs_missing: int
     tested: int
+    sealed: bool = False
 
 
 def visit_progress(db: Session, participant_ids: Sequence[int], today: dt.date) -> dict[int, list[VisitProgress]]:
@@ -40,5 +41,7 @@ def visit_progress(db: Session, participant_ids: Sequence[int], today: dt.date) 
     for row in slots.slots_filled(db, participant_ids):
         past = row.date is not None and row.date < today
         missing = row.slots - row.filled if past and not row.locked else 0
-        found[row.participant_id].append(VisitProgress(row.visit_id, row.number, row.date, row.slots, row.filled, missing, row.tested))
+        tested = 0 if row.sealed else row.tested
+        progress = VisitProgress(row.visit_id, row.number, row.date, row.slots, row.filled, missing, tested, row.sealed)
+        found[row.participant_id].append(progress)
     return found

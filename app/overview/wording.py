@@ -24,12 +24,16 @@ _TASKS: dict[Task, str | Callable[[int], str]] = {
     Task.SET_THRESHOLD: "Beta threshold \u03be\u03b2 is not set; jobs cannot start",
     Task.WAIT_FOR_RANKING: "The first ranking is being made",
     Task.RANK: "No ranking yet: start the pipeline",
+    Task.OPEN_KEY: "A blinded visit is held, and nothing learns from it: open the key of its plan",
     Task.RANK_AGAIN: "New sessions since the last ranking; it is stale",
     Task.TRAIN_NEXT: "New sessions since the last ranking: train the next generation",
     Task.DRAFT_PLAN: "No plan for this visit yet",
     Task.APPROVE_PLAN: "A visit plan waits for approval",
     Task.LOOK_AT_FAILED: lambda n: f"{counted(n, 'job')} failed in the last 7 days",
 }
+
+
+SEALED_ACT = "took the bundle of a session of a blinded plan"
 
 
 def what(step: NextStep) -> str:

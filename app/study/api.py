@@ -156,20 +156,23 @@ def read_trace(session: CurrentSession, db: Db, caller: CurrentCaller) -> TraceO
 
 
 @router.get("/sessions/{session_id}/traces")
-def read_traces(session: CurrentSession, db: Db) -> list[RecordedTraceOut]:
+def read_traces(session: CurrentSession, db: Db, caller: CurrentCaller) -> list[RecordedTraceOut]:
     """Every trace of every recording of the session: all channels and powers, the amplitudes of all programs and sides."""
+    require_known(session.visit, caller)
     return [recorded_trace_out(t) for t in recorded_traces(db, session, session.visit.participant.current_settings)]
 
 
 @router.get("/sessions/{session_id}/conditions")
-def read_conditions(session: CurrentSession) -> ConditionsOut | None:
+def read_conditions(session: CurrentSession, caller: CurrentCaller) -> ConditionsOut | None:
     """What the session ran under; null of a proposal, whose conditions are taken down when it is confirmed."""
+    require_known(session.visit, caller)
     return ConditionsOut.model_validate(session.conditions) if session.conditions else None
 
 
 @router.put("/sessions/{session_id}/conditions", responses=problems(409))
 def change_conditions(session: CurrentSession, change: ConditionsChange, db: Db, caller: CurrentCaller) -> ConditionsOut:
     """Correct what the session ran under; buffers made from now on take it from here, those made before keep theirs."""
+    require_known(session.visit, caller)
     row = conditions.change(db, session, change, caller)
     db.commit()
     return ConditionsOut.model_validate(row)

@@ -1,11 +1,13 @@
 """The one gate through which pages, exports and analyses learn which controller a session had.
 
-Blinding hangs on this place: who may not know an arm is refused here or told that it is hidden, and nowhere else is the column read.
+Blinding hangs on this place: who may not know an arm is refused here or told that it is hidden, and nowhere else is the column read. It
+holds for two things: a person's role (blinded assessor), and a visit under a blinded plan whose key is sealed, of which nobody knows more
+than letters (`app.planning.plans.key`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy.orm import Session
@@ -44,7 +46,7 @@ def arm(session: StudySession, user: Caller) -> Arm:
 
     Raises:
         Conflict: the session is a proposal, and nobody has stated its controller yet.
-        Forbidden: the user is blinded, and the visit is not locked yet.
+        Forbidden: the user may not know it (`may_know`).
     """
     stated = stated_arm(session, user)
     if stated is None:
@@ -58,34 +60,58 @@ def stated_arm(session: StudySession, user: Caller) -> Arm | None:
     return None if session._controller is None else Arm(Controller(session._controller), session._policy_id)
 
 
+def is_stated(session: StudySession) -> bool:
+    """Whether a controller stands with a session, whichever it is."""
+    return session._controller is not None
+
+
 def visible_arm(session: StudySession, user: Caller) -> Arm | None:
     """For lists: the arm, or None where it is hidden from this user or open."""
     return stated_arm(session, user) if may_know(session.visit, user) else None
 
 
 def may_know(visit: Visit, user: Caller) -> bool:
-    """Whether the user may know the arms of a visit: everybody but a blinded assessor, and these once it is locked."""
+    """Whether the user may know the arms of a visit.
+
+    While the key of its blinded plan is sealed no person may, whoever drafted or signed it; machines may, and show nobody what they read.
+    Else everybody but a blinded assessor, and these once the visit is locked.
+    """
     site = visit.participant.site
     user.require(can.READ, site.study_id, site.id)
-    return user.may(can.READ_ARMS, site.study_id, site.id) or visit.locked
+    if user.is_system:
+        return True
+    return not visit.sealed and (user.may(can.READ_ARMS, site.study_id, site.id) or visit.locked)
 
 
 def require_known(visit: Visit, user: Caller) -> None:
     """Raises Forbidden where the user may not know the arms of a visit, nor see what gives them away."""
-    if not may_know(visit, user):
+    if may_know(visit, user):
+        return
+    if visit.sealed:
         raise Forbidden(
-            f"What ran at visit {visit.number} is hidden from you until the visit is locked.",
-            "You are a blinded assessor; a clinician locks the visit when its data are complete.",
+            f"What ran at visit {visit.number} is hidden from everybody while the key of its blinded plan is sealed.",
+            "A clinician opens the key on the page of the plan.",
         )
+    raise Forbidden(
+        f"What ran at visit {visit.number} is hidden from you until the visit is locked.",
+        "You are a blinded assessor; a clinician locks the visit when its data are complete.",
+    )
 
 
-def sight(db: Session, participant: Participant, user: Caller) -> Hashable:
-    """What the user may know of a participant's arms: equal sights, equal arms. "all", or the visits that are locked."""
-    site = participant.site
-    user.require(can.READ, site.study_id, site.id)
-    if user.may(can.READ_ARMS, site.study_id, site.id):
-        return "all"
-    return frozenset(repository.locked_visits(db, participant.id))
+def unsealed(sessions: Iterable[StudySession], user: Caller) -> list[StudySession]:
+    """Those whose visit's key is not sealed to the user: what compares sessions by controller leaves the others out."""
+    return [s for s in sessions if user.is_system or not s.visit.sealed]
+
+
+def sights(db: Session, participants: Sequence[Participant], user: Caller) -> list[Hashable]:
+    """What the user may know of each participant's arms: equal sights, equal arms. The visits that are hidden from the user."""
+    for p in participants:
+        user.require(can.READ, p.site.study_id, p.site.id)
+    if user.is_system:
+        return ["all"] * len(participants)
+    hidden = repository.hidden_visits(db, [p.id for p in participants])
+    told = [user.may(can.READ_ARMS, p.site.study_id, p.site.id) for p in participants]
+    return [(hidden.sealed(p.id), None if knows else hidden.unlocked(p.id)) for p, knows in zip(participants, told, strict=True)]
 
 
 def assign(session: StudySession, controller: Controller | None, policy_id: int | None) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from datetime import date, datetime
 from enum import StrEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import sqlalchemy as sa
 from sqlalchemy import CheckConstraint, ForeignKey, Index, LargeBinary, SmallInteger, String, Text, UniqueConstraint, func, text
-from sqlalchemy.orm import Mapped, mapped_column, relationship
+from sqlalchemy.orm import Mapped, column_property, mapped_column, relationship
 
 from app.accounts.models import Site
 from app.platform.database import Base
@@ -191,11 +192,25 @@ class Visit(Base):
     cdbs_amplitudes: Mapped[list[CdbsAmplitude]] = relationship(lazy="selectin")
     doses: Mapped[list[Dose]] = relationship(lazy="selectin", order_by=(Dose.taken_at, Dose.id))
     locks: Mapped[list[VisitLock]] = relationship(back_populates="visit", order_by="VisitLock.id", lazy="selectin")
+    if TYPE_CHECKING:  # mapped below, where the class that they belong to is there
+        sealed: Mapped[bool]
+        """Whether the key of its signed plan is sealed, so that nobody may know what ran (`app.study.blinding`)."""
+        unsealed_at: Mapped[datetime | None]
+        """When the key of its signed plan was opened; None where it is sealed or the plan is not blinded."""
 
     @property
     def locked(self) -> bool:
         """Whether the visit's data are closed for changes, and open to blinded assessors."""
         return bool(self.locks) and self.locks[-1].locked
+
+
+_PLANS = sa.table("plan", *(sa.column(name) for name in ("visit_id", "status", "blinded", "key_opened_at")))
+_BLINDED = (_PLANS.c.visit_id == Visit.id, _PLANS.c.status == "approved", _PLANS.c.blinded)
+# plans belong to a later phase, and of their table only the key is needed here; a column of the visit costs a list of visits no query
+Visit.sealed = column_property(sa.exists().where(*_BLINDED, _PLANS.c.key_opened_at.is_(None)).correlate(Visit.__table__))
+Visit.unsealed_at = column_property(
+    sa.select(func.max(_PLANS.c.key_opened_at)).where(*_BLINDED).correlate(Visit.__table__).scalar_subquery()
+)
 
 
 class VisitLock(Base):
@@ -264,6 +279,10 @@ class StudySession(Base):
     qocs: Mapped[list[QocRevision]] = relationship(back_populates="session", order_by="QocRevision.revision")
     conditions_revisions: Mapped[list[SessionConditions]] = relationship(order_by="SessionConditions.revision")
 
+    if TYPE_CHECKING:
+        letter: Mapped[str | None]
+        """What its blinded plan calls it; None outside of blinded plans."""
+
     @property
     def qoc(self) -> QocRevision | None:
         """The newest revision of the session's QoCs."""
@@ -273,6 +292,12 @@ class StudySession(Base):
     def conditions(self) -> SessionConditions | None:
         """What the session ran under, newest revision; None of a proposal, whose conditions are taken down when it is confirmed."""
         return self.conditions_revisions[-1] if self.conditions_revisions else None
+
+
+_ITEMS = sa.table("plan_item", sa.column("id"), sa.column("label"))
+StudySession.letter = column_property(
+    sa.select(_ITEMS.c.label).where(_ITEMS.c.id == StudySession.plan_item_id).correlate(StudySession.__table__).scalar_subquery()
+)
 
 
 class Recording(Base):

@@ -107,10 +107,26 @@ def visit_by_number(db: Session, participant_id: int, number: int) -> Visit | No
     return db.scalar(select(Visit).where(Visit.participant_id == participant_id, Visit.number == number))
 
 
-def locked_visits(db: Session, participant_id: int) -> Sequence[int]:
-    """Visits of a participant that are locked now."""
-    newest = select(func.max(VisitLock.id)).join(VisitLock.visit).where(Visit.participant_id == participant_id).group_by(VisitLock.visit_id)
-    return db.scalars(select(VisitLock.visit_id).where(VisitLock.id.in_(newest), VisitLock.locked)).all()
+class HiddenVisits(NamedTuple):
+    """Visits that hide what ran from somebody, of several participants: (participant, visit, key is sealed, locked)."""
+
+    rows: Sequence[tuple[int, int, bool, bool]]
+
+    def sealed(self, participant_id: int) -> frozenset[int]:
+        """A participant's visits under a blinded plan whose key is sealed."""
+        return frozenset(visit for owner, visit, sealed, _ in self.rows if owner == participant_id and sealed)
+
+    def unlocked(self, participant_id: int) -> frozenset[int]:
+        """A participant's visits that are not locked now."""
+        return frozenset(visit for owner, visit, _, locked in self.rows if owner == participant_id and not locked)
+
+
+def hidden_visits(db: Session, participant_ids: Collection[int]) -> HiddenVisits:
+    """Visits of participants, each with whether its key is sealed and whether it is locked."""
+    newest = select(VisitLock.locked).where(VisitLock.visit_id == Visit.id).order_by(VisitLock.id.desc()).limit(1)
+    locked = func.coalesce(newest.correlate(Visit).scalar_subquery(), false())
+    query = select(Visit.participant_id, Visit.id, Visit.sealed, locked).where(Visit.participant_id.in_(participant_ids))
+    return HiddenVisits([(row[0], row[1], row[2], row[3]) for row in db.execute(query)])
 
 
 def lock_row(db: Session, visit: Visit) -> None:

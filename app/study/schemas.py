@@ -124,9 +124,11 @@ class SessionOut(Model):
     participant: str
     ordinal: int
     controller: Controller | None = Field(
-        description="Null of a proposal whose controller nobody has stated yet, and where it is hidden from a blinded assessor."
+        description="Null of a proposal whose controller nobody has stated yet, and where it is hidden: from a blinded assessor, and from "
+        "everybody while the key of the visit's blinded plan is sealed."
     )
     policy_id: int | None
+    letter: str | None = Field(description="What the visit's blinded plan calls it; null of sessions of no blinded plan.")
     hemisphere: Hemisphere | None
     status: str
     started_at: datetime | None

@@ -51,6 +51,7 @@ def session_out(s: StudySession, caller: Caller) -> SessionOut:
         ordinal=s.ordinal,
         controller=arm.controller if arm else None,
         policy_id=arm.policy_id if arm else None,
+        letter=s.letter,
         hemisphere=s.hemisphere,
         status=s.status,
         started_at=s.started_at,

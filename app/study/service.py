@@ -147,8 +147,8 @@ def change_session(db: Session, session: StudySession, change: SessionChange, ca
     require_unlocked(session.visit)
     given = change.model_dump(exclude_unset=True, exclude={"reason"})
     set_reason(db, change.reason)
-    arm = blinding.arm(session, caller)
     if "controller" in given or "policy_id" in given:
+        arm = blinding.arm(session, caller)
         controller = given.pop("controller", None) or arm.controller
         kept = arm.policy_id if controller in POLICY_CONTROLLERS else None
         policy_id = given.pop("policy_id", kept)

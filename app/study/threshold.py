@@ -70,8 +70,8 @@ def mdp_settings(settings: SettingsVersion, suggestion: SuggestedThreshold | Non
 def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> SuggestedThreshold | None:
     """A threshold from the data: midway between the median beta of cDBS sessions and that of no-DBS sessions, else the median of all.
 
-    Of confirmed sessions that are not excluded, with beta in the settings' unit and from their source; None where these leave it open and
-    the sessions have several, which are never mixed.
+    Of confirmed sessions that are not excluded nor of a blinded plan whose key is sealed, with beta in the settings' unit and from their
+    source; None where these leave it open and the sessions have several, which are never mixed.
     """
     settings = participant.current_settings
     groups: dict[Controller, list[np.ndarray[Any, Any]]] = {}
@@ -79,6 +79,8 @@ def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> Su
     sessions = repository.sessions_of_participant(db, participant.id)
     traces = traces_of(db, sessions)
     for session in sessions:
+        if session.visit.sealed:
+            continue
         table = laid_out(session, settings, traces)
         trace = table.beta_trace
         if session.excluded_reason or trace is None:

@@ -44,6 +44,8 @@ class LeftOut(StrEnum):
     NOT_CONFIRMED = "not_confirmed"
     UNREADABLE = "unreadable"
     HIDDEN = "hidden"
+    SEALED = "sealed"
+    """Of a blinded plan whose key is sealed."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,8 @@ def evidence(db: Session, participant: Participant, caller: Caller) -> Evidence:
 def of_all(db: Session, participants: Sequence[Participant], caller: Caller) -> list[Evidence]:
     """The evidence of several participants; what is not kept is read for some of them at once."""
     versions = fingerprints(db, [p.id for p in participants])
-    keys = [("evidence", p.id, versions[p.id], blinding.sight(db, p, caller)) for p in participants]
+    sights = blinding.sights(db, participants, caller)
+    keys = [("evidence", p.id, versions[p.id], sight) for p, sight in zip(participants, sights, strict=True)]
     found: list[Evidence | None] = [recalled(key) for key in keys]
     lacking = [i for i, known in enumerate(found) if known is None]
     for start in range(0, len(lacking), READ_AT_ONCE):
@@ -84,7 +85,7 @@ def _read(
         elif session.excluded_reason:
             excluded.append(Excluded(*place, LeftOut.EXCLUDED, session.excluded_reason))
         elif (arm := blinding.visible_arm(session, caller)) is None:
-            excluded.append(Excluded(*place, LeftOut.HIDDEN, ""))
+            excluded.append(Excluded(*place, LeftOut.SEALED if session.visit.sealed else LeftOut.HIDDEN, ""))
         else:
             try:
                 counted.append(read(session, arm, lambda i: traces.get(i, [])))

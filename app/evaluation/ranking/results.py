@@ -50,7 +50,8 @@ class DrivenSession:
 def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller, sessions: ReadOnce | None = None) -> list[DrivenSession]:
     """Every confirmed session of a policy or of cDBS, by visit and order, under a snapshot's settings, unit and source of beta.
 
-    The buffer's gate does not matter here: it guards what is learnt from, and these sessions are only looked at.
+    Those of a blinded plan whose key is sealed are left out, of what jobs compute for people too. The buffer's gate does not matter here:
+    it guards what is learnt from, and these sessions are only looked at.
 
     Args:
         db: the session. snapshot: what the estimates rest on. caller: decides which arms may be known.
@@ -58,7 +59,7 @@ def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller, sessi
     """
     sessions = sessions or ReadOnce(db, snapshot.participant_id)
     version = study_repository.settings_version(db, snapshot.settings_version_id)
-    arms = [(s, blinding.arm(s, caller)) for s in sessions.rows]
+    arms = [(s, blinding.arm(s, caller)) for s in blinding.unsealed(sessions.rows, caller)]
     driven = [(s, arm) for s, arm in arms if arm.policy_id is not None or arm.controller is Controller.CDBS]
     traces = traces_of(db, [s for s, _ in driven])
     found = []
@@ -104,7 +105,7 @@ def tested_before(
         sessions: of the participant, where somebody else reads them too.
     """
     sessions = sessions or ReadOnce(db, participant.id)
-    key = ("tested before", evaluation.id, evaluation.created_at, sessions.fingerprint, cdbs, blinding.sight(db, participant, caller))
+    key = ("tested before", evaluation.id, evaluation.created_at, sessions.fingerprint, cdbs, *blinding.sights(db, [participant], caller))
 
     def read() -> dict[int, TestedBefore]:
         settings = mdp_settings(study_repository.settings_version(db, evaluation.settings_version_id))

@@ -67,7 +67,8 @@ def _kept_changes(db: Session, participant: Participant, snapshot: BufferSnapsho
     What this transaction has read before may be older than the key says, so that settings are read again, as `sessions` are.
     """
     decision = learning.newest_gate_decision(db, participant.id)
-    key = ("changes since", snapshot.id, snapshot.created_at, sessions.fingerprint, decision.id if decision else None)
+    sealed = study_repository.hidden_visits(db, [participant.id]).sealed(participant.id)
+    key = ("changes since", snapshot.id, snapshot.created_at, sessions.fingerprint, decision.id if decision else None, sealed)
 
     def read() -> list[Flag]:
         rows = sessions.rows
@@ -90,8 +91,9 @@ def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot, se
     found = Counter({"newer": len(added), "unconfirmed": len(before.keys() - now.keys())})
     for pinned, session in both:
         learned = blinding.arm(session, SYSTEM).controller in LEARNED
-        shut_out = bool(session.excluded_reason) or (learned and not barrier.is_open)
-        free = session.id in readmitted or (learned and opened)
+        shut_out = bool(session.excluded_reason) or (learned and not barrier.is_open) or session.visit.sealed
+        unsealed = session.visit.unsealed_at is not None and session.visit.unsealed_at > snapshot.created_at
+        free = session.id in readmitted or (learned and opened) or unsealed
         found["qoc"] += (session.qoc.id if session.qoc else None) != pinned.qoc_id
         found["conditions"] += pinned.conditions_id is not None and (session.conditions and session.conditions.id) != pinned.conditions_id
         found["left_out"] += shut_out and pinned.left_out_reason is None

@@ -38,9 +38,9 @@ Floats = NDArray[np.float64]
 
 
 def sessions_to_replay(db: Session, participant: Participant) -> Sequence[StudySession]:
-    """Sessions over whose beta policies may be run, newest first."""
+    """Sessions over whose beta policies may be run, newest first; none of a blinded plan whose key is sealed."""
     found = study_repository.sessions_of_participant(db, participant.id)
-    return [s for s in reversed(found) if s.excluded_reason is None]
+    return [s for s in reversed(found) if s.excluded_reason is None and not s.visit.sealed]
 
 
 def replay(db: Session, participant: Participant, session_id: int, policies: Sequence[Policy], caller: Caller) -> ReplayOut:

@@ -26,6 +26,8 @@ LABELS = {
     "visit": "Visit", "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "from": "From", "to": "To",
     "control": "Control channel", "program": "Program", "started_at": "Start", "start_s": "From", "stop_s": "To",
 }  # fmt: skip
+HIDDEN = "hidden"
+"""Stands for a controller that is stated and may not be told; sent back, it changes nothing."""
 PARTS = 6
 """Rows of the form that cuts a recording; longer days are cut twice, or over the interface."""
 
@@ -42,7 +44,7 @@ class ProposalForm:
         drawn: how the amplitudes of a random session were drawn; empty for other sessions.
         usable: usable steps by channel, the control channel first.
         programs: that the control recording has an amplitude of.
-        thumbnail: beta and amplitude at a glance, None where neither is known.
+        thumbnail: beta and amplitude at a glance, None where neither is known or they may not be told.
         problem: why the form was refused.
         to_add: the visit that can be made of the recording.
     """
@@ -81,11 +83,12 @@ class ProposalForm:
 
 def texts(db: Session, session: StudySession, proposal: SessionProposal, caller: Caller) -> dict[str, str]:
     """The values of a proposal as text."""
-    arm = blinding.stated_arm(session, caller)
+    arm = blinding.visible_arm(session, caller)
+    hidden = arm is None and blinding.is_stated(session)
     control = next(s for s in session.segments if s.is_control)
     return {
         "visit": "" if proposal.visit_open else str(session.visit.number),
-        "controller": arm.controller.value if arm else "",
+        "controller": HIDDEN if hidden else arm.controller.value if arm else "",
         "policy": study.policy_name(db, arm.policy_id if arm else None) or "",
         "hemisphere": session.hemisphere or "",
         "control": f"{session.control_stream}|{session.control_channel or ''}",

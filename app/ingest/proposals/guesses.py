@@ -36,6 +36,9 @@ def controller(db: Session, session: StudySession) -> Guess:
     slot = logged.slot_of_recording(db, control_recording(session))
     if slot is not None and slot.planned is not None:
         facts = {"visit": slot.visit_number, "position": slot.planned.position}
+        if slot.planned.sealed and not session.visit.sealed:
+            # where it stands now everybody would be shown what its sealed plan hides
+            return Guess(None, None, Evidence(Source.RECORDING, Reason.SLOT, facts))
         return Guess(Controller(slot.planned.controller), slot.planned.policy_id, Evidence(Source.RECORDING, Reason.SLOT, facts))
     ran = logged.of_recording(db, control_recording(session))
     if ran is not None and ran.policy_id is not None:

@@ -68,9 +68,8 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     length = f"{session.duration_s / 60:.1f} min" if session.duration_s else "no data"
     seen, usable = _seen(session, placement), sentence(usable_steps(db, session))
     if stated.counts:
-        said = (
-            f"Session {session.id}: visit {guess.visit.number}, {stated.controller}, {length}, {seen} (recording {placement.control.id})."
-        )
+        ran = wording.HIDDEN if session.visit.sealed else stated.controller
+        said = f"Session {session.id}: visit {guess.visit.number}, {ran}, {length}, {seen} (recording {placement.control.id})."
         flagged = [*placement.notes, *sessions.fix_milliamperes(db, session), *sentences(contradictions(db, session))]
         conditions.record(db, session, upload.created_by)
         return NewSession(session, group, [said, usable, *outcomes_intake.derive(db, session)], flagged)
@@ -94,10 +93,12 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     )
     db.add(proposal)
     db.flush()
+    why = wording.reasons({name: e.as_json() for name, e in evidence.items()}, session.visit.sealed)
+    ran = wording.HIDDEN if session.visit.sealed and controller else controller or "controller open"
     said = (
         f"Proposed session {session.id}, which counts nowhere until it is confirmed: "
-        f"{'visit open' if guess.open else f'visit {guess.visit.number}'} ({wording.reason(guess.why)}), "
-        f"{controller or 'controller open'} ({wording.reason(evidence['controller'])}), {length}, {seen}."
+        f"{'visit open' if guess.open else f'visit {guess.visit.number}'} ({why['visit']}), "
+        f"{ran} ({why['controller']}), {length}, {seen}."
     )
     return NewSession(session, group, [said, usable], [*placement.notes, *sentences(contradictions(db, session, guess.open))])
 

@@ -16,7 +16,7 @@ from app.ingest import repository, wording
 from app.ingest.deps import CurrentProposal
 from app.ingest.models import SessionProposal
 from app.ingest.proposals import service as proposals
-from app.ingest.proposals.forms import ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
+from app.ingest.proposals.forms import HIDDEN, ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
 from app.ingest.proposals.thumbnail import thumbnail
 from app.ingest.proposals.visit_of_recording import add_visit_of_recording, visit_to_add
 from app.ingest.uploads import service
@@ -27,7 +27,7 @@ from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.study import repository as study
 from app.study import service as study_service
-from app.study.blinding import CONTROLLER_NAMES
+from app.study.blinding import CONTROLLER_NAMES, may_know
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant, StudySession, Visit
 from app.study.sessions import designs
@@ -174,11 +174,12 @@ def _page(
         only=only,
         forms=forms,
         beyond=max(len(waiting) - SHOWN, 0),
-        chart=_chart(db, only) if only else None,
+        chart=_chart(db, only) if only and may_know(only.visit, caller) else None,
         confirmed=fresh,
         grasp_files=[] if only else repository.waiting_grasp_files(db, participant.id),
         sessions=everyone,
         visits=visits,
+        hidden=(HIDDEN, "hidden: kept as it is"),
         controllers=[("", "open: choose …"), *((c.value, name) for c, name in CONTROLLER_NAMES.items())],
         policies=study.policy_names(db, participant.id),
         may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
@@ -200,7 +201,8 @@ def _form(
 ) -> ProposalForm:
     stored = texts(db, session, proposal, caller)
     data = _steps(db, session)
-    found = designs.of_session(db, session, data.table, caller) if data else None
+    told = may_know(session.visit, caller)
+    found = designs.of_session(db, session, data.table, caller) if data and told else None
     return ProposalForm(
         session,
         proposal,
@@ -208,12 +210,12 @@ def _form(
         {**stored, **own_texts(sent, session.id, stored)} if error else stored,
         typed_parts(sent if error else {}, session.id),
         is_clocked(session),
-        wording.reasons(proposal.evidence),
+        wording.reasons(proposal.evidence, session.visit.sealed),
         sentences(contradictions(db, session, proposal.visit_open)),
         drawn_words(found) if found else "",
         usable_steps(db, session),
         control_programs(db, session),
-        thumbnail(data) if data else None,
+        thumbnail(data) if data and told else None,
         sent.get(f"reason-{session.id}", "") if error else "",
         error.problem(request.url.path) if error else None,
         visit_to_add(session, proposal, visits),

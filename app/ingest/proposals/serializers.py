@@ -35,7 +35,7 @@ def proposal_out(db: Session, session: StudySession, row: SessionProposal, calle
         version=row.version,
         upload_id=row.upload_id,
         visit_open=row.visit_open,
-        evidence=wording.reasons(row.evidence),
+        evidence=wording.reasons(row.evidence, session.visit.sealed),
         changed_by=row.changed_by,
         parts=[
             PartOut(

@@ -118,9 +118,9 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
         Conflict: as `change`, or another confirmed session counts on the same stretch. Invalid: visit or controller is still open.
     """
     proposal = _correct(db, session, wanted, caller, confirming=True)
-    missing = [name for name, open_ in (("visit", proposal.visit_open), ("controller", _controller(session, caller) is None)) if open_]
+    missing = [name for name, open_ in (("visit", proposal.visit_open), ("controller", not blinding.is_stated(session))) if open_]
     if missing:
-        known = wording.reasons(proposal.evidence)
+        known = wording.reasons(proposal.evidence, session.visit.sealed)
         why = "; ".join(f"{name}: {known.get(name, 'nobody stated it')}" for name in missing)
         raise Invalid(f"Session {session.id} cannot be confirmed yet: its {' and '.join(missing)} is open ({why}).", "State it.")
     require_unlocked(session.visit)
@@ -142,7 +142,7 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
     for (_, stop), (start, _) in pairwise(spans):
         if start < stop - 1e-6:
             raise Invalid(f"Two parts share the time from {start:g} to {stop:g} s.", "Let each part begin where the one before has ended.")
-    arm = blinding.stated_arm(session, caller)
+    arm = blinding.stated_arm(session, SYSTEM)  # a guess that finds the same controller keeps its policy; nobody is told
     made = []
     for part in sorted(parts, key=lambda p: p.start_s):
         placement = placement_of(session, *on_grid(session, part.start_s, part.stop_s))
@@ -194,11 +194,6 @@ def locked(db: Session, session: StudySession, version: int, caller: Caller) -> 
     return proposal
 
 
-def _controller(session: StudySession, caller: Caller) -> Controller | None:
-    arm = blinding.stated_arm(session, caller)
-    return arm.controller if arm else None
-
-
 def _move_to_visit(db: Session, session: StudySession, proposal: SessionProposal, given: dict[str, object]) -> None:
     number = given.get("visit")
     if not isinstance(number, int):
@@ -216,7 +211,9 @@ def _move_to_visit(db: Session, session: StudySession, proposal: SessionProposal
 def _name_controller(db: Session, session: StudySession, given: dict[str, object], caller: Caller) -> None:
     if not {"controller", "policy"} & given.keys():
         return
-    arm = blinding.stated_arm(session, caller)
+    if "controller" not in given:
+        blinding.require_known(session.visit, caller)  # what a policy alone is refused for would tell the controller
+    arm = blinding.stated_arm(session, SYSTEM)
     wanted = given.get("controller", arm.controller if arm else None)
     controller = Controller(str(wanted)) if wanted else None
     name = str(given["policy"] or "") if "policy" in given else None

@@ -15,6 +15,8 @@ def differs_from_slot(slot: LoggedSlot | None, stated: StatedSession) -> bool:
     if slot is None or slot.planned is None:
         return False
     planned = slot.planned
+    if planned.sealed and (stated.controller is not None or stated.policy_id is not None):
+        return True  # whether they agree would tell what ran
     return (
         (stated.visit is not None and stated.visit.id != planned.visit_id)
         or (stated.controller is not None and stated.controller != planned.controller)

@@ -80,8 +80,8 @@ class Gate:
 
 
 def gate(db: Session, participant: Participant, sessions: Sequence[StudySession]) -> Gate:
-    """The gate as the participant's confirmed sessions, less the excluded ones, have it."""
-    live = [s for s in sessions if s.status == "confirmed" and not s.excluded_reason]
+    """The gate as the participant's confirmed sessions have it, less excluded ones and those of a plan whose key is sealed."""
+    live = [s for s in sessions if s.status == "confirmed" and not s.excluded_reason and not s.visit.sealed]
     arms = [(s, blinding.arm(s, SYSTEM).controller) for s in live]
     learned = [s for s, controller in arms if controller in LEARNED]
     random = [s for s, controller in arms if controller is Controller.RANDOM]

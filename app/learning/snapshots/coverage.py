@@ -20,6 +20,8 @@ from ml.mdp import AMPLITUDE_TOLERANCE
 from ml.trajectories import ReplayBuffer
 
 AMPLITUDE_BINS = 20
+HIDDEN = "hidden"
+"""Stands for the controller of a session whose plan's key is sealed."""
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
@@ -67,7 +69,9 @@ def describe(db: Session, snapshot: BufferSnapshot, caller: Caller) -> SnapshotV
     for member in snapshot.members:
         session = sessions[member.session_id]
         if member.left_out_reason is None:
-            by_visit.setdefault(session.visit.number, Counter())[blinding.arm(session, caller).controller.value] += 1
+            # a plan may be signed over sessions which an earlier snapshot holds: of these the visit alone is told
+            arm = blinding.arm(session, caller) if blinding.unsealed([session], caller) else None
+            by_visit.setdefault(session.visit.number, Counter())[arm.controller.value if arm else HIDDEN] += 1
     present = {name for counts in by_visit.values() for name in counts}
     amplitude = np.concatenate([s.amplitude for s in buffer.sessions])
     beta = np.concatenate([s.beta for s in buffer.sessions])
@@ -75,7 +79,7 @@ def describe(db: Session, snapshot: BufferSnapshot, caller: Caller) -> SnapshotV
     return SnapshotView(
         snapshot=snapshot,
         settings_version=study_repository.settings_version(db, snapshot.settings_version_id).version,
-        controllers=[name for name in CONTROLLERS if name in present],
+        controllers=[name for name in (*CONTROLLERS, HIDDEN) if name in present],
         sessions_by_visit=dict(sorted(by_visit.items())),
         left_out=[LeftOut(sessions[m.session_id], m.left_out_reason) for m in snapshot.members if m.left_out_reason is not None],
         steps=int(amplitude.size),

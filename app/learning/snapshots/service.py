@@ -40,6 +40,7 @@ from ml.mdp import MdpSettings
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
 
 PINS_VERSION = 2
+SEALED = "the key of its visit's blinded plan is sealed: a clinician opens it on the page of the plan"
 REPEATED = "its minutes of this device stand in another session that counts: exclude one of the two"
 
 
@@ -203,6 +204,8 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
 
 def _read(db: Session, session: StudySession, version: SettingsVersion, traces: TracesOf) -> Member:
     """The session's trajectory, or the first reason of its own against it."""
+    if session.visit.sealed:
+        return Member(session, None, None, SEALED)  # how much was learnt from it, and what, would tell what ran
     try:
         table = session_data(db, session, traces).table
     except Invalid as error:

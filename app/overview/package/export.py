@@ -38,6 +38,8 @@ from ml.statistics.within_visits.contrasts import Average
 def export_participant(db: Session, participant: Participant, caller: Caller) -> bytes:
     """Everything the caller may know of a participant, as a zipped data package. Controllers come through the blinding gate.
 
+    Sessions of a blinded plan whose key is sealed are left out, and README.txt names their visits.
+
     A session whose steps cannot be read has its row all the same, with the reason in the column `problem`. No date leaves: times are days
     since the participant was enrolled.
     """
@@ -71,7 +73,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
         "datapackage.json": json.dumps(descriptor(participant.code, contents), indent=2, ensure_ascii=False),
         "settings.json": json.dumps(settings, indent=2),
         "recompute.py": Path(__file__).with_name("recompute.py").read_text("utf-8"),
-        "README.txt": _readme(participant),
+        "README.txt": _readme(participant, caller),
     }
     sink = io.BytesIO()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -86,7 +88,7 @@ def _sessions(
     compared = {s.session_id for s in found.sessions if "mean_beta" in s.values}
     sessions: list[tuple[Any, ...]] = []
     steps: list[tuple[Any, ...]] = []
-    for session in study.sessions_of_participant(db, participant.id):
+    for session in blinding.unsealed(study.sessions_of_participant(db, participant.id), caller):
         arm, qoc = blinding.arm(session, caller), session.qoc
         try:
             table, problem = session_data(db, session).table, None
@@ -160,7 +162,9 @@ def _cell(value: Any) -> Any:
     return str(value).lower() if isinstance(value, bool) else value
 
 
-def _readme(participant: Participant) -> str:
+def _readme(participant: Participant, caller: Caller) -> str:
+    sealed = [str(v.number) for v in participant.visits if v.sealed and not caller.is_system]
+    left_out = f"\nLeft out: the sessions of visit {', '.join(sealed)}, whose blinded plan's key is sealed.\n" if sealed else ""
     listed = "\n".join(f"{name + '.csv':22}{text}" for name, text in TITLES.items())
     return (
         f"betaloop {__version__}: record of participant {participant.code}, as a Frictionless data package.\n\n"
@@ -170,4 +174,5 @@ def _readme(participant: Participant) -> str:
         "characteristics.json  leads, symptoms, hand and medication schedule, every version\n"
         "recompute.py          recomputes the primary tables from sessions and steps with numpy and scipy, and compares\n\n"
         "Days are counted from the enrolment in the software; what happened before has a day below 0.\n"
+        f"{left_out}"
     )

@@ -41,6 +41,8 @@ def tested_policies(db: Session, participant: Participant) -> list[Tested]:
     """
     visits: dict[int, list[int]] = {}
     for session in study.sessions_of_participant(db, participant.id):
+        if session.visit.sealed:
+            continue  # what goes on from it would tell what ran
         # which policies did best does not depend on who asks; only those who may know every arm can
         policy_id = arm(session, SYSTEM).policy_id
         if policy_id is not None and session.excluded_reason is None:

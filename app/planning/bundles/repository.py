@@ -9,17 +9,13 @@ from sqlalchemy.orm import Session
 
 from app.learning.models import Policy
 from app.planning.bundles.models import BundleRelease
-from app.planning.plans.models import Plan, PlanItem
+from app.planning.plans.models import SEALED, Plan, PlanItem
 from app.study.models import Visit
 
 
 def releases(db: Session, policy_id: int) -> Sequence[BundleRelease]:
     """The bundles of a policy that left so far, newest first; without those of sealed plans (`plans.key`), whose time tells what ran."""
-    sealed = (
-        select(PlanItem.id)
-        .join(Plan, Plan.id == PlanItem.plan_id)
-        .where(Plan.blinded, Plan.approved_at.is_not(None), Plan.key_opened_at.is_(None))
-    )
+    sealed = select(PlanItem.id).join(Plan, Plan.id == PlanItem.plan_id).where(SEALED)
     told = or_(BundleRelease.plan_item_id.is_(None), BundleRelease.plan_item_id.not_in(sealed))
     return db.scalars(select(BundleRelease).where(BundleRelease.policy_id == policy_id, told).order_by(BundleRelease.id.desc())).all()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime, time
 from typing import Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, SmallInteger, String, Text, UniqueConstraint, func
+from sqlalchemy import CheckConstraint, ForeignKey, Index, SmallInteger, String, Text, UniqueConstraint, and_, func
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
@@ -46,6 +46,10 @@ class Plan(Base):
     """Why it was opened; in an emergency it may be given afterwards."""
     key_opened_in_emergency: Mapped[bool] = mapped_column(server_default="false")
     items: Mapped[list[PlanItem]] = relationship(order_by="PlanItem.position", cascade="all, delete-orphan")
+
+
+SEALED = and_(Plan.blinded, Plan.approved_at.is_not(None), Plan.key_opened_at.is_(None))
+"""Condition on `Plan`: as `app.planning.plans.key.sealed`, of replaced plans too."""
 
 
 class PlanItem(Base):

@@ -52,6 +52,11 @@ def session_count(db: Session, visit_id: int) -> int:
     return db.scalar(select(func.count()).select_from(StudySession).where(StudySession.visit_id == visit_id, CONFIRMED)) or 0
 
 
+def has_sessions(db: Session, visit_id: int) -> bool:
+    """Whether a visit has sessions, proposed ones too."""
+    return db.scalar(select(exists().where(StudySession.visit_id == visit_id))) or False
+
+
 def open_visits(db: Session, participant_id: int, today: date) -> Sequence[Visit]:
     """Visits that may still be planned: without a confirmed session, today or later or without a date; by number."""
     return db.scalars(

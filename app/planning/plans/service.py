@@ -18,7 +18,7 @@ from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of, planned_sessions, seed_of
-from app.planning.plans.key import label_sessions
+from app.planning.plans.key import label_sessions, sealed
 from app.planning.plans.limits import StatedLimits, require_limits, set_limits
 from app.planning.plans.models import Plan, PlanItem
 from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
@@ -232,6 +232,11 @@ def _supersede(db: Session, visit: Visit, reason: str | None, caller: Caller) ->
         return
     if earlier.status == "approved":
         study.require(caller, can.APPROVE_PLAN, visit.participant)
+        if sealed(earlier) and repository.has_sessions(db, visit.id):
+            raise Conflict(
+                f"Sessions of visit {visit.number} ran under blinded plan {earlier.id}, whose key is sealed.",
+                "Open the key first, or plan another visit.",
+            )
         why = (reason or "").strip()
         if not why:
             raise Invalid(

@@ -23,7 +23,7 @@ def sessions_of_day(db: Session, visit_id: int) -> Sequence[StudySession]:
 class Filled:
     """How many slots of a visit's approved plan a confirmed session fills.
 
-    `tested`: of those that run a policy. `locked`: whether the visit is.
+    `tested`: of those that run a policy. `locked`: whether the visit is. `sealed`: whether the plan's key is.
     """
 
     participant_id: int
@@ -34,6 +34,7 @@ class Filled:
     filled: int
     tested: int
     locked: bool
+    sealed: bool
 
 
 def slots_filled(db: Session, participant_ids: Sequence[int]) -> list[Filled]:
@@ -44,7 +45,7 @@ def slots_filled(db: Session, participant_ids: Sequence[int]) -> list[Filled]:
     newest = select(VisitLock.locked).where(VisitLock.visit_id == Visit.id).order_by(VisitLock.id.desc()).limit(1)
     locked = func.coalesce(newest.correlate(Visit).scalar_subquery(), false())
     query = (
-        select(Visit.participant_id, Visit.id, Visit.number, Visit.date, func.count(PlanItem.id), filled, tested, locked)
+        select(Visit.participant_id, Visit.id, Visit.number, Visit.date, func.count(PlanItem.id), filled, tested, locked, Visit.sealed)
         .join(Plan, Plan.visit_id == Visit.id)
         .join(PlanItem, PlanItem.plan_id == Plan.id)
         .outerjoin(StudySession, StudySession.plan_item_id == PlanItem.id)

@@ -127,11 +127,11 @@ def record_qoc(request: Request, session: CurrentSession, db: Db, caller: Curren
         service.record_qoc(db, session, parse(QocIn, changes.fields | reason | answers, _QOC_LABELS), caller)
     except BetaloopError as error:
         db.rollback()
-        if not may_know(session.visit, caller):
+        if _on_blinded_page(session, caller):
             return blinded_page(request, db, session.visit, caller, error, session, changes.fields | reason)
         return _page(request, db, session, caller, error, typed=changes.fields | reason)
     db.commit()
-    if not may_know(session.visit, caller):
+    if _on_blinded_page(session, caller):
         return RedirectResponse(f"/visits/{session.visit_id}?done=qoc", 303)
     return RedirectResponse(f"/sessions/{session.id}?done=qoc", 303)
 
@@ -225,6 +225,11 @@ def _correction(session: StudySession, caller: Caller) -> dict[str, str]:
     }
 
 
+def _on_blinded_page(session: StudySession, caller: Caller) -> bool:
+    """Whether the caller enters QoCs on the blinded page of the visit."""
+    return not may_know(session.visit, caller) and not service.may(caller, can.READ_ARMS, session.visit.participant)
+
+
 def _qoc_revisions(session: StudySession) -> list[Shown]:
     """Every revision as the form showed it; before the first one, it was empty."""
     return [Shown(0, _shown_qoc(None), ""), *(Shown(q.revision, _shown_qoc(q), q.entered_by) for q in session.qocs)]
@@ -262,6 +267,8 @@ def _page(
     typed: dict[str, str] | None = None,
 ) -> HTMLResponse:
     participant = session.visit.participant
+    if session.visit.sealed and not may_know(session.visit, caller):
+        return _sealed_page(request, db, session, caller, error, typed)
     recordings = list(dict.fromkeys(s.recording for s in session.segments))
     traces = {r.id: repository.traces_of_recording(db, r.id) for r in recordings}
     data, trouble = None, None
@@ -312,6 +319,31 @@ def _page(
         ran_under=dict(_conditions_revisions(session)[-1].fields)
         | {"conditions_reason": ""}
         | {k: v for k, v in (typed or {}).items() if k in _CONDITIONS_LABELS},
+        may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
+        problem=error.problem(request.url.path) if error else None,
+        remarks=field_notes(error, typed or {}),
+    )
+    return HTMLResponse(page, error.status if error else 200)
+
+
+def _sealed_page(
+    request: Request, db: Session, session: StudySession, caller: Caller, error: BetaloopError | None, typed: dict[str, str] | None
+) -> HTMLResponse:
+    """A session of a blinded plan whose key is sealed: its letter and outcomes, and nothing that tells what ran."""
+    participant = session.visit.participant
+    known = _shown_qoc(session.qoc)
+    page = render(
+        request,
+        "study/sessions/session_sealed.html",
+        session=session,
+        visit=session.visit,
+        participant=participant,
+        contradictions=sentences(contradictions(db, session)),
+        outcomes=session_view.outcomes_view(db, session),
+        qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
+        events=events_of_session(db, session.id),
+        event_kinds=EVENT_KINDS,
+        event_severities=EVENT_SEVERITIES,
         may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
         problem=error.problem(request.url.path) if error else None,
         remarks=field_notes(error, typed or {}),

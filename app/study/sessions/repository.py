@@ -8,7 +8,7 @@ from datetime import datetime
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from sqlalchemy import Select, String, cast, column, func, literal, literal_column, or_, select, table, true, union_all
+from sqlalchemy import Select, String, and_, cast, column, func, literal, literal_column, or_, select, table, true, union_all
 from sqlalchemy.dialects.postgresql import aggregate_order_by
 from sqlalchemy.orm import Session
 
@@ -76,7 +76,10 @@ class ReadOnce:
 
 
 class SlotHead(NamedTuple):
-    """One session of a plan as it stands: where it is, what it runs, and whether its plan is still signed (`plan_status` approved)."""
+    """One session of a plan as it stands: where it is, what it runs, and whether its plan is still signed (`plan_status` approved).
+
+    `sealed`: whether the plan was signed blinded, and its key never opened.
+    """
 
     slot_id: int
     plan_id: int
@@ -85,6 +88,7 @@ class SlotHead(NamedTuple):
     position: int
     controller: str
     policy_id: int | None
+    sealed: bool
 
 
 def slot_head(db: Session, participant_id: int, slot_id: int) -> SlotHead | None:
@@ -92,9 +96,10 @@ def slot_head(db: Session, participant_id: int, slot_id: int) -> SlotHead | None
 
     Plans belong to a later phase; of their tables only these columns are needed here.
     """
-    plans = table("plan", *(column(name) for name in ("id", "visit_id", "status")))
+    plans = table("plan", *(column(name) for name in ("id", "visit_id", "status", "blinded", "approved_at", "key_opened_at")))
     items = table("plan_item", *(column(name) for name in ("id", "plan_id", "position", "controller", "policy_id")))
-    wanted = (items.c.id, plans.c.id, plans.c.status, plans.c.visit_id, items.c.position, items.c.controller, items.c.policy_id)
+    sealed = and_(plans.c.blinded, plans.c.approved_at.is_not(None), plans.c.key_opened_at.is_(None))
+    wanted = (items.c.id, plans.c.id, plans.c.status, plans.c.visit_id, items.c.position, items.c.controller, items.c.policy_id, sealed)
     query = select(*wanted).join_from(items, plans, items.c.plan_id == plans.c.id).join(Visit, Visit.id == plans.c.visit_id)
     row = db.execute(query.where(items.c.id == slot_id, Visit.participant_id == participant_id)).first()
     return None if row is None else SlotHead(*row)

@@ -83,7 +83,7 @@ def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller:
 @router.get("/visits/{visit_id}")
 def visit_page(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """One visit day: its sessions in order; to a blinded assessor without what gives the controllers away."""
-    if not may_know(visit, caller):
+    if not may_know(visit, caller) and not (visit.sealed and may(caller, can.READ_ARMS, visit.participant)):
         return blinded_page(request, db, visit, caller)
     return shown_visit(request, db, visit, caller)
 
@@ -131,7 +131,8 @@ def shown_visit(
 ) -> HTMLResponse:
     """The page of a visit; `typed` and `dose` are what a refused form of a correction or a dose said."""
     sessions, _ = repository.sessions_of_visit(db, visit.id)
-    ran = [(arm(s, caller).controller, tablet.of_recording(control_recording(s))) for s in sessions if s.segments]
+    told = may_know(visit, caller)  # else its plan is sealed: letters and outcomes, and what else tells nothing of what ran
+    ran = [(arm(s, caller).controller, tablet.of_recording(control_recording(s))) for s in sessions if s.segments and told]
     seen = form.texts(visit)
     page = render(
         request,
@@ -139,6 +140,7 @@ def shown_visit(
         visit=visit,
         participant=visit.participant,
         rows=[_session_row(db, s, caller) for s in sessions],
+        told=told,
         latencies=tablet.by_controller(ran),
         slots=request.app.state.slots_of_visit(db, visit, caller),
         may_upload=may(caller, can.UPLOAD, visit.participant) and not visit.locked,
@@ -163,8 +165,10 @@ def shown_visit(
 def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str, Any]:
     """What the visit's table says of a session; a session that cannot be laid on the grid says why."""
     clashes = outcomes.disagreements(session, outcome_values.derive(db, session))
-    row: dict[str, Any] = {"session": session, "arm": arm(session, caller), "summary": None, "problem": "", "clashes": clashes}
+    row: dict[str, Any] = {"session": session, "arm": visible_arm(session, caller), "summary": None, "problem": "", "clashes": clashes}
     row["since"] = since_last_dose(session)
+    if row["arm"] is None:
+        return row
     try:
         row["summary"] = session_pages.summarise(session_data(db, session))
     except BetaloopError as error:

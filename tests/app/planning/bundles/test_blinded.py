@@ -174,6 +174,7 @@ def test_a_blinded_day_runs_without_telling_and_comes_back_by_its_slots(
     path = f"/api/v1/visits/{studied.visit}/slots"
     done = client.post(f"{path}/confirm", json={})
     assert done.status_code == 200, done.text
+    assert client.post(f"/api/v1/visits/{studied.visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
     for row in client.get(path).json()["rows"]:
         item = items[row["position"]]
         assert (row["confirmed"], row["deviations"]) == (True, [])

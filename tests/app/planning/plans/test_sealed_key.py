@@ -1,0 +1,249 @@
+"""While the key of a blinded plan is sealed, nobody is shown what ran in its sessions: on no page, by no route, in no sentence."""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from collections.abc import Callable
+from itertools import chain
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+from fastapi.routing import iter_route_contexts
+from fastapi.testclient import TestClient
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import SYSTEM
+from app.learning.snapshots.service import take_snapshot
+from app.planning.plans.models import Plan
+from app.study.repository import participant_by_code
+from tests.app.planning.slots.test_logs import DAY, log_of, send
+
+PAGE = {"Accept": "text/html"}
+Clients = Callable[[str], TestClient]
+TELLING = re.compile(r"rl-0\d|\brl\b|cdbs\b(?!_)|\brandom\b|distilled|No DBS|mean amplitude", re.IGNORECASE)
+
+
+@pytest.fixture
+def plan(client: TestClient, db: Session, studied: Any, sign_plan: Callable[..., Any]) -> Plan:
+    """A signed, blinded plan: two policies, cDBS between, a random session."""
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "design": "stratified"}})
+    assert client.patch(f"/api/v1/visits/{studied.visit}", json={"date": str(DAY), "reason": "agreed"}).status_code == 200
+    wanted = {"policy_ids": list(studied.policies[:2]), "random_sessions": 1, "seed": 1, "minutes_per_session": 5, "blinded": True}
+    drafted = client.post(f"/api/v1/visits/{studied.visit}/plan", json=wanted)
+    assert drafted.status_code == 201, drafted.text
+    assert sign_plan(studied.visit).status_code == 200
+    return db.get_one(Plan, drafted.json()["id"])
+
+
+@pytest.fixture
+def coordinator(client_as: Clients) -> TestClient:
+    return client_as("coordinator")
+
+
+@pytest.fixture
+def uploads(coordinator: TestClient, db: Session, plan: Plan) -> list[dict[str, Any]]:
+    """The logs of all its sessions, uploaded by a coordinator; some name a policy and its network."""
+    networks = dict(db.execute(text("select id, onnx_sha256 from policy")).all())
+    return [
+        send(coordinator, log_of(plan, i.position, 10 * i.position, number=i.position, network_sha256=networks.get(i.policy_id)))
+        for i in plan.items
+    ]
+
+
+@pytest.fixture
+def held(coordinator: TestClient, studied: Any, uploads: list[dict[str, Any]]) -> dict[int, int]:
+    """Confirmed by the coordinator in one step: session by position."""
+    done = coordinator.post(f"/api/v1/visits/{studied.visit}/slots/confirm", json={})
+    assert done.status_code == 200, done.text
+    assert not TELLING.search(str(done.json())), done.json()
+    return {row["position"]: row["session_id"] for row in done.json()["comparison"]["rows"]}
+
+
+def words(page: str) -> str:
+    """What a page says of its own: without its forms' choices, scripts and navigation."""
+    body = page[page.index("<main") :] if "<main" in page else page
+    return re.sub(r"<(select|datalist|script|nav)\b.*?</\1>|<[^>]*>", " ", body, flags=re.DOTALL)
+
+
+def open_key(client: TestClient, visit: int) -> None:
+    assert client.post(f"/api/v1/visits/{visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
+
+
+def test_a_coordinator_uploads_and_confirms_by_letters(
+    client: TestClient, coordinator: TestClient, db: Session, studied: Any, plan: Plan, uploads: list[dict[str, Any]]
+) -> None:
+    for body in uploads:
+        (proposal,) = body["proposals"]
+        assert (proposal["session"]["controller"], proposal["session"]["policy_id"]) == (None, None)
+        assert "key of the blinded plan is sealed" in proposal["evidence"]["controller"]
+        assert not TELLING.search(str(body["report"])), body["report"]
+    first = uploads[0]["proposals"][0]["session"]["id"]
+    for path in ("/participants/P1/proposals", f"/proposals/{first}", f"/uploads/{uploads[0]['id']}", f"/visits/{studied.visit}"):
+        said = words(coordinator.get(path, headers=PAGE).text).replace("cDBS amplitude", "").replace("% of cDBS", "")
+        assert not TELLING.search(said), (path, TELLING.search(said))
+    form = coordinator.get("/participants/P1/proposals", headers=PAGE).text
+    assert form.count('<option value="hidden" selected>') == len(uploads)
+    asked = {"version": uploads[0]["proposals"][0]["version"], "policy": "rl-01"}
+    assert coordinator.patch(f"/api/v1/proposals/{first}", json=asked).status_code == 403, "what is refused would tell"
+    # the form of all proposals, sent back as it is, keeps what it could not show
+    fields = dict(re.findall(r'name="((?:version|seen)-\d+)" value="([^"]*)"', form))
+    sent = fields | {f"controller-{b['proposals'][0]['session']['id']}": "hidden" for b in uploads} | {"do": "save:all"}
+    assert coordinator.post("/participants/P1/proposals", data=sent, headers=PAGE, follow_redirects=False).status_code == 303
+    done = coordinator.post(f"/visits/{studied.visit}/slots/confirm", headers=PAGE)
+    assert done.status_code == 200, done.text
+    ran = db.execute(
+        text("select s.controller, s.policy_id, i.controller, i.policy_id from session s join plan_item i on i.id = s.plan_item_id")
+    )
+    pairs = [(tuple(row[:2]), tuple(row[2:])) for row in ran]
+    assert len(pairs) == len(plan.items)
+    assert all(session == item for session, item in pairs)
+    letters = {s["letter"] for s in coordinator.get(f"/api/v1/visits/{studied.visit}/sessions").json()["items"]}
+    assert letters == {i.label for i in plan.items}
+    open_key(client, studied.visit)
+    shown = coordinator.get(f"/visits/{studied.visit}", headers=PAGE).text
+    assert {m.lower() for m in TELLING.findall(words(shown))} >= {"cdbs", "rl", "random"}
+    assert {s["controller"] for s in coordinator.get(f"/api/v1/visits/{studied.visit}/sessions").json()["items"]} == {
+        "cdbs",
+        "rl",
+        "random",
+    }
+
+
+HELD = ("session", "controller, policy_id", "plan_item_id")
+PLANNED = ("plan_item", "controller, policy_id, min_ma, max_ma, design, repeat, verdict, min_fraction", "id")
+
+
+def swap(db: Session, what: tuple[str, str, str], one: int, other: int) -> None:
+    """Let the arms of two sessions change places, as they were held or as they were planned."""
+    table, names, key = what
+    twin = f"(select {names} from {table} t where t.{key} = case x.{key} when :one then :other else :one end)"
+    db.execute(text(f"update {table} x set ({names}) = {twin} where x.{key} in (:one, :other)"), {"one": one, "other": other})
+    db.commit()
+
+
+def test_no_page_and_no_route_depends_on_what_ran_until_the_key_is_opened(
+    client: TestClient,
+    client_as: Clients,
+    coordinator: TestClient,
+    service_app: FastAPI,
+    db: Session,
+    studied: Any,
+    plan: Plan,
+    held: dict[int, int],
+) -> None:
+    """What every page and route answers is the same where two sessions change places, and another once the key is open."""
+    policy = next(i for i in plan.items if i.policy_id == studied.policies[0])
+    other = next(i for i in plan.items if i.controller == "cdbs")
+    named = {"code": "P1", "visit_id": studied.visit, "policy_id": studied.policies[0]}
+    skipped = ("/audit", "/bundle", "/events", "/metrics", ".pdf", "/key", "/account", "openapi", "/jobs")
+    paths = sorted(
+        {
+            c.path.format(**named, session_id=session)
+            for c in iter_route_contexts(service_app.routes)
+            for session in (held[policy.position], held[other.position])
+            if c.path
+            and "GET" in (getattr(c, "methods", None) or ())
+            and set(re.findall(r"{(\w+)", c.path)) <= {*named, "session_id"}
+            and not any(part in c.path for part in skipped)
+        }
+    )
+    assert len(paths) > 60
+
+    def answers(caller: TestClient) -> dict[str, str]:
+        changing = r'[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f-]{22}|"request_id":"\w+"|name="csrf[^>]*>|nonce-?="?[\w-]+|\d\d:\d\d:\d\d[\d.]*'
+        found = {p: caller.get(p) for p in paths}
+        assert [p for p, answer in found.items() if answer.status_code >= 500] == []
+        return {p: re.sub(changing, "", answer.text) for p, answer in found.items()}
+
+    people = {"coordinator": coordinator, "clinician": client_as("clinician")}
+    sealed = {role: answers(person) for role, person in people.items()}
+    swap(db, HELD, policy.id, other.id)
+    for role, person in people.items():
+        now = answers(person)
+        assert [p for p in paths if sealed[role][p] != now[p]] == [], role
+    swap(db, PLANNED, policy.id, other.id)
+    now, visit = answers(coordinator), studied.visit
+    of_signature = {f"/visits/{visit}/plan", f"/api/v1/visits/{visit}/plan", f"/api/v1/visits/{visit}/day", f"/visit-day/{visit}"}
+    assert {p for p in paths if sealed["coordinator"][p] != now[p]} == of_signature, "it is broken by any change"
+    open_key(client, studied.visit)
+    known = answers(coordinator)
+    swap(db, HELD, policy.id, other.id)
+    again = answers(coordinator)
+    assert sum(known[p] != again[p] for p in paths) >= 10, "the swap shows once the key is open"
+    assert all(again[p] != sealed["coordinator"][p] for p in (f"/visits/{studied.visit}", f"/sessions/{held[policy.position]}"))
+
+
+def test_traces_conditions_and_samples_are_refused_to_everybody_with_the_way_out(client: TestClient, held: dict[int, int]) -> None:
+    for session in list(held.values())[:1]:
+        for part in ("trace", "traces", "conditions", "samples", "signal"):
+            refused = client.get(f"/api/v1/sessions/{session}/{part}")
+            assert refused.status_code == 403, part
+            assert "A clinician opens the key" in refused.json()["hint"]
+        assert client.put(f"/api/v1/sessions/{session}/conditions", json={"lower_bound": 0.1, "reason": "x"}).status_code == 403
+        # what tells nothing goes on
+        assert client.put(f"/api/v1/sessions/{session}/qoc", json={"rating": 6}).status_code == 200
+        assert client.patch(f"/api/v1/sessions/{session}", json={"excluded_reason": "cable", "reason": "x"}).status_code == 200
+        page = client.get(f"/sessions/{session}", headers=PAGE).text
+        assert "key of this visit" in page
+        assert "cable" in page
+        assert client.post(f"/sessions/{session}/exclusion", data={"include": "yes"}, follow_redirects=False).status_code == 303
+
+
+def test_the_audit_trail_tells_no_arm_of_a_sealed_plan(
+    client: TestClient, db: Session, studied: Any, plan: Plan, held: dict[int, int]
+) -> None:
+    def trail() -> str:
+        entities = ("plan_item", "session", "session_proposal", "session_conditions")
+        return " ".join(words(client.get(f"/audit?entity={e}&limit=100", headers=PAGE).text) for e in entities)
+
+    assert db.scalar(text("select count(*) from audit_event where entity = 'plan_item' and after ->> 'controller' = 'random'"))
+    sealed = trail()
+    assert "hidden from you" in sealed
+    assert not re.findall(r".{0,60}\b(?:random|rl|rl-0\d|stratified)\b", sealed)
+    open_key(client, studied.visit)
+    assert re.search(r"\brandom\b", trail())
+
+
+def test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened(
+    client: TestClient, db: Session, studied: Any, plan: Plan, held: dict[int, int]
+) -> None:
+    participant = participant_by_code(db, "P1", SYSTEM)
+    before = take_snapshot(db, participant, SYSTEM)
+    db.commit()
+    members = {m.session_id: m.left_out_reason or "" for m in before.members}
+    assert all("blinded plan is sealed" in members[s] for s in held.values())
+    found = client.get("/api/v1/participants/P1/analyses").json()
+    assert {e["reason"] for e in found["excluded"] if e["session_id"] in held.values()} == {"the key of its visit's blinded plan is sealed"}
+    assert "visit 2: the key of its blinded plan is sealed" in client.get("/api/v1/participants/P1/calibration").json()["left_out"]
+    package = zipfile.ZipFile(io.BytesIO(client.get("/participants/P1/export.zip").content))
+    assert "the sessions of visit 2, whose blinded plan's key is sealed" in package.read("P1/README.txt").decode()
+    assert not set(map(str, held.values())) & {line.split(",")[0] for line in package.read("P1/sessions.csv").decode().splitlines()}
+    open_key(client, studied.visit)
+    db.expire_all()
+    after = take_snapshot(db, participant, SYSTEM)
+    kept = {m.session_id for m in after.members if m.left_out_reason is None}
+    assert set(held.values()) & kept, "at least the sessions of cDBS and random draws enter"
+    assert after.id != before.id
+
+
+def test_a_sealed_plan_that_was_run_is_not_replaced_before_its_key_is_opened(
+    client: TestClient, studied: Any, held: dict[int, int]
+) -> None:
+    draft = {"policy_ids": [studied.policies[0]], "reason": "another order"}
+    refused = client.post(f"/api/v1/visits/{studied.visit}/plan", json=draft)
+    assert (refused.status_code, "Open the key first" in refused.json()["hint"]) == (409, True)
+    open_key(client, studied.visit)
+    assert client.post(f"/api/v1/visits/{studied.visit}/plan", json=draft).status_code == 201
+
+
+def test_a_log_of_a_sealed_plan_that_is_uploaded_to_another_visit_tells_nothing_there(
+    client: TestClient, db: Session, plan: Plan, studied: Any
+) -> None:
+    bodies = [send(client, log_of(plan, i.position, 10 * i.position, number=i.position), visit="1") for i in plan.items[:2]]
+    assert [p["session"]["controller"] for p in chain(*(b["proposals"] for b in bodies))] == [None, None]
+    stated = send(client, log_of(plan, 3, 30, number=3), visit="2", controller="random")
+    assert stated["proposals"], "whether the statement is right is not told: somebody confirms it into its slot"
