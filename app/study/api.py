@@ -30,8 +30,9 @@ from app.study.schemas import (
     VisitLockIn,
     VisitLockOut,
     VisitOut,
+    VisitUnlockIn,
 )
-from app.study.serializers import outcome_out, participant_out, recorded_trace_out, session_out, trace_out, visit_out
+from app.study.serializers import lock_rows, outcome_out, participant_out, recorded_trace_out, session_out, trace_out, visit_out
 from app.study.sessions import conditions
 from app.study.sessions.data import session_data
 from app.study.settings.schemas import SettingsChange, SettingsOut
@@ -106,25 +107,28 @@ def change_visit(visit: CurrentVisit, change: VisitChange, db: Db, caller: Curre
 
 
 @router.get("/visits/{visit_id}/locks")
-def list_locks(visit: CurrentVisit) -> list[VisitLockOut]:
+def list_locks(visit: CurrentVisit, db: Db) -> list[VisitLockOut]:
     """When a visit was locked and unlocked, oldest first; the last one holds."""
-    return [VisitLockOut.model_validate(row) for row in visit.locks]
+    return lock_rows(db, visit)
 
 
-@router.post("/visits/{visit_id}/lock", responses=problems(409))
+@router.post("/visits/{visit_id}/lock", responses=problems(409, 429))
 def lock_visit(visit: CurrentVisit, why: VisitLockIn, db: Db, caller: CurrentCaller) -> VisitLockOut:
-    """Close the data of a visit for changes; blinded assessors see its controllers from now on."""
-    row = visits.lock(db, visit, why.reason, caller)
+    """Close the data of a visit for changes, signed as complete and reviewed; blinded assessors see its controllers from now on.
+
+    The signature covers the visit, its doses, and every session with its controller, QoCs, conditions, exclusion and samples.
+    """
+    visits.lock(db, visit, why.reason, caller, why.password, why.code)
     db.commit()
-    return VisitLockOut.model_validate(row)
+    return lock_rows(db, visit)[-1]
 
 
 @router.post("/visits/{visit_id}/unlock", responses=problems(409))
-def unlock_visit(visit: CurrentVisit, why: VisitLockIn, db: Db, caller: CurrentCaller) -> VisitLockOut:
+def unlock_visit(visit: CurrentVisit, why: VisitUnlockIn, db: Db, caller: CurrentCaller) -> VisitLockOut:
     """Open the data of a visit for corrections."""
-    row = visits.unlock(db, visit, why.reason, caller)
+    visits.unlock(db, visit, why.reason, caller)
     db.commit()
-    return VisitLockOut.model_validate(row)
+    return lock_rows(db, visit)[-1]
 
 
 @router.get("/visits/{visit_id}/sessions")

@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, StringConstraints, field_validator
 from pydantic_core import PydanticCustomError
 
+from app.platform.signatures.schemas import SignatureOut, Signing
+from app.platform.signatures.service import SignatureState
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
 from app.study.sessions.models import Activity
@@ -160,8 +162,14 @@ class SessionChange(Model):
     reason: Text | None = Field(None, max_length=1000)
 
 
-class VisitLockIn(Model):
-    """Why a visit is locked or unlocked."""
+class VisitUnlockIn(Model):
+    """Why a visit is unlocked."""
+
+    reason: Text = Field(min_length=1, max_length=1000, description="Kept with the lock and in the audit trail.")
+
+
+class VisitLockIn(Signing):
+    """Why a visit is locked, and who signs that its data are complete and reviewed."""
 
     reason: Text = Field(min_length=1, max_length=1000, description="Kept with the lock and in the audit trail.")
 
@@ -173,6 +181,10 @@ class VisitLockOut(Model):
     reason: str
     created_at: datetime
     created_by: str
+    signature: SignatureOut | None
+    signature_state: SignatureState = Field(
+        description="`broken`: changed since. `ended`: the visit was unlocked since. `not_kept`: locked by an earlier version."
+    )
 
 
 class HoldModel(Model):

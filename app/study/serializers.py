@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
+from app.platform.signatures.schemas import SignatureOut
 from app.study import blinding
 from app.study.doses.since import hours_since_dose
 from app.study.models import Participant, StudySession, Visit
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
-from app.study.schemas import OutcomeOut, ParticipantOut, QocOut, RecordedTraceOut, SessionOut, TraceOut, VisitOut
+from app.study.schemas import OutcomeOut, ParticipantOut, QocOut, RecordedTraceOut, SessionOut, TraceOut, VisitLockOut, VisitOut
 from app.study.sessions.data import SessionData
 from app.study.settings.schemas import SettingsOut
 from app.study.traces import RecordedTrace
+from app.study.visits.sign_off import signatures_of_locks
 
 
 def outcome_out(session: StudySession, derived: outcome_values.Derived) -> OutcomeOut:
@@ -38,6 +41,22 @@ def visit_out(v: Visit, code: str) -> VisitOut:
     return VisitOut.model_validate(
         {"id": v.id, "participant": code, "number": v.number, "date": v.date, "note": v.note or "", "cdbs_amplitudes": amplitudes}
     )
+
+
+def lock_rows(db: Session, v: Visit) -> list[VisitLockOut]:
+    """The locks and unlocks of a visit for the API, oldest first, with what became of their signatures."""
+    found = signatures_of_locks(db, v)
+    return [
+        VisitLockOut(
+            locked=row.locked,
+            reason=row.reason,
+            created_at=row.created_at,
+            created_by=row.created_by,
+            signature=SignatureOut.model_validate(found[row.id][1]) if found[row.id][1] else None,
+            signature_state=found[row.id][0],
+        )
+        for row in v.locks
+    ]
 
 
 def session_out(s: StudySession, caller: Caller) -> SessionOut:

@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from fastapi import APIRouter, Request
-from fastapi.responses import HTMLResponse, Response
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
+from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning.deps import CurrentOwnPolicy
@@ -21,12 +22,15 @@ from app.planning.bundles import service as bundles
 from app.planning.plans.key import common_limits
 from app.planning.plans.limits import device_limits
 from app.planning.plans.view import read_plan
+from app.planning.releases import service as releases
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
+from app.settings import get_settings
 from app.study.deps import CurrentParticipant, CurrentVisit
 from app.study.models import Hemisphere, Participant
+from app.study.service import may
 from ml.deploy.wording import battery_life_words, energy_words, warning_sentences
 
 router = APIRouter()
@@ -58,15 +62,31 @@ def take_bundle(
     """The signed ZIP under the limits of the form; the page again, with what was typed, where they cannot be used."""
     typed = {name: str(values.get(name, "")) for name in LABELS}
     try:
-        stated = parse(StatedLimits, typed, LABELS)
-        limits = bundles.Limits(stated.min_ma, stated.max_ma, stated.ramp_ma_per_s)
-        content = bundles.bundle(db, participant, policy, limits, stated.hemisphere, caller)
+        limits, hemisphere = _stated(typed)
+        content = bundles.bundle(db, participant, policy, limits, hemisphere, caller)
         db.commit()
     except BetaloopError as error:
         db.rollback()
         return _page(request, participant, policy, db, caller, error, typed)
     name = f"{participant.code}-policy-{policy.id}.zip"
     return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+@router.post("/participants/{code}/policies/{policy_id}/release")
+def release_policy(
+    request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller, values: FormValues
+) -> Response:
+    """Sign the policy as released for testing in participants, within the limits of the form."""
+    typed = {name: str(values.get(name, "")) for name in LABELS}
+    try:
+        limits, hemisphere = _stated(typed)
+        password, code = str(values.get("password", "")), str(values.get("code", ""))
+        releases.release(db, participant, policy, limits, hemisphere, caller, password, code)
+        db.commit()
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, participant, policy, db, caller, error, typed)
+    return RedirectResponse(f"/participants/{participant.code}/policies/{policy.id}/bundle?done=released#release", 303)
 
 
 @router.get("/visits/{visit_id}/bundles")
@@ -91,6 +111,12 @@ def session_bundles(request: Request, visit: CurrentVisit, db: Db, caller: Curre
         key=bundles.public_key(),
     )
     return HTMLResponse(page)
+
+
+def _stated(typed: Mapping[str, str]) -> tuple[bundles.Limits, Hemisphere | None]:
+    """The limits and the side of a form. Raises Invalid, naming the field."""
+    stated = parse(StatedLimits, typed, LABELS)
+    return bundles.Limits(stated.min_ma, stated.max_ma, stated.ramp_ma_per_s), stated.hemisphere
 
 
 def _page(
@@ -125,6 +151,10 @@ def _page(
         device=device_limits(db, participant, None),
         releases=repository.releases(db, policy.id),
         may_take=bundles.may_take(participant, caller),
+        release=releases.release_of(db, participant, policy),
+        release_meaning=releases.MEANING,
+        release_required=get_settings().require_released_policies,
+        may_release=may(caller, can.APPROVE_PLAN, participant),
         key=bundles.public_key(),
         problem=error.problem(request.url.path) if error else None,
         **facts,

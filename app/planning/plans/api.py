@@ -26,13 +26,13 @@ from app.planning.plans.schemas import (
     PlanOut,
     PlanWarningOut,
     Removal,
-    SignatureOut,
 )
 from app.planning.plans.view import PlanLine, PlanView, shown
 from app.planning.plans.view import read_plan as plan_of
 from app.planning.protocol.session_order import Order
 from app.platform.audit import record
 from app.platform.database import Db, now
+from app.platform.signatures.schemas import SignatureOut
 from app.platform.web.schemas import problems
 from app.study.deps import CurrentVisit
 

@@ -11,6 +11,7 @@ from pydantic import Field
 from app.evaluation.schemas import EstimateSummary
 from app.planning.notices import Code
 from app.planning.protocol.session_order import Order
+from app.platform.signatures.schemas import SignatureOut, Signing
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
 
@@ -86,21 +87,10 @@ class PlanIn(PlanOptions):
     )
 
 
-class Approval(Model):
+class Approval(Signing):
     """A signature under a draft."""
 
-    password: Text = Field(max_length=1000, description="The signer's own, asked for again.")
-    code: Text = Field("", max_length=40, description="Of the signer's second factor, or a recovery code; empty where there is none.")
     plan_id: Id | None = Field(None, description="Which draft was read; a guard against signing one that somebody replaced meanwhile.")
-
-
-class SignatureOut(Model):
-    """Who signed, when, and with which meaning."""
-
-    signer: str
-    signed_at: datetime
-    meaning: str
-    sha256: str = Field(description="Of the canonical JSON of all that was signed.")
 
 
 class PlanEstimateOut(EstimateSummary):

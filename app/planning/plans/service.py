@@ -23,12 +23,14 @@ from app.planning.plans.limits import StatedLimits, require_limits, set_limits
 from app.planning.plans.models import Plan, PlanItem
 from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
 from app.planning.plans.schemas import Move, PlanIn, PlanOptions
-from app.planning.plans.sign_off import SignatureState, sign_plan
+from app.planning.plans.sign_off import sign_plan
 from app.planning.plans.view import PlanView, medication_due, read_plan, refuse_withdrawn, view_of
 from app.planning.protocol.schedule import Candidate, Rules, require_controls, schedule
 from app.planning.protocol.session_order import Order
+from app.planning.releases import service as releases
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
+from app.platform.signatures.service import SignatureState
 from app.study import service as study
 from app.study.models import Controller, Participant, Visit
 from app.study.sessions.logged import CONTROLLER_OF_KIND
@@ -102,7 +104,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
 
     Raises:
         NotFound: no plan. Conflict: approved already, replaced meanwhile, with a policy that was retired since it was drafted, limits that
-            were set for another cDBS amplitude, or what `safeguards.refuse_approval` refuses.
+            were set for another cDBS amplitude, or what `safeguards.refuse_approval` or `releases.refuse_unreleased` refuse.
         Invalid: no cDBS amplitude by which limits are ones in milliamperes. Forbidden, TooMany: as `sign_off.sign_plan`.
     """
     study.require(caller, can.APPROVE_PLAN, visit.participant)
@@ -117,6 +119,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
     policies = {line.policy.id: line.policy for line in view.lines if line.policy}
     stated = [(v.policy, Safeguard(v.item.verdict, v.item.min_fraction, v.item.override_reason)) for v in view.lines if v.policy]
     refuse_approval(assessment_of(db, visit.participant, view.evaluation) if view.evaluation else None, stated)
+    releases.refuse_unreleased(db, visit.participant, [(line.policy, line.item) for line in view.lines if line.policy])
     _fix_designs(visit, plan)
     require_limits(visit, plan.items)
     signature = sign_plan(db, visit, plan, policies, caller, password, code)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import StrEnum
 from typing import Any, Final
 
 from sqlalchemy.orm import Session
@@ -15,19 +14,11 @@ from app.planning.plans.models import Plan, PlanItem
 from app.platform.errors import Conflict, Forbidden
 from app.platform.signatures import repository, service
 from app.platform.signatures.models import Signature
+from app.platform.signatures.service import SignatureState
 from app.study.models import Visit
 
 KIND: Final = "plan"
 MEANING: Final = "approved for use in this participant"
-
-
-class SignatureState(StrEnum):
-    """What became of a plan's signature."""
-
-    NONE = "none"  # a draft
-    STANDS = "stands"
-    BROKEN = "broken"  # something was changed since
-    NOT_KEPT = "not_kept"  # approved by a version that kept no signatures
 
 
 def sign_plan(
@@ -55,11 +46,8 @@ def signature_of(db: Session, visit: Visit, plan: Plan, policies: Mapping[int, P
     """Whether a plan's signature stands, and the newest one under it, standing or broken."""
     if plan.approved_at is None:
         return SignatureState.NONE, None
-    standing = service.standing(db, KIND, plan.id, signed_content(visit, plan, policies))
-    if standing is not None:
-        return SignatureState.STANDS, standing
     newest = next(iter(repository.signatures_of(db, KIND, plan.id)), None)
-    return (SignatureState.NOT_KEPT if newest is None else SignatureState.BROKEN), newest
+    return service.state_of(newest, signed_content(visit, plan, policies)), newest
 
 
 def signed_content(visit: Visit, plan: Plan, policies: Mapping[int, Policy]) -> dict[str, Any]:

@@ -24,11 +24,12 @@ from app.planning.plans.designs import Planned, bounds_of
 from app.planning.plans.key import CommonLimits, common_limits, sealed
 from app.planning.plans.limits import require_limits
 from app.planning.plans.models import Plan, PlanItem
-from app.planning.plans.sign_off import SignatureState, signature_of
+from app.planning.plans.sign_off import signature_of
 from app.planning.plans.visits import today
 from app.planning.protocol.medication import due_before
 from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
 from app.platform.signatures.models import Signature
+from app.platform.signatures.service import SignatureState
 from app.study import service as study
 from app.study.characteristics.service import fields_of
 from app.study.models import Controller, Participant, Visit

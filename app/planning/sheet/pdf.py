@@ -14,12 +14,12 @@ from fpdf.enums import XPos, YPos
 
 from app.evaluation.wording import method_name
 from app.planning import wording
-from app.planning.plans.sign_off import SignatureState
 from app.planning.plans.view import PlanView, shown
 from app.planning.sheet.cards import WIDTH, draw_cards
 from app.planning.sheet.content import HASH
 from app.planning.sheet.ink import INK, LINE, MUTED, clock, shade
 from app.planning.sheet.latin1_text import latin
+from app.platform.signatures.service import SignatureState
 from app.study.characteristics.service import fields_of
 from app.study.wording import MEDICATION, characteristics_words, doses_words
 

@@ -6,14 +6,24 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 from sqlalchemy.orm import Session
 
-from app.platform.signatures import repository
 from app.platform.signatures.models import Signature
 
 _EXACT = 2**53
+
+
+class SignatureState(StrEnum):
+    """What became of a signature."""
+
+    NONE = "none"  # nothing that wants one: a draft, an unlock, a policy that was not released
+    STANDS = "stands"
+    BROKEN = "broken"  # something was changed since
+    NOT_KEPT = "not_kept"  # approved or locked by a version that kept no signatures
+    ENDED = "ended"  # of a lock that holds no more
 
 
 @dataclass(frozen=True)
@@ -53,12 +63,16 @@ def record(db: Session, signer: Signer, *, kind: str, subject_id: int, meaning: 
     return signature
 
 
-def standing(db: Session, kind: str, subject_id: int, content: Mapping[str, Any]) -> Signature | None:
-    """The newest signature under something, if it was given for exactly this content and its own record is whole; else None."""
-    newest = next(iter(repository.signatures_of(db, kind, subject_id)), None)
-    if newest is None or newest.sha256 != content_hash(content) or newest.sha256 != content_hash(newest.content):
-        return None
-    return newest
+def covers(signature: Signature, content: Mapping[str, Any]) -> bool:
+    """Whether a signature was given for exactly this content, and its own record is whole."""
+    return signature.sha256 == content_hash(content) == content_hash(signature.content)
+
+
+def state_of(signature: Signature | None, content: Mapping[str, Any]) -> SignatureState:
+    """What became of a signature that is wanted, given what is there now."""
+    if signature is None:
+        return SignatureState.NOT_KEPT
+    return SignatureState.STANDS if covers(signature, content) else SignatureState.BROKEN
 
 
 def _canonical(value: Any) -> Any:

@@ -10,7 +10,7 @@ from app.platform.web.schemas import problems
 from app.study.deps import CurrentParticipant
 from app.study.margins import service
 from app.study.margins.schemas import MarginsChange, MarginsLockIn, MarginsLockOut, MarginsOut
-from app.study.margins.serializers import lock_out
+from app.study.margins.serializers import lock_rows
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
@@ -30,14 +30,14 @@ def change_margins(participant: CurrentParticipant, change: MarginsChange, db: D
 
 
 @router.get("/participants/{code}/margins/locks")
-def list_margins_locks(participant: CurrentParticipant) -> list[MarginsLockOut]:
+def list_margins_locks(participant: CurrentParticipant, db: Db) -> list[MarginsLockOut]:
     """When margins were locked, oldest first; the last one holds. Verdicts confirm with sessions recorded after it alone."""
-    return [lock_out(lock) for lock in participant.margins_locks]
+    return lock_rows(db, participant)
 
 
-@router.post("/participants/{code}/margins/locks", status_code=201, responses=problems(409))
+@router.post("/participants/{code}/margins/locks", status_code=201, responses=problems(409, 429))
 def lock_margins(participant: CurrentParticipant, wanted: MarginsLockIn, db: Db, caller: CurrentCaller) -> MarginsLockOut:
-    """Lock the present margins before the sessions that they will judge. Those who approve plans alone."""
-    row = service.lock_margins(db, participant, wanted.version, wanted.reason, caller)
+    """Lock the present margins before the sessions that they will judge, signed over their values. Those who approve plans alone."""
+    service.lock_margins(db, participant, wanted.version, wanted.reason, caller, wanted.password, wanted.code)
     db.commit()
-    return lock_out(row)
+    return lock_rows(db, participant)[-1]

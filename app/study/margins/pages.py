@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
@@ -14,8 +15,8 @@ from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.form_changes import Shown, own_changes, reason_of
-from app.study.margins import service
-from app.study.margins.schemas import MarginsIn, MarginsLockIn
+from app.study.margins import service, sign_off
+from app.study.margins.schemas import MarginsIn, MarginsLockFields
 from app.study.models import Participant
 from app.study.service import may
 from app.study.settings.form import SettingField, SettingGroup, history, texts
@@ -47,12 +48,13 @@ GROUPS = (
     ),
 )
 LABELS = {f.name: f.label for group in GROUPS for f in group.fields}
+_LOCK_FIELDS = {"version": "version", "reason": "lock_reason"}
 
 
 @router.get("/participants/{code}/margins")
-def margins(request: Request, participant: CurrentParticipant, caller: CurrentCaller) -> HTMLResponse:
+def margins(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Present margins and levels, each explained, and the versions before."""
-    return _page(request, participant, caller, texts(participant.current_margins, LABELS))
+    return _page(request, db, participant, caller, texts(participant.current_margins, LABELS))
 
 
 @router.post("/participants/{code}/margins")
@@ -69,31 +71,35 @@ def change_margins(request: Request, participant: CurrentParticipant, db: Db, ca
     except BetaloopError as error:
         db.rollback()
         typed = texts(participant.current_margins, LABELS) | changes.fields
-        return _page(request, participant, caller, typed, error, reason_of(values))
+        return _page(request, db, participant, caller, typed, error, reason_of(values))
     db.commit()
     return RedirectResponse(f"/participants/{participant.code}/margins?done={'changed' if row.version != before else 'same'}", 303)
 
 
 @router.post("/participants/{code}/margins/lock")
 def lock_margins(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
-    """Lock the present margins."""
+    """Lock the present margins, signed."""
+    typed = {name: str(values.get(field, "")) for name, field in _LOCK_FIELDS.items()}
     try:
-        wanted = parse(MarginsLockIn, {"version": values.get("version", ""), "reason": values.get("lock_reason", "")}, {"reason": "Reason"})
-        service.lock_margins(db, participant, wanted.version, wanted.reason, caller)
+        wanted = parse(MarginsLockFields, typed, {"reason": "Reason"})
+        password, code = str(values.get("password", "")), str(values.get("code", ""))
+        service.lock_margins(db, participant, wanted.version, wanted.reason, caller, password, code)
     except BetaloopError as error:
         db.rollback()
-        return _page(request, participant, caller, texts(participant.current_margins, LABELS), error)
+        return _page(request, db, participant, caller, texts(participant.current_margins, LABELS), error, lock_reason=typed["reason"])
     db.commit()
     return RedirectResponse(f"/participants/{participant.code}/margins?done=locked", 303)
 
 
 def _page(
     request: Request,
+    db: Session,
     participant: Participant,
     caller: Caller,
     values: dict[str, str],
     error: BetaloopError | None = None,
     reason: str | None = None,
+    lock_reason: str = "",
 ) -> HTMLResponse:
     page = render(
         request,
@@ -104,6 +110,9 @@ def _page(
         reason=reason,
         groups=GROUPS,
         history=history(participant.margins, LABELS),
+        lock_reason=lock_reason,
+        lock_meaning=sign_off.MEANING,
+        lock_signatures=sign_off.signatures_of_locks(db, participant),
         may_write=may(caller, can.APPROVE_PLAN, participant),
         remarks=field_notes(error, values),
         problem=error.problem(request.url.path) if error else None,

@@ -6,6 +6,8 @@ from datetime import datetime
 
 from pydantic import ConfigDict, Field, ValidationInfo, field_validator
 
+from app.platform.signatures.schemas import SignatureOut, Signing
+from app.platform.signatures.service import SignatureState
 from app.platform.web.schemas import Int, Model, Number, Text
 from app.study.settings.schemas import Bound, published
 
@@ -60,11 +62,15 @@ class MarginsChange(Model):
     reason: Text = Field(max_length=1000)
 
 
-class MarginsLockIn(Model):
+class MarginsLockFields(Model):
     """Which margins to lock, and why."""
 
     version: Int = Field(ge=1, le=100_000, description="Of the present margins, as the caller has read them.")
     reason: Text = Field(max_length=1000, description="What the margins rest on; kept with the lock and in the audit trail.")
+
+
+class MarginsLockIn(MarginsLockFields, Signing):
+    """Which margins to lock, why, and who signs."""
 
 
 class MarginsLockOut(Model):
@@ -74,3 +80,5 @@ class MarginsLockOut(Model):
     reason: str
     created_at: datetime
     created_by: str
+    signature: SignatureOut | None
+    signature_state: SignatureState = Field(description="`broken`: a value was changed since. `not_kept`: locked by an earlier version.")

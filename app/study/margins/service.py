@@ -10,6 +10,7 @@ from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import service as study
+from app.study.margins import sign_off
 from app.study.margins.models import MarginsLock, MarginsVersion
 from app.study.margins.schemas import MarginsIn
 from app.study.models import Participant
@@ -47,15 +48,18 @@ def change_margins(db: Session, participant: Participant, change: MarginsIn, rea
     return row
 
 
-def lock_margins(db: Session, participant: Participant, version: int, reason: str, caller: Caller) -> MarginsLock:
-    """Fix the present margins: sessions that are recorded from now on are judged by them, earlier ones only explore.
+def lock_margins(
+    db: Session, participant: Participant, version: int, reason: str, caller: Caller, password: str, code: str = ""
+) -> MarginsLock:
+    """Fix the present margins, signed over their values: sessions recorded from now on are judged by them, earlier ones only explore.
 
     Args:
-        version: of the margins that the caller looked at.
+        version: of the margins that the caller looked at. password: of the caller, asked for again; empty where a fresh sign-on stands
+            for it. code: of the second factor.
 
     Raises:
-        Invalid: no reason. Forbidden: the caller approves no plans of this participant. Conflict: newer margins are there, or these are
-            locked already.
+        Invalid: no reason. Forbidden: the caller approves no plans of this participant, or as `app.accounts.signing`, as TooMany is.
+            Conflict: newer margins are there, or these are locked already.
     """
     study.require(caller, can.APPROVE_PLAN, participant)
     current = participant.current_margins
@@ -69,4 +73,5 @@ def lock_margins(db: Session, participant: Participant, version: int, reason: st
     set_reason(db, row.reason)
     participant.margins_locks.append(row)
     db.flush()
+    sign_off.sign_lock(db, participant, row, caller, password, code)
     return row

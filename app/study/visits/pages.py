@@ -32,7 +32,7 @@ from app.study.service import may
 from app.study.sessions import pages as session_pages
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.data import session_data
-from app.study.visits import form
+from app.study.visits import form, sign_off
 from app.study.visits import service as visit_locks
 from app.study.visits.blinded import blinded_page
 from app.study.wording import DRUG_NAMES
@@ -90,13 +90,16 @@ def visit_page(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCal
 
 @router.post("/visits/{visit_id}/lock")
 def lock_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
-    """Close the data of a visit, or open them again (`unlock`)."""
-    unlock = values.get("unlock") == "yes"
+    """Sign the data of a visit as complete and close them, or open them again (`unlock`)."""
+    unlock, reason = values.get("unlock") == "yes", str(values.get("lock_reason", ""))[:1000]
     try:
-        (visit_locks.unlock if unlock else visit_locks.lock)(db, visit, str(values.get("lock_reason", ""))[:1000], caller)
+        if unlock:
+            visit_locks.unlock(db, visit, reason, caller)
+        else:
+            visit_locks.lock(db, visit, reason, caller, str(values.get("password", "")), str(values.get("code", "")))
     except BetaloopError as error:
         db.rollback()
-        return shown_visit(request, db, visit, caller, None, error)
+        return shown_visit(request, db, visit, caller, None, error, lock_reason=reason)
     db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done={'unlocked' if unlock else 'locked'}#lock", 303)
 
@@ -128,8 +131,9 @@ def shown_visit(
     typed: dict[str, str] | None = None,
     error: BetaloopError | None = None,
     dose: dict[str, str] | None = None,
+    lock_reason: str = "",
 ) -> HTMLResponse:
-    """The page of a visit; `typed` and `dose` are what a refused form of a correction or a dose said."""
+    """The page of a visit; `typed`, `dose` and `lock_reason` are what a refused form of a correction, a dose or a lock said."""
     sessions, _ = repository.sessions_of_visit(db, visit.id)
     told = may_know(visit, caller)  # else its plan is sealed: letters and outcomes, and what else tells nothing of what ran
     ran = [(arm(s, caller).controller, tablet.of_recording(control_recording(s))) for s in sessions if s.segments and told]
@@ -156,6 +160,9 @@ def shown_visit(
         dose=dose,
         may_dose=may(caller, can.WRITE_STUDY, visit.participant) and visit.participant.status != service.WITHDRAWN and not visit.locked,
         may_lock=may(caller, can.LOCK_VISIT, visit.participant),
+        lock_reason=lock_reason,
+        lock_meaning=sign_off.MEANING,
+        lock_signatures=sign_off.signatures_of_locks(db, visit),
         problem=error.problem(request.url.path) if error else None,
         remarks=field_notes(error, seen | (typed or {}), form.asked_about),
     )

@@ -10,16 +10,27 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import repository
 from app.study.models import Visit, VisitLock
+from app.study.visits import sign_off
 
 
-def lock(db: Session, visit: Visit, reason: str, caller: Caller) -> VisitLock:
-    """Close the data of a visit. Raises Conflict where it is locked already or sessions wait for confirmation, Invalid without a reason."""
+def lock(db: Session, visit: Visit, reason: str, caller: Caller, password: str, code: str = "") -> VisitLock:
+    """Close the data of a visit, signed over what they are.
+
+    Args:
+        password: of the caller, asked for again; empty where a fresh sign-on stands for it. code: of the second factor.
+
+    Raises:
+        Conflict: it is locked already, or sessions wait for confirmation. Invalid: no reason. Forbidden, TooMany: as
+            `app.accounts.signing`.
+    """
     waiting = [s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id]
     if waiting:
         raise Conflict(
             f"Visit {visit.number} has {len(waiting)} proposed session(s) that nobody has confirmed.", "Confirm or discard them, then lock."
         )
-    return _set(db, visit, True, reason, caller)
+    row = _set(db, visit, True, reason, caller)
+    sign_off.sign_lock(db, visit, row, caller, password, code)
+    return row
 
 
 def unlock(db: Session, visit: Visit, reason: str, caller: Caller) -> VisitLock:

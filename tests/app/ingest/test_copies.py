@@ -22,6 +22,7 @@ from app.learning.snapshots.service import take_snapshot
 from app.study.models import Recording
 from app.study.repository import participant_by_code
 from tests.app.ingest.conftest import device_zip, loose
+from tests.conftest import PASSWORD
 
 STATED = {"visit": 1, "controller": "random"}
 FOLDER = device_zip()
@@ -286,7 +287,9 @@ def test_two_parts_keep_their_minutes_in_the_whole_recording(send: Any, client: 
 def test_a_fuller_copy_changes_no_session_of_a_locked_visit(send: Any, client: TestClient) -> None:
     send(("half.zip", changed(cut)), **STATED)
     (before,) = sessions_of(client)
-    assert client.post(f"/api/v1/visits/{before['visit_id']}/lock", json={"reason": "data complete"}).status_code == 200
+    assert (
+        client.post(f"/api/v1/visits/{before['visit_id']}/lock", json={"reason": "data complete", "password": PASSWORD}).status_code == 200
+    )
     answer = send(("whole.zip", FOLDER)).json()
     assert sessions_of(client)[0] == before
     assert [p["session"]["id"] for p in answer["proposals"]] != [before["id"]]

@@ -17,6 +17,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from tests.app.analysis.conftest import add_session, add_visits  # noqa: F401 (fixtures)
+from tests.conftest import PASSWORD
 
 CHECKS = {"integer": r"-?\d+", "number": r"-?[\d.]+(e-?\d+)?", "boolean": "true|false", "string": r"[\s\S]*"}
 
@@ -25,7 +26,10 @@ CHECKS = {"integer": r"-?\d+", "number": r"-?[\d.]+(e-?\d+)?", "boolean": "true|
 def package(client: TestClient, add_visits: Callable[..., None], add_session: Callable[..., int], tmp_path: Path) -> Path:  # noqa: F811
     """P1 with six visits, a failure, an excluded session, ties, another beta and a locked margin, unpacked."""
     add_visits(2)
-    assert client.post("/api/v1/participants/P1/margins/locks", json={"version": 1, "reason": "protocol"}).status_code == 201
+    assert (
+        client.post("/api/v1/participants/P1/margins/locks", json={"version": 1, "reason": "protocol", "password": PASSWORD}).status_code
+        == 201
+    )
     add_visits(4, first=3, seed=9)
     add_session("rl", fraction=0.3, stopped="tremor", visit=4)
     add_session("rl", fraction=0.3, excluded="cable", visit=4, grasp=90 / 7)

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from tests.conftest import PASSWORD
+
 PRIMARY = "/api/v1/participants/P1/analyses/primary"
 PAGE = "/participants/P1/analyses"
 AddSession = Callable[..., int]
@@ -25,7 +27,12 @@ def comparison(answer: dict[str, Any], metric: str, controller: str = "rl") -> d
 
 
 def lock(client: TestClient) -> None:
-    assert client.post("/api/v1/participants/P1/margins/locks", json={"version": 1, "reason": "protocol 3.2"}).status_code == 201
+    assert (
+        client.post(
+            "/api/v1/participants/P1/margins/locks", json={"version": 1, "reason": "protocol 3.2", "password": PASSWORD}
+        ).status_code
+        == 201
+    )
 
 
 def test_each_visit_counts_once_against_its_own_cdbs(client: TestClient, add_session: AddSession) -> None:
@@ -102,7 +109,7 @@ def test_sessions_after_the_lock_without_grasp_under_cdbs_say_so(client: TestCli
 
 def test_the_lock_holds_what_was_locked_and_new_margins_need_a_new_one(client: TestClient, add_visits: AddVisits) -> None:
     lock(client)
-    again = client.post("/api/v1/participants/P1/margins/locks", json={"version": 1, "reason": "again"})
+    again = client.post("/api/v1/participants/P1/margins/locks", json={"version": 1, "reason": "again", "password": PASSWORD})
     assert again.status_code == 409
     changed = client.put("/api/v1/participants/P1/margins", json={"margins": {"rating_points": 3}, "reason": "looser"})
     assert changed.json()["version"] == 2
@@ -116,7 +123,7 @@ def test_the_lock_holds_what_was_locked_and_new_margins_need_a_new_one(client: T
 def relock(client: TestClient, **margins: float) -> None:
     """New margins, locked."""
     change = client.put("/api/v1/participants/P1/margins", json={"margins": margins, "reason": "after the interim look"}).json()
-    body = {"version": change["version"], "reason": "protocol 4"}
+    body = {"version": change["version"], "reason": "protocol 4", "password": PASSWORD}
     assert client.post("/api/v1/participants/P1/margins/locks", json=body).status_code == 201
 
 

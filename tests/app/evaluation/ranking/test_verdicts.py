@@ -14,6 +14,7 @@ from app.evaluation.ranking.decisions import Circumstances, decide
 from app.study.margins.models import MarginsVersion
 from tests.app.evaluations import judged
 from tests.app.words import above_fold, methods_named
+from tests.conftest import PASSWORD
 from tests.ml.ope.posterior.draws import N, cdbs, share
 
 RANKING = "/api/v1/participants/P1/ranking"
@@ -71,14 +72,14 @@ def test_locked_margins_hold_in_the_ranking_too_and_newer_levels_count_at_once(
 ) -> None:
     judge({policies[0]: judged(50.0, outcome_draws={"tremor_percent": [26.0] * N})})
     margins = "/api/v1/participants/P1/margins"
-    assert client.post(f"{margins}/locks", json={"version": 1, "reason": "protocol"}).status_code == 201
+    assert client.post(f"{margins}/locks", json={"version": 1, "reason": "protocol", "password": PASSWORD}).status_code == 201
     assert client.put(margins, json={"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}).status_code == 200
     assert ranked(client)["policies"][0]["decision"] == "test", "the analyses go by the locked margins as well"
     page = client.get("/participants/P1/ranking", headers={"Accept": "text/html"}).text
     assert "tremor at most 10 percentage points more" in page
     assert client.put(margins, json={"margins": {"test_saves": 0.95}, "reason": "longer battery"}).status_code == 200
     assert "at least 95 % likely to use less energy" in client.get("/participants/P1/ranking", headers={"Accept": "text/html"}).text
-    assert client.post(f"{margins}/locks", json={"version": 3, "reason": "amended"}).status_code == 201
+    assert client.post(f"{margins}/locks", json={"version": 3, "reason": "amended", "password": PASSWORD}).status_code == 201
     assert ranked(client)["policies"][0]["decision"] == "unsafe"
 
 

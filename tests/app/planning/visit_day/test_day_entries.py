@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 
 from app.planning.visit_day.record import SlotOutcome, outcomes_of
 from app.planning.visit_day.repository import entries, slot_times
+from tests.conftest import PASSWORD
 
 TAPS = {
     "method": "taps",
@@ -165,7 +166,7 @@ def test_entries_about_a_replaced_plan_stay_true(clinic_day: Any, db: Session) -
 
 def test_a_locked_visit_refuses_entries_and_the_tablet_may_send_them_again_later(clinic_day: Any, db: Session) -> None:
     base, entry = f"/api/v1/visits/{clinic_day.visit}", clinic_day.entry("rating", {"value": 7})
-    assert clinic_day.client.post(f"{base}/lock", json={"reason": "complete"}).status_code in (200, 201)
+    assert clinic_day.client.post(f"{base}/lock", json={"reason": "complete", "password": PASSWORD}).status_code in (200, 201)
     (result,) = clinic_day.send(entry).json()["results"]
     assert (result["outcome"], "was locked by" in result["detail"]) == ("refused", True)
     assert clinic_day.client.post(f"{base}/unlock", json={"reason": "a rating came late"}).status_code in (200, 201)
@@ -221,7 +222,7 @@ def test_adverse_events_stand_among_the_adverse_events_at_once(clinic_day: Any) 
 
 
 def test_a_locked_visit_still_takes_adverse_events(clinic_day: Any) -> None:
-    clinic_day.client.post(f"/api/v1/visits/{clinic_day.visit}/lock", json={"reason": "complete"})
+    clinic_day.client.post(f"/api/v1/visits/{clinic_day.visit}/lock", json={"reason": "complete", "password": PASSWORD})
     fall = {"kind": "fall", "severity": "severe", "serious": False, "note": "", "no_names": []}
     assert clinic_day.outcomes(clinic_day.entry("adverse_event", fall)) == ["stored"]
 

@@ -15,11 +15,18 @@ from app.accounts.permissions import SYSTEM, Caller
 from app.accounts.signing import sign
 from app.platform.audit import AuditEvent
 from app.platform.errors import Forbidden, TooMany
-from app.platform.signatures.service import content_hash, standing
+from app.platform.signatures.models import Signature
+from app.platform.signatures.repository import signatures_of
+from app.platform.signatures.service import content_hash, covers
 
 PASSWORD = "correct horse battery"
 CONTENT: dict[str, Any] = {"order": ["cdbs", "rl"], "max_ma": 3.0, "note": "Łódź", "limits": {"b": 0.1, "a": None}}
 FLAT = {"kind": "plan", "subject_id": 7, "meaning": "approved for use in this participant"}
+
+
+def standing(db: Session, kind: str, subject_id: int, content: dict[str, Any]) -> Signature | None:
+    newest = next(iter(signatures_of(db, kind, subject_id)), None)
+    return newest if newest is not None and covers(newest, content) else None
 
 
 @pytest.fixture

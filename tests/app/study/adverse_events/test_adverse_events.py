@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 from tests.app.evaluations import judge as judge
 from tests.app.evaluations import judged
 from tests.app.evaluations import policies as policies
+from tests.conftest import PASSWORD
 
 Clients = Callable[[str], TestClient]
 Upload = Callable[..., int]
@@ -118,7 +119,7 @@ def test_a_locked_visit_takes_events_and_a_blinded_assessor_may_write_one_down(
     assert (written.status_code, written.json()["policy_id"]) == (201, None)
     assert blinded.get(PATH).status_code == 403
     visit = client.get(f"/api/v1/sessions/{session}").json()["visit_id"]
-    assert client.post(f"/api/v1/visits/{visit}/lock", json={"reason": "complete"}).status_code == 200
+    assert client.post(f"/api/v1/visits/{visit}/lock", json={"reason": "complete", "password": PASSWORD}).status_code == 200
     assert add(client, session_id=session)["visit_id"] == visit, "harm is written down whenever it becomes known"
 
 

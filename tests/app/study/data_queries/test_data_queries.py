@@ -89,7 +89,7 @@ def test_a_blinded_assessor_neither_reads_queries_nor_is_led_to_them(
     blinded = client_as("blinded_assessor")
     assert blinded.get(f"/sessions/{session_id}").status_code == 403
     visit = client.get(f"/api/v1/sessions/{session_id}").json()["visit_id"]
-    assert client.post(f"/api/v1/visits/{visit}/lock", json={"reason": "data complete"}).status_code == 200
+    assert client.post(f"/api/v1/visits/{visit}/lock", json={"reason": "data complete", "password": PASSWORD}).status_code == 200
     page = blinded.get(f"/sessions/{session_id}")
     assert (page.status_code, "data-queries" in page.text) == (200, False)
     for closed in (HOME, "/participants/P1/data-queries"):

@@ -22,6 +22,7 @@ from app.study.models import StudySession
 from app.study.schemas import SessionChange
 from app.study.sessions.contradictions import Kind, contradictions
 from tests.app.study.conftest import START
+from tests.conftest import PASSWORD
 
 Upload = Callable[..., int]
 
@@ -89,7 +90,7 @@ def test_doses_are_entered_refused_and_taken_back(client: TestClient, enrolled: 
         assert "not near visit 5" in client.post(api, json=dose | {"taken_at": taken_at}).json()["detail"]
     tomorrow = (datetime.now(UTC) + timedelta(days=1)).isoformat()
     assert "has not come yet" in client.post(api, json=dose | {"taken_at": tomorrow}).json()["detail"]
-    client.post(f"/api/v1/visits/{visit}/lock", json={"reason": "complete"})
+    client.post(f"/api/v1/visits/{visit}/lock", json={"reason": "complete", "password": PASSWORD})
     assert client.post(f"/api/v1/doses/{made['id']}/removal", json={"reason": "not taken"}).status_code == 409
     client.post(f"/api/v1/visits/{visit}/unlock", json={"reason": "misread"})
     client.patch(f"/api/v1/participants/{enrolled}", json={"status": "withdrawn", "reason": "asked"})

@@ -11,6 +11,7 @@ from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 
 from app.accounts.blinded import is_open
+from tests.conftest import PASSWORD
 
 Upload = Callable[..., int]
 Clients = Callable[[str], TestClient]
@@ -19,7 +20,8 @@ Clients = Callable[[str], TestClient]
 def lock(client: TestClient, visit: int = 1, what: str = "lock", reason: str = "data complete"):  # type: ignore[no-untyped-def]
     visits = client.get("/api/v1/participants/P1/visits").json()["items"]
     number = next(v["id"] for v in visits if v["number"] == visit)
-    return client.post(f"/api/v1/visits/{number}/{what}", json={"reason": reason})
+    body = {"reason": reason} | ({"password": PASSWORD} if what == "lock" else {})
+    return client.post(f"/api/v1/visits/{number}/{what}", json=body)
 
 
 def test_a_locked_visit_takes_no_change_until_it_is_unlocked_with_a_reason(client: TestClient, upload: Upload) -> None:
@@ -53,7 +55,7 @@ def test_the_page_of_a_visit_locks_and_unlocks(client: TestClient, upload: Uploa
     session = upload("cdbs")
     visit = client.get(f"/api/v1/sessions/{session}").json()["visit_id"]
     assert "Lock this visit" in client.get(f"/visits/{visit}").text
-    done = client.post(f"/visits/{visit}/lock", data={"lock_reason": "complete"}, follow_redirects=False)
+    done = client.post(f"/visits/{visit}/lock", data={"lock_reason": "complete", "password": PASSWORD}, follow_redirects=False)
     assert done.status_code == 303
     assert "Unlock this visit" in client.get(f"/visits/{visit}").text
     engineer = client_as("engineer")

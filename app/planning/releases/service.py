@@ -1,0 +1,165 @@
+"""Rules of releases: what is signed of a policy, by whom, and what an approved plan may ask of it. The caller commits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from sqlalchemy.orm import Session
+
+from app.accounts import permissions as can
+from app.accounts import signing
+from app.accounts.permissions import Caller
+from app.learning.models import BufferSnapshot, Policy
+from app.learning.policies.service import onnx_of
+from app.planning.bundles import service as bundles
+from app.planning.plans.models import PlanItem
+from app.platform.errors import Conflict, Forbidden
+from app.platform.signatures import repository as signatures
+from app.platform.signatures.models import Signature
+from app.platform.signatures.service import SignatureState, state_of
+from app.settings import get_settings
+from app.study import repository as study_repository
+from app.study import service as study
+from app.study.models import Hemisphere, Participant
+
+KIND: Final = "policy"
+MEANING: Final = "released for testing in participants"
+_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Release:
+    """What became of a policy's release.
+
+    Attributes:
+        signature: the newest, standing or not; None where nobody released the policy.
+    """
+
+    state: SignatureState
+    signature: Signature | None
+
+    @property
+    def limits(self) -> dict[str, Any] | None:
+        """The limits that were signed: `hemisphere`, `cdbs_ma`, `min_ma`, `max_ma`, `ramp_ma_per_s`."""
+        return self.signature.content.get("limits") if self.signature else None
+
+
+def release(
+    db: Session,
+    participant: Participant,
+    policy: Policy,
+    limits: bundles.Limits,
+    hemisphere: Hemisphere | None,
+    caller: Caller,
+    password: str,
+    code: str = "",
+) -> Release:
+    """Sign a policy as released for testing in participants, within limits. A newer release takes the place of an older one.
+
+    Args:
+        limits: what is left out takes the default of a bundle. password: of the caller, asked for again; empty where a fresh sign-on
+            stands for it. code: of the second factor.
+
+    Raises:
+        Forbidden: whoever brought a policy from elsewhere, one who approves no plans, or a wrong password. TooMany: too many wrong ones.
+        Conflict: a retired policy. Invalid: limits that contradict each other or leave the stimulator's own; a damaged file; or nobody has
+            stated the cDBS amplitude or the unit of beta.
+    """
+    study.require(caller, can.APPROVE_PLAN, participant)
+    study.require_own(participant, policy, f"policy {policy.id}")
+    if policy.retired_reason:
+        raise Conflict(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", "Take it back first, or release another one.")
+    if policy.kind == bundles.FOREIGN and policy.created_by == caller.label:
+        raise Forbidden(
+            f"You brought policy '{policy.name}' from elsewhere yourself.",
+            "A second person looks at it and releases it: ask a clinician.",
+        )
+    onnx_of(policy)
+    manifest, _ = bundles.manifest_of(db, participant, policy, limits, hemisphere, caller)
+    signed = {
+        "hemisphere": manifest.hemisphere,
+        "cdbs_ma": manifest.cdbs_ma,
+        "min_ma": manifest.min_ma,
+        "max_ma": manifest.max_ma,
+        "ramp_ma_per_s": manifest.ramp_ma_per_s,
+    }
+    content = signed_content(db, participant, policy) | {"limits": signed}
+    row = signing.sign(db, caller, password, kind=KIND, subject_id=policy.id, meaning=MEANING, content=content, code=code)
+    return Release(SignatureState.STANDS, row)
+
+
+def release_of(db: Session, participant: Participant, policy: Policy) -> Release:
+    """Whether a policy is released, and whether it is still what was released."""
+    return _judged(db, participant, policy, signatures.newest_of_each(db, KIND, [policy.id]).get(policy.id))
+
+
+def refuse_unreleased(db: Session, participant: Participant, planned: Sequence[tuple[Policy, PlanItem]]) -> None:
+    """Hold the sessions of a plan that is to be approved against the releases of their policies.
+
+    Raises:
+        Conflict: a policy that was changed since it was released, or a session that goes beyond the limits of the release; and, where this
+            installation asks for it (`BETALOOP_REQUIRE_RELEASED_POLICIES`), a policy that nobody released.
+    """
+    found = signatures.newest_of_each(db, KIND, sorted({policy.id for policy, _ in planned}))
+    for policy, item in planned:
+        one = _judged(db, participant, policy, found.get(policy.id))
+        if one.state is SignatureState.BROKEN:
+            raise Conflict(
+                f"Policy '{policy.name}' was changed since it was released for testing.", "Look at the audit trail; plan another policy."
+            )
+        if one.limits is None:
+            if get_settings().require_released_policies:
+                raise Conflict(
+                    f"Policy '{policy.name}' is not released for testing in participants.",
+                    "A clinician releases it on the page of its controller bundle; then approve the plan.",
+                )
+            continue
+        _refuse_beyond(policy, item, one.limits)
+
+
+def _judged(db: Session, participant: Participant, policy: Policy, newest: Signature | None) -> Release:
+    if newest is None:
+        return Release(SignatureState.NONE, None)
+    content = signed_content(db, participant, policy) | {"limits": newest.content.get("limits")}
+    return Release(state_of(newest, content), newest)
+
+
+def _refuse_beyond(policy: Policy, item: PlanItem, limits: dict[str, Any]) -> None:
+    """Raises Conflict where a planned session goes beyond what its policy was released for."""
+    side = limits["hemisphere"]
+    beyond = (
+        (item.min_ma is not None and item.min_ma < limits["min_ma"] - _TOLERANCE)
+        or (item.max_ma is not None and item.max_ma > limits["max_ma"] + _TOLERANCE)
+        or (item.ramp_ma_per_s is not None and item.ramp_ma_per_s > limits["ramp_ma_per_s"] + _TOLERANCE)
+        or (side is not None and item.hemisphere is not None and str(item.hemisphere) != side)
+    )
+    if beyond:
+        within = f"{limits['min_ma']:g} to {limits['max_ma']:g} mA, ramp {limits['ramp_ma_per_s']:g} mA/s{f', {side}' if side else ''}"
+        raise Conflict(
+            f"Session {item.position} goes beyond the limits within which policy '{policy.name}' was released: {within}.",
+            "Draft the visit anew within them, or have a clinician release the policy with other limits.",
+        )
+
+
+def signed_content(db: Session, participant: Participant, policy: Policy) -> dict[str, Any]:
+    """All that a signature under a policy covers, but the limits: its bytes, and what it was made of."""
+    snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id else None
+    teacher = db.get(Policy, policy.teacher_id) if policy.teacher_id else None
+    return {
+        "participant": participant.code,
+        "policy": policy.id,
+        "name": policy.name,
+        "kind": policy.kind,
+        "algorithm": policy.algorithm,
+        "onnx_sha256": policy.onnx_sha256,
+        "checkpoint_sha256": policy.checkpoint_sha256,
+        "teacher_sha256": teacher.onnx_sha256 if teacher else None,
+        "snapshot": {"pins_sha256": snapshot.pins_sha256, "file_sha256": snapshot.file_sha256} if snapshot else None,
+        "settings_version": study_repository.settings_version(db, policy.settings_version_id).version,
+        "config": policy.config,
+        "seed": policy.seed,
+        "code_version": policy.code_version,
+        "made_by": policy.created_by,
+    }

@@ -1,0 +1,150 @@
+"""The release of a policy: signed over its bytes and limits, broken by any change, and what it means for plans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import select, text
+from sqlalchemy.orm import Session
+
+from app.learning.models import Policy
+from app.platform.signatures.models import Signature
+from app.settings import get_settings
+from ml.rl import MlpPolicy
+from tests.conftest import PASSWORD
+
+PAGE = {"Accept": "text/html"}
+BROKEN = "Signature broken: this policy was changed"
+LIMITS = {"min_ma": 0.5, "max_ma": 3.0, "ramp_ma_per_s": 1.5}
+Clients = Callable[[str], TestClient]
+
+
+@pytest.fixture
+def policy(client: TestClient, enrolled: str) -> int:
+    """A policy made elsewhere, which the administrator has added."""
+    content = MlpPolicy(10, (20, 10), mean=1.0, std=0.5, seed=1).to_onnx()
+    posted = client.post("/api/v1/participants/P1/policies", data={"name": "lyon"}, files={"file": ("x.onnx", content)})
+    return int(posted.json()["id"])
+
+
+def release(client: TestClient, policy: int, **more: Any) -> Any:
+    return client.post(f"/api/v1/policies/{policy}/release", json={"password": PASSWORD} | LIMITS | more)
+
+
+def read(client: TestClient, policy: int) -> dict[str, Any]:
+    found: dict[str, Any] = client.get(f"/api/v1/policies/{policy}/release").json()
+    return found
+
+
+def test_a_clinician_releases_a_policy_over_its_bytes_and_limits(client: TestClient, client_as: Clients, db: Session, policy: int) -> None:
+    assert (read(client, policy)["signature_state"], read(client, policy)["signature"]) == ("none", None)
+    done = release(client_as("clinician"), policy)
+    assert (done.status_code, done.json()["signature_state"]) == (201, "stands"), done.text
+    signature = done.json()["signature"]
+    assert (signature["signer"], signature["meaning"]) == ("clinician@clinic.example", "released for testing in participants")
+    assert done.json()["limits"] == LIMITS | {"cdbs_ma": 3.0, "hemisphere": None}
+    content, stored = db.scalars(select(Signature)).one().content, db.get_one(Policy, policy)
+    assert (content["onnx_sha256"], content["limits"]["max_ma"]) == (stored.onnx_sha256, 3.0)
+    page = client.get(f"/participants/P1/policies/{policy}/bundle", headers=PAGE).text
+    assert (signature["sha256"] in page, BROKEN in page) == (True, False)
+
+
+def test_whoever_brought_it_an_engineer_and_a_wrong_password_release_nothing(
+    client: TestClient, client_as: Clients, db: Session, policy: int
+) -> None:
+    own = release(client, policy)
+    assert (own.status_code, "You brought policy 'lyon' from elsewhere yourself." in own.text) == (403, True)
+    assert "Release lyon" not in client.get(f"/participants/P1/policies/{policy}/bundle", headers=PAGE).text
+    assert release(client_as("engineer"), policy).status_code == 403
+    clinician = client_as("clinician")
+    assert clinician.post(f"/api/v1/policies/{policy}/release", json=LIMITS).status_code == 422
+    assert release(clinician, policy, password="a wrong guess").status_code == 403
+    form = {"min_ma": "0.5", "max_ma": "3.25", "ramp_ma_per_s": "1.5", "password": "a wrong guess"}
+    page = clinician.post(f"/participants/P1/policies/{policy}/release", data=form, headers=PAGE)
+    assert (page.status_code, "The password is wrong." in page.text, 'value="3.25"' in page.text) == (403, True, True)
+    assert db.scalars(select(Signature)).all() == []
+    sent = clinician.post(
+        f"/participants/P1/policies/{policy}/release", data=form | {"password": PASSWORD}, headers=PAGE, follow_redirects=False
+    )
+    assert (sent.status_code, read(client, policy)["limits"]["max_ma"]) == (303, 3.25)
+
+
+def test_a_retired_policy_and_impossible_limits_are_refused(client: TestClient, client_as: Clients, policy: int) -> None:
+    clinician = client_as("clinician")
+    assert release(clinician, policy, min_ma=3.0, max_ma=1.0).status_code == 422
+    client.patch(f"/api/v1/policies/{policy}", json={"retired_reason": "speech"})
+    assert release(clinician, policy).status_code == 409
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "update policy set onnx_sha256 = (select min(sha256) from stored_file where sha256 <> onnx_sha256)",
+        "update policy set checkpoint_sha256 = onnx_sha256",
+        "update policy set name = 'another'",
+        "update policy set config = '{\"window\": 11}'",
+        "update signature set content = jsonb_set(content, '{limits,max_ma}', '25')",
+    ],
+)
+def test_any_change_breaks_it_visibly(client: TestClient, client_as: Clients, owner_db: Session, policy: int, change: str) -> None:
+    other = MlpPolicy(10, (20, 10), mean=1.0, std=0.5, seed=2).to_onnx()
+    client.post("/api/v1/participants/P1/policies", data={"name": "second"}, files={"file": ("x.onnx", other)})
+    release(client_as("clinician"), policy)
+    table = change.split()[1]
+    owner_db.execute(text(f"alter table {table} disable trigger user"))  # what the owner can do, and no service
+    where = f"id = {policy}" if table == "policy" else "true"
+    assert owner_db.execute(text(f"{change} where {where}")).rowcount == 1  # type: ignore[attr-defined]
+    owner_db.commit()
+    assert read(client, policy)["signature_state"] == "broken"
+    assert BROKEN in client.get(f"/participants/P1/policies/{policy}/bundle", headers=PAGE).text
+
+
+def test_retiring_and_taking_back_breaks_nothing(client: TestClient, client_as: Clients, policy: int) -> None:
+    release(client_as("clinician"), policy)
+    client.patch(f"/api/v1/policies/{policy}", json={"retired_reason": "speech"})
+    client.patch(f"/api/v1/policies/{policy}", json={"retired_reason": None})
+    assert read(client, policy)["signature_state"] == "stands"
+
+
+class TestPlans:
+    """What a release means for the plans that its policy stands in."""
+
+    @pytest.fixture
+    def drafted(self, client: TestClient, studied: Any) -> int:
+        body = {"policy_ids": [studied.policies[0]], "seed": 7, "min_ma": 0.5, "max_ma": 3.5}
+        answer = client.post(f"/api/v1/visits/{studied.visit}/plan", json=body)
+        assert answer.status_code == 201, answer.text
+        return int(studied.policies[0])
+
+    def test_a_plan_is_approved_without_releases_unless_they_are_asked_for(
+        self, client_as: Clients, studied: Any, drafted: int, sign_plan: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("BETALOOP_REQUIRE_RELEASED_POLICIES", "true")
+        get_settings.cache_clear()
+        refused = sign_plan(studied.visit)
+        assert (refused.status_code, "is not released for testing in participants" in refused.text) == (409, True)
+        assert release(client_as("clinician"), drafted, max_ma=3.5).status_code == 201
+        assert sign_plan(studied.visit).status_code == 200
+
+    def test_a_plan_beyond_the_limits_of_a_release_is_not_approved(
+        self, client_as: Clients, studied: Any, drafted: int, sign_plan: Callable[..., Any]
+    ) -> None:
+        clinician = client_as("clinician")
+        for narrower in ({"max_ma": 3.4}, {"min_ma": 0.6}, {"ramp_ma_per_s": 1.4}):
+            assert release(clinician, drafted, **{"max_ma": 3.5} | narrower).status_code == 201
+            refused = sign_plan(studied.visit)
+            assert (refused.status_code, "goes beyond the limits" in refused.text) == (409, True), narrower
+        assert release(clinician, drafted, max_ma=3.5).status_code == 201
+        assert sign_plan(studied.visit).status_code == 200
+
+    def test_a_policy_that_was_changed_since_its_release_is_in_no_approved_plan(
+        self, client_as: Clients, studied: Any, drafted: int, owner_db: Session, sign_plan: Callable[..., Any]
+    ) -> None:
+        assert release(client_as("clinician"), drafted, max_ma=3.5).status_code == 201
+        owner_db.execute(text("update policy set seed = 77 where id = :policy"), {"policy": drafted})
+        owner_db.commit()
+        refused = sign_plan(studied.visit)
+        assert (refused.status_code, "was changed since it was released" in refused.text) == (409, True)
