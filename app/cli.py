@@ -28,7 +28,7 @@ from app.platform.errors import BetaloopError
 from app.platform.tables import load_tables
 from app.platform.terminal import ACTOR, AsJson, Code, say, show
 from app.platform.upkeep.commands import app as upkeep_app
-from app.settings import get_settings
+from app.settings import Settings, get_settings
 from app.simulation import commands as simulation
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="betaloop: the study system for closed-loop deep brain stimulation.")
@@ -46,6 +46,20 @@ app.add_typer(audit_app, name="audit")
 app.add_typer(upkeep_app)
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+
+def decide_cookies(settings: Settings, host: str, *, tls: bool) -> None:
+    """Whether sessions and HTTPS belong together: always with TLS of one's own; where other machines reach the service, unless somebody
+    has said otherwise (`BETALOOP_COOKIE_SECURE=false`), and then it is told.
+    """
+    log = structlog.get_logger()
+    if tls:
+        settings.cookie_secure = True
+    elif host not in LOOPBACK and "cookie_secure" not in settings.model_fields_set:
+        settings.cookie_secure = True
+        log.info("other machines reach this service: people sign in over HTTPS alone, by a TLS proxy or --tls-certificate")
+    elif host not in LOOPBACK and not settings.cookie_secure:
+        log.warning("other machines reach this service without TLS, as BETALOOP_COOKIE_SECURE=false says: passwords can be read on the way")
 
 
 def main() -> None:
@@ -82,16 +96,11 @@ def serve(
         raise typer.BadParameter("TLS needs both --tls-certificate and --tls-key")
     bring_up_to_date()
     settings = get_settings()
-    if tls_certificate is not None:
-        settings.cookie_secure = True
+    decide_cookies(settings, host or settings.host, tls=tls_certificate is not None)
     if (store := bucket()) is not None:
         store.check_keys(settings)
     supervise_database()
     structlog.get_logger().info("database", lies_in=database_place())
-    if (host or settings.host) not in LOOPBACK and not settings.cookie_secure:
-        structlog.get_logger().warning(
-            "other machines reach this service without TLS: give --tls-certificate, or use a TLS proxy and set BETALOOP_COOKIE_SECURE"
-        )
     if configured():
         provider()  # settings that do not fit are said now, not to the first person who signs on
     service = create_app()

@@ -10,14 +10,15 @@ from typing import Any
 
 import plotly
 import structlog
-from fastapi import APIRouter, Depends, FastAPI, Response
+from fastapi import APIRouter, Depends, FastAPI, Request, Response
 from fastapi.openapi.utils import get_openapi
+from fastapi.responses import JSONResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from starlette.concurrency import run_in_threadpool
 
 from app import __version__
-from app.accounts.deps import judge, results_viewed
+from app.accounts.deps import METRICS, CurrentCaller, judge, reader_of_figures, results_viewed
 from app.analysis.primary.outlook import outlook
 from app.planning.slots.pages import facts as slots_of_visit
 from app.platform import logs
@@ -32,6 +33,8 @@ from app.platform.web.schemas import problems
 from app.platform.web.templates import STATIC
 
 log = structlog.get_logger()
+
+DESCRIPTION = "/api/v1/openapi.json"
 
 API_MODULES = (
     "app.accounts.studies.api",
@@ -56,6 +59,7 @@ API_MODULES = (
     "app.pipeline.api",
     "app.planning.plans.api",
     "app.planning.bundles.api",
+    "app.planning.releases.api",
     "app.planning.visit_day.api",
     "app.planning.slots.api",
     "app.analysis.primary.api",
@@ -143,7 +147,7 @@ def _built() -> FastAPI:
     load_tables()
     logs.configure_own()
     app = FastAPI(
-        title="betaloop", version=__version__, openapi_url="/api/v1/openapi.json", docs_url=None, redoc_url=None, lifespan=_lifespan
+        title="betaloop", version=__version__, openapi_url=None, docs_url=None, redoc_url=None, lifespan=_lifespan
     )  # fmt: skip
     web.install(app, judge)
     api = APIRouter(prefix="/api/v1")
@@ -156,6 +160,7 @@ def _built() -> FastAPI:
     app.mount("/static/plotly", CompressedFiles(packages=[(plotly.__name__, "package_data")]))
     app.mount("/static", _Static(directory=STATIC))
     app.state.outlook = outlook  # of the analyses, for the plan, which stands before them
+    app.state.description = DESCRIPTION
     app.state.slots_of_visit = slots_of_visit  # of the plan, for the page of the visit
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
@@ -194,10 +199,15 @@ def _service_routes() -> APIRouter:
             raise DatabaseAway(f"The database has schema {has or 'none'}; this version needs {needs}.", "Run `betaloop migrate`.")
         return {"status": "ready", "schema": has}
 
-    @router.get("/metrics", include_in_schema=False)
+    @router.get(METRICS, include_in_schema=False, dependencies=[Depends(reader_of_figures)])
     def metrics() -> Response:
         """Prometheus metrics."""
         return Response(generate_latest(), media_type=CONTENT_TYPE_LATEST)
+
+    @router.get(DESCRIPTION, include_in_schema=False)
+    def description(request: Request, _: CurrentCaller) -> JSONResponse:
+        """The OpenAPI document, for who has signed in or has a token."""
+        return JSONResponse(request.app.openapi())
 
     return router
 

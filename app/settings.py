@@ -36,7 +36,16 @@ class Settings(BaseSettings):
     )
     session_idle_minutes: int = Field(60, ge=1, description="A browser session ends after this many idle minutes.")
     session_max_hours: int = Field(12, ge=1, description="A browser session ends after this many hours in any case.")
-    cookie_secure: bool = Field(False, description="Send the session cookie over HTTPS only; switch on behind TLS.")
+    metrics_on_loopback: bool = Field(
+        False, description="Answer /metrics without a token to programs of this machine; not where a proxy runs beside the service."
+    )
+    require_released_policies: bool = Field(
+        False, description="Approve plans only of policies that a clinician has released, with a signature of its own."
+    )
+    cookie_secure: bool = Field(
+        False,
+        description="Send the session cookie over HTTPS only; on with TLS, and where other machines reach the service unless set to false.",
+    )
     public_url: str | None = Field(None, description="Address at which browsers reach this service; needed for a sign-on.")
     oidc_issuer: str | None = Field(
         None, description="Address of a hospital's identity provider (OpenID Connect); without one there is no sign-on."

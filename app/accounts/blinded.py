@@ -18,6 +18,7 @@ OPEN = (
     ("GET", "/glossary"),
     ("GET", "/energy-saved"),
     ("GET", "/api-reference"),
+    ("GET", "/api/v1/openapi.json"),
     ("GET", "(/api/v1)?/visits/[0-9]+"),
     ("GET", "/api/v1/visits/[0-9]+/(sessions|locks)"),
     ("GET", "(/api/v1)?/sessions/[0-9]+"),

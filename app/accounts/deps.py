@@ -12,12 +12,16 @@ from starlette.concurrency import run_in_threadpool
 
 from app.accounts import service
 from app.accounts.blinded import is_open
+from app.accounts.models import Scope
 from app.accounts.permissions import Caller
 from app.platform.audit import record_view
 from app.platform.database import Db, new_session, set_actor
 from app.platform.errors import Forbidden, Unauthorized
+from app.platform.sources import from_this_machine
+from app.settings import get_settings
 
 COOKIE = "betaloop_session"
+METRICS = "/metrics"
 
 _bearer = HTTPBearer(auto_error=False, description="API token from `betaloop token create`.")
 
@@ -37,6 +41,8 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
         raise Unauthorized(
             "This needs a bearer token or a browser session.", "Make one with `betaloop token create EMAIL --name NAME`, or sign in."
         )
+    if caller.token_scope is Scope.METRICS and request.url.path != METRICS:
+        raise Forbidden("A token for 'metrics' reads the figures of the service and nothing else.", "Make one with a wider scope.")
     if caller.is_blinded and not is_open(request.method, request.url.path):
         raise Forbidden(
             "This is closed to blinded assessors: it may show which controller a session had.",
@@ -48,6 +54,16 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
 
 
 CurrentCaller = Annotated[Caller, Depends(get_caller)]
+
+
+def reader_of_figures(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> None:
+    """For `/metrics`: whoever has signed in or has a token; where the installation says so, every program of this machine too.
+
+    Raises:
+        Unauthorized, Forbidden: as `get_caller`.
+    """
+    if not (get_settings().metrics_on_loopback and from_this_machine(request)):
+        get_caller(request, db, bearer)
 
 
 async def judge(request: Request) -> str:

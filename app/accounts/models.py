@@ -31,6 +31,7 @@ class Scope(StrEnum):
     READ = "read"
     UPLOAD = "upload"
     JOBS = "jobs"
+    METRICS = "metrics"
 
 
 class Study(Base):
@@ -118,6 +119,8 @@ class SignOnLink(Base):
     issuer: Mapped[str] = mapped_column(String(500))
     subject: Mapped[str] = mapped_column(String(255))
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    last_used_at: Mapped[datetime | None]
+    """When the newest login there was made that was shown here; none at or before it confirms anything."""
     user: Mapped[User] = relationship()
 
 
@@ -141,7 +144,7 @@ class ApiToken(Base):
     __tablename__ = "api_token"
     __table_args__ = (
         UniqueConstraint("user_id", "name"),
-        CheckConstraint("scope in ('full', 'read', 'upload', 'jobs')", name="scope"),
+        CheckConstraint("scope in ('full', 'read', 'upload', 'jobs', 'metrics')", name="scope"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)

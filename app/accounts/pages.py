@@ -28,7 +28,13 @@ from app.settings import get_settings
 
 router = APIRouter()
 
-SCOPE_NAMES = {Scope.FULL: "all that I may", Scope.READ: "read", Scope.UPLOAD: "upload and read", Scope.JOBS: "jobs and read"}
+SCOPE_NAMES = {
+    Scope.FULL: "all that I may",
+    Scope.READ: "read",
+    Scope.UPLOAD: "upload and read",
+    Scope.JOBS: "jobs and read",
+    Scope.METRICS: "figures of the service alone",
+}
 _A_DAY_S = 86_400
 _passwords = Bounded(2, 100)  # argon2 takes all of a core and 64 MiB each time
 

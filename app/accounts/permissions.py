@@ -45,6 +45,7 @@ SCOPES: dict[Scope, frozenset[str] | None] = {
     Scope.READ: _VIEWER,
     Scope.UPLOAD: _VIEWER | {UPLOAD},
     Scope.JOBS: _VIEWER | {RUN_JOBS},
+    Scope.METRICS: frozenset(),
 }
 """The permissions that a token's scope leaves of its user's; None leaves all. Blinding follows the role alone."""
 

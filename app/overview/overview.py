@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
+from sqlalchemy import true
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
@@ -20,6 +21,7 @@ from app.accounts.repository import studies
 from app.accounts.service import reads_whole_audit
 from app.overview import repository, state, wording
 from app.overview.audit_words import headline, sentence
+from app.overview.trail.repository import of_reader
 from app.platform.audit import AUDITED, AuditEvent
 from app.platform.database import Db
 from app.platform.errors import Forbidden, NotFound
@@ -87,16 +89,17 @@ def audit(
     entity_id: Annotated[Text, Query(max_length=200)] = "",
     actor: Annotated[Text, Query(max_length=254)] = "",
 ) -> HTMLResponse:
-    """Who changed what, when and why, newest first."""
+    """Who changed what, when and why, newest first; of the studies and sites in which the caller reads it."""
     caller.require(can.READ_AUDIT)
-    if not reads_whole_audit(db, caller):
-        raise Forbidden("The audit trail covers all studies and sites, and your role does not.", "Ask an administrator of all studies.")
-    events, total = repository.audit_events(db, entity, entity_id, actor.strip().lower(), paging.limit, paging.offset)
+    whole = reads_whole_audit(db, caller)
+    within = true() if whole else of_reader(caller)
+    events, total = repository.audit_events(db, within, entity, entity_id, actor.strip().lower(), paging.limit, paging.offset)
     page = render(
         request,
         "overview/audit.html",
         acts=acts(db, events, caller),
         total=total,
+        whole=whole,
         paging=paging,
         entities=sorted(AUDITED),
         filters={"entity": entity, "entity_id": entity_id, "actor": actor},

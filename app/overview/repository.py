@@ -6,7 +6,7 @@ import datetime as dt
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from sqlalchemy import Row, Select, false, func, select
+from sqlalchemy import ColumnElement, Row, Select, false, func, select
 from sqlalchemy.orm import Session, joinedload
 
 from app.accounts.permissions import Caller
@@ -21,9 +21,11 @@ from app.study.models import Participant, QocRevision, StudySession, Visit
 from app.study.repository import in_scope
 
 
-def audit_events(db: Session, entity: str, entity_id: str, actor: str, limit: int, offset: int) -> tuple[Sequence[AuditEvent], int]:
-    """A page of the audit trail, newest first, and how many rows match; empty filters match all."""
-    query: Select[AuditEvent] = select(AuditEvent)
+def audit_events(
+    db: Session, within: ColumnElement[bool], entity: str, entity_id: str, actor: str, limit: int, offset: int
+) -> tuple[Sequence[AuditEvent], int]:
+    """A page of the audit trail, newest first, and how many rows match; empty filters match all. `within`: rows that may be read."""
+    query: Select[AuditEvent] = select(AuditEvent).where(within)
     for column, wanted in ((AuditEvent.entity, entity), (AuditEvent.entity_id, entity_id), (AuditEvent.actor, actor)):
         if wanted:
             query = query.where(column == wanted)

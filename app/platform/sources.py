@@ -5,6 +5,7 @@ Kept in the memory of one process: several web processes each count for themselv
 
 from __future__ import annotations
 
+import ipaddress
 import math
 import threading
 import time
@@ -70,6 +71,16 @@ class Allowance:
 def network_address(request: Request) -> str:
     """Where a request comes from; behind a proxy that uvicorn trusts (FORWARDED_ALLOW_IPS) the address that the proxy names."""
     return request.client.host if request.client else "unknown"
+
+
+def from_this_machine(request: Request) -> bool:
+    """Whether a request comes from this machine and no proxy has passed it on."""
+    if any(name in request.headers for name in ("forwarded", "x-forwarded-for", "x-real-ip", "via")):
+        return False
+    try:
+        return ipaddress.ip_address(network_address(request)).is_loopback
+    except ValueError:
+        return False
 
 
 def in_words(seconds: int) -> str:

@@ -11,6 +11,7 @@ from fastapi.testclient import TestClient
 from app.accounts import service as accounts
 from app.accounts.models import Role
 from app.learning.policies.baselines import constant_onnx
+from app.main import DESCRIPTION
 from app.platform.database import transaction
 
 MAPPING = {
@@ -45,7 +46,7 @@ METHODS = ("get", "post", "put", "patch", "delete")
 def routes(app: Any) -> list[tuple[str, str]]:
     """(method, path) of every route of the REST interface, as the service has them, but its own description."""
     found = [(m.lower(), c.path) for c in iter_route_contexts(app.routes) if c.path for m in sorted(getattr(c, "methods", None) or ())]
-    return [(m, p) for m, p in found if m in METHODS and p.startswith(("/api/", "/healthz", "/readyz")) and p != app.openapi_url]
+    return [(m, p) for m, p in found if m in METHODS and p.startswith(("/api/", "/healthz", "/readyz")) and p != DESCRIPTION]
 
 
 def token_of(role: str, study: str | None = None, name: str | None = None) -> str:
@@ -113,9 +114,9 @@ class World:
             ("post", "/studies/{study_code}/sites"): {"json": {"code": "south", "name": "South"}},
             ("patch", "/studies/{study_code}/sites/{site_code}"): {"json": {"name": "Main clinic", "reason": "moved"}},
             ("put", "/participants/{code}/settings"): {"code": "P3", "json": {"settings": {"gamma": 0.9}}},
-            ("post", "/visits/{visit_id}/lock"): {"json": {"reason": "complete"}},
+            ("post", "/visits/{visit_id}/lock"): {"json": {"reason": "complete", "password": PASSWORD}},
             ("post", "/visits/{visit_id}/unlock"): {"json": {"reason": "rating misread"}},
-            ("post", "/participants/{code}/margins/locks"): {"json": {"version": 2, "reason": "protocol"}},
+            ("post", "/participants/{code}/margins/locks"): {"json": {"version": 2, "reason": "protocol", "password": PASSWORD}},
             ("put", "/participants/{code}/margins"): {"json": {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}},
             ("get", "/participants/{code}/replay"): {"params": self.replayed(small)},
             ("put", "/participants/{code}/characteristics"): {
@@ -167,6 +168,7 @@ class World:
                 "json": {"reason": "the program changed"},
             },
             ("post", "/participants/{code}/policies"): {"data": {"name": "x"}, "files": {"file": ("x.onnx", constant_onnx(0.5, 10))}},
+            ("post", "/policies/{policy_id}/release"): {"json": {"password": PASSWORD}},
             ("patch", "/policies/{policy_id}"): {"json": {"retired_reason": "worn out"}},
             ("post", "/participants/{code}/jobs"): {"code": "P4", "json": {"kind": "evaluate", "preset": "quick", "methods": ["linear"]}},
             ("post", "/jobs/{job_id}/cancel"): {

@@ -178,6 +178,16 @@ INTENDED: dict[str, str] = {
         "API: a plan is approved by a signature",
     ),
     **dict.fromkeys(
+        (
+            "components > schemas > PolicyReleaseIn",
+            "components > schemas > PolicyReleaseLimits",
+            "components > schemas > PolicyReleaseOut",
+            "components > schemas > SignatureState",
+            "paths > /api/v1/policies/{policy_id}/release",
+        ),
+        "API: policies are released for testing by a signature",
+    ),
+    **dict.fromkeys(
         ("paths > /api/v1/bundle-withdrawals", "paths > /api/v1/visits/{visit_id}/plan/sessions/{position}/bundle"),
         "API: bundles for the sessions of a signed plan",
     ),
@@ -276,6 +286,7 @@ INTENDED: dict[str, str] = {
             "components > schemas > MarginsLockOut",
             "components > schemas > VisitLockIn",
             "components > schemas > VisitLockOut",
+            "components > schemas > VisitUnlockIn",
             "paths > /api/v1/participants/{code}/margins/locks",
             "paths > /api/v1/visits/{visit_id}/lock",
             "paths > /api/v1/visits/{visit_id}/locks",

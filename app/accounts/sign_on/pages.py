@@ -18,7 +18,7 @@ from app.accounts import service as accounts
 from app.accounts.browser import SIGNED_OUT, count_try, failed_sign_ins, local_path, signed_in
 from app.accounts.deps import COOKIE, CurrentCaller
 from app.accounts.sign_on import service
-from app.accounts.sign_on.provider import RETURN_PATH, Begun, Identity, Refused, configured, provider
+from app.accounts.sign_on.provider import RETURN_PATH, Begun, Identity, ProviderAway, Refused, configured, provider
 from app.platform.database import new_session, set_actor
 from app.platform.errors import BetaloopError, NotFound, TooMany, Unauthorized
 from app.platform.web.templates import render
@@ -60,7 +60,7 @@ def begin_to_confirm(caller: CurrentCaller, next: str = "/") -> Response:
 def come_back(request: Request) -> Response:
     """Where the provider sends the browser to."""
     _require_configured()
-    way = _opened(request.cookies.get(BEGUN, ""))
+    way, source = _opened(request.cookies.get(BEGUN, "")), None
     try:
         if way is None:
             raise Refused("This sign-on was not begun in this browser, or more than ten minutes ago.", "Begin again from here.")
@@ -68,6 +68,8 @@ def come_back(request: Request) -> Response:
         answer = _arrived(request, way, provider().finish(way.begun, request.query_params, _max_age_s()))
         failed_sign_ins.give_back(source)
     except BetaloopError as error:
+        if isinstance(error, ProviderAway) and source is not None:
+            failed_sign_ins.give_back(source)  # nobody was refused
         answer = _refusal(request, error, way)
     # each begin is good for one return
     answer.delete_cookie(BEGUN, path=_PATH, httponly=True, samesite="lax", secure=get_settings().cookie_secure)

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import lru_cache
 from typing import Any
 from urllib.parse import urlencode, urlsplit
@@ -68,11 +69,13 @@ class Identity:
 
     Attributes:
         issuer, subject: name the person for good. address: an e-mail address that the provider vouches for, or None.
+        asked_at: when the provider asked them, by its clock.
     """
 
     issuer: str
     subject: str
     address: str | None
+    asked_at: datetime
 
 
 def configured() -> bool:
@@ -243,7 +246,9 @@ class Provider:
         subject = claims["sub"]
         if not isinstance(subject, str) or not 0 < len(subject) <= 255:
             raise Refused("What the provider said of you names nobody.", "Tell those who run the sign-on.")
-        return Identity(self.issuer, subject, self._address(claims))
+        if claims["auth_time"] > time.time() + LEEWAY_S:
+            raise Refused("The provider's clock is ahead of ours.", "Tell those who run the sign-on.")
+        return Identity(self.issuer, subject, self._address(claims), datetime.fromtimestamp(claims["auth_time"], UTC))
 
     def _address(self, claims: Mapping[str, Any]) -> str | None:
         address = claims.get(self._claim)

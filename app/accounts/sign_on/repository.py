@@ -16,6 +16,12 @@ def link_of(db: Session, issuer: str, subject: str) -> SignOnLink | None:
     return db.scalar(select(SignOnLink).where(mine).options(selectinload(SignOnLink.user).selectinload(User.memberships)))
 
 
+def use_login(db: Session, link: SignOnLink, at: datetime) -> bool:
+    """Note that a login, made at the provider at `at`, was shown here; whether it is newer than all that were. Two show not the same."""
+    newer = (SignOnLink.id == link.id) & (SignOnLink.last_used_at.is_(None) | (SignOnLink.last_used_at < at))
+    return db.scalar(update(SignOnLink).where(newer).values(last_used_at=at).returning(SignOnLink.id)) is not None
+
+
 def link_of_user(db: Session, user_id: int, issuer: str) -> SignOnLink | None:
     """The link of a user at a provider."""
     return db.scalar(select(SignOnLink).where(SignOnLink.user_id == user_id, SignOnLink.issuer == issuer))

@@ -16,6 +16,7 @@ from app.platform.audit import record
 from app.platform.database import now, set_actor
 from app.platform.errors import Forbidden
 
+_AGAIN = "Begin again, and give your password there; or give the one of here."
 CONFIRMED_FOR = timedelta(minutes=5)
 """A confirmation that is older signs nothing."""
 
@@ -38,7 +39,10 @@ def sign_on(db: Session, identity: Identity) -> str:
     if link is None:
         if repository.link_of_user(db, user.id, identity.issuer):
             raise _refused(db, user.email, "The account of your address belongs to somebody else at the sign-on.")
-        db.add(SignOnLink(user_id=user.id, issuer=identity.issuer, subject=identity.subject))
+        link = SignOnLink(user_id=user.id, issuer=identity.issuer, subject=identity.subject)
+        db.add(link)
+        db.flush()
+    repository.use_login(db, link, identity.asked_at)
     return open_session(db, user, identity.issuer)
 
 
@@ -46,7 +50,7 @@ def confirm(db: Session, caller: Caller, identity: Identity) -> None:
     """Note that the user of a browser session has shown, just now, who they are: it stands for the password of one signature.
 
     Raises:
-        Refused: it was somebody else.
+        Refused: it was somebody else, or a login that was shown here before, for a sign-on or another signature.
     """
     link = repository.link_of(db, identity.issuer, identity.subject)
     row = db.get(SignIn, caller.sign_in_id) if caller.sign_in_id is not None else None
@@ -56,6 +60,8 @@ def confirm(db: Session, caller: Caller, identity: Identity) -> None:
         )
     if row is None or link.user_id != caller.user_id:
         raise _refused(db, caller.label, "Somebody else has signed on at the provider than the user of this page.")
+    if not repository.use_login(db, link, identity.asked_at):
+        raise _refused(db, caller.label, "The provider has not asked you again who you are since you last signed on or confirmed.", _AGAIN)
     row.confirmed_at = now()
 
 
@@ -79,8 +85,8 @@ def _user_of(db: Session, address: str | None) -> User | None:
     return user if user is not None and address is not None and user.email == address.strip().lower() else None
 
 
-def _refused(db: Session, whose: str, detail: str) -> Refused:
+def _refused(db: Session, whose: str, detail: str, hint: str = "Ask an administrator of the study.") -> Refused:
     db.rollback()
     record(db, "refuse", "sign_on", whose)
     db.commit()
-    return Refused(detail, "Ask an administrator of the study.")
+    return Refused(detail, hint)

@@ -40,7 +40,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "membership": (),
     "second_factor": ("sealed_secret", "recovery", "last_used_at"),
     "sign_in": ("token_sha256", "last_seen_at"),
-    "sign_on_link": (),
+    "sign_on_link": ("last_used_at",),
     "api_token": ("token_sha256", "last_used_at"),
     "study": (),
     "site": (),

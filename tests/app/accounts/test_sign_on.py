@@ -17,12 +17,9 @@ from typer.testing import CliRunner
 from app import cli
 from app.accounts import service as accounts
 from app.accounts.models import Role, User
-from app.accounts.permissions import Caller
 from app.accounts.sign_on import provider as ours
 from app.accounts.sign_on import service
-from app.accounts.signing import sign
-from app.platform.database import new_session, now, set_actor
-from app.platform.errors import Forbidden
+from app.platform.database import new_session
 from app.settings import get_settings
 from tests import identity_provider as theirs
 from tests.conftest import PASSWORD
@@ -174,6 +171,7 @@ def _other_key(hospital: theirs.Provider) -> None:
         _claims(sub=17),
         _claims(auth_time=None),
         _claims(auth_time=time.time() - 7200),
+        _claims(auth_time=int(time.time()) + 3600),
         _claims(at_hash="AAAA"),
         _other_key,
         theirs.Provider.sign_with_the_public_key,
@@ -181,7 +179,21 @@ def _other_key(hospital: theirs.Provider) -> None:
         lambda hospital: setattr(hospital, "secret", "changed there"),
     ],
     ids=[
-        *("nonce", "no-nonce", "aud", "azp", "iss", "expired", "early", "no-sub", "sub-type", "no-auth-time", "old-auth-time", "at-hash"),
+        *(
+            "nonce",
+            "no-nonce",
+            "aud",
+            "azp",
+            "iss",
+            "expired",
+            "early",
+            "no-sub",
+            "sub-type",
+            "no-auth-time",
+            "old-auth-time",
+            "early-auth-time",
+            "at-hash",
+        ),
         *("other-key", "public-key", "unsigned", "secret"),
     ],
 )
@@ -244,6 +256,27 @@ def test_a_refusal_there_and_a_provider_that_is_away_are_said(browser: TestClien
         ours.Provider("http://127.0.0.1:9", theirs.CLIENT_ID, "", PUBLIC).metadata()
 
 
+def test_a_provider_that_is_away_uses_up_no_tries(
+    browser: TestClient, hospital: theirs.Provider, ada: User, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.accounts.browser.failed_sign_ins._most", lambda: 5)
+    back = sent_back(browser, "/sign-on")
+    begun = browser.cookies["betaloop_sign_on"]
+
+    def away(*_: Any) -> Any:
+        raise ours.ProviderAway("St. Elsewhere does not answer as it should.")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ours.Provider, "_exchanged", away)
+        codes = []
+        for _ in range(8):
+            remember(browser, begun)
+            codes.append(browser.get(back).status_code)
+    assert codes == [503] * 8
+    remember(browser, begun)
+    assert browser.get(back).status_code == 303, "it is back, and nobody has to wait"
+
+
 def test_renewed_keys_are_read_again_but_not_for_every_forged_token(
     browser: TestClient, hospital: theirs.Provider, ada: User, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -279,71 +312,38 @@ def test_somebody_who_signed_on_there_long_ago_is_asked_again(browser: TestClien
     assert hospital.asked == 1
 
 
-def caller_in(browser: TestClient) -> Caller:
-    with new_session() as db:
-        caller = accounts.caller_of_cookie(db, browser.cookies["betaloop_session"])
-    assert caller is not None
-    return caller
-
-
-def signs(browser: TestClient, password: str = "") -> None:
-    caller = caller_in(browser)
-    with new_session() as db:
-        set_actor(db, caller.label, caller.user_id)
-        sign(db, caller, password, kind="test", subject_id=1, meaning="read", content={"a": 1})
-        db.commit()
-
-
-def test_a_fresh_sign_on_stands_for_the_password_of_one_signature(
-    browser: TestClient, hospital: theirs.Provider, ada: User, db: Session
-) -> None:
-    assert signed_on(browser).status_code == 303
-    with pytest.raises(Forbidden, match="password is wrong"):
-        signs(browser)
-    back = signed_on(browser, "/sign-on/confirm?next=/account")
-    assert (back.status_code, back.headers["location"]) == (303, "/account")
-    assert hospital.asked == 2, "asked again, however lately they were"
-    signs(browser)
-    with pytest.raises(Forbidden):
-        signs(browser)
-    signs(browser, PASSWORD)
-    assert db.scalar(text("select count(*) from signature")) == 2
-    assert trail(db, "sign_in") == [("insert", ADA.email), ("update", ADA.email), ("update", ADA.email)]
-
-
-def test_a_confirmation_runs_out_and_is_of_one_browser_session(browser: TestClient, ada: User, db: Session) -> None:
-    assert signed_on(browser).status_code == 303
-    assert signed_on(browser, "/sign-on/confirm").status_code == 303
-    confirmed = caller_in(browser)
-    with new_session() as other:
-        token = accounts.sign_in(other, ADA.email, PASSWORD)
-        other.commit()
-        beside = accounts.caller_of_cookie(other, token)
-        assert beside is not None
-        with pytest.raises(Forbidden):
-            service.use_confirmation(other, beside)
-    db.execute(text("update sign_in set confirmed_at = :at"), {"at": now() - service.CONFIRMED_FOR})
+@pytest.mark.parametrize(
+    ("vouched", "same"),
+    [
+        ("ada@clinic.example", True),
+        (" ADA@Clinic.Example ", True),
+        ("ａｄａ@clinic.example", False),
+        ("ada@ｃlinic.example", False),
+        ("ᴀda@clinic.example", False),
+        ("ada@clinic.example\u200b", False),
+        ("strasse@clinic.example", True),
+        ("straße@clinic.example", False),
+        ("nobody@clinic.example", False),
+        ("", False),
+        (None, False),
+    ],
+)
+def test_an_account_belongs_to_exactly_the_address_that_is_vouched_for(db: Session, ada: User, vouched: str | None, same: bool) -> None:
+    accounts.add_user(db, "strasse@clinic.example", Role.VIEWER, PASSWORD)
     db.commit()
-    with new_session() as other, pytest.raises(Forbidden, match="sign within 5 minutes"):
-        service.use_confirmation(other, confirmed)
+    found = service._user_of(db, vouched)
+    assert (found is not None) is same
+    if found is not None and vouched is not None:
+        assert found.email == vouched.strip().lower()
 
 
-def test_nobody_else_confirms_and_an_old_sign_on_does_not(browser: TestClient, hospital: theirs.Provider, ada: User, db: Session) -> None:
-    accounts.add_user(db, BOB.email, Role.CLINICIAN, PASSWORD)
-    db.commit()
-    for person in (BOB, ADA):  # both are known to the sign-on; the browser session is Ada's
-        hospital.present, hospital.person = None, person
-        browser.cookies.clear()
-        assert signed_on(browser).status_code == 303
-    hospital.person = BOB
-    refused = signed_on(browser, "/sign-on/confirm")
-    assert (refused.status_code, "Somebody else" in refused.text) == (403, True)
-    hospital.person = ADA
-    hospital.change["auth_time"] = int(time.time()) - 120
-    assert "not asked you again" in signed_on(browser, "/sign-on/confirm").text
-    with pytest.raises(Forbidden):
-        signs(browser)
-    assert browser.get("/account").status_code == 200, "Ada is still signed in"
+def test_look_alikes_of_an_address_open_no_account(browser: TestClient, hospital: theirs.Provider, ada: User, db: Session) -> None:
+    for number, look_alike in enumerate(("ａda@clinic.example", "ada＠clinic.example", "ada@clinic。example", "ᵃda@clinic.example")):
+        hospital.present, hospital.person = None, theirs.Person(f"x{number}", look_alike)
+        assert signed_on(browser).status_code == 403, look_alike
+    assert db.scalar(text("select count(*) from sign_on_link")) == 0
+    hospital.present, hospital.person = None, ADA
+    assert signed_on(browser).status_code == 303
 
 
 def test_an_installation_without_a_sign_on_shows_none(anonymous_client: TestClient) -> None:
