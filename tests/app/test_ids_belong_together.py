@@ -29,10 +29,10 @@ RELEASE = "/participants/{code}/policies/{policy_id}/release"
 PAIRS: dict[tuple[str, str], dict[str, Any]] = {
     # every route with two or more ids in its path, and what makes the call of a matched pair succeed
     ("GET", "/participants/{code}/policies/{policy_id}"): {},
+    ("POST", RELEASE): {"data": BUNDLE_FORM["data"] | {"password": PASSWORD}},
     ("POST", "/participants/{code}/policies/{policy_id}/retire"): {"data": {"reason": "worn out"}},
     ("GET", "/participants/{code}/policies/{policy_id}/bundle"): {},
     ("POST", "/participants/{code}/policies/{policy_id}/bundle"): BUNDLE_FORM,
-    ("POST", RELEASE): {"data": BUNDLE_FORM["data"] | {"password": PASSWORD}},
     ("PATCH", "/api/v1/studies/{study_code}/sites/{site_code}"): {"json": {"name": "Moved", "reason": "new house"}},
 }
 Ids = dict[str, Any]
