@@ -84,7 +84,7 @@ class World:
         assert signing.post(f"/api/v1/visits/{blinded}/plan/approve", json={"password": PASSWORD}).status_code == 200
         jobs = self.read("/participants/P4/jobs")["items"]
         small = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "distilled")
-        trained = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "trained")
+        retired = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "trained")
         visit = self.read("/participants/P4/visits")["items"][0]["id"]
         session, graspless = (s["id"] for s in self.read(f"/visits/{visit}/sessions")["items"][:2])
         derived = self.upload("d.csv", TABLE, visit="2", controller="other", more=[("g.csv", GRASPS)])["sessions"][0]["id"]
@@ -169,8 +169,8 @@ class World:
                 "json": {"reason": "the program changed"},
             },
             ("post", "/participants/{code}/policies"): {"data": {"name": "x"}, "files": {"file": ("x.onnx", constant_onnx(0.5, 10))}},
-            ("post", "/policies/{policy_id}/release"): {"policy_id": trained, "json": {"password": PASSWORD}},
-            ("patch", "/policies/{policy_id}"): {"json": {"retired_reason": "worn out"}},
+            ("post", "/policies/{policy_id}/release"): {"json": {"password": PASSWORD}},
+            ("patch", "/policies/{policy_id}"): {"policy_id": retired, "json": {"retired_reason": "worn out"}},
             ("post", "/participants/{code}/jobs"): {"code": "P4", "json": {"kind": "evaluate", "preset": "quick", "methods": ["linear"]}},
             ("post", "/jobs/{job_id}/cancel"): {
                 "job_id": self.send("/participants/P4/jobs", json={"kind": "evaluate", "preset": "quick", "methods": ["linear"]})["id"]
