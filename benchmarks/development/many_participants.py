@@ -1,9 +1,9 @@
 """What a study of a thousand participants costs the database and the pages that look across it, in seconds of the processor.
 
-    python benchmarks/many_participants.py                 1 000 participants x 3 visits x 4 sessions x 4 policies, 400 rows of the trail
-    python benchmarks/many_participants.py --quick         50 participants
+    python -m benchmarks.development.many_participants            1 000 participants x 3 visits x 4 sessions x 4 policies, with a trail
+    python -m benchmarks.development.many_participants --quick    50 participants
 
-One participant is made through the models, as for benchmarks/pages.py; all others are its rows, copied by SQL with numbers and codes of
+One participant is made through the models, as for `benchmarks/pages.py`; all others are its rows, copied by SQL with numbers and codes of
 their own. Then a job is asked for of every participant, as a night of re-ranking does, and each page is read five times. Figures are
 seconds of the processor, of the service (this process) and of PostgreSQL (its processes, from /proc), which other work on the machine
 changes little; median over the reads of a page after its first.
@@ -25,7 +25,6 @@ from typing import Any
 from fastapi.testclient import TestClient
 from sqlalchemy import Computed, Integer, Table, create_engine, text
 from sqlalchemy.orm import Session
-from support.page_study import EMAIL, Extent, add_account, add_participant
 
 from app.accounts import service as accounts
 from app.accounts.permissions import SYSTEM
@@ -35,6 +34,7 @@ from app.platform.database import Base, owner_url, transaction
 from app.platform.migrate import migrate
 from app.settings import get_settings
 from app.study import repository
+from benchmarks.support.page_study import EMAIL, Extent, add_account, add_participant
 
 PAGES = {
     "today": "/",
