@@ -174,7 +174,7 @@ HAZARDS: tuple[Hazard, ...] = (
     Hazard(
         "H18", "An outdated bundle runs: yesterday's, or of a plan that was replaced", (_U, _O), _S3, _P2,
         "A bundle names its visit's day and runs on no other; plans that were replaced stand on the study's signed list of "
-        "withdrawals; a clock that was set back is noticed.",
+        "withdrawals; a clock that was set back by a day is noticed.",
         _P1, "On the day itself the list must reach the tablet.",
     ),
     Hazard(

@@ -8,7 +8,7 @@ out of order where controller and policy say clearly what it was.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta
 from enum import StrEnum
 
@@ -19,6 +19,8 @@ from app.study.models import Controller
 FAR = timedelta(minutes=60)
 """A session that began further than this from what the clinic day entered for a slot is another one."""
 NEAR = timedelta(minutes=10)
+CLOCKS = (timedelta(0), timedelta(hours=1), timedelta(hours=-1))
+"""By how much the clock of a day's recordings may be off against the clinic day's: not at all, or by the hour of summer time."""
 _SHARE = 0.2
 """A session whose length differs from the plan by more than this share is named."""
 
@@ -32,6 +34,8 @@ class Deviation(StrEnum):
     SHORTER = "shorter"
     LONGER = "longer"
     OTHER_DAY = "other_day"
+    OTHER_TIME = "other_time"
+    """It began further than NEAR from what the clinic day says: one of the two clocks is wrong."""
     OTHER_PLAN = "other_plan"
     """A controller's log of a session of another plan."""
     SECOND_RUN = "second_run"
@@ -94,7 +98,7 @@ def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) 
     open_slots = [p for p in slots if p.item_id not in pairs]
     # a log that names its slot fills that one or none, and one of a bench never any
     free = [s for s in sessions if s.session_id not in taken and s.logged is None and not s.bench]
-    in_order = _aligned(open_slots, free)
+    in_order = _by_clock(open_slots, free)
     pairs |= in_order
     taken |= {s.session_id for s in in_order.values()}
     crossed = set()
@@ -150,8 +154,19 @@ def _score(slot: Planned, session: Done) -> float:
     return 0.0 if apart > FAR else known + (2.0 if apart <= NEAR else 0.0)
 
 
-def _aligned(slots: Sequence[Planned], sessions: Sequence[Done]) -> dict[int, Done]:
-    """The best assignment that keeps the order of both."""
+def _by_clock(slots: Sequence[Planned], sessions: Sequence[Done]) -> dict[int, Done]:
+    """The best assignment by the recordings' clock as it is, or an hour off where that explains more of at least two sessions."""
+    own = {s.session_id: s for s in sessions}
+    best, most = {}, -1.0
+    for off in CLOCKS:
+        found, score = _aligned(slots, [s if s.began is None else replace(s, began=s.began - off) for s in sessions])
+        if not off or (len(found) > 1 and score > most):
+            best, most = found, score
+    return {item: own[s.session_id] for item, s in best.items()}
+
+
+def _aligned(slots: Sequence[Planned], sessions: Sequence[Done]) -> tuple[dict[int, Done], float]:
+    """The best assignment that keeps the order of both, and how much it explains."""
     best = np.zeros((len(slots) + 1, len(sessions) + 1))
     for i, slot in enumerate(slots):
         for j, session in enumerate(sessions):
@@ -171,7 +186,7 @@ def _aligned(slots: Sequence[Planned], sessions: Sequence[Done]) -> dict[int, Do
             assert score > 0
             found[slots[i - 1].item_id] = sessions[j - 1]
             i, j = i - 1, j - 1
-    return found
+    return found, float(best[-1, -1])
 
 
 def _judged(slot: Planned, session: Done | None, crossed: bool, day: date | None) -> Match:
@@ -185,4 +200,6 @@ def _judged(slot: Planned, session: Done | None, crossed: bool, day: date | None
         said.append(Deviation.LONGER)
     if day is not None and session.began is not None and abs((session.began.date() - day).days) > 1:
         said.append(Deviation.OTHER_DAY)
+    elif slot.began is not None and session.began is not None and abs(slot.began - session.began) > NEAR:
+        said.append(Deviation.OTHER_TIME)
     return Match(slot.item_id, session.session_id, tuple(said))

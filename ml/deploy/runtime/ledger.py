@@ -34,9 +34,13 @@ class Ledger:
     folder: Path
 
     def check_clock(self, now: datetime) -> None:
-        """Raise NotAllowed where the tablet's clock stands before a time that it has shown already."""
+        """Raise NotAllowed where the tablet's clock stands on a day before one that it has shown already.
+
+        Within a day a clock that was fast may be set right: that opens nothing, for a slot runs on its own day alone and once, and what was
+        withdrawn is remembered.
+        """
         latest = self._latest()
-        if latest is not None and now < latest - CLOCK_TOLERANCE:
+        if latest is not None and now < latest - CLOCK_TOLERANCE and now.date() < latest.astimezone(now.tzinfo).date():
             raise NotAllowed(
                 Refusal.CLOCK,
                 f"the tablet's clock says {now:%Y-%m-%d %H:%M} and has said {latest.astimezone(now.tzinfo):%Y-%m-%d %H:%M} before: set it",

@@ -14,6 +14,7 @@ import zipfile
 from collections.abc import Iterable
 from datetime import datetime, timedelta
 from pathlib import Path
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
@@ -162,6 +163,34 @@ def test_a_bundle_of_tomorrow_waits_and_a_clock_that_is_set_back_opens_nothing(t
     run(of_slot(tmp_path, slot=tomorrow), tmp_path, MORNING + timedelta(days=1))
     with pytest.raises(Invalid, match="has said 2026-03-03 09:30 before"):
         run(of_slot(tmp_path), tmp_path, MORNING, log="back.csv")
+
+
+@pytest.mark.hazard("H18")
+def test_a_clock_that_was_an_hour_fast_may_be_set_right_within_the_day(tmp_path: Path) -> None:
+    run(of_slot(tmp_path), tmp_path, MORNING + timedelta(hours=1))
+    second = of_slot(tmp_path, slot=dataclasses.replace(SLOT, slot_id=21, position=3))
+    assert run(second, tmp_path, MORNING + timedelta(minutes=15), log="second.csv").end is End.COMPLETE
+    with pytest.raises(Invalid, match="a slot runs once"):
+        run(of_slot(tmp_path), tmp_path, MORNING + timedelta(minutes=30), log="again.csv")
+
+
+@pytest.mark.hazard("H12")
+@pytest.mark.parametrize("start", ["2026-10-25T00:58:00+00:00", "2026-03-29T00:58:00+00:00"])
+def test_summer_time_that_ends_or_begins_in_mid_session_changes_neither_periods_nor_times(tmp_path: Path, start: str) -> None:
+    began, place = datetime.fromisoformat(start), ZoneInfo("Europe/Berlin")
+    slot = dataclasses.replace(SLOT, visit_date=start[:10], issued_at=f"{start[:10]}T00:10:00+00:00")
+    opened = verified(of_slot(tmp_path, slot=slot), PUBLIC)
+    device = SimulatedDevice(brain_of("P1:3", opened.manifest, 400), opened.manifest)
+    ledger = Ledger(tmp_path / "ledger")
+    tablet = Tablet(ledger=ledger, now=lambda: (began + timedelta(seconds=device.now())).astimezone(place))
+    log = tmp_path / "log.csv"
+    outcome = run_slot(opened.manifest_json, opened.manifest_sha256, opened.controller(), device, log, tablet)
+    assert outcome.end is End.COMPLETE
+    assert tablet.now().utcoffset() != began.astimezone(place).utcoffset(), "the hour changed on the way"
+    np.testing.assert_allclose(np.diff([d.t_s for d in outcome.session.decisions]), 2.0, atol=0.5)
+    (recording,) = decode(log).recordings
+    assert recording.started_at == began + timedelta(seconds=20)
+    ledger.check_clock(tablet.now())  # raises where the hour that came twice is taken for a clock that was set back
 
 
 @pytest.mark.hazard("H15")

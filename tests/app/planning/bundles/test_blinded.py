@@ -120,6 +120,20 @@ def test_the_page_of_bundles_tells_the_limits_of_all_sessions_alike_until_the_ke
     assert any(re.search(r"\s3 mA, cDBS", row) for row in rows()), "a session of cDBS has one amplitude"
 
 
+def test_the_page_of_a_policy_lists_the_bundles_of_a_sealed_plan_once_its_key_is_opened(
+    client: TestClient, db: Session, studied: Any, policies: list[int], bundles: dict[int, bytes]
+) -> None:
+    def taken() -> int:
+        page = client.get(f"/participants/P1/policies/{policies[0]}/bundle", headers={"Accept": "text/html"})
+        assert page.status_code == 200
+        return page.text.count("cDBS 3 mA, ramp")
+
+    assert db.scalar(text("select count(*) from bundle_release where policy_id = :id"), {"id": policies[0]}) == 1
+    assert taken() == 0, "when it was taken, beside the other sessions' bundles, would tell which session it was"
+    assert client.post(f"/api/v1/visits/{studied.visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
+    assert taken() == 1
+
+
 def test_a_sealed_part_that_was_exchanged_or_cut_is_no_bundle(client: TestClient, bundles: dict[int, bytes]) -> None:
     key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(client.get("/api/v1/bundle-key").text.strip()))
     first, second = (files_of(bundles[p]) for p in (1, 2))

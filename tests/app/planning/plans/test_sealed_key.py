@@ -216,6 +216,8 @@ def test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened(
     db.commit()
     members = {m.session_id: m.left_out_reason or "" for m in before.members}
     assert all("blinded plan is sealed" in members[s] for s in held.values())
+    slots = f"/api/v1/visits/{studied.visit}/slots"
+    assert not [r for r in client.get(slots).json()["rows"] if r["predicted"] or "energy" in r["done"]], "100 % of cDBS would name cDBS"
     found = client.get("/api/v1/participants/P1/analyses").json()
     assert {e["reason"] for e in found["excluded"] if e["session_id"] in held.values()} == {"the key of its visit's blinded plan is sealed"}
     assert "visit 2: the key of its blinded plan is sealed" in client.get("/api/v1/participants/P1/calibration").json()["left_out"]
@@ -223,6 +225,7 @@ def test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened(
     assert "the sessions of visit 2, whose blinded plan's key is sealed" in package.read("P1/README.txt").decode()
     assert not set(map(str, held.values())) & {line.split(",")[0] for line in package.read("P1/sessions.csv").decode().splitlines()}
     open_key(client, studied.visit)
+    assert all("energy" in r["done"] for r in client.get(slots).json()["rows"])
     db.expire_all()
     after = take_snapshot(db, participant, SYSTEM)
     kept = {m.session_id for m in after.members if m.left_out_reason is None}

@@ -46,6 +46,29 @@ def test_the_clinic_days_times_say_which_of_two_cdbs_sessions_is_missing() -> No
     assert filled(match(slots, held, DAY)) == [1, None, None, 4, None]
 
 
+def test_recordings_whose_clock_is_an_hour_off_find_their_slots_and_are_said_to_be() -> None:
+    slots = [Planned(p.item_id, p.controller, p.policy_id, p.minutes, NINE + timedelta(minutes=20 * i)) for i, p in enumerate(PLAN)]
+    for off in (60, -60, 61):  # summer time either way, and a drift beside it
+        held = [done(20 + i, None, at=off + 20 * i + 1) for i in range(5)]
+        found = match(slots, held, DAY)
+        assert filled(found) == [20, 21, 22, 23, 24], off
+        assert {m.deviations for m in found} == {(Deviation.OTHER_TIME,)}
+    right = match(slots, [done(20 + i, None, at=20 * i + 1) for i in range(5)], DAY)
+    assert (filled(right), {m.deviations for m in right}) == ([20, 21, 22, 23, 24], {()})
+    late = match(slots, [done(22, None, at=41), done(23, None, at=61), done(24, None, at=81)], DAY)
+    assert filled(late) == [None, None, 22, 23, 24], "an hour is not supposed where the clock explains as much"
+
+
+def test_a_log_of_a_tablet_whose_clock_is_fast_fills_its_slot_and_is_said_to_be_off() -> None:
+    slots = [Planned(p.item_id, p.controller, p.policy_id, p.minutes, NINE + timedelta(minutes=20 * i)) for i, p in enumerate(PLAN)]
+    logs = [
+        Done(30 + i, p.controller, p.policy_id, 600.0, NINE + timedelta(minutes=60 + 20 * i), logged=p.item_id) for i, p in enumerate(PLAN)
+    ]
+    found = match(slots, logs, DAY)
+    assert filled(found) == [30, 31, 32, 33, 34]
+    assert {m.deviations for m in found} == {(Deviation.OTHER_TIME,)}
+
+
 def test_open_sessions_take_the_place_that_their_order_leaves() -> None:
     held = [done(1, None), done(2, Controller.CDBS), done(3, None), done(4, Controller.CDBS), done(5, None)]
     assert filled(match(PLAN, held, DAY)) == [1, 2, 3, 4, 5]

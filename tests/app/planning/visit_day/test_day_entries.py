@@ -74,6 +74,16 @@ def test_times_are_the_services_by_the_tablets_clock_and_its_offset(clinic_day: 
     assert (times.started_at, times.stopped_at) == (datetime(2026, 11, 22, 10, tzinfo=UTC), datetime(2026, 11, 22, 10, 10, 30, tzinfo=UTC))
 
 
+def test_an_hour_that_the_clock_has_twice_makes_no_session_longer(clinic_day: Any, db: Session) -> None:
+    start = clinic_day.entry("start", device_time="2026-10-25T02:58:00+02:00")
+    stop = clinic_day.entry("stop", device_time="2026-10-25T02:08:00+01:00")
+    assert clinic_day.outcomes(start, stop) == ["stored", "stored"]
+    times = slot_times(db, clinic_day.plan)[clinic_day.slots[0]]
+    assert times.started_at == datetime(2026, 10, 25, 0, 58, tzinfo=UTC)
+    assert times.stopped_at is not None
+    assert (times.stopped_at - times.started_at).total_seconds() == 600
+
+
 def test_outcomes_of_a_session_are_those_of_its_last_attempt(clinic_day: Any, db: Session) -> None:
     clinic_day.outcomes(
         clinic_day.entry("start", device_time=at(0)),
