@@ -46,6 +46,7 @@ READABLE = (
     "/api/v1/participants/{code}/analyses",
     "/api/v1/participants/{code}/analyses/primary",
     "/api/v1/participants/{code}/analyses/energy",
+    "/api/v1/participants/{code}/analyses/battery",
     "/api/v1/participants/{code}/analyses/beta",
     "/api/v1/participants/{code}/analyses/evaluations",
     "/api/v1/analyses",
@@ -143,6 +144,7 @@ BLINDED = {
     ("get", "/api/v1/participants/{code}/analyses"),
     ("get", "/api/v1/participants/{code}/analyses/primary"),
     ("get", "/api/v1/participants/{code}/analyses/energy"),
+    ("get", "/api/v1/participants/{code}/analyses/battery"),
     ("get", "/api/v1/participants/{code}/analyses/beta"),
     ("get", "/api/v1/analyses"),
 }

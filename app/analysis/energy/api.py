@@ -8,8 +8,8 @@ from fastapi import APIRouter, Query, Response
 
 from app.accounts.deps import CurrentCaller
 from app.analysis.energy import service
-from app.analysis.energy.schemas import EnergyOut
-from app.analysis.energy.serializers import CSV_COLUMNS, csv_rows, energy_out
+from app.analysis.energy.schemas import BatteryIn, BatteryOut, EnergyOut
+from app.analysis.energy.serializers import BATTERY_COLUMNS, CSV_COLUMNS, battery_csv_rows, battery_out, csv_rows, energy_out
 from app.analysis.tables import csv_of
 from app.platform.database import Db
 from app.platform.web.csv_files import download
@@ -36,3 +36,19 @@ def read_energy(
     if format == "csv":
         return download(csv_of(CSV_COLUMNS, csv_rows(found)), f"{participant.code}-energy.csv")
     return energy_out(found)
+
+
+@router.get(
+    "/participants/{code}/analyses/battery",
+    response_model=BatteryOut,
+    responses={200: {"content": {"text/csv": {"schema": {"type": "string"}}}}},
+)
+def read_battery(
+    participant: CurrentParticipant, db: Db, caller: CurrentCaller, stated: Annotated[BatteryIn, Query()]
+) -> BatteryOut | Response:
+    """Days of one charge, or of a primary cell, if a controller ran all the time; under assumptions that the query states."""
+    found = service.energy(db, participant, caller)
+    rows = service.battery(found, stated)
+    if stated.format == "csv":
+        return download(csv_of(BATTERY_COLUMNS, battery_csv_rows(found, rows, stated)), f"{participant.code}-battery.csv")
+    return battery_out(found, rows, stated)

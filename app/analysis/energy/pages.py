@@ -14,13 +14,12 @@ from app.analysis.energy.serializers import CSV_COLUMNS, csv_rows
 from app.analysis.energy.wording import MEASURES
 from app.analysis.tables import csv_of
 from app.platform.database import Db
-from app.platform.errors import BetaloopError, Invalid
+from app.platform.errors import BetaloopError
 from app.platform.web.csv_files import download
 from app.platform.web.forms import parse
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.recordings.battery import readings
-from ml.energy import Implant, Range
 
 router = APIRouter()
 
@@ -49,12 +48,11 @@ def energy_page(
     """Every measure of energy with its definition; days of a battery under assumptions that the page's form states."""
     found = service.energy(db, participant, caller, impedance)
     typed = {name: request.query_params.get(name, "") for name in FIELDS}
-    rows, problem, implant = [], None, None
+    rows, problem, implant = list[service.BatteryRow](), None, None
     if any(typed.values()):
         try:
             stated = parse(ImplantIn, typed, {name: label for name, (label, _) in FIELDS.items()})
-            implant = _implant(stated)
-            rows = _battery(found, implant, stated.cdbs_ma)
+            rows, implant = service.battery(found, stated), stated
         except BetaloopError as error:
             problem = error
     page = render(
@@ -78,32 +76,3 @@ def energy_page(
 def energy_table(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
     """Every measure of energy as a table."""
     return download(csv_of(CSV_COLUMNS, csv_rows(service.energy(db, participant, caller))), f"{participant.code}-energy.csv")
-
-
-def _battery(found: service.Energy, implant: Implant, cdbs_ma: float) -> list[service.BatteryRow]:
-    """Raises Invalid where a controller draws nothing and nothing else does."""
-    try:
-        return service.battery(found, implant, cdbs_ma)
-    except ValueError as error:
-        raise Invalid(f"No life follows from these assumptions: {error}.", "State all other drain of the implant, above 0.") from error
-
-
-def _implant(stated: ImplantIn) -> Implant:
-    """Raises Invalid for a range that falls."""
-
-    def exactly(value: float) -> Range:
-        return Range(value, value)
-
-    try:
-        return Implant(
-            capacity_mah=Range(stated.capacity_low_mah, stated.capacity_high_mah),
-            voltage_v=exactly(stated.voltage_v),
-            other_drain_uw=exactly(stated.other_drain_uw),
-            impedance_ohm=exactly(stated.impedance_ohm),
-            supply_v=exactly(stated.supply_v),
-            pulse_width_us=exactly(stated.pulse_width_us),
-            rate_hz=exactly(stated.rate_hz),
-            source=stated.source,
-        )
-    except ValueError as error:
-        raise Invalid(f"These assumptions do not fit together: {error}.", "Give the smaller capacity first.") from error

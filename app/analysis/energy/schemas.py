@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 from pydantic import Field
 
-from app.platform.web.schemas import Model, Number, Text
+from app.platform.web.schemas import Model, Text
 from app.study.models import Controller
+
+Amount = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class MeasureOut(Model):
@@ -32,13 +36,36 @@ class EnergyOut(Model):
 class ImplantIn(Model):
     """Assumptions about an implant; no recording holds them."""
 
-    capacity_low_mah: Number = Field(gt=0, le=1e5)
-    capacity_high_mah: Number = Field(gt=0, le=1e5)
-    voltage_v: Number = Field(gt=0, le=100)
-    other_drain_uw: Number = Field(ge=0, le=1e6)
-    impedance_ohm: Number = Field(gt=0, le=1e5)
-    supply_v: Number = Field(gt=0, le=100)
-    pulse_width_us: Number = Field(gt=0, le=1000)
-    rate_hz: Number = Field(gt=0, le=1000)
-    cdbs_ma: Number = Field(gt=0, le=25.5)
+    capacity_low_mah: Amount = Field(gt=0, le=1e5)
+    capacity_high_mah: Amount = Field(gt=0, le=1e5)
+    voltage_v: Amount = Field(gt=0, le=100)
+    other_drain_uw: Amount = Field(ge=0, le=1e6)
+    impedance_ohm: Amount = Field(gt=0, le=1e5)
+    supply_v: Amount = Field(gt=0, le=100)
+    pulse_width_us: Amount = Field(gt=0, le=1000)
+    rate_hz: Amount = Field(gt=0, le=1000)
+    cdbs_ma: Amount = Field(gt=0, le=25.5)
     source: Text = Field(min_length=1, max_length=300)
+
+
+class BatteryIn(ImplantIn):
+    """The same as a query."""
+
+    format: Literal["json", "csv"] = "json"
+
+
+class BatteryRowOut(Model):
+    """Days of one charge, or of a primary cell, if one controller ran all the time."""
+
+    controller: Controller
+    days_low: float
+    days_high: float
+    session_ids: list[int] = Field(description="Sessions whose amplitudes it goes by.")
+
+
+class BatteryOut(Model):
+    """A battery's life by controller under stated assumptions."""
+
+    participant: str
+    source: str = Field(description="Where the assumptions are from.")
+    rows: list[BatteryRowOut]

@@ -9,9 +9,11 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.analysis.energy.measures import Measure, Pulses, Taken, mean, pulses_of, taken
+from app.analysis.energy.schemas import ImplantIn
 from app.analysis.evidence import repository
 from app.analysis.evidence.facts import Facts
 from app.analysis.evidence.service import Evidence, evidence
+from app.platform.errors import Invalid
 from app.platform.kept import kept
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller, Participant
@@ -43,6 +45,7 @@ class BatteryRow:
     controller: Controller
     label: str
     days: Range
+    session_ids: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -69,25 +72,52 @@ def energy(db: Session, participant: Participant, caller: Caller, impedance_ohm:
     return kept(("energy", held.key, impedance_ohm), compute)
 
 
-def battery(found: Energy, implant: Implant, cdbs_ma: float) -> list[BatteryRow]:
+def battery(found: Energy, stated: ImplantIn) -> list[BatteryRow]:
     """Days of one charge if a controller ran all the time, at the mean and mean square of its amplitude fraction.
 
     Args:
-        found: the energy. implant: assumptions about the implant. cdbs_ma: amplitude of cDBS, mA.
+        found: the energy. stated: assumptions about the implant.
 
     Raises:
-        ValueError: numbers from which no life follows.
+        Invalid: a range that falls, or assumptions from which no life follows.
     """
-    rows = []
-    for controller in Controller:
-        mine = [t for t in found.sessions if t.session.controller is controller]
-        squares = [t.values[Measure.SQUARE] for t in mine if Measure.SQUARE in t.values]
-        means = [t.values[Measure.AMPLITUDE] for t in mine if Measure.AMPLITUDE in t.values]
-        if squares and means:
-            least = implant.life([cdbs_ma * (sum(squares) / len(squares)) ** 0.5]).days
-            most = implant.life([cdbs_ma * sum(means) / len(means)]).days
-            rows.append(BatteryRow(controller, CONTROLLER_NAMES[controller], Range(min(least.low, most.low), max(least.high, most.high))))
-    return rows
+    implant = _implant(stated)
+    try:
+        return [row for c in Controller if (row := _life(found, implant, c, stated.cdbs_ma)) is not None]
+    except ValueError as error:
+        raise Invalid(f"No life follows from these assumptions: {error}.", "State all other drain of the implant, above 0.") from error
+
+
+def _life(found: Energy, implant: Implant, controller: Controller, cdbs_ma: float) -> BatteryRow | None:
+    """None where no session of the controller has an amplitude."""
+    mine = [t for t in found.sessions if t.session.controller is controller and {Measure.SQUARE, Measure.AMPLITUDE} <= t.values.keys()]
+    square, amplitude = (mean([t.values[m] for t in mine]) for m in (Measure.SQUARE, Measure.AMPLITUDE))
+    if square is None or amplitude is None:
+        return None
+    least, most = implant.life([cdbs_ma * square**0.5]).days, implant.life([cdbs_ma * amplitude]).days
+    days = Range(min(least.low, most.low), max(least.high, most.high))
+    return BatteryRow(controller, CONTROLLER_NAMES[controller], days, tuple(t.session.session_id for t in mine))
+
+
+def _implant(stated: ImplantIn) -> Implant:
+    """Raises Invalid for a range that falls."""
+
+    def exactly(value: float) -> Range:
+        return Range(value, value)
+
+    try:
+        return Implant(
+            capacity_mah=Range(stated.capacity_low_mah, stated.capacity_high_mah),
+            voltage_v=exactly(stated.voltage_v),
+            other_drain_uw=exactly(stated.other_drain_uw),
+            impedance_ohm=exactly(stated.impedance_ohm),
+            supply_v=exactly(stated.supply_v),
+            pulse_width_us=exactly(stated.pulse_width_us),
+            rate_hz=exactly(stated.rate_hz),
+            source=stated.source,
+        )
+    except ValueError as error:
+        raise Invalid(f"These assumptions do not fit together: {error}.", "Give the smaller capacity first.") from error
 
 
 def _row(measure: Measure, controller: Controller, sessions: Sequence[Taken]) -> MeasureRow:

@@ -17,8 +17,12 @@ from app.analysis.pooled.schemas import (
 )
 from app.analysis.pooled.service import Pooled, StepTime
 from app.analysis.primary.serializers import average_out, verdict_out
+from app.analysis.trial_time.service import TrialTime
 from ml.statistics.pooling import Summary
 from ml.statistics.within_visits.contrasts import Unavailable
+
+Table = tuple[Sequence[str], Sequence[Sequence[object]]]
+"""Columns and rows."""
 
 
 def pooled_out(found: Pooled, times: Sequence[StepTime]) -> PooledOut:
@@ -45,6 +49,18 @@ def pooled_out(found: Pooled, times: Sequence[StepTime]) -> PooledOut:
         ],
         computation_time=[StepTimeOut(**asdict(t)) for t in times],
     )
+
+
+def trial_table(found: TrialTime) -> Table:
+    """Columns and rows of the trial time, one row per participant and controller."""
+    rows = [(row.participant, t.controller.value, t.sessions, t.minutes) for row in found.rows for t in row.tested]
+    return tuple(TimeTestedOut.model_fields), rows
+
+
+def computation_table(times: Sequence[StepTime]) -> Table:
+    """Columns and rows of the computation time, one row per job and step."""
+    columns = tuple(StepTimeOut.model_fields)
+    return columns, [tuple(asdict(t)[name] for name in columns) for t in times]
 
 
 def _summary(found: Summary | Unavailable) -> SummaryOut:

@@ -87,7 +87,8 @@ def addresses() -> tuple[str, ...]:
         own = [keyed.replace("{key}", key) for key in KEYS] if "{key}" in keyed else [named]
         parameters = answers.get(path, {}).get("get", {}).get("parameters", [])
         formats = [f for p in parameters if p["name"] == "format" for f in p["schema"]["enum"]]
-        made += [f"{p}?format={f}" for p in own for f in formats] or own
+        stated = "".join(f"&{p['name']}=1" for p in parameters if p["in"] == "query" and p["required"])
+        made += [f"{p}?format={f}{stated}" for p in own for f in formats] or own
     return tuple(made)
 
 
@@ -131,6 +132,7 @@ def test_any_study_gets_sentences(client: TestClient, db: Session, enrolled: str
     numbers = count(1)
     really = db.commit
     assert {"/analyses", "/api/v1/analyses?format=svg", "/participants/CODE/analyses/models/rl", "/trial-time"} <= set(addresses())
+    assert any("/analyses/battery?format=csv&" in a for a in addresses())
     assert "{" not in "".join(addresses())
 
     @settings(

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import html
+import io
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -107,6 +111,18 @@ def test_a_battery_lasts_longer_with_less_and_the_answer_is_a_range(client: Test
     low, high = 100 * 3.7e3 / (140.4 + 200) / 24, 120 * 3.7e3 / (70.2 + 200) / 24
     assert f"{low:.1f}" in page.text
     assert f"{high:.1f}" in page.text
+    api = "/api/v1/participants/P1/analyses/battery"
+    cdbs, rl = client.get(api, params=ASSUMED).json()["rows"]
+    assert (cdbs["days_low"], cdbs["days_high"]) == pytest.approx((low, high))
+    assert rl["days_low"] > cdbs["days_low"]
+    assert all(f"/sessions/{i}" in page.text for i in cdbs["session_ids"] + rl["session_ids"])
+    linked = re.search(r'href="([^"]*battery[^"]*format=csv)"', page.text)
+    assert linked
+    table = list(csv.DictReader(io.StringIO(client.get(html.unescape(linked[1])).text)))
+    assert [float(r["days_high"]) for r in table] == pytest.approx([cdbs["days_high"], rl["days_high"]])
+    assert table[0]["source"] == ASSUMED["source"]
+    assert client.get(api, params=ASSUMED | {"capacity_low_mah": "500"}).status_code == 422
+    assert client.get(api, params=ASSUMED | {"rate_hz": "nan"}).status_code == 422
     wrong = client.get("/participants/P1/analyses/energy", params=ASSUMED | {"capacity_low_mah": "500"})
     assert wrong.status_code == 422
     assert "Give the smaller capacity first" in wrong.text

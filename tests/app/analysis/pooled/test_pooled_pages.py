@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 import io
 import re
 from collections.abc import Callable
@@ -119,7 +120,14 @@ def test_computation_time_counts_ended_steps(client: TestClient, db: Session, en
     db.commit()
     (row,) = client.get("/api/v1/analyses").json()["computation_time"]
     assert row == {"job": "train", "step": "train", "n": 3, "median_s": 30.0, "longest_s": 50.0}
-    assert "Computation time" in client.get("/analyses").text
+    shown = client.get("/analyses").text
+    assert "Computation time" in shown
+    for table in ("computation_time", "trial_time"):
+        address = f"/api/v1/analyses?format=csv&table={table}"
+        assert html.escape(address) in shown
+        rows = list(csv.DictReader(io.StringIO(client.get(address).text)))
+        assert [list(r.values()) for r in rows] == [[str(v) for v in r.values()] for r in client.get("/api/v1/analyses").json()[table]]
+    assert client.get("/api/v1/analyses?format=csv&table=weather").status_code == 422
 
 
 def test_without_anything_the_pages_say_so(client: TestClient) -> None:
