@@ -10,6 +10,7 @@ from fastapi.testclient import TestClient
 
 from app.accounts import service as accounts
 from app.accounts.models import Role
+from app.analysis.energy.schemas import ImplantIn
 from app.learning.policies.baselines import constant_onnx
 from app.main import DESCRIPTION
 from app.platform.database import transaction
@@ -120,6 +121,7 @@ class World:
             ("post", "/participants/{code}/margins/locks"): {"json": {"version": 2, "reason": "protocol", "password": PASSWORD}},
             ("put", "/participants/{code}/margins"): {"json": {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}},
             ("get", "/participants/{code}/replay"): {"params": self.replayed(small)},
+            ("get", "/participants/{code}/analyses/battery"): {"params": dict.fromkeys(ImplantIn.model_fields, "1")},
             ("put", "/participants/{code}/characteristics"): {
                 "json": {"version": 0, "characteristics": {"hand": "left"}, "reason": "asked"}
             },
