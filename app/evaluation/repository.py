@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from datetime import datetime
-from typing import Any
+from typing import Any, NamedTuple
 
-from sqlalchemy import Select, or_, select, text
-from sqlalchemy.orm import Session, defer, selectinload
+from sqlalchemy import or_, select, text
+from sqlalchemy.orm import Session, defer
 
-from app.evaluation.models import Evaluation
+from app.evaluation.models import EstimateRow, Evaluation
 from app.learning.models import Policy
 from app.platform.audit import AuditEvent
 
 
 def newest_evaluation(db: Session, participant_id: int) -> Evaluation | None:
-    """The participant's last evaluation with its estimates."""
-    return db.scalar(_evaluations().where(Evaluation.participant_id == participant_id).order_by(Evaluation.id.desc()).limit(1))
+    """The participant's last evaluation; its estimates, with all their draws, are read when something asks for them."""
+    return db.scalar(select(Evaluation).where(Evaluation.participant_id == participant_id).order_by(Evaluation.id.desc()).limit(1))
 
 
 def lock_job(db: Session, job_id: str) -> None:
@@ -26,12 +26,12 @@ def lock_job(db: Session, job_id: str) -> None:
 
 def evaluation_of_job(db: Session, job_id: str) -> Evaluation | None:
     """What a job evaluated."""
-    return db.scalar(_evaluations().where(Evaluation.job_id == job_id))
+    return db.scalar(select(Evaluation).where(Evaluation.job_id == job_id))
 
 
 def evaluation(db: Session, participant_id: int, evaluation_id: int) -> Evaluation | None:
     """A participant's evaluation by its number."""
-    return db.scalar(_evaluations().where(Evaluation.participant_id == participant_id, Evaluation.id == evaluation_id))
+    return db.scalar(select(Evaluation).where(Evaluation.participant_id == participant_id, Evaluation.id == evaluation_id))
 
 
 def evaluation_times(db: Session, participant_id: int) -> dict[int, datetime]:
@@ -44,6 +44,52 @@ def policies_by_id(db: Session, ids: Sequence[int]) -> dict[int, Policy]:
     """Policies by their number; their curves and other metrics are read when something asks for them."""
     query = select(Policy).where(Policy.id.in_(ids)).options(defer(Policy.metrics))
     return {p.id: p for p in db.scalars(query)}
+
+
+def methods(db: Session, evaluation_id: int) -> set[str]:
+    """Methods that an evaluation has estimates of."""
+    return set(db.scalars(select(EstimateRow.method).where(EstimateRow.evaluation_id == evaluation_id).distinct()))
+
+
+class PolicyHead(NamedTuple):
+    """What a ranking says of a policy and judges it by, as values: two equal heads are judged equally.
+
+    `amplitude` is what a constant holds, fraction of cDBS; None for every other policy.
+    """
+
+    id: int
+    name: str
+    kind: str
+    algorithm: str
+    teacher_id: int | None
+    retired_reason: str | None
+    amplitude: float | None
+
+    @property
+    def is_cdbs(self) -> bool:
+        """Whether it is the reference that holds the cDBS amplitude."""
+        return self.kind == "baseline" and self.algorithm == "constant" and self.amplitude == 1.0
+
+
+def head_of(policy: Policy) -> PolicyHead:
+    """The same of a policy that is at hand."""
+    held = _amplitude(policy.config.get("amplitude"))
+    return PolicyHead(policy.id, policy.name, policy.kind, policy.algorithm, policy.teacher_id, policy.retired_reason, held)
+
+
+def policy_heads(db: Session, evaluation_id: int) -> dict[int, PolicyHead]:
+    """Every policy that an evaluation estimated, as it is now, by its number."""
+    estimated = select(EstimateRow.policy_id).where(EstimateRow.evaluation_id == evaluation_id)
+    columns = (Policy.id, Policy.name, Policy.kind, Policy.algorithm, Policy.teacher_id, Policy.retired_reason)
+    query = select(*columns, Policy.config["amplitude"].label("held")).where(Policy.id.in_(estimated)).order_by(Policy.id)
+    return {
+        row.id: PolicyHead(row.id, row.name, row.kind, row.algorithm, row.teacher_id, row.retired_reason, _amplitude(row.held))
+        for row in db.execute(query)
+    }
+
+
+def _amplitude(stored: Any) -> float | None:
+    return float(stored) if isinstance(stored, int | float) else None
 
 
 def changed_since(
@@ -68,7 +114,3 @@ def changed_since(
         if event.after is not None:
             now.append(event.after)
     return then, now
-
-
-def _evaluations() -> Select[Evaluation]:
-    return select(Evaluation).options(selectinload(Evaluation.estimates))

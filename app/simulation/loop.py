@@ -13,7 +13,7 @@ from typing import Protocol
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.evaluation.ranking.service import current_assessment
+from app.evaluation.ranking.service import current
 from app.learning import repository as learning
 from app.pipeline.service import start_job
 from app.planning.plans import repository as plans
@@ -219,7 +219,7 @@ class ParticipantLoop:
 
         Unsafe ones fill what would stay empty, with a reason: nobody is harmed here, and an arm without sessions measures nothing.
         """
-        found = current_assessment(db, person, self.caller)
+        found = current(db, person, self.caller).assessment
         fit = [a for a in found.candidates if a.decided and not a.policy.retired_reason]
         fit.sort(key=lambda a: a.decided is not None and a.decided.needs_override)  # stable: the ranking's order otherwise
         careful = [a for a in fit if a.decided and a.decided.decision == "test_with_care"]

@@ -31,7 +31,6 @@ from app.evaluation import repository
 from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.actual import QUANTITIES, Actual, actual
-from app.evaluation.ranking.assessment import is_cdbs
 from app.evaluation.ranking.results import DrivenSession, driven_sessions
 from app.learning.models import BufferSnapshot, Policy
 from app.planning.plans import repository as plans
@@ -59,7 +58,7 @@ class _Before:
     @property
     def cdbs(self) -> int | None:
         """Id of its cDBS reference."""
-        return next((i for i, p in self.policies.items() if is_cdbs(p)), None)
+        return next((i for i, p in self.policies.items() if repository.head_of(p).is_cdbs), None)
 
 
 def calibration(db: Session, participant: Participant, caller: Caller) -> CalibrationOut:

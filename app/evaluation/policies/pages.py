@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 from sqlalchemy.orm import Session
@@ -11,12 +9,10 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.evaluation import verdict_wording
-from app.evaluation.ranking.answer import Row, answer
-from app.evaluation.ranking.assessment import Assessment
-from app.evaluation.ranking.picture import Picture, picture
-from app.evaluation.ranking.service import current_assessment
+from app.evaluation.ranking.judged import own_row
+from app.evaluation.ranking.service import current
 from app.learning.deps import CurrentOwnPolicy
-from app.learning.models import BufferSnapshot, Policy
+from app.learning.models import Policy
 from app.learning.policies.curves import curve_charts
 from app.learning.sweeps.comparison import below_bound
 from app.platform.database import Db
@@ -34,10 +30,10 @@ router = APIRouter()
 def policy_page(request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """One policy: its verdict and picture, where it comes from, its learning curves, its bundle."""
     try:
-        assessment = current_assessment(db, participant, caller)
+        judged = current(db, participant, caller)
     except NotFound:
-        assessment = None
-    row = _row(assessment, policy) if assessment else None
+        judged = None
+    row = own_row(judged.assessment, judged.answer, policy.id) if judged else None
     below = below_bound(policy)
     page = render(
         request,
@@ -50,25 +46,12 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
         curves=curve_charts(policy.metrics.get("curve", {}), f"policy {policy.name}"),
         config={k: v for k, v in policy.config.items() if not k.endswith("_every")},
         row=row,
-        picture=_picture(db, assessment, row, participant.current_settings.lower_bound) if assessment and row else None,
+        picture=judged.picture(participant.current_settings.lower_bound, policy.id) if judged and row else None,
         plainly=verdict_wording.plainly,
         standing_names=verdict_wording.STANDING_NAMES,
         may_write=may(caller, can.WRITE_POLICIES, participant),
     )
     return HTMLResponse(page)
-
-
-def _row(assessment: Assessment, policy: Policy) -> Row | None:
-    """The policy in the ranking, under its own name; None where it is no candidate of the newest one."""
-    found, own = answer(assessment).everyone().get(policy.id), assessment.of(policy.id)
-    if found is None or own is None or own.decided is None:
-        return None
-    return found if found.one is own else replace(found, one=own, decided=own.decided)
-
-
-def _picture(db: Session, assessment: Assessment, row: Row, lower_bound: float) -> Picture:
-    snapshot = db.get_one(BufferSnapshot, assessment.evaluation.snapshot_id)
-    return picture(assessment, [row], snapshot.beta_unit, lower_bound)
 
 
 def _lineage(db: Session, policy: Policy) -> list[tuple[str, Policy]]:

@@ -11,8 +11,8 @@ from app.evaluation.estimates.coverage import coverage_by_policy, coverage_faile
 from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.decisions import Circumstances, Decided, decide, ordering_told, session_noise
+from app.evaluation.repository import PolicyHead
 from app.evaluation.schemas import CoverageOut, TestedBefore
-from app.learning.models import Policy
 from app.platform.errors import Invalid
 from app.study import cdbs_amplitude
 from app.study.models import Participant, SettingsVersion
@@ -35,7 +35,7 @@ class Assessed:
         decided: the verdict; None for references. coverage: None where nothing was checked. tested: None where it never ran.
     """
 
-    policy: Policy
+    policy: PolicyHead
     reference: str | None
     estimate: Estimate | None
     estimates: Mapping[str, Estimate]
@@ -117,17 +117,18 @@ class Assessment:
 
 def assess(
     evaluation: Evaluation,
-    policies: Mapping[int, Policy],
+    policies: Mapping[int, PolicyHead],
     method: str,
     participant: Participant,
     version: SettingsVersion,
+    cdbs_ma: float | None,
     harmful: Collection[int] = (),
 ) -> Assessment:
     """What an evaluation says of its policies by one method, with the verdicts by the participant's margins of now.
 
     Args:
         evaluation: with its estimates. policies: all of them, by id. method: whose estimates rank; one of the evaluation's.
-        participant: whose. version: the settings that the evaluation rests on.
+        participant: whose. version: the settings that the evaluation rests on. cdbs_ma: as `cdbs_amplitude_now` gives it.
         harmful: policies under which something serious happened that no clinician has cleared.
     """
     table: dict[int, dict[str, Estimate]] = defaultdict(dict)
@@ -136,7 +137,6 @@ def assess(
     coverage, by_method = coverage_by_policy(evaluation), {i: by[method] for i, by in table.items() if method in by}
     references = _references(policies, by_method)
     cdbs = next((table[i] for i, r in references.items() if r == "cdbs"), {})
-    cdbs_ma = _cdbs_ma(participant)
     given = Circumstances(
         evaluation.id,
         evaluation.created_at,
@@ -176,7 +176,7 @@ def assess(
     return Assessment(evaluation, participant, method, found, cdbs_ma, ordered)
 
 
-def _references(policies: Mapping[int, Policy], by_method: Mapping[int, Estimate]) -> dict[int, str]:
+def _references(policies: Mapping[int, PolicyHead], by_method: Mapping[int, Estimate]) -> dict[int, str]:
     """Kinds of the policies that are not ranked; the best constant is so by its own estimate."""
     references = {i: _reference(p) for i, p in policies.items() if p.kind == "baseline"}
     constants = {i: by_method[i] for i, r in references.items() if r in ("cdbs", "constant") and i in by_method and by_method[i].supported}
@@ -187,18 +187,13 @@ def _references(policies: Mapping[int, Policy], by_method: Mapping[int, Estimate
     return references
 
 
-def _reference(policy: Policy) -> str:
+def _reference(policy: PolicyHead) -> str:
     if policy.algorithm != "constant":
         return policy.algorithm
-    return "cdbs" if is_cdbs(policy) else "constant"
+    return "cdbs" if policy.is_cdbs else "constant"
 
 
-def is_cdbs(policy: Policy) -> bool:
-    """Whether a policy is the reference that holds the cDBS amplitude."""
-    return policy.kind == "baseline" and policy.algorithm == "constant" and policy.config.get("amplitude") == 1.0
-
-
-def _cdbs_ma(participant: Participant) -> float | None:
+def cdbs_amplitude_now(participant: Participant) -> float | None:
     """The cDBS amplitude, mA; None where nobody stated one, or each side has its own: amplitudes are then told as shares of cDBS."""
     try:
         return cdbs_amplitude.in_force_now(participant, None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -16,9 +15,9 @@ from app.evaluation.estimates import coverage, held_out
 from app.evaluation.estimates.methods import names
 from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
-from app.evaluation.ranking.answer import OFF_SHARE, Answer, answer
+from app.evaluation.ranking.answer import OFF_SHARE
 from app.evaluation.ranking.export import csv_of
-from app.evaluation.ranking.picture import Picture, picture
+from app.evaluation.ranking.judged import Judged
 from app.evaluation.schemas import RANKING_KINDS, RankingFilter, RankingOut
 from app.learning.snapshots.service import not_ready
 from app.platform.database import Db
@@ -27,11 +26,10 @@ from app.platform.jobs import registry
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.models import JobStatus
 from app.platform.web.forms import parse
-from app.platform.web.templates import render
+from app.platform.web.templates import render, render_part
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.service import may
-from app.study.sessions.repository import ReadOnce
 from ml.ope import registry as estimators
 
 router = APIRouter()
@@ -52,24 +50,15 @@ def ranking_page(
 ) -> HTMLResponse:
     """Policies and ranking; the filter form leaves empty what it does not ask for."""
     shown = parse(RankingFilter, {"supported": supported, "kind": kind, "tested": tested})
+    judged: Judged | None = None
     found: RankingOut | None = None
-    answered: Answer | None = None
-    drawn: Picture | None = None
-    held: dict[str, Any] = {}
-    weights: Mapping[str, float] = {}
-    correlation: float | None = None
     missing: dict[str, Any] | None = None
-    sessions = ReadOnce(db, participant.id)
     try:
-        assessment = ranking.current_assessment(db, participant, caller, method or None, sessions)
-        found, answered = ranking.ranking_of(db, assessment, shown, sessions), answer(assessment)
-        drawn = picture(
-            assessment, [*answered.rows, *answered.like_off], found.snapshot.beta_unit, participant.current_settings.lower_bound
-        )
-        held = held_out.of_evaluation(assessment.evaluation)
-        weights, correlation = assessment.weights, assessment.held_out_correlation
+        judged = ranking.current(db, participant, caller, method or None)
+        found = ranking.ranking_of(judged, shown)
     except NotFound as error:
         missing = error.problem(request.url.path)
+    may_run, may_plan = may(caller, can.RUN_JOBS, participant), may(caller, can.DRAFT_PLAN, participant)
     live = _live_jobs(db, participant)
     blocked = not_ready(db, participant) if found is None else None
     page = render(
@@ -77,41 +66,63 @@ def ranking_page(
         "evaluation/ranking.html",
         participant=participant,
         ranking=found,
-        answer=answered,
-        picture=drawn,
-        held=held,
-        plainly=verdict_wording.plainly,
-        amplitude=wording.amplitude,
-        signed=wording.signed,
-        chance=wording.chance,
-        further=verdict_wording.further_sessions,
-        off_share=OFF_SHARE,
-        weights=weights,
-        correlation=correlation,
-        unfolded=bool(method or shown != RankingFilter()),
-        margins=participant.margins_in_force,
-        levels=participant.current_margins,
+        answer=judged.answer if judged else None,
+        body=_body(judged, found, shown, may_plan, may_run, unfolded=bool(method)) if judged and found else "",
         missing=missing,
-        forest=charts.forest(found) if found else None,
-        references=charts.shown_references(found) if found else [],
-        label=charts.label,
-        method_names=names(),
-        method_short={m.key: m.short for m in estimators.methods()},
-        standing_names=verdict_wording.STANDING_NAMES,
-        standings={number: row.decided.standing for number, row in answered.everyone().items()} if answered else {},
-        coverage=coverage,
-        shown=shown,
         live=live,
         kinds={job.kind: registry.kind(job.kind).title for job in live},
         ranking_kinds=RANKING_KINDS,
         refresh_s=REFRESH_S,
-        may_run=may(caller, can.RUN_JOBS, participant),
-        may_plan=may(caller, can.DRAFT_PLAN, participant),
+        may_run=may_run,
+        may_plan=may_plan,
         may_write=may(caller, can.WRITE_POLICIES, participant),
         readiness=blocked.problem(request.url.path) if blocked else None,
         window=participant.current_settings.window,
     )
     return HTMLResponse(page)
+
+
+def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: bool, may_run: bool, *, unfolded: bool) -> str:
+    """The page below its notes, which is kept: it is made of nothing but what is named here."""
+    participant, unfolded = judged.participant, unfolded or shown != RankingFilter()
+    lower_bound = participant.current_settings.lower_bound
+
+    def write() -> str:
+        answered, assessment = judged.answer, judged.assessment
+        return render_part(
+            "evaluation/_ranking.html",
+            base=f"/participants/{participant.code}",
+            ranking=found,
+            answer=answered,
+            picture=judged.picture(lower_bound),
+            held=held_out.of_evaluation(judged.evaluation),
+            plainly=verdict_wording.plainly,
+            amplitude=wording.amplitude,
+            signed=wording.signed,
+            chance=wording.chance,
+            further=verdict_wording.further_sessions,
+            off_share=OFF_SHARE,
+            weights=assessment.weights,
+            correlation=assessment.held_out_correlation,
+            unfolded=unfolded,
+            margins=participant.margins_in_force,
+            levels=participant.current_margins,
+            forest=charts.forest(found),
+            references=charts.shown_references(found),
+            label=charts.label,
+            method_names=names(),
+            method_short={m.key: m.short for m in estimators.methods()},
+            standing_names=verdict_wording.STANDING_NAMES,
+            standings={number: row.decided.standing for number, row in answered.everyone().items()},
+            coverage=coverage,
+            shown=shown,
+            may_run=may_run,
+            may_plan=may_plan,
+        )
+
+    # `found` less its reasons to be stale, which the page has above, follows from the evaluation, its key and the filter
+    name = ("body", participant.code, lower_bound, tuple(shown.model_dump().items()), may_plan, may_run, unfolded)
+    return judged.kept(name, write)
 
 
 @router.get("/glossary")

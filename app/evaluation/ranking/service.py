@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
-from app.accounts.permissions import SYSTEM, Caller
+from app.accounts.permissions import Caller
 from app.evaluation import repository, verdict_wording, wording
 from app.evaluation.estimates.coverage import coverage_failed
-from app.evaluation.models import Evaluation
-from app.evaluation.ranking.assessment import Assessed, Assessment, assess
+from app.evaluation.ranking.assessment import Assessed, Assessment
+from app.evaluation.ranking.judged import Judged, judged
 from app.evaluation.ranking.notes import ranking_notes
-from app.evaluation.ranking.results import tested_before
 from app.evaluation.ranking.staleness import stale_reasons
 from app.evaluation.schemas import CoverageOut, EstimateOut, FlagOut, GainOut, RankedPolicy, RankedSnapshot, RankingFilter, RankingOut
 from app.evaluation.shown import estimate_out, flag_out, reason_out
 from app.learning.models import BufferSnapshot
-from app.platform.errors import Invalid, NotFound
+from app.platform.errors import NotFound
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.adverse_events.repository import events_of_participant
-from app.study.adverse_events.service import blocked_policies
 from app.study.models import Participant
 from app.study.sessions.repository import ReadOnce
 from ml.ope.compare.gain import gain_over
@@ -43,63 +42,36 @@ def current_ranking(
     Raises:
         NotFound: nothing was evaluated yet. Invalid: the method is not in this evaluation.
     """
-    sessions = ReadOnce(db, participant.id)
-    return ranking_of(db, current_assessment(db, participant, caller, method, sessions), shown, sessions)
+    return ranking_of(current(db, participant, caller, method), shown)
 
 
-def current_assessment(
-    db: Session, participant: Participant, caller: Caller, method: str | None = None, sessions: ReadOnce | None = None
-) -> Assessment:
-    """What the newest evaluation says of every policy, with the verdicts by the margins in force now. Raises as `current_ranking`.
-
-    Args:
-        db, participant, caller, method: as there. sessions: of the participant, where somebody else reads them too.
-    """
+def current(db: Session, participant: Participant, caller: Caller, method: str | None = None) -> Judged:
+    """The newest evaluation, judged by the margins in force now, with what its policies showed in sessions. Raises as `current_ranking`."""
     study.require(caller, can.READ, participant)
     evaluation = repository.newest_evaluation(db, participant.id)
     if evaluation is None:
         raise NotFound(
             f"Participant {participant.code} has no ranking yet.", "Start a job of kind 'pipeline', or 'evaluate' where there are policies."
         )
-    found = assessment_of(db, participant, evaluation, method)
-    return found.with_tests(tested_before(db, evaluation, participant, caller, found.cdbs_id, sessions))
+    return judged(db, participant, evaluation, method, caller, ReadOnce(db, participant.id))
 
 
-def assessment_of(db: Session, participant: Participant, evaluation: Evaluation, method: str | None = None) -> Assessment:
-    """What one evaluation says of every policy, the newest or not, without what sessions showed since.
-
-    Raises:
-        Invalid: it has no estimate by the method.
-    """
-    there = {row.method for row in evaluation.estimates}
-    methods = [m for m in method_keys() if m in there]
-    chosen = method or evaluation.default_method
-    if chosen not in methods:
-        raise Invalid(f"This ranking has no estimates by '{chosen}'.", f"Choose one of {', '.join(methods)}.")
-    policies = repository.policies_by_id(db, [row.policy_id for row in evaluation.estimates])
-    version = study_repository.settings_version(db, evaluation.settings_version_id)
-    # a verdict does not depend on who asks for it
-    harmful = blocked_policies(events_of_participant(db, participant.id), SYSTEM)
-    return assess(evaluation, policies, chosen, participant, version, harmful)
-
-
-def ranking_of(db: Session, found: Assessment, shown: RankingFilter | None = None, sessions: ReadOnce | None = None) -> RankingOut:
-    """An assessment as the interface has it.
+def ranking_of(found: Judged, shown: RankingFilter | None = None) -> RankingOut:
+    """A judged evaluation as the interface has it.
 
     Args:
-        db: the session. found: the assessment. shown: which candidates to give; all where not given.
-        sessions: of the participant, where somebody else reads them too.
+        found: the evaluation. shown: which candidates to give; all where not given.
     """
-    evaluation, participant = found.evaluation, found.participant
-    candidates, references = [_ranked(found, a) for a in found.candidates], [_ranked(found, a) for a in found.references]
-    reasons = [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation, sessions)]
+    db, evaluation, participant = found.db, found.evaluation, found.participant
+    ranked = _kept(found)
+    reasons = [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation, found.sessions)]
     return RankingOut(
         participant=participant.code,
         evaluation_id=evaluation.id,
         job_id=evaluation.job_id,
         created_at=evaluation.created_at,
         default_method=found.method,
-        methods=[m for m in method_keys() if any(m in a.estimates for a in found.assessed)],
+        methods=ranked.methods,
         failed_methods=evaluation.diagnostics.get("failed", {}),
         horizon_steps=evaluation.horizon_steps,
         gamma=evaluation.gamma,
@@ -107,13 +79,38 @@ def ranking_of(db: Session, found: Assessment, shown: RankingFilter | None = Non
         stale=bool(reasons),
         stale_reasons=reasons,
         stale_reason="; ".join(reasons) or None,
-        notes=[wording.sentence(n) for n in ranking_notes(candidates, references, found.method)],
-        policies=[p for p in candidates if _passes(p, shown)],
-        references=references,
+        notes=ranked.notes,
+        policies=[p for p in ranked.candidates if _passes(p, shown)],
+        references=ranked.references,
         coverage_failed=coverage_failed(evaluation),
         choice=None,
-        hidden=sum(not _passes(p, shown) for p in candidates),
+        hidden=sum(not _passes(p, shown) for p in ranked.candidates),
     )
+
+
+def evaluation_notes(found: Judged) -> list[str]:
+    """The notes of an evaluation's ranking by its own method, whether or not it is the newest."""
+    return _kept(found).notes
+
+
+@dataclass(frozen=True)
+class _Ranked:
+    """What the interface says of an evaluation's policies; kept, and so never changed."""
+
+    candidates: list[RankedPolicy]
+    references: list[RankedPolicy]
+    methods: list[str]
+    notes: list[str]
+
+
+def _kept(found: Judged) -> _Ranked:
+    return found.kept("ranked", lambda: _read(found.with_draws))
+
+
+def _read(found: Assessment) -> _Ranked:
+    candidates, references = [_ranked(found, a) for a in found.candidates], [_ranked(found, a) for a in found.references]
+    methods = [m for m in method_keys() if any(m in a.estimates for a in found.assessed)]
+    return _Ranked(candidates, references, methods, [wording.sentence(n) for n in ranking_notes(candidates, references, found.method)])
 
 
 def _passes(policy: RankedPolicy, shown: RankingFilter | None) -> bool:
@@ -122,12 +119,6 @@ def _passes(policy: RankedPolicy, shown: RankingFilter | None) -> bool:
         return True
     tested = "yes" if policy.tested else "no"
     return (policy.supported or not shown.supported) and shown.kind in (None, policy.kind) and shown.tested in (None, tested)
-
-
-def evaluation_notes(found: Assessment) -> list[str]:
-    """The notes of an evaluation's ranking by its own method, whether or not it is the newest."""
-    candidates, references = [_ranked(found, a) for a in found.candidates], [_ranked(found, a) for a in found.references]
-    return [wording.sentence(n) for n in ranking_notes(candidates, references, found.method)]
 
 
 def _ranked(found: Assessment, one: Assessed) -> RankedPolicy:

@@ -18,9 +18,9 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.evaluation import verdict_wording
 from app.evaluation import wording as evaluation_wording
-from app.evaluation.ranking.answer import Answer, Row, answer
-from app.evaluation.ranking.assessment import Assessment
-from app.evaluation.ranking.service import current_assessment
+from app.evaluation.ranking.answer import Answer, Row
+from app.evaluation.ranking.judged import Judged
+from app.evaluation.ranking.service import current
 from app.evaluation.wording import method_name, sentence
 from app.learning import repository as learning
 from app.learning.models import Policy
@@ -224,14 +224,13 @@ def _page(
         full = None
     view = shown(full) if full else None
     try:
-        found: Assessment | None = current_assessment(db, participant, caller)
+        found: Judged | None = current(db, participant, caller)
     except NotFound:
         found = None
     defaults = rules_of(PlanOptions())
-    answered = answer(found) if found is not None else None
-    choices = _choices(db, participant, answered)
+    choices = _choices(db, participant, found.answer if found is not None else None)
     form = _form_values(full, values, choices)
-    suggestions = suggested(found, most_policies(defaults), answered)
+    suggestions = suggested(found, most_policies(defaults))
     return render(
         request,
         "planning/plan.html",

@@ -13,7 +13,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation import repository as evaluations
 from app.evaluation.models import Evaluation
-from app.evaluation.ranking.service import assessment_of
+from app.evaluation.ranking.judged import judged
 from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning.plans import repository
@@ -53,7 +53,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
     seed = _seed(participant, rules) if draft.seed is None else draft.seed
     day = schedule([Candidate(p.id, controller_of(p)) for p in chosen], rules, seed)
     evaluation = _evaluation(db, participant, draft.evaluation_id)
-    found = assessment_of(db, participant, evaluation) if evaluation else None
+    found = judged(db, participant, evaluation).assessment if evaluation else None
     overrides, limits = {o.policy_id: o.reason for o in draft.overrides}, {v.policy_id: v.min_fraction for v in draft.limits}
     guarded = safeguards(found, chosen, overrides, limits, may_override=study.may(caller, can.APPROVE_PLAN, participant))
     repository.lock_visit(db, visit.id)
@@ -118,7 +118,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
     refuse_withdrawn(view)
     policies = {line.policy.id: line.policy for line in view.lines if line.policy}
     stated = [(v.policy, Safeguard(v.item.verdict, v.item.min_fraction, v.item.override_reason)) for v in view.lines if v.policy]
-    refuse_approval(assessment_of(db, visit.participant, view.evaluation) if view.evaluation else None, stated)
+    refuse_approval(judged(db, visit.participant, view.evaluation).assessment if view.evaluation else None, stated)
     releases.refuse_unreleased(db, visit.participant, [(line.policy, line.item) for line in view.lines if line.policy])
     _fix_designs(visit, plan)
     require_limits(visit, plan.items)

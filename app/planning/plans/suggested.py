@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.evaluation.ranking.answer import Answer, answer
+from app.evaluation.ranking.answer import answer
 from app.evaluation.ranking.assessment import Assessment
-from app.learning.models import Policy
+from app.evaluation.ranking.judged import Judged
+from app.evaluation.repository import PolicyHead
 from ml.ope.posterior.portfolio import Suggestion, portfolio
 from ml.ope.posterior.verdict import FEWEST_DRAWS
 
@@ -17,20 +18,25 @@ from ml.ope.posterior.verdict import FEWEST_DRAWS
 class Suggested:
     """A policy of the portfolio, and why it is in it."""
 
-    policy: Policy
+    policy: PolicyHead
     why: Suggestion
 
 
-def suggested(found: Assessment | None, slots: int, answered: Answer | None = None) -> tuple[Suggested, ...]:
+def suggested(found: Judged | None, slots: int) -> tuple[Suggested, ...]:
     """The policies that teach most in a visit with so many slots, each behaviour once; none where the data cannot order policies.
 
-    Only candidates whose verdict is *test* or *test with care* are asked, and at most one of the latter is taken. `answered` is what the
-    ranking says, where the caller has it already.
+    Only candidates whose verdict is *test* or *test with care* are asked, and at most one of the latter is taken.
     """
-    if found is None or not found.ordered or found.cdbs is None or found.cdbs.posterior is None:
+    if found is None or not found.answer.ordered:
+        return ()
+    return found.kept(("suggested", slots), lambda: _portfolio(found.with_draws, slots))
+
+
+def _portfolio(found: Assessment, slots: int) -> tuple[Suggested, ...]:
+    if found.cdbs is None or found.cdbs.posterior is None:
         return ()
     theirs = np.asarray(found.cdbs.posterior.details.get("draws") or [], dtype=np.float64)
-    answered = answered or answer(found)
+    answered = answer(found)
     careful = {str(row.one.policy.id) for row in answered.of("test_with_care")}
     differences, policies = {}, {}
     for row in (*answered.of("test"), *answered.of("test_with_care")):

@@ -12,10 +12,9 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation import repository as evaluations
 from app.evaluation import wording
-from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.models import Evaluation
-from app.evaluation.ranking.assessment import Assessment
-from app.evaluation.ranking.service import assessment_of, evaluation_notes
+from app.evaluation.ranking.judged import Judged, judged
+from app.evaluation.ranking.service import evaluation_notes
 from app.evaluation.ranking.staleness import stale_reasons
 from app.learning.models import Policy
 from app.planning.notices import Code, PlanWarning, without_policies
@@ -161,8 +160,8 @@ def _masked(item: PlanItem, limits: CommonLimits | None) -> PlanItem:
 def view_of(db: Session, plan: Plan, visit: Visit) -> PlanView:
     """A plan with all that is known about it."""
     evaluation = repository.evaluation(db, plan.evaluation_id) if plan.evaluation_id else None
-    found = assessment_of(db, visit.participant, evaluation) if evaluation else None
-    estimates = {e.policy_id: estimate_of(e) for e in evaluation.estimates if e.method == evaluation.default_method} if evaluation else {}
+    found = judged(db, visit.participant, evaluation) if evaluation else None
+    estimates = {a.policy.id: a.estimate for a in found.assessment.assessed} if found else {}
     policies = evaluations.policies_by_id(db, [i.policy_id for i in plan.items if i.policy_id is not None])
     lines, start = [], 0.0
     for item in plan.items:
@@ -205,7 +204,7 @@ def _stale_reasons(db: Session, participant: Participant, evaluation: Evaluation
 
 
 def _warnings(
-    db: Session, visit: Visit, plan: Plan, lines: Sequence[PlanLine], found: Assessment | None, stale: Sequence[str]
+    db: Session, visit: Visit, plan: Plan, lines: Sequence[PlanLine], found: Judged | None, stale: Sequence[str]
 ) -> list[PlanWarning]:
     warnings = [PlanWarning(Code.STALE_RANKING, values={"reason": reason}) for reason in stale]
     if found:
@@ -233,7 +232,7 @@ def _warnings(
     return warnings
 
 
-def _of_policy(line: PlanLine, found: Assessment | None) -> list[PlanWarning]:
+def _of_policy(line: PlanLine, found: Judged | None) -> list[PlanWarning]:
     """What speaks against one policy of a plan."""
     policy, item, estimate = line.policy, line.item, line.estimate
     if policy is None:

@@ -12,6 +12,7 @@ from typing import Any
 import plotly
 from fastapi import Request
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
 
 from app.platform.database import now
 from app.platform.web.charts import written
@@ -38,6 +39,11 @@ def render(request: Request, template: str, **values: Any) -> str:
     return _environment.get_template(template).render(
         request=request, me=getattr(request.state, "caller", None), path=request.url.path, **values
     )
+
+
+def render_part(template: str, **values: Any) -> Markup:
+    """A part of a page, made of its values alone: it knows neither the request nor who is signed in, so that it may be kept."""
+    return Markup(_environment.get_template(template).render(**values))  # noqa: S704
 
 
 def static_url(name: str) -> str:

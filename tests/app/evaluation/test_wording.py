@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 from app.evaluation import verdict_wording, wording
 from app.evaluation.estimates.rows import row_of
 from app.evaluation.models import EstimateRow, Evaluation
+from app.platform.kept import forget
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag, distinct
 from ml.ope.support.coverage import thin
@@ -45,6 +46,7 @@ def test_reworded_sentences_change_no_rank_support_or_decision(
             monkeypatch.setattr(words, name, lambda *_: "x")
     monkeypatch.setattr(wording, "_SENTENCES", {})
     monkeypatch.setattr(verdict_wording, "_PLAINLY", {})
+    forget()  # other words are other code, which begins with nothing in memory
     after = client.get(RANKING).json()
     assert {f["text"] for p in after["policies"] for f in p["flags"]} == {p["decision_reason"] for p in after["policies"]} == {"x"}
     assert without_words(after) == without_words(before)

@@ -1,0 +1,200 @@
+"""An evaluation as it is judged now: what follows from its draws is computed once and kept by this process under all that it depends on.
+
+An evaluation and its estimates never change. Verdicts also depend on the margins and levels in force, the policies as they are now, the
+cDBS amplitude and what happened under which policy; a page also on the sessions so far. All of these are in the key as values or, for
+sessions, as their rows' versions, so that whatever changes makes a new key. The draws themselves, a megabyte of JSON, are read only where
+something is not kept yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, TypeVar
+
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import SYSTEM, Caller
+from app.evaluation import repository
+from app.evaluation.models import Evaluation
+from app.evaluation.ranking.answer import Answer, Row, answer
+from app.evaluation.ranking.assessment import Assessed, Assessment, assess, cdbs_amplitude_now
+from app.evaluation.ranking.picture import Picture, picture
+from app.evaluation.ranking.results import tested_before
+from app.evaluation.repository import PolicyHead
+from app.evaluation.schemas import TestedBefore
+from app.learning.models import BufferSnapshot
+from app.platform.errors import Invalid
+from app.platform.kept import kept
+from app.study import blinding
+from app.study import repository as study_repository
+from app.study.adverse_events.repository import events_of_participant
+from app.study.adverse_events.service import blocked_policies
+from app.study.models import Participant
+from app.study.sessions.repository import ReadOnce
+from ml.ope.estimate import Estimate
+from ml.ope.registry import method_keys
+
+T = TypeVar("T")
+
+DRAWS = ("draws", "outcome_draws")
+"""What is left out of the details of an estimate that is kept."""
+
+
+@dataclass
+class Judged:
+    """One evaluation of a participant, by one method, as it is judged now; of one request.
+
+    Attributes:
+        heads: its policies as they are now, by id. harmful: those under which something serious happened that no clinician has cleared.
+        caller, sessions: who asks what sessions showed, and the participant's; both None where nobody asks for that.
+    """
+
+    db: Session
+    participant: Participant
+    evaluation: Evaluation
+    method: str
+    heads: Mapping[int, PolicyHead]
+    harmful: frozenset[int]
+    cdbs_ma: float | None
+    caller: Caller | None = None
+    sessions: ReadOnce | None = None
+
+    @cached_property
+    def key(self) -> Hashable:
+        """Everything that what is kept depends on, beside this code."""
+        margins, levels = self.participant.margins_in_force.id, self.participant.current_margins.id
+        judged = (self.evaluation.id, self.evaluation.created_at, self.method, tuple(self.heads.values()), self.harmful, self.cdbs_ma)
+        shown: Hashable = None
+        if self.caller is not None and self.sessions is not None:
+            shown = (self.sessions.fingerprint, blinding.sight(self.db, self.participant, self.caller))
+        return (*judged, margins, levels, shown)
+
+    def kept(self, name: Hashable, compute: Callable[[], T]) -> T:
+        """What follows from this under a name that says what else it depends on."""
+        return kept((name, self.key), compute)
+
+    @cached_property
+    def tested(self) -> dict[int, TestedBefore]:
+        """What sessions showed, by policy; empty where nobody asks."""
+        if self.caller is None or self.sessions is None:
+            return {}
+        cdbs = next((i for i, head in self.heads.items() if head.is_cdbs), None)
+        return tested_before(self.db, self.evaluation, self.participant, self.caller, cdbs, self.sessions)
+
+    @cached_property
+    def with_draws(self) -> Assessment:
+        """The assessment with every draw, read and judged anew. For computing what is kept."""
+        version = study_repository.settings_version(self.db, self.evaluation.settings_version_id)
+        found = assess(self.evaluation, self.heads, self.method, self.participant, version, self.cdbs_ma, self.harmful)
+        return found.with_tests(self.tested)
+
+    @cached_property
+    def assessment(self) -> Assessment:
+        """The same without the draws of its estimates."""
+
+        def read() -> tuple[tuple[Assessed, ...], bool]:
+            return tuple(_without_draws(a) for a in self.with_draws.assessed), self.with_draws.ordered
+
+        assessed, ordered = self.kept("assessed", read)
+        return Assessment(self.evaluation, self.participant, self.method, assessed, self.cdbs_ma, ordered)
+
+    @cached_property
+    def _answer_with_draws(self) -> Answer:
+        return answer(self.with_draws)
+
+    @cached_property
+    def answer(self) -> Answer:
+        """What to test and what not; its estimates are without draws."""
+
+        def read() -> Answer:
+            found = self._answer_with_draws
+            rows, like_cdbs, like_off = (tuple(map(_row_without_draws, of)) for of in (found.rows, found.like_cdbs, found.like_off))
+            return replace(found, rows=rows, like_cdbs=like_cdbs, like_off=like_off)
+
+        return self.kept("answer", read)
+
+    def picture(self, lower_bound: float, policy_id: int | None = None) -> Picture:
+        """The picture of the candidates that are neither cDBS nor off by another name, or of one candidate.
+
+        Args:
+            lower_bound: B, fraction of cDBS. policy_id: a candidate, which is drawn under its own name where it is a twin.
+        """
+
+        def read() -> Picture:
+            found, unit = self._answer_with_draws, self.db.get_one(BufferSnapshot, self.evaluation.snapshot_id).beta_unit
+            one = None if policy_id is None else own_row(self.with_draws, found, policy_id)
+            rows = [*found.rows, *found.like_off] if policy_id is None else [one] if one else []
+            return picture(self.with_draws, rows, unit, lower_bound)
+
+        return self.kept(("picture", lower_bound, policy_id), read)
+
+
+def own_row(found: Assessment, answered: Answer, policy_id: int) -> Row | None:
+    """A candidate's row under its own name, also where it is the twin of another; None where it is no candidate."""
+    row, own = answered.everyone().get(policy_id), found.of(policy_id)
+    if row is None or own is None or own.decided is None:
+        return None
+    return row if row.one is own else replace(row, one=own, decided=own.decided)
+
+
+def judged(
+    db: Session,
+    participant: Participant,
+    evaluation: Evaluation,
+    method: str | None = None,
+    caller: Caller | None = None,
+    sessions: ReadOnce | None = None,
+) -> Judged:
+    """One evaluation, the newest or not, as it is judged now.
+
+    Args:
+        db, participant, evaluation: whose. method: whose estimates rank; the evaluation's default where not given.
+        caller, sessions: as `Judged` has them.
+
+    Raises:
+        Invalid: it has no estimate by the method.
+    """
+    chosen = method or evaluation.default_method
+    if chosen != evaluation.default_method or chosen not in method_keys():
+        stored = repository.methods(db, evaluation.id)
+        there = [m for m in method_keys() if m in stored]
+        if chosen not in there:
+            raise Invalid(f"This ranking has no estimates by '{chosen}'.", f"Choose one of {', '.join(there)}.")
+    # a verdict does not depend on who asks for it
+    harmful = frozenset(blocked_policies(events_of_participant(db, participant.id), SYSTEM))
+    heads, cdbs_ma = repository.policy_heads(db, evaluation.id), cdbs_amplitude_now(participant)
+    return Judged(db, participant, evaluation, chosen, heads, harmful, cdbs_ma, caller, sessions)
+
+
+class _WithoutDraws(dict[str, Any]):
+    """Details of an estimate whose draws were left out: to ask for them is an error, not an answer of nothing."""
+
+    def __getitem__(self, name: str) -> Any:
+        return super().__getitem__(_present(name))
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(_present(name))
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return super().get(_present(name), default)
+
+
+def _present(name: Any) -> Any:
+    if name in DRAWS:
+        raise RuntimeError(f"the {name} of an estimate that is kept were left out: ask the assessment with draws")
+    return name
+
+
+def _without_draws(one: Assessed) -> Assessed:
+    slim = {method: _slim(e) for method, e in one.estimates.items()}
+    return replace(one, estimate=_slim(one.estimate) if one.estimate else None, estimates=slim)
+
+
+def _slim(estimate: Estimate) -> Estimate:
+    return replace(estimate, details=_WithoutDraws({k: v for k, v in estimate.details.items() if k not in DRAWS}))
+
+
+def _row_without_draws(row: Row) -> Row:
+    return replace(row, one=_without_draws(row.one), twins=tuple(_without_draws(a) for a in row.twins))
