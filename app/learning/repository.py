@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.dialects.postgresql import insert
-from sqlalchemy.orm import Session, selectinload
+from sqlalchemy.orm import Session, defer, selectinload
 
 from app.accounts.models import Site
 from app.accounts.permissions import Caller
@@ -99,8 +99,11 @@ def policies_named(db: Session, participant_id: int, ids: Sequence[int]) -> list
 
 
 def candidates(db: Session, participant_id: int) -> Sequence[Policy]:
-    """Policies that a ranking should hold: trained, distilled or made elsewhere, and not retired; oldest first."""
-    return db.scalars(select(Policy).where(*_ranked(participant_id)).order_by(Policy.id)).all()
+    """Policies that a ranking should hold: trained, distilled or made elsewhere, and not retired; oldest first.
+
+    Their curves and other metrics are read when something asks for them.
+    """
+    return db.scalars(select(Policy).where(*_ranked(participant_id)).order_by(Policy.id).options(defer(Policy.metrics))).all()
 
 
 def candidate_names(db: Session, participant_id: int) -> dict[int, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from fastapi import APIRouter, Request
@@ -9,17 +10,20 @@ from fastapi.responses import HTMLResponse
 
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
-from app.analysis.evidence.service import evidence
+from app.analysis.evidence.service import Evidence, evidence
 from app.analysis.metrics import service as analysis
 from app.analysis.metrics.charts import view
 from app.overview import state, wording
 from app.overview.story import story_chart
 from app.platform.database import Db
+from app.platform.kept import kept
+from app.platform.web.charts import Chart
 from app.platform.web.templates import render
 from app.study import repository as study
-from app.study.blinding import visible_arm
 from app.study.characteristics.service import fields_of
 from app.study.deps import CurrentParticipant
+from app.study.models import SettingsVersion, Visit
+from app.study.visits.service import days_of
 from app.study.wording import characteristics_words
 
 router = APIRouter()
@@ -29,7 +33,7 @@ router = APIRouter()
 def participant_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """One participant."""
     visits, _ = study.visits(db, participant.id, 1000, 0)
-    sessions = study.sessions_of_participant(db, participant.id)
+    sessions = study.sessions_for_lists(db, participant.id)
     held = evidence(db, participant, caller)
     page = render(
         request,
@@ -42,10 +46,16 @@ def participant_page(request: Request, participant: CurrentParticipant, db: Db, 
         characteristics=characteristics_words(fields_of(participant.current_characteristics)),
         actors=wording.ACTORS,
         progress=wording.progress,
-        days=[(v, [(s, visible_arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in visits],
+        days=days_of(visits, sessions, caller),
         minutes=sum(s.duration_s for s in sessions) / 60,
-        story=story_chart(held, visits, participant.settings),
-        analysis=view(analysis.five_metrics(db, participant, caller, held)),
+        story=_story(held, visits, participant.settings),
+        analysis=view(analysis.five_metrics(db, participant, caller, held), held.key),
         may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
     )
     return HTMLResponse(page)
+
+
+def _story(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsVersion]) -> Chart | None:
+    """The months on one axis, kept while none of what they are made of has changed."""
+    key = ("story", held.key, tuple((v.id, v.date) for v in visits), tuple((v.version, v.created_at) for v in versions))
+    return kept(key, lambda: story_chart(held, visits, versions))

@@ -70,6 +70,12 @@ def visible_arm(session: StudySession, user: Caller) -> Arm | None:
     return stated_arm(session, user) if may_know(session.visit, user) else None
 
 
+def visible_arms(sessions: Sequence[StudySession], user: Caller) -> list[Arm | None]:
+    """The same of many sessions, asking once for each of their visits."""
+    known = {i: may_know(visit, user) for i, visit in {s.visit_id: s.visit for s in sessions}.items()}
+    return [Arm(Controller(s._controller), s._policy_id) if known[s.visit_id] and s._controller is not None else None for s in sessions]
+
+
 def may_know(visit: Visit, user: Caller) -> bool:
     """Whether the user may know the arms of a visit.
 

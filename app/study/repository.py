@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from sqlalchemy import ARRAY, ColumnElement, Integer, Select, any_, cast, column, false, func, or_, select, table, true
 from sqlalchemy.dialects.postgresql import JSONB
-from sqlalchemy.orm import Session, contains_eager, joinedload, selectinload
+from sqlalchemy.orm import Session, contains_eager, joinedload, lazyload, selectinload
 
 from app.accounts.models import Site
 from app.accounts.permissions import Caller
@@ -163,7 +163,15 @@ def sessions_of_participant(db: Session, participant_id: int, with_proposals: bo
 def sessions_without_data(db: Session, participant_ids: Collection[int]) -> Sequence[StudySession]:
     """Confirmed sessions of several participants with their visits, and nothing else of them: for counts and arms."""
     query = select(StudySession).join(StudySession.visit).where(Visit.participant_id.in_(participant_ids), CONFIRMED)
-    return db.scalars(query.options(contains_eager(StudySession.visit)).order_by(Visit.participant_id, Visit.number)).all()
+    visit = contains_eager(StudySession.visit).options(lazyload(Visit.cdbs_amplitudes), lazyload(Visit.doses))
+    return db.scalars(query.options(visit).order_by(Visit.participant_id, Visit.number)).all()
+
+
+def sessions_for_lists(db: Session, participant_id: int) -> Sequence[StudySession]:
+    """Confirmed sessions of a participant by visit and order, with their visits and QoCs, and nothing of their recordings."""
+    query = select(StudySession).join(StudySession.visit).where(Visit.participant_id == participant_id, CONFIRMED)
+    query = query.options(contains_eager(StudySession.visit), selectinload(StudySession.qocs))
+    return db.scalars(query.order_by(Visit.number, StudySession.ordinal)).all()
 
 
 def proposals_of_participant(db: Session, participant_id: int) -> Sequence[StudySession]:

@@ -62,11 +62,13 @@ def rank_sum(x: ArrayLike, y: ArrayLike, level: float = 0.95) -> RankSum:
     x, y = _group(x, "first"), _group(y, "second")
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")
-    u, exact = _u(x, y), _is_exact(x, y)
-    upper = _tail(x, y, u, exact)
-    lower = _tail(y, x, x.size * y.size - u, exact)
+    u = _u(x, y)
+    exact = _is_exact(x, y)
+    null = _null(x, y) if exact else None
+    upper = _tail(x, y, u, null)
+    lower = _tail(y, x, x.size * y.size - u, _null(y, x) if exact else None)
     differences = np.sort(np.subtract.outer(x, y).ravel())
-    low, high = _shift_interval(x, y, differences, level, exact)
+    low, high = _shift_interval(x, y, differences, level, null)
     return RankSum(
         u=u,
         p_value=min(1.0, 2 * min(upper, lower)),
@@ -103,7 +105,7 @@ def p_greater(x: ArrayLike, y: ArrayLike) -> float:
         ValueError: a group `rank_sum` would refuse.
     """
     x, y = _group(x, "first"), _group(y, "second")
-    return _tail(x, y, _u(x, y), _is_exact(x, y))
+    return _tail(x, y, _u(x, y), _null(x, y) if _is_exact(x, y) else None)
 
 
 @lru_cache(maxsize=256)
@@ -194,10 +196,10 @@ def _standard_deviation(x: NDArray[np.float64], y: NDArray[np.float64]) -> float
     return float(np.sqrt(x.size * y.size / 12 * (n + 1 - correction)))
 
 
-def _tail(x: NDArray[np.float64], y: NDArray[np.float64], u: float, exact: bool) -> float:
-    """P(U >= u) under the null hypothesis."""
-    if exact:
-        return float(min(1.0, _null(x, y)[round(2 * u) :].sum()))
+def _tail(x: NDArray[np.float64], y: NDArray[np.float64], u: float, null: NDArray[np.float64] | None) -> float:
+    """P(U >= u) under the null hypothesis, by its exact distribution where there is one."""
+    if null is not None:
+        return float(min(1.0, null[round(2 * u) :].sum()))
     sd = _standard_deviation(x, y)
     if sd == 0:
         return 1.0
@@ -205,12 +207,12 @@ def _tail(x: NDArray[np.float64], y: NDArray[np.float64], u: float, exact: bool)
 
 
 def _shift_interval(
-    x: NDArray[np.float64], y: NDArray[np.float64], differences: NDArray[np.float64], level: float, exact: bool
+    x: NDArray[np.float64], y: NDArray[np.float64], differences: NDArray[np.float64], level: float, null: NDArray[np.float64] | None
 ) -> tuple[float, float]:
     """Interval of the shift: the k-th smallest and largest of the pairwise differences, k from the null distribution of U."""
     tail = (1 - level) / 2
-    if exact:
-        k = int(np.searchsorted(np.cumsum(_null(x, y))[::2], tail, side="right"))
+    if null is not None:
+        k = int(np.searchsorted(np.cumsum(null)[::2], tail, side="right"))
     else:
         k = int(np.floor(x.size * y.size / 2 + float(ndtri(tail)) * _standard_deviation(x, y)))
     k = min(max(k, 1), (differences.size + 1) // 2)

@@ -63,20 +63,52 @@ def test_more_visits_and_sessions_ask_no_more_queries(
     assert {path: queries(path) for path in PAGES} == few
 
 
-def test_a_page_of_a_ranking_reads_the_sessions_once(
-    client: TestClient, upload: Callable[..., int], policies: list[int], judge: Callable[..., int]
-) -> None:
-    judge({policies[0]: judged(50.0)})
+@pytest.fixture
+def statements() -> Iterator[list[str]]:
+    """What the service asks the database."""
     asked: list[str] = []
 
     def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:
         asked.append(statement)
 
-    forget()
     event.listen(get_engine(), "before_cursor_execute", note)
-    try:
-        assert client.get("/participants/P1/ranking").status_code == 200
-    finally:
-        event.remove(get_engine(), "before_cursor_execute", note)
-    assert sum("session.excluded_reason" in s and "session.ordinal" in s.split("ORDER BY")[-1] for s in asked) == 1
-    assert sum("session_conditions.xmin" in s for s in asked) == 1, "nor is what they are made of looked at twice"
+    yield asked
+    event.remove(get_engine(), "before_cursor_execute", note)
+
+
+def test_a_page_of_a_ranking_reads_the_sessions_once(
+    client: TestClient, policies: list[int], judge: Callable[..., int], statements: list[str]
+) -> None:
+    judge({policies[0]: judged(50.0)})
+    forget()
+    statements.clear()
+    assert client.get("/participants/P1/ranking").status_code == 200
+    assert sum("session.excluded_reason" in s and "session.ordinal" in s.split("ORDER BY")[-1] for s in statements) == 1
+    assert sum("session_conditions.xmin" in s for s in statements) == 1, "nor is what they are made of looked at twice"
+
+
+def test_jobs_read_no_trace_twice_and_say_at_once_that_nothing_can_be_learned(
+    client: TestClient, upload: Callable[..., int], statements: list[str]
+) -> None:
+    session, page = upload("random", steps=20), "/participants/P1/jobs"
+    forget()
+    assert "can enter a replay buffer" not in client.get(page).text
+    assert any("trace.values_f32" in s for s in statements)
+    statements.clear()
+    assert "can enter a replay buffer" not in client.get(page).text
+    assert not any("trace.values_f32" in s for s in statements)
+    assert client.patch(f"/api/v1/sessions/{session}", json={"excluded_reason": "tablet froze"}).status_code == 200
+    assert "has no session that can enter a replay buffer" in client.get(page).text
+    assert client.patch(f"/api/v1/sessions/{session}", json={"excluded_reason": None}).status_code == 200
+    assert "can enter a replay buffer" not in client.get(page).text
+
+
+def test_a_participants_page_asks_for_no_recording_once_it_has_been_seen(
+    client: TestClient, upload: Callable[..., int], statements: list[str]
+) -> None:
+    upload("random", steps=20)
+    upload("cdbs", steps=20)
+    seen = client.get("/participants/P1").text
+    statements.clear()
+    assert client.get("/participants/P1").text == seen
+    assert not any("FROM recording" in s or "JOIN recording" in s for s in statements if "xmin" not in s)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from app.analysis.evidence.measurements import HIGHER_IS_BETTER
 from app.analysis.metrics.comparisons import ALPHA, Comparison, Group
 from app.analysis.metrics.service import FiveMetrics, MetricResult
+from app.platform.kept import kept
 from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, figure, marker
 from app.platform.web.templates import p_text
 from app.study.models import Controller
@@ -31,9 +32,9 @@ class FiveMetricsView:
     charts: list[Chart]
 
 
-def view(result: FiveMetrics) -> FiveMetricsView:
-    """The analysis with its charts."""
-    return FiveMetricsView(result, [metric_chart(m) for m in result.metrics if m.n])
+def view(result: FiveMetrics, evidence: Hashable) -> FiveMetricsView:
+    """The analysis with its charts, which are kept under the key of the evidence that it is made of."""
+    return FiveMetricsView(result, kept(("metric charts", evidence), lambda: [metric_chart(m) for m in result.metrics if m.n]))
 
 
 def metric_chart(metric: MetricResult) -> Chart:

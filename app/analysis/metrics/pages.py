@@ -6,6 +6,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import HTMLResponse
 
 from app.accounts.deps import CurrentCaller
+from app.analysis.evidence.service import evidence
 from app.analysis.metrics import export, service
 from app.analysis.metrics.charts import view
 from app.platform.database import Db
@@ -18,7 +19,8 @@ router = APIRouter()
 @router.get("/participants/{code}/analyses/paper")
 def analyses(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """The five metrics by controller, with tests, tables and limits."""
-    analysis = view(service.five_metrics(db, participant, caller))
+    held = evidence(db, participant, caller)
+    analysis = view(service.five_metrics(db, participant, caller, held), held.key)
     return HTMLResponse(render(request, "analysis/analyses.html", participant=participant, analysis=analysis))
 
 

@@ -11,7 +11,7 @@ from app.accounts.permissions import Caller
 from app.analysis.evidence.facts import LeftOut
 from app.analysis.evidence.service import Evidence
 from app.study import repository as study
-from app.study.blinding import CONTROLLER_NAMES, Arm, visible_arm
+from app.study.blinding import CONTROLLER_NAMES, Arm, visible_arms
 from app.study.models import Controller, Participant, StudySession
 
 PAPER_ORDER = (Controller.CDBS, Controller.RL, Controller.DISTILLED, Controller.NO_DBS)
@@ -59,7 +59,8 @@ def trial_time(db: Session, participants: Sequence[Participant], caller: Caller)
     counted = []
     for participant in participants:
         held = by_participant[participant.id]
-        ran = [(visible_arm(s, caller), s.duration_s) for s in held if s.excluded_reason is None]
+        counting = [s for s in held if s.excluded_reason is None]
+        ran = [(arm, s.duration_s) for s, arm in zip(counting, visible_arms(counting, caller), strict=True)]
         counted.append(_Counted(participant.code, ran, sum(s.excluded_reason is not None for s in held)))
     return _table(counted)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -24,6 +25,7 @@ from app.learning.models import BufferSnapshot, SnapshotSession
 from app.learning.snapshots.trajectories import trajectory_of
 from app.platform import files
 from app.platform.errors import Invalid
+from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
@@ -126,8 +128,10 @@ class Collection:
         return hashlib.sha256(json.dumps(pins, sort_keys=True).encode()).hexdigest()
 
 
-def collect(db: Session, participant: Participant) -> Collection:
+def collect(db: Session, participant: Participant, sessions: Sequence[StudySession] | None = None) -> Collection:
     """The buffer of the participant as the data are now; nothing is stored.
+
+    `sessions`: the confirmed ones, where they are at hand.
 
     Raises:
         Invalid: no beta threshold yet (with a suggestion from the data), one without a unit and source, or no session with a usable step
@@ -136,7 +140,7 @@ def collect(db: Session, participant: Participant) -> Collection:
     version = participant.current_settings
     suggestion = suggest_xi_beta(db, participant, SYSTEM) if version.xi_beta is None else None
     settings = mdp_settings(version, suggestion)
-    sessions = [s for s in study_repository.sessions_of_participant(db, participant.id) if s.status == "confirmed"]
+    sessions = study_repository.sessions_of_participant(db, participant.id) if sessions is None else sessions
     placeless = session_repository.repeated_sessions(db, participant.id)
     twice = {s.id for s in sessions if s.id in placeless and counts_elsewhere(db, s)}
     traces = traces_of(db, sessions)
@@ -157,12 +161,27 @@ def collect(db: Session, participant: Participant) -> Collection:
 
 
 def not_ready(db: Session, participant: Participant) -> Invalid | None:
-    """Why nothing can be learned or estimated yet; None when it can."""
-    try:
-        collect(db, participant)
-    except Invalid as error:
-        return error
-    return None
+    """Why nothing can be learned or estimated yet; None when it can.
+
+    Kept by this process until a row of the participant's sessions or settings changes, or the gate is decided on, or another session has
+    the minutes of one first: to find it out, every trace is read.
+    """
+    sessions = session_repository.ReadOnce(db, participant.id)
+    decision = repository.newest_gate_decision(db, participant.id)
+    placeless = frozenset(session_repository.repeated_sessions(db, participant.id))
+    key = ("not ready", participant.id, sessions.fingerprint, decision.id if decision else None, placeless)
+
+    def read() -> tuple[str, ...]:
+        rows = sessions.rows
+        db.refresh(participant, ["settings"])  # what was read before may be older than the key
+        try:
+            collect(db, participant, rows)
+        except Invalid as error:
+            return error.detail, error.hint
+        return ()
+
+    why = kept(key, read)
+    return Invalid(*why) if why else None
 
 
 def take_snapshot(db: Session, participant: Participant, caller: Caller) -> BufferSnapshot:

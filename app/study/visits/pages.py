@@ -18,7 +18,7 @@ from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import render
 from app.settings import get_settings
 from app.study import repository, service
-from app.study.blinding import arm, may_know, visible_arm
+from app.study.blinding import arm, may_know
 from app.study.deps import CurrentParticipant, CurrentVisit
 from app.study.doses.serializers import dose_out
 from app.study.doses.since import since_last_dose
@@ -47,8 +47,7 @@ _FIRST_PROGRAM = ("cdbs_left", "cdbs_right")
 def visits(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """All visits of a participant with their sessions."""
     rows, _ = repository.visits(db, participant.id, 1000, 0)
-    sessions = repository.sessions_of_participant(db, participant.id)
-    days = [(v, [(s, visible_arm(s, caller)) for s in sessions if s.visit_id == v.id]) for v in rows]
+    days = visit_locks.days_of(rows, repository.sessions_for_lists(db, participant.id), caller)
     may_write = may(caller, can.WRITE_STUDY, participant)
     waiting = repository.proposals_of_participant(db, participant.id)
     return HTMLResponse(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
@@ -9,8 +11,19 @@ from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import repository
-from app.study.models import Visit, VisitLock
+from app.study.blinding import Arm, visible_arms
+from app.study.models import StudySession, Visit, VisitLock
 from app.study.visits import sign_off
+
+Day = tuple[Visit, list[tuple[StudySession, Arm | None]]]
+
+
+def days_of(visits: Sequence[Visit], sessions: Sequence[StudySession], caller: Caller) -> list[Day]:
+    """Visits with their sessions in order, each with its arm as far as the caller may know it."""
+    found: dict[int, list[tuple[StudySession, Arm | None]]] = {v.id: [] for v in visits}
+    for session, arm in zip(sessions, visible_arms(sessions, caller), strict=True):
+        found.get(session.visit_id, []).append((session, arm))
+    return [(v, found[v.id]) for v in visits]
 
 
 def lock(db: Session, visit: Visit, reason: str, caller: Caller, password: str, code: str = "") -> VisitLock:

@@ -30,18 +30,7 @@ def order_imbalance(data: Measurements) -> float | None:
 
     None where no order is known or no visit has both arms.
     """
-    cells = data.cells
-    if data.order is None or not cells.visit.size:
-        return None
-    order = data.order[cells.rows]
-    if not np.isfinite(order).all():
-        return None
-    sums, of_visit = cells.sums(order), cells.cell // 2
-    n = cells.counts.sum(1)
-    away = order - (sums.sum(1) / n)[of_visit]
-    spread = np.sqrt(np.bincount(of_visit, weights=away**2, minlength=n.size) / n)
-    later = sums[:, 0] / cells.counts[:, 0] - sums[:, 1] / cells.counts[:, 1]
-    return float(np.mean(np.divide(later, spread, out=np.zeros_like(later), where=spread > 0)))
+    return data.imbalance
 
 
 def primary(data: Measurements, level: float = 0.95, scale: Scale = "difference") -> Average | Unavailable:
@@ -76,7 +65,7 @@ def adjusted_average(
     """
     known = np.isfinite(data.value) & np.all(np.isfinite(covariates), axis=0)
     table = np.column_stack([c[known] for c in covariates])
-    kept = data.take(known)
+    kept = data if known.all() else data.take(known)
     contrasts = visit_contrasts(kept, scale)
     if isinstance(contrasts, Unavailable):
         return contrasts
@@ -111,14 +100,14 @@ def _common_slopes(data: Measurements, table: Floats) -> Floats | None:
         moments.append(centred.T @ values)
     gram, moment = np.array(grams), np.array(moments)
     totals = np.concatenate([gram.sum(0)[None], gram.sum(0) - gram])
-    if min(_smallest_share(g, totals[0]) for g in totals) < 1e-6:
+    if _smallest_share(totals, totals[0]) < 1e-6:
         return None
     return np.asarray(np.linalg.solve(totals, np.concatenate([moment.sum(0)[None], moment.sum(0) - moment])[..., None])[..., 0])
 
 
-def _smallest_share(gram: Floats, whole: Floats) -> float:
-    """Smallest eigenvalue of a gram matrix whose columns are scaled by those of another."""
+def _smallest_share(grams: Floats, whole: Floats) -> float:
+    """Smallest eigenvalue of gram matrices [k, c, c] whose columns are scaled by those of another."""
     scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     if not np.diag(whole).all():
         return 0.0
-    return float(np.linalg.eigvalsh(gram / np.outer(scale, scale))[0])
+    return float(np.linalg.eigvalsh(grams / np.outer(scale, scale)).min())

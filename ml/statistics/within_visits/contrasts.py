@@ -169,6 +169,27 @@ class Measurements:
         """The measured sessions of visits with both arms, counted by visit and arm."""
         return cells_of(np.isfinite(self.value), self.visit, self.tested)
 
+    @cached_property
+    def contrasts(self) -> dict[Scale, VisitContrasts | Unavailable]:
+        """What `visit_contrasts` has found, by scale."""
+        return {}
+
+    @cached_property
+    def imbalance(self) -> float | None:
+        """As `order_imbalance` describes it."""
+        cells = self.cells
+        if self.order is None or not cells.visit.size:
+            return None
+        order = self.order[cells.rows]
+        if not np.isfinite(order).all():
+            return None
+        sums, of_visit = cells.sums(order), cells.cell // 2
+        n = cells.counts.sum(1)
+        away = order - (sums.sum(1) / n)[of_visit]
+        spread = np.sqrt(np.bincount(of_visit, weights=away**2, minlength=n.size) / n)
+        later = sums[:, 0] / cells.counts[:, 0] - sums[:, 1] / cells.counts[:, 1]
+        return float(np.mean(np.divide(later, spread, out=np.zeros_like(later), where=spread > 0)))
+
     def no_evidence(self) -> Unavailable:
         """Why no visit has both arms."""
         tested = self.tested[np.isfinite(self.value)]
@@ -259,8 +280,14 @@ def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitCon
             two whole steps lies between what these give.
 
     Returns:
-        The contrasts, or why there is none: no session of an arm, or no visit with both.
+        The contrasts, or why there is none: no session of an arm, or no visit with both. The same object whenever it is asked again.
     """
+    if scale not in data.contrasts:
+        data.contrasts[scale] = _contrasts(data, scale)
+    return data.contrasts[scale]
+
+
+def _contrasts(data: Measurements, scale: Scale) -> VisitContrasts | Unavailable:
     cells = data.cells
     if not cells.visit.size:
         return data.no_evidence()
