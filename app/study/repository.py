@@ -260,6 +260,8 @@ def lock_session(db: Session, session: StudySession) -> None:
 
 def uploads_of_files(db: Session, upload_file_ids: Sequence[int]) -> dict[int, int]:
     """Number of the upload that each file came in. Uploads belong to a later phase; of their table only numbers are needed here."""
+    if not upload_file_ids:
+        return {}
     files = table("upload_file", column("id"), column("upload_id"))
     rows = db.execute(select(files.c.id, files.c.upload_id).where(files.c.id.in_(upload_file_ids)))
     return {row.id: row.upload_id for row in rows}

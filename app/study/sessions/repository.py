@@ -5,10 +5,26 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
-from sqlalchemy import Select, String, and_, cast, column, func, literal, literal_column, or_, select, table, true, union_all
+from sqlalchemy import (
+    BindParameter,
+    Select,
+    String,
+    and_,
+    bindparam,
+    cast,
+    column,
+    func,
+    literal,
+    literal_column,
+    or_,
+    select,
+    table,
+    true,
+    union_all,
+)
 from sqlalchemy.dialects.postgresql import aggregate_order_by
 from sqlalchemy.orm import Session
 
@@ -22,6 +38,15 @@ def fingerprints(db: Session, participant_ids: Collection[int]) -> dict[int, str
 
     PostgreSQL gives every version of a row such a number (`xmin`), so that any change of any column changes the hash.
     """
+    found = dict.fromkeys(participant_ids, "")
+    for owner, name, versions in db.execute(_row_versions(), {"participants": list(found)}):
+        found[owner] += f"{name} {versions} "
+    return found
+
+
+@lru_cache(maxsize=1)
+def _row_versions() -> Select[Any]:
+    """The query of `fingerprints`: to write it takes longer than to run it, and every page of results asks it."""
     visit, recording = Visit.participant_id, Recording.participant_id
     parts = [
         _versions("visit", Visit.id, visit),
@@ -40,11 +65,9 @@ def fingerprints(db: Session, participant_ids: Collection[int]) -> dict[int, str
         _versions("recording", Recording.id, recording),
         _versions("trace", Trace.id, recording, Trace.recording),
     ]
-    found = dict.fromkeys(participant_ids, "")
-    rows = union_all(*(part.where(owner.in_(found)) for part, owner in parts)).subquery()
-    for owner, name, versions in db.execute(select(rows).order_by(rows.c.name)):
-        found[owner] += f"{name} {versions} "
-    return found
+    asked: BindParameter[Any] = bindparam("participants", expanding=True)
+    rows = union_all(*(part.where(owner.in_(asked)) for part, owner in parts)).subquery()
+    return select(rows).order_by(rows.c.name)
 
 
 def _versions(name: str, key: Any, owner: Any, *joins: Any) -> tuple[Select[Any], Any]:

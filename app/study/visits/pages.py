@@ -18,7 +18,7 @@ from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import render
 from app.settings import get_settings
 from app.study import repository, service
-from app.study.blinding import arm, may_know
+from app.study.blinding import arm, may_know, visible_arm
 from app.study.deps import CurrentParticipant, CurrentVisit
 from app.study.doses.serializers import dose_out
 from app.study.doses.since import since_last_dose
@@ -32,6 +32,7 @@ from app.study.service import may
 from app.study.sessions import pages as session_pages
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.data import session_data
+from app.study.traces import TracesOf, traces_of
 from app.study.visits import form, sign_off
 from app.study.visits import service as visit_locks
 from app.study.visits.blinded import blinded_page
@@ -136,13 +137,13 @@ def shown_visit(
     sessions, _ = repository.sessions_of_visit(db, visit.id)
     told = may_know(visit, caller)  # else its plan is sealed: letters and outcomes, and what else tells nothing of what ran
     ran = [(arm(s, caller).controller, tablet.of_recording(control_recording(s))) for s in sessions if s.segments and told]
-    seen = form.texts(visit)
+    seen, traces = form.texts(visit), traces_of(db, sessions)
     page = render(
         request,
         "study/visits/visit.html",
         visit=visit,
         participant=visit.participant,
-        rows=[_session_row(db, s, caller) for s in sessions],
+        rows=[_session_row(db, s, traces, caller) for s in sessions],
         told=told,
         latencies=tablet.by_controller(ran),
         slots=request.app.state.slots_of_visit(db, visit, caller),
@@ -168,7 +169,7 @@ def shown_visit(
     return HTMLResponse(page, error.status if error else 200)
 
 
-def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str, Any]:
+def _session_row(db: Session, session: StudySession, traces: TracesOf, caller: Caller) -> dict[str, Any]:
     """What the visit's table says of a session; a session that cannot be laid on the grid says why."""
     clashes = outcomes.disagreements(session, outcome_values.derive(db, session))
     row: dict[str, Any] = {"session": session, "arm": visible_arm(session, caller), "summary": None, "problem": "", "clashes": clashes}
@@ -176,7 +177,7 @@ def _session_row(db: Session, session: StudySession, caller: Caller) -> dict[str
     if row["arm"] is None:
         return row
     try:
-        row["summary"] = session_pages.summarise(session_data(db, session))
+        row["summary"] = session_pages.summarise(session_data(db, session, traces))
     except BetaloopError as error:
         row["problem"] = error.detail
     return row
