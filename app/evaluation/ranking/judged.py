@@ -68,7 +68,7 @@ class Judged:
         judged = (self.evaluation.id, self.evaluation.created_at, self.method, tuple(self.heads.values()), self.harmful, self.cdbs_ma)
         shown: Hashable = None
         if self.caller is not None and self.sessions is not None:
-            shown = (self.sessions.fingerprint, blinding.sight(self.db, self.participant, self.caller))
+            shown = (self.sessions.fingerprint, blinding.sights(self.db, [self.participant], self.caller)[0])
         return (*judged, margins, levels, shown)
 
     def kept(self, name: Hashable, compute: Callable[[], T]) -> T:
