@@ -66,13 +66,21 @@ def _recorded(event: AuditEvent, names: Names) -> str:
     number = int(event.entity_id) if event.entity_id.isdecimal() else 0
     plan = names.plans.get(number)
     said = {
-        ("view", "results"): f"looked at the results of {event.entity_id}",
+        ("view", "results"): _looked(event.entity_id),
         ("export", "participant"): f"exported the record of {names.participant(number)}",
         ("export", "session"): f"exported the samples of {names.session(number)}",
         ("download", "plan"): f"printed plan {number}" + (f" for {names.visit(plan)}" if plan is not None else ""),
         ("refuse", "sign_in"): f"refused a sign-in of {event.entity_id}",
     }
     return said.get((event.action, event.entity), f"{event.action}: {event.entity.replace('_', ' ')} {event.entity_id}")
+
+
+def _looked(path: str) -> str:
+    """Which results, by the address of their page."""
+    whose, _, page = path.removeprefix("/api/v1").removeprefix("/participants/").partition("/")
+    if not whose or not page:
+        return f"looked at the results of {path}"
+    return f"looked at the results of {whose}: {page.replace('-', ' ').replace('/', ', ')}"
 
 
 def _plainly(event: AuditEvent) -> str:

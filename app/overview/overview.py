@@ -154,10 +154,9 @@ def changes(db: Session, event: AuditEvent, caller: Caller, sealed: bool) -> lis
 
 def _may_know_arm(db: Session, session_id: str, caller: Caller) -> bool:
     try:
-        blinding.arm(study.session(db, int(session_id), caller), caller)
+        return blinding.may_know(study.session(db, int(session_id), caller).visit, caller)
     except (NotFound, Forbidden):
         return False
-    return True
 
 
 def _short(value: Any) -> str | None:

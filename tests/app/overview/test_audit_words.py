@@ -39,7 +39,7 @@ SESSION = {"id": 7, "visit_id": 4, "ordinal": 3, "status": "confirmed", "exclude
         (event("settings_version", None, {"participant_id": 1, "version": 2}), "changed the settings of P1 (version 2)"),
         (event("sign_in", {"ended_at": None}, {"ended_at": "2026-03-02"}), "signed out"),
         (event("participant", {"code": "P1", "status": "active"}, {"code": "P1", "status": "withdrawn"}), "recorded that P1 has withdrawn"),
-        (recorded("view", "results", "/participants/P1/analyses"), "looked at the results of /participants/P1/analyses"),
+        (recorded("view", "results", "/participants/P1/analyses"), "looked at the results of P1: analyses"),
         (recorded("export", "participant", "1"), "exported the record of P1"),
         (recorded("export", "session", "7"), "exported the samples of session 3 of visit 2 of P1"),
         (recorded("download", "plan", "9"), "printed plan 9 for visit 2 of P1"),

@@ -182,7 +182,7 @@ def test_what_leaves_and_who_looked_is_in_the_trail(client: TestClient, enrolled
     me = "admin@clinic.example"
     assert actions("results") == [(me, "view", f"/participants/{enrolled}/analyses")], "a reload is one view"
     said = client.get("/audit").text
-    assert f"looked at the results of /participants/{enrolled}/analyses" in said
+    assert f"looked at the results of {enrolled}: analyses" in said
     assert f"exported the record of {enrolled}" in said
     assert [(a, what) for a, what, _ in actions("participant") if what == "export"] == [(me, "export")]
 
