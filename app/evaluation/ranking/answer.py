@@ -55,6 +55,11 @@ class Row:
         """Probability that grasp, rating and tremor are all no worse than cDBS by more than their margins."""
         return self.decided.verdict.within if self.decided.verdict else None
 
+    @property
+    def may_be_picked(self) -> bool:
+        """Whether a visit may be planned with it, without a clinician's reason, and would show anything."""
+        return self.decided.standing not in ("unsafe", "not_advised", "same_as_cdbs") and self.one.policy.retired_reason is None
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -93,7 +98,7 @@ class Answer:
     @property
     def pickable(self) -> bool:
         """Whether there is a candidate that a visit may be planned with, without a clinician's reason."""
-        return any(may_be_picked(r) for r in (*self.rows, *self.like_cdbs, *self.like_off))
+        return any(r.may_be_picked for r in (*self.rows, *self.like_cdbs, *self.like_off))
 
     @property
     def tested(self) -> bool:
@@ -112,11 +117,6 @@ class Answer:
         told = [(n, r) for r in self.rows for n in [_needed(r)] if n is not None]
         fewest = min((n for n, _ in told), default=None)
         return sorted((r for n, r in told if n == fewest), key=lambda r: -(r.within or 0.0))
-
-
-def may_be_picked(row: Row) -> bool:
-    """Whether a visit may be planned with it, without a clinician's reason, and would show anything."""
-    return row.decided.standing not in ("unsafe", "not_advised", "same_as_cdbs") and row.one.policy.retired_reason is None
 
 
 def answer(found: Assessment) -> Answer:
