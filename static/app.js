@@ -82,6 +82,17 @@ document.addEventListener("keydown", (event) => {
   find.select();
 });
 
+// --- what stands for some seconds gives way to what stands then, beside it; the service goes by its own clock
+for (const part of document.querySelectorAll("[data-ends-in]")) {
+  const ends = Date.now() + 1000 * Number(part.dataset.endsIn);
+  const looking = setInterval(() => {
+    if (Date.now() < ends) return;
+    clearInterval(looking);
+    part.hidden = true;
+    part.parentElement.querySelector("[data-then]").hidden = false;
+  }, 1000);
+}
+
 // --- what takes long comes after the page: a link to the page that holds it, within an element of the same id
 for (const late of document.querySelectorAll("[data-late][id]")) {
   fetch(late.querySelector("a").href, { headers: { Accept: "text/html" } })

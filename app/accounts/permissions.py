@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 
 from app.accounts.models import Role, Scope
+from app.platform.database import now
 from app.platform.errors import Forbidden, NotFound
+
+CONFIRMED_FOR = timedelta(minutes=5)
+"""A confirmation by the sign-on that is older signs nothing."""
 
 READ = "read"
 READ_ARMS = "arms:read"  # which controller a session had, also before its visit is locked
@@ -76,6 +80,12 @@ class Caller:
     """Of the browser session; None for a token."""
     confirmed_at: datetime | None = None
     """When the user showed at the sign-on, in this browser session, who they are, to sign something with it."""
+
+    @property
+    def confirmed_until(self) -> datetime | None:
+        """Until when the user may sign with that confirmation instead of the password; None where there is none, or an old one."""
+        ends = self.confirmed_at + CONFIRMED_FOR if self.confirmed_at is not None else None
+        return ends if ends is not None and ends > now() else None
 
     def may(self, permission: str, study_id: int | None = None, site_id: int | None = None) -> bool:
         """Whether some grant that covers the site holds the permission; without a study: whether any grant does."""

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from datetime import timedelta
-
 from sqlalchemy.orm import Session
 
 from app.accounts import repository as accounts
 from app.accounts.models import SignIn, SignOnLink, User
-from app.accounts.permissions import Caller
+from app.accounts.permissions import CONFIRMED_FOR, Caller
 from app.accounts.service import open_session
 from app.accounts.sign_on import repository
 from app.accounts.sign_on.provider import Identity, Refused
@@ -17,8 +15,6 @@ from app.platform.database import now, set_actor
 from app.platform.errors import Forbidden
 
 _AGAIN = "Begin again, and give your password there; or give the one of here."
-CONFIRMED_FOR = timedelta(minutes=5)
-"""A confirmation that is older signs nothing."""
 
 
 def sign_on(db: Session, identity: Identity) -> str:

@@ -273,18 +273,26 @@ def _page(
 
 @dataclass(frozen=True)
 class Choice:
-    """A policy that may be planned, and what the ranking says of it; `row` is None for what no ranking holds."""
+    """A policy that may be planned, and what the ranking says of it.
+
+    Attributes:
+        row: None for what no ranking holds. twins: policies that do the same by the ranking, such as its students.
+    """
 
     policy: Policy
     row: Row | None
+    twins: tuple[Policy, ...]
 
 
 def _choices(db: Session, participant: Participant, answered: Answer | None) -> list[Choice]:
-    """Policies that may be planned, what to test first; those that no ranking holds come last."""
+    """Behaviours that may be planned, what to test first; policies that no ranking holds come last."""
     rows = answered.everyone() if answered is not None else {}
     places = {i: k for k, i in enumerate(rows)}
     policies = sorted(learning.candidates(db, participant.id), key=lambda p: (places.get(p.id, len(places)), p.id))
-    return [Choice(p, rows.get(p.id)) for p in policies]
+    known = {p.id for p in policies}
+    heads = {p.id: rows[p.id].one.policy.id if p.id in rows and rows[p.id].one.policy.id in known else p.id for p in policies}
+    twins = {head: tuple(p for p in policies if heads[p.id] == head and p.id != head) for head in heads.values()}
+    return [Choice(p, rows.get(p.id), twins[p.id]) for p in policies if heads[p.id] == p.id]
 
 
 def _chosen(view: PlanView | None, values: FormData | None) -> Sequence[int]:

@@ -13,11 +13,12 @@ from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
 from app.accounts.models import Role, User
-from app.accounts.permissions import Caller
+from app.accounts.permissions import CONFIRMED_FOR, Caller
 from app.accounts.sign_on import service
 from app.accounts.signing import sign
 from app.platform.database import new_session, now, set_actor
 from app.platform.errors import Forbidden
+from app.platform.web.templates import _environment
 from tests import identity_provider as theirs
 from tests.app.accounts.test_sign_on import ADA, BOB, ada, browser, hospital, signed_on, trail  # noqa: F401
 from tests.conftest import PASSWORD
@@ -86,7 +87,7 @@ def test_a_confirmation_runs_out_and_is_of_one_browser_session(browser: TestClie
         assert beside is not None
         with pytest.raises(Forbidden):
             service.use_confirmation(other, beside)
-    db.execute(text("update sign_in set confirmed_at = :at"), {"at": now() - service.CONFIRMED_FOR})
+    db.execute(text("update sign_in set confirmed_at = :at"), {"at": now() - CONFIRMED_FOR})
     db.commit()
     with new_session() as other, pytest.raises(Forbidden, match="sign within 5 minutes"):
         service.use_confirmation(other, confirmed)
@@ -108,3 +109,27 @@ def test_nobody_else_confirms_and_an_old_sign_on_does_not(browser: TestClient, h
     with pytest.raises(Forbidden):
         signs(browser)
     assert browser.get("/account").status_code == 200, "Ada is still signed in"
+
+
+def test_a_page_says_until_when_a_confirmation_stands_and_then_that_it_is_over(browser: TestClient, ada: User, db: Session) -> None:
+    assert signed_on(browser).status_code == 303
+    assert caller_in(browser).confirmed_until is None
+    assert signed_on(browser, "/sign-on/confirm").status_code == 303
+    caller = caller_in(browser)
+    assert caller.confirmed_at is not None
+    assert caller.confirmed_until == caller.confirmed_at + CONFIRMED_FOR
+    form = _identity(caller)
+    assert f"confirmed until {caller.confirmed_until:%H:%M:%S} UTC" in form
+    assert '<p role="status" data-then hidden>' in form
+    db.execute(text("update sign_in set confirmed_at = :at"), {"at": now() - CONFIRMED_FOR})
+    db.commit()
+    form = _identity(caller_in(browser))
+    assert "confirmed until" not in form
+    assert '<p role="status" data-then>' in form
+    assert 'name="password" type="password" value="" required' in form
+
+
+def _identity(caller: Caller) -> str:
+    """The part of a signature's form that asks who signs."""
+    macros = _environment.get_template("accounts/signing.html").make_module({})
+    return str(macros.identity_again(caller, "/"))  # type: ignore[attr-defined]

@@ -9,7 +9,10 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import select, update
+from sqlalchemy.orm import Session
 
+from app.learning.models import BufferSnapshot, Policy
 from tests.app.evaluations import judge as judge
 from tests.app.evaluations import judged
 from tests.app.evaluations import policies as policies
@@ -66,3 +69,22 @@ def _with(value: float, draws: list[float], **changed: Any) -> dict[str, Any]:
     estimate = judged(value, **changed)
     estimate["details"]["draws"] = draws
     return estimate
+
+
+def test_policies_that_do_the_same_stand_under_their_teacher_and_can_still_be_ticked(
+    client: TestClient, db: Session, policies: list[int], judge: Judge
+) -> None:
+    a, b, c = policies
+    judge({a: judged(50.0), b: judged(50.0), c: judged(60.0, behaviour={"mean_amplitude": 0.3})})
+    snapshot = db.scalars(select(BufferSnapshot.id)).one()
+    for student in (b, c):  # what c does differs from what its teacher does
+        db.execute(update(Policy).where(Policy.id == student).values(kind="distilled", teacher_id=a, snapshot_id=snapshot))
+    db.commit()
+    visit = client.post("/api/v1/participants/P1/visits", json={"number": 2}).json()["id"]
+    page = client.get(f"/visits/{visit}/plan", headers={"accept": "text/html"}).text
+    assert page.count('name="policy_ids"') == 3
+    (fold,) = re.findall(r"<details><summary><small>and 1 that does the same</small>(.*?)</details>", page, re.S)
+    assert re.findall(r'aria-label="Test (p\d)"', fold) == ["p1"]
+    assert client.post(f"/api/v1/visits/{visit}/plan", json={"policy_ids": [b]}).status_code == 201
+    again = client.get(f"/visits/{visit}/plan", headers={"accept": "text/html"}).text
+    assert "<details open><summary><small>and 1 that does the same" in again, "what the draft holds is not hidden"
