@@ -12,7 +12,6 @@ from datetime import datetime
 from fpdf import FPDF
 from fpdf.enums import XPos, YPos
 
-from app.evaluation.wording import method_name
 from app.planning import wording
 from app.planning.plans.view import PlanView, shown
 from app.planning.sheet.cards import WIDTH, draw_cards
@@ -181,14 +180,14 @@ def _reading(pdf: _Sheet, view: PlanView) -> None:
     levels = {line.estimate.level for line in view.lines if line.estimate}
     sentences = []
     if evaluation and levels:
-        method = method_name(evaluation.default_method)
         sentences.append(
-            f"Estimated return: E[r_end + discounted step rewards] over {evaluation.horizon_steps} steps (gamma {evaluation.gamma:g}) by "
-            f"{method}, with its {100 * min(levels):.0f} % interval, as ranked on {evaluation.created_at:%Y-%m-%d}. Energy of a policy: "
-            "predicted mean squared amplitude fraction."
+            f"Return: what a session of {evaluation.horizon_steps} control steps is worth by this study's scores of beta, energy, grasp, "
+            f"rating and tremor, more being better, as estimated on {evaluation.created_at:%Y-%m-%d}; in brackets its "
+            f"{100 * min(levels):.0f} % interval. "
+            "Energy: the mean of the squared amplitude, 1 under cDBS."
         )
     if any(line.estimate and not line.estimate.supported for line in view.lines):
-        sentences.append("* The data do not support this estimate.")
+        sentences.append("* The recordings hold too little of the kind to rely on this estimate.")
     start = "by the clinic's clock" if view.plan.starts_at else "h:mm from the start of the first session"
     sentences.append(f"Start: {start}. Washout: pause on clinical stimulation after it. Bundle: first {HASH} characters of its hash.")
     pdf.set_font("Helvetica", "", 8)

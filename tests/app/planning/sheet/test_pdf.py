@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from pypdf import PdfReader
 
 from app.planning.sheet.latin1_text import latin
+from tests.app.words import methods_named
 
 
 def _sheet(client: TestClient, visit_id: int) -> list[str]:
@@ -51,13 +52,15 @@ def test_a_draft_says_so_and_holds_everything_that_the_clinic_needs(client: Test
         f"Page 1 of {len(pages)}",
         f"plan {plan['id']}, seed 7, evaluation {studied.evaluation}, snapshot {plan['evaluation']['snapshot_id']}",
         "by admin@clinic.example",
-        "by DLSM, with its 90 % interval",
+        "in brackets its 90 % interval",
+        "* The recordings hold too little of the kind",
         "! The data do not support the estimate of policy 'rl-02-small'",
     ):
         assert words in text, words
     rows = [f"{s['position']} {int(s['start_minute']) // 60}:{int(s['start_minute']) % 60:02d} " for s in plan["sessions"]]
     places = [text.index(row, text.index("Stimulation site")) for row in rows]
     assert places == sorted(places)
+    assert methods_named(text) == []
 
 
 def test_an_approved_sheet_has_no_watermark_and_names_who_approved(client: TestClient, studied: Any, sign_plan: Any) -> None:
