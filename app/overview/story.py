@@ -16,6 +16,8 @@ from app.study.models import SettingsVersion, Visit
 _GAP = 0.022
 _SHARE = 0.7
 """Of the shortest time between two visits that the sessions of a visit may take on the axis."""
+_TICKS = 8
+"""Days that find room below the axis, on a tablet too."""
 _APART = dt.timedelta(minutes=20)
 """Between sessions of a visit whose times nobody stated, so that they stand beside each other in their order."""
 
@@ -37,6 +39,7 @@ def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[Sett
         shown = marker(controller.value, 8)
         data.append({"type": "scatter", "mode": "markers", "name": CONTROLLER_NAMES[controller], "x": [None], "y": [None], "marker": shown})
     layout["shapes"], layout["annotations"] = _marks(dated, places, versions)
+    layout["xaxis"] |= _days(dated, places)
     columns = ("Start", "Visit", "Session", "Controller", *(f"{name} ({unit})" for name, unit, _ in panels))
     rows: list[list[Cell]] = [
         [f"{moment:%Y-%m-%d %H:%M}", s.visit, s.session_id, CONTROLLER_NAMES[s.controller], *(values[i] for _, _, values in panels)]
@@ -120,6 +123,16 @@ def _panels(
             }
         )  # fmt: skip
     return data, layout
+
+
+def _days(dated: Sequence[tuple[dt.datetime, Facts]], places: Sequence[dt.datetime]) -> dict[str, Any]:
+    """Ticks where visits stand, with their days: a calendar's would date sessions that stand beside their visit's day by another one."""
+    spans: dict[int, list[tuple[dt.datetime, dt.datetime]]] = {}
+    for (moment, s), place in zip(dated, places, strict=True):
+        spans.setdefault(s.visit_id, []).append((place, moment))
+    ticks = sorted((min(at)[0] + (max(at)[0] - min(at)[0]) / 2, min(m for _, m in at)) for at in spans.values())
+    shown = ticks[:: -(-len(ticks) // _TICKS)]
+    return {"tickvals": [at.isoformat() for at, _ in shown], "ticktext": [f"{day:%Y-%m-%d}" for _, day in shown]}
 
 
 def _title(name: str, unit: str) -> dict[str, Any]:
