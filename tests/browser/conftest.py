@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -43,11 +44,11 @@ class Watched:
         answer = self.page.goto(self.address + path)
         assert answer.status == 200, f"{path}: {answer.status}"
 
-    def sign_in(self) -> None:
+    def sign_in(self, email: str = "admin@clinic.example", password: str = PASSWORD) -> None:
         """Sign in through the form."""
         self.open("/sign-in")
-        self.page.fill("[name=email]", "admin@clinic.example")
-        self.page.fill("[name=password]", PASSWORD)
+        self.page.fill("[name=email]", email)
+        self.page.fill("[name=password]", password)
         self.page.click("main button")
         self.page.wait_for_selector("a.who")
 
@@ -96,10 +97,10 @@ def chromium() -> Iterator[Any]:
         browser.close()
 
 
-@pytest.fixture
-def address(service_app) -> Iterator[str]:  # type: ignore[no-untyped-def]
-    """Where the service answers; it runs in a thread on the test's database."""
-    server = uvicorn.Server(uvicorn.Config(service_app, host="127.0.0.1", port=0, log_level="warning"))
+@contextmanager
+def serving(app: Any) -> Iterator[str]:
+    """Where a service answers that runs in a thread, on the database in use."""
+    server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning"))
     thread = threading.Thread(target=server.run)
     thread.start()
     deadline = time.monotonic() + 180
@@ -113,9 +114,9 @@ def address(service_app) -> Iterator[str]:  # type: ignore[no-untyped-def]
     assert not thread.is_alive()
 
 
-@pytest.fixture
-def window(chromium: Any, address: str, client: TestClient) -> Iterator[Callable[..., Watched]]:
-    """Open windows of a size and colour scheme; `client` has made the administrator."""
+@contextmanager
+def windows(chromium: Any, address: str) -> Iterator[Callable[..., Watched]]:
+    """Open windows of a size and colour scheme on a service."""
     contexts = []
 
     def make(width: int = 1400, height: int = 900, scheme: str = "light") -> Watched:
@@ -130,6 +131,20 @@ def window(chromium: Any, address: str, client: TestClient) -> Iterator[Callable
     yield make
     for context in contexts:
         context.close()
+
+
+@pytest.fixture
+def address(service_app) -> Iterator[str]:  # type: ignore[no-untyped-def]
+    """Where the service answers; it runs in a thread on the test's database."""
+    with serving(service_app) as found:
+        yield found
+
+
+@pytest.fixture
+def window(chromium: Any, address: str, client: TestClient) -> Iterator[Callable[..., Watched]]:
+    """Open windows of a size and colour scheme; `client` has made the administrator."""
+    with windows(chromium, address) as make:
+        yield make
 
 
 @pytest.fixture

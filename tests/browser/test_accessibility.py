@@ -100,6 +100,20 @@ def test_no_page_breaks_a_rule_of_accessibility_or_moves(
     assert looked_at(window(width, 900, scheme), addresses, (width, scheme) == (1280, "light")) == []
 
 
+def test_the_first_tick_of_a_ranking_is_fifteen_tabs_away_at_most(ranked: dict[str, int], window: Callable) -> None:  # type: ignore[type-arg]
+    watched = window(1280, 900, "light")
+    watched.sign_in()
+    watched.open(RANKED["ranking"])
+    keys = 0
+    while not watched.page.evaluate("() => document.activeElement.matches('input[name=policy_ids]')"):
+        assert keys < 15
+        skips = watched.page.evaluate("() => document.activeElement.matches('a.skip[href=\"#candidates\"]')")
+        watched.page.keyboard.press("Enter" if skips else "Tab")
+        keys += 1
+    watched.page.keyboard.press("Space")
+    assert watched.page.evaluate("() => document.activeElement.checked")
+
+
 @WINDOWS
 def test_the_pages_of_a_ranking_break_no_rule_either(
     ranked: dict[str, int],
