@@ -7,8 +7,8 @@ import zlib
 from fastapi.testclient import TestClient
 
 from app.settings import get_settings
-from tests.app.every_page import ELSEWHERE, addresses, routes
 from tests.app.every_route import PASSWORD, World
+from tests.app.pages.every_page import ELSEWHERE, addresses, routes
 
 MOST_BYTES = 60_000
 
