@@ -55,8 +55,15 @@ def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] |
         except ValidationError as error:
             for e in error.errors():
                 name = ".".join(map(str, e["loc"]))
-                errors.append({"where": labels.get(name, name), "what": e["msg"], "name": name})
+                errors.append({"where": labels.get(name, name), "what": _said(e), "name": name})
     raise Invalid("Some fields cannot be used.", "Correct them and send the form again.", errors=errors)
+
+
+def _said(error: Mapping[str, Any]) -> str:
+    """What is wrong with a field; a pattern is no sentence, and the field's name or help says what it takes."""
+    if error["type"] == "string_pattern_mismatch":
+        return f"'{error['input']}' is not written as this field takes it"
+    return str(error["msg"])
 
 
 @dataclass(frozen=True)
