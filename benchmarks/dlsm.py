@@ -53,6 +53,7 @@ def random_batch(steps: int) -> Batch:
         lengths=torch.full((BATCH,), steps),
         outcomes=torch.randn(BATCH, 4, generator=g),
         outcome_mask=torch.ones(BATCH, 4),
+        randomised=ones[0],
     )
 
 

@@ -183,6 +183,10 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "no_better_than_mean": lambda f: (
         f"left-out sessions are predicted no better than by the mean of the others (error {number(f):.2f} of that one's)"
     ),
+    "members_discarded": lambda f: (
+        f"{number(f):.0f} of {f.limit or 0:.0f} models of the ensemble were left out, because their answer to a lasting dose is none, or "
+        "the opposite of that within the random sessions"
+    ),
     "no_answer_to_amplitude": lambda f: (
         "the model's answer to the amplitude is no better than none: in left-out sessions it misses how controllers differ"
     ),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,8 @@ class Batch:
         usable: 1 where the step may be learnt from, [T, B]; never beyond `alive`.
         first_known: 1 where s_0 is free of gaps, [B].
         lengths: T of each session, [B].
+        randomised: 1 where the session's doses were drawn at random, [B].
+        left, resting: `LinearPart.of`, [T, B] and [W + T, B]; None without a linear part.
         outcomes, outcome_mask: `OUTCOMES` standardised and whether they were measured, [B, 4].
     """
 
@@ -41,6 +43,9 @@ class Batch:
     lengths: Tensor
     outcomes: Tensor
     outcome_mask: Tensor
+    randomised: Tensor
+    left: Tensor | None = None
+    resting: Tensor | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -62,6 +67,21 @@ class Batch:
             lengths,
             self.outcomes[index],
             self.outcome_mask[index],
+            self.randomised[index],
+            None if self.left is None else self.left[:t, index],
+            None if self.resting is None else self.resting[: t + self.states.shape[2], index],
+        )
+
+    def cut(self, steps: int) -> Batch:
+        """The first steps alone."""
+        window = self.states.shape[2]
+        return replace(
+            self,
+            states=self.states[: steps + 1],
+            **{name: getattr(self, name)[:steps] for name in ("actions", "rewards", "alive", "usable")},
+            lengths=self.lengths.clamp(max=steps),
+            left=None if self.left is None else self.left[:steps],
+            resting=None if self.resting is None else self.resting[: window + steps],
         )
 
 
@@ -100,6 +120,7 @@ def make_batch(buffer: ReplayBuffer, scale: Scale, dtype: torch.dtype = torch.fl
         torch.as_tensor([s.steps for s in sessions], dtype=torch.long),
         tensor(np.where(mask, outcomes, 0.0)),
         tensor(mask),
+        tensor(np.array([s.controller == "random" for s in sessions])),
     )
 
 

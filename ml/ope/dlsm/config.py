@@ -5,7 +5,8 @@ simulator outside the cohort (`hidden` of the tests). They and the objective wer
 (`benchmarks/development/dlsm_selection.py`, table in docs/history.md): smaller, shorter and longer trained models predicted worse on
 average, larger ones alike at twice the cost. No objective was best on every data set; `sum` had the least mean and the least bad worst
 score, by less than the scatter, and a choice per data set (`select`) did no better on sessions that had not made it. Known returns were
-looked at after that and changed nothing, though `free_running` was a little better by them.
+looked at after that and changed nothing, though `free_running` was a little better by them. `expert` is what a job's DLSM is: its
+features were set by argument and measured together on part A of the virtual population (docs/evaluation.md).
 """
 
 from __future__ import annotations
@@ -32,6 +33,13 @@ class DlsmConfig:
         start: roll-outs from `observed` s_0 through q(z_0 | s_0), or from the `prior` (paper).
         skip: a linear path from z_{t-1} and the inputs to the mean of z_t past the LSTM; without it z_t is drawn given h_t alone (paper).
         qoc_terms: the QoCs shape the latent state as r_end does; without it they are only read from it (paper).
+        residual: the head of beta predicts what a linear one-step prediction from window and recent amplitudes leaves; it starts at zero,
+            and the untrained model is one of the checks.
+        reward_terms: a Gaussian density of the reward in the objective (paper); without it the reward is the known one of sampled beta.
+        free_bits: KL of a step that costs nothing, nats.
+        overshoot: free runs of the objective start from posterior states at a multiple of so many steps, drawn anew at every
+            gradient step; 0: from the first step alone.
+        recurrent_heads: heads of steps see the decoder's recurrent state beside z.
         kl_weight, end_weight: weights in the objective; 1 and 1 is the bound.
         members: ensemble size, one seed each.
         steps: gradient steps at most. batch: sessions per step. learning_rate: of Adam, falling to a tenth along a half cosine.
@@ -39,6 +47,10 @@ class DlsmConfig:
         check_every: steps between held-out checks; `patience`: checks without improvement before stopping.
         keep: the weights of the `best` held-out check, or of the `last` step, whatever the checks say (paper).
         held_out: share of the sessions that a member does not learn from.
+        bootstrap: a member learns from as many sessions as there are, drawn with replacement; those not drawn are its held-out ones.
+        dose_contrast: held-out checks also ask how beta moves with the dose within sessions.
+        pretrained: members start from the weights of `ml.ope.dlsm.pretrained`, whose shape is that of `expert`.
+        discard: leave out members whose answer to a lasting dose is null or wrong-signed against that within sessions.
         replay_draws: free runs per held-out session in a check.
         rollouts: trajectories per policy and member. block: trajectories advanced together.
         reward_source: step return from the learnt reward `head`, from the `known` reward on sampled beta, or whichever predicts
@@ -63,6 +75,11 @@ class DlsmConfig:
     start: Literal["observed", "prior"] = "observed"
     skip: bool = True
     qoc_terms: bool = True
+    residual: bool = False
+    reward_terms: bool = True
+    free_bits: float = 0.0
+    overshoot: int = 0
+    recurrent_heads: bool = False
     kl_weight: float = 1.0
     end_weight: float = 1.0
     members: int = 5
@@ -75,6 +92,10 @@ class DlsmConfig:
     patience: int = 4
     keep: Literal["best", "last"] = "best"
     held_out: float = 0.2
+    bootstrap: bool = False
+    dose_contrast: bool = False
+    pretrained: bool = False
+    discard: bool = False
     replay_draws: int = 16
     rollouts: int = 256
     block: int = 1024
@@ -93,6 +114,12 @@ class DlsmConfig:
                 raise ValueError(f"{name} of a DLSM must be above 0, not {getattr(self, name)}")
         if not 0 < self.held_out < 1:
             raise ValueError(f"held_out must be a share between 0 and 1, not {self.held_out}")
+        if self.free_bits < 0 or self.overshoot < 0:
+            raise ValueError(f"free_bits and overshoot of a DLSM must be at least 0, not {self.free_bits} and {self.overshoot}")
+        if self.residual and self.state_terms != "newest":
+            raise ValueError("residual needs state_terms='newest': the linear part predicts the newest beta alone")
+        if not self.reward_terms and self.reward_source == "head":
+            raise ValueError("reward_source='head' needs reward_terms: without them no reward head is learnt")
         if self.decode_all_window and self.state_terms != "window":
             raise ValueError("decode_all_window needs state_terms='window': a head of the newest beta cannot draw the others")
 
@@ -105,6 +132,21 @@ class DlsmConfig:
     def of_size(cls, size: Size, seed: int = 0) -> DlsmConfig:
         """Settings at a size of `ml.ope.registry`."""
         return cls.demo(seed) if size == "demo" else cls(seed=seed)
+
+    @classmethod
+    def expert(cls, size: Size = "full", seed: int = 0) -> DlsmConfig:
+        """What a job's DLSM is: every feature but `pretrained` and `recurrent_heads` (docs/evaluation.md says why)."""
+        return replace(
+            cls.of_size(size, seed),
+            residual=True,
+            reward_terms=False,
+            learning_rate=2e-3,
+            overshoot=60,
+            free_bits=0.1,
+            bootstrap=True,
+            dose_contrast=True,
+            discard=True,
+        )
 
     @classmethod
     def paper(cls, size: Size = "full", seed: int = 0) -> DlsmConfig:

@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from ml.ope.behaviour import controller_key
+from ml.ope.dlsm import pretrained
 from ml.ope.dlsm.batches import Batch, make_batch
 from ml.ope.dlsm.config import DlsmConfig
+from ml.ope.dlsm.dose_answer import Judged, judge
 from ml.ope.dlsm.held_out import FreeRuns, shares
 from ml.ope.dlsm.rollout import Rollouts, roll_out
-from ml.ope.dlsm.selection import Selection, SelectionRun, usable_folds
+from ml.ope.dlsm.selection import Selection, SelectionRun, resampled, usable_folds
 from ml.ope.dlsm.training import Member, MemberTraining
 from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS, Flag
@@ -37,6 +39,9 @@ from ml.progress import Report, part_of, silent
 from ml.trajectories import ReplayBuffer, content_hash, to_parquet
 
 Floats = NDArray[np.float64]
+
+CHECKPOINT = 2
+"""Raised when the state of a training means something else: checkpoints of another number are refused."""
 
 FEWEST_SESSIONS = 4
 DRAWS = 200
@@ -70,7 +75,8 @@ class Dlsm:
         """Train every member; what a checkpoint in `checkpoint_dir` calls finished is not trained again.
 
         Raises:
-            ValueError: fewer than four sessions, no usable step, or a checkpoint of another buffer or other settings.
+            ValueError: fewer than four sessions, no usable step, a checkpoint of another buffer or other settings, or every member is
+                discarded for its answer to a lasting dose.
         """
         data = self._prepare(buffer)
         parts = self.config.members + (1 if self.config.select else 0)
@@ -78,7 +84,12 @@ class Dlsm:
         c = self._chosen(selection)
         first = parts - c.members
         members = tuple(self._train(data, c, k, part_of(report, first + k, parts), checkpoint_dir) for k in range(c.members))
-        return FittedDlsm(self.method, c, buffer, data.batch, data.scale, members, fit_end_model(buffer), selection)
+        judged = judge([m.networks for m in members], data.batch, c.seed) if c.discard else None
+        if judged is not None:
+            members = tuple(m for k, m in enumerate(members) if k not in judged.discarded)
+            if not members:
+                raise ValueError(judged.sentence())
+        return FittedDlsm(self.method, c, buffer, data.batch, data.scale, members, fit_end_model(buffer), selection, judged)
 
     def fit_member(self, buffer: ReplayBuffer, k: int, report: Report = silent, checkpoint_dir: Path | None = None) -> Member:
         """Train member `k` alone, for ensembles whose members learn side by side: `fit` finds its checkpoint finished.
@@ -101,7 +112,8 @@ class Dlsm:
             raise ValueError(f"the DLSM needs at least {FEWEST_SESSIONS} sessions with usable steps and holds some out; the buffer has {n}")
         scale = learn_scale(buffer)
         folds = usable_folds(buffer, c.held_out, c.seed)
-        named = content_hash(to_parquet(buffer)) + json.dumps(c.to_json(), sort_keys=True)
+        start = pretrained.fingerprint() if c.pretrained else ""
+        named = f"{CHECKPOINT}{start}{content_hash(to_parquet(buffer))}{json.dumps(c.to_json(), sort_keys=True)}"
         return _Data(buffer, make_batch(buffer, scale), scale, folds, hashlib.sha256(named.encode()).hexdigest())
 
     def _select(self, data: _Data, report: Report, checkpoint_dir: Path | None) -> Selection | None:
@@ -114,14 +126,19 @@ class Dlsm:
         return self.config if selection is None else self.config.candidates()[selection.chosen]
 
     def _train(self, data: _Data, config: DlsmConfig, k: int, report: Report, checkpoint_dir: Path | None) -> Member:
-        held = data.folds[k % len(data.folds)]
-        training = MemberTraining(data.buffer, data.batch, data.scale, held, config, config.seed + k, data.fingerprint)
+        held, learnt = data.folds[k % len(data.folds)], None
+        if config.bootstrap:
+            learnt, held = resampled(data.buffer, config.seed + k)
+        training = MemberTraining(data.buffer, data.batch, data.scale, held, config, config.seed + k, data.fingerprint, learnt=learnt)
         return training.run(None if checkpoint_dir is None else checkpoint_dir / f"dlsm-member-{k}.pt", report)
 
 
 @dataclass(frozen=True)
 class FittedDlsm:
-    """A trained ensemble and the buffer it came from; `config` is what was chosen where there was a choice."""
+    """A trained ensemble and the buffer it came from; `config` is what was chosen where there was a choice.
+
+    `members` are those that `judged` left in; it is None where the settings ask for no judgement.
+    """
 
     method: str
     config: DlsmConfig
@@ -131,6 +148,7 @@ class FittedDlsm:
     members: tuple[Member, ...]
     end: EndModel
     selection: Selection | None = None
+    judged: Judged | None = None
 
     @property
     def checks(self) -> tuple[FreeRuns, ...]:
@@ -140,6 +158,8 @@ class FittedDlsm:
     @property
     def reward_source(self) -> str:
         """`head` or `known`: what the step return is read from, by the held-out sessions unless the settings say."""
+        if not self.config.reward_terms:
+            return "known"
         if self.config.reward_source != "held_out":
             return self.config.reward_source
         head, known = (sum(getattr(c, name) for c in self.checks) for name in ("error_head", "error_known"))
@@ -209,6 +229,7 @@ class FittedDlsm:
             per_policy=per_policy,
             seed=self.config.seed + 1000 + k,
             prior=prior,
+            before=None if member.networks.linear is None else member.networks.linear.before,
             report=report,
         )
 
@@ -296,6 +317,8 @@ class FittedDlsm:
         flags += [unknown] if (unknown := day_noise(self.buffer, horizon, 1, 0)[1]) else []
         skill = self.held_out_skill()
         flags += _warnings(skill)
+        if self.judged is not None and self.judged.discarded:
+            flags.append(Flag("members_discarded", float(len(self.judged.discarded)), float(len(self.judged.members)), "members"))
         other_step, other_end = zip(*(self._parts(run) for run in others), strict=True)
         return Estimate(
             method=self.method,
@@ -319,6 +342,8 @@ class FittedDlsm:
                 "step_return_head": float(np.mean([run.return_head[i].mean() for run in runs])),
                 "step_return_known": float(np.mean([run.return_known[i].mean() for run in runs])),
                 "members": [float(v) for v in values[:, i]],
+                "pretrained": all(m.pretrained for m in self.members),
+                "dose_answer": None if self.judged is None else self.judged.to_json(),
                 "level_error": self.level_error(),
                 "coverage": logged.to_json(),
                 "coverage_simulated": simulated.to_json(),
@@ -354,7 +379,7 @@ def _warnings(skill: dict[str, Any]) -> list[Flag]:
 
 def build(key: str, seed: int, size: Size) -> Dlsm:
     """The estimator at a size of `ml.ope.registry`."""
-    return Dlsm(DlsmConfig.of_size(size, seed), key)
+    return Dlsm(DlsmConfig.expert(size, seed), key)
 
 
 def build_paper(key: str, seed: int, size: Size) -> Dlsm:

@@ -17,12 +17,16 @@ from numpy.typing import NDArray
 from ml.mdp import MdpSettings
 from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.networks import DlsmNetworks
+from ml.ope.fqe.steps import memories
 from ml.ope.scale import Scale
 
 Floats = NDArray[np.float64]
 
 BLOCK = 30
 """Steps whose means are compared: about a minute."""
+
+FEWEST_BLOCKS, LEAST_DOSE = 3, 0.03
+"""Blocks of a session, and standard deviation of their doses, that tell how beta moves with the dose within it."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,8 @@ class SessionError:
         beta_constant, reward_constant: those of a constant.
         outcomes, outcomes_constant: mean over the measured outcomes; None where none was.
         beta_seen, beta_predicted: mean beta over the usable steps.
+        dose_spread: sum of squares of the blocks' doses around the session's mean, 0 where it was not asked for.
+        dose_seen, dose_predicted: slopes of beta on the dose over the blocks of the session.
     """
 
     session: int
@@ -66,6 +72,9 @@ class SessionError:
     outcomes_constant: float | None
     beta_seen: float
     beta_predicted: float
+    dose_spread: float = 0.0
+    dose_seen: float = 0.0
+    dose_predicted: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -76,6 +85,7 @@ class Shares:
         beta, head, known: of block means. outcomes: None where none was measured.
         contrast: of the differences in mean beta between controllers, as a share of these differences: the answer to the action, free of
             what all sessions are off by alike. None where the sessions are of one controller.
+        dose: of how beta moves with the dose within random sessions, as a share of that movement; None where it was not asked for.
     """
 
     beta: float
@@ -83,11 +93,12 @@ class Shares:
     known: float
     outcomes: float | None
     contrast: float | None
+    dose: float | None = None
 
     @property
     def score(self) -> float:
         """What selection minimises: the mean of the parts, the reward by whichever of its two sources predicts better."""
-        parts = [self.beta, min(self.head, self.known), self.outcomes, self.contrast]
+        parts = [self.beta, min(self.head, self.known), self.outcomes, self.contrast, self.dose]
         return float(np.mean([p for p in parts if p is not None]))
 
 
@@ -115,7 +126,15 @@ def shares(groups: Sequence[Sequence[SessionError]], kinds: Mapping[int, object]
         known=share("known", "reward_constant") or 0.0,
         outcomes=share("outcomes", "outcomes_constant"),
         contrast=None if kinds is None else _contrast([e for g in known for e in g], kinds),
+        dose=_dose_share([e for g in known for e in g]),
     )
+
+
+def _dose_share(errors: Sequence[SessionError]) -> float | None:
+    seen = sum(e.dose_spread * e.dose_seen**2 for e in errors)
+    if seen <= 0:
+        return None
+    return float(sum(e.dose_spread * (e.dose_predicted - e.dose_seen) ** 2 for e in errors) / max(seen, 1e-9))
 
 
 def _contrast(errors: Sequence[SessionError], kinds: Mapping[int, object]) -> float | None:
@@ -190,14 +209,17 @@ def held_out(
         ValueError: none of the sessions has a usable step.
     """
     run = _predict(networks, batch, draws, seed, float(scale.beta(np.array(settings.xi_beta))))
+    contrast = networks.config.dose_contrast
     usable = batch.usable.numpy() > 0
     actions = batch.actions.numpy().astype(np.float64)
     actual = batch.rewards.numpy().astype(np.float64) * scale.reward_std + scale.reward_mean
-    head = run.reward * scale.reward_std + scale.reward_mean
     known = settings.r_a + (settings.r_b - settings.r_a) * run.above - settings.c1 * actions
+    head = run.reward * scale.reward_std + scale.reward_mean if networks.config.reward_terms else known
     scaled = [(p - scale.reward_mean) / scale.reward_std for p in (head, known)]
     errors = [
-        e for j, session in enumerate(sessions) if (e := _session_error(session, j, batch, usable[:, j], run, scaled, constant)) is not None
+        e
+        for j, session in enumerate(sessions)
+        if (e := _session_error(session, j, batch, usable[:, j], run, scaled, constant, contrast)) is not None
     ]
     mask = batch.outcome_mask.numpy() > 0
     squared = (batch.outcomes.numpy() - run.outcomes) ** 2
@@ -225,7 +247,14 @@ def _predict(networks: DlsmNetworks, batch: Batch, draws: int, seed: int, thresh
 
 
 def _session_error(
-    session: int, j: int, batch: Batch, usable: NDArray[np.bool_], run: _Predicted, rewards: Sequence[Floats], constant: Constant
+    session: int,
+    j: int,
+    batch: Batch,
+    usable: NDArray[np.bool_],
+    run: _Predicted,
+    rewards: Sequence[Floats],
+    constant: Constant,
+    contrast: bool,
 ) -> SessionError | None:
     """Errors of the batch's j-th session; None where it has no usable step."""
     beta = batch.states[1:, j, -1].numpy().astype(np.float64)
@@ -242,6 +271,8 @@ def _session_error(
     mask = batch.outcome_mask[j].numpy() > 0
     seen = batch.outcomes[j].numpy()[mask]
     ends = [float(np.mean((seen - p[mask]) ** 2)) for p in (run.outcomes[j], np.array(constant.outcomes))] if mask.any() else [None, None]
+    contrast = contrast and bool(batch.randomised[j] > 0)  # a controller that follows beta turns the sign
+    slopes = dose_slopes(batch.actions[:, j].numpy(), usable, beta, run.beta[:, j]) if contrast else (0.0, 0.0, 0.0)
     return SessionError(
         session=session,
         beta=float(beta_errors[0]),
@@ -253,6 +284,9 @@ def _session_error(
         outcomes_constant=ends[1],
         beta_seen=float(beta[usable].mean()),
         beta_predicted=float(run.beta[usable, j].mean()),
+        dose_spread=slopes[0],
+        dose_seen=slopes[1],
+        dose_predicted=slopes[2],
     )
 
 
@@ -268,6 +302,24 @@ def block_error(seen: Floats, predicted: Floats) -> Floats:
     counted = [b for b in blocks if known[b].sum() >= BLOCK // 3] or [slice(None)]
     squares = [(predicted[:, b][:, known[b]].mean(1) - seen[b][known[b]].mean()) ** 2 for b in counted]
     return np.asarray(np.mean(squares, axis=0), dtype=np.float64)
+
+
+def dose_slopes(actions: NDArray[Any], usable: NDArray[np.bool_], *betas: Floats) -> tuple[float, ...]:
+    """Sum of squares of a session's doses over blocks, and the slope of each beta [T] on them; zeros where doses hardly differ.
+
+    The dose is the average over about 20 steps (`ml.ope.fqe.steps`); blocks as in `block_error`, of which three at least must count.
+    """
+    dose = memories(actions.astype(np.float64))[:, 1]
+    blocks = [slice(first, first + BLOCK) for first in range(0, usable.size, BLOCK)]
+    kept = [np.arange(usable.size)[b][usable[b]] for b in blocks if usable[b].sum() >= BLOCK // 3]
+    if len(kept) < FEWEST_BLOCKS:
+        return (0.0,) * (1 + len(betas))
+    x = np.array([dose[k].mean() for k in kept])
+    x = x - x.mean()
+    spread = float(x @ x)
+    if spread < LEAST_DOSE**2 * len(kept):
+        return (0.0,) * (1 + len(betas))
+    return (spread, *(float(x @ np.array([b[k].mean() for k in kept]) / spread) for b in betas))
 
 
 def _mean(values: NDArray[Any], usable: NDArray[np.bool_]) -> float:

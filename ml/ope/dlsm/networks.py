@@ -7,15 +7,17 @@ Source: Gao et al. 2023, section 5 (eq:encoder, eq:decoder, eq:elbo) and Algorit
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.heads import GaussianHead, gaussian_kl, gaussian_log_prob
-from ml.ope.dlsm.recurrence import LatentWeights, bounded, lstm, lstm_loop, stochastic_lstm, stochastic_lstm_loop
+from ml.ope.dlsm.linear_part import LinearPart
+from ml.ope.dlsm.recurrence import LatentWeights, bounded, lstm, lstm_loop, stochastic_lstm, stochastic_lstm_loop, unbounded
 from ml.ope.estimate import OUTCOMES
 
 
@@ -47,10 +49,13 @@ class LatentRecurrence(nn.Module):
         weights = LatentWeights(self.w_x, self.bias, self.a_x, self.w_z, self.w_h, self.a_z, self.w_out, self.b_out)
         return (stochastic_lstm if fast else stochastic_lstm_loop)(x, z0, eps, weights)
 
-    def follow(self, x: Tensor, z: Tensor, fast: bool = True) -> tuple[Tensor, Tensor]:
-        """Means and log standard deviations of z_t given the z_{t-1} of another path, [T, B, Z]; z is z_0 ... z_{T-1}."""
+    def recurrent(self, x: Tensor, z: Tensor, fast: bool = True) -> Tensor:
+        """h_1 ... h_T along a path, [T, B, H]; z is z_0 ... z_{T-1}."""
+        return (lstm if fast else lstm_loop)(torch.cat([x, z], dim=2), torch.cat([self.w_x, self.w_z]), self.bias, self.w_h)
+
+    def follow(self, x: Tensor, z: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and log standard deviations of z_t given the z_{t-1} of another path and its `recurrent`, [T, B, Z]."""
         given = torch.cat([x, z], dim=2)
-        h = (lstm if fast else lstm_loop)(given, torch.cat([self.w_x, self.w_z]), self.bias, self.w_h)
         head, raw = (h @ self.w_out + self.b_out).chunk(2, dim=2)
         return given @ torch.cat([self.a_x, self.a_z]) + head, bounded(raw)
 
@@ -66,11 +71,12 @@ class LatentRecurrence(nn.Module):
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard normal draws of one evaluation: z_0 [B, Z]; encoder and decoder paths [T, B, Z]."""
+    """Standard normal draws of one evaluation: z_0 [B, Z]; encoder and decoder paths [T, B, Z]. `start`: first step of the free run."""
 
     first: Tensor
     encoder: Tensor
     decoder: Tensor
+    start: int = 0
 
 
 @dataclass(frozen=True)
@@ -100,7 +106,8 @@ class DlsmNetworks(nn.Module):
         self.window, self.config = window, config
         z, hidden, heads = config.latent, config.hidden, config.heads
         self.state_width = window if config.state_terms == "window" else 1
-        extra = 1 if config.action_emission else 0
+        extra = (1 if config.action_emission else 0) + (hidden if config.recurrent_heads else 0)
+        self.linear: LinearPart | None = None
         self.first = GaussianHead(window, z, heads)
         self.encoder = LatentRecurrence(1 + window, z, hidden, config.skip)
         self.decoder = LatentRecurrence(1, z, hidden, config.skip)
@@ -109,26 +116,40 @@ class DlsmNetworks(nn.Module):
         self.reward = GaussianHead(z + extra, 1, heads)
         self.outcome = GaussianHead(z if config.end_features == "final" else 2 * z, len(OUTCOMES), ())
 
+    def start_at_zero(self) -> None:
+        """Leave the prediction of beta to the linear part, with its own noise; the head then learns to differ."""
+        with torch.no_grad():
+            self.state.affine.weight.zero_()
+            self.state.affine.bias.copy_(torch.tensor([0.0, unbounded(0.0)]))
+
     def noise(self, steps: int, sessions: int, generator: torch.Generator) -> Noise:
         """Fresh draws."""
         dtype = self.decoder.bias.dtype
         z = self.config.latent
         first = torch.randn(sessions, z, generator=generator, dtype=dtype)
         encoder = torch.randn(steps, sessions, z, generator=generator, dtype=dtype)
-        return Noise(first, encoder, torch.randn(steps, sessions, z, generator=generator, dtype=dtype))
+        decoder = torch.randn(steps, sessions, z, generator=generator, dtype=dtype)
+        block = self.config.overshoot
+        start = block * int(torch.randint(max(1, steps // block), (), generator=generator)) if block else 0
+        return Noise(first, encoder, decoder, start)
 
-    def head_input(self, z: Tensor, actions: Tensor) -> Tensor:
-        """What the heads of steps see, [..., Z (+ 1)]; actions without the last axis."""
-        return torch.cat([z, actions.unsqueeze(-1)], dim=-1) if self.config.action_emission else z
+    def head_input(self, z: Tensor, actions: Tensor, h: Tensor | None = None) -> Tensor:
+        """What the heads of steps see, [..., Z (+ H) (+ 1)]; actions without the last axis, h where `recurrent_heads` ask for it."""
+        parts = [z] if h is None else [z, h]
+        return torch.cat([*parts, actions.unsqueeze(-1)] if self.config.action_emission else parts, dim=-1)
 
     def posterior_terms(self, batch: Batch, noise: Noise, fast: bool = True) -> Terms:
         """Theorem 1: reconstruction from samples of the encoder, decoder following the encoder's path."""
         z0, kl_first, first_states = self._first(batch, noise)
         a = batch.actions.unsqueeze(-1)
         z, mean_q, log_std_q = self.encoder.run(torch.cat([a, batch.states[1:]], dim=2), z0, noise.encoder, fast)
-        mean_p, log_std_p = self.decoder.follow(a, torch.cat([z0.unsqueeze(0), z[:-1]]), fast)
-        kl_path = (gaussian_kl(mean_q, log_std_q, mean_p, log_std_p).sum(2) * batch.alive).sum(0)
-        states, rewards, outcomes = self._reconstruct(batch, z, fast)
+        before = torch.cat([z0.unsqueeze(0), z[:-1]])
+        h = self.decoder.recurrent(a, before, fast)
+        kl = gaussian_kl(mean_q, log_std_q, *self.decoder.follow(a, before, h)).sum(2)
+        if self.config.free_bits:
+            kl = kl.clamp(min=self.config.free_bits)
+        kl_path = (kl * batch.alive).sum(0)
+        states, rewards, outcomes = self._reconstruct(batch, z, h if self.config.recurrent_heads else None, fast)
         return Terms(first_states + states, rewards, outcomes, kl_first, kl_path)
 
     def free_running_terms(self, batch: Batch, noise: Noise, fast: bool = True) -> Terms:
@@ -139,9 +160,24 @@ class DlsmNetworks(nn.Module):
         """
         z0, kl_first, first_states = self._first(batch, noise)
         start = noise.first if self.config.start == "prior" else z0
-        z, _, _ = self.decoder.run(batch.actions.unsqueeze(-1), start, noise.decoder, fast)
-        states, rewards, outcomes = self._reconstruct(batch, z, fast)
+        a = batch.actions.unsqueeze(-1)
+        if noise.start:
+            noise = replace(noise, decoder=self._along_posterior(batch, noise, z0, fast))
+            batch = replace(batch, usable=batch.usable * (torch.arange(len(a)) >= noise.start).unsqueeze(1))
+            start = z0
+        z, _, _ = self.decoder.run(a, start, noise.decoder, fast)
+        h = self.decoder.recurrent(a, torch.cat([start.unsqueeze(0), z[:-1]]), fast) if self.config.recurrent_heads else None
+        states, rewards, outcomes = self._reconstruct(batch, z, h, fast)
         return Terms(first_states + states, rewards, outcomes, kl_first, torch.zeros_like(kl_first))
+
+    def _along_posterior(self, batch: Batch, noise: Noise, z0: Tensor, fast: bool) -> Tensor:
+        """The decoder's noise, [T, B, Z], with that in the first `start` steps under which its own run is the encoder's path."""
+        a = batch.actions.unsqueeze(-1)
+        with torch.no_grad():
+            z, _, _ = self.encoder.run(torch.cat([a, batch.states[1:]], dim=2), z0, noise.encoder, fast)
+            before = torch.cat([z0.unsqueeze(0), z[:-1]])
+            mean, log_std = self.decoder.follow(a, before, self.decoder.recurrent(a, before, fast))
+            return torch.cat([((z - mean) * torch.exp(-log_std))[: noise.start], noise.decoder[noise.start :]])
 
     def loss(self, batch: Batch, noise: Noise, fast: bool = True) -> Tensor:
         """The training objective, negated, per living step of the batch."""
@@ -161,11 +197,15 @@ class DlsmNetworks(nn.Module):
         log_prob = gaussian_log_prob(batch.states[0], *self.first_state(z0)).sum(1) * batch.first_known
         return z0, kl, log_prob
 
-    def _reconstruct(self, batch: Batch, z: Tensor, fast: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _reconstruct(self, batch: Batch, z: Tensor, h: Tensor | None, fast: bool) -> tuple[Tensor, Tensor, Tensor]:
         """log p of s_1 ... s_T, of r_0 ... r_{T-1} and of the outcomes along z_1 ... z_T, [B] each."""
-        seen = self.head_input(z, batch.actions)
-        states = self.state.log_prob(seen, batch.states[1:, :, -self.state_width :], fast)
-        rewards = self.reward.log_prob(seen, batch.rewards.unsqueeze(2), fast)
+        seen = self.head_input(z, batch.actions, h)
+        targets = batch.states[1:, :, -self.state_width :]
+        if self.config.residual:
+            targets = self._left(batch).unsqueeze(2)
+        states = self.state.log_prob(seen, targets, fast)
+        learnt = self.config.reward_terms
+        rewards = self.reward.log_prob(seen, batch.rewards.unsqueeze(2), fast) if learnt else torch.zeros_like(states)
         outcomes = self._outcome_terms(batch, z)
         return (states * batch.usable).sum(0), (rewards * batch.usable).sum(0), outcomes.sum(1)
 
@@ -192,9 +232,15 @@ class DlsmNetworks(nn.Module):
         wide = [batch.actions.repeat(1, draws), batch.alive.repeat(1, draws)]
         noise = self.noise(steps, sessions * draws, generator)
         mean, log_std = self.first(batch.states[0].repeat(draws, 1))
-        z, _, _ = self.decoder.run(wide[0].unsqueeze(-1), mean + log_std.exp() * noise.first, noise.decoder)
-        seen = self.head_input(z, wide[0])
+        z0 = mean + log_std.exp() * noise.first
+        a = wide[0].unsqueeze(-1)
+        z, _, _ = self.decoder.run(a, z0, noise.decoder)
+        h = self.decoder.recurrent(a, torch.cat([z0.unsqueeze(0), z[:-1]])) if self.config.recurrent_heads else None
+        seen = self.head_input(z, wide[0], h)
         state_mean, state_log_std = self.state(seen)
+        if self.linear is not None:
+            state_mean = self._with_linear(batch, draws, state_mean, state_log_std, generator)
+            state_log_std = state_log_std + math.log(self.linear.noise)
         reward = self.reward(seen)[0].squeeze(2)
         end = self.outcome(self.end_input(z, batch.lengths.repeat(draws), wide[1]))[0]
 
@@ -207,6 +253,20 @@ class DlsmNetworks(nn.Module):
             by_draw(reward),
             end.view(draws, sessions, len(OUTCOMES)),
         )
+
+    def _left(self, batch: Batch) -> Tensor:
+        if batch.left is None:
+            raise ValueError("a residual model learns from what its linear part leaves: the batch has none")
+        return batch.left
+
+    def _with_linear(self, batch: Batch, draws: int, mean: Tensor, log_std: Tensor, generator: torch.Generator) -> Tensor:
+        """Means of beta given the simulated past, [T, draws B, 1], from what the heads say of its linear prediction."""
+        if self.linear is None or batch.resting is None:
+            raise ValueError("free runs of a residual model need the batch of its own linear part")
+        drawn = torch.randn(mean.shape[:2], generator=generator, dtype=mean.dtype)
+        parts = (batch.states[0].repeat(draws, 1), batch.resting.repeat(1, draws), mean[:, :, 0], log_std[:, :, 0].exp(), drawn)
+        found = self.linear.run(*(p.numpy().astype(np.float64) for p in parts))
+        return torch.as_tensor(found, dtype=mean.dtype).unsqueeze(2)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ special case and lets an effect of the action reach z_t in one step.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -26,6 +27,13 @@ def bounded(raw: Tensor) -> Tensor:
     """Log standard deviation within `LOG_STD_BOUNDS`, smooth in the raw value."""
     low, high = LOG_STD_BOUNDS
     return low + (high - low) * torch.sigmoid(raw)
+
+
+def unbounded(log_std: float) -> float:
+    """The raw value of a log standard deviation, which is taken to lie within a hundredth of the bounds' width inside them."""
+    low, high = LOG_STD_BOUNDS
+    share = min(max((log_std - low) / (high - low), 0.01), 0.99)
+    return math.log(share / (1 - share))
 
 
 class LatentWeights(NamedTuple):

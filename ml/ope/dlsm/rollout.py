@@ -10,7 +10,9 @@ import torch
 from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings, step_reward
+from ml.ope.dlsm.linear_part import LinearPart
 from ml.ope.dlsm.networks import DlsmNetworks
+from ml.ope.linear.dynamics import LinearResponse
 from ml.ope.outcomes.minutes import AMPLITUDE, BETA, ENERGY, FEATURES, Minutes, each_feature, minute_bounds, with_shares
 from ml.ope.scale import Scale
 from ml.policies.policy import Policy
@@ -70,6 +72,7 @@ def roll_out(
     per_policy: int,
     seed: int,
     prior: bool = False,
+    before: Floats | None = None,
     report: Report = silent,
 ) -> Rollouts:
     """Simulate every policy from the same starts with the same noise, so that differences between policies are the policies' own.
@@ -83,6 +86,7 @@ def roll_out(
         per_policy: M trajectories of each policy.
         seed: of the noise.
         prior: start from z_0 ~ N(0, I) and its own s_0 (paper) instead of q(z_0 | s_0).
+        before: dose before each of the starts, [n]; NaN: a policy's first amplitude. For models with a linear part.
         report: called after every block.
     """
     block = max(1, networks.config.block // max(1, len(policies)))
@@ -90,9 +94,10 @@ def roll_out(
     parts = []
     for first in range(0, per_policy, block):
         count = min(block, per_policy - first)
-        rows = starts[(first + np.arange(count)) % len(starts)]
+        of = (first + np.arange(count)) % len(starts)
+        rows, doses = starts[of], np.full(count, np.nan) if before is None else before[of]
         with torch.inference_mode():
-            parts.append(_roll_block(networks, policies, rows, scale, settings, horizon, rng, prior))
+            parts.append(_roll_block(networks, policies, rows, doses, scale, settings, horizon, rng, prior))
         report((first + count) / per_policy, "rolling out policies")
     joined = {
         name: np.concatenate([getattr(p, name) for p in parts], axis=1) for name in ("return_head", "return_known", "outcomes", "actions")
@@ -105,6 +110,7 @@ def _roll_block(
     networks: DlsmNetworks,
     policies: Sequence[Policy],
     starts: Floats,
+    doses: Floats,
     scale: Scale,
     settings: MdpSettings,
     horizon: int,
@@ -135,18 +141,21 @@ def _roll_block(
     minute_of = np.repeat(np.arange(len(bounds)), [j - i for i, j in bounds])
     summed = np.zeros((len(bounds), FEATURES, p * m))
     kept, keep_every = [], max(1, horizon // 50)
+    linear = None if networks.linear is None else LinearRun(networks.linear, doses, p)
     for t in range(horizon):
         a = np.concatenate([policy.act(window[i * m : (i + 1) * m]) for i, policy in enumerate(policies)])
         action = torch.as_tensor(a, dtype=dtype)
         z, h, c = networks.decoder.step(action.unsqueeze(1), z, h, c, shared(config.latent))
         pooled += z
-        seen = networks.head_input(z, action)
+        seen = networks.head_input(z, action, h if config.recurrent_heads else None)
         mean, log_std = networks.state(seen)
-        drawn = mean + log_std.exp() * shared(networks.state_width)
+        drawn = (mean + log_std.exp() * shared(networks.state_width)).numpy()
+        if linear is not None:
+            drawn = linear.noise * drawn + linear.predicted(scale.beta(window), a)[:, None]
         if config.decode_all_window:
-            window = _within(scale.raw_beta(drawn.numpy()), scale)
+            window = _within(scale.raw_beta(drawn), scale)
         else:
-            newest = _within(scale.raw_beta(drawn[:, -1:].numpy()), scale)
+            newest = _within(scale.raw_beta(drawn[:, -1:]), scale)
             window = np.concatenate([window[:, 1:], newest], axis=1)
         discount = settings.gamma**t
         head = networks.reward(seen)[0].squeeze(1).numpy().astype(np.float64)
@@ -164,6 +173,27 @@ def _roll_block(
         actions=np.stack(kept, axis=1).reshape(p, -1),
         **{name: values.reshape(p, m) for name, values in sums.items()},
     )
+
+
+class LinearRun:
+    """One-step predictions of a linear part for P policies of m trajectories each, step by step."""
+
+    def __init__(self, part: LinearPart, doses: Floats, policies: int) -> None:
+        self._part, self._doses, self._policies, self.noise = part, doses, policies, part.noise
+        self._response: LinearResponse | None = None
+        self._rest = np.empty(0)
+
+    def predicted(self, window: Floats, a: Floats) -> Floats:
+        """Standardised beta [P m] after the windows [P m, W] under the amplitudes [P m]."""
+        amplitudes = a.reshape(self._policies, 1, -1)
+        if self._response is None:
+            self._response = self._part.response(amplitudes, self._doses)
+            lasting = self._part.level + self._response.lasting().reshape(-1)
+            self._rest = np.repeat(lasting[:, None], window.shape[1], axis=1)
+        now = self._part.level + self._response.step(amplitudes).reshape(-1)
+        result = now + (window - self._rest) @ self._part.phi[::-1]
+        self._rest = np.concatenate([self._rest[:, 1:], now[:, None]], axis=1)
+        return np.asarray(result, dtype=np.float64)
 
 
 def _minutes(summed: Floats, counts: NDArray[np.int64], policies: int) -> Minutes:

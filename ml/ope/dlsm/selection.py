@@ -86,7 +86,7 @@ class SelectionRun:
         held = usable_folds(self.buffer, config.held_out, self.seed, without=left_out)[0]
         training = MemberTraining(self.buffer, self.batch, self.scale, held, config, self.seed, fingerprint, left_out)
         training.run(checkpoint, report)
-        return training.score(self.batch.select(left_out), tuple(left_out))
+        return training.score(training.batch.select(left_out), tuple(left_out))
 
     def _compare(self) -> Selection:
         kinds = {k: controller_key(s) for k, s in enumerate(self.buffer.sessions)}
@@ -126,3 +126,18 @@ def usable_folds(buffer: ReplayBuffer, share: float, seed: int, without: Sequenc
     usable = [i for i, s in enumerate(buffer.sessions) if s.usable().any() and i not in set(without)]
     folds = session_folds([buffer.sessions[i] for i in usable], max(2, round(1 / share)), seed)
     return [[usable[k] for k in fold] for fold in folds]
+
+
+FEWEST_HELD = 2
+"""Sessions that a resampled member must not have learnt from."""
+
+
+def resampled(buffer: ReplayBuffer, seed: int) -> tuple[list[int], list[int]]:
+    """Indices of sessions drawn with replacement, as many as are usable, and of those that were not drawn."""
+    usable = [i for i, s in enumerate(buffer.sessions) if s.usable().any()]
+    rng = np.random.default_rng([seed, 0xB007])
+    while True:
+        drawn = sorted(int(i) for i in rng.choice(usable, len(usable)))
+        held = [i for i in usable if i not in set(drawn)]
+        if len(held) >= FEWEST_HELD and len(set(drawn)) >= FEWEST_HELD:
+            return drawn, held

@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from ml.ope.dlsm import pretrained
 from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.held_out import Constant, FreeRuns, held_out
+from ml.ope.dlsm.linear_part import LinearPart
 from ml.ope.dlsm.networks import DlsmNetworks
 from ml.ope.scale import Scale
 from ml.progress import Report, silent
@@ -24,11 +26,15 @@ from ml.trajectories import ReplayBuffer
 
 @dataclass(frozen=True)
 class Member:
-    """A trained ensemble member: its networks at the check that `keep` names, that check, and the course as (step, loss, score)."""
+    """A trained ensemble member: its networks at the check that `keep` names, that check, and the course as (step, loss, score).
+
+    `pretrained`: whether it started from the constants of `ml.ope.dlsm.pretrained`.
+    """
 
     networks: DlsmNetworks
     check: FreeRuns
     course: tuple[tuple[int, float, float], ...]
+    pretrained: bool = False
 
 
 class MemberTraining:
@@ -40,6 +46,7 @@ class MemberTraining:
         config: settings. seed: of initial weights, noise and batches.
         fingerprint: names buffer and settings; a checkpoint of another one is refused.
         left_out: indices of sessions that are neither learnt from nor looked at.
+        learnt: indices of those that are learnt from, which may repeat; all others where it is not given.
     """
 
     def __init__(
@@ -52,16 +59,24 @@ class MemberTraining:
         seed: int,
         fingerprint: str,
         left_out: Sequence[int] = (),
+        learnt: Sequence[int] | None = None,
     ) -> None:
         self.config, self.scale, self.settings, self.seed = config, scale, buffer.settings, seed
         self.fingerprint = fingerprint
         self.held = tuple(held)
-        self.learnt = [i for i in range(len(buffer.sessions)) if i not in {*held, *left_out}]
-        self.batch, self.held_batch = batch, batch.select(held)
+        others = [i for i in range(len(buffer.sessions)) if i not in {*held, *left_out}]
+        self.learnt = others if learnt is None else list(learnt)
+        linear = LinearPart.fit(buffer, scale, self.learnt) if config.residual else None
+        self.batch = batch if linear is None else linear.of(batch)
+        self.held_batch = self.batch.select(held)
         self.constant = Constant.of(batch.select(self.learnt))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.networks = DlsmNetworks(buffer.settings.window, config)
+            if linear is not None:
+                self.networks.linear = linear
+                self.networks.start_at_zero()
+            self.pretrained = config.pretrained and pretrained.start(self.networks)
         self.optimizer = torch.optim.AdamW(
             self.networks.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, foreach=True
         )
@@ -81,6 +96,9 @@ class MemberTraining:
         """Train to the end, going on from a checkpoint where there is one; the member is that of the check that `keep` names."""
         if checkpoint is not None and checkpoint.exists():
             self.load(checkpoint)
+        if (self.config.residual or self.config.pretrained) and not self.course:
+            self.check()
+            report(0.0, "fitting the deep latent sequential model", held_out_score=self.course[-1][2])
         while not self.finished:
             self.advance()
             if self.step % self.config.check_every == 0 or self.step == self.config.steps:
@@ -93,7 +111,7 @@ class MemberTraining:
             raise ValueError("the DLSM's held-out score was never a finite number: lower the learning rate")
         self.networks.load_state_dict(self.best_weights)
         self.networks.eval()
-        return Member(self.networks, self.best, tuple(self.course))
+        return Member(self.networks, self.best, tuple(self.course), self.pretrained)
 
     def advance(self) -> None:
         """One gradient step over a batch of sessions."""
@@ -115,7 +133,7 @@ class MemberTraining:
 
     def check(self) -> None:
         """Score held-out sessions along free runs and remember the best weights."""
-        steps_since = self.step - (self.course[-1][0] if self.course else 0)
+        steps_since = max(1, self.step - (self.course[-1][0] if self.course else 0))
         scored = self.score(self.held_batch, self.held)
         self.course.append((self.step, self.loss_sum / steps_since, scored.score))
         self.loss_sum = 0.0
@@ -163,7 +181,8 @@ class MemberTraining:
         state: dict[str, Any] = torch.load(path, weights_only=True)
         if state["fingerprint"] != self.fingerprint:
             raise ValueError(
-                f"the checkpoint {path.name} belongs to another buffer or other DLSM settings; give this fit an empty checkpoint folder"
+                f"the checkpoint {path.name} belongs to another buffer or other DLSM settings, such as those of an earlier betaloop; give "
+                "this fit an empty checkpoint folder, or start the job again"
             )
         self.networks.load_state_dict(state["networks"])
         self.optimizer.load_state_dict(state["optimizer"])

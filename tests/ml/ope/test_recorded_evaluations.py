@@ -35,10 +35,10 @@ METHODS = ("dlsm", "dlsm_paper", "linear", "impulse", "dlmm", "fqe", "wdr", "dua
 HORIZON_STEPS = 50
 
 SEED = 11
-SIZES: dict[str, Any] = {"latent": 4, "hidden": 8, "heads": (8,), "members": 2, "rollouts": 32}
-SMALL = SIZES | {"steps": 30, "check_every": 10, "replay_draws": 4}
 # what is held is the arithmetic, not how good the estimates are
-FORMS = {"dlsm": DlsmConfig(**SMALL, seed=SEED), "dlsm_paper": replace(DlsmConfig.paper("full", SEED), **SMALL)}
+SHORT: dict[str, Any] = {"members": 2, "rollouts": 32, "steps": 30, "check_every": 10, "replay_draws": 4}
+SMALL = SHORT | {"latent": 4, "hidden": 8, "heads": (8,)}
+FORMS = {"dlsm": replace(DlsmConfig.expert("full", SEED), **SHORT), "dlsm_paper": replace(DlsmConfig.paper("full", SEED), **SMALL)}
 
 
 @cache

@@ -89,7 +89,7 @@ def bound(net, states, actions, rewards, end, samples=20_000):
         outcomes[:, 0], mask[:, 0] = end, 1.0
     ones = torch.ones(steps, samples, dtype=torch.float64)
     batch = Batch(
-        wide(states).unsqueeze(2), wide(actions), wide(rewards), ones, ones, ones[0], torch.full((samples,), steps), outcomes, mask
+        wide(states).unsqueeze(2), wide(actions), wide(rewards), ones, ones, ones[0], torch.full((samples,), steps), outcomes, mask, ones[0]
     )
     with torch.no_grad():
         values = net.posterior_terms(batch, net.noise(steps, samples, torch.Generator().manual_seed(0))).bound()
