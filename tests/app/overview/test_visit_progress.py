@@ -13,6 +13,7 @@ from app.overview.visit_progress import VisitProgress, visit_progress
 from app.overview.wording import progress, what
 from app.study.models import Participant, SettingsVersion
 from tests.clinic_day import clinic_day
+from tests.conftest import PASSWORD
 
 __all__ = ["clinic_day"]
 
@@ -30,7 +31,8 @@ def test_logs_are_missing_only_after_the_day_of_the_visit(clinic_day: Any, db: S
     db.expire_all()
     assert visit_progress(db, [1], date(2099, 11, 23)) == {1: [VisitProgress(clinic_day.visit, 2, day, 3, 1, 2, 0)]}
     for change, missing in (("lock", 0), ("unlock", 2)):
-        assert clinic_day.client.post(f"/api/v1/visits/{clinic_day.visit}/{change}", json={"reason": "complete"}).status_code in (200, 201)
+        body = {"reason": "complete"} | ({"password": PASSWORD} if change == "lock" else {})
+        assert clinic_day.client.post(f"/api/v1/visits/{clinic_day.visit}/{change}", json=body).status_code in (200, 201)
         (found,) = visit_progress(db, [1], date(2099, 11, 23))[1]
         assert found.logs_missing == missing, "a locked visit takes no logs"
 
