@@ -6,7 +6,6 @@ key in `secrets/`: machines with other keys would encrypt what no other machine 
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 from collections.abc import Callable, Iterator
@@ -24,7 +23,6 @@ log = structlog.get_logger()
 
 T = TypeVar("T")
 CHUNK = 1 << 20
-DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 SHARED_KEYS = ("quarantine", "pseudonyms", "second-factor", "sign-on", "bundle-signing", "audit-seals", "visit-day")
 """Keys that every machine of an installation must have alike."""
 _FINGERPRINT = b"betaloop key fingerprint 1\0"
@@ -149,11 +147,7 @@ class Bucket:
         return f"{self._root}/files/{sha256[:2]}/{sha256}"
 
     def _asked(self, ask: Callable[[], T]) -> T:
-        """What the bucket says.
-
-        Raises:
-            FileNotFoundError: no such object. OSError: no room on the disk of this machine. StoreAway: all else that goes wrong there.
-        """
+        """What the bucket says. Raises FileNotFoundError, or StoreAway for all else that goes wrong there."""
         from botocore.exceptions import BotoCoreError, ClientError
 
         try:
@@ -161,7 +155,5 @@ class Bucket:
         except FileNotFoundError:
             raise
         except (BotoCoreError, ClientError, OSError, TimeoutError) as error:
-            if isinstance(error, OSError) and error.errno in DISK_FULL:
-                raise
             log.error("the bucket cannot be used", error=type(error).__name__, what=str(error)[:200])
             raise StoreAway("The store of files does not answer.", "Nothing is lost. Try again in a while.") from error

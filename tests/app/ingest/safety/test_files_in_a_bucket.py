@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import multiprocessing
 import os
@@ -300,15 +299,3 @@ def test_an_address_that_is_no_bucket_is_refused_in_words(fresh_database: str, m
     with pytest.raises(RuntimeError, match="give s3://BUCKET"):
         buckets.bucket()
     get_settings.cache_clear()
-
-
-def test_a_full_disk_of_this_machine_is_not_blamed_on_the_bucket(shared: str, tmp_path: Path) -> None:
-    store = buckets.bucket()
-    assert store is not None
-    kept, content = tmp_path / "kept", SECRET * 10_000  # more than a buffer holds until the file is closed
-    kept.write_bytes(content)
-    sha256 = hashlib.sha256(content).hexdigest()
-    store.put(kept, sha256)
-    with pytest.raises(OSError, match="No space left") as full:
-        store.fetch(sha256, Path("/dev/full"))
-    assert full.value.errno == errno.ENOSPC
