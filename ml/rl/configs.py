@@ -114,6 +114,12 @@ class CriticConfig(TrainConfig):
         "Updates during which only the critics learn: a policy fine-tuned without its critic is evaluated before it is changed.",
         low=0,
     )
+    critic_memory: bool = field(
+        default=False,
+        metadata={
+            "doc": "Whether the critics see means of past amplitudes beside the beta window (`ml.rl.memory`); the policy never does."
+        },
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

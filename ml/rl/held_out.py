@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ml.policies.policy import Policy, Score
 from ml.rl.end_reward import EndReward
+from ml.rl.memory import remembered
 from ml.trajectories import ReplayBuffer, to_parquet
 
 _SPLIT_STREAM = 5
@@ -80,6 +81,11 @@ class HeldOutSessions:
         if not states:
             raise ValueError("no held-out session has a usable step")
         return np.stack(states), float(np.mean(returns))
+
+    def start_memory(self) -> NDArray[np.float64]:
+        """What critics that remember past amplitudes see at the states of `starts`, [n, M]."""
+        used = [(s, np.flatnonzero(s.usable())) for s in self.sessions.sessions]
+        return np.stack([remembered(s, self.sessions.settings.period_s)[k[0]] for s, k in used if k.size])
 
     def name(self) -> str:
         """Names the sessions and the rule, for checkpoints."""

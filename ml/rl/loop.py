@@ -56,7 +56,7 @@ class Learner(Protocol):
     def policy(self, member: int) -> MlpPolicy:
         """A copy of one policy as it is now."""
 
-    def start_values(self, states: NDArray[np.float64]) -> list[float] | None:
+    def start_values(self, states: NDArray[np.float64], memory: NDArray[np.float64]) -> list[float] | None:
         """Mean Q(s, pi(s)) over beta windows [n, W] for each policy, in reward units; None for an algorithm without a critic."""
 
     def rows(self, member: int) -> dict[str, Any]:
@@ -187,7 +187,7 @@ def _score(
 ) -> None:
     """A point on the held-out sessions for each policy; keeps the eligible state of the best score, the earlier one of equals."""
     states, logged = starts
-    values = learner.start_values(states)
+    values = learner.start_values(states, held_out.start_memory())
     for k, record in enumerate(records):
         point = {"update": float(done)}
         if values is not None:

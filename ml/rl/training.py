@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ml.progress import Report, silent
-from ml.rl.algorithms._learner import StackedLearner
+from ml.rl.algorithms._learner import StackedLearner, remembers
 from ml.rl.algorithms.registry import algorithm
 from ml.rl.configs import TrainConfig
 from ml.rl.end_reward import fit_end_reward
@@ -28,6 +29,7 @@ from ml.rl.loop import (
     tensors_from_bytes,
     tensors_to_bytes,
 )
+from ml.rl.memory import memory_of
 from ml.trajectories import ReplayBuffer, Transitions
 
 _UNSHARED = {"checkpoint_every"}
@@ -166,7 +168,8 @@ def train_many(
         shares = np.concatenate([share.per_step(s)[s.usable()] for s in buffer.sessions])
         data = replace(data, rewards=data.rewards + shares)
         held_out = replace(held_out, end_reward=share) if held_out else None
-    return train_on(data, buffer.settings.gamma, buffer.beta_scale(), configs, report, checkpoint, initial, held_out)
+    memory = memory_of(buffer, data) if configs and remembers(configs[0]) else None
+    return train_on(data, buffer.settings.gamma, buffer.beta_scale(), configs, report, checkpoint, initial, held_out, memory)
 
 
 def train_on(
@@ -178,9 +181,12 @@ def train_on(
     checkpoint: Path | None = None,
     initial: Start = None,
     held_out: HeldOutSessions | None = None,
+    memory: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> list[TrainedPolicy]:
-    """`train_many` on transitions of any source, with gamma and the mean and standard deviation of beta."""
+    """`train_many` on transitions of any source, with gamma, the mean and standard deviation of beta, and what critics remember."""
     _require_together(configs)
+    if remembers(configs[0]) and memory is None:
+        raise ValueError("critics with a memory of past amplitudes need it beside the transitions")
     config, device = configs[0], configs[0].resolved_device()
     learner_type = algorithm(config.algorithm).learner
     scale = RewardScale.of(transitions.rewards, gamma)
@@ -190,7 +196,7 @@ def train_on(
     with single_thread():
         starts = [_start(learner_type, transitions.states.shape[1], beta_scale, own, initial) for own in configs]
         learner = learner_type(starts, configs, scale, device)
-        data = packed(transitions, starts[0]["policy"].normalise, scale)
+        data = packed(transitions, starts[0]["policy"].normalise, scale, memory if remembers(config) else None)
         named = [{n: v for n, v in own.to_json().items() if n not in _UNSHARED} for own in configs]
         owner = {"algorithm": config.algorithm, "configs": named, "gamma": gamma, "device": device}
         fingerprint = fingerprint_of(data, owner | {"held_out": held_out.name() if held_out else None}, learner.state())
@@ -247,5 +253,15 @@ def _start(
         raise ValueError(
             f"the initial training is of {initial.algorithm}, whose critics {config.algorithm} cannot go on with; "
             "start from its policy alone, with a critic_warmup"
+        )
+    if remembers(initial.config) != remembers(config):
+        raise ValueError(
+            "the initial training's critics "
+            + (
+                "remember past amplitudes; set critic_memory"
+                if remembers(initial.config)
+                else "know no past amplitudes; unset critic_memory"
+            )
+            + ", or start from its policy alone, with a critic_warmup"
         )
     return {"policy": policy, **initial.networks}

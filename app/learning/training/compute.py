@@ -51,7 +51,7 @@ def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
         initial = _initial(params.get("initial"))
         configs = [method.config.from_json(_with_start(given, initial)) for given in params["configs"]]
         updates = configs[0].updates
-        learnt, held_out = _hold_out(buffer, params["held_out"], every=max(1, updates // 10))
+        learnt, held_out = hold_out(buffer, params["held_out"], every=max(1, updates // 10))
         results = rl.train_many(learnt, configs, report.curves(updates), workdir / "checkpoint.pt", initial, held_out)
     except (rl.TrainingDiverged, rl.CheckpointError, ValueError) as error:
         raise JobError(f"The policies cannot be trained: {error}.") from error
@@ -78,7 +78,7 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
         the largest gain by the posterior among those that sessions support, None without one; `held_out_sessions`.
     """
     buffer = read_buffer(params["snapshot_sha256"])
-    learnt, held_out = _hold_out(buffer, params["held_out"], every=1)
+    learnt, held_out = hold_out(buffer, params["held_out"], every=1)
     watched = held_out.sessions.sessions if held_out else ()
     cloning = rl.algorithm("cloning")
     try:
@@ -119,7 +119,7 @@ def best_supported(constants: Mapping[str, PosteriorGain]) -> float | None:
     return float(max(supported, key=supported.__getitem__)) if supported else None
 
 
-def _hold_out(buffer: ReplayBuffer, wanted: bool, every: int) -> tuple[ReplayBuffer, rl.HeldOutSessions | None]:
+def hold_out(buffer: ReplayBuffer, wanted: bool, every: int) -> tuple[ReplayBuffer, rl.HeldOutSessions | None]:
     """Sessions to learn from, and those that watch; all and none where they are too few to spare any."""
     if not wanted or len(buffer.sessions) < FEWEST_TO_HOLD_OUT:
         return buffer, None

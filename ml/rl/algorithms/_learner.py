@@ -15,6 +15,7 @@ from ml.rl.configs import CriticConfig, TrainConfig
 from ml.rl.kernels.batches import RewardScale, TransitionBatch
 from ml.rl.kernels.networks import Critic, MlpPolicy
 from ml.rl.kernels.stacked import Stack, StackedActor, StackedAdam, into_module
+from ml.rl.memory import SPANS_S
 
 SATURATION_MARGIN = 0.01
 """An amplitude fraction this near to 0 or 1 counts as saturated."""
@@ -73,7 +74,7 @@ class StackedLearner(abc.ABC, Generic[C]):
     def measure(self, probe: TransitionBatch) -> list[dict[str, float]]:
         """Points of the learning curves of each member, as `TrainedPolicy.curve` describes them."""
         actions = self.policy_stack.act(probe.states)
-        values = self._probe_values(probe.states, actions)
+        values = self._probe_values(probe.critic_states, actions)
         distance = (actions - probe.actions).abs().mean(dim=(1, 2)).tolist()
         saturated = ((actions - 0.5).abs() > 0.5 - SATURATION_MARGIN).double().mean(dim=(1, 2)).tolist()
         means = {name: (total / max(self._since_measure, 1)).tolist() for name, total in self._sums.items()}
@@ -90,11 +91,17 @@ class StackedLearner(abc.ABC, Generic[C]):
         """A copy of one policy as it is now."""
         return self.modules(self.rows(member))["policy"]
 
-    def start_values(self, states: NDArray[np.float64]) -> list[float] | None:
-        """Mean Q(s, pi(s)) over beta windows [n, W] for each member, in reward units; None for an algorithm without a critic."""
+    def start_values(self, states: NDArray[np.float64], memory: NDArray[np.float64]) -> list[float] | None:
+        """Mean Q(s, pi(s)) over beta windows [n, W] for each member, in reward units; None for an algorithm without a critic.
+
+        `memory`, [n, M], is what critics that remember past amplitudes see beside the windows.
+        """
         windows = torch.tensor(states, dtype=torch.float32)
         scores = self._starts[0]["policy"].normalise(windows).to(self.device).expand(self.members, -1, -1)
-        values = self._probe_values(scores, self.policy_stack.act(scores))
+        seen = scores
+        if remembers(self.config):
+            seen = torch.cat([scores, torch.tensor(memory, dtype=torch.float32, device=self.device).expand(self.members, -1, -1)], dim=2)
+        values = self._probe_values(seen, self.policy_stack.act(scores))
         return None if values is None else [self.scale.value(value) for value in values]
 
     def rows(self, member: int) -> dict[str, Any]:
@@ -174,7 +181,7 @@ class CriticLearner(StackedLearner[CC], Generic[CC]):
     def _descend_on_target(self, name: str, batch: TransitionBatch, targets: Any) -> None:
         """One step of a critic's least squares Q(s, a) towards `targets` [K, B, 1]."""
         critic = self.stacks[name]
-        error = critic.forward(batch.states, batch.actions).sub_(targets)
+        error = critic.forward(batch.critic_states, batch.actions).sub_(targets)
         if name == "critic":
             self._note("critic_loss", error.square())
         critic.backward(error.mul_(2.0 / error.shape[1]))
@@ -192,4 +199,14 @@ class CriticLearner(StackedLearner[CC], Generic[CC]):
 
 def fresh_critic(config: TrainConfig, policy: MlpPolicy, seed: int, *, layer_norm: bool = False) -> Critic:
     """A critic of the configuration's sizes."""
-    return Critic(policy.window, config.hidden, layer_norm=layer_norm, seed=seed)
+    return Critic(critic_inputs(config, policy), config.hidden, layer_norm=layer_norm, seed=seed)
+
+
+def remembers(config: TrainConfig) -> bool:
+    """Whether the critics of a training see past amplitudes."""
+    return isinstance(config, CriticConfig) and config.critic_memory
+
+
+def critic_inputs(config: TrainConfig, policy: MlpPolicy) -> int:
+    """How many numbers a critic sees of a state."""
+    return policy.window + (len(SPANS_S) if remembers(config) else 0)

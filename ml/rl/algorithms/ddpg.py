@@ -50,11 +50,11 @@ class DdpgLearner(CriticLearner[DdpgConfig]):
     def update(self, batch: TransitionBatch) -> None:
         """One DDPG update, in the order of the module's text."""
         critic, actor = self.stacks["critic"], self.policy_stack
-        next_values = self.target_stacks["critic"].forward(batch.next_states, self.target_actor.act(batch.next_states))
+        next_values = self.target_stacks["critic"].forward(batch.next_critic_states, self.target_actor.act(batch.next_states))
         self._descend_on_target("critic", batch, torch.add(batch.rewards, next_values, alpha=self.scale.gamma))
         if self._warm:
             actions = actor.act(batch.states)
-            critic.forward(batch.states, actions)
+            critic.forward(batch.critic_states, actions)
             actor.backward_from_actions(critic.action_gradient(self._uphill), actions)
             self.adams["policy"].step()
         self._follow()

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from ml.rl.algorithms._learner import CriticLearner, fresh_critic
+from ml.rl.algorithms._learner import CriticLearner, critic_inputs, fresh_critic
 from ml.rl.configs import CriticConfig, setting
 from ml.rl.kernels.batches import TransitionBatch
 from ml.rl.kernels.networks import MlpPolicy, Value
@@ -50,16 +50,16 @@ class IqlLearner(CriticLearner[IqlConfig]):
             "policy": policy,
             "critic": fresh_critic(config, policy, seeds[0]),
             "critic_2": fresh_critic(config, policy, seeds[1]),
-            "value": Value(policy.window, config.hidden, seed=seeds[2]),
+            "value": Value(critic_inputs(config, policy), config.hidden, seed=seeds[2]),
         }
 
     def update(self, batch: TransitionBatch) -> None:
         """One update, in the order of the module's text."""
-        logged = self.target_stacks["critic"].forward(batch.states, batch.actions).clone()
-        logged = torch.minimum(logged, self.target_stacks["critic_2"].forward(batch.states, batch.actions))
+        logged = self.target_stacks["critic"].forward(batch.critic_states, batch.actions).clone()
+        logged = torch.minimum(logged, self.target_stacks["critic_2"].forward(batch.critic_states, batch.actions))
         value = self.stacks["value"]
-        next_values = value.forward(batch.next_states).clone()
-        advantage = logged - value.forward(batch.states)
+        next_values = value.forward(batch.next_critic_states).clone()
+        advantage = logged - value.forward(batch.critic_states)
         expectile = self.member_setting("expectile")
         weight = torch.where(advantage > 0, expectile, 1.0 - expectile)
         self._note("value_loss", weight * advantage.square())

@@ -49,13 +49,13 @@ class RebracLearner(Td3Learner):
     def update(self, batch: TransitionBatch) -> None:
         """One update, in the order of the module's text."""
         next_actions = self._smoothed_target_actions(batch)
-        values = self._smaller_target_value(batch.next_states, next_actions)
+        values = self._smaller_target_value(batch.next_critic_states, next_actions)
         values.sub_((next_actions - batch.next_actions).square_().mul_(batch.next_known).mul_(4.0 * self._critic_penalty))
         self._critic_steps(batch, values)
         if self._actors_turn:
             if self._warm:
                 actions = self.policy_stack.act(batch.states)
-                self._actor_step(batch, actions, self._penalty, *self._smaller_value_slope(batch.states, actions))
+                self._actor_step(batch, actions, self._penalty, *self._smaller_value_slope(batch.critic_states, actions))
             self._follow()
         self._counted()
 

@@ -41,12 +41,12 @@ class Td3BcLearner(Td3Learner):
 
     def update(self, batch: TransitionBatch) -> None:
         """One update, in the order of the module's text."""
-        self._critic_steps(batch, self._smaller_target_value(batch.next_states, self._smoothed_target_actions(batch)))
+        self._critic_steps(batch, self._smaller_target_value(batch.next_critic_states, self._smoothed_target_actions(batch)))
         if self._actors_turn:
             if self._warm:
                 actions = self.policy_stack.act(batch.states)
                 critic = self.stacks["critic"]
-                values = critic.forward(batch.states, actions).clone()
+                values = critic.forward(batch.critic_states, actions).clone()
                 self._actor_step(batch, actions, self._penalty, critic.action_gradient(self._ones), values)
             self._follow()
         self._counted()

@@ -27,6 +27,8 @@ class TransitionBatch(NamedTuple):
         next_actions: the amplitude fraction logged after this one, [K, B, 1]; 0 where none is known.
         next_known: 1 where `next_actions` is known, else 0, [K, B, 1].
         noise: standard normal, [K, B, 1]; None for a learner that uses none.
+        remembering, next_remembering: states and next states with the critics' memory of past amplitudes behind, [K, B, W + M]; None
+            where they have none.
     """
 
     states: Any
@@ -36,19 +38,38 @@ class TransitionBatch(NamedTuple):
     next_actions: Any
     next_known: Any
     noise: Any = None
+    remembering: Any = None
+    next_remembering: Any = None
+
+    @property
+    def critic_states(self) -> Any:
+        """What the critics see of the states, [K, B, W + M]."""
+        return self.states if self.remembering is None else self.remembering
+
+    @property
+    def next_critic_states(self) -> Any:
+        """What the critics see of the next states, [K, B, W + M]."""
+        return self.next_states if self.next_remembering is None else self.next_remembering
 
 
 class PackedTransitions:
-    """A buffer in one tensor [N, 2W + 4], so that a batch is one gather.
+    """A buffer in one tensor [N, 2 (W + M) + 4], so that a batch is one gather.
 
     Args:
         states, next_states: z-scored windows, float32 tensors [N, W].
         actions, rewards: float32 tensors [N].
         next_actions: float32 tensor [N], NaN where unknown; None knows none.
+        memory: of past amplitudes at the states and at the next states, float32 tensors [N, M]; None for critics that have none.
     """
 
-    def __init__(self, states: Any, actions: Any, rewards: Any, next_states: Any, next_actions: Any = None) -> None:
+    def __init__(
+        self, states: Any, actions: Any, rewards: Any, next_states: Any, next_actions: Any = None, memory: tuple[Any, Any] | None = None
+    ) -> None:
         self._window = states.shape[1]
+        self._remembers = memory is not None
+        if memory is not None:
+            states, next_states = (torch.cat(parts, dim=1) for parts in zip((states, next_states), memory, strict=True))
+        self._seen = states.shape[1]
         following = torch.full_like(actions, math.nan) if next_actions is None else next_actions
         known = (~following.isnan()).to(states.dtype)
         columns = [states, actions[:, None], rewards[:, None], next_states, following.nan_to_num(0.0)[:, None], known[:, None]]
@@ -59,16 +80,17 @@ class PackedTransitions:
 
     def take(self, index: Any, noise: Any = None) -> TransitionBatch:
         """The rows of an int64 tensor [K, B]; a copy, so that nothing a learner does can reach the buffer."""
-        w = self._window
+        w, seen = self._window, self._seen
         rows = self._rows.index_select(0, index.reshape(-1)).view(*index.shape, -1)
-        states, actions, rewards, next_states, next_actions, known = rows.split((w, 1, 1, w, 1, 1), dim=-1)
-        return TransitionBatch(states, actions, rewards, next_states, next_actions, known, noise)
+        now, actions, rewards, after, next_actions, known = rows.split((seen, 1, 1, seen, 1, 1), dim=-1)
+        batch = TransitionBatch(now[..., :w], actions, rewards, after[..., :w], next_actions, known, noise)
+        return batch._replace(remembering=now, next_remembering=after) if self._remembers else batch
 
     def probe(self, members: int = 1) -> TransitionBatch:
         """Up to 2048 rows spread evenly over the buffer, the same for each of K policies, for measurements."""
         index = torch.from_numpy(np.unique(np.linspace(0, len(self) - 1, _PROBE_STATES).astype(np.int64)))
         one = self.take(index[None].to(self._rows.device))
-        return TransitionBatch(*(column.expand(members, -1, -1) for column in one[:-1]))
+        return TransitionBatch(*(None if column is None else column.expand(members, -1, -1) for column in one))
 
     def to(self, device: str) -> PackedTransitions:
         """The same on another device."""
@@ -109,8 +131,8 @@ class RewardScale(NamedTuple):
         return scaled / self.factor + self.shift / (1 - self.gamma)
 
 
-def packed(transitions: Transitions, normalise: Any, scale: RewardScale) -> PackedTransitions:
-    """Transitions for learners: windows z-scored by `normalise` (a policy's own), rewards scaled."""
+def packed(transitions: Transitions, normalise: Any, scale: RewardScale, memory: tuple[Any, Any] | None = None) -> PackedTransitions:
+    """Transitions for learners: windows z-scored by `normalise` (a policy's own), rewards scaled, `memory` as `ml.rl.memory` gives it."""
     following = np.full(transitions.actions.size, np.nan)
     consecutive = (np.diff(transitions.session) == 0) & (np.diff(transitions.step) == 1)
     following[:-1][consecutive] = transitions.actions[1:][consecutive]
@@ -120,6 +142,7 @@ def packed(transitions: Transitions, normalise: Any, scale: RewardScale) -> Pack
         torch.tensor(scale.scaled(transitions.rewards), dtype=torch.float32),
         normalise(torch.tensor(transitions.next_states, dtype=torch.float32)),
         torch.tensor(following, dtype=torch.float32),
+        None if memory is None else tuple(torch.tensor(part, dtype=torch.float32) for part in memory),  # type: ignore[arg-type]
     )
 
 

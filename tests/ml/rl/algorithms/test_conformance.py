@@ -191,7 +191,7 @@ def test_an_update_leaves_its_batch_and_the_buffer_as_they_are(name, buffer):
     before, copies = data.digest(), [None if x is None else x.clone() for x in batch]
     for _ in range(3):
         learner.update(batch)
-    assert all(torch.equal(a, b) for a, b in zip(batch, copies, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(batch, copies, strict=True) if b is not None)
     assert data.digest() == before
 
 
