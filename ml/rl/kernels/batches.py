@@ -142,7 +142,7 @@ def packed(transitions: Transitions, normalise: Any, scale: RewardScale, memory:
         torch.tensor(scale.scaled(transitions.rewards), dtype=torch.float32),
         normalise(torch.tensor(transitions.next_states, dtype=torch.float32)),
         torch.tensor(following, dtype=torch.float32),
-        None if memory is None else tuple(torch.tensor(part, dtype=torch.float32) for part in memory),  # type: ignore[arg-type]
+        None if memory is None else tuple(torch.tensor(part, dtype=torch.float32) for part in memory),
     )
 
 
