@@ -28,7 +28,7 @@ from ml.deploy.bundle import OpenBundle, open_bundle
 from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.runtime.control_loop import End, LiveSession
 from ml.deploy.runtime.decision_log import LogFailed, LogFile, Row
-from ml.deploy.runtime.envelope import Decision, Reason, Signal, reason_names
+from ml.deploy.runtime.envelope import OF_THE_CONTROLLER, Decision, Reason, Signal, reason_names
 from ml.deploy.runtime.session import describe, is_blinded, latency, latency_words
 from ml.deploy.wording import battery_words, warning_sentences
 from ml.energy import Implant, relative_energy, saving_percent
@@ -133,7 +133,7 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
             )
         facts |= _replayed(opened, stream, run, wish, task)
     found = facts | run.summary(stream) | _battery(run, implant) | _foreign(run, manifest)
-    return {name: None if name in _TELLING else value for name, value in found.items()} if facts.get("blinded") else found
+    return _masked(found) if facts.get("blinded") else found
 
 
 def _no_rows() -> Rows:
@@ -223,6 +223,13 @@ def drive(
             row = rows.send(decision.amplitude_ma)
         except StopIteration:
             row = None
+
+
+def _masked(summary: dict[str, Any]) -> dict[str, Any]:
+    """The summary of a blinded session, without what tells its controller."""
+    telling = reason_names(OF_THE_CONTROLLER)
+    kept = {name: None if name in _TELLING else value for name, value in summary.items()}
+    return kept | {"reasons": {name: count for name, count in summary["reasons"].items() if name not in telling}}
 
 
 def lines(summary: dict[str, Any]) -> str:

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .envelope import BetaSample, Decision, reason_names
+from .envelope import OF_THE_CONTROLLER, BetaSample, Decision, reason_names
 from .slot import mask
 
 VERSION = 3
@@ -114,8 +114,13 @@ def seal_row(number: int, drawn: tuple[int, float | None] | None, nonce: str) ->
 
 
 def masked(row: Row, number: int, nonce: str) -> list[Any]:
-    """A row of a blinded session: no draws, no timing, no request, which tell a network from a schedule. The amplitude is as it was."""
-    told = dict(zip(COLUMNS, cells(row), strict=True))
+    """A row of a blinded session: no draws, no timing, no request and no reason of the controller's, which tell a network from a schedule.
+
+    The amplitude is as it was.
+    """
+    seen = row.decision._replace(reasons=row.decision.reasons & ~OF_THE_CONTROLLER)
+    seen = seen._replace(detail="") if row.decision.reasons & OF_THE_CONTROLLER else seen
+    told = dict(zip(COLUMNS, cells(row._replace(decision=seen)), strict=True))
     hidden = dict.fromkeys(("fraction", "requested_ma", "latency_us", "signal_us", "late_ms", "hold", "log_density"), "")
     return list((told | hidden | {"sealed": seal_row(number, row.drawn, nonce)}).values())
 

@@ -58,6 +58,8 @@ class Reason:
 
 _NOTES = Reason.LATE_SAMPLE | Reason.WINDOW_GAP  # no trouble in themselves: the window that they leave behind is judged
 REASON_NAMES = {value: name.lower() for name, value in vars(Reason).items() if name.isupper()}
+OF_THE_CONTROLLER = Reason.POLICY_FAILED | Reason.POLICY_OUTPUT | Reason.MINIMUM | Reason.MAXIMUM | Reason.RAMP
+"""Reasons that cDBS, one amplitude within its limits, never gives: they tell a blinded session's controller."""
 
 
 def reason_names(reasons: int) -> tuple[str, ...]:

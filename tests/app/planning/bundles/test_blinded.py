@@ -28,6 +28,7 @@ from app.tablet.sources import Wish
 from app.tablet.task import Task
 from ml.deploy.bundle import BundleError, open_bundle
 from ml.deploy.manifest import BundleManifest
+from ml.deploy.runtime.envelope import OF_THE_CONTROLLER, reason_names
 from ml.deploy.runtime.slot import SEALED
 from ml.rl import MlpPolicy
 
@@ -37,10 +38,10 @@ TELLING = ("net-", "rl", "distilled", "random", "paper", "stratified", "relu", "
 
 @pytest.fixture
 def policies(client: TestClient, studied: Any) -> list[int]:
-    """A small network and a large one."""
+    """A small network and a large one, which goes from one end to the other at the smallest change of beta: limits and ramp hold it."""
     made = []
-    for name, layers in (("net-small", (8,)), ("net-large", (96, 96))):
-        content = MlpPolicy(10, layers, mean=1.0, std=0.5, seed=1).to_onnx()
+    for name, layers, std in (("net-small", (8,), 0.5), ("net-large", (96, 96), 1e-3)):
+        content = MlpPolicy(10, layers, mean=1.0, std=std, seed=1).to_onnx()
         posted = client.post("/api/v1/participants/P1/policies", data={"name": name}, files={"file": ("x.onnx", content)})
         made.append(int(posted.json()["id"]))
     return made
@@ -176,12 +177,15 @@ def test_a_blinded_day_runs_without_telling_and_comes_back_by_its_slots(
         assert "signature, files and test vectors are right" in checked, "how many files there are tells a network from a schedule"
         told = lines(control(bundle, f"simulated:P1:{position}", Wish(), task))
         assert "blinded" in told
+        assert not set(reason_names(OF_THE_CONTROLLER)) & set(re.findall(r"\w+", told)), told
         assert not [w for w in (*TELLING, "mA", "energy", "decision in us", "battery") if re.search(rf"\b{w}\b", told)], told
         head, described, header, *rows = log.read_text().splitlines()
         assert not words_of(described.encode()) & {*TELLING, "latency", "design", "seed"}
         heads.add((head, len(described) - len(str(position)), header))
         for name in ("fraction", "requested_ma", "latency_us", "late_ms", "hold", "log_density"):
             assert {row.split(",")[header.split(",").index(name)] for row in rows} == {""}, name
+        given = {word for row in rows for word in row.split(",")[header.split(",").index("reasons")].split()}
+        assert not given & set(reason_names(OF_THE_CONTROLLER)), given
         sent = client.post("/api/v1/uploads", data={"participant": "P1"}, files={"file": ("log.csv", log.read_bytes())})
         assert sent.status_code == 201, sent.text
     assert len(heads) == 1, "one log looks like another but for its amplitudes"
