@@ -42,9 +42,9 @@ ALGORITHM_NAMES: dict[str, str] = {name: algorithm.title for name, algorithm in 
 
 Aim = Literal["steps", "return", "both"]
 Anchor = Literal["logged", "cdbs", "both"]
-DEFAULT_SWEEP: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "both"}
+DEFAULT_SWEEP: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "both", "critic_memory": True}
 """What the pipeline trains where nothing else is asked for: the paper's algorithm, and one held near what was logged or near cDBS, each
-with and without a share of r_end. DDPG alone went below cDBS in all participants of the demo."""
+with and without a share of r_end. DDPG alone went below cDBS in all participants of the demo. The critics see past amplitudes."""
 
 
 class SweepParams(Model):
@@ -63,6 +63,11 @@ class SweepParams(Model):
         "logged",
         description="What TD3+BC and ReBRAC hold the policy near: the logged amplitudes, as published; the cDBS amplitude, so that it "
         "leaves the standard of care only where the values speak for it; or by turns one and the other. The others have no such bond.",
+    )
+    critic_memory: bool = Field(
+        False,
+        description="Whether the critics see means of past amplitudes beside the beta window. The policy never does. A fine-tuned policy "
+        "keeps what its critics had.",
     )
     policies: PolicyIds = Field(default_factory=list, description="Fine-tune from each of these; empty: train from scratch.")
     count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch; the paper trains 6.")

@@ -22,6 +22,7 @@ class PipelineParams(SweepParams):
         DEFAULT_SWEEP["algorithms"], description="The policies are dealt to these in turn; from scratch only."
     )
     aim: Aim = Field(DEFAULT_SWEEP["aim"], description="What the critics sum; see `train`.")
+    critic_memory: bool = Field(DEFAULT_SWEEP["critic_memory"], description="Whether the critics see past amplitudes; see `train`.")
     anchor: Anchor = Field(DEFAULT_SWEEP["anchor"], description="What TD3+BC and ReBRAC hold the policy near; see `train`.")
     updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each policy.")
     actor_lr_low: Number | None = Field(None, gt=0, le=1, description="Lowest learning rate of the policies.")

@@ -17,11 +17,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ from ml.population.virtual import WORLDS_PER_PART, World, visit_days, world
 from ml.population.virtual.world import Part
 from ml.qoc import Margins
 from ml.statistics.bootstrap import percentile_interval
+from ml.trajectories import ReplayBuffer
 
 SLOTS, TEST_VISITS, EARLY_VISITS = 4, 3, 3
 HOURS = (0.0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6)
@@ -66,6 +68,17 @@ class Clinic:
         """The visit's cDBS sessions and one session of each named policy. A policy meets the same noise whoever chose it."""
         placed = [*((CDBS, place) for place in CDBS_PLACES), *zip(names, TEST_PLACES, strict=False)]
         return [self._session(number, name, place) for name, place in placed]
+
+    def early(self, buffer: ReplayBuffer) -> list[TestSession]:
+        """The cDBS sessions of the visits before, which tell how sessions of one day differ; no test is held against them."""
+        s, found = self.world.settings, []
+        for one in buffer.sessions:
+            if one.controller == "cdbs":
+                end = one.end_reward(s)
+                steps = float(one.rewards(s) @ s.gamma ** np.arange(one.steps))
+                values = {"return": steps + (end or 0.0), "energy": float((one.amplitude**2).mean()), **asdict(one.qoc)}
+                found.append(TestSession(None, -one.visit, {k: float(v) for k, v in values.items() if v is not None}))
+        return found
 
     def _session(self, number: int, name: str, place: int) -> TestSession:
         w, s = self.world, self.world.settings
@@ -95,27 +108,28 @@ class Found:
 
 def by_posterior(clinic: Clinic, fitted: FittedPosterior, *, respecting: bool) -> Found:
     """Three visits of portfolios; each visit's sessions move the posterior."""
-    sessions: list[TestSession] = []
+    sessions: list[TestSession] = clinic.early(fitted.buffer)
     tested, kept = [], []
     estimates = fitted.evaluate(clinic.policies, STEPS)
     for number in range(1, TEST_VISITS + 1):
-        names = suggested(estimates, respecting)
+        had = {name for names in tested for name in names}
+        names = suggested(estimates, respecting, had)
         sessions += clinic.visit(number, names)
         estimates = replace(fitted, tests=tuple(differences_to_cdbs(sessions))).evaluate(clinic.policies, STEPS)
         tested.append(names)
-        had = [CDBS, *(name for names in tested for name in names)]
-        kept.append(max(had, key=lambda name: estimates[name].value))
+        kept.append(max([CDBS, *sorted(had.union(names))], key=lambda name: estimates[name].value))
     return Found(tested, kept)
 
 
-def suggested(estimates: Mapping[str, Estimate], respecting: bool) -> tuple[str, ...]:
+def suggested(estimates: Mapping[str, Estimate], respecting: bool, had: set[str]) -> tuple[str, ...]:
     """The portfolio of a visit among what may be proposed, or among all without a hazard."""
     cdbs = estimates[CDBS]
     verdicts = {n: verdict(e, cdbs, Margins(), Levels()) for n, e in estimates.items() if n != CDBS}
     able = {n for n, v in verdicts.items() if (v.proposed if respecting else not v.hazards)}
     careful = {n for n in able if verdicts[n].code == "test_with_care"} if respecting else set()
     draws = {n: np.asarray(e.details["draws"]) for n, e in estimates.items()}
-    return tuple(s.name for s in portfolio({n: draws[n] - draws[CDBS] for n in able}, SLOTS, careful))
+    noise = float(cdbs.details["return_noise"]) * math.sqrt(1 + 1 / len(CDBS_PLACES))
+    return tuple(s.name for s in portfolio({n: draws[n] - draws[CDBS] for n in able}, SLOTS, careful, had, noise))
 
 
 def in_order(clinic: Clinic, order: list[str]) -> Found:

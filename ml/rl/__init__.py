@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ml.rl.algorithms._learner import SATURATION_MARGIN
     from ml.rl.algorithms.registry import ALGORITHMS, Algorithm, algorithm
-    from ml.rl.configs import TrainConfig
+    from ml.rl.configs import CriticConfig, TrainConfig
     from ml.rl.distillation import DistilConfig, distil
     from ml.rl.end_reward import fit_end_reward
     from ml.rl.held_out import HeldOutSessions, split_sessions
@@ -24,6 +24,7 @@ _HOMES = {
     "ALGORITHMS": "algorithms.registry",
     "Algorithm": "algorithms.registry",
     "CheckpointError": "loop",
+    "CriticConfig": "configs",
     "DistilConfig": "distillation",
     "HeldOutSessions": "held_out",
     "MlpPolicy": "kernels.networks",
@@ -48,6 +49,7 @@ __all__ = [
     "TEACHER_HIDDEN",
     "Algorithm",
     "CheckpointError",
+    "CriticConfig",
     "DistilConfig",
     "HeldOutSessions",
     "MlpPolicy",

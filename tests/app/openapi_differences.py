@@ -304,6 +304,10 @@ INTENDED: dict[str, str] = {
         "API: a session has `stopped_reason` and `medication_h`",
     ),
     **dict.fromkeys(
+        tuple(f"components > schemas > {job} > properties > critic_memory" for job in ("PipelineJob", "TrainJob", "NextGenerationJob")),
+        "Critics may remember past amplitudes (`critic_memory`)",
+    ),
+    **dict.fromkeys(
         tuple(f"components > schemas > PipelineJob > properties > {name} > default" for name in ("aim", "algorithms", "anchor")),
         "The pipeline trains one default sweep from the page's button, the form, the API and the command line",
     ),

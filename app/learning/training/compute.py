@@ -239,11 +239,12 @@ def _initial(start: dict[str, str] | None) -> rl.TrainedPolicy | rl.MlpPolicy | 
 
 
 def _with_start(values: dict[str, Any], initial: rl.TrainedPolicy | rl.MlpPolicy | None) -> dict[str, Any]:
-    """Hyper-parameters for a start: a fine-tuned policy keeps its layers, and without its critic learns that one first."""
+    """Hyper-parameters for a start: fine-tuning keeps layers and the critic's inputs; without its critic, that one learns first."""
     if initial is None:
         return values
     if isinstance(initial, rl.TrainedPolicy):
-        return values | {"hidden": list(initial.config.hidden)}
+        seen = {"critic_memory": initial.config.critic_memory} if isinstance(initial.config, rl.CriticConfig) else {}
+        return values | {"hidden": list(initial.config.hidden)} | seen
     warmup = {"critic_warmup": values["updates"] // 4} if "critic_lr" in values else {}
     return values | {"hidden": list(initial.hidden)} | warmup
 

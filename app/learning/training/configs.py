@@ -130,6 +130,7 @@ def _config(params: TrainParams, algorithm: str, *, actor_lr: float, seed: int) 
     }
     if algorithm != "cloning":
         config["critic_lr"] = preset["critic_lr"] if params.critic_lr is None else params.critic_lr
+        config["critic_memory"] = params.critic_memory
     return config
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,9 @@ from app.evaluation.ranking.judged import Judged
 from app.evaluation.repository import PolicyHead
 from ml.ope.posterior.portfolio import Suggestion, portfolio
 from ml.ope.posterior.verdict import FEWEST_DRAWS
+
+CDBS_SESSIONS = 2
+"""Sessions of cDBS that a visit's policies are held against, at least."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +42,16 @@ def _portfolio(found: Assessment, slots: int) -> tuple[Suggested, ...]:
     theirs = np.asarray(found.cdbs.posterior.details.get("draws") or [], dtype=np.float64)
     answered = answer(found)
     careful = {str(row.one.policy.id) for row in answered.of("test_with_care")}
-    differences, policies = {}, {}
+    differences, policies, tested = {}, {}, set()
     for row in (*answered.of("test"), *answered.of("test_with_care")):
         own = row.one.posterior
         ours = np.asarray(own.details.get("draws") or [], dtype=np.float64) if own is not None else np.empty(0)
         if ours.size == theirs.size >= FEWEST_DRAWS:
             differences[str(row.one.policy.id)] = ours - theirs
             policies[str(row.one.policy.id)] = row.one.policy
-    return tuple(Suggested(policies[s.name], s) for s in portfolio(differences, slots, careful))
+            if row.one.tested is not None:
+                tested.add(str(row.one.policy.id))
+    # of a session's difference to the visit's cDBS, of which a plan holds two sessions or more; evaluations of before do not say it
+    noise = float(found.cdbs.posterior.details.get("return_noise") or 0.0) * math.sqrt(1 + 1 / CDBS_SESSIONS)
+    chosen = portfolio(differences, slots, careful, tested, noise)
+    return tuple(Suggested(policies[s.name], s) for s in chosen)

@@ -21,6 +21,7 @@ from ml.ope.linear.estimator import FittedLinear, LinearConfig, Replayed
 from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.posterior.constants import VERSION
 from ml.ope.posterior.draws import Draws, Replays, joint_draws
+from ml.ope.posterior.further_sessions import return_noise
 from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference, similarity, updated
 from ml.ope.posterior.held_out import HeldOut, held_out
 from ml.ope.posterior.skill import Skill, ordering_skill
@@ -149,6 +150,13 @@ class FittedPosterior:
         """Level of every session, [n], over structures."""
         return np.sum([self.predictions.weights[f.key] * f.drawn.levels.mean(0) for f in self.fits], axis=0)
 
+    @property
+    def _parts(self) -> dict[str, float]:
+        """What one unit of each QoC adds to the return."""
+        s = self.buffer.settings
+        parts = {"grasp_hz": s.c2, "rating": s.c3, "tremor_percent": -s.c4 / (100.0 if s.tremor_as_fraction else 1.0)}
+        return {name: weight for name, weight in parts.items() if weight}
+
     def _replays(self, policies: list[Policy], horizon: int, report: Report) -> Replays:
         """Every structure's replays side by side; the draws of r_end are dealt out over the structures."""
         found: list[Replayed] = []
@@ -194,7 +202,7 @@ class FittedPosterior:
         if not self.tests:
             return found
         names, rng = list(policies), np.random.default_rng([self.config.seed, 0x7E57])
-        return replace(found, values=updated(found.values, names, len(names) - 1, self.tests, found.between_visits, rng))
+        return replace(found, values=updated(found.values, names, len(names) - 1, self.tests, found.between_visits, rng, self._parts))
 
     def _estimate(
         self, i: int, replays: Replays, draws: Draws, support: Support, skill: Skill, amplitudes: list[Flag], horizon: int
@@ -230,6 +238,7 @@ class FittedPosterior:
                 "skill": skill.to_json(),
                 "weights": {key: round(w, 4) for key, w in self.predictions.weights.items()},
                 "tests": len(self.tests),
+                "return_noise": round(return_noise(self.buffer, horizon), 4),
                 "constants_version": VERSION,
             },
         )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ml.ope.posterior.verdict import OUTCOMES, Levels
 from ml.qoc import Qoc
+from ml.returns import actual_return
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
@@ -47,6 +48,20 @@ def session_noise(buffer: ReplayBuffer) -> dict[str, float]:
                 found[name] = deviation
                 break
     return found
+
+
+def return_noise(buffer: ReplayBuffer, horizon_steps: int) -> float:
+    """Standard deviation of a session's return from session to session under one steady controller at one visit, reward units.
+
+    0 where fewer than three degrees of freedom speak about it. A missing r_end leaves the session out where others have one.
+    """
+    groups: dict[tuple[object, ...], list[float | None]] = {}
+    for s in buffer.sessions:
+        if s.controller != "random":
+            found = actual_return(s, buffer.settings, horizon_steps)
+            whole = None if found.step_return is None or found.end_reward is None else found.step_return + found.end_reward
+            groups.setdefault((s.visit, s.controller, s.policy_id), []).append(whole)
+    return _within_groups(list(groups.values()))
 
 
 def _within_groups(groups: Sequence[Sequence[float | None]]) -> float:

@@ -25,6 +25,8 @@ LENGTH = 0.15
 """Amplitude fraction by which policies may differ and still share most of what a structure gets wrong."""
 MOST_STATES = 600
 JITTER = 1e-6
+_ROOM = 1.1
+"""Least variance of a session's return over that of its QoCs' part."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class TestedDifference:
         policy_name: name under which the policy is evaluated. visit: its number. n_sessions: of the policy at that visit.
         differences: by `QUANTITIES`, in the unit of each (`energy`: mean squared amplitude fraction); a key is absent where not measured.
         standard_errors: of the same keys.
+        n_reference: sessions of cDBS at that visit, whose chance all policies of the visit share; None where it is not known (tests stored
+            before it was kept), and then their errors count as their own.
 
     Raises:
         ValueError: no session, an unknown quantity, keys that differ, or a standard error that is not positive.
@@ -47,6 +51,7 @@ class TestedDifference:
     n_sessions: int
     differences: Mapping[str, float]
     standard_errors: Mapping[str, float]
+    n_reference: int | None = None
 
     def __post_init__(self) -> None:
         who = f"the test of {self.policy_name!r} at visit {self.visit}"
@@ -86,6 +91,7 @@ def updated(
     tests: Sequence[TestedDifference],
     spread_between_visits: Mapping[str, float],
     rng: np.random.Generator,
+    parts_of_return: Mapping[str, float] | None = None,
 ) -> dict[str, Floats]:
     """Draws [P, K] by quantity after tested sessions.
 
@@ -94,12 +100,13 @@ def updated(
         tests: differences to the same visit's cDBS; a difference of a quantity without draws says nothing here.
         spread_between_visits: standard deviation of a policy's true difference to cDBS between visits, by quantity: a test shows one visit.
         rng: of the errors.
+        parts_of_return: what one unit of a QoC adds to the return; a session's chance in it is then not counted a second time.
 
     Raises:
         ValueError: a test of a policy that is not among the names.
     """
     quantities = list(draws)
-    observed, noise, values = [], [], []
+    observed, seen_of, values = [], [], []
     for test in tests:
         if test.policy_name not in names:
             raise ValueError(f"the test of {test.policy_name!r} at visit {test.visit} is of a policy that is not evaluated: name it too")
@@ -107,15 +114,54 @@ def updated(
         for quantity in quantities:
             if quantity in test.differences and row != reference:
                 observed.append(draws[quantity][row] - draws[quantity][reference])
-                noise.append(test.standard_errors[quantity] ** 2 + spread_between_visits.get(quantity, 0.0) ** 2)
+                seen_of.append((test, quantity))
                 values.append(test.differences[quantity])
     if not observed:
         return dict(draws)
-    seen, error, y = np.stack(observed), np.array(noise), np.array(values)
+    seen, y = np.stack(observed), np.array(values)
+    error = errors_of_tests(seen_of, spread_between_visits, parts_of_return or {})
     flat = np.concatenate([draws[q] for q in quantities])
     k = flat.shape[1] - 1
     centred, centred_seen = flat - flat.mean(1, keepdims=True), seen - seen.mean(1, keepdims=True)
-    gain = (centred @ centred_seen.T / k) @ np.linalg.inv(centred_seen @ centred_seen.T / k + np.diag(error))
-    said = y[:, None] - seen - np.sqrt(error)[:, None] * rng.standard_normal(seen.shape)
+    gain = (centred @ centred_seen.T / k) @ np.linalg.inv(centred_seen @ centred_seen.T / k + error)
+    said = y[:, None] - seen - np.linalg.cholesky(error) @ rng.standard_normal(seen.shape)
     moved = flat + gain @ said
     return {q: moved[i * len(names) : (i + 1) * len(names)] for i, q in enumerate(quantities)}
+
+
+def errors_of_tests(
+    observed: Sequence[tuple[TestedDifference, str]], spread_between_visits: Mapping[str, float], parts_of_return: Mapping[str, float]
+) -> Floats:
+    """Covariance [n, n] of the errors of observed differences, each of one test and one quantity.
+
+    Three things move a difference: its own sessions; the visit's cDBS sessions, which all tests of the visit share; and how the policy's
+    true difference varies between visits. A return holds the session's QoCs, so that its chance goes with theirs: per session the
+    covariance of return and QoC is the QoC's weight in the return times its variance.
+    """
+    n = len(observed)
+    found = np.zeros((n, n))
+    for i, (one, first) in enumerate(observed):
+        found[i, i] += spread_between_visits.get(first, 0.0) ** 2
+        for j, (other, second) in enumerate(observed):
+            if one is other or (one.visit == other.visit and one.n_reference and one.n_reference == other.n_reference):
+                chance = _chance(one, first, second, parts_of_return)
+                reference = 1.0 / one.n_reference if one.n_reference else 0.0
+                found[i, j] += chance * ((1.0 / one.n_sessions if one is other else 0.0) + reference)
+    return found
+
+
+def _chance(test: TestedDifference, first: str, second: str, parts_of_return: Mapping[str, float]) -> float:
+    """Covariance of two quantities from session to session, as a test's standard errors tell it."""
+    share = 1.0 / test.n_sessions + (1.0 / test.n_reference if test.n_reference else 0.0)
+
+    def variance(name: str) -> float:
+        return test.standard_errors[name] ** 2 / share
+
+    of_qocs = sum(w**2 * variance(name) for name, w in parts_of_return.items() if name in test.standard_errors)
+    if first == second:
+        # at least what its QoCs bring, and a tenth more, so that the covariance stays one
+        return max(variance(first), _ROOM * of_qocs) if first == "return" else variance(first)
+    if "return" in (first, second):
+        qoc = second if first == "return" else first
+        return parts_of_return.get(qoc, 0.0) * variance(qoc)
+    return 0.0

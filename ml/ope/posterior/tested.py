@@ -57,7 +57,7 @@ def differences_to_cdbs(sessions: Sequence[TestSession]) -> list[TestedDifferenc
                 differences[name] = float(a.mean() - b.mean())
                 errors[name] = float(sd * np.sqrt(1 / a.size + 1 / b.size))
         if differences:
-            found.append(TestedDifference(policy, visit, len(ours), differences, errors))
+            found.append(TestedDifference(policy, visit, len(ours), differences, errors, len(theirs)))
     return sorted(found, key=lambda test: (test.visit, test.policy_name))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ml.ope.posterior.gaussian import LENGTH, TestedDifference, correlated, similarity, updated
+from ml.ope.posterior.gaussian import LENGTH, TestedDifference, correlated, errors_of_tests, similarity, updated
 from ml.policies.policy import ConstantPolicy
 
 
@@ -39,6 +39,33 @@ def test_a_test_moves_the_draws_as_conditioning_a_normal_does() -> None:
     assert np.allclose(found.mean(1), np.array([10.0, 8.0, 9.0]) + gain * (-5.0 - 1.0), atol=0.1)
     assert found[0].var() == pytest.approx(4.0 - 16.0 / total, rel=0.05)
     assert found[1].mean() < 8.0  # what was not tested moves with what was
+
+
+def test_policies_of_one_visit_share_the_chance_of_its_cdbs_sessions() -> None:
+    """Errors of two tests of one visit: variance sd^2 (1/n + 1/m), covariance sd^2 / m; other visits have none in common."""
+    sd, m = 2.0, 2
+    tests = [
+        TestedDifference(p, v, n, {"return": 1.0}, {"return": sd * np.sqrt(1 / n + 1 / m)}, m)
+        for p, v, n in (("first", 4, 1), ("second", 4, 2), ("first", 5, 1))
+    ]
+    found = errors_of_tests([(t, "return") for t in tests], {"return": 1.0}, {})
+    assert np.allclose(found, [[1 + 4 * 1.5, 2.0, 0.0], [2.0, 1 + 4 * 1.0, 0.0], [0.0, 0.0, 1 + 4 * 1.5]])
+    # so the difference between two policies of one visit is told as well as without cDBS between them
+    assert found[0, 0] + found[1, 1] - 2 * found[0, 1] == pytest.approx(2 * 1.0 + sd**2 * (1 / 1 + 1 / 2))
+
+
+def test_a_lucky_rating_is_not_counted_again_in_the_return() -> None:
+    """Where the return is its rating's part alone, seeing both says no more than seeing the rating."""
+    draws = prior()
+    draws["rating"] = draws["return"] / 2.0
+    names, weights = ["first", "second", "cdbs"], {"rating": 2.0}
+    both = TestedDifference("first", 4, 1, {"return": 6.0, "rating": 3.0}, {"return": 3.0, "rating": 1.5}, 2)
+    alone = TestedDifference("first", 4, 1, {"rating": 3.0}, {"rating": 1.5}, 2)
+    together, one = (updated(draws, names, 2, [test], {}, np.random.default_rng(0), weights)["return"][0] for test in (both, alone))
+    assert together.mean() == pytest.approx(one.mean(), abs=0.1)
+    assert together.std() == pytest.approx(one.std(), rel=0.05)
+    twice = updated(draws, names, 2, [both], {}, np.random.default_rng(0))["return"][0]
+    assert twice.std() < 0.95 * one.std(), "what it would say if the two were taken for independent"
 
 
 def test_many_precise_tests_are_mostly_what_happened() -> None:

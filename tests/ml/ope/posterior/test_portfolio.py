@@ -57,6 +57,25 @@ def test_greedy_finds_the_best_pair_of_a_small_set() -> None:
     assert {s.name for s in portfolio(given, 2)} == set(max(worth, key=lambda pair: worth[pair]))
 
 
+def test_what_is_known_already_is_not_tested_again_and_what_may_beat_it_is() -> None:
+    known, open_, worse = drawn(5.0, 0.01, 1), drawn(4.0, 2.0, 2), drawn(-9.0, 0.5, 3)
+    assert [s.name for s in portfolio({"known": known, "open": open_, "worse": worse}, 3, tested={"known"})] == ["open"]
+    z = (4.0 - 5.0) / 2.0
+    (only,) = portfolio({"known": known, "open": open_}, 3, tested={"known"})
+    assert only.adds == pytest.approx(2.0 * (norm.pdf(z) + z * norm.cdf(z)), rel=0.02), "expected improvement over what is in hand"
+
+
+def test_a_session_with_noise_is_worth_what_it_may_change_the_mean_by() -> None:
+    """One session moves the mean by a normal of variance sd^4 / (sd^2 + noise^2): the knowledge gradient."""
+    sd, noise, mean = 2.0, 3.0, -1.0
+    moved = sd**2 / np.sqrt(sd**2 + noise**2)
+    z = mean / moved
+    (only,) = portfolio({"a": drawn(mean, sd, 1)}, 1, noise=noise)
+    assert only.adds == pytest.approx(moved * (norm.pdf(z) + z * norm.cdf(z)), rel=0.03)
+    again = portfolio({"lucky": drawn(1.0, sd, 1)}, 1, tested={"lucky"}, noise=noise)
+    assert [s.name for s in again] == ["lucky"], "one session does not settle it"
+
+
 def test_nothing_is_suggested_where_there_is_nothing() -> None:
     assert portfolio({}, 3) == ()
     assert portfolio({"a": drawn(1, 1, 1)}, 0) == ()
