@@ -304,7 +304,7 @@ INTENDED: dict[str, str] = {
         "API: a session has `stopped_reason` and `medication_h`",
     ),
     **dict.fromkeys(
-        tuple(f"components > schemas > {job} > properties > critic_memory" for job in ("PipelineJob", "TrainJob", "NextGenerationJob")),
+        tuple(f"components > schemas > {job} > properties > critic_memory" for job in ("PipelineJob", "TrainJob")),
         "Critics may remember past amplitudes (`critic_memory`)",
     ),
     **dict.fromkeys(
