@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -19,7 +20,8 @@ from app.accounts import service as accounts
 from app.accounts.models import Role, User
 from app.accounts.sign_on import provider as ours
 from app.accounts.sign_on import service
-from app.platform.database import new_session
+from app.accounts.sign_on.provider import Identity
+from app.platform.database import new_session, now
 from app.settings import get_settings
 from tests import identity_provider as theirs
 from tests.conftest import PASSWORD
@@ -344,6 +346,27 @@ def test_look_alikes_of_an_address_open_no_account(browser: TestClient, hospital
     assert db.scalar(text("select count(*) from sign_on_link")) == 0
     hospital.present, hospital.person = None, ADA
     assert signed_on(browser).status_code == 303
+
+
+def test_two_first_sign_ons_of_one_person_at_once_are_one_link(ada: User, db: Session) -> None:
+    who = Identity(PUBLIC, ADA.subject, ADA.email, now())
+    opened: list[str] = []
+
+    def second() -> None:
+        with new_session() as own:
+            opened.append(service.sign_on(own, who))
+            own.commit()
+
+    with new_session() as first:
+        opened.append(service.sign_on(first, who))
+        other = threading.Thread(target=second)
+        other.start()
+        other.join(1.0)
+        assert other.is_alive(), "it waits for the first"
+        first.commit()
+    other.join(20.0)
+    assert len(opened) == 2
+    assert db.scalar(text("select count(*) from sign_on_link")) == 1
 
 
 def test_an_installation_without_a_sign_on_shows_none(anonymous_client: TestClient) -> None:
