@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from ml.ope.posterior.draws import Draws, Replays, joint_draws
 from ml.ope.posterior.further_sessions import return_noise
 from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference, similarity, updated
 from ml.ope.posterior.held_out import HeldOut, held_out
-from ml.ope.posterior.skill import Skill, ordering_skill
+from ml.ope.posterior.skill import ordering_skill
 from ml.ope.posterior.structures import STRUCTURES, Fit, no_answer
 from ml.ope.posterior.support import LATE_STEPS, SessionSupport, Support
 from ml.ope.registry import Size
@@ -139,9 +140,10 @@ class FittedPosterior:
         supports = [support.of(s) for s in replays.summaries]
         draws = self._draws(replays, everyone, supports, horizon)
         skill = ordering_skill(self.buffer, self.predictions, self.equal, self.ends, self.levels)
+        common = {"skill": skill.to_json(), "return_noise": round(return_noise(self.buffer, horizon), 4)}
         look = AmplitudeSupport(self.buffer)
         return {
-            name: self._estimate(i, replays, draws, supports[i], skill, list(look.of_policy(chosen[i]).flags()), horizon)
+            name: self._estimate(i, replays, draws, supports[i], common, list(look.of_policy(chosen[i]).flags()), horizon)
             for i, name in enumerate(names[:-1])
         }
 
@@ -202,10 +204,12 @@ class FittedPosterior:
         if not self.tests:
             return found
         names, rng = list(policies), np.random.default_rng([self.config.seed, 0x7E57])
-        return replace(found, values=updated(found.values, names, len(names) - 1, self.tests, found.between_visits, rng, self._parts))
+        return replace(
+            found, values=updated(found.values, names, len(names) - 1, self.tests, found.between_visits, rng, self._parts, alike)
+        )
 
     def _estimate(
-        self, i: int, replays: Replays, draws: Draws, support: Support, skill: Skill, amplitudes: list[Flag], horizon: int
+        self, i: int, replays: Replays, draws: Draws, support: Support, common: dict[str, Any], amplitudes: list[Flag], horizon: int
     ) -> Estimate:
         values = {name: rows[i] for name, rows in draws.values.items()}
         own, with_end = values["return"], self.ends.seen[0]
@@ -230,15 +234,14 @@ class FittedPosterior:
             flags=distinct(flags),
             n=len(self.buffer.sessions),
             details={
+                **common,
                 "horizon_steps": horizon,
                 "draws": [round(float(v), 4) for v in own],
                 "outcome_draws": {name: [round(float(v), 4) for v in drawn] for name, drawn in shown.items()},
                 "support": support.to_json(),
                 "behaviour": replays.behaviour[i],
-                "skill": skill.to_json(),
                 "weights": {key: round(w, 4) for key, w in self.predictions.weights.items()},
                 "tests": len(self.tests),
-                "return_noise": round(return_noise(self.buffer, horizon), 4),
                 "constants_version": VERSION,
             },
         )

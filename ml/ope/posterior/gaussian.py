@@ -8,7 +8,7 @@ f + K_o (K_oo + R)^-1 (y - f_o - e), with o what was observed, e ~ N(0, R), and 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +25,8 @@ LENGTH = 0.15
 """Amplitude fraction by which policies may differ and still share most of what a structure gets wrong."""
 MOST_STATES = 600
 JITTER = 1e-6
-_ROOM = 1.1
-"""Least variance of a session's return over that of its QoCs' part."""
+_OWN = 0.1
+"""Least variance of a return beside its QoCs, as a share of theirs."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,7 @@ def updated(
     spread_between_visits: Mapping[str, float],
     rng: np.random.Generator,
     parts_of_return: Mapping[str, float] | None = None,
+    alike: Floats | None = None,
 ) -> dict[str, Floats]:
     """Draws [P, K] by quantity after tested sessions.
 
@@ -101,6 +102,7 @@ def updated(
         spread_between_visits: standard deviation of a policy's true difference to cDBS between visits, by quantity: a test shows one visit.
         rng: of the errors.
         parts_of_return: what one unit of a QoC adds to the return; a session's chance in it is then not counted a second time.
+        alike: correlation of the policies' days, [P, P]; without it only a policy's own tests of a visit share its day.
 
     Raises:
         ValueError: a test of a policy that is not among the names.
@@ -119,7 +121,10 @@ def updated(
     if not observed:
         return dict(draws)
     seen, y = np.stack(observed), np.array(values)
-    error = errors_of_tests(seen_of, spread_between_visits, parts_of_return or {})
+    rows = {name: i for i, name in enumerate(names)}
+    days = {} if alike is None else {"alike": lambda a, b: float(alike[rows[a], rows[b]])}
+    error = errors_of_tests(seen_of, spread_between_visits, parts_of_return or {}, **days)
+    error += JITTER * np.diag(np.diag(error))
     flat = np.concatenate([draws[q] for q in quantities])
     k = flat.shape[1] - 1
     centred, centred_seen = flat - flat.mean(1, keepdims=True), seen - seen.mean(1, keepdims=True)
@@ -130,38 +135,52 @@ def updated(
 
 
 def errors_of_tests(
-    observed: Sequence[tuple[TestedDifference, str]], spread_between_visits: Mapping[str, float], parts_of_return: Mapping[str, float]
+    observed: Sequence[tuple[TestedDifference, str]],
+    spread_between_visits: Mapping[str, float],
+    parts_of_return: Mapping[str, float],
+    alike: Callable[[str, str], float] = lambda a, b: float(a == b),
 ) -> Floats:
     """Covariance [n, n] of the errors of observed differences, each of one test and one quantity.
 
     Three things move a difference: its own sessions; the visit's cDBS sessions, which all tests of the visit share; and how the policy's
-    true difference varies between visits. A return holds the session's QoCs, so that its chance goes with theirs: per session the
-    covariance of return and QoC is the QoC's weight in the return times its variance.
+    true difference varies between visits, in which policies that act alike go together. A return holds the session's QoCs, so that its
+    chance, and its day, go with theirs. Every error is written as loadings on independent parts, so that the matrix is symmetric and
+    positive definite whatever was measured in which test.
+
+    Args:
+        observed: tests and quantities. spread_between_visits: standard deviation by quantity. parts_of_return: as in `updated`.
+        alike: correlation of two policies' days, by name; 1 of a policy with itself.
     """
     n = len(observed)
+    chance = [_loadings(quantity, _session_sd(test), parts_of_return) for test, quantity in observed]
+    day = [_loadings(quantity, spread_between_visits, parts_of_return) for _, quantity in observed]
     found = np.zeros((n, n))
-    for i, (one, first) in enumerate(observed):
-        found[i, i] += spread_between_visits.get(first, 0.0) ** 2
-        for j, (other, second) in enumerate(observed):
-            if one is other or (one.visit == other.visit and one.n_reference and one.n_reference == other.n_reference):
-                chance = _chance(one, first, second, parts_of_return)
-                reference = 1.0 / one.n_reference if one.n_reference else 0.0
-                found[i, j] += chance * ((1.0 / one.n_sessions if one is other else 0.0) + reference)
+    for i, (one, _) in enumerate(observed):
+        for j, (other, _) in enumerate(observed):
+            same_test = one is other
+            shared = one.n_reference if same_test or (one.visit == other.visit and one.n_reference == other.n_reference) else None
+            weight = (1.0 / one.n_sessions if same_test else 0.0) + (1.0 / shared if shared else 0.0)
+            found[i, j] = weight * _common(chance[i], chance[j])
+            if one.visit == other.visit:
+                found[i, j] += alike(one.policy_name, other.policy_name) * _common(day[i], day[j])
     return found
 
 
-def _chance(test: TestedDifference, first: str, second: str, parts_of_return: Mapping[str, float]) -> float:
-    """Covariance of two quantities from session to session, as a test's standard errors tell it."""
+def _session_sd(test: TestedDifference) -> dict[str, float]:
+    """Standard deviation of one session by quantity, as a test's standard errors tell it."""
     share = 1.0 / test.n_sessions + (1.0 / test.n_reference if test.n_reference else 0.0)
+    return {name: error / np.sqrt(share) for name, error in test.standard_errors.items()}
 
-    def variance(name: str) -> float:
-        return test.standard_errors[name] ** 2 / share
 
-    of_qocs = sum(w**2 * variance(name) for name, w in parts_of_return.items() if name in test.standard_errors)
-    if first == second:
-        # at least what its QoCs bring, and a tenth more, so that the covariance stays one
-        return max(variance(first), _ROOM * of_qocs) if first == "return" else variance(first)
-    if "return" in (first, second):
-        qoc = second if first == "return" else first
-        return parts_of_return.get(qoc, 0.0) * variance(qoc)
-    return 0.0
+def _loadings(quantity: str, sd: Mapping[str, float], parts_of_return: Mapping[str, float]) -> dict[str, float]:
+    """What moves a quantity, by independent part: a QoC by itself, a return by its QoCs and by what else is in it."""
+    if quantity != "return":
+        return {quantity: sd.get(quantity, 0.0)}
+    of_qocs = {name: weight * sd[name] for name, weight in parts_of_return.items() if name in sd}
+    rest = sd.get("return", 0.0) ** 2 - sum(v**2 for v in of_qocs.values())
+    # at least a tenth of what its QoCs bring is its own, so that a return is never taken for known from them
+    return of_qocs | {"return": float(np.sqrt(max(rest, _OWN * sum(v**2 for v in of_qocs.values()))))}
+
+
+def _common(a: Mapping[str, float], b: Mapping[str, float]) -> float:
+    return float(sum(value * b[name] for name, value in a.items() if name in b))

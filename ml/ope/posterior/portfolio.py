@@ -110,6 +110,8 @@ class _Beliefs:
     @staticmethod
     def of(draws: Floats, noise: float) -> _Beliefs:
         by_chance = np.random.default_rng(_SEED).standard_normal(draws.shape)
+        # centred, or a policy whose draws of chance are high on average would seem to gain by any session
+        by_chance -= by_chance.mean(axis=1, keepdims=True)
         covariance = np.atleast_2d(np.cov(draws, bias=True))
         return _Beliefs(draws, draws.mean(axis=1), covariance, noise, draws + noise * by_chance)
 

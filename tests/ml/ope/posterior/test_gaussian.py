@@ -54,6 +54,38 @@ def test_policies_of_one_visit_share_the_chance_of_its_cdbs_sessions() -> None:
     assert found[0, 0] + found[1, 1] - 2 * found[0, 1] == pytest.approx(2 * 1.0 + sd**2 * (1 / 1 + 1 / 2))
 
 
+def test_errors_stay_a_covariance_whatever_was_measured_in_which_test() -> None:
+    rng, weights = np.random.default_rng(0), {"grasp_hz": 5.0, "rating": 10.0, "tremor_percent": 0.0}
+    spread = {"return": 4.0, "rating": 0.5, "energy": 0.02}
+    for _ in range(300):
+        seen = []
+        for k in range(4):
+            names = [q for q in ("return", "energy", "grasp_hz", "rating", "tremor_percent") if rng.random() < 0.7] or ["energy"]
+            errors = dict(zip(names, rng.uniform(0.05, 5, len(names)), strict=True))
+            test = TestedDifference(
+                f"p{k % 3}", 4 + k // 3, int(rng.integers(1, 6)), dict.fromkeys(names, 0.0), errors, int(rng.integers(1, 4))
+            )
+            seen += [(test, q) for q in names]
+        found = errors_of_tests(seen, spread, weights, lambda a, b: 1.0 if a == b else 0.9)
+        assert np.allclose(found, found.T)
+        assert np.linalg.eigvalsh(found).min() > -1e-9 * np.trace(found)
+
+
+def test_a_qoc_without_weight_that_one_test_lacks_is_no_obstacle() -> None:
+    draws = prior(500) | {"tremor_percent": prior(500)["return"]}
+    full = TestedDifference("first", 4, 1, {"return": 1.0, "tremor_percent": 2.0}, {"return": 1.0, "tremor_percent": 1.0}, 2)
+    lacks = TestedDifference("second", 4, 1, {"return": 1.0}, {"return": 1.0}, 2)
+    for tests in ([full, lacks], [lacks, full]):
+        found = updated(draws, ["first", "second", "cdbs"], 2, tests, {}, np.random.default_rng(0), {"tremor_percent": 0.0})
+        assert np.isfinite(found["return"]).all()
+
+
+def test_twins_of_one_visit_share_its_day() -> None:
+    tests = [TestedDifference(p, 4, 1, {"return": 1.0}, {"return": 1.0}, 2) for p in ("first", "twin")]
+    found = errors_of_tests([(t, "return") for t in tests], {"return": 3.0}, {}, lambda a, b: 1.0)
+    assert found[0, 1] == pytest.approx(9.0 + 1 / 1.5 / 2), "the day, and the chance of the two cDBS sessions"
+
+
 def test_a_lucky_rating_is_not_counted_again_in_the_return() -> None:
     """Where the return is its rating's part alone, seeing both says no more than seeing the rating."""
     draws = prior()

@@ -65,6 +65,12 @@ def test_what_is_known_already_is_not_tested_again_and_what_may_beat_it_is() -> 
     assert only.adds == pytest.approx(2.0 * (norm.pdf(z) + z * norm.cdf(z)), rel=0.02), "expected improvement over what is in hand"
 
 
+def test_what_is_known_adds_nothing_with_noise_either() -> None:
+    assert portfolio({"known": drawn(10.0, 2.0, 1)[:400]}, 1, tested={"known"}, noise=3.0) == ()
+    given = {"a": drawn(10.0, 2.0, 1)[:400], "b": drawn(3.0, 1.0, 2)[:400], "c": drawn(4.0, 1.5, 3)[:400]}
+    assert portfolio(given, 3, tested={"a"}, noise=6.0) == ()
+
+
 def test_a_session_with_noise_is_worth_what_it_may_change_the_mean_by() -> None:
     """One session moves the mean by a normal of variance sd^4 / (sd^2 + noise^2): the knowledge gradient."""
     sd, noise, mean = 2.0, 3.0, -1.0
