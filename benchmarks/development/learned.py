@@ -1,7 +1,7 @@
 """What three visits teach: six policies by the default sweep on virtual patients, the posterior's first of them, and the best by truth.
 
     python -m benchmarks.development.learned --worlds 12 --out FOLDER             every fifth world of part A; resumable
-    python -m benchmarks.development.learned --memory                             critics that see past amplitudes beside the beta window
+    python -m benchmarks.development.learned --memory                             critics that see past amplitudes, and those that do not
     python -m benchmarks.development.learned --designs stratified,paper           data by both designs
     python -m benchmarks.development.learned --part B                             to report on; each run is counted
 
@@ -112,7 +112,12 @@ def main() -> None:
     out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-learned-"))
     out.mkdir(parents=True, exist_ok=True)
     cells, figures = Cells(out / "learned.jsonl"), {}
-    arms = [(d, m) for d in DESIGNS if d in chosen.designs.split(",") for m in ((False, True) if chosen.memory else (False,))]
+    arms = [
+        (d, m)
+        for d in DESIGNS
+        if d in chosen.designs.split(",")
+        for m in ((False, True) if chosen.memory else (DEFAULT_SWEEP["critic_memory"],))
+    ]
     for index in range(0, chosen.every * chosen.worlds, chosen.every):
         for design, memory in arms:
             key = f"{chosen.part} {design} {'memory' if memory else 'window'}"

@@ -74,13 +74,14 @@ def combine(estimates: Mapping[str, Mapping[str, Estimate]], bias: Mapping[str, 
     """Combined estimate of every policy.
 
     Args:
-        estimates: method -> policy -> estimate. A method takes part when it is supported for at least one policy; combinations do not.
+        estimates: method -> policy -> estimate. A method takes part when it is supported for at least one policy; combinations, and
+            methods that run only where they are named, do not.
         bias: root mean squared error of each method on left-out controllers, unit of the return.
 
     Raises:
         ValueError: no method takes part, or no policy has been estimated by all that do.
     """
-    apart = {m.key for m in methods_of_all() if m.family == "combination"}
+    apart = {m.key for m in methods_of_all() if m.family == "combination" or m.on_request}
     methods = [m for m, table in estimates.items() if m not in apart and any(e.supported for e in table.values())]
     if not methods:
         raise ValueError("nothing to combine: no method supports any policy")

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.special import stdtrit
 
 from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.held_out import dose_slopes
@@ -21,8 +22,8 @@ from ml.ope.fqe.steps import memories
 FEWEST_SESSIONS = 4
 """Random sessions with doses that differ, below which the data say nothing."""
 
-TOLD = 2.0
-"""Standard errors by which the answer of the data must differ from zero."""
+TOLD = 0.975
+"""One-sided confidence (Student's t over sessions) with which the answer of the data must differ from zero."""
 
 LEAST_SHARE = 0.1
 """An answer below this share of that of the data is null."""
@@ -49,8 +50,10 @@ class DoseAnswer:
 
     @property
     def told(self) -> bool:
-        """Whether it can be told from zero."""
-        return self.sessions >= FEWEST_SESSIONS and abs(self.slope) > TOLD * self.error
+        """Whether it can be told from zero, and members can be asked for theirs."""
+        if self.sessions < FEWEST_SESSIONS or not self.high > self.low:
+            return False
+        return abs(self.slope) > float(stdtrit(self.sessions - 1, TOLD)) * self.error
 
     def holds_against(self, slope: float) -> bool:
         """Whether a member's answer is null, or of the other sign, where the data tell theirs."""
@@ -68,8 +71,8 @@ def answer_of_data(batch: Batch) -> DoseAnswer:
     for j in np.flatnonzero(batch.randomised.numpy() > 0):
         actions = batch.actions[:, j].numpy().astype(np.float64)
         spread, slope = dose_slopes(actions, usable[:, j], batch.states[1:, j, -1].numpy().astype(np.float64))
-        doses.append(memories(actions)[usable[:, j], 1])
         if spread > 0:
+            doses.append(memories(actions)[usable[:, j], 1])
             found.append((spread, slope))
     if len(found) < 2:
         return DoseAnswer(0.0, float("inf"), len(found), 0.0, 0.0)
@@ -113,7 +116,7 @@ class Judged:
         """Why no member is left, with the numbers."""
         data, said = self.data, ", ".join(f"{slope:+.2f}" for slope in self.members)
         return (
-            f"no member of the DLSM answers to a lasting dose as the data do: within {data.sessions} random sessions beta changes by "
+            f"no two members of the DLSM answer to a lasting dose as the data do: within {data.sessions} random sessions beta changes by "
             f"{data.slope:+.2f} ± {data.error:.2f} of its standard deviation from no stimulation to cDBS, in the members by {said}"
         )
 

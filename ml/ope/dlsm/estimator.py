@@ -75,8 +75,8 @@ class Dlsm:
         """Train every member; what a checkpoint in `checkpoint_dir` calls finished is not trained again.
 
         Raises:
-            ValueError: fewer than four sessions, no usable step, a checkpoint of another buffer or other settings, or every member is
-                discarded for its answer to a lasting dose.
+            ValueError: fewer than four sessions, no usable step, a checkpoint of another buffer or other settings, or so many members are
+                discarded for their answer to a lasting dose that no spread is left.
         """
         data = self._prepare(buffer)
         parts = self.config.members + (1 if self.config.select else 0)
@@ -87,7 +87,7 @@ class Dlsm:
         judged = judge([m.networks for m in members], data.batch, c.seed) if c.discard else None
         if judged is not None:
             members = tuple(m for k, m in enumerate(members) if k not in judged.discarded)
-            if not members:
+            if len(members) < min(2, c.members):
                 raise ValueError(judged.sentence())
         return FittedDlsm(self.method, c, buffer, data.batch, data.scale, members, fit_end_model(buffer), selection, judged)
 
@@ -178,12 +178,12 @@ class FittedDlsm:
     def held_out_skill(self) -> dict[str, Any]:
         """Held-out free-running skill of the members together: 1 is perfect, 0 no better than the mean of the learnt sessions.
 
-        `answer_skill` is that of the differences in mean beta between controllers; None while some session was left out by no member.
+        `answer_skill` is that of the differences in mean beta between controllers, of sessions that some member did not learn from; None
+        where these are of one controller.
         """
         sessions = {e.session for c in self.checks for e in c.errors}
-        whole = len(sessions) == sum(bool(s.usable().any()) for s in self.buffer.sessions)
         kinds = {k: controller_key(s) for k, s in enumerate(self.buffer.sessions)}
-        found = shares([c.errors for c in self.checks], kinds if whole else None)
+        found = shares([c.errors for c in self.checks], kinds)
         return {
             "beta_skill": 1 - found.beta,
             "reward_skill": 1 - (found.head if self.reward_source == "head" else found.known),
@@ -339,7 +339,7 @@ class FittedDlsm:
                 "value_from_other_start": float(np.mean(other_step, axis=0)[i] + np.mean(other_end, axis=0)[i]),
                 "reward_source": self.reward_source,
                 "end_source": self.end_source,
-                "step_return_head": float(np.mean([run.return_head[i].mean() for run in runs])),
+                "step_return_head": float(np.mean([run.return_head[i].mean() for run in runs])) if self.config.reward_terms else None,
                 "step_return_known": float(np.mean([run.return_known[i].mean() for run in runs])),
                 "members": [float(v) for v in values[:, i]],
                 "pretrained": all(m.pretrained for m in self.members),

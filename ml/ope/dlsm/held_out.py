@@ -139,8 +139,13 @@ def _dose_share(errors: Sequence[SessionError]) -> float | None:
 
 def _contrast(errors: Sequence[SessionError], kinds: Mapping[int, object]) -> float | None:
     by_kind: dict[object, list[tuple[float, float]]] = {}
+    by_session: dict[int, list[tuple[float, float]]] = {}
     for e in errors:
-        by_kind.setdefault(kinds[e.session], []).append((e.beta_seen, e.beta_predicted))
+        by_session.setdefault(e.session, []).append((e.beta_seen, e.beta_predicted))
+    # a session that several members left out counts once
+    for session, each in by_session.items():
+        seen_mean, predicted_mean = np.mean(each, axis=0)
+        by_kind.setdefault(kinds[session], []).append((float(seen_mean), float(predicted_mean)))
     if len(by_kind) < 2:
         return None
     seen, predicted = np.array([np.mean(v, axis=0) for v in by_kind.values()]).T

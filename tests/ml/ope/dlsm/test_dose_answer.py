@@ -117,35 +117,54 @@ def test_the_answer_of_a_member_is_that_of_its_linear_part_while_its_heads_have_
     assert found == pytest.approx((rests[1] - rests[0]) / 0.4, rel=0.15)
 
 
-@pytest.mark.parametrize(("factor", "kept"), [(-1.0, 1), (0.02, 1), (0.6, 2)])
+@pytest.mark.parametrize(("factor", "kept"), [(-1.0, 2), (0.02, 2), (0.6, 3)])
 def test_a_member_whose_answer_is_null_or_wrong_signed_is_discarded_and_said_so(
     factor: float, kept: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     buffer = held_doses(-2.0)
     fit = LinearPart.fit
-    calls = iter((1.0, factor))
+    calls = iter((1.0, 1.0, factor))
 
     def one_turned(*given: Any) -> LinearPart:
         part = fit(*given)
         return replace(part, answer=part.answer * next(calls))
 
     monkeypatch.setattr(LinearPart, "fit", one_turned)
-    found = fitted(buffer)
+    found = fitted(buffer, members=3)
     assert len(found.members) == kept
     estimate = found.evaluate({"half": ConstantPolicy(0.5)}, 20)["half"]
     assert len(estimate.details["members"]) == kept
     flags = {f.code: f for f in estimate.flags}
-    assert ("members_discarded" in flags) == (kept == 1)
-    if kept == 1:
-        assert (flags["members_discarded"].value, flags["members_discarded"].limit) == (1.0, 2.0)
-        assert sentence(flags["members_discarded"]).startswith("1 of 2 models of the ensemble were left out")
-        assert estimate.details["dose_answer"]["discarded"] == [1]
+    assert ("members_discarded" in flags) == (kept == 2)
+    if kept == 2:
+        assert (flags["members_discarded"].value, flags["members_discarded"].limit) == (1.0, 3.0)
+        assert sentence(flags["members_discarded"]).startswith("1 of 3 models of the ensemble were left out")
+        assert estimate.details["dose_answer"]["discarded"] == [2]
+
+
+def test_one_member_alone_has_no_spread_and_gives_no_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = LinearPart.fit
+    calls = iter((1.0, -1.0))
+
+    def one_turned(*given: Any) -> LinearPart:
+        part = fit(*given)
+        return replace(part, answer=part.answer * next(calls))
+
+    monkeypatch.setattr(LinearPart, "fit", one_turned)
+    with pytest.raises(ValueError, match="no two members of the DLSM answer"):
+        fitted(held_doses(-2.0))
+
+
+def test_few_sessions_or_one_dose_tell_nothing() -> None:
+    assert DoseAnswer(-1.0, 0.3, 8, 0.4, 0.9).told
+    assert not DoseAnswer(-1.0, 0.4, 4, 0.4, 0.9).told, "t with three degrees of freedom asks for 3.2 standard errors"
+    assert not DoseAnswer(-1.0, 0.1, 8, 0.7, 0.7).told, "members cannot be asked between a dose and itself"
 
 
 def test_where_all_are_discarded_there_is_no_estimate_and_the_reason_has_the_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     fit = LinearPart.fit
     monkeypatch.setattr(LinearPart, "fit", lambda *given: replace(fit(*given), answer=-fit(*given).answer))
-    with pytest.raises(ValueError, match="no member of the DLSM answers to a lasting dose as the data do: within 8 random sessions"):
+    with pytest.raises(ValueError, match="no two members of the DLSM answer to a lasting dose as the data do: within 8 random sessions"):
         fitted(held_doses(-2.0))
     assert len(fitted(held_doses(-2.0), discard=False).members) == 2
 

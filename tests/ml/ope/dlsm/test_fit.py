@@ -213,9 +213,10 @@ def test_a_model_that_predicts_left_out_sessions_no_better_than_their_mean_says_
     assert "no_better_than_mean" in {f.code for f in unlearnt.flags}
 
 
+@pytest.mark.parametrize("bootstrap", [False, True])
 @pytest.mark.parametrize(("answer", "said"), [(-0.5, True), (0.5, False)])
-def test_a_model_that_answers_the_wrong_way_round_in_left_out_sessions_says_so(small_buffer, answer, said):
-    fitted = Dlsm(replace(TINY, members=5, steps=5)).fit(small_buffer)  # each session is left out by one member
+def test_a_model_that_answers_the_wrong_way_round_in_left_out_sessions_says_so(small_buffer, answer, said, bootstrap):
+    fitted = Dlsm(replace(TINY, members=5, steps=5, bootstrap=bootstrap)).fit(small_buffer)
 
     def answering(check):
         return replace(check, errors=tuple(replace(e, beta_predicted=answer * e.beta_seen) for e in check.errors))
