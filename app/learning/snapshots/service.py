@@ -164,12 +164,13 @@ def not_ready(db: Session, participant: Participant) -> Invalid | None:
     """Why nothing can be learned or estimated yet; None when it can.
 
     Kept by this process until a row of the participant's sessions or settings changes, or the gate is decided on, or another session has
-    the minutes of one first: to find it out, every trace is read.
+    the minutes of one first, or a visit is sealed or opened: to find it out, every trace is read.
     """
     sessions = session_repository.ReadOnce(db, participant.id)
     decision = repository.newest_gate_decision(db, participant.id)
     placeless = frozenset(session_repository.repeated_sessions(db, participant.id))
-    key = ("not ready", participant.id, sessions.fingerprint, decision.id if decision else None, placeless)
+    sealed = study_repository.hidden_visits(db, [participant.id]).sealed(participant.id)
+    key = ("not ready", participant.id, sessions.fingerprint, decision.id if decision else None, placeless, sealed)
 
     def read() -> tuple[str, ...]:
         rows = sessions.rows

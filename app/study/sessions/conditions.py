@@ -18,6 +18,7 @@ from app.study.schemas import ConditionsChange, ConditionsFields
 from app.study.sessions import designs, logged, programming
 from app.study.sessions.models import SessionConditions
 from app.study.traces import StepTable, driving, step_table
+from app.study.visits.service import require_unlocked
 
 OF_SETTINGS = ("lower_bound", "window", "period_s", "xi_beta")
 """What a settings version tells of the sessions that ran under it."""
@@ -55,11 +56,13 @@ def change(db: Session, session: StudySession, wanted: ConditionsChange, caller:
     """Correct what a session ran under: a new revision; what is left out stays. Same values, no revision.
 
     Raises:
-        Conflict: a proposal, which has none yet. Invalid: B, W or period taken back, or a lower limit above the upper one.
+        Conflict: a proposal, which has none yet, or a locked visit.
+        Invalid: B, W or period taken back, or a lower limit above the upper one.
     """
     service.require(caller, can.WRITE_STUDY, session.visit.participant)
     if session.status != "confirmed":
         raise Conflict(f"Session {session.id} is a proposal that nobody has confirmed yet.", "Confirm it first; then state its conditions.")
+    require_unlocked(session.visit)
     repository.lock_session(db, session)
     known = record(db, session, caller.label)
     present = {name: getattr(known, name) for name in ConditionsFields.model_fields}

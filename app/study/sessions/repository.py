@@ -28,6 +28,7 @@ from sqlalchemy import (
 from sqlalchemy.dialects.postgresql import aggregate_order_by
 from sqlalchemy.orm import Session
 
+from app.study.doses.models import Dose
 from app.study.models import CdbsAmplitude, QocRevision, Recording, SessionSegment, SettingsVersion, StudySession, Trace, Visit
 from app.study.repository import CONFIRMED, sessions_of_participant
 from app.study.sessions.models import CountedTime, SessionConditions
@@ -52,6 +53,7 @@ def _row_versions() -> Select[Any]:
         _versions("visit", Visit.id, visit),
         _versions("settings_version", SettingsVersion.id, SettingsVersion.participant_id),
         _versions("cdbs_amplitude", CdbsAmplitude.id, visit, (Visit, Visit.id == CdbsAmplitude.visit_id)),
+        _versions("dose", Dose.id, visit, (Visit, Visit.id == Dose.visit_id)),
         _versions("session", StudySession.id, visit, StudySession.visit),
         _versions("qoc", QocRevision.id, visit, QocRevision.session, StudySession.visit),
         _versions(

@@ -17,9 +17,9 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.snapshots.service import take_snapshot
+from app.learning.snapshots.service import not_ready, take_snapshot
 from app.planning.plans.models import Plan
-from app.study.repository import participant_by_code
+from app.study.repository import participant_by_code, sessions_of_participant
 from tests.app.planning.slots.test_logs import DAY, log_of, send
 
 PAGE = {"Accept": "text/html"}
@@ -231,6 +231,23 @@ def test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened(
     kept = {m.session_id for m in after.members if m.left_out_reason is None}
     assert set(held.values()) & kept, "at least the sessions of cDBS and random draws enter"
     assert after.id != before.id
+
+
+def test_what_can_be_learned_from_is_asked_anew_once_the_key_is_opened(
+    client: TestClient, db: Session, studied: Any, held: dict[int, int]
+) -> None:
+    participant = participant_by_code(db, "P1", SYSTEM)
+    for session in sessions_of_participant(db, participant.id):
+        if session.id not in held.values():
+            body = {"excluded_reason": "another day", "reason": "another day"}
+            assert client.patch(f"/api/v1/sessions/{session.id}", json=body).status_code == 200
+    db.expire_all()
+    blocked = not_ready(db, participant)
+    assert blocked is not None
+    assert "blinded plan is sealed" in blocked.detail
+    open_key(client, studied.visit)
+    db.expire_all()
+    assert not_ready(db, participant) is None
 
 
 def test_a_sealed_plan_that_was_run_is_not_replaced_before_its_key_is_opened(

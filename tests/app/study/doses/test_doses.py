@@ -100,6 +100,22 @@ def test_doses_are_entered_refused_and_taken_back(client: TestClient, enrolled: 
     assert client.get(api).json() == []
 
 
+def test_analyses_that_were_looked_at_follow_a_dose_that_is_entered_and_one_that_is_taken_back(client: TestClient, upload: Upload) -> None:
+    session = upload("cdbs", started_at="2026-03-02T09:00:00Z")
+    visit = client.get(f"/api/v1/sessions/{session}").json()["visit_id"]
+
+    def timed() -> list[int]:
+        pairs = client.get("/api/v1/participants/P1/analyses/beta").json()["medication"]
+        return list(next(p for p in pairs if p["y"] == "grasp")["session_ids"])
+
+    assert timed() == []
+    dose = {"drug": "levodopa", "mg": 100, "taken_at": "2026-03-02T07:30:00Z"}
+    number = client.post(f"/api/v1/visits/{visit}/doses", json=dose).json()["id"]
+    assert timed() == [session]
+    assert client.post(f"/api/v1/doses/{number}/removal", json={"reason": "not taken"}).status_code == 204
+    assert timed() == []
+
+
 def test_the_visit_page_the_snapshot_and_the_package_carry_them(client: TestClient, enrolled: str, upload: Upload) -> None:
     settings = {"xi_beta": 1.0, "beta_unit": "uV", "beta_source": "table"}
     client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": settings})

@@ -31,9 +31,16 @@ def test_a_locked_visit_takes_no_change_until_it_is_unlocked_with_a_reason(clien
     refused = [
         client.put(f"/api/v1/sessions/{session}/qoc", json={"rating": 2, "reason": "x"}),
         client.patch(f"/api/v1/sessions/{session}", json={"excluded_reason": "cable", "reason": "x"}),
+        client.patch(f"/api/v1/sessions/{session}", json={"stopped_reason": "dyskinesia", "reason": "x"}),
+        client.put(f"/api/v1/sessions/{session}/conditions", json={"lower_bound": 0.5, "reason": "x"}),
+        client.post(f"/sessions/{session}/conditions", data={"revision": "1", "lower_bound": "0.5", "conditions_reason": "x"}),
         client.patch(f"/api/v1/visits/{visit}", json={"note": "x", "reason": "x"}),
+        client.patch(f"/api/v1/visits/{visit}", json={"cdbs_amplitudes": [{"hemisphere": "left", "amplitude_ma": 2.0}], "reason": "x"}),
+        client.post(f"/api/v1/visits/{visit}/doses", json={"drug": "levodopa", "mg": 100, "taken_at": "2026-03-02T07:00:00Z"}),
     ]
-    assert [r.status_code for r in refused] == [409, 409, 409]
+    assert [r.status_code for r in refused] == [409] * len(refused)
+    assert client.get(f"/api/v1/visits/{visit}/locks").json()[-1]["signature_state"] == "stands"
+    assert client.get(f"/api/v1/sessions/{session}/conditions").json()["revision"] == 1
     assert "was locked by admin@clinic.example" in refused[0].json()["detail"]
     assert lock(client).status_code == 409
     assert client.post(f"/api/v1/visits/{visit}/unlock", json={"reason": ""}).status_code == 422
