@@ -258,8 +258,10 @@ def application():  # type: ignore[no-untyped-def]
 
 @pytest.fixture
 def service_app(application, fresh_database: str):  # type: ignore[no-untyped-def]
-    """The web service on the test's database."""
-    return application
+    """The web service on the test's database; a route that a test adds goes with it."""
+    routes = list(application.router.routes)
+    yield application
+    application.router.routes[:] = routes
 
 
 @pytest.fixture

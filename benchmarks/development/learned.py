@@ -2,6 +2,7 @@
 
     python -m benchmarks.development.learned --worlds 12 --out FOLDER             every fifth world of part A; resumable
     python -m benchmarks.development.learned --memory                             critics that see past amplitudes, and those that do not
+    python -m benchmarks.development.learned --quick                              one world, few updates and simulated sessions
     python -m benchmarks.development.learned --designs stratified,paper           data by both designs
     python -m benchmarks.development.learned --part B                             to report on; each run is counted
 
@@ -36,32 +37,33 @@ from ml.population.virtual import DataDesign, World, is_responder, simple_polici
 from ml.trajectories import ReplayBuffer
 
 POLICIES, TRUTH, EVERY, SAVED = 6, 150, 5, 0.2
+QUICK_UPDATES, QUICK_TRUTH = 50, 40
 DESIGNS: tuple[DataDesign, ...] = ("stratified", "paper")
 
 
-def sweep(buffer: ReplayBuffer, memory: bool) -> dict[str, Policy]:
+def sweep(buffer: ReplayBuffer, memory: bool, updates: int | None) -> dict[str, Policy]:
     """Six policies as a sweep of the service trains them."""
     found: dict[str, Policy] = {}
-    for group in training_groups(TrainParams(preset="quick", count=POLICIES, **DEFAULT_SWEEP), [None] * POLICIES):
+    for group in training_groups(TrainParams(preset="quick", count=POLICIES, updates=updates, **DEFAULT_SWEEP), [None] * POLICIES):
         given = [{**config, "critic_memory": memory} for config in group["configs"]]
         configs = [rl.algorithm(group["algorithm"]).config.from_json(one) for one in given]
-        learnt, held = hold_out(buffer, wanted=True, every=configs[0].updates // 10)
+        learnt, held = hold_out(buffer, wanted=True, every=max(1, configs[0].updates // 10))
         for config, result in zip(configs, rl.train_many(learnt, configs, held_out=held), strict=True):
             held_near = "cDBS" if getattr(config, "anchor", "") == "constant" else "logged"
             found[f"{group['algorithm']} {config.aim} {held_near} {config.seed}"] = result.policy
     return found
 
 
-def cell(w: World, design: DataDesign, memory: bool) -> dict[str, Any]:
+def cell(w: World, design: DataDesign, memory: bool, quick: bool) -> dict[str, Any]:
     """What the six of one virtual patient are, by the posterior and by truth."""
     buffer = w.data(design)
-    policies = sweep(buffer, memory)
+    policies, truth = sweep(buffer, memory, QUICK_UPDATES if quick else None), QUICK_TRUTH if quick else TRUTH
     gains = gains_over_cdbs(buffer, policies)
-    cdbs = w.truth(ConstantPolicy(1.0), TRUTH)
-    simple = {name: w.truth(policy, TRUTH) for name, policy in simple_policies(w.settings, w.spread).items()}
+    cdbs = w.truth(ConstantPolicy(1.0), truth)
+    simple = {name: w.truth(policy, truth) for name, policy in simple_policies(w.settings, w.spread).items()}
     rows = {}
     for name, policy in policies.items():
-        true = w.truth(policy, TRUTH)
+        true = w.truth(policy, truth)
         saves = 1 - true.energy.value / cdbs.energy.value
         rows[name] = {
             "posterior": gains[name].gain.value,
@@ -100,6 +102,7 @@ def told(cells: list[dict[str, Any]]) -> dict[str, float]:
 def main() -> None:
     """Print a line per arm and, as the last line, one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help=f"one world, {QUICK_UPDATES} updates, few simulated sessions")
     parser.add_argument("--part", default="A", choices=("A", "B"), help="A to develop on, B to report on")
     parser.add_argument("--worlds", type=int, default=12)
     parser.add_argument("--every", type=int, default=EVERY, help="take every so manyth world")
@@ -111,19 +114,19 @@ def main() -> None:
     look(chosen.part, " ".join(["learned", *sys.argv[1:]]), None)
     out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-learned-"))
     out.mkdir(parents=True, exist_ok=True)
-    cells, figures = Cells(out / "learned.jsonl"), {}
+    cells, figures = Cells(out / f"learned{'-quick' if chosen.quick else ''}.jsonl"), {}
     arms = [
         (d, m)
         for d in DESIGNS
         if d in chosen.designs.split(",")
         for m in ((False, True) if chosen.memory else (DEFAULT_SWEEP["critic_memory"],))
     ]
-    for index in range(0, chosen.every * chosen.worlds, chosen.every):
+    for index in range(0, chosen.every * (1 if chosen.quick else chosen.worlds), chosen.every):
         for design, memory in arms:
             key = f"{chosen.part} {design} {'memory' if memory else 'window'}"
             if cells.get(f"{key} {index:02d}") is None:
                 start = time.process_time()
-                found = cell(world(chosen.part, index), design, memory)
+                found = cell(world(chosen.part, index), design, memory, chosen.quick)
                 cells.add(f"{key} {index:02d}", **found, seconds=time.process_time() - start)
                 print(f"{key} {index:02d}: {time.process_time() - start:.0f} s", flush=True)
     for design, memory in arms:

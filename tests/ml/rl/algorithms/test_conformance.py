@@ -202,7 +202,7 @@ def test_measuring_changes_nothing_that_the_next_update_depends_on(name, buffer)
         watched.update(batch)
         alone.update(batch)
         watched.measure(data.probe())
-        watched.start_values(buffer.transitions().states[:5])
+        watched.start_values(buffer.transitions().states[:5], np.zeros((5, 0)))
     for stack, other in zip(watched.stacks.values(), alone.stacks.values(), strict=True):
         assert torch.equal(stack.weights, other.weights)
 
