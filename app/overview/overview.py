@@ -22,6 +22,7 @@ from app.accounts.service import reads_whole_audit
 from app.overview import repository, state, wording
 from app.overview.audit_words import headline, sentence
 from app.overview.trail.repository import of_reader
+from app.planning.plans.models import Plan
 from app.platform.audit import AUDITED, AuditEvent
 from app.platform.database import Db
 from app.platform.errors import Forbidden, NotFound
@@ -46,6 +47,8 @@ _KEPT = {
     "session_conditions": frozenset({"id", "session_id", "revision", "entered_by", "reason", "created_at"}),
     "bundle_release": frozenset({"id", "participant_id", "plan_item_id", "created_at", "created_by"}),
     "adverse_event": frozenset({"id", "participant_id", "visit_id", "session_id", "entry_key", "created_at"}),
+    "stored_file": frozenset({"sha256", "size", "created_at"}),
+    "plan": frozenset(c.name for c in Plan.__table__.columns) - {"seed", "rules"},  # from which the order is drawn
 }
 """Columns that tell nobody what ran, of tables that would: all that is shown of their rows while the key of a blinded plan is sealed."""
 
@@ -112,11 +115,13 @@ class Act:
     """What one request did: in words, by its most telling change, and every row that it changed.
 
     Attributes:
-        event: the change that names it. said: in words. rows: each change with column, value before, value after.
+        event: the change that names it. said: in words. reason: why, as far as it may be shown.
+        rows: each change with column, value before, value after.
     """
 
     event: AuditEvent
     said: str
+    reason: str | None
     rows: list[tuple[AuditEvent, list[tuple[str, str | None, str | None]]]]
 
 
@@ -129,7 +134,9 @@ def acts(db: Session, events: Sequence[AuditEvent], caller: Caller) -> list[Act]
         rows = list(group)
         telling = headline(rows)
         said = wording.SEALED_ACT if telling.id in sealed and telling.entity == "bundle_release" else sentence(telling, names)
-        found.append(Act(telling, said, [(e, changes(db, e, caller, e.id in sealed)) for e in rows]))
+        # earlier versions wrote a bundle's limits there
+        of_bundle = any(e.id in sealed and e.entity in ("bundle_release", "stored_file") for e in rows)
+        found.append(Act(telling, said, None if of_bundle else telling.reason, [(e, changes(db, e, caller, e.id in sealed)) for e in rows]))
     return found
 
 

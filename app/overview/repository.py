@@ -14,6 +14,7 @@ from app.evaluation.models import EstimateRow, Evaluation
 from app.evaluation.schemas import RANKING_KINDS
 from app.learning.models import BufferSnapshot, Policy
 from app.overview.audit_words import Names
+from app.planning.bundles.models import BundleRelease
 from app.planning.plans.models import SEALED, Plan, PlanItem
 from app.platform.audit import AuditEvent
 from app.platform.jobs.models import Job, JobStatus
@@ -64,7 +65,7 @@ def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
 
 
 def sealed_events(db: Session, events: Sequence[AuditEvent]) -> frozenset[int]:
-    """Those of the events that changed a row of a blinded plan whose key is sealed, or of the sessions of its visit."""
+    """Those of the events that changed a blinded plan whose key is sealed, a row of it, a file of its bundles, or sessions of its visit."""
     plans = set(db.scalars(select(Plan.id).where(SEALED)))
     if not plans:
         return frozenset()
@@ -79,6 +80,8 @@ def sealed_events(db: Session, events: Sequence[AuditEvent]) -> frozenset[int]:
         "session_proposal": ("session_id", sessions),
         "session_conditions": ("session_id", sessions),
         "bundle_release": ("plan_item_id", items),
+        "stored_file": ("sha256", set(db.scalars(select(BundleRelease.sha256).where(BundleRelease.plan_item_id.in_(items))))),
+        "plan": ("id", plans),
         "adverse_event": ("visit_id", visits),
     }
 

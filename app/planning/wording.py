@@ -23,7 +23,10 @@ LEAVE_AT_ONCE = "A stop, an adverse event or a lost link: back to cDBS at once; 
 
 
 def release_reason(manifest: BundleManifest) -> str:
-    """Why a bundle's bytes were stored, for the audit trail."""
+    """Why a bundle's bytes were stored, for the audit trail; of a blinded plan nothing that tells one session from another."""
+    if manifest.slot is not None and manifest.slot.label:
+        place = f"session {manifest.slot.position} of plan {manifest.slot.plan_id}"
+        return f"session bundle of a blinded plan: {place}, {manifest.participant}"
     side = f", {manifest.hemisphere}" if manifest.hemisphere else ""
     what = f"policy {manifest.policy_id}" if manifest.schedule is None else manifest.policy_name
     slot = f", session {manifest.slot.position} of plan {manifest.slot.plan_id}" if manifest.slot else ""

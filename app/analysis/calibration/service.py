@@ -73,7 +73,7 @@ def calibration(db: Session, participant: Participant, caller: Caller) -> Calibr
     policies: list[TestedPolicyOut] = []
     left_out: list[str] = []
     for visit, sessions in by_visit.items():
-        if not blinding.unsealed(sessions, caller):
+        if not blinding.unsealed(sessions):
             left_out.append(f"visit {visit.number}: the key of its blinded plan is sealed")
             continue
         known_from = min(s.created_at for s in sessions)

@@ -59,7 +59,7 @@ def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller, sessi
     """
     sessions = sessions or ReadOnce(db, snapshot.participant_id)
     version = study_repository.settings_version(db, snapshot.settings_version_id)
-    arms = [(s, blinding.arm(s, caller)) for s in blinding.unsealed(sessions.rows, caller)]
+    arms = [(s, blinding.arm(s, caller)) for s in blinding.unsealed(sessions.rows)]
     driven = [(s, arm) for s, arm in arms if arm.policy_id is not None or arm.controller is Controller.CDBS]
     traces = traces_of(db, [s for s, _ in driven])
     found = []

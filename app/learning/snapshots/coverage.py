@@ -70,7 +70,7 @@ def describe(db: Session, snapshot: BufferSnapshot, caller: Caller) -> SnapshotV
         session = sessions[member.session_id]
         if member.left_out_reason is None:
             # a plan may be signed over sessions which an earlier snapshot holds: of these the visit alone is told
-            arm = blinding.arm(session, caller) if blinding.unsealed([session], caller) else None
+            arm = blinding.arm(session, caller) if blinding.unsealed([session]) else None
             by_visit.setdefault(session.visit.number, Counter())[arm.controller.value if arm else HIDDEN] += 1
     present = {name for counts in by_visit.values() for name in counts}
     amplitude = np.concatenate([s.amplitude for s in buffer.sessions])

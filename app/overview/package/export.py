@@ -88,7 +88,7 @@ def _sessions(
     compared = {s.session_id for s in found.sessions if "mean_beta" in s.values}
     sessions: list[tuple[Any, ...]] = []
     steps: list[tuple[Any, ...]] = []
-    for session in blinding.unsealed(study.sessions_of_participant(db, participant.id), caller):
+    for session in blinding.unsealed(study.sessions_of_participant(db, participant.id)):
         arm, qoc = blinding.arm(session, caller), session.qoc
         try:
             table, problem = session_data(db, session).table, None

@@ -105,7 +105,7 @@ def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) 
     for slot in slots:
         if slot.item_id in pairs:
             continue
-        found = next((s for s in free if s.session_id not in taken and _score(slot, s) >= _CLEAR), None)
+        found = next((s for s in free if s.session_id not in taken and _is_clear(slot, s)), None)
         if found is not None:
             pairs[slot.item_id] = found
             taken.add(found.session_id)
@@ -139,6 +139,8 @@ def _passed(slots: Sequence[Planned], sessions: Sequence[Done], pairs: Mapping[i
 
 
 _CLEAR = 3.0
+_MUCH_BETTER = 1.0
+"""By how much more than the clock as it is another one must explain to be supposed: as much as a session of which nothing is known."""
 
 
 def _score(slot: Planned, session: Done) -> float:
@@ -151,16 +153,28 @@ def _score(slot: Planned, session: Done) -> float:
     if slot.began is None or session.began is None:
         return known
     apart = abs(slot.began - session.began)
-    return 0.0 if apart > FAR else known + (2.0 if apart <= NEAR else 0.0)
+    # falls from NEAR to FAR, so that a day of clocks minutes apart is not moved whole to the neighbours' slots
+    return 0.0 if apart > FAR else known + 2.0 * min(1.0, (FAR - apart) / (FAR - NEAR))
+
+
+def _is_clear(slot: Planned, session: Done) -> bool:
+    """Whether a session fills a slot out of order: its controller and policy say so, or its time."""
+    if (score := _score(slot, replace(session, began=None))) >= _CLEAR:
+        return _score(slot, session) > 0
+    near = slot.began is not None and session.began is not None and abs(slot.began - session.began) <= NEAR
+    return score > 0 and near
 
 
 def _by_clock(slots: Sequence[Planned], sessions: Sequence[Done]) -> dict[int, Done]:
-    """The best assignment by the recordings' clock as it is, or an hour off where that explains more of at least two sessions."""
+    """The best assignment by the recordings' clock as it is, or an hour off where that explains as many of two or more much better."""
     own = {s.session_id: s for s in sessions}
-    best, most = {}, -1.0
+    best, most, fewest = {}, -1.0, 2
     for off in CLOCKS:
         found, score = _aligned(slots, [s if s.began is None else replace(s, began=s.began - off) for s in sessions])
-        if not off or (len(found) > 1 and score > most):
+        if not off:
+            best, most, fewest = found, score, max(fewest, len(found))
+        elif len(found) >= fewest and score > most + _MUCH_BETTER:
+            # clocks minutes apart would let some sessions lie close to their neighbours' slots an hour off, and leave others out
             best, most = found, score
     return {item: own[s.session_id] for item, s in best.items()}
 

@@ -19,7 +19,7 @@ from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import render
 from app.study import repository, service
 from app.study.adverse_events.repository import events_of_session
-from app.study.blinding import CONTROLLER_NAMES, arm, may_know
+from app.study.blinding import CONTROLLER_NAMES, arm, may_know, require_known
 from app.study.data_queries.repository import not_closed_of_session
 from app.study.deps import CurrentSession
 from app.study.doses.since import since_last_dose
@@ -187,6 +187,7 @@ def correct_conditions(request: Request, session: CurrentSession, db: Db, caller
     reason = str(values.get("conditions_reason", "")).strip()[:1000]
     try:
         service.require(caller, can.WRITE_STUDY, session.visit.participant)
+        require_known(session.visit, caller)  # before what is refused could tell
         changes.refuse_conflicts()
         labels = _CONDITIONS_LABELS | {"reason": "Reason"}
         conditions.change(db, session, parse(ConditionsChange, changes.fields | {"reason": reason}, labels), caller)

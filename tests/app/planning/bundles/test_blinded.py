@@ -243,3 +243,22 @@ def test_a_withdrawn_policy_and_another_participant_are_refused_to_a_blinded_bun
     with pytest.raises(Invalid, match="was withdrawn") as refused:
         control(bundle, "simulated:P1", Wish(), Task(key=key, log=tmp_path / "a.csv", ledger=tmp_path / "l", withdrawn=listed))
     assert f"policy {policies[0]}" not in str(refused.value), "a refusal does not tell whose session it was"
+
+
+def test_the_audit_trail_gives_no_limits_of_a_sealed_plans_bundles(
+    client: TestClient, db: Session, studied: Any, plan: dict[str, Any], bundles: dict[int, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def trail() -> str:
+        paths = ("/audit?limit=100", "/audit?entity=bundle_release", "/audit?entity=stored_file&limit=100")
+        return " ".join(client.get(path, headers={"Accept": "text/html"}).text for path in paths)
+
+    kept = db.scalars(text("select reason from audit_event where entity = 'bundle_release' order by id")).all()
+    assert kept == [f"session bundle of a blinded plan: session {n} of plan {plan['id']}, P1" for n in bundles]
+    old = "controller bundle of P1, policy 7: 0.5 to 3 mA"  # as earlier versions wrote it
+    monkeypatch.setattr("app.planning.wording.release_reason", lambda manifest: old)
+    assert client.get(f"/api/v1/visits/{studied.visit}/plan/sessions/1/bundle").status_code == 200
+    sealed = trail()
+    assert "took the bundle of a session of a blinded plan" in sealed
+    assert not re.findall(rf".{{0,200}}{old}", sealed)
+    assert client.post(f"/api/v1/visits/{studied.visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
+    assert trail().count(old) == 3, "on the page of all, and with the releases and the files"

@@ -17,6 +17,8 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.evaluation.ranking.results import driven_sessions
+from app.learning.snapshots.coverage import describe
 from app.learning.snapshots.service import not_ready, take_snapshot
 from app.planning.plans.models import Plan
 from app.study.repository import participant_by_code, sessions_of_participant
@@ -184,6 +186,11 @@ def test_traces_conditions_and_samples_are_refused_to_everybody_with_the_way_out
             assert refused.status_code == 403, part
             assert "A clinician opens the key" in refused.json()["hint"]
         assert client.put(f"/api/v1/sessions/{session}/conditions", json={"lower_bound": 0.1, "reason": "x"}).status_code == 403
+        for bound in ("0.1", "0.99"):  # a bound above what was delivered would be refused in words that name it
+            typed = {"lower_bound": bound, "conditions_reason": "x"}
+            answer = client.post(f"/sessions/{session}/conditions", data=typed, headers=PAGE, follow_redirects=False)
+            assert answer.status_code == 403, answer.text
+            assert "hidden from everybody" in answer.text
         # what tells nothing goes on
         assert client.put(f"/api/v1/sessions/{session}/qoc", json={"rating": 6}).status_code == 200
         assert client.patch(f"/api/v1/sessions/{session}", json={"excluded_reason": "cable", "reason": "x"}).status_code == 200
@@ -224,9 +231,14 @@ def test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened(
     package = zipfile.ZipFile(io.BytesIO(client.get("/participants/P1/export.zip").content))
     assert "the sessions of visit 2, whose blinded plan's key is sealed" in package.read("P1/README.txt").decode()
     assert not set(map(str, held.values())) & {line.split(",")[0] for line in package.read("P1/sessions.csv").decode().splitlines()}
+    # of machines too: what a job computes for people would tell them
+    assert not set(held.values()) & {s.session_id for s in driven_sessions(db, before, SYSTEM)}
+    assert describe(db, before, SYSTEM).sessions_by_visit.keys() == {1}
     open_key(client, studied.visit)
     assert all("energy" in r["done"] for r in client.get(slots).json()["rows"])
     db.expire_all()
+    ran = {s for s, i in zip(held.values(), plan.items, strict=True) if i.policy_id is not None or i.controller == "cdbs"}
+    assert ran <= {s.session_id for s in driven_sessions(db, before, SYSTEM)}
     after = take_snapshot(db, participant, SYSTEM)
     kept = {m.session_id for m in after.members if m.left_out_reason is None}
     assert set(held.values()) & kept, "at least the sessions of cDBS and random draws enter"

@@ -59,6 +59,22 @@ def test_recordings_whose_clock_is_an_hour_off_find_their_slots_and_are_said_to_
     assert filled(late) == [None, None, 22, 23, 24], "an hour is not supposed where the clock explains as much"
 
 
+def test_an_hour_is_not_supposed_of_clocks_that_are_minutes_apart() -> None:
+    kinds = [(Controller.RL, 7), (Controller.CDBS, None)] * 3
+    for spacing in (25, 35):
+        slots = [Planned(i, kind, policy, 20.0, NINE + timedelta(minutes=spacing * (i - 1))) for i, (kind, policy) in enumerate(kinds, 1)]
+        for off in (11, 12, -12, -13, -15):
+            held = [done(20 + i, None, minutes=20, at=spacing * i + off) for i in range(6)]
+            found = match(slots, held, DAY)
+            assert filled(found) == [20, 21, 22, 23, 24, 25], (spacing, off)
+            assert {m.deviations for m in found} == {(Deviation.OTHER_TIME,)}
+            part = match(slots, held[2:], DAY)  # at 13 of 25 minutes the neighbour's slot is the closer one
+            assert abs(off) > 12 or filled(part) == [None, None, 22, 23, 24, 25], (spacing, off)
+        for off in (59, 61, -59, -61):
+            held = [done(20 + i, None, minutes=20, at=spacing * i + off) for i in range(6)]
+            assert filled(match(slots, held, DAY)) == [20, 21, 22, 23, 24, 25], (spacing, off)
+
+
 def test_a_log_of_a_tablet_whose_clock_is_fast_fills_its_slot_and_is_said_to_be_off() -> None:
     slots = [Planned(p.item_id, p.controller, p.policy_id, p.minutes, NINE + timedelta(minutes=20 * i)) for i, p in enumerate(PLAN)]
     logs = [
