@@ -137,8 +137,9 @@ def _page(
         energy = None
         if m.energy_of_cdbs is not None and m.charge_of_cdbs is not None:
             energy = [energy_words(m.energy_of_cdbs), battery_life_words(m.energy_of_cdbs, m.charge_of_cdbs)]
-        shown = {"min_ma": f"{m.min_ma:g}", "max_ma": f"{m.max_ma:g}", "ramp_ma_per_s": f"{m.ramp_ma_per_s:.4g}"}
-        facts |= {"manifest": m, "warnings": warning_sentences(m), "energy": energy, "shown": shown | {"hemisphere": m.hemisphere or ""}}
+        # so many digits that a release signed as shown allows a plan with the same defaults (`releases.service.TOLERANCE`)
+        shown = {name: f"{getattr(m, name):.9g}" for name in ("min_ma", "max_ma", "ramp_ma_per_s")} | {"hemisphere": m.hemisphere or ""}
+        facts |= {"manifest": m, "warnings": warning_sentences(m), "energy": energy, "shown": shown}
     except Invalid as reason:
         facts["unmade"] = reason.problem(request.url.path)
     page = render(
@@ -153,6 +154,7 @@ def _page(
         may_take=bundles.may_take(participant, caller),
         release=releases.release_of(db, participant, policy),
         release_meaning=releases.MEANING,
+        brought=releases.brought_by(db, policy, caller),
         release_required=get_settings().require_released_policies,
         may_release=may(caller, can.APPROVE_PLAN, participant),
         key=bundles.public_key(),

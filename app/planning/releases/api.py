@@ -28,7 +28,7 @@ def read_release(policy: CurrentPolicy, db: Db) -> PolicyReleaseOut:
 def release_policy(policy: CurrentPolicy, wanted: PolicyReleaseIn, db: Db, caller: CurrentCaller) -> PolicyReleaseOut:
     """Sign a policy as released for testing in participants: its file, its snapshot and settings, and the limits in mA.
 
-    Those who approve plans alone, and a policy made elsewhere not by whoever added it.
+    Those who approve plans alone, and a policy made elsewhere, and what was made from it, not by whoever added it.
     """
     participant = db.get_one(Participant, policy.participant_id)
     limits = Limits(wanted.min_ma, wanted.max_ma, wanted.ramp_ma_per_s)

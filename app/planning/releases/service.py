@@ -26,7 +26,8 @@ from app.study.models import Hemisphere, Participant
 
 KIND: Final = "policy"
 MEANING: Final = "released for testing in participants"
-_TOLERANCE = 1e-6
+TOLERANCE = 1e-6
+"""By how much a planned limit may pass a signed one, mA and mA/s: the digits that a form loses."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,8 @@ def release(
             stands for it. code: of the second factor.
 
     Raises:
-        Forbidden: whoever brought a policy from elsewhere, one who approves no plans, or a wrong password. TooMany: too many wrong ones.
+        Forbidden: whoever brought a policy, or one that it was made from, from elsewhere; one who approves no plans; a wrong password.
+        TooMany: too many wrong ones.
         Conflict: a retired policy. Invalid: limits that contradict each other or leave the stimulator's own; a damaged file; or nobody has
             stated the cDBS amplitude or the unit of beta.
     """
@@ -71,9 +73,11 @@ def release(
     study.require_own(participant, policy, f"policy {policy.id}")
     if policy.retired_reason:
         raise Conflict(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", "Take it back first, or release another one.")
-    if policy.kind == bundles.FOREIGN and policy.created_by == caller.label:
+    brought = brought_by(db, policy, caller)
+    if brought is not None:
+        made_of = "" if brought is policy else f" Policy '{policy.name}' was made from it."
         raise Forbidden(
-            f"You brought policy '{policy.name}' from elsewhere yourself.",
+            f"You brought policy '{brought.name}' from elsewhere yourself.{made_of}",
             "A second person looks at it and releases it: ask a clinician.",
         )
     onnx_of(policy)
@@ -88,6 +92,16 @@ def release(
     content = signed_content(db, participant, policy) | {"limits": signed}
     row = signing.sign(db, caller, password, kind=KIND, subject_id=policy.id, meaning=MEANING, content=content, code=code)
     return Release(SignatureState.STANDS, row)
+
+
+def brought_by(db: Session, policy: Policy, caller: Caller) -> Policy | None:
+    """What the caller brought from elsewhere of a policy and of those that it was distilled or tuned from; None where nothing."""
+    line: list[Policy] = [policy]
+    for one in line:  # grows by what each was made from; a policy is never changed, so that no line leads back
+        if one.kind == bundles.FOREIGN and one.created_by == caller.label:
+            return one
+        line += [db.get_one(Policy, number) for number in (one.teacher_id, one.parent_id) if number is not None]
+    return None
 
 
 def release_of(db: Session, participant: Participant, policy: Policy) -> Release:
@@ -130,9 +144,9 @@ def _refuse_beyond(policy: Policy, item: PlanItem, limits: dict[str, Any]) -> No
     """Raises Conflict where a planned session goes beyond what its policy was released for."""
     side = limits["hemisphere"]
     beyond = (
-        (item.min_ma is not None and item.min_ma < limits["min_ma"] - _TOLERANCE)
-        or (item.max_ma is not None and item.max_ma > limits["max_ma"] + _TOLERANCE)
-        or (item.ramp_ma_per_s is not None and item.ramp_ma_per_s > limits["ramp_ma_per_s"] + _TOLERANCE)
+        (item.min_ma is not None and item.min_ma < limits["min_ma"] - TOLERANCE)
+        or (item.max_ma is not None and item.max_ma > limits["max_ma"] + TOLERANCE)
+        or (item.ramp_ma_per_s is not None and item.ramp_ma_per_s > limits["ramp_ma_per_s"] + TOLERANCE)
         or (side is not None and item.hemisphere is not None and str(item.hemisphere) != side)
     )
     if beyond:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from enum import Enum
 from typing import Any, Final
@@ -11,12 +12,14 @@ from sqlalchemy.orm import Session
 
 from app.accounts import signing
 from app.accounts.permissions import SYSTEM, Caller
+from app.platform.errors import Invalid
 from app.platform.signatures import repository as signatures
 from app.platform.signatures.models import Signature
 from app.platform.signatures.service import SignatureState, content_hash, state_of
 from app.study import repository
 from app.study.blinding import stated_arm
 from app.study.models import StudySession, Visit, VisitLock
+from app.study.traces import sources
 
 KIND: Final = "visit_lock"
 MEANING: Final = "data of this visit are complete and reviewed"
@@ -63,11 +66,13 @@ def signed_content(db: Session, visit: Visit, lock: VisitLock) -> dict[str, Any]
     """All that a signature under a lock covers: the visit, its doses, and of every session who says what, what it counts, and its samples.
 
     Samples are covered by the SHA-256 of what the newest reading of each recording gives, so that reading a file again with the same
-    values changes nothing.
+    values changes nothing. The cDBS amplitude in force is covered beside the stated ones: where the visit states none it is that of the
+    settings, and every fraction, energy and verdict goes by it.
     """
     sessions, _ = repository.sessions_of_visit(db, visit.id, 1000)
     used = {segment.recording_id for session in sessions for segment in session.segments}
     read = {number: _digest(traces) for number, traces in repository.traces_of_recordings(db, used).items()} if used else {}
+    heads = repository.trace_heads(db, used) if used else {}
     return {
         "participant": visit.participant.code,
         "visit": visit.number,
@@ -77,7 +82,7 @@ def signed_content(db: Session, visit: Visit, lock: VisitLock) -> dict[str, Any]
         "lock_reason": lock.reason,
         "cdbs_amplitudes": sorted([str(a.hemisphere), a.program, a.amplitude_ma] for a in visit.cdbs_amplitudes),
         "doses": sorted([str(d.drug), d.mg, _plain(d.taken_at)] for d in visit.doses),
-        "sessions": [_session(session, read) for session in sessions],
+        "sessions": [_session(session, read) | {"cdbs_amplitude_in_force_ma": _cdbs_ma(session, heads)} for session in sessions],
     }
 
 
@@ -94,6 +99,14 @@ def _session(session: StudySession, read: dict[int, str]) -> dict[str, Any]:
             for s in sorted(session.segments, key=lambda s: (s.recording_id, s.start_s))
         ],
     }
+
+
+def _cdbs_ma(session: StudySession, heads: Mapping[int, Sequence[repository.TraceHead]]) -> float | None:
+    """What the session's amplitude is a fraction of, mA; None where nobody stated it, or nothing says which of several it is."""
+    try:
+        return sources(session, session.visit.participant.current_settings, heads).cdbs_ma
+    except Invalid:
+        return None
 
 
 def _digest(traces: list[Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
 from app.learning.models import Policy
+from app.platform import files
 from app.platform.signatures.models import Signature
 from app.settings import get_settings
 from ml.rl import MlpPolicy
@@ -32,6 +34,12 @@ def policy(client: TestClient, enrolled: str) -> int:
 
 def release(client: TestClient, policy: int, **more: Any) -> Any:
     return client.post(f"/api/v1/policies/{policy}/release", json={"password": PASSWORD} | LIMITS | more)
+
+
+def give_a_network(db: Session, policy: int) -> None:
+    """A file that a bundle can be made of."""
+    content = MlpPolicy(10, (20, 10), mean=1.0, std=0.5, seed=policy).to_onnx()
+    db.get_one(Policy, policy).onnx_sha256 = files.store(db, content).sha256
 
 
 def read(client: TestClient, policy: int) -> dict[str, Any]:
@@ -70,6 +78,26 @@ def test_whoever_brought_it_an_engineer_and_a_wrong_password_release_nothing(
         f"/participants/P1/policies/{policy}/release", data=form | {"password": PASSWORD}, headers=PAGE, follow_redirects=False
     )
     assert (sent.status_code, read(client, policy)["limits"]["max_ma"]) == (303, 3.25)
+
+
+def test_whoever_brought_a_policy_does_not_release_what_was_made_from_it(
+    client: TestClient, client_as: Clients, db: Session, studied: Any, external: int
+) -> None:
+    tuned, unrelated, student, _ = studied.policies
+    brought = db.get_one(Policy, external)
+    brought.created_by = "admin@clinic.example"
+    for made in (tuned, student):
+        give_a_network(db, made)
+    db.get_one(Policy, tuned).parent_id = external
+    db.commit()
+    assert db.get_one(Policy, student).teacher_id == tuned
+    for made in (tuned, student):
+        refused = release(client, made)
+        assert (refused.status_code, f"You brought policy '{brought.name}' from elsewhere" in refused.text) == (403, True)
+        page = client.get(f"/participants/P1/policies/{made}/bundle", headers=PAGE).text
+        assert ("which this one was made from" in page, f"Release {db.get_one(Policy, made).name}" in page) == (True, False)
+    assert release(client, unrelated).status_code == 201, "its line holds nothing from elsewhere"
+    assert release(client_as("clinician"), tuned).status_code == 201
 
 
 def test_a_retired_policy_and_impossible_limits_are_refused(client: TestClient, client_as: Clients, policy: int) -> None:
@@ -139,6 +167,24 @@ class TestPlans:
             assert (refused.status_code, "goes beyond the limits" in refused.text) == (409, True), narrower
         assert release(clinician, drafted, max_ma=3.5).status_code == 201
         assert sign_plan(studied.visit).status_code == 200
+
+    def test_a_release_as_its_page_proposes_it_allows_a_plan_by_its_own_defaults(
+        self, client: TestClient, client_as: Clients, db: Session, studied: Any, sign_plan: Callable[..., Any]
+    ) -> None:
+        give_a_network(db, studied.policies[0])
+        db.commit()
+        amplitude = {"settings": {"cdbs_amplitude_ma": 3.1249}, "reason": "programmed"}  # 1.56245 mA/s over a period of 2 s
+        assert client.put("/api/v1/participants/P1/settings", json=amplitude).status_code == 200
+        policy, clinician = studied.policies[0], client_as("clinician")
+        form = clinician.get(f"/participants/P1/policies/{policy}/bundle", headers=PAGE).text.split('id="release"')[1]
+        proposed = {name: re.search(rf'name="{name}"[^>]*?value="([^"]+)"', form) for name in LIMITS}
+        shown = {name: found[1] for name, found in proposed.items() if found}
+        assert set(shown) == set(LIMITS)
+        path = f"/participants/P1/policies/{policy}/release"
+        assert clinician.post(path, data=shown | {"password": PASSWORD}, headers=PAGE, follow_redirects=False).status_code == 303
+        assert client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [policy], "seed": 7}).status_code == 201
+        approved = sign_plan(studied.visit)
+        assert approved.status_code == 200, approved.text
 
     def test_a_policy_that_was_changed_since_its_release_is_in_no_approved_plan(
         self, client_as: Clients, studied: Any, drafted: int, owner_db: Session, sign_plan: Callable[..., Any]

@@ -92,6 +92,18 @@ def test_any_change_breaks_it_visibly(client: TestClient, owner_db: Session, vis
     assert BROKEN in client.get(f"/visits/{visit}", headers=PAGE).text
 
 
+@pytest.mark.parametrize(("stated", "found"), [([], "broken"), ([{"hemisphere": "left", "amplitude_ma": 3.0}], "stands")])
+def test_the_cdbs_amplitude_of_the_settings_is_signed_where_the_visit_states_none(
+    client: TestClient, visit: int, stated: list[dict[str, Any]], found: str
+) -> None:
+    body = {"cdbs_amplitudes": stated, "reason": "as programmed"}
+    assert client.patch(f"/api/v1/visits/{visit}", json=body).status_code == 200
+    assert lock(client, visit).status_code == 200
+    other = {"settings": {"cdbs_amplitude_ma": 2.5}, "reason": "programmed anew"}
+    assert client.put("/api/v1/participants/P1/settings", json=other).status_code == 200
+    assert state(client, visit) == found
+
+
 def test_a_file_read_again_with_the_same_values_breaks_nothing_and_other_values_do(
     client: TestClient, owner_db: Session, visit: int
 ) -> None:
