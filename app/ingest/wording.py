@@ -158,7 +158,10 @@ _SENTENCES: dict[Reason, Callable[[Mapping[str, Any]], str]] = {
     Reason.NO_VISIT_OF_DAY: lambda f: f"recorded on {f['day']}, and no visit has that date: choose the visit, or add it",
     Reason.AMPLITUDE: _amplitude,
     Reason.LOG: lambda f: f"its log names policy {f['policy']}",
-    Reason.SLOT: lambda f: f"its log is of session {f['position']} of the plan of visit {f['visit']}",
+    Reason.SLOT: lambda f: (
+        f"its log is of session {f['position']} of the plan of visit {f['visit']}"
+        + (f", whose key is sealed; visit {f['stated']}, which the upload says, is not taken" if "stated" in f else "")
+    ),
     Reason.OTHER_VISIT: lambda f: (
         f"the upload says visit {f['stated']}, and its log is of session {f['position']} of the plan of visit {f['visit']}: choose one"
     ),

@@ -152,6 +152,7 @@ INTENDED: dict[str, str] = {
             "components > schemas > PlanOut > properties > block",
             "components > schemas > PlanOut > properties > key",
             "components > schemas > PlanOut > properties > order",
+            "components > schemas > PlanOut > properties > seed",
             "components > schemas > PlanOut > properties > starts_at",
             "components > schemas > PlanOut > properties > warnings",
             "components > schemas > PlanWarningOut",

@@ -42,7 +42,8 @@ class Reason(StrEnum):
     LOG = "log"
     """`policy`: name of the participant's policy that the controller's log names."""
     SLOT = "slot"
-    """`visit`, `position`: of the signed plan's session that the controller's log names."""
+    """`visit`, `position`: of the signed plan's session that the controller's log names. `stated`: another visit, which the upload says and
+    which is not taken, for the plan's key is sealed."""
     OTHER_VISIT = "other_visit"
     """`stated`: visit of the upload; `visit`, `position`: of the session that the log names."""
     SURVEY = "survey"

@@ -24,8 +24,8 @@ from app.study import repository as study
 from app.study import service as study_service
 from app.study.models import Controller, StudySession
 from app.study.service import POLICY_CONTROLLERS
-from app.study.sessions import conditions
-from app.study.sessions.contradictions import contradictions
+from app.study.sessions import conditions, logged
+from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.visits.service import require_unlocked
 from app.study.wording import sentences
 
@@ -202,6 +202,13 @@ def _move_to_visit(db: Session, session: StudySession, proposal: SessionProposal
     visit = study.visit_by_number(db, participant.id, number)
     if visit is None:
         raise Invalid(f"Participant {participant.code} has no visit {number}.", "Add the visit first.")
+    slot = logged.slot_of_recording(db, control_recording(session))
+    if slot is not None and slot.planned is not None and slot.planned.sealed and visit.id not in (session.visit_id, slot.planned.visit_id):
+        raise Conflict(
+            f"Session {session.id} stays at its visit: its log is of a session of visit {slot.visit_number}, whose plan's key is sealed, "
+            f"and visit {number} would show what ran.",
+            "A clinician opens the key on the page of the plan; then it can be moved.",
+        )
     if visit.id != session.visit_id:
         session.ordinal = study.next_ordinal(db, visit.id)
         session.visit = visit

@@ -25,12 +25,17 @@ def differs_from_slot(slot: LoggedSlot | None, stated: StatedSession) -> bool:
 
 
 def visit_of_slot(visits: Sequence[Visit], slot: LoggedSlot | None, stated: Visit | None) -> VisitGuess | None:
-    """The visit of the planned session that a log names; open where the sender says another one. None where it names none."""
+    """The visit of the planned session that a log names; open where the sender says another one, but while its plan's key is sealed.
+
+    None where it names none.
+    """
     planned = slot.planned if slot is not None else None
     own = next((v for v in visits if planned is not None and v.id == planned.visit_id), None)
     if planned is None or own is None:
         return None
     facts = {"visit": own.number, "position": planned.position}
     if stated is not None and stated.id != own.id:
+        if planned.sealed:  # at another visit everybody would be shown what its sealed plan hides
+            return VisitGuess(own, False, Evidence(Source.RECORDING, Reason.SLOT, facts | {"stated": stated.number}))
         return VisitGuess(stated, True, Evidence(Source.RECORDING, Reason.OTHER_VISIT, facts | {"stated": stated.number}))
     return VisitGuess(own, False, Evidence(Source.RECORDING, Reason.SLOT, facts))

@@ -128,7 +128,7 @@ def plan_out(view: PlanView) -> PlanOut:
         date=visit.date,
         participant=visit.participant.code,
         status=plan.status,
-        seed=plan.seed,
+        seed=None if view.sealed else plan.seed,
         note=plan.note,
         created_at=plan.created_at,
         created_by=plan.created_by,

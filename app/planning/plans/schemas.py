@@ -217,7 +217,7 @@ class PlanOut(Model):
     date: dt.date | None
     participant: str
     status: str = Field(description="draft, approved or superseded.")
-    seed: int
+    seed: int | None = Field(description="Of the order's draw; null while the key of a blinded plan is sealed.")
     note: str
     created_at: datetime
     created_by: str

@@ -57,10 +57,11 @@ class _Sheet(FPDF):  # type: ignore[misc]
     def footer(self) -> None:
         plan, evaluation = self._view.plan, self._view.evaluation
         ranking = f"evaluation {evaluation.id}, snapshot {evaluation.snapshot_id}" if evaluation else "no evaluation"
+        seed = "" if self._view.sealed else f"seed {plan.seed}, "
         self.set_y(-12)
         self.set_font("Helvetica", "", 8)
         self.set_text_color(*MUTED)
-        self.cell(0, 5, latin(f"betaloop \u00b7 plan {plan.id}, seed {plan.seed}, {ranking} \u00b7 {self._printed}"))
+        self.cell(0, 5, latin(f"betaloop \u00b7 plan {plan.id}, {seed}{ranking} \u00b7 {self._printed}"))
         self.set_x(self.l_margin)
         self.cell(0, 5, f"Page {self.page_no()} of {{nb}}", align="R")
         if plan.status != "approved":

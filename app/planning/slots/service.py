@@ -174,7 +174,8 @@ def _done(db: Session, session: StudySession) -> Done:
     slot = logged.slot_of_recording(db, recording)
     # a number that this participant's plans do not have, or have for another session, may be that of any slot here
     of_log = None if slot is None else slot.slot_id if slot.planned is not None else NO_SLOT
-    arm = stated_arm(session, SYSTEM)
+    # while the key is sealed a stated or guessed controller counts for nothing: where it were put to would tell what ran there
+    arm = None if session.visit.sealed else stated_arm(session, SYSTEM)
     controller, policy = (arm.controller, arm.policy_id) if arm is not None else (None, None)
     return Done(
         session.id,

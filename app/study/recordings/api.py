@@ -18,4 +18,5 @@ router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 @router.get("/participants/{code}/device-history")
 def device_history(participant: CurrentParticipant, db: Db) -> list[DeviceHistoryOut]:
     """Trends, snapshots and surveys of spectra, therapy groups and events that the participant's devices told, the newest report first."""
-    return [history_out(history_of(r)) for r in repository.histories(db, participant.id)]
+    hidden = repository.sealed_days(db, participant.id)
+    return [history_out(history_of(r, hidden)) for r in repository.histories(db, participant.id)]

@@ -5,12 +5,15 @@ Everything in it was reduced to numbers, times and known words before it was sto
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
 from app.study.models import Recording
+
+_CLOCKS = (timedelta(hours=-12), timedelta(0), timedelta(hours=14))
+"""The latest, the middle and the earliest clock on earth against UTC: a day lies within what they call it."""
 
 
 @dataclass(frozen=True)
@@ -94,15 +97,19 @@ class History:
         return [e for e in self.events if e.kind == "patient"]
 
 
-def history_of(recording: Recording) -> History:
-    """The history that a recording holds."""
+def history_of(recording: Recording, hidden: Collection[date] = ()) -> History:
+    """The history that a recording holds.
+
+    Args:
+        hidden: days of which neither trends nor programs are told, as any clock on earth has them: of visits whose plan's key is sealed.
+    """
     kept = recording.details.get("settings", {})
     battery = kept.get("battery") or {}
     present = [_group(g, recording.started_at) for g in kept.get("groups") or []]
     before = [_group(g, _moment(visit["at"])) for visit in kept.get("group_history") or [] for g in visit["groups"]]
     return History(
         recording=recording,
-        trends=[Trend(side, t["unix_s"], t["power_device_units"], t["amplitude_ma"]) for side, t in (kept.get("trends") or {}).items()],
+        trends=[t for t in (_trend(side, stored, hidden) for side, stored in (kept.get("trends") or {}).items()) if t.unix_s],
         snapshots=[
             Spectrum(side, s["hz"], s["magnitude"], _moment(e["at"]), e["label"])
             for e in kept.get("snapshots") or []
@@ -112,11 +119,22 @@ def history_of(recording: Recording) -> History:
             Spectrum(m["side"], m["hz"], m["magnitude"], channel=m["channel"] or "", artifact=m["artifact"] or "")
             for m in kept.get("montage") or []
         ],
-        groups=[*before, *present],
+        groups=[g for g in (*before, *present) if g.at is None or not _within(g.at.timestamp(), hidden)],
         events=_events(recording),
         battery_percent=battery.get("percent"),
         battery_months=battery.get("months_left"),
     )
+
+
+def _trend(side: str, stored: Mapping[str, Any], hidden: Collection[date]) -> Trend:
+    rows = zip(stored["unix_s"], stored["power_device_units"], stored["amplitude_ma"], strict=True)
+    told = [row for row in rows if not _within(row[0], hidden)]
+    return Trend(side, [row[0] for row in told], [row[1] for row in told], [row[2] for row in told])
+
+
+def _within(unix_s: float, days: Collection[date]) -> bool:
+    at = datetime.fromtimestamp(unix_s, UTC)
+    return bool(days) and any((at + shift).date() in days for shift in _CLOCKS)
 
 
 def _group(stored: Mapping[str, Any], at: datetime | None) -> Group:

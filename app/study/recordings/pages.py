@@ -20,7 +20,7 @@ def device_history_page(request: Request, participant: CurrentParticipant, db: D
     """The newest report's history, or that of the recording `report`."""
     recordings = repository.histories(db, participant.id)
     chosen = next((r for r in recordings if str(r.id) == report), recordings[0] if recordings else None)
-    history = history_of(chosen) if chosen is not None else None
+    history = history_of(chosen, repository.sealed_days(db, participant.id)) if chosen is not None else None
     page = render(
         request,
         "study/device_history.html",

@@ -13,6 +13,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
+from pypdf import PdfReader
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
@@ -23,6 +24,8 @@ from app.learning.snapshots.service import not_ready, take_snapshot
 from app.planning.plans.models import Plan
 from app.study.repository import participant_by_code, sessions_of_participant
 from tests.app.planning.slots.test_logs import DAY, log_of, send
+from tests.app.planning.slots.test_slots import recording
+from tests.app.study.recordings.test_device_history import BEGIN, report
 
 PAGE = {"Accept": "text/html"}
 Clients = Callable[[str], TestClient]
@@ -277,5 +280,59 @@ def test_a_log_of_a_sealed_plan_that_is_uploaded_to_another_visit_tells_nothing_
 ) -> None:
     bodies = [send(client, log_of(plan, i.position, 10 * i.position, number=i.position), visit="1") for i in plan.items[:2]]
     assert [p["session"]["controller"] for p in chain(*(b["proposals"] for b in bodies))] == [None, None]
+    assert {p["session"]["visit_id"] for p in chain(*(b["proposals"] for b in bodies))} == {studied.visit}, "whatever the sender says"
+    assert "visit 1, which the upload says, is not taken" in str(bodies[0]["report"])
+    proposal = bodies[0]["proposals"][0]
+    path, asked = f"/api/v1/proposals/{proposal['session']['id']}", {"version": proposal["version"], "reason": "x"}
+    refused = client.patch(path, json=asked | {"visit": 1})
+    assert (refused.status_code, "stays at its visit" in refused.json()["detail"]) == (409, True), refused.text
+    assert client.patch(path, json=asked | {"visit": 2}).status_code == 200
     stated = send(client, log_of(plan, 3, 30, number=3), visit="2", controller="random")
     assert stated["proposals"], "whether the statement is right is not told: somebody confirms it into its slot"
+
+
+def test_where_a_session_is_put_does_not_depend_on_the_controller_that_somebody_states(
+    client: TestClient, coordinator: TestClient, plan: Plan, studied: Any
+) -> None:
+    """A recording without a slot's number goes by order and clock, so that no answer says which letter is cDBS."""
+    other = next(i for i in plan.items if i.controller != plan.items[0].controller)
+    data = {"participant": "P1", "visit": "2", "started_at": f"{DAY}T09:00:00Z", "controller": other.controller}
+    sent = coordinator.post("/api/v1/uploads", data=data, files={"file": ("1.csv", recording(1, controlled=False))})
+    assert sent.status_code == 201, sent.text
+    rows = coordinator.get(f"/api/v1/visits/{studied.visit}/slots").json()["rows"]
+    assert [r["position"] for r in rows if r["session_id"]] == [plan.items[0].position]
+
+
+def test_the_seed_from_which_the_order_was_drawn_is_hidden_until_the_key_is_opened(client: TestClient, plan: Plan, studied: Any) -> None:
+    def told() -> list[bool]:
+        pdf = PdfReader(io.BytesIO(client.get(f"/api/v1/visits/{studied.visit}/plan.pdf").content))
+        trail = client.get(f"/audit?entity=plan&entity_id={plan.id}", headers=PAGE).text
+        return [
+            client.get(f"/api/v1/visits/{studied.visit}/plan").json()["seed"] is not None,
+            "seed 1" in client.get(f"/visits/{studied.visit}/plan", headers=PAGE).text,
+            "seed 1" in pdf.pages[0].extract_text(),
+            bool(re.search(r"seed</span>\s*<ins>1</ins>", trail)),
+        ]
+
+    assert told() == [False] * 4
+    open_key(client, studied.visit)
+    assert told() == [True] * 4
+
+
+def test_the_devices_own_averages_of_a_sealed_visits_day_are_left_out(client: TestClient, db: Session, plan: Plan, studied: Any) -> None:
+    sent = client.post("/api/v1/uploads", data={"participant": "P1"}, files={"file": ("report.json", report())})
+    assert sent.status_code == 201, sent.text
+    db.execute(text("update visit set date = '2026-02-02' where id = :id"), {"id": studied.visit})
+    db.commit()
+
+    def hours() -> list[float]:
+        (told,) = client.get("/api/v1/participants/P1/device-history").json()
+        (trend,) = told["trends"]
+        assert len(trend["amplitude_ma"]) == len(trend["power"]) == len(trend["unix_s"])
+        page = client.get("/participants/P1/device-history", headers=PAGE).text
+        assert f"left: {len(trend['unix_s'])} averages" in page
+        return [(t - BEGIN.timestamp()) / 3600 for t in trend["unix_s"]]
+
+    assert 0 < max(hours()) < 10, "from 14 hours before the day begins in UTC"
+    open_key(client, studied.visit)
+    assert max(hours()) > 49
