@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.analysis.evaluations import repository
 from app.evaluation.models import Evaluation
-from app.evaluation.ranking.results import driven_sessions, results_by_policy
+from app.evaluation.ranking.results import DrivenSession, driven_sessions, results_by_policy
 from app.learning.models import BufferSnapshot
 from app.study import repository as study
 from app.study.models import Participant
@@ -49,7 +49,8 @@ class BySeed:
 
     Attributes:
         snapshot_id: None without an evaluation. seeds: that were run on it. rows: where later sessions tell. policies: estimated under
-            every seed, with a return after the snapshot; the errors are of these.
+            every seed, with a return after the snapshot; the errors are of these. sessions: ids of the sessions after the snapshot that
+            those returns are of.
     """
 
     participant: str
@@ -57,6 +58,7 @@ class BySeed:
     seeds: tuple[int, ...]
     policies: int
     rows: tuple[SeedRow, ...]
+    sessions: tuple[int, ...] = ()
 
 
 def by_seed(db: Session, participant: Participant, caller: Caller) -> BySeed:
@@ -72,17 +74,23 @@ def by_seed(db: Session, participant: Participant, caller: Caller) -> BySeed:
     chosen = max(alike, key=lambda k: (min(len(alike[k]), WANTED_SEEDS), k[0], max(e.id for e in alike[k].values())))
     snapshot_id, seeds = chosen[0], alike[chosen]
     everywhere = set.intersection(*({e.policy_id for e in one.estimates} for one in seeds.values()))
-    returns = {i: value for i, value in _later_returns(db, seeds[min(seeds)], caller).items() if i in everywhere}
+    later = _later_sessions(db, seeds[min(seeds)], caller)
+    returns = {i: value for i, value in _returns(db, seeds[min(seeds)], later).items() if i in everywhere}
+    behind = tuple(s.session_id for s in later if s.policy_id in returns)
     rows: list[SeedRow] = []
     if len(returns) >= LEAST_POLICIES:
         rows = [row for seed in sorted(seeds) for row in _rows(seeds[seed], seed, returns)]
-    return BySeed(participant.code, snapshot_id, tuple(sorted(seeds)), len(returns), tuple(rows))
+    return BySeed(participant.code, snapshot_id, tuple(sorted(seeds)), len(returns), tuple(rows), behind)
 
 
-def _later_returns(db: Session, evaluation: Evaluation, caller: Caller) -> dict[int, float]:
-    """Mean return by policy of the sessions that the snapshot does not hold, under the evaluation's settings, horizon and discount."""
+def _later_sessions(db: Session, evaluation: Evaluation, caller: Caller) -> list[DrivenSession]:
+    """Sessions of policies that the snapshot does not hold."""
     seen = repository.sessions_of_snapshot(db, evaluation.snapshot_id)
-    ran = [s for s in driven_sessions(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller) if s.session_id not in seen]
+    return [s for s in driven_sessions(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller) if s.session_id not in seen]
+
+
+def _returns(db: Session, evaluation: Evaluation, ran: list[DrivenSession]) -> dict[int, float]:
+    """Mean return by policy of sessions, under the evaluation's settings, horizon and discount."""
     settings = mdp_settings(study.settings_version(db, evaluation.settings_version_id))
     results = results_by_policy(ran, settings, evaluation.horizon_steps, None)
     return {i: r.mean_return for i, r in results.items() if r.mean_return is not None}

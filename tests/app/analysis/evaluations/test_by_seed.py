@@ -45,8 +45,10 @@ def test_seeds_of_one_horizon_stand_together(
     before = client.get(PATH).json()
     assert (before["seeds"], before["policies"], before["rows"]) == ([1, 2], 0, [])
     assert "0 of the policies" in before["text"]
-    for k, policy in enumerate(policies[:2]):
+    later = [
         upload("rl", level=0.5, policy=policy, qoc={"grasp_hz": 2.0 + 0.1 * k, "rating": 7, "tremor_percent": 10.0})
+        for k, policy in enumerate(policies[:2])
+    ]
     found = client.get(PATH).json()
     assert (found["seeds"], found["policies"]) == ([1, 2], 2)
     assert {r["seed"] for r in found["rows"]} == {1, 2}
@@ -61,5 +63,6 @@ def test_seeds_of_one_horizon_stand_together(
     assert longer["seeds"] == [0, 3, 4]
     assert {r["policies"] for r in longer["rows"]} == {2}
     assert longer["rows"][0]["mae"] != pytest.approx(found["rows"][0]["mae"])
-    assert client.get("/participants/P1/analyses/evaluations").status_code == 200
+    shown = client.get("/participants/P1/analyses/evaluations").text
+    assert all(f'href="/sessions/{session}"' in shown for session in later), "the sessions behind the numbers are a click away"
     assert len(client.get("/participants/P1/analyses/evaluations.csv").text.splitlines()) == 4
