@@ -6,7 +6,7 @@ from typing import Any
 
 from sqlalchemy import Column, ColumnElement, Integer, Table, and_, case, cast, false, func, or_, select, true
 from sqlalchemy.dialects.postgresql import JSONB
-from sqlalchemy.orm import QueryableAttribute
+from sqlalchemy.orm import QueryableAttribute, aliased
 
 from app.accounts.models import Site
 from app.accounts.permissions import PERMISSIONS, READ_AUDIT, Caller
@@ -16,6 +16,8 @@ from app.platform.database import Base
 _ROOTS = ("participant", "site", "study")
 _SIGNED = ("plan", "policy", "visit_lock", "margins_lock")
 """Tables whose rows are signed; a signature names them by kind."""
+_REMOVED = ("visit", "session", "plan")
+"""Tables with rows below them of which the service removes some: empty visits, discarded proposals, drafts."""
 _ROW_CHANGES = ("insert", "update", "delete")
 _NUMBER = r"^[0-9]{1,9}$"
 
@@ -67,8 +69,11 @@ class _Scope:
         named = {name: self._inside(name, number) for name in ("participant", "session", "plan", "visit", "policy")}
         return case(named | {"results": by_code}, value=AuditEvent.entity, else_=false())
 
-    def _inside(self, name: str, number: ColumnElement[int]) -> ColumnElement[bool]:
-        """Whether the row of a table with this number belongs to the reader's sites."""
+    def _inside(self, name: str, number: ColumnElement[int], removed: bool = True) -> ColumnElement[bool]:
+        """Whether the row of a table with this number belongs to the reader's sites.
+
+        `removed`: it may be gone since, and is looked up in the trail's own row of its removal then; what a present row names is there.
+        """
         if name == "site":
             return number.in_(self._sites)
         if name == "study":
@@ -76,7 +81,15 @@ class _Scope:
         table = Base.metadata.tables[name]
         key = _key(table)
         assert key is not None
-        return number.in_(select(table.c.id).where(self._inside(_parent(key), key)))
+        present = number.in_(select(table.c.id).where(self._inside(_parent(key), key, removed=False)))
+        if not removed or name not in _REMOVED:
+            return present
+        gone = aliased(AuditEvent)
+        last = cast(gone.before, JSONB)[key.name].as_integer()
+        removals = select(cast(gone.entity_id, Integer)).where(
+            gone.entity == name, gone.action == "delete", self._inside(_parent(key), last)
+        )
+        return or_(present, number.in_(removals))
 
 
 def _leads_to_root(table: Table) -> bool:

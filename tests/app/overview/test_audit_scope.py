@@ -84,6 +84,22 @@ def test_every_row_of_ones_own_study_is_shown_and_none_of_another(client: TestCl
     assert sum(e.entity == "signature" for e in of["north"]) == 4
 
 
+def test_rows_of_a_visit_that_was_removed_stay_in_the_trail_of_its_study(client: TestClient, north: Study, db: Session) -> None:
+    body = {"number": 9, "cdbs_amplitudes": [{"hemisphere": "left", "amplitude_ma": 2.5}]}
+    visit = client.post("/api/v1/participants/N1/visits", json=body).json()["id"]
+    assert client.post(f"/api/v1/visits/{visit}/removal", json={"reason": "entered twice"}).status_code in (200, 204)
+    sites = {code: db.scalars(select(Site.id).where(Site.code == code)).one() for code in ("n1", "n2")}
+    main = db.scalars(select(Study.id).where(Study.code == "main")).one()
+
+    def amplitudes(study: int, site: int | None) -> list[str]:
+        found = seen(db, Caller("x", 1, (Grant(study, site, Role.MONITOR),)))
+        return [e.action for e in found if e.entity == "cdbs_amplitude" and (e.after or e.before or {})["visit_id"] == visit]
+
+    assert amplitudes(north.id, None) == ["delete", "insert"]
+    assert amplitudes(north.id, sites["n1"]) == ["delete", "insert"]
+    assert amplitudes(north.id, sites["n2"]) == amplitudes(main, None) == []
+
+
 def test_a_reader_at_one_site_sees_that_site(north: Study, db: Session) -> None:
     site = db.scalars(select(Site).where(Site.code == "n1")).one()
     found = seen(db, Caller("x", 1, (Grant(north.id, site.id, Role.MONITOR),)))
