@@ -297,7 +297,7 @@ def main(folder: Path) -> int:
     for r in read(folder, "noninferiority.csv"):
         count += 1
         again = noninferiority(sessions, r, float(r["grasp_share"]))
-        named = f"{r['controller']} {r['outcome']}"
+        named = f"{r['controller']} {r['outcome']} (margins_version {r['margins_version']}, confirmatory {r['confirmatory']})"
         wrong += [f"{named} {n}: {r[n]} stored, {again.get(n)} here" for n in ("estimate", "p_non_inferior") if differs(r[n], again.get(n))]
     said = "\n".join(wrong) if wrong else f"{count} rows of primary.csv and noninferiority.csv recomputed: all agree."
     sys.stdout.write(f"{said}\n")

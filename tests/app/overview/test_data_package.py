@@ -77,6 +77,20 @@ def test_a_number_that_was_changed_is_found(package: Path) -> None:
     assert "rl rating estimate" in done.stdout
 
 
+def test_a_verdict_that_was_changed_is_named_with_the_margins_that_it_went_by(package: Path) -> None:
+    path = package / "noninferiority.csv"
+    rows = list(csv.DictReader(path.open()))
+    judged = next(r for r in rows if r["estimate"])
+    other = {**judged, "margins_version": "7", "estimate": str(float(judged["estimate"]) + 1)}
+    with path.open("w", newline="") as file:
+        out = csv.DictWriter(file, rows[0])
+        out.writeheader()
+        out.writerows([*rows, other])
+    (line,) = run(package).stdout.splitlines()
+    named = f"{other['controller']} {other['outcome']} (margins_version 7, confirmatory {other['confirmatory']}) estimate: "
+    assert line.startswith(named), line
+
+
 def test_the_dictionary_describes_every_column_and_every_file(package: Path) -> None:
     described = json.loads((package / "datapackage.json").read_text())
     assert {r["path"] for r in described["resources"]} == {p.name for p in package.glob("*.csv")}

@@ -14,6 +14,7 @@ from app.study import repository
 from app.study.margins.schemas import BOUNDS
 from app.study.margins.service import margins_of
 from ml.qoc import Margins
+from tests.conftest import PASSWORD
 
 HTML = {"Accept": "text/html", "Sec-Fetch-Site": "same-origin"}
 PATH = "/api/v1/participants/P1/margins"
@@ -71,6 +72,14 @@ def test_the_page_changes_what_was_typed_and_keeps_what_was_refused(client: Test
     assert client.get(PATH).json()[-1]["tremor_points"] == 6.0
     old = client.post(page, data={"version": "1", "tremor_points": "8", "reason": "late"}, headers=HTML)
     assert old.status_code == 409, "a form opened before somebody else's change does not take it back"
+
+
+def test_the_page_says_which_visits_only_explore(client: TestClient, enrolled: str) -> None:
+    page = "/participants/P1/margins"
+    assert "only explore" not in client.get(page, headers=HTML).text
+    locked = client.post(f"{PATH}/locks", json={"version": 1, "reason": "protocol", "password": PASSWORD})
+    assert locked.status_code == 201, locked.text
+    assert "visits that began before the first lock only explore" in client.get(page, headers=HTML).text
 
 
 def test_participants_of_the_released_version_have_the_defaults(released_database: str) -> None:
