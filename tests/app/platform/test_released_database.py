@@ -22,6 +22,7 @@ from sqlalchemy import text
 import app.platform.database as database
 from app.accounts import repository as accounts_repository
 from app.accounts import service as accounts
+from app.analysis.energy.schemas import ImplantIn
 from app.platform.database import Base
 from app.platform.files import path_of
 from app.platform.tables import load_tables
@@ -73,8 +74,9 @@ ABSENT = {
     "/api/v1/proposals/{session_id}": "select id from session where status <> 'proposed'",
     "/proposals/{session_id}": "select id from session where status <> 'proposed'",
 }
-# what a route needs to be told besides its path: a session and a policy of P1
-QUERIES = dict.fromkeys(
+# what a route needs to be told besides its path: a session and a policy of P1; the stated implant
+QUERIES = {"/api/v1/participants/{code}/analyses/battery": f"select '{'&'.join(f'{name}=1' for name in ImplantIn.model_fields)}'"}
+QUERIES |= dict.fromkeys(
     ("/api/v1/participants/{code}/replay", "/participants/{code}/compare"),
     "select 'session=' || min(s.id) || '&policy=' || min(p.id) from session s"
     " join visit v on v.id = s.visit_id join policy p on p.participant_id = v.participant_id"
