@@ -51,7 +51,8 @@ def test_a_killed_worker_takes_its_children_along_and_the_next_one_finishes_the_
     job = jobs.ended(job_id)
     assert job.status == "succeeded"
     assert jobs.counted(job_id) == [0, 1]
-    assert min(job.result["resumed_from"]) >= 5
+    # a part counts a number before its checkpoint holds it, and may be killed between the two
+    assert min(job.result["resumed_from"]) >= 4
     assert [s.attempts for s in job.steps] == [2, 2, 1]
     for part in range(2):
         # the number in flight may be counted again (a step is at least once), its result is not
