@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 from numpy.typing import NDArray
-from sqlalchemy import make_url, text
+from sqlalchemy import event, make_url, text
 
-from app.platform.database import database_url, new_session
+from app.platform.database import database_url, get_engine, new_session
 from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
 from tests.app.every_route import World
@@ -201,3 +201,16 @@ def ended(client: TestClient) -> Callable[[str, float], dict[str, Any]]:
         )
 
     return wait
+
+
+@pytest.fixture
+def statements() -> Iterator[list[str]]:
+    """What the service asks the database."""
+    asked: list[str] = []
+
+    def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        asked.append(statement)
+
+    event.listen(get_engine(), "before_cursor_execute", note)
+    yield asked
+    event.remove(get_engine(), "before_cursor_execute", note)

@@ -63,19 +63,6 @@ def test_more_visits_and_sessions_ask_no_more_queries(
     assert {path: queries(path) for path in PAGES} == few
 
 
-@pytest.fixture
-def statements() -> Iterator[list[str]]:
-    """What the service asks the database."""
-    asked: list[str] = []
-
-    def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:
-        asked.append(statement)
-
-    event.listen(get_engine(), "before_cursor_execute", note)
-    yield asked
-    event.remove(get_engine(), "before_cursor_execute", note)
-
-
 def test_a_page_of_a_ranking_reads_the_sessions_once(
     client: TestClient, policies: list[int], judge: Callable[..., int], statements: list[str]
 ) -> None:

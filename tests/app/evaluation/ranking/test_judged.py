@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import event
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation.ranking.service import current
-from app.platform.database import get_engine
 from app.platform.kept import forget
 from app.study.repository import participant_by_code
 from tests.app.evaluations import judged
@@ -24,18 +22,6 @@ PAGES = (
     "/participants/P1/policies/{0}",
     "/visits/1/plan",
 )
-
-
-@pytest.fixture
-def statements() -> Iterator[list[str]]:
-    asked: list[str] = []
-
-    def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:
-        asked.append(statement)
-
-    event.listen(get_engine(), "before_cursor_execute", note)
-    yield asked
-    event.remove(get_engine(), "before_cursor_execute", note)
 
 
 def seen(client: TestClient, policies: list[int]) -> list[str]:

@@ -40,7 +40,7 @@ def _worker_of(jobs, job_id):
 def test_a_killed_worker_takes_its_children_along_and_the_next_one_finishes_the_job(jobs):
     worker = jobs.start_worker()
     job_id = jobs.submit(parts=2, numbers=30, pause_s=0.1)
-    _count_until(jobs, job_id, 5)
+    _count_until(jobs, job_id, 6)  # a part counts a number before its checkpoint holds it, so five are held for sure
     children = jobs.children(worker)
     assert len(children) == 2
     worker.send_signal(signal.SIGKILL)
@@ -51,8 +51,7 @@ def test_a_killed_worker_takes_its_children_along_and_the_next_one_finishes_the_
     job = jobs.ended(job_id)
     assert job.status == "succeeded"
     assert jobs.counted(job_id) == [0, 1]
-    # a part counts a number before its checkpoint holds it, and may be killed between the two
-    assert min(job.result["resumed_from"]) >= 4
+    assert min(job.result["resumed_from"]) >= 5
     assert [s.attempts for s in job.steps] == [2, 2, 1]
     for part in range(2):
         # the number in flight may be counted again (a step is at least once), its result is not
