@@ -41,10 +41,11 @@ ALGORITHM_NAMES: dict[str, str] = {name: algorithm.title for name, algorithm in 
 
 
 Aim = Literal["steps", "return", "both"]
-Anchor = Literal["logged", "cdbs", "both"]
-DEFAULT_SWEEP: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "both", "critic_memory": True}
-"""What the pipeline trains where nothing else is asked for: the paper's algorithm, and one held near what was logged or near cDBS, each
-with and without a share of r_end. DDPG alone went below cDBS in all participants of the demo. The critics see past amplitudes."""
+Anchor = Literal["logged", "cdbs", "best", "both", "all"]
+DEFAULT_SWEEP: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "all", "critic_memory": True}
+"""What the pipeline trains where nothing else is asked for: the paper's algorithm, and one held near what was logged, near the best
+constant amplitude or near cDBS, with and without a share of r_end. DDPG alone went below cDBS in all participants of the demo. The three
+anchors span the energies, so that a visit has something to choose from. The critics see past amplitudes."""
 
 
 class SweepParams(Model):
@@ -62,7 +63,9 @@ class SweepParams(Model):
     anchor: Anchor = Field(
         "logged",
         description="What TD3+BC and ReBRAC hold the policy near: the logged amplitudes, as published; the cDBS amplitude, so that it "
-        "leaves the standard of care only where the values speak for it; or by turns one and the other. The others have no such bond.",
+        "leaves the standard of care only where the values speak for it; `best`, the constant amplitude with the largest estimated return "
+        "of those that sessions support and that probably keep all QoCs within the margins; `both`, by turns logged and cDBS; or `all` "
+        "three by turns. The others have no such bond. Where policies are fine-tuned, by turns means what each was held near.",
     )
     critic_memory: bool = Field(
         False,
@@ -219,6 +222,10 @@ class SweepCandidateOut(Model):
         description="What estimated the gain: `fqe` in older sweeps, whose order rests on the scores; null without a gain."
     )
     supported: bool | None = Field(description="Whether sessions lie near what the policy does; null where that was not asked.")
+    beyond_margin: bool | None = Field(
+        description="Whether an outcome is as probably worse than under cDBS by more than its margin as makes a verdict `unsafe`; "
+        "null where that was not asked."
+    )
     below_bound: float | None = Field(
         description="Share of the buffer's states answered with less than the lower bound of its random sessions; null without those."
     )

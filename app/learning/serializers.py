@@ -130,6 +130,7 @@ def sweep_out(db: Session, sweep: Sweep) -> SweepOut:
                 gain_low=c.gain.low if c.gain else None,
                 gain_method=None if c.gain is None else "posterior" if c.by_posterior else "fqe",
                 supported=c.supported if c.by_posterior else None,
+                beyond_margin=c.beyond,
                 below_bound=c.below[1] if c.below else None,
             )
             for c in comparison.candidates(sweep)

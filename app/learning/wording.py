@@ -13,6 +13,7 @@ STANDINGS = {
     Standing.RETIRED: "retired",
     Standing.BELOW_TRIED: "below what the random controller tried",
     Standing.NO_SESSION_NEAR: "no session near",
+    Standing.BEYOND_MARGIN: "probably beyond a margin",
     Standing.ABOVE_CDBS: "estimated above cDBS",
     Standing.NOT_ABOVE_CDBS: "not above cDBS with confidence",
     Standing.UNTOLD: "cannot tell",

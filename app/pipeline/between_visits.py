@@ -25,7 +25,7 @@ def run_pipeline(job: JobContext) -> dict[str, Any]:
     planned = plan_on_snapshot(job, lambda db, snapshot: {"starts": training_starts(db, snapshot.participant_id, training)})
     snapshot = planned["snapshot"]
     groups = training_groups(training, planned["starts"])
-    trainings = training_calls(training, snapshot["sha256"], groups)
+    trainings = training_calls(training, snapshot, groups)
     results = job.compute_all([*trainings, *fit_calls(evaluation, snapshot["sha256"])])
     policies = store_trained(job, training, snapshot["id"], groups, results[: len(trainings)])
     models = store_members(job, results[len(trainings) :])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -12,6 +13,7 @@ from app.learning.models import BufferSnapshot, Policy
 from app.learning.snapshots import service as snapshots
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
+from app.study.margins.service import margins_of
 from app.study.models import Participant
 
 STORE_WEIGHT = 0.1
@@ -38,9 +40,13 @@ def take_snapshot(job: JobContext, db: Session) -> BufferSnapshot:
     return snapshots.take_snapshot(db, participant_of(db, job), acting(job))
 
 
-def snapshot_facts(snapshot: BufferSnapshot) -> dict[str, Any]:
-    """What later steps need to know of a snapshot."""
-    return {"id": snapshot.id, "sha256": snapshot.file_sha256, "sessions": snapshot.sessions, "steps": snapshot.steps}
+def snapshot_facts(db: Session, snapshot: BufferSnapshot) -> dict[str, Any]:
+    """What later steps need to know of a snapshot, and the margins and levels by which its participant's policies are judged."""
+    participant = db.get_one(Participant, snapshot.participant_id)
+    levels = participant.current_margins
+    margins = asdict(margins_of(participant.margins_in_force)) | {"test_within": levels.test_within, "unsafe_beyond": levels.unsafe_beyond}
+    known = {"id": snapshot.id, "sha256": snapshot.file_sha256, "sessions": snapshot.sessions, "steps": snapshot.steps}
+    return known | {"margins": margins}
 
 
 def plan_on_snapshot(job: JobContext, more: Callable[[Session, BufferSnapshot], dict[str, Any]] | None = None) -> dict[str, Any]:
@@ -52,7 +58,7 @@ def plan_on_snapshot(job: JobContext, more: Callable[[Session, BufferSnapshot], 
 
     def plan(db: Session) -> dict[str, Any]:
         snapshot = take_snapshot(job, db)
-        return {"snapshot": snapshot_facts(snapshot)} | (more(db, snapshot) if more else {})
+        return {"snapshot": snapshot_facts(db, snapshot)} | (more(db, snapshot) if more else {})
 
     return job.transact("plan", plan)
 

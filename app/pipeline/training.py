@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -30,7 +30,7 @@ def run_train(job: JobContext) -> dict[str, Any]:
     declare_training(job, params)
     planned = plan_on_snapshot(job, lambda db, snapshot: {"starts": training_starts(db, snapshot.participant_id, params)})
     groups = training_groups(params, planned["starts"])
-    results = job.compute_all(training_calls(params, planned["snapshot"]["sha256"], groups))
+    results = job.compute_all(training_calls(params, planned["snapshot"], groups))
     policies = store_trained(job, params, planned["snapshot"]["id"], groups, results)
     return {"snapshot_id": planned["snapshot"]["id"], "policy_ids": [p["id"] for p in policies]}
 
@@ -53,19 +53,22 @@ def training_starts(db: Session, participant_id: int, params: TrainParams) -> li
         known = {"checkpoint_sha256": policy.checkpoint_sha256} if policy.checkpoint_sha256 else {"onnx_sha256": policy.onnx_sha256}
         # a student has no critic: the sweep's own algorithm goes on from it
         algorithm = policy.algorithm if policy.checkpoint_sha256 else params.algorithms[0]
-        starts.append({"policy_id": policy.id, "algorithm": algorithm, **known})
+        own = {name: policy.config[name] for name in ("aim", "anchor", "anchor_amplitude") if name in policy.config}
+        starts.append({"policy_id": policy.id, "algorithm": algorithm, "trained_with": own, **known})
     return starts
 
 
-def training_calls(params: TrainParams, sha256: str, groups: Sequence[Group]) -> list[ComputeStep]:
-    """Compute steps of the training stage: the groups of policies, then the baselines."""
+def training_calls(params: TrainParams, snapshot: Mapping[str, Any], groups: Sequence[Group]) -> list[ComputeStep]:
+    """Compute steps of the training stage: the groups of policies, then the baselines; `snapshot` as `stages.snapshot_facts` has it."""
+    # a job that an earlier version began knows no margins
+    common = {"snapshot_sha256": snapshot["sha256"], "held_out": params.held_out, "margins": snapshot.get("margins")}
     calls: list[ComputeStep] = []
     for group in groups:
-        call = {"snapshot_sha256": sha256, "algorithm": group["algorithm"], "configs": group["configs"], "held_out": params.held_out}
+        call = {**common, "algorithm": group["algorithm"], "configs": group["configs"]}
         if group["start"] is not None:
             call["initial"] = {name: value for name, value in group["start"].items() if name.endswith("sha256")}
         calls.append((group["key"], "train", call))
-    return [*calls, (BASELINES, "baselines", {"snapshot_sha256": sha256, "held_out": params.held_out, "seed": params.seed})]
+    return [*calls, (BASELINES, "baselines", {**common, "seed": params.seed})]
 
 
 def declare_training(job: JobContext, params: TrainParams, groups: Sequence[Group] | None = None) -> None:

@@ -2,14 +2,18 @@
 
     python -m benchmarks.development.learned --worlds 12 --out FOLDER             every fifth world of part A; resumable
     python -m benchmarks.development.learned --memory                             critics that see past amplitudes, and those that do not
+    python -m benchmarks.development.learned --anchors both,all                   held near two amplitudes, or also near the best constant
+    python -m benchmarks.development.learned --updates 2000 --minutes 20          shorter trainings; no further world after so long
     python -m benchmarks.development.learned --quick                              one world, few updates and simulated sessions
     python -m benchmarks.development.learned --designs stratified,paper           data by both designs
     python -m benchmarks.development.learned --part B                             to report on; each run is counted
 
 A policy succeeds where all three QoCs are truly within the default margins of cDBS and it saves a fifth of the energy. Told over
-responders, patients in whom some constant or proportional controller does: the share in which the policy that the posterior puts first
-succeeds, and in which any of the six does; energy and true gain of both. Training is the service's: learning rates, left-out sessions and
-the choice of a state are those of a sweep of the preset `quick`. True returns only measure. CPU seconds of one thread.
+responders, patients in whom some constant or proportional controller does, and others are not trained: the share in which the policy that
+the posterior puts first succeeds, and in which any of the six does; energy and true gain of both; between arms the difference of the same
+patients with its standard error. First is as in the ranking: what no session supports, or what probably leaves the margins, comes last.
+Training is the service's: learning rates, left-out sessions and the choice of a state are those of a sweep of the preset `quick`. True
+returns only measure. CPU seconds of one thread.
 """
 
 from __future__ import annotations
@@ -20,18 +24,20 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from app.learning.schemas import DEFAULT_SWEEP, TrainParams
-from app.learning.training.compute import hold_out
+from app.learning.schemas import DEFAULT_SWEEP, Anchor, TrainParams
+from app.learning.sweeps.comparison import held_near
+from app.learning.training.compute import hold_out, with_best_anchor
 from app.learning.training.configs import training_groups
 from benchmarks.support.cells import Cells
 from benchmarks.support.looks import look
 from ml import rl
 from ml.ope.posterior.gains import gains_over_cdbs
+from ml.ope.posterior.verdict import Levels
 from ml.policies.policy import ConstantPolicy, Policy
 from ml.population.virtual import DataDesign, World, is_responder, simple_policies, within_margins, world
 from ml.trajectories import ReplayBuffer
@@ -39,28 +45,43 @@ from ml.trajectories import ReplayBuffer
 POLICIES, TRUTH, EVERY, SAVED = 6, 150, 5, 0.2
 QUICK_UPDATES, QUICK_TRUTH = 50, 40
 DESIGNS: tuple[DataDesign, ...] = ("stratified", "paper")
+ANCHORS: tuple[Anchor, ...] = ("both", "all")
 
 
-def sweep(buffer: ReplayBuffer, memory: bool, updates: int | None) -> dict[str, Policy]:
+class Arm(NamedTuple):
+    """How data are made and policies trained."""
+
+    design: DataDesign
+    memory: bool
+    anchor: Anchor
+
+    @property
+    def key(self) -> str:
+        """Its name in files and lines."""
+        return f"{self.design} {'memory' if self.memory else 'window'} {self.anchor}"
+
+
+def sweep(buffer: ReplayBuffer, arm: Arm, updates: int | None) -> dict[str, Policy]:
     """Six policies as a sweep of the service trains them."""
     found: dict[str, Policy] = {}
-    for group in training_groups(TrainParams(preset="quick", count=POLICIES, updates=updates, **DEFAULT_SWEEP), [None] * POLICIES):
-        given = [{**config, "critic_memory": memory} for config in group["configs"]]
+    asked = DEFAULT_SWEEP | {"critic_memory": arm.memory, "anchor": arm.anchor}
+    for group in training_groups(TrainParams(preset="quick", count=POLICIES, updates=updates, **asked), [None] * POLICIES):
+        given = with_best_anchor(group["configs"], buffer, margins=None)
         configs = [rl.algorithm(group["algorithm"]).config.from_json(one) for one in given]
         learnt, held = hold_out(buffer, wanted=True, every=max(1, configs[0].updates // 10))
         for config, result in zip(configs, rl.train_many(learnt, configs, held_out=held), strict=True):
-            held_near = "cDBS" if getattr(config, "anchor", "") == "constant" else "logged"
-            found[f"{group['algorithm']} {config.aim} {held_near} {config.seed}"] = result.policy
+            found[f"{group['algorithm']} {config.aim}, near {held_near(config.to_json()) or 'nothing'}, {config.seed}"] = result.policy
     return found
 
 
-def cell(w: World, design: DataDesign, memory: bool, quick: bool) -> dict[str, Any]:
-    """What the six of one virtual patient are, by the posterior and by truth."""
-    buffer = w.data(design)
-    policies, truth = sweep(buffer, memory, QUICK_UPDATES if quick else None), QUICK_TRUTH if quick else TRUTH
-    gains = gains_over_cdbs(buffer, policies)
+def cell(w: World, arm: Arm, updates: int | None, truth: int) -> dict[str, Any]:
+    """What the six of one virtual patient are, by the posterior and by truth; none are trained for who responds to nothing simple."""
     cdbs = w.truth(ConstantPolicy(1.0), truth)
-    simple = {name: w.truth(policy, truth) for name, policy in simple_policies(w.settings, w.spread).items()}
+    if not is_responder({name: w.truth(policy, truth) for name, policy in simple_policies(w.settings, w.spread).items()}, cdbs):
+        return {"responder": False, "policies": {}}
+    buffer = w.data(arm.design)
+    policies = sweep(buffer, arm, updates)
+    gains = gains_over_cdbs(buffer, policies)
     rows = {}
     for name, policy in policies.items():
         true = w.truth(policy, truth)
@@ -68,35 +89,77 @@ def cell(w: World, design: DataDesign, memory: bool, quick: bool) -> dict[str, A
         rows[name] = {
             "posterior": gains[name].gain.value,
             "supported": gains[name].supported,
+            "within": gains[name].within,
             "told": gains[name].told,
             "gain": true.total.value - cdbs.total.value,
             "saves": saves,
             "succeeds": bool(saves >= SAVED and within_margins(true, cdbs)),
         }
-    return {"responder": is_responder(simple, cdbs), "policies": rows}
+    return {"responder": True, "policies": rows}
 
 
 def first_by_posterior(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The row with the largest estimated gain, of those that sessions support where any is."""
-    supported = [row for row in rows.values() if row["supported"]]
-    return max(supported or rows.values(), key=lambda row: float(row["posterior"]))
+    """The row with the largest estimated gain, of those that the ranking does not put last where any is."""
+    fit = [row for row in rows.values() if row["supported"] and 1 - row["within"] < Levels().unsafe_beyond]
+    return max(fit or rows.values(), key=lambda row: float(row["posterior"]))
+
+
+def outcomes(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
+    """One patient's figures."""
+    first, best = first_by_posterior(rows), max(rows.values(), key=lambda row: float(row["gain"]))
+    return {
+        "first_succeeds": float(first["succeeds"]),
+        "any_succeeds": float(any(row["succeeds"] for row in rows.values())),
+        "succeed": float(np.mean([row["succeeds"] for row in rows.values()])),
+        "first_gain": first["gain"],
+        "best_gain": best["gain"],
+        "mean_gain": float(np.mean([row["gain"] for row in rows.values()])),
+        "first_saves": first["saves"],
+    }
 
 
 def told(cells: list[dict[str, Any]]) -> dict[str, float]:
     """Shares and means over responders."""
-    rows = [one["policies"] for one in cells if one["responder"]]
-    first = [first_by_posterior(of) for of in rows]
-    best = [max(of.values(), key=lambda row: float(row["gain"])) for of in rows]
-    return {
-        "responders": float(len(rows)),
-        "first_succeeds": float(np.mean([row["succeeds"] for row in first])),
-        "any_succeeds": float(np.mean([any(row["succeeds"] for row in of.values()) for of in rows])),
-        "first_gain": float(np.mean([row["gain"] for row in first])),
-        "best_gain": float(np.mean([row["gain"] for row in best])),
-        "mean_gain": float(np.mean([row["gain"] for of in rows for row in of.values()])),
-        "first_saves": float(np.mean([row["saves"] for row in first])),
-        "seconds": float(np.mean([one["seconds"] for one in cells])),
-    }
+    each = [outcomes(one["policies"]) for one in cells if one["responder"]]
+    means = {name: float(np.mean([one[name] for one in each])) for name in (each[0] if each else ())}
+    return {"responders": float(len(each))} | means | {"seconds": float(np.mean([one["seconds"] for one in cells if one["responder"]]))}
+
+
+def differences(cells: dict[str, dict[str, Any]], others: dict[str, dict[str, Any]]) -> dict[str, tuple[float, float]]:
+    """Mean and standard error of one arm less another over the responders of both, which are the same patients."""
+    both = [(outcomes(cells[k]["policies"]), outcomes(others[k]["policies"])) for k in cells if k in others and cells[k]["responder"]]
+    if len(both) < 2:
+        return {}
+    apart = {name: np.array([one[name] - other[name] for one, other in both]) for name in both[0][0]}
+    return {name: (float(d.mean()), float(d.std(ddof=1) / np.sqrt(d.size))) for name, d in apart.items()}
+
+
+def arms(chosen: argparse.Namespace) -> list[Arm]:
+    """What is asked for."""
+    memories = (False, True) if chosen.memory else (bool(DEFAULT_SWEEP["critic_memory"]),)
+    anchors = [a for a in ANCHORS if a in chosen.anchors.split(",")]
+    return [Arm(d, m, a) for d in DESIGNS if d in chosen.designs.split(",") for m in memories for a in anchors]
+
+
+def trained(chosen: argparse.Namespace, of: list[Arm]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Finished worlds of every arm, by its key and the world's number."""
+    out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-learned-"))
+    out.mkdir(parents=True, exist_ok=True)
+    updates, truth = (QUICK_UPDATES, QUICK_TRUTH) if chosen.quick else (chosen.updates, TRUTH)
+    cells, begun = Cells(out / f"learned-{updates or 'preset'}.jsonl"), time.monotonic()
+    found: dict[str, dict[str, dict[str, Any]]] = {arm.key: {} for arm in of}
+    for index in range(0, chosen.every * (1 if chosen.quick else chosen.worlds), chosen.every):
+        for arm in of:
+            key = f"{chosen.part} {arm.key} {index:02d}"
+            if cells.get(key) is None and time.monotonic() - begun < 60 * chosen.minutes:
+                start = time.process_time()
+                one = cell(world(chosen.part, index), arm, updates, truth)
+                cells.add(key, **one, seconds=time.process_time() - start)
+                sys.stdout.write(f"{key}: {time.process_time() - start:.0f} s\n")
+                sys.stdout.flush()
+            if (known := cells.get(key)) is not None:
+                found[arm.key][f"{index:02d}"] = known
+    return found
 
 
 def main() -> None:
@@ -107,33 +170,23 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=12)
     parser.add_argument("--every", type=int, default=EVERY, help="take every so manyth world")
     parser.add_argument("--designs", default="stratified", help="with commas: stratified, paper")
+    parser.add_argument("--anchors", default=DEFAULT_SWEEP["anchor"], help="with commas: both, all")
     parser.add_argument("--memory", action="store_true", help="critics that see past amplitudes, and those that do not")
+    parser.add_argument("--updates", type=int, help="of every training; those of the preset by default")
+    parser.add_argument("--minutes", type=float, default=1e9, help="start no further training after so many minutes")
     parser.add_argument("--out", type=Path, help="folder of the finished worlds; a temporary one by default")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     look(chosen.part, " ".join(["learned", *sys.argv[1:]]), None)
-    out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-learned-"))
-    out.mkdir(parents=True, exist_ok=True)
-    cells, figures = Cells(out / f"learned{'-quick' if chosen.quick else ''}.jsonl"), {}
-    arms = [
-        (d, m)
-        for d in DESIGNS
-        if d in chosen.designs.split(",")
-        for m in ((False, True) if chosen.memory else (DEFAULT_SWEEP["critic_memory"],))
-    ]
-    for index in range(0, chosen.every * (1 if chosen.quick else chosen.worlds), chosen.every):
-        for design, memory in arms:
-            key = f"{chosen.part} {design} {'memory' if memory else 'window'}"
-            if cells.get(f"{key} {index:02d}") is None:
-                start = time.process_time()
-                found = cell(world(chosen.part, index), design, memory, chosen.quick)
-                cells.add(f"{key} {index:02d}", **found, seconds=time.process_time() - start)
-                print(f"{key} {index:02d}: {time.process_time() - start:.0f} s", flush=True)
-    for design, memory in arms:
-        key = f"{chosen.part} {design} {'memory' if memory else 'window'}"
-        figures[key] = told(cells.all(f"{key} "))
-        print(key, " ".join(f"{name} {value:.2f}" for name, value in figures[key].items()))
-    print(json.dumps({"name": "learned", "figures": figures}))
+    of = arms(chosen)
+    found, figures = trained(chosen, of), {}
+    for arm in of:
+        figures[arm.key] = told(list(found[arm.key].values()))
+        sys.stdout.write(f"{arm.key}: {' '.join(f'{name} {value:.2f}' for name, value in figures[arm.key].items())}\n")
+    for arm in of[1:]:
+        apart = differences(found[arm.key], found[of[0].key])
+        sys.stdout.write(f"{arm.key} less {of[0].key}: {' '.join(f'{n} {m:+.2f} +- {e:.2f}' for n, (m, e) in apart.items())}\n")
+    sys.stdout.write(json.dumps({"name": "learned", "figures": figures}) + "\n")
 
 
 if __name__ == "__main__":

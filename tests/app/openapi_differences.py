@@ -312,6 +312,11 @@ INTENDED: dict[str, str] = {
         tuple(f"components > schemas > PipelineJob > properties > {name} > default" for name in ("aim", "algorithms", "anchor")),
         "The pipeline trains one default sweep from the page's button, the form, the API and the command line",
     ),
+    "components > schemas > SweepCandidateOut > properties > beyond_margin": "(API: `beyond_margin`)",
+    **dict.fromkeys(
+        tuple(f"components > schemas > {job} > properties > anchor" for job in ("PipelineJob", "TrainJob")),
+        "Policies may be held near the best constant amplitude",
+    ),
     **dict.fromkeys(
         ("components > schemas > DayDoseOut", "components > schemas > DoseEntry", "components > schemas > DosePayload"),
         "API: a dose is an entry of the clinic day (kind `dose`; migration 0029)",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,6 +38,7 @@ class Candidate:
         gain: estimated return less that of cDBS, with its lower bound; None where it was not estimated.
         by_posterior: whether the posterior estimated it; sweeps of before have gains by fitted Q evaluation, which decide nothing.
         supported, told: whether sessions lie near what the policy does, and whether they can order policies at all.
+        beyond: whether an outcome is as probably beyond its margin as makes a verdict *unsafe*; None where that was not asked.
         below: the lower bound B of the buffer's random sessions, and the share of its states answered with less; None where unknown.
     """
 
@@ -55,11 +56,16 @@ class Candidate:
     by_posterior: bool = False
     supported: bool = True
     told: bool = True
+    beyond: bool | None = None
 
     @property
     def standing(self) -> tuple[bool, float] | None:
-        """Larger is better, unsupported ones are last; None where the posterior has not spoken, or the data cannot order policies."""
-        return (self.supported, self.gain.value) if self.by_posterior and self.told and self.gain is not None else None
+        """Larger is better; who is unsupported or probably beyond a margin is last, as in the ranking.
+
+        None where the posterior has not spoken, or the data cannot order policies.
+        """
+        fit = self.supported and not self.beyond
+        return (fit, self.gain.value) if self.by_posterior and self.told and self.gain is not None else None
 
     @property
     def leaves_the_logged_range(self) -> bool:
@@ -68,7 +74,7 @@ class Candidate:
 
 
 def candidates(sweep: Sweep) -> list[Candidate]:
-    """The sweep's policies, the largest gain over cDBS by the posterior first and those without supporting sessions last.
+    """The sweep's policies, the largest gain over cDBS by the posterior first; last those without supporting sessions or beyond a margin.
 
     Where the posterior has not spoken of all of them, or the data cannot order policies: by their score on held-out sessions, and in the
     order of training where nothing was held out.
@@ -90,7 +96,8 @@ def better_without_learning(found: Sequence[Candidate], baselines: Sequence[dict
     By the gain over cDBS where the posterior orders all of them, else by the scores on held-out sessions.
     """
     stored = {str(row["controller"]): row.get("gain_over_cdbs") for row in baselines}
-    told = {name: (bool(g["supported"]), float(g["value"])) for name, g in stored.items() if g is not None and g["told"]}
+    fit = {name: bool(g["supported"]) and not g.get("beyond_margin", False) for name, g in stored.items() if g is not None}
+    told = {name: (fit[name], float(g["value"])) for name, g in stored.items() if g is not None and g["told"]}
     if ordered_by_posterior(found) and told:
         name = max(told, key=told.__getitem__)
         return name if told[name] > max(c.standing for c in found if c.standing is not None) else None
@@ -102,11 +109,20 @@ def better_without_learning(found: Sequence[Candidate], baselines: Sequence[dict
 def surely_above_cdbs(found: Sequence[Candidate]) -> Candidate | None:
     """The policy with the largest lower bound of its gain over cDBS by the posterior; None where no bound lies above 0.
 
-    Policies that are retired or that no session supports, and all where the data cannot order policies, are left out.
+    Policies that are retired, that no session supports or that are probably beyond a margin, and all where the data cannot order policies,
+    are left out.
     """
-    judged = {str(k): c for k, c in enumerate(found) if c.by_posterior and c.supported and c.told and c.policy.retired_reason is None}
+    judged = {str(k): c for k, c in enumerate(found) if c.standing is not None and c.standing[0] and c.policy.retired_reason is None}
     name = surest({k: c.gain for k, c in judged.items() if c.gain is not None})
     return None if name is None else found[int(name)]
+
+
+def held_near(config: Mapping[str, Any]) -> str | None:
+    """What a policy's training held it near, by its configuration: `logged`, `cDBS`, or such as `0.70 of cDBS`; None where nothing."""
+    if config.get("anchor") != "constant":
+        return config.get("anchor")
+    amplitude = float(config.get("anchor_amplitude", 1.0))
+    return "cDBS" if amplitude == 1.0 else f"{amplitude:.2f} of cDBS"
 
 
 def below_bound(policy: Policy) -> tuple[float, float] | None:
@@ -122,6 +138,7 @@ def _candidate(policy: Policy) -> Candidate:
     at = _chosen(held, policy.metrics.get("best_update"))
     stored = dict(policy.metrics.get("gain_over_cdbs") or {})
     by, supported, told = stored.pop("by", None), stored.pop("supported", True), stored.pop("told", True)
+    beyond = stored.pop("beyond_margin", None)
     return Candidate(
         policy=policy,
         score=_at(held, "score", at),
@@ -137,6 +154,7 @@ def _candidate(policy: Policy) -> Candidate:
         by_posterior=by == "posterior",
         supported=supported,
         told=told,
+        beyond=beyond,
     )
 
 

@@ -39,5 +39,6 @@ def sweep_page(request: Request, sweep: CurrentSweep, db: Db) -> HTMLResponse:
         standings=wording.STANDINGS,
         looks=parallel.LOOKS,
         algorithm_names=ALGORITHM_NAMES,
+        held_near=comparison.held_near,
     )
     return HTMLResponse(page)

@@ -11,7 +11,7 @@ from typing import Any
 from markupsafe import Markup
 
 from app.learning.schemas import ALGORITHM_NAMES
-from app.learning.sweeps.comparison import Candidate
+from app.learning.sweeps.comparison import Candidate, held_near
 from app.platform.web.charts import Cell
 from app.platform.web.svg import Plane, apart, drawing, shown_tick
 
@@ -26,6 +26,7 @@ class Standing(StrEnum):
     RETIRED = "retired"
     BELOW_TRIED = "below_tried"
     NO_SESSION_NEAR = "no_session_near"
+    BEYOND_MARGIN = "beyond_margin"
     ABOVE_CDBS = "above_cdbs"
     NOT_ABOVE_CDBS = "not_above_cdbs"
     UNTOLD = "untold"
@@ -37,6 +38,7 @@ LOOKS = {
     Standing.NOT_ABOVE_CDBS: ("accent", ""),
     Standing.BELOW_TRIED: ("bad", "8 4"),
     Standing.NO_SESSION_NEAR: ("warn", "2 4"),
+    Standing.BEYOND_MARGIN: ("bad", "2 4"),
     Standing.RETIRED: ("muted", "10 3 2 3"),
     Standing.UNTOLD: ("muted", ""),
 }
@@ -81,6 +83,8 @@ def standing(candidate: Candidate) -> Standing:
         return Standing.UNTOLD
     if not candidate.supported:
         return Standing.NO_SESSION_NEAR
+    if candidate.beyond:
+        return Standing.BEYOND_MARGIN
     return Standing.ABOVE_CDBS if candidate.gain.low > 0 else Standing.NOT_ABOVE_CDBS
 
 
@@ -105,7 +109,7 @@ def _axes(candidates: Sequence[Candidate]) -> list[Axis]:
     return [
         _named("Algorithm", [ALGORITHM_NAMES.get(c.policy.algorithm, c.policy.algorithm) for c in candidates]),
         _named("Aim", [{"steps": "steps", "return": "with r_end"}.get(str(g.get("aim", "steps")), "other") for g in configs]),
-        _named("Held near", ["cDBS" if g.get("anchor") == "constant" else "logged" if "anchor" in g else "nothing" for g in configs]),
+        _named("Held near", [held_near(g) or "nothing" for g in configs]),
         _number("Learning rate", [c.rate for c in candidates], logarithmic=True),
         _number("Critic's rate", [g.get("critic_lr") for g in configs], logarithmic=True),
         _number("Updates", [g.get("updates") for g in configs], logarithmic=True),

@@ -6,23 +6,26 @@ Loaded by those children alone: everything heavy is imported here, and nothing t
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from app.learning.snapshots.buffers import read_buffer
+from app.learning.training.configs import BEST
 from app.learning.training.results import CLONE, POLICY, policy_file, training_file
 from app.platform import files
 from app.platform.jobs import JobError, StepReport, write_atomically
 from ml import rl
 from ml.ope.fqe.score import fqe_value
 from ml.ope.posterior.gains import PosteriorGain, gains_over_cdbs
+from ml.ope.posterior.verdict import Levels
 from ml.policies.from_buffer import behaviour_mean, proportional_from_buffer
 from ml.policies.logged_range import random_bound, share_below_bound, stays_in_range
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.policies.policy import ConstantPolicy, Policy
+from ml.qoc import Margins
 from ml.trajectories import ReplayBuffer
 
 FEWEST_TO_HOLD_OUT = 5
@@ -38,7 +41,7 @@ def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
 
     Args:
         params: `snapshot_sha256`; `algorithm`; `configs`, members of its configuration; `held_out`, whether sessions are left out;
-            optionally `initial` with `checkpoint_sha256` or `onnx_sha256`.
+            `margins` as `_judged_by` takes them; optionally `initial` with `checkpoint_sha256` or `onnx_sha256`.
         workdir: gets each policy as `policy-K.onnx` and its whole training as `training-K.pt`.
         report: learning curves over updates.
 
@@ -49,13 +52,14 @@ def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
     try:
         method = rl.algorithm(params["algorithm"])
         initial = _initial(params.get("initial"))
-        configs = [method.config.from_json(_with_start(given, initial)) for given in params["configs"]]
+        given = with_best_anchor(params["configs"], buffer, params["margins"])
+        configs = [method.config.from_json(_with_start(one, initial)) for one in given]
         updates = configs[0].updates
         learnt, held_out = hold_out(buffer, params["held_out"], every=max(1, updates // 10))
         results = rl.train_many(learnt, configs, report.curves(updates), workdir / "checkpoint.pt", initial, held_out)
     except (rl.TrainingDiverged, rl.CheckpointError, ValueError) as error:
         raise JobError(f"The policies cannot be trained: {error}.") from error
-    gains = stored_gains(buffer, {str(k): result.policy for k, result in enumerate(results)})
+    gains = stored_gains(buffer, {str(k): result.policy for k, result in enumerate(results)}, params["margins"])
     members = []
     for k, result in enumerate(results):
         write_atomically(workdir / policy_file(k), result.policy.to_onnx())
@@ -69,13 +73,13 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
     """Score controllers that learn nothing, or no more than to imitate, as the policies of the sweep are scored.
 
     Args:
-        params: `snapshot_sha256`; `held_out`, whether sessions are left out; `seed`.
+        params: `snapshot_sha256`; `held_out`, whether sessions are left out; `margins` as `_judged_by` takes them; `seed`.
         workdir: gets the clone of the logged behaviour as `clone.onnx`.
         report: progress.
 
     Returns:
         `rows` with `controller`, `score` on held-out sessions, `mean_amplitude` and `gain_over_cdbs`; `best_constant`, the amplitude with
-        the largest gain by the posterior among those that sessions support, None without one; `held_out_sessions`.
+        the largest gain by the posterior among those of `best_supported`, None without one; `held_out_sessions`.
     """
     buffer = read_buffer(params["snapshot_sha256"])
     learnt, held_out = hold_out(buffer, params["held_out"], every=1)
@@ -87,8 +91,7 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
         raise JobError(f"The logged behaviour cannot be cloned: {error}.") from error
     write_atomically(workdir / CLONE, clone.to_onnx())
     report.progress(0.3, "scoring constant amplitudes")
-    constants = _gains(buffer, {f"{a:.2f}": ConstantPolicy(a) for a in CONSTANT_GRID})
-    best = best_supported(constants)
+    best = supported_best(buffer, params["margins"])
     named: dict[str, Policy] = {
         "cDBS": ConstantPolicy(1.0),
         **({} if best is None else {f"best constant, {best:.2f}": ConstantPolicy(best)}),
@@ -100,7 +103,7 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
         named["proportional to beta"] = proportional_from_buffer(learnt)
     states = buffer.transitions().states
     report.progress(0.6, "estimating gains over cDBS")
-    gains = stored_gains(buffer, named)
+    gains = stored_gains(buffer, named, params["margins"])
     rows = [
         {
             "controller": name,
@@ -113,10 +116,37 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
     return {"rows": rows, "best_constant": best, "held_out_sessions": [s.session_id for s in watched]}
 
 
-def best_supported(constants: Mapping[str, PosteriorGain]) -> float | None:
-    """The amplitude with the largest gain among those that sessions support, by names such as `0.70`; None without one."""
-    supported = {name: one.gain.value for name, one in constants.items() if one.supported}
-    return float(max(supported, key=supported.__getitem__)) if supported else None
+def best_supported(constants: Mapping[str, PosteriorGain], level: float) -> float | None:
+    """The amplitude with the largest gain, by names such as `0.70`; None without one.
+
+    Among those that sessions support and, where a QoC is known, that keep all of them within the margins with a probability of `level`.
+    A return without r_end would else take the lowest amplitude at which beta is still well.
+    """
+    fit = {name: one.gain.value for name, one in constants.items() if one.supported and (one.within is None or one.within >= level)}
+    return float(max(fit, key=fit.__getitem__)) if fit else None
+
+
+def supported_best(buffer: ReplayBuffer, margins: Mapping[str, float] | None) -> float | None:
+    """`best_supported` of tenths; `margins` as `_judged_by` takes them."""
+    limits, levels = _judged_by(margins)
+    constants = _gains(buffer, {f"{a:.2f}": ConstantPolicy(a) for a in CONSTANT_GRID}, limits)
+    return best_supported(constants, levels.test_within)
+
+
+def _judged_by(margins: Mapping[str, float] | None) -> tuple[Margins, Levels]:
+    """The participant's margins, and how sure a verdict must be, from members of both by name; the defaults where None."""
+    given = dict(margins or {})
+    levels = {name: given.pop(name) for name in ("test_within", "unsafe_beyond") if name in given}
+    return Margins(**given), Levels(**levels)
+
+
+def with_best_anchor(configs: Sequence[dict[str, Any]], buffer: ReplayBuffer, margins: Mapping[str, float] | None) -> list[dict[str, Any]]:
+    """Configurations in which the anchor `best` is the amplitude that it means; cDBS where no constant has a claim to be better."""
+    if not any(one.get("anchor") == BEST for one in configs):
+        return list(configs)
+    best = supported_best(buffer, margins)
+    found = {"anchor": "constant", "anchor_amplitude": 1.0 if best is None else best}
+    return [one | found if one.get("anchor") == BEST else one for one in configs]
 
 
 def hold_out(buffer: ReplayBuffer, wanted: bool, every: int) -> tuple[ReplayBuffer, rl.HeldOutSessions | None]:
@@ -146,23 +176,27 @@ def _share_of_end(learnt: ReplayBuffer, config: rl.TrainConfig) -> dict[str, Any
     return {"end_reward": {"skill": share.skill, "sessions": share.sessions} if share else None}
 
 
-def stored_gains(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> dict[str, dict[str, Any] | None]:
+def stored_gains(
+    buffer: ReplayBuffer, policies: Mapping[str, Policy], margins: Mapping[str, float] | None = None
+) -> dict[str, dict[str, Any] | None]:
     """Gain of each policy over cDBS by the posterior over the whole buffer, as it is stored; None where it cannot be estimated.
 
-    The policies have seen most of these sessions, which flatters them.
+    The policies have seen most of these sessions, which flatters them. `margins` as `_judged_by` takes them.
     """
-    gains = _gains(buffer, policies)
-    return {name: _stored(gains[name]) if name in gains else None for name in policies}
+    limits, levels = _judged_by(margins)
+    gains = _gains(buffer, policies, limits)
+    return {name: _stored(gains[name], levels) if name in gains else None for name in policies}
 
 
-def _stored(one: PosteriorGain) -> dict[str, Any]:
-    return asdict(one.gain) | {"by": "posterior", "supported": one.supported, "told": one.told}
+def _stored(one: PosteriorGain, levels: Levels) -> dict[str, Any]:
+    beyond = one.within is not None and 1 - one.within >= levels.unsafe_beyond
+    return asdict(one.gain) | {"by": "posterior", "supported": one.supported, "told": one.told, "beyond_margin": beyond}
 
 
-def _gains(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> dict[str, PosteriorGain]:
+def _gains(buffer: ReplayBuffer, policies: Mapping[str, Policy], margins: Margins) -> dict[str, PosteriorGain]:
     """Gains over cDBS; none where the sessions are too few for the posterior."""
     try:
-        return gains_over_cdbs(buffer, policies)
+        return gains_over_cdbs(buffer, policies, margins=margins)
     except ValueError:  # what the method says of sessions that it cannot fit
         return {}
 

@@ -21,6 +21,9 @@ CONSTRAINED = {"low": 1e-4, "high": 1e-3}
 ANCHORED = ("td3_bc", "rebrac")
 """Algorithms whose policies are held near an amplitude."""
 
+BEST = "best"
+"""As `anchor` of a configuration: near the best constant amplitude, which the child process finds before it trains."""
+
 FINE_TUNING = {"low": 1e-7, "high": 1e-5}
 """The paper's learning rates when going on from a tested policy."""
 
@@ -36,7 +39,8 @@ def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]
 
     Args:
         params: what was asked for.
-        starts: one for each policy: None from scratch, else `policy_id`, `algorithm` and the hash of the parent's file.
+        starts: one for each policy: None from scratch, else `policy_id`, `algorithm`, the hash of the parent's file, and `trained_with`,
+            the aim and the anchor of the parent's own training where it had any.
 
     Returns:
         For each group: `key` of its step, `algorithm`, `configs` (members of the algorithm's configuration), `start`.
@@ -82,10 +86,7 @@ def _kinds(params: TrainParams) -> list[tuple[str, dict[str, Any]]]:
     """Kinds of policies in the order of dealing: every algorithm once before any has a second aim or anchor."""
     aims = ("steps", "return") if params.aim == "both" else (params.aim,)
     # Cloning knows no reward, so that its aims would be twins.
-    each = {
-        a: [{"aim": aim} | anchor for aim in (aims if a != "cloning" else ("steps",)) for anchor in _anchors(params, a)]
-        for a in dict.fromkeys(params.algorithms)
-    }
+    each = {a: _variants(aims if a != "cloning" else ("steps",), _anchors(params, a)) for a in dict.fromkeys(params.algorithms)}
     most = max(len(variants) for variants in each.values())
     return [(a, variants[turn]) for turn in range(most) for a, variants in each.items() if turn < len(variants)]
 
@@ -94,17 +95,28 @@ def _fine_tuning(params: TrainParams, k: int, start: dict[str, Any]) -> dict[str
     low, high = _rates(params, start["algorithm"])
     rate = _between(low, high, k, len(params.policies))
     config = _config(params, start["algorithm"], actor_lr=rate, seed=params.seed + k)
-    config |= {"aim": "return" if params.aim == "return" else "steps"} | _anchors(params, start["algorithm"])[0]
+    asked: dict[str, Any] = {"aim": "return" if params.aim == "return" else "steps"} | _anchors(params, start["algorithm"])[0]
+    # By turns means what the parent had: its critics sum that aim, and another anchor would undo what was tested.
+    turns = {name for name, by_turns in (("aim", params.aim == "both"), ("anchor", params.anchor in ("both", "all"))) if by_turns}
+    kept = {name: value for name, value in start.get("trained_with", {}).items() if name.removesuffix("_amplitude") in turns}
+    config |= asked | kept
     return {"key": f"train/{k}", "algorithm": start["algorithm"], "configs": [config], "start": start}
+
+
+def _variants(aims: Sequence[str], anchors: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Every pair of an aim and an anchor. Both change from one to the next, so that few policies have all aims and all anchors."""
+    n, again = len(aims), math.lcm(len(aims), len(anchors))
+    return [{"aim": aims[(k + k // again) % n]} | anchors[k % len(anchors)] for k in range(n * len(anchors))]
 
 
 def _anchors(params: TrainParams, algorithm: str) -> list[dict[str, Any]]:
     """What the policies of an algorithm are held near, as members of its configuration; the logged amplitudes first."""
     logged: dict[str, Any] = {"anchor": "logged"}
     cdbs: dict[str, Any] = {"anchor": "constant", "anchor_amplitude": 1.0}
+    best: dict[str, Any] = {"anchor": BEST}
     if algorithm not in ANCHORED:
         return [{}]
-    return {"logged": [logged], "cdbs": [cdbs], "both": [logged, cdbs]}[params.anchor]
+    return {"logged": [logged], "cdbs": [cdbs], "best": [best], "both": [logged, cdbs], "all": [logged, best, cdbs]}[params.anchor]
 
 
 def _rates(params: TrainParams, algorithm: str) -> tuple[float, float]:

@@ -38,7 +38,7 @@ def run_next_generation(job: JobContext) -> dict[str, Any]:
     declare_fit(job, evaluation)
     declare_distillation(job, sum(len(group["configs"]) for group in groups))
     declare_evaluation(job, evaluation, fit=False)
-    trainings = training_calls(training, snapshot["sha256"], groups)
+    trainings = training_calls(training, snapshot, groups)
     results = job.compute_all([*trainings, *fit_calls(evaluation, snapshot["sha256"])])
     policies = store_trained(job, training, snapshot["id"], groups, results[: len(trainings)])
     models = store_members(job, results[len(trainings) :])

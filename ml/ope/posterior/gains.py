@@ -8,10 +8,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from ml.ope.compare.gain import gain_over
+from ml.ope.estimate import Estimate
 from ml.ope.posterior.estimator import build
+from ml.ope.posterior.verdict import slacks
 from ml.policies.policy import ConstantPolicy, Policy
 from ml.progress import Report, silent
+from ml.qoc import Margins
 from ml.returns import Gain
 from ml.trajectories import ReplayBuffer
 
@@ -25,17 +30,19 @@ class PosteriorGain:
 
     Attributes:
         gain: of the return. supported: whether sessions lie near what the policy would do. told: whether the sessions can order policies.
+        within: probability that every known QoC lies within its margin of cDBS; None where no QoC is known.
     """
 
     gain: Gain
     supported: bool
     told: bool
+    within: float | None = None
 
 
 def gains_over_cdbs(
-    buffer: ReplayBuffer, policies: Mapping[str, Policy], seed: int = 0, report: Report = silent
+    buffer: ReplayBuffer, policies: Mapping[str, Policy], seed: int = 0, report: Report = silent, margins: Margins | None = None
 ) -> dict[str, PosteriorGain]:
-    """Gain of every policy, by name; a policy that acts as cDBS has one of about 0.
+    """Gain of every policy, by name; a policy that acts as cDBS has one of about 0. `margins` are the default ones where None.
 
     Raises:
         ValueError: fewer than two sessions with usable steps.
@@ -47,6 +54,13 @@ def gains_over_cdbs(
         numbered = {str(k): policy for k, policy in enumerate([*(policies[n] for n in part), ConstantPolicy(1.0)])}
         *estimates, cdbs = fitted.evaluate(numbered).values()
         for name, one in zip(part, estimates, strict=True):
-            found[name] = PosteriorGain(gain_over(one, cdbs), one.supported, bool(one.details["skill"]["told"]))
+            within = _within(one, cdbs, margins or Margins())
+            found[name] = PosteriorGain(gain_over(one, cdbs), one.supported, bool(one.details["skill"]["told"]), within)
         report(len(found) / len(names), "estimating gains over cDBS")
     return found
+
+
+def _within(one: Estimate, cdbs: Estimate, margins: Margins) -> float | None:
+    """Share of the draws in which every known QoC lies within its margin."""
+    gaps = slacks(one, cdbs, margins)
+    return float(np.mean(np.min(np.stack(list(gaps.values())), axis=0) >= 0)) if gaps else None

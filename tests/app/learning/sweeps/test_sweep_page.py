@@ -25,6 +25,7 @@ from app.platform.jobs import service as jobs
 from app.study.repository import participant_by_code
 from ml.ope.posterior.gains import PosteriorGain
 from ml.policies.policy import ConstantPolicy
+from ml.population.virtual import world
 from ml.returns import Gain
 from ml.trajectories import ReplayBuffer
 
@@ -152,12 +153,14 @@ def test_cdbs_gains_nothing_over_itself_and_no_stimulation_is_not_supported_by_o
     assert (off["by"], off["supported"]) == ("posterior", False)
 
 
-def test_the_best_constant_is_one_that_sessions_support() -> None:
-    def one(value: float, supported: bool) -> PosteriorGain:
-        return PosteriorGain(Gain(value, value, 1.0), supported, True)
+def test_the_best_constant_is_one_that_sessions_support_and_that_keeps_the_outcomes_within_their_margins() -> None:
+    def one(value: float, supported: bool, within: float | None = None) -> PosteriorGain:
+        return PosteriorGain(Gain(value, value, 1.0), supported, True, within)
 
-    assert best_supported({"0.10": one(50.0, False), "0.70": one(3.0, True), "1.00": one(0.0, True)}) == 0.7
-    assert best_supported({"0.10": one(50.0, False)}) is None
+    assert best_supported({"0.10": one(50.0, False), "0.70": one(3.0, True), "1.00": one(0.0, True)}, 0.8) == 0.7
+    assert best_supported({"0.10": one(50.0, False)}, 0.8) is None
+    doses = {"0.40": one(9.0, True, 0.3), "0.60": one(5.0, True, 0.8), "0.80": one(2.0, True, 0.97)}
+    assert [best_supported(doses, level) for level in (0.8, 0.9, 0.99)] == [0.6, 0.8, None]
 
 
 def test_policies_are_ordered_by_the_posterior_and_not_by_the_held_out_score(store: Store, client: TestClient) -> None:
@@ -169,6 +172,24 @@ def test_policies_are_ordered_by_the_posterior_and_not_by_the_held_out_score(sto
     page = client.get(f"/sweeps/{sweep.id}").text
     assert "rl-1 has the largest lower bound" in page, "the larger bound of rl-2 is extrapolation"
     assert page.count(">no session near</span>") == 1
+
+
+def test_what_is_probably_beyond_a_margin_stands_last_as_in_the_ranking(store: Store, client: TestClient) -> None:
+    sweep = store(
+        metrics(9.0, 6.0, 2.0, 0.0, beyond_margin=True), metrics(2.0, 3.0, 1.0, 0.0, beyond_margin=False), metrics(1.0, 2.0, 1.5, 0.0)
+    )
+    told = client.get(f"/api/v1/sweeps/{sweep.id}").json()
+    assert [(c["name"], c["beyond_margin"]) for c in told["candidates"]] == [("rl-1", False), ("rl-2", None), ("rl-0", True)]
+    page = client.get(f"/sweeps/{sweep.id}").text
+    assert "rl-2 has the largest lower bound" in page, "the larger bound of rl-0 is of a return, and an outcome pays for it"
+    assert page.count(">beyond a margin</span>") == 1
+
+
+def test_a_stored_gain_says_whether_an_outcome_is_probably_beyond_its_margin() -> None:
+    buffer, policies = world("A", 14).data("stratified"), {"0.50": ConstantPolicy(0.5), "0.90": ConstantPolicy(0.9)}
+    wide = {"grasp_share": 0.9, "rating_points": 8.0, "tremor_points": 99.0}
+    assert [g["beyond_margin"] for g in stored_gains(buffer, policies).values() if g] == [True, False]
+    assert [g["beyond_margin"] for g in stored_gains(buffer, policies, wide).values() if g] == [False, False]
 
 
 def test_a_controller_without_learning_that_no_session_supports_is_marked(store: Store, client: TestClient) -> None:

@@ -12,11 +12,13 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.learning.models import Policy
-from app.learning.schemas import AlgorithmName, TrainParams
-from app.learning.sweeps.comparison import Candidate, better_without_learning
+from app.learning.schemas import DEFAULT_SWEEP, AlgorithmName, TrainParams
+from app.learning.sweeps.comparison import Candidate, better_without_learning, held_near
+from app.learning.training.compute import with_best_anchor
 from app.learning.training.configs import ANCHORED, training_groups
 from app.platform import files
 from ml.policies.onnx_policy import OnnxPolicy
+from ml.population.virtual import world
 from ml.rl import ALGORITHMS, TrainedPolicy
 
 Upload = Callable[..., int]
@@ -65,6 +67,46 @@ def test_what_holds_a_policy_is_offered_to_the_algorithms_that_have_it_and_logge
         assert len({getattr(config, "anchor", None) for config in made}) == 1
     (tuned,) = training_groups(TrainParams(policies=[3], anchor="cdbs"), [{"policy_id": 3, "algorithm": "td3_bc"}])
     assert (tuned["configs"][0]["anchor"], tuned["configs"][0]["anchor_amplitude"]) == ("constant", 1.0)
+
+
+def test_the_six_of_the_default_sweep_have_both_aims_and_all_three_anchors() -> None:
+    groups = training_groups(TrainParams(count=6, **DEFAULT_SWEEP), [None] * 6)
+    dealt = sorted((c["seed"], g["algorithm"], c["aim"], held_near(c)) for g in groups for c in g["configs"])
+    assert [d[1:] for d in dealt] == [
+        ("ddpg", "steps", None), ("rebrac", "steps", "logged"), ("ddpg", "return", None),
+        ("rebrac", "return", "best"), ("rebrac", "steps", "cDBS"), ("rebrac", "return", "logged"),
+    ]  # fmt: skip
+    many = training_groups(TrainParams(algorithms=["rebrac"], aim="both", anchor="all", count=6), [None] * 6)
+    assert len({(c["aim"], held_near(c)) for g in many for c in g["configs"]}) == 6, "every pair once"
+
+
+def test_a_policy_is_held_near_the_dose_that_the_sessions_speak_for_and_near_cdbs_without_one() -> None:
+    buffer = world("A", 10).data("stratified")
+    given = [{"anchor": "best", "seed": 1}, {"anchor": "logged", "seed": 2}]
+    margins = {"grasp_share": 0.1, "rating_points": 1.0, "tremor_points": 10.0, "test_within": 0.8}
+    found, logged = with_best_anchor(given, buffer, margins)
+    assert logged == given[1]
+    assert (found["anchor"], found["seed"]) == ("constant", 1)
+    assert found["anchor_amplitude"] in (0.6, 0.7, 0.8), "truth allows 0.4 to 0.89, and these save a fifth"
+    assert held_near(found) == f"{found['anchor_amplitude']:.2f} of cDBS"
+    narrow = margins | {"tremor_points": 1e-6, "rating_points": 1e-6, "grasp_share": 1e-6}
+    (fallen_back,) = with_best_anchor(given[:1], buffer, narrow)
+    assert held_near(fallen_back) == "cDBS", "no dose keeps margins of nothing"
+
+
+def test_a_fine_tuned_policy_keeps_its_parents_aim_and_anchor_where_they_go_by_turns() -> None:
+    own = {"aim": "return", "anchor": "constant", "anchor_amplitude": 0.7}
+    starts = [
+        {"policy_id": 3, "algorithm": "rebrac", "trained_with": own},
+        {"policy_id": 4, "algorithm": "ddpg", "trained_with": {"aim": "return"}},
+    ]
+    by_turns, plain = (
+        [g["configs"][0] for g in training_groups(TrainParams(policies=[3, 4], **asked), starts)]
+        for asked in ({"aim": "both", "anchor": "all"}, {"aim": "steps", "anchor": "logged"})
+    )
+    assert {name: by_turns[0][name] for name in own} == own
+    assert (by_turns[1]["aim"], "anchor" in by_turns[1]) == ("return", False)
+    assert [(c["aim"], c.get("anchor")) for c in plain] == [("steps", "logged"), ("steps", None)], "what is asked for by name is done"
 
 
 def test_every_fine_tuned_policy_goes_on_with_its_parents_algorithm_at_the_papers_rates() -> None:
