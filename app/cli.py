@@ -24,14 +24,19 @@ from app.platform import logs
 from app.platform.audit.commands import app as audit_app
 from app.platform.bucket import bucket
 from app.platform.database import database_place, supervise_database, transaction
-from app.platform.errors import BetaloopError
+from app.platform.start import in_one_line, require_data_folder, require_free
 from app.platform.tables import load_tables
 from app.platform.terminal import ACTOR, AsJson, Code, say, show
 from app.platform.upkeep.commands import app as upkeep_app
 from app.settings import Settings, get_settings
 from app.simulation import commands as simulation
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="betaloop: the study system for closed-loop deep brain stimulation.")
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,  # a fault of ours is told as Python tells it, in lines that can be searched
+    help="betaloop: the study system for closed-loop deep brain stimulation.",
+)
 study_app = typer.Typer(no_args_is_help=True, help="Whole studies.")
 app.add_typer(accounts.user_app, name="user")
 app.add_typer(accounts.token_app, name="token")
@@ -69,8 +74,11 @@ def main() -> None:
     try:
         logs.configure_own()
         app(standalone_mode=True)
-    except (BetaloopError, RuntimeError) as error:
-        say(f"betaloop: {error}")
+    except Exception as error:
+        said = in_one_line(error)
+        if said is None:
+            raise
+        say(f"betaloop: {said}")
         sys.exit(1)
 
 
@@ -94,9 +102,12 @@ def serve(
     logs.configure()
     if (tls_certificate is None) != (tls_key is None):
         raise typer.BadParameter("TLS needs both --tls-certificate and --tls-key")
-    bring_up_to_date()
     settings = get_settings()
-    decide_cookies(settings, host or settings.host, tls=tls_certificate is not None)
+    host, port = host or settings.host, settings.port if port is None else port
+    require_free(host, port)
+    require_data_folder()
+    bring_up_to_date()
+    decide_cookies(settings, host, tls=tls_certificate is not None)
     if (store := bucket()) is not None:
         store.check_keys(settings)
     supervise_database()
@@ -109,7 +120,7 @@ def serve(
     threading.Thread(target=keep_resuming, args=("the service", threading.Event()), daemon=True).start()
     threading.Thread(target=keep_sealing, args=(threading.Event(),), daemon=True).start()
     uvicorn.run(
-        service, host=host or settings.host, port=port or settings.port, log_level=settings.log_level.lower(), access_log=False,
+        service, host=host, port=port, log_level=settings.log_level.lower(), access_log=False,
         timeout_graceful_shutdown=3, timeout_keep_alive=75, ssl_certfile=tls_certificate, ssl_keyfile=tls_key,
     )  # fmt: skip
 
@@ -121,6 +132,7 @@ def worker(slots: Annotated[int | None, typer.Option(min=1, help="Compute steps 
     from app.platform.migrate import migrate as bring_up_to_date
 
     logs.configure()
+    require_data_folder()
     bring_up_to_date()
     if (store := bucket()) is not None:
         store.check_keys(get_settings())

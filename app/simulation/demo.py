@@ -28,8 +28,9 @@ from app.accounts import repository as accounts_repository
 from app.accounts import service as accounts
 from app.accounts.models import Role
 from app.platform.database import now, transaction
-from app.platform.errors import BetaloopError, Conflict
+from app.platform.errors import BetaloopError
 from app.platform.migrate import migrate
+from app.platform.start import require_data_folder, require_free
 from app.platform.web.templates import minutes_left
 from app.settings import get_settings, private_folder, written_once
 from app.simulation.demo_study import DemoVisit, demo_visits, participant_body
@@ -53,7 +54,8 @@ def run_demo(host: str, port: int) -> None:
     settings = get_settings()
     os.environ["BETALOOP_DATA_DIR"] = str(settings.data_dir.resolve())
     url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"  # noqa: S104
-    _refuse_taken_port(url)
+    require_free(host, port)
+    require_data_folder()
     started = time.monotonic()
     with console.status("Starting the database …"):
         migrate()
@@ -132,14 +134,6 @@ def _stop(children: list[subprocess.Popen[bytes]]) -> None:
 
 def _interrupt(_number: int, _frame: Any) -> None:
     raise KeyboardInterrupt
-
-
-def _refuse_taken_port(url: str) -> None:
-    try:
-        httpx.get(f"{url}/healthz", timeout=2)
-    except httpx.TransportError:
-        return
-    raise Conflict(f"Something already answers at {url}.", "Is a demo running? Otherwise choose another port: betaloop demo --port 8001")
 
 
 def _wait_until_up(url: str, children: list[subprocess.Popen[bytes]]) -> None:

@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from app.platform.signatures.schemas import SignatureOut, Signing
 from app.platform.signatures.service import SignatureState
-from app.platform.web.schemas import Bool, Int, Model, Number, Text
+from app.platform.web.schemas import Bool, Day, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
 from app.study.sessions.models import Activity
 from app.study.settings.schemas import CDBS_MA, SettingsOut
@@ -53,7 +53,7 @@ class VisitIn(Model):
     """A visit to make."""
 
     number: Int = Field(ge=1, le=10_000)
-    date: dt.date | None = None
+    date: Day | None = None
     note: Text = Field("", max_length=4000)
     cdbs_amplitudes: list[CdbsAmplitudeModel] = Field(default_factory=list, max_length=8)
 
@@ -61,7 +61,7 @@ class VisitIn(Model):
 class VisitChange(Model):
     """What a person may correct of a visit; what is left out stays. A list of amplitudes replaces the whole list."""
 
-    date: dt.date | None = None
+    date: Day | None = None
     note: Text | None = Field(None, max_length=4000)
     cdbs_amplitudes: list[CdbsAmplitudeModel] | None = Field(None, max_length=8)
     reason: Text = Field(min_length=1, max_length=1000, description="Why; kept in the audit trail.")

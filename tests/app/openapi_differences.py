@@ -38,6 +38,7 @@ INTENDED: dict[str, str] = {
     "components > schemas > ParticipantIn > properties > is_study_code": (
         "API: a study code that may be a name or holds a year or date of birth is questioned (422, `questions`)"
     ),
+    "components > schemas > ParticipantIn > properties > site": "API: `site` of an enrolment takes `STUDY/SITE`",
     **dict.fromkeys(
         (
             "components > schemas > SweepCandidateOut > properties > gain_method",

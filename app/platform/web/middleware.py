@@ -19,9 +19,10 @@ from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 from starlette.middleware.base import RequestResponseEndpoint
+from starlette.requests import ClientDisconnect
 from starlette.routing import compile_path
 
-from app.platform.errors import BetaloopError, DatabaseAway, Forbidden, StorageFull, TooMany, Unauthorized
+from app.platform.errors import BetaloopError, Conflict, DatabaseAway, Forbidden, StorageFull, TooMany, Unauthorized
 from app.platform.web.body_limit import BodyLimit, Judge
 from app.platform.web.compression import Compression
 from app.platform.web.error_pages import advised, kept_entries
@@ -50,6 +51,7 @@ def install(app: FastAPI, judge: Judge) -> None:
     app.add_exception_handler(DBAPIError, _database_error)
     app.add_exception_handler(PoolTimeout, _database_error)
     app.add_exception_handler(OSError, _system_error)
+    app.add_exception_handler(ClientDisconnect, _gone)
     app.add_exception_handler(Exception, _unknown_error)
 
 
@@ -140,14 +142,25 @@ async def _bad_input(request: Request, error: Exception) -> Response:
 
 
 class _PlainError(BetaloopError):
-    def __init__(self, status: int, detail: str) -> None:
-        super().__init__(detail)
+    def __init__(self, status: int, detail: str, hint: str = "") -> None:
+        super().__init__(detail, hint)
         self.status, self.title = status, detail
+
+
+_HINTS = {
+    400: "Send JSON as one document in UTF-8 (nested less than a thousand deep, numbers of ordinary length); send forms and files as "
+    "a browser or `curl -F` does.",
+    404: "/api/v1/openapi.json lists every address of this service.",
+}
+"""What to do about errors that the framework finds before any rule of ours is asked."""
 
 
 async def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    response = await _answer(request, _PlainError(error.status_code, str(error.detail)))
+    if isinstance(error.__cause__, OSError):  # what the framework calls a body that cannot be read, where our disk could not take it
+        return await _system_error(request, error.__cause__)
+    hint = _HINTS.get(error.status_code, "") if not wants_page(request) else ""
+    response = await _answer(request, _PlainError(error.status_code, str(error.detail), hint))
     response.headers.update(error.headers or {})
     if error.status_code == 405:
         response.headers["Allow"] = ", ".join(_methods(request))
@@ -163,16 +176,36 @@ def _methods(request: Request) -> list[str]:
     return sorted(found)
 
 
+async def _gone(request: Request, error: Exception) -> Response:
+    """Nobody is there any more to read an answer; no fault of ours, and nothing that strangers should fill the log with."""
+    log.debug("the caller left before the whole request had come", path=request.url.path)
+    return await _answer(request, _PlainError(400, "The request ended before it was whole."))
+
+
 RETRY_S = 5
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _DISK_FULL = "53100"
+_AT_ONCE = {"23505", "23503", "40001", "40P01"}
+"""Of what two requests do at the same moment: a row that is there already, one that is gone, transactions in each other's way."""
 
 
 async def _database_error(request: Request, error: Exception) -> Response:
-    """503 where the database is away, restarting or out of connections, 507 where its disk is full; anything else is an error of ours."""
+    """503 where the database is away, restarting or out of connections, 507 where its disk is full, 409 where somebody else was first;
+    anything else is an error of ours.
+    """
     state = getattr(getattr(error, "orig", None), "sqlstate", None)
     if state == _DISK_FULL:
         return await _full(request, error)
+    if state in _AT_ONCE:
+        constraint = getattr(getattr(getattr(error, "orig", None), "diag", None), "constraint_name", None)
+        log.warning("two requests at the same moment", path=request.url.path, sqlstate=state, constraint=constraint)
+        return await _answer(
+            request,
+            Conflict(
+                "Another request changed the same at the same moment, and was first; or this one was sent twice.",
+                "Look at what is stored now, then send what is missing.",
+            ),
+        )
     invalidated = isinstance(error, DBAPIError) and error.connection_invalidated
     unreached = isinstance(error, PoolTimeout) or (isinstance(error, OperationalError) and state is None)
     if not (invalidated or unreached or (state or "")[:2] == "08" or (state or "")[:3] in {"57P", "533"}):

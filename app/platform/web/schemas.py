@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Depends, Query
@@ -38,6 +38,21 @@ def sensible_time(value: datetime) -> datetime:
 
 Moment = Annotated[datetime, AfterValidator(sensible_time)]
 """A time; without an offset it is UTC."""
+
+
+def sensible_day(value: date) -> date:
+    """A day within the same years; a year that was mistyped would stand before, or after, every other visit.
+
+    Raises:
+        ValueError: a year outside 1990-2200.
+    """
+    if not 1990 <= value.year <= 2200:
+        raise ValueError("the year must lie between 1990 and 2200")
+    return value
+
+
+Day = Annotated[date, AfterValidator(sensible_day)]
+"""A day of the calendar."""
 RowId = Annotated[int, Field(ge=1, le=2**31 - 1)]
 Text = Annotated[str, Field(pattern=r"^[^\x00]*$")]
 """Text without the zero character, which PostgreSQL cannot hold."""

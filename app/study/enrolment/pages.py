@@ -60,7 +60,7 @@ def _enrolment(
         values=values,
         stated=form.AT_ENROLMENT,
         constants=form.LATER,
-        sites=sites,
+        sites=[(service.in_study(s), s.name, s.study.name) for s in sites],
         questioned=bool(error and any("field" not in q for q in error.extra.get("questions", ()))),
         remarks=field_notes(error, known | values),
         problem=error.problem(request.url.path) if error else None,

@@ -19,6 +19,8 @@ class ParticipantIn(Model):
     is_study_code: Bool = Field(
         False, description="A person has looked at a code that resembles a name or holds a birth year or date: it is a study code."
     )
-    site: Text | None = Field(None, max_length=40, description="Code of the site; needed when there are several.")
+    site: Text | None = Field(
+        None, max_length=81, description="Code of the site; needed when there are several. `STUDY/SITE` where two studies share a code."
+    )
     settings: SettingsIn = Field(default_factory=SettingsIn)
     sure: list[Literal["cdbs_amplitude_ma"]] | None = Field(None, max_length=1, description=SURE)

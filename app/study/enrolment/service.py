@@ -58,9 +58,16 @@ def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
 
 
 def _site(db: Session, code: str | None, caller: Caller) -> Site:
-    sites = [s for s in repository.sites(db, caller) if code in (None, s.code)]
+    """The site of a code, or the only one at which the caller enrols."""
+    readable = [s for s in repository.sites(db, caller) if code in (None, s.code, in_study(s))]
+    if not readable:
+        raise NotFound(f"There is no site '{code}', or you have no access to it.")
+    sites = [s for s in readable if caller.may(can.WRITE_STUDY, s.study_id, s.id)] or readable
     if len(sites) == 1:
         return sites[0]
-    if not sites:
-        raise NotFound(f"There is no site '{code}', or you have no access to it.")
-    raise Invalid("There are several sites.", f"Name one: {', '.join(s.code for s in sites)}.")
+    raise Invalid("There are several sites.", f"Name one: {', '.join(map(in_study, sites))}.")
+
+
+def in_study(site: Site) -> str:
+    """A site by its study, for two studies may have sites of one code."""
+    return f"{site.study.code}/{site.code}"

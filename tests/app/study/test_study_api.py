@@ -129,3 +129,16 @@ def test_a_controller_without_a_policy_takes_none(client: TestClient, enrolled: 
     refused = client.patch(f"/api/v1/sessions/{session}", json={"policy_id": 1})
     assert refused.status_code == 422
     assert "A cdbs session has no policy" in refused.json()["detail"]
+
+
+@pytest.mark.parametrize("day", ["0001-01-01", "0226-03-02", "1989-12-31", "2201-01-01", "9999-12-31"])
+def test_a_mistyped_year_of_a_visit_is_refused(client: TestClient, enrolled: str, day: str) -> None:
+    made = client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": day})
+    assert made.status_code == 422
+    assert "the year must lie between 1990 and 2200" in made.json()["detail"]
+    visit = client.get("/api/v1/participants/P1/visits").json()["items"][0]["id"]
+    assert client.patch(f"/api/v1/visits/{visit}", json={"date": day, "reason": "typed"}).status_code == 422
+    typed = {"number": "2", "date": day, "note": ""}
+    page = client.post("/participants/P1/visits", data=typed, headers={"accept": "text/html"})
+    assert page.status_code == 422
+    assert "between 1990 and 2200" in page.text

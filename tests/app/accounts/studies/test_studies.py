@@ -11,6 +11,8 @@ from typer.testing import CliRunner
 from app import cli
 from app.accounts import service as accounts
 from app.accounts.models import Role
+from app.accounts.permissions import SYSTEM
+from app.accounts.studies.service import grant, study_to_manage
 from app.platform.database import transaction
 from tests.conftest import PASSWORD
 
@@ -135,3 +137,25 @@ def test_the_page_shows_members_and_keeps_others_out(client: TestClient, client_
     assert "Adaptive" in text
     assert "admin@clinic.example" in text
     assert clinician.get("/studies").status_code == 403
+
+
+def test_sites_of_one_code_in_two_studies_are_told_apart(client: TestClient, second: None) -> None:
+    assert client.post("/api/v1/studies/main/sites", json={"code": "north", "name": "North"}).status_code == 201
+    refused = client.post("/api/v1/participants", json={"code": "P9", "site": "north"})
+    assert refused.status_code == 422
+    assert "ADAPT/north, main/north" in refused.json()["hint"]
+    assert enrol(client, "P9", "ADAPT/north") == 201
+    assert 'value="main/north"' in client.get("/participants/new").text
+    form = {"code": "P10", "site": "main/north", "beta_unit": "uV", "beta_source": "table"}
+    assert client.post("/participants", data=form, follow_redirects=False).status_code == 303
+    assert client.get("/api/v1/participants/P10").json()["site"] == "north"
+
+
+def test_who_enrols_in_one_study_alone_names_no_site(client: TestClient, second: None) -> None:
+    with transaction("test") as db:
+        accounts.add_user(db, "both@clinic.example", Role.COORDINATOR, PASSWORD, study_code="main")
+        grant(db, study_to_manage(db, "ADAPT", SYSTEM), "both@clinic.example", Role.VIEWER, None, SYSTEM)
+    both = browser(client, "both@clinic.example")
+    assert 'name="site"' not in both.get("/participants/new").text
+    assert both.post("/participants", data={"code": "P9", "beta_unit": "uV", "beta_source": "table"}).status_code == 303
+    assert client.get("/api/v1/participants/P9").json()["site"] == "main"

@@ -205,3 +205,13 @@ def test_the_routes_of_uploads_read_their_forms_encrypted(client: TestClient, en
         fields = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
         assert client.post(path, data=fields, files={"file": ("t.csv", table)}).status_code in (200, 201, 303), path
     assert [stream.closed for stream in made] == [True, True]
+
+
+def test_a_disk_that_fills_while_a_form_comes_is_named(client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = lambda: raw_bytes._stream(open("/dev/full", "r+b", buffering=0), bytes(32))  # noqa: E731, SIM115 - its reader closes it
+    monkeypatch.setattr(encrypted_form, "raw_stream", full)
+    for path in ("/api/v1/uploads", f"/participants/{enrolled}/upload"):
+        fields = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+        answer = client.post(path, data=fields, files={"file": ("t.csv", b"1" * (1 << 20))}, headers={"accept": "text/html"})
+        assert answer.status_code == 507, path
+        assert "There is no room left on the disk." in answer.text

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from structlog.testing import capture_logs
 
 from app.platform.web.body_limit import PLAIN_LIMIT
 
@@ -32,3 +35,21 @@ def test_a_document_that_states_no_length_is_cut_off(client: TestClient) -> None
 def test_a_document_within_the_limit_is_read(client: TestClient) -> None:
     answer = client.post("/api/v1/participants", content=b" " * (PLAIN_LIMIT - 10) + b"{}", headers={"content-type": "application/json"})
     assert answer.status_code == 422
+
+
+def test_who_leaves_before_the_whole_form_has_come_fills_no_log(client: TestClient) -> None:
+    sent: list[dict[str, Any]] = []
+    parts = iter([{"type": "http.request", "body": b"email=a", "more_body": True}, {"type": "http.disconnect"}])
+
+    async def receive() -> dict[str, Any]:
+        return next(parts)
+
+    async def send(message: dict[str, Any]) -> None:
+        sent.append(message)
+
+    form = (b"content-type", b"application/x-www-form-urlencoded")
+    scope = {"type": "http", "method": "POST", "path": "/sign-in", "query_string": b"", "headers": [form], "client": ("127.0.0.1", 1)}
+    scope |= {"server": ("testserver", 80), "scheme": "http", "http_version": "1.1", "raw_path": b"/sign-in", "root_path": ""}
+    with capture_logs() as logs:
+        asyncio.run(client.app(scope, receive, send))
+    assert [line for line in logs if line["log_level"] in ("warning", "error")] == []

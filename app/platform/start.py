@@ -1,0 +1,92 @@
+"""What a start needs of its machine, asked before anything else is done, and why a command could not be carried out, in a line."""
+
+from __future__ import annotations
+
+import errno
+import socket
+from tempfile import TemporaryFile
+
+from pydantic import ValidationError
+from sqlalchemy.exc import OperationalError
+
+from app.platform.database import database_place
+from app.platform.errors import BetaloopError, Conflict
+from app.settings import Settings, get_settings
+
+_WHY = {
+    errno.EADDRINUSE: ("another program listens there", "Is betaloop running already? Else choose another port: --port 8001."),
+    errno.EACCES: ("this user may not listen there", "Choose a port from 1024 up: --port 8000. A proxy before it may have port 443."),
+    errno.EADDRNOTAVAIL: ("this machine has no such address", "Give one that it has, or 0.0.0.0 for all of them: --host."),
+}
+
+
+def require_free(host: str, port: int) -> None:
+    """Raises Conflict where nobody can listen at this port of this machine."""
+    try:
+        if not 0 <= port < 1 << 16:
+            raise OverflowError("no port")  # which some systems would cut to 16 bits
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except (OSError, OverflowError) as error:
+        raise Conflict(f"No service can listen at {host}:{port}: there is no such address.", "Give another: --host, --port.") from error
+    with socket.socket(family, kind, protocol) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was left a moment ago is free
+        try:
+            probe.bind(address)
+        except OSError as error:
+            why, hint = _WHY.get(error.errno or 0, (str(error.strerror), "Give another address: --host, --port."))
+            raise Conflict(f"No service can listen at {host}:{port}: {why}.", hint) from error
+
+
+def require_data_folder() -> None:
+    """Make the data folder and try it, before somebody's first upload does. A full disk is no reason not to start: a start makes room.
+
+    Raises:
+        OSError: it cannot be written to.
+    """
+    folder = get_settings().data_dir
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise type(error)(error.errno, error.strerror, str(folder)) from error
+
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_NOT_REACHED = {None, "28P01", "28000", "3D000", "57P03", "53300"}
+"""SQLSTATE of a server that is not there, refuses who asks, has no such database, starts, or has no connection left."""
+_DATABASE_HINT = (
+    "Start it, or correct BETALOOP_DATABASE_URL (BETALOOP_OWNER_URL for migrate, backup and restore); `betaloop where` reads them."
+)
+_RIGHTS = "Run betaloop as the user whom it belongs to, or give this one the right"
+_NO_FOLDER = "There is a file where a folder is wanted: name another place"
+_FOLDER_HINTS = {
+    errno.EACCES: _RIGHTS,
+    errno.EPERM: _RIGHTS,
+    errno.EROFS: "It is mounted for reading alone: mount it for writing, or name another place",
+    errno.ENOSPC: "Make room on its disk, then do this again",
+    errno.EDQUOT: "Have this user's quota raised or make room, then do this again",
+    errno.ENOTDIR: _NO_FOLDER,
+    errno.EEXIST: _NO_FOLDER,
+}
+
+
+def in_one_line(error: Exception) -> str | None:
+    """Why a command could not be carried out and what to do about it; None for what is a fault of ours."""
+    if isinstance(error, BetaloopError | RuntimeError):
+        return str(error)
+    if isinstance(error, OperationalError) and getattr(error.orig, "sqlstate", None) in _NOT_REACHED:
+        return f"the database at {database_place()} does not let us in. It says: {_last_line(error.orig)} {_DATABASE_HINT}"
+    if isinstance(error, ValidationError) and error.title == Settings.__name__:
+        wrong = (f"BETALOOP_{'_'.join(map(str, e['loc'])).upper()}={e['input']}: {e['msg']}" for e in error.errors())
+        return f"{'; '.join(wrong)}. Correct the environment or the file .env."
+    if isinstance(error, OSError) and error.errno in _FOLDER_HINTS and error.filename is not None:
+        return f"{error.filename}: {error.strerror}. {_FOLDER_HINTS[error.errno]} (the data folder is BETALOOP_DATA_DIR)."
+    return None
+
+
+def _last_line(error: BaseException | None) -> str:
+    """The last line of what a server or its library says, ending as a sentence does."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip() and "Is the server running" not in line]
+    return f"{lines[-1].rstrip('.') if lines else 'nothing'}."
