@@ -91,14 +91,17 @@ class Caller:
         """Whether some grant that covers the site holds the permission; without a study: whether any grant does."""
         if self.is_system:
             return True
-        if self.token_scope is not None and (allowed := SCOPES[self.token_scope]) is not None and permission not in allowed:
-            return False
         return any(
-            permission in PERMISSIONS[g.role]
-            and (study_id is None or g.study_id == study_id)
-            and (site_id is None or g.site_id is None or g.site_id == site_id)
-            for g in self.grants
+            (study_id is None or g.study_id == study_id) and (site_id is None or g.site_id is None or g.site_id == site_id)
+            for g in self.grants_with(permission)
         )
+
+    def grants_with(self, permission: str) -> tuple[Grant, ...]:
+        """The grants that hold a permission, as far as the scope of the token leaves it. Whoever needs to know where asks this."""
+        left = SCOPES[self.token_scope] if self.token_scope is not None else None
+        if left is not None and permission not in left:
+            return ()
+        return tuple(g for g in self.grants if permission in PERMISSIONS[g.role])
 
     def require(self, permission: str, study_id: int | None = None, site_id: int | None = None) -> None:
         """Raises NotFound for what the caller may not see, Forbidden for what it may see but not do."""

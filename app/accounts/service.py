@@ -16,7 +16,7 @@ from app.accounts import repository, second_factor
 from app.accounts.addresses import LONGEST_ADDRESS, normal_address
 from app.accounts.models import ApiToken, Membership, Role, Scope, SignIn, SignInAttempt, Study, User
 from app.accounts.passwords import MIN_PASSWORD, weakness
-from app.accounts.permissions import MANAGE_ACCOUNTS, PERMISSIONS, READ_AUDIT, Caller, Grant
+from app.accounts.permissions import MANAGE_ACCOUNTS, READ_AUDIT, Caller, Grant
 from app.platform.audit import record
 from app.platform.database import new_session, now
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
@@ -106,9 +106,8 @@ def confirm_password(user_id: int, password: str, code: str = "") -> None:
 
 def administers(caller: Caller, study_id: int, site_id: int | None = None) -> bool:
     """Whether the caller may manage accounts of a site, or (site_id None) of a whole study."""
-    return caller.is_system or any(
-        MANAGE_ACCOUNTS in PERMISSIONS[g.role] and g.study_id == study_id and g.site_id in (None, site_id) for g in caller.grants
-    )
+    where = caller.grants_with(MANAGE_ACCOUNTS)
+    return caller.is_system or any(g.study_id == study_id and g.site_id in (None, site_id) for g in where)
 
 
 def manages(caller: Caller, user: User) -> bool:
@@ -118,7 +117,7 @@ def manages(caller: Caller, user: User) -> bool:
 
 def reads_whole_audit(db: Session, caller: Caller) -> bool:
     """Whether the caller may read the audit trail, whose rows belong to no study: a grant over every study, at all of its sites."""
-    whole = {g.study_id for g in caller.grants if READ_AUDIT in PERMISSIONS[g.role] and g.site_id is None}
+    whole = {g.study_id for g in caller.grants_with(READ_AUDIT) if g.site_id is None}
     return caller.is_system or all(study.id in whole for study in repository.studies(db))
 
 

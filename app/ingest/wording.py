@@ -55,6 +55,9 @@ def cut_short(upload_id: int, kept: int, of: int) -> tuple[str, str]:
     return what, f"What is kept is read by itself within some minutes: its report will be on /uploads/{upload_id}.{rest}"
 
 
+MADE_ANEW = "What was kept of it was missing or damaged; these bytes took its place."
+
+
 def read_by_mapping(mapping: ColumnMapping) -> str:
     """That a table was read by a column mapping of its study, and by which."""
     return f"read by the study's column mapping '{mapping.name}', version {mapping.version}"

@@ -77,9 +77,9 @@ class Bucket:
             return None
 
     def put(self, path: Path, sha256: str) -> None:
-        """Store a file; there is no object until all of it has arrived. What is there already stays."""
+        """Store a file; there is no object until all of it has arrived. What is there already stays, unless it was damaged since."""
         size = path.stat().st_size
-        if self.size(sha256) == size:
+        if self.size(sha256) == size and self.hash_of(sha256) == sha256:
             return
         self._asked(lambda: self._fs.put_file(str(path), self._name(sha256)))
         if self.size(sha256) != size:

@@ -19,6 +19,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO
 
+import structlog
 from sqlalchemy import BigInteger, CheckConstraint, String, func
 from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.orm import Mapped, Session, mapped_column
@@ -27,6 +28,8 @@ from app.platform.bucket import Bucket, StoreAway, bucket
 from app.platform.database import Base
 from app.platform.errors import BetaloopError
 from app.settings import get_settings, private_folder
+
+log = structlog.get_logger()
 
 CHUNK = 1 << 20
 _LOCK = ".lock"
@@ -120,7 +123,7 @@ def is_whole(sha256: str, size: int | None = None, hashes: bool = True) -> bool:
     path = _place(sha256)
     if not path.is_file() or (size is not None and path.stat().st_size != size):
         return False
-    return not hashes or hash_file(path)[0] == sha256
+    return not hashes or whole_at(path, sha256)
 
 
 def prune_copies() -> int:
@@ -312,7 +315,9 @@ def store(db: Session, content: bytes | Path, *, copy: bool = True) -> StoredFil
 
 
 def keep(draft: Path, *, copy: bool = True) -> str:
-    """Move a draft to where its bytes live, on disk or in the bucket when this returns, and give their hash; what is there already stays.
+    """Move a draft to where its bytes live, on disk or in the bucket when this returns, and give their hash.
+
+    What is there already stays, unless it was damaged since: then these bytes take its place.
 
     Args:
         copy: whether this machine keeps a copy of what is in the bucket; not of what is to be removed for good one day.
@@ -321,7 +326,7 @@ def keep(draft: Path, *, copy: bool = True) -> str:
     target = _place(sha256)
     if (store := bucket()) is not None:
         store.put(draft, sha256)
-    if target.exists() or (store is not None and not copy):
+    if whole_at(target, sha256) or (store is not None and not copy):
         draft.unlink()
     else:
         draft.chmod(0o600)
@@ -330,6 +335,17 @@ def keep(draft: Path, *, copy: bool = True) -> str:
         draft.rename(target)
         _sync(target.parent)
     return sha256
+
+
+def whole_at(path: Path, sha256: str) -> bool:
+    """Whether a file is there with the bytes of its hash. One that cannot be read is damaged."""
+    try:
+        return hash_file(path)[0] == sha256
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        log.error("a stored file cannot be read", sha256=sha256, error=type(error).__name__, errno=error.errno)
+        return False
 
 
 def read(sha256: str) -> bytes:

@@ -37,7 +37,8 @@ def in_force(visit: Visit, hemisphere: Hemisphere | None, settings: SettingsVers
     """The cDBS amplitude of a visit's hemisphere and program, mA, else the settings' shorthand; None where nobody stated one.
 
     Args:
-        alone: no other program of this side stimulates; else the amplitude stated for another program says nothing about this one.
+        settings: the participant's present ones. alone: no other program of this side stimulates; else the amplitude stated for another
+            program says nothing about this one.
 
     Raises:
         Invalid: as `stated_at`.
@@ -47,7 +48,21 @@ def in_force(visit: Visit, hemisphere: Hemisphere | None, settings: SettingsVers
         if of_side and not any(a.program == program for a in of_side):
             return None
     stated = stated_at(visit, hemisphere, program)
-    return plausible(settings.cdbs_amplitude_ma, "The participant's settings state") if stated is None else stated
+    usual = held_settings(visit, settings).cdbs_amplitude_ma
+    return plausible(usual, "The participant's settings state") if stated is None else stated
+
+
+def held_settings(visit: Visit, settings: SettingsVersion) -> SettingsVersion:
+    """The settings whose cDBS amplitude a visit goes by where it states none: a locked one by those at its lock.
+
+    A new amplitude says nothing of days that are closed; the fractions, energies and signatures of those stay as they were.
+
+    Args:
+        settings: the participant's present ones, by which an open visit goes.
+    """
+    if not visit.locked or visit.locks[-1].settings_version_id is None:
+        return settings
+    return next(v for v in visit.participant.settings if v.id == visit.locks[-1].settings_version_id)
 
 
 def of_session(session: StudySession, settings: SettingsVersion, program: int = 0, alone: bool = True) -> float | None:

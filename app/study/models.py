@@ -225,6 +225,8 @@ class VisitLock(Base):
     reason: Mapped[str] = mapped_column(Text)
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
+    settings_version_id: Mapped[int | None] = mapped_column(ForeignKey("settings_version.id"))
+    """The participant's settings when the visit was locked, by which it goes while it stays locked; None of an unlock."""
     visit: Mapped[Visit] = relationship(back_populates="locks")
 
 

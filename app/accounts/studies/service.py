@@ -87,13 +87,20 @@ def grant(db: Session, study: Study, email: str, role: Role, site_code: str | No
     """Give a user a role in a study, at one site or at all; a role that the user has there is replaced.
 
     Raises:
-        NotFound: no such user or site. Invalid: one's own role, or a blinded assessor with another role in the study.
+        NotFound: no such user or site. Invalid: one's own role, or a blinded assessor with another role in the study. Forbidden: to blind
+            somebody who works in a study that the caller does not administer, for it would close that study to them.
     """
     user, site_id = _user(db, email), site_of(db, study, site_code).id if site_code else None
     _require_other(user, caller)
     others = [m.role for m in user.memberships if m.study_id == study.id and m.site_id != site_id]
     if others and Role.BLINDED_ASSESSOR in (role, *others) and {role, *others} != {Role.BLINDED_ASSESSOR}:
         raise Invalid("A blinded assessor has no other role in the study.", "End the other role first.")
+    elsewhere = [m for m in user.memberships if m.study_id != study.id and m.role != Role.BLINDED_ASSESSOR]
+    if role is Role.BLINDED_ASSESSOR and not all(administers(caller, m.study_id, m.site_id) for m in elsewhere):
+        raise Forbidden(
+            f"{user.email} works in a study that you do not administer, and a blinded assessor is blinded in every study.",
+            "Ask an administrator of both studies, or name somebody else.",
+        )
     found = repository.membership(db, user.id, study.id, site_id)
     if found is None:
         found = Membership(user_id=user.id, study_id=study.id, site_id=site_id, role=role)

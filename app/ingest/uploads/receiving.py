@@ -116,7 +116,7 @@ class Receiver:
         try:
             with raw_bytes.received(one.stream, limit_mb * 1024 * 1024) as (raw, sha256, size):
                 if known := self._known(name, sha256):
-                    return known
+                    return self._mended(raw, known)
                 content = self._store(raw) if size else StoredContent("unreadable", None, None, Redaction(), EMPTY)
         except OverflowError as error:
             raise TooLarge(f"'{name}' is larger than {limit_mb} MiB.", "Split it, or have BETALOOP_UPLOAD_LIMIT_MB raised.") from error
@@ -146,6 +146,33 @@ class Receiver:
         note = f"The same bytes came before, as '{row.name}' in upload {row.upload_id}; nothing was stored again."
         report = FileReport(name=row.name, understood=[note])
         return FileOutcome(name, row, [report], duplicate=True, same_bytes=True, recordings=self._recordings(row))
+
+    def _mended(self, raw: RawFile, known: FileOutcome) -> FileOutcome:
+        """The outcome for bytes that came before; where what was kept of them is missing or damaged, they take its place."""
+        row = known.row
+        if row.stored_sha256 is None or files.is_whole(row.stored_sha256):
+            return known
+        content = self._store(raw)
+        if content.problem is not None or content.stored_sha256 is None:
+            self._drop_seal(content.quarantine_sha256)
+            return known
+        log.warning("a stored file was damaged and is made anew", upload_file=row.id, sha256=row.stored_sha256)
+        row.stored_sha256, row.redactor_version = content.stored_sha256, REDACTOR_VERSION
+        sealed_still = row.quarantine_sha256 is not None and content.quarantine_sha256 is not None and row.decided_at is None
+        if sealed_still:
+            row.quarantine_sha256 = content.quarantine_sha256
+        else:
+            self._drop_seal(content.quarantine_sha256)
+        self.db.commit()
+        known.reports[0].understood.append(wording.MADE_ANEW)
+        return known
+
+    def _drop_seal(self, sealed: str | None) -> None:
+        """Remove bytes that were encrypted for nothing: they are encrypted anew each time, so that no other row has them."""
+        if sealed is not None:
+            self.db.delete(self.db.get_one(files.StoredFile, sealed))
+            self.db.commit()
+            files.remove(sealed)
 
     def _recordings(self, row: UploadFile) -> list[Recording]:
         mine = [*repository.recordings_of_file(self.db, row.id), *repository.recordings_by_id(self.db, known_recordings(row))]
@@ -321,17 +348,15 @@ class Receiver:
     def _failed_before(self, name: str, row: UploadFile, before: UploadFile, report: FileReport, problem: UndecodableFile) -> FileOutcome:
         """The same bytes were of no use before, and still are: they are kept once."""
         report.understood.append(f"The same bytes came before, as file {before.id} in upload {before.upload_id}; they are kept once.")
-        sealed = row.quarantine_sha256
+        sealed, kept = row.quarantine_sha256, before.quarantine_sha256
         before.report = {**(before.report or {}), **lasting(row)}
+        if sealed is not None and kept is not None and not files.is_whole(kept):
+            before.quarantine_sha256, sealed = sealed, None
+            before.stored_sha256 = before.quarantine_sha256 if before.stored_sha256 == kept else before.stored_sha256
         self.db.delete(row)
-        self.db.flush()
-        if sealed is not None:
-            # encrypted anew each time, so that no other row has these bytes
-            self.db.delete(self.db.get_one(files.StoredFile, sealed))
         store_reports(before, [report])
         self.db.commit()
-        if sealed is not None:
-            files.remove(sealed)
+        self._drop_seal(sealed)
         return FileOutcome(name, before, [report], duplicate=True, same_bytes=True, for_sender=problem.for_sender)
 
 

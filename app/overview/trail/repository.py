@@ -9,7 +9,7 @@ from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import QueryableAttribute, aliased
 
 from app.accounts.models import Site
-from app.accounts.permissions import PERMISSIONS, READ_AUDIT, Caller
+from app.accounts.permissions import READ_AUDIT, Caller
 from app.platform.audit import AUDITED, AuditEvent
 from app.platform.database import Base
 
@@ -42,7 +42,7 @@ class _Scope:
     """The sites of a reader, and conditions that lead to them."""
 
     def __init__(self, caller: Caller) -> None:
-        grants = [g for g in caller.grants if READ_AUDIT in PERMISSIONS[g.role]]
+        grants = caller.grants_with(READ_AUDIT)
         allowed = [(Site.study_id == g.study_id) & (Site.id == g.site_id if g.site_id else true()) for g in grants]
         self._sites = select(Site.id).where(or_(false(), *allowed))
         self._studies = sorted({g.study_id for g in grants if g.site_id is None})

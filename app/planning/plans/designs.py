@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.platform.errors import Invalid
-from app.study.cdbs_amplitude import plausible
+from app.study.cdbs_amplitude import held_settings, plausible
 from app.study.models import SettingsVersion, Visit
 from ml.designs import LOW_AMPLITUDE, Decision, DesignedSession, DesignSettings, amplitudes, lay_out
 
@@ -117,8 +117,8 @@ def bounds_of(visit: Visit, settings: SettingsVersion, lower_bound: float) -> tu
     stated = [
         (str(a.hemisphere), plausible(a.amplitude_ma, f"Visit {visit.number} states")) for a in visit.cdbs_amplitudes if a.program == 0
     ]
-    shorthand = plausible(settings.cdbs_amplitude_ma, "The participant's settings state")
-    sides: list[tuple[str | None, float]] = list(stated) or ([(None, shorthand)] if shorthand is not None else [])
+    usual = plausible(held_settings(visit, settings).cdbs_amplitude_ma, "The participant's settings state")
+    sides: list[tuple[str | None, float]] = list(stated) or ([(None, usual)] if usual is not None else [])
     if not sides:
         raise Invalid(
             "The plan has random sessions with a lower bound, and the cDBS amplitude that it is a fraction of is not known.",

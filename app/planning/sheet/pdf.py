@@ -19,6 +19,7 @@ from app.planning.sheet.content import HASH
 from app.planning.sheet.ink import INK, LINE, MUTED, clock, shade
 from app.planning.sheet.latin1_text import latin
 from app.platform.signatures.service import SignatureState
+from app.study.cdbs_amplitude import held_settings
 from app.study.characteristics.service import fields_of
 from app.study.wording import MEDICATION, characteristics_words, doses_words
 
@@ -138,8 +139,8 @@ def _circumstances(pdf: _Sheet, view: PlanView) -> None:
     stated = [
         f"{a.hemisphere} {a.amplitude_ma:g} mA" + (f" (program {a.program})" if a.program else "") for a in view.visit.cdbs_amplitudes
     ]
-    shorthand = view.visit.participant.current_settings.cdbs_amplitude_ma
-    amplitude = ", ".join(stated) or (f"{shorthand:g} mA" if shorthand else "__________ mA")
+    usual = held_settings(view.visit, view.visit.participant.current_settings).cdbs_amplitude_ma
+    amplitude = ", ".join(stated) or (f"{usual:g} mA" if usual else "__________ mA")
     pdf.set_text_color(*INK)
     pdf.set_font("Helvetica", "", 9)
     pdf.cell(0, 6, latin(f"cDBS amplitude: {amplitude}    Stimulation site and program: {'_' * 50}"), new_x=XPos.LMARGIN, new_y=YPos.NEXT)

@@ -1,7 +1,8 @@
 """Backup and restore of a whole installation: database, stored files and keys, sealed with a key that does not lie beside them.
 
-The database is dumped first, in one snapshot; stored files are never changed or deleted, so every file that the dump names is there when
-the files are copied after it. Passwords of the embedded server stay out: a restored installation has its own.
+The database is dumped first, in one snapshot; stored files are never changed, and none but quarantined ones are removed, so every other
+file that the dump names is there when the files are copied after it. Passwords of the embedded server stay out: a restored installation
+has its own.
 """
 
 from __future__ import annotations
@@ -53,11 +54,13 @@ class Restored:
 
     Attributes:
         tables: rows by table. files: stored files, each with its hash checked. made_at: when the backup was made, ISO 8601.
+        damaged: hashes of stored files that were missing or damaged already when the backup was made.
     """
 
     tables: dict[str, int]
     files: int
     made_at: str
+    damaged: list[str]
 
 
 def make_key(path: Path) -> None:
@@ -92,6 +95,9 @@ def read_key(path: Path, *apart_from: Path) -> bytes:
 def backup(folder: Path, key_file: Path) -> dict[str, Any]:
     """Make a backup in a new folder and return its manifest; a backup that was cut off has no manifest.
 
+    A stored file that is missing or damaged is named in the manifest (`damaged`) and left out; all else is backed up. So is one that
+    somebody removed for good meanwhile (`removed`), as they may a quarantined one.
+
     Raises:
         BackupError: the folder exists, the key cannot be used, or the database cannot be dumped.
     """
@@ -105,13 +111,12 @@ def backup(folder: Path, key_file: Path) -> dict[str, Any]:
     manifest: dict[str, Any] = {"form": FORM, "betaloop": __version__, "made_at": now().isoformat(), "revision": revision, "parts": {}}
     with transaction("backup") as db:
         seal(db)
+    before = _stored()
     with _sealed(folder / DATABASE, key) as out:
         _dump(out)
-    names = _stored()
+    names = sorted({*before, *_stored()})
     with _sealed(folder / FILES, key) as out, tarfile.open(fileobj=out, mode="w|") as archive:
-        for sha256 in names:
-            with files.borrowed(sha256) as path:
-                archive.add(path, arcname=sha256, recursive=False)
+        absent = [sha256 for sha256 in names if not _added(archive, sha256)]
     with _sealed(folder / KEYS, key) as out, tarfile.open(fileobj=out, mode="w|") as archive:
         for path in sorted((settings.data_dir / "secrets").glob("*")):
             if path.is_file() and path.name not in SERVER_PASSWORDS:
@@ -119,7 +124,8 @@ def backup(folder: Path, key_file: Path) -> dict[str, Any]:
     for name in (DATABASE, FILES, KEYS):
         sha256, size = files.hash_file(folder / name)
         manifest["parts"][name] = {"sha256": sha256, "bytes": size}
-    manifest["files"] = len(names)
+    manifest["files"], named = len(names) - len(absent), set(_stored())
+    manifest |= {"damaged": [s for s in absent if s in named], "removed": [s for s in absent if s not in named]}
     draft = folder / f"{MANIFEST}.new"
     draft.write_text(json.dumps(manifest, indent=1) + "\n")
     draft.rename(folder / MANIFEST)
@@ -141,10 +147,12 @@ def restore(folder: Path, key_file: Path) -> Restored:
     with (folder / DATABASE).open("rb") as source:
         _load(SealedReader(source, key))
     migrate()
-    missing = [sha256 for sha256 in _stored() if not files.is_whole(sha256)]
+    damaged = manifest.get("damaged", [])
+    known = {*damaged, *manifest.get("removed", [])}
+    missing = [sha256 for sha256 in _stored() if sha256 not in known and not files.is_whole(sha256)]
     if missing:
         raise BackupError(f"{len(missing)} of the stored files are missing or damaged, the first {missing[0]}.", "Use another backup.")
-    return Restored(_rows(get_engine()), count, manifest["made_at"])
+    return Restored(_rows(get_engine()), count, manifest["made_at"], damaged)
 
 
 def verify(folder: Path) -> dict[str, Any]:
@@ -167,6 +175,15 @@ def verify(folder: Path) -> dict[str, Any]:
                 f"{name} is missing or damaged: it does not have the hash of the manifest.", "Use another copy of the backup."
             )
     return manifest
+
+
+def _added(archive: tarfile.TarFile, sha256: str) -> bool:
+    """Put a stored file into the archive; whether it is whole, for what is not whole is left out."""
+    with files.borrowed(sha256) as path:
+        if not files.whole_at(path, sha256):
+            return False
+        archive.add(path, arcname=sha256, recursive=False)
+    return True
 
 
 @contextmanager

@@ -46,18 +46,30 @@ def backup_key(path: Annotated[Path, typer.Argument(help="New file for the key."
 
 @app.command(epilog="Example: betaloop backup /mnt/backups/2026-11-22 --key-file /media/key/betaloop.key")
 def backup(folder: Annotated[Path, typer.Argument(help="New folder for the backup.")], key_file: KeyFile, as_json: AsJson = False) -> None:
-    """Back up database, stored files and keys, encrypted; the service may go on meanwhile."""
+    """Back up database, stored files and keys, encrypted; the service may go on meanwhile. Exit code 1 where stored files are damaged."""
     manifest = backups.backup(folder, key_file)
     size = sum(part["bytes"] for part in manifest["parts"].values())
-    show(manifest, as_json, f"{folder}: {manifest['files']} stored files, {size / (1 << 20):.1f} MiB, encrypted.")
+    said = f"{folder}: {manifest['files']} stored files, {size / (1 << 20):.1f} MiB, encrypted."
+    show(manifest, as_json, "\n".join([said, *_damaged(manifest["damaged"], "All else is in this backup.")]))
+    if manifest["damaged"]:
+        raise typer.Exit(1)
 
 
 @app.command(epilog="Example: betaloop restore /mnt/backups/2026-11-22 --key-file /media/key/betaloop.key")
 def restore(folder: Annotated[Path, typer.Argument(help="Folder of the backup.")], key_file: KeyFile, as_json: AsJson = False) -> None:
     """Bring a backup back into an empty installation, and check every stored file. Stop the service first."""
     done = backups.restore(folder, key_file)
-    result = {"made_at": done.made_at, "files": done.files, "rows": done.tables}
-    show(result, as_json, f"Restored the backup of {done.made_at}: {sum(done.tables.values())} rows, {done.files} files.")
+    result = {"made_at": done.made_at, "files": done.files, "rows": done.tables, "damaged": done.damaged}
+    said = f"Restored the backup of {done.made_at}: {sum(done.tables.values())} rows, {done.files} files."
+    show(result, as_json, "\n".join([said, *_damaged(done.damaged, "They were so when the backup was made.")]))
+
+
+def _damaged(hashes: list[str], rest: str) -> list[str]:
+    """Lines that name stored files which are missing or damaged; none where all are whole."""
+    if not hashes:
+        return []
+    hint = f"{rest} Send their files once more, or take them from an older backup; `betaloop doctor --hashes` names what is still missing."
+    return [f"{len(hashes)} stored files are missing or damaged: {', '.join(hashes)}.", hint]
 
 
 @app.command(epilog="Example: betaloop doctor --hashes")

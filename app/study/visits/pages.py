@@ -17,7 +17,7 @@ from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import render
 from app.settings import get_settings
-from app.study import repository, service
+from app.study import cdbs_amplitude, repository, service
 from app.study.blinding import arm, may_know, visible_arm
 from app.study.deps import CurrentParticipant, CurrentVisit
 from app.study.doses.serializers import dose_out
@@ -151,6 +151,7 @@ def shown_visit(
         limit_mb=get_settings().upload_limit_mb,
         proposals=[s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id],
         seen=seen,
+        shorthand_ma=cdbs_amplitude.held_settings(visit, visit.participant.current_settings).cdbs_amplitude_ma,
         draft=seen | {"reason": ""} | (typed or {}),
         labels=form.labels(seen),
         may_write=may(caller, can.WRITE_STUDY, visit.participant),

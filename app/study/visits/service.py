@@ -70,7 +70,8 @@ def _set(db: Session, visit: Visit, locked: bool, reason: str, caller: Caller) -
     if visit.locked is locked:
         raise Conflict(f"Visit {visit.number} is {'locked already' if locked else 'not locked'}.", "Load the page again.")
     set_reason(db, reason.strip())
-    row = VisitLock(visit_id=visit.id, locked=locked, reason=reason.strip(), created_by=caller.label)
+    held = visit.participant.current_settings.id if locked else None
+    row = VisitLock(visit_id=visit.id, locked=locked, reason=reason.strip(), created_by=caller.label, settings_version_id=held)
     visit.locks.append(row)
     db.flush()
     return row

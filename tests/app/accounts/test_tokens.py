@@ -62,6 +62,36 @@ def test_a_scope_blinds_nobody_whose_role_may_know_what_ran(scope: Scope) -> Non
         assert Caller("x", 1, (Grant(1, None, role),), token_scope=scope).may(READ_ARMS, 1) is knows, role
 
 
+@pytest.mark.parametrize("scope", [Scope.READ, Scope.UPLOAD, Scope.JOBS])
+def test_a_narrow_token_of_an_administrator_changes_no_study(
+    db: Session, ada: str, client_with: Callable[[str], TestClient], scope: Scope
+) -> None:
+    token = service.create_token(db, ada, "tablet", scope)
+    db.commit()
+    client, named = client_with(token), {"code": "other", "name": "Other"}
+    changes = [
+        client.post("/api/v1/studies", json=named),
+        client.patch("/api/v1/studies/main", json={"name": "Other", "reason": "x"}),
+        client.post("/api/v1/studies/main/sites", json=named),
+        client.patch("/api/v1/studies/main/sites/main", json={"name": "Other", "reason": "x"}),
+    ]
+    assert [answer.status_code for answer in changes] == [403] * 4
+    assert "Other" not in client.get("/api/v1/studies").text
+
+
+def test_a_host_in_disguise_opens_nothing_more(db: Session, ada: str, client_with: Callable[[str], TestClient]) -> None:
+    """What is open to a token for figures, and to blinded assessors, is told by the address that is answered, not by what `Host` says."""
+    service.add_user(db, "blind@clinic.example", Role.BLINDED_ASSESSOR, PASSWORD)
+    figures = service.create_token(db, ada, "figures", Scope.METRICS)
+    blinded = service.create_token(db, "blind@clinic.example", "tablet")
+    db.commit()
+    for host in ("x", "x/metrics?", "x/participants?", "x/metrics#", "x/account/\\", "user@x/metrics?:80"):
+        for path in ("/api/v1/studies", "/audit", "//metrics/../audit", "/audit%3F/metrics", "/audit%00", "/audit%0A"):
+            for token in (figures, blinded):
+                answer = client_with(token).get(path, headers={"Host": host})
+                assert answer.status_code in (403, 404), (host, path, answer.status_code)
+
+
 def test_a_token_ends_on_its_day(db: Session, ada: str) -> None:
     token = service.create_token(db, ada, "tablet", days=1)
     assert service.caller_of_token(db, token) is not None

@@ -116,6 +116,22 @@ def test_a_blinded_assessor_gets_no_second_role(client: TestClient, client_as: C
     assert "no other role in the study" in both.text
 
 
+def test_nobody_blinds_who_works_in_a_study_of_others(client: TestClient, client_as: Clients) -> None:
+    """A blinded assessor is blinded in every study: the role would close the other study to them."""
+    client_as("clinician")
+    add_second(client)
+    with transaction("test") as db:
+        accounts.add_user(db, "eve@clinic.example", Role.ADMIN, PASSWORD, study_code="ADAPT")
+        accounts.add_user(db, "own@clinic.example", Role.VIEWER, PASSWORD, study_code="ADAPT")
+    eve = browser(client, "eve@clinic.example")
+    wanted = {"email": "clinician@clinic.example", "role": "blinded_assessor"}
+    refused = eve.post("/studies/ADAPT/members", data=wanted)
+    assert refused.status_code == 403
+    assert "works in a study that you do not administer" in refused.text
+    assert eve.post("/studies/ADAPT/members", data=wanted | {"role": "viewer"}).status_code == 303
+    assert eve.post("/studies/ADAPT/members", data=wanted | {"email": "own@clinic.example"}).status_code == 303
+
+
 def test_the_command_line_does_the_same(client: TestClient) -> None:
     with transaction("test") as db:
         accounts.add_user(db, "ada@clinic.example", Role.VIEWER, PASSWORD)

@@ -80,11 +80,12 @@ def test_a_wrong_password_locks_nothing(client: TestClient, db: Session, visit: 
         "update trace set valid_bits = overlay(valid_bits placing '\\x00'::bytea from 1)",
         "update session_segment set stop_s = stop_s - 2",
         "update visit_lock set reason = 'another'",
+        "insert into cdbs_amplitude (visit_id, hemisphere, program, amplitude_ma) select id, 'left', 0, 2.75 from visit",
     ],
 )
 def test_any_change_breaks_it_visibly(client: TestClient, owner_db: Session, visit: int, change: str) -> None:
     assert lock(client, visit).status_code == 200
-    table = change.split()[1].replace("into", "qoc")
+    table = change.split()[2 if change.startswith("insert") else 1]
     owner_db.execute(text(f"alter table {table} disable trigger user"))  # what the owner can do, and no service
     assert owner_db.execute(text(change)).rowcount > 0  # type: ignore[attr-defined]
     owner_db.commit()
@@ -92,16 +93,32 @@ def test_any_change_breaks_it_visibly(client: TestClient, owner_db: Session, vis
     assert BROKEN in client.get(f"/visits/{visit}", headers=PAGE).text
 
 
-@pytest.mark.parametrize(("stated", "found"), [([], "broken"), ([{"hemisphere": "left", "amplitude_ma": 3.0}], "stands")])
-def test_the_cdbs_amplitude_of_the_settings_is_signed_where_the_visit_states_none(
-    client: TestClient, visit: int, stated: list[dict[str, Any]], found: str
-) -> None:
-    body = {"cdbs_amplitudes": stated, "reason": "as programmed"}
-    assert client.patch(f"/api/v1/visits/{visit}", json=body).status_code == 200
+def cdbs_ma(client: TestClient, visit: int) -> float | None:
+    (session,) = client.get(f"/api/v1/visits/{visit}/sessions").json()["items"]
+    return client.get(f"/api/v1/sessions/{session['id']}/trace").json()["cdbs_amplitude_ma"]
+
+
+def test_a_locked_visit_goes_by_the_settings_at_its_lock(client: TestClient, visit: int) -> None:
+    """Where it states no cDBS amplitude; a new one says nothing of a day that is closed."""
+    before = cdbs_ma(client, visit)
+    assert before is not None
     assert lock(client, visit).status_code == 200
-    other = {"settings": {"cdbs_amplitude_ma": 2.5}, "reason": "programmed anew"}
+    other = {"settings": {"cdbs_amplitude_ma": before + 0.5}, "reason": "programmed anew"}
     assert client.put("/api/v1/participants/P1/settings", json=other).status_code == 200
-    assert state(client, visit) == found
+    assert (state(client, visit), cdbs_ma(client, visit)) == ("stands", before)
+    assert "(from the settings at the lock)" in client.get(f"/visits/{visit}", headers=PAGE).text
+    assert client.post(f"/api/v1/visits/{visit}/unlock", json={"reason": "rating misread"}).status_code == 200
+    assert cdbs_ma(client, visit) == before + 0.5, "an open visit goes by the present settings"
+    assert lock(client, visit).status_code == 200
+    assert (state(client, visit), cdbs_ma(client, visit)) == ("stands", before + 0.5)
+
+
+def test_another_amplitude_in_the_version_at_the_lock_breaks_the_signature(client: TestClient, owner_db: Session, visit: int) -> None:
+    assert lock(client, visit).status_code == 200
+    owner_db.execute(text("alter table settings_version disable trigger user"))
+    owner_db.execute(text("update settings_version set cdbs_amplitude_ma = cdbs_amplitude_ma + 0.5"))
+    owner_db.commit()
+    assert state(client, visit) == "broken"
 
 
 def test_a_file_read_again_with_the_same_values_breaks_nothing_and_other_values_do(

@@ -1,0 +1,32 @@
+"""The permissions of each role and scope, written down a second time: whoever changes one says so here, and in the README."""
+
+from __future__ import annotations
+
+from app.accounts.models import Role, Scope
+from app.accounts.permissions import PERMISSIONS, SCOPES
+
+READER = {"read", "arms:read"}
+STAFF = READER | {"study:write", "qoc:write", "settings:write", "upload", "jobs:run", "plan:draft", "bundles:take", "audit:read"}
+CLINICIAN = STAFF | {"quarantine:decide", "plan:approve", "visit:lock", "queries:ask"}
+
+
+def test_a_role_may_what_is_written_here() -> None:
+    assert {
+        Role.BLINDED_ASSESSOR: {"read", "qoc:write"},
+        Role.VIEWER: READER,
+        Role.MONITOR: READER | {"audit:read", "queries:ask"},
+        Role.COORDINATOR: READER | {"study:write", "qoc:write", "upload", "audit:read", "queries:ask"},
+        Role.CLINICIAN: CLINICIAN,
+        Role.ENGINEER: STAFF | {"policies:write"},
+        Role.ADMIN: CLINICIAN | {"policies:write", "accounts:write"},
+    } == PERMISSIONS
+
+
+def test_a_scope_leaves_what_is_written_here() -> None:
+    assert {
+        Scope.FULL: None,
+        Scope.READ: READER,
+        Scope.UPLOAD: READER | {"upload"},
+        Scope.JOBS: READER | {"jobs:run"},
+        Scope.METRICS: frozenset(),
+    } == SCOPES

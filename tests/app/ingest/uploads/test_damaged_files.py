@@ -1,0 +1,93 @@
+"""A stored file that is missing or damaged comes back with the bytes that it was made of; a backup goes on around it, and names it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+from typer.testing import CliRunner
+
+from app import cli
+from app.ingest.wording import MADE_ANEW
+from app.platform import files
+from app.platform.upkeep import backup as backups
+from tests.app.every_route import TABLE
+
+DAMAGES = ("changed", "missing", "unreadable")
+
+
+def damage(sha256: str, how: str) -> None:
+    path = files.path_of(sha256)
+    content = path.read_bytes()
+    path.unlink()
+    if how == "changed":
+        path.write_bytes(bytes([content[0] ^ 1]) + content[1:])
+    if how == "unreadable":
+        path.mkdir()  # opens, and gives no bytes: as a file on a bad disk
+
+
+def send(client: TestClient, participant: str, name: str, content: bytes, **stated: str) -> dict[str, Any]:
+    answer = client.post("/api/v1/uploads", data={"participant": participant, **stated}, files={"file": (name, content)})
+    assert answer.status_code in (200, 201), answer.text
+    (file,) = answer.json()["files"]
+    return dict(file) | {"told": answer.text}
+
+
+def send_unreadable(client: TestClient, participant: str) -> None:
+    file = {"file": ("x.csv", b"no recording at all")}
+    assert client.post("/api/v1/uploads", data={"participant": participant}, files=file).status_code == 422
+
+
+@pytest.mark.parametrize("how", ["changed", "missing"])
+def test_the_same_bytes_sent_again_take_the_place_of_a_damaged_file(client: TestClient, enrolled: str, how: str) -> None:
+    first = send(client, enrolled, "s.csv", TABLE, visit="1", controller="random")
+    whole = files.read(first["stored_sha256"])
+    assert MADE_ANEW not in send(client, enrolled, "s.csv", TABLE)["told"]
+    damage(first["stored_sha256"], how)
+    again = send(client, enrolled, "s.csv", TABLE)
+    assert again["duplicate"]
+    assert MADE_ANEW in again["told"]
+    assert files.read(again["stored_sha256"]) == whole
+    assert MADE_ANEW not in send(client, enrolled, "s.csv", TABLE)["told"]
+
+
+def test_a_damaged_file_in_quarantine_comes_back_encrypted(client: TestClient, enrolled: str, db: Session) -> None:
+    sealed = text("select quarantine_sha256 from upload_file")
+    send_unreadable(client, enrolled)
+    before = db.scalar(sealed)
+    assert before is not None
+    damage(before, "changed")
+    send_unreadable(client, enrolled)
+    db.rollback()
+    (after,) = db.scalars(sealed).all()
+    assert files.is_whole(after)
+    assert b"no recording" not in files.read(after)
+    assert db.scalars(text("select count(*) from upload_file f join stored_file s on s.sha256 = f.quarantine_sha256")).all() == [1]
+
+
+def test_bytes_that_are_kept_a_second_time_replace_damaged_ones(db: Session) -> None:
+    sha256 = files.store(db, b"as it was").sha256
+    damage(sha256, "changed")
+    with pytest.raises(files.MissingFile):
+        files.read(sha256)
+    assert files.store(db, b"as it was").sha256 == sha256
+    assert files.read(sha256) == b"as it was"
+
+
+@pytest.mark.parametrize("how", DAMAGES)
+def test_a_backup_goes_on_around_a_damaged_file_and_names_it(client: TestClient, enrolled: str, tmp_path: Path, how: str) -> None:
+    good = send(client, enrolled, "a.csv", TABLE, visit="1", controller="random")["stored_sha256"]
+    bad = send(client, enrolled, "b.csv", TABLE + b"42,1,1\n", visit="1", controller="random")["stored_sha256"]
+    damage(bad, how)
+    key = tmp_path / "key"
+    backups.make_key(key)
+    done = CliRunner().invoke(cli.app, ["backup", str(tmp_path / "backup"), "--key-file", str(key)])
+    assert done.exit_code == 1
+    assert bad in done.output
+    assert good not in done.output
+    manifest = backups.verify(tmp_path / "backup")
+    assert (manifest["damaged"], manifest["removed"], manifest["files"]) == ([bad], [], 1)
