@@ -1,10 +1,11 @@
 """Exploration designs: which amplitudes the random sessions of early visits try, laid out before the visit.
 
-Two designs, by their names:
+Designs, by their names:
 
 * `paper`: a new uniform draw on [B, 1] every step (Gao et al. 2023, section 6.1). The mean over a minute hardly ever leaves the middle.
 * `stratified`: each random session has a level of its own, stratified over [B, 1] across sessions and visits, and draws around it that are
   held 10 to 60 s (log-uniform). A titration ladder (1, 0.8, 0.6, ..., two minutes each) may stand once in each visit.
+* `near`: a session that is held near one stated amplitude, as a verdict asks for: draws within `NEAR_SPREAD` of it.
 
 Safety comes before information: nothing is below B, and anything below `LOW_AMPLITUDE` lies in the last `LOW_SECONDS` of a session, so it
 lasts no longer than that and ends with the session. One hold is one decision: its density is conditional on the level and on which bound is
@@ -14,7 +15,7 @@ in force, and is the density that `Decision.log_density` gives.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, Literal
@@ -26,6 +27,7 @@ from ml.trajectories import Hold
 
 Floats = NDArray[np.float64]
 DesignName = Literal["paper", "stratified"]
+SessionDesign = Literal["paper", "stratified", "ladder", "near"]
 
 LOW_AMPLITUDE: Final = 0.6
 """Fraction of the cDBS amplitude below which a session may stay for `LOW_SECONDS` at most."""
@@ -33,6 +35,8 @@ LOW_SECONDS: Final = 300.0
 HOLD_SECONDS: Final = (10.0, 60.0)
 SPREAD: Final = 0.12
 """Draws around a level reach this far, as a fraction of the cDBS amplitude."""
+NEAR_SPREAD: Final = 0.05
+"""Draws of a session near an amplitude reach this far from it, as a fraction of the cDBS amplitude."""
 EVERYWHERE: Final = 0.2
 """Share of draws that come from all of [B, 1], so that every amplitude has a density in every session."""
 LADDER_STEP: Final = 0.2
@@ -102,11 +106,11 @@ class DesignedSession:
     """One session of a design.
 
     Attributes:
-        design: `paper`, `stratified` or `ladder`. visit: 1, 2, ... number: within the visit, 0, 1, ...
+        design: `paper`, `stratified`, `ladder` or `near`. visit: 1, 2, ... number: within the visit, 0, 1, ...
         level: of the session; None where it has none. seed: of the design. decisions: in order, without gaps.
     """
 
-    design: Literal["paper", "stratified", "ladder"]
+    design: SessionDesign
     visit: int
     number: int
     level: float | None
@@ -163,10 +167,11 @@ def stratified_levels(settings: DesignSettings) -> Floats:
 
 @dataclass(frozen=True)
 class DrawDensity:
-    """Density of held amplitudes around a level: uniform within `SPREAD` of it, mixed with a share of uniform on all of [low, 1].
+    """Density of held amplitudes around a level: uniform within a distance of it, mixed with a share of uniform on all of [low, 1].
 
     Attributes:
         level: of the session. low: the bound in force: B, or at least `LOW_AMPLITUDE` outside the last minutes of a session.
+        spread: the distance. everywhere: the share.
 
     Raises:
         ValueError: a bound or a level outside [0, 1].
@@ -174,6 +179,8 @@ class DrawDensity:
 
     level: float
     low: float
+    spread: float = SPREAD
+    everywhere: float = EVERYWHERE
 
     def __post_init__(self) -> None:
         if not (0 <= self.low < 1 and 0 <= self.level <= 1):
@@ -183,19 +190,47 @@ class DrawDensity:
     def near(self) -> tuple[float, float]:
         """Range of the draws around the level; a level below the bound is lifted to it."""
         level = max(self.level, self.low)
-        return max(self.low, level - SPREAD), min(1.0, level + SPREAD)
+        return max(self.low, level - self.spread), min(1.0, level + self.spread)
 
     def draw(self, rng: np.random.Generator) -> float:
         """An amplitude."""
-        low, high = (self.low, 1.0) if rng.random() < EVERYWHERE else self.near
+        low, high = (self.low, 1.0) if rng.random() < self.everywhere else self.near
         return float(rng.uniform(low, high))
 
     def density(self, amplitude: NDArray[np.float64] | float) -> Floats:
         """Density at amplitudes, any shape; integrates to 1 over [low, 1]."""
         a = np.asarray(amplitude, dtype=np.float64)
         low, high = self.near
-        everywhere = EVERYWHERE * ((a >= self.low) & (a <= 1)) / (1 - self.low)
-        return np.asarray(everywhere + (1 - EVERYWHERE) * ((a >= low) & (a <= high)) / (high - low))
+        everywhere = self.everywhere * ((a >= self.low) & (a <= 1)) / (1 - self.low)
+        return np.asarray(everywhere + (1 - self.everywhere) * ((a >= low) & (a <= high)) / (high - low))
+
+
+def near_density(level: float, low: float) -> DrawDensity:
+    """Density of held amplitudes near one: uniform within `NEAR_SPREAD` of it, above the bound in force."""
+    return DrawDensity(level, low, NEAR_SPREAD, everywhere=0.0)
+
+
+def near_session(level: float, steps: int, period_s: float, lower_bound: float, seed: int, number: int) -> DesignedSession:
+    """A session held near an amplitude; below `LOW_AMPLITUDE` in its last `LOW_SECONDS` alone, and as low as that allows before.
+
+    Args:
+        level: fraction of cDBS. steps: T. period_s: of a step. lower_bound: B. seed, number: the same ones give the same draws.
+
+    Raises:
+        ValueError: a level below B, or of cDBS itself.
+    """
+    if not lower_bound <= level < 1:
+        raise ValueError(f"a session is held near an amplitude from B, {lower_bound:g}, to below 1, not near {level:g}")
+    rng = np.random.default_rng([seed, 0x6E6561, number])
+    decisions = _held(steps, period_s, lower_bound, rng, lambda low: near_density(level, low))
+    return DesignedSession("near", 1, number, level, seed, decisions)
+
+
+def near_doses(level: float, steps: int, period_s: float, lower_bound: float) -> tuple[float, float]:
+    """Expected mean amplitude of a session held near a level, over the session and over its last `LOW_SECONDS`."""
+    late = min(steps, int(LOW_SECONDS / period_s))
+    before, after = (float(np.mean(near_density(level, low).near)) for low in (max(lower_bound, LOW_AMPLITUDE), lower_bound))
+    return (before * (steps - late) + after * late) / steps, after
 
 
 def hold_steps(rng: np.random.Generator, period_s: float) -> int:
@@ -227,19 +262,26 @@ def _paper_session(settings: DesignSettings, visit: int, number: int, rng: np.ra
 
 
 def _held_session(settings: DesignSettings, visit: int, number: int, level: float, rng: np.random.Generator) -> DesignedSession:
+    decisions = _held(settings.steps, settings.period_s, settings.lower_bound, rng, lambda low: DrawDensity(level, low))
+    return DesignedSession("stratified", visit, number, level, settings.seed, decisions)
+
+
+def _held(
+    steps: int, period_s: float, lower_bound: float, rng: np.random.Generator, law: Callable[[float], DrawDensity]
+) -> tuple[Decision, ...]:
+    """Held draws by a density that depends on the bound in force."""
     # Low amplitudes stand at the end: outcomes are taken there, and a session that is broken off has not been low for nothing.
-    low_begins = max(0, settings.steps - int(LOW_SECONDS / settings.period_s))
+    low_begins = max(0, steps - int(LOW_SECONDS / period_s))
     decisions: list[Decision] = []
     k = 0
-    while k < settings.steps:
+    while k < steps:
         guarded = k < low_begins
-        end = low_begins if guarded else settings.steps
-        law = DrawDensity(level, max(settings.lower_bound, LOW_AMPLITUDE) if guarded else settings.lower_bound)
-        amplitude = law.draw(rng)
-        steps = min(hold_steps(rng, settings.period_s), end - k)
-        decisions.append(Decision(k, steps, amplitude, float(np.log(law.density(amplitude)))))
-        k += steps
-    return DesignedSession("stratified", visit, number, level, settings.seed, tuple(decisions))
+        density = law(max(lower_bound, LOW_AMPLITUDE) if guarded else lower_bound)
+        amplitude = density.draw(rng)
+        length = min(hold_steps(rng, period_s), (low_begins if guarded else steps) - k)
+        decisions.append(Decision(k, length, amplitude, float(np.log(density.density(amplitude)))))
+        k += length
+    return tuple(decisions)
 
 
 @dataclass(frozen=True)

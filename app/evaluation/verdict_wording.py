@@ -24,7 +24,7 @@ def decision(reasons: Sequence[Flag]) -> str:
     Args:
         reasons: as `app.evaluation.ranking.decisions.decide` gives them.
     """
-    told = [reason for reason in reasons if reason.code not in ("sessions_needed", "near_amplitude")]
+    told = [reason for reason in reasons if reason.code not in _FURTHER]
     more = further_sessions(reasons)
     return "; ".join([*map(sentence, told), *([more] if more else [])])
 
@@ -43,11 +43,15 @@ def plainly(reasons: Sequence[Flag], limit: float | None = None, limit_ma: float
 
 
 def further_sessions(reasons: Sequence[Flag]) -> str:
-    """How many further sessions near which amplitude would tell; empty where none is named."""
+    """How many further sessions near which amplitude, on how many visits, would tell; empty where none is named."""
     by_code = {reason.code: reason for reason in reasons}
     if not {"sessions_needed", "near_amplitude"} <= by_code.keys():
         return ""
-    return f"{sentence(by_code['sessions_needed'])} {sentence(by_code['near_amplitude'])} would tell"
+    told = [sentence(by_code[code]) for code in ("sessions_needed", "near_amplitude", "visits_needed") if code in by_code]
+    return f"{' '.join(told)} would tell"
+
+
+_FURTHER = ("sessions_needed", "near_amplitude", "visits_needed")
 
 
 _PLAINLY: dict[str, Callable[[Flag], str]] = {
@@ -68,5 +72,6 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "reference_unsupported": lambda f: "too few sessions of cDBS to hold it against",
     "outcomes_unknown": lambda f: "no session has grasp, rating or tremor",
     "undecided": lambda f: "within the margins or beyond: still open",
+    "not_settled_by_sessions": lambda f: "more sessions near its amplitude would not settle it",
 }
 """For the first screen of the ranking, by code; what is not here is told further down alone."""

@@ -215,6 +215,8 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         f"{chance(number(f))} likely within the margins of grasp, rating and tremor (a test asks for {percent(f.limit)})"
     ),
     "saves_energy": lambda f: f"{chance(number(f))} likely to use less energy (a test asks for {percent(f.limit)})",
+    "visits_needed": lambda f: f"on {count(int(number(f)), 'visit', 'visits')}",
+    "not_settled_by_sessions": lambda f: "more sessions held near what it does would not settle it",
     "sessions_needed": lambda f: count(int(number(f)), "session", "sessions"),
     "near_amplitude": lambda f: f"held near {f.value:.1f} mA" if f.unit == "mA" else f"held near {percent(f.value)} of the cDBS amplitude",
     # of the choice of a method

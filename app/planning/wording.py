@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from app.evaluation.wording import amplitude, chance, joined
+from app.evaluation.wording import amplitude, chance, count, joined
 from app.planning.notices import Code, PlanWarning
 from app.planning.plans.designs import Bound, Planned, delivered_ma
-from app.planning.plans.models import Plan, PlanItem
+from app.planning.plans.models import NEAR, Plan, PlanItem, is_held
+from app.planning.plans.suggested import Hold
 from app.planning.protocol.session_order import Order
 from app.planning.slots.matching import Deviation
 from app.planning.visit_day.record import Contradiction, Entry, grasp_hz, moment
@@ -16,7 +17,7 @@ from app.planning.visit_day.screening import Found
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller
 from ml.deploy.manifest import BundleManifest
-from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
+from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS, NEAR_SPREAD
 from ml.ope.posterior.portfolio import Suggestion
 
 LEAVE_AT_ONCE = "A stop, an adverse event or a lost link: back to cDBS at once; the rest of the session is not made up for."
@@ -81,6 +82,15 @@ def suggestion(why: Suggestion, first: bool) -> str:
     return f"{chance(why.better)} likely to turn out better on the whole {than}{tells}."
 
 
+def holding(hold: Hold) -> str:
+    """What sessions near an amplitude would tell, in one clause."""
+    names = [f"'{policy.name}'" for policy in hold.policies]
+    of = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    visits = f" on {hold.visits} visits" if hold.visits > 1 else ""
+    is_worth = f"{of} {'is' if len(names) == 1 else 'are'} worth a test"
+    return f"{count(hold.sessions, 'session', 'sessions')} held near it{visits} would tell whether {is_worth}"
+
+
 TELLING = 0.2
 """Share of what is open about the other candidates from which a policy's test is said to tell about them."""
 
@@ -134,8 +144,17 @@ def _entered(entry: Entry) -> str:
     return str(payload.get("value") or payload.get("grade") or payload.get("reason") or payload.get("cause") or entry.kind)
 
 
+def scheduled_name(design: str, level: float | None) -> str:
+    """What a bundle calls a session without a policy."""
+    if design == NEAR and level is not None:
+        return f"session held near {level:.2f} of cDBS"
+    return "cDBS" if design == "constant" else f"random session, {design} design"
+
+
 def design_name(planned: Planned) -> str:
     """A design in two words, for a table."""
+    if planned.design == NEAR:
+        return f"held near {_near(planned)}"
     return {"paper": "paper's draws", "ladder": "titration ladder"}.get(planned.design) or f"level {planned.level:.2f}"
 
 
@@ -147,7 +166,16 @@ def design_words(planned: Planned) -> str:
         steps = ", ".join(f"{h.amplitude:g}" for h in planned.holds)
         return f"titration ladder: {steps} of cDBS, {planned.holds[0].steps * planned.period_s / 60:g} min each"
     low, high = HOLD_SECONDS
+    if planned.design == NEAR:
+        return f"held near {_near(planned)}: {len(planned.holds)} draws within {NEAR_SPREAD:g} of it, each held {low:g} to {high:g} s"
     return f"stratified design: level {planned.level:.2f} of cDBS, {len(planned.holds)} draws held {low:g} to {high:g} s"
+
+
+def _near(planned: Planned) -> str:
+    """The amplitude of a session that is held near one: milliamperes by side where they are known, and the share of cDBS."""
+    share = f"{planned.level:.2f} of cDBS"
+    given = ", ".join(_side(b, f"{(planned.level or 0.0) * b.cdbs_ma:.1f} mA") for b in planned.bounds)
+    return f"{given} ({share})" if given else share
 
 
 def bound_words(planned: Planned, bounds: tuple[Bound, ...]) -> str:
@@ -175,7 +203,8 @@ def session_name(item: PlanItem) -> str:
     """What a session of a plan is called: its controller, and its letter in a blinded plan; the letter alone while the key is sealed."""
     if not item.controller:
         return f"Session {item.label}"
-    name = CONTROLLER_NAMES[Controller(item.controller)] + (f" {item.repeat}" if item.repeat > 1 else "")
+    name = "Held" if is_held(item) else CONTROLLER_NAMES[Controller(item.controller)]
+    name += f" {item.repeat}" if item.repeat > 1 else ""
     return f"{name} ({item.label})" if item.label else name
 
 

@@ -16,6 +16,7 @@ from app.study.models import Controller, Hemisphere
 from app.study.sessions.models import Activity
 from app.study.settings.schemas import CDBS_MA, SettingsOut
 from app.study.usual.values import SURE
+from ml.designs import SessionDesign
 
 Code = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$")]
 
@@ -235,7 +236,7 @@ class ConditionsFields(Model):
     min_ma: Number | None = Field(description="Lowest amplitude that limits allowed, mA.")
     max_ma: Number | None = Field(description="Highest amplitude that limits allowed, mA.")
     seed: Int | None = Field(description="Of the design.")
-    design: Literal["paper", "stratified", "ladder"] | None = Field(description="Of a random session; null where nobody stated one.")
+    design: SessionDesign | None = Field(description="Of a random session; null where nobody stated one.")
     design_parameters: DesignParameters
     lead_amplitude_ma: Number | None = Field(description="Amplitude in force just before the session, mA.")
     cdbs_amplitude_ma: Number | None = Field(description="cDBS amplitude when the session was confirmed, mA; for the record.")
@@ -264,7 +265,7 @@ class ConditionsChange(Model):
     min_ma: Number | None = Field(None, ge=0, le=25.5)
     max_ma: Number | None = Field(None, ge=0, le=25.5)
     seed: Int | None = None
-    design: Literal["paper", "stratified", "ladder"] | None = None
+    design: SessionDesign | None = None
     design_parameters: DesignParameters | None = None
     lead_amplitude_ma: Number | None = Field(None, ge=0, le=25.5)
     cdbs_amplitude_ma: Number | None = Field(None, gt=0, le=25.5)

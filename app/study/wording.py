@@ -134,6 +134,7 @@ def drawn_words(drawn: Drawn) -> str:
         "paper": "the paper's: a new draw every step",
         "stratified": "stratified" + ("" if drawn.level is None else f", level {drawn.level:.2f} of cDBS") + holds,
         "ladder": f"titration ladder{holds}",
+        "near": "held near" + (" one amplitude" if drawn.level is None else f" {drawn.level:.2f} of cDBS") + holds,
         "held": f"not stated; {held}: their density is not known",
         "unstated": "not stated; taken for the paper's, a new draw every step, which the amplitudes do not contradict",
     }[drawn.kind]

@@ -213,6 +213,10 @@ INTENDED: dict[str, str] = {
         "API: settings have `design`, `design_ladder` and `early_visits`, and a planned session has `design`.",
     ),
     **dict.fromkeys(
+        ("components > schemas > HeldIn", "components > schemas > PlanIn > properties > held"),
+        "API: a plan's `held` asks for sessions held near an amplitude (design `near`).",
+    ),
+    **dict.fromkeys(
         ("components > schemas > RecordedTraceOut", "paths > /api/v1/sessions/{session_id}/traces"),
         "API: `GET /sessions/{id}/traces` gives every trace of a session's recordings, not the control trace alone.",
     ),

@@ -15,11 +15,15 @@ from ml.designs import (
     HOLD_SECONDS,
     LOW_AMPLITUDE,
     LOW_SECONDS,
+    NEAR_SPREAD,
     SPREAD,
     DesignSettings,
     DrawDensity,
     hold_steps,
     lay_out,
+    near_density,
+    near_doses,
+    near_session,
     recognise,
     stratified_levels,
 )
@@ -178,3 +182,46 @@ def test_constant_and_too_short_sessions_are_neither():
     assert recognise([0.5, 0.6]).kind == "unknown"
     assert recognise([]).kind == "unknown"
     assert recognise([np.nan] * 30).kind == "unknown"
+
+
+@given(seed=seeds, bound=st.floats(0.0, 0.9), place=st.floats(0.0, 0.99), steps=st.integers(1, 600))
+def test_a_session_near_an_amplitude_stays_near_it_within_the_rules_of_safety(seed, bound, place, steps):
+    level = bound + place * (1 - bound)
+    session = near_session(level, steps, 2.0, bound, seed, 0)
+    assert (session.design, session.level, session.seed) == ("near", level, seed)
+    a = session.amplitudes
+    assert a.size == steps
+    assert a.min() >= bound
+    assert a.max() <= 1
+    low = np.flatnonzero(a < LOW_AMPLITUDE)
+    assert low.size * 2.0 <= LOW_SECONDS
+    assert low.size == 0 or low.min() >= steps - LOW_SECONDS / 2.0
+    late = a[-int(min(steps, LOW_SECONDS / 2.0)) :]
+    assert np.abs(late - level).max() <= NEAR_SPREAD + 1e-12
+    for d in session.decisions:
+        law = near_density(level, max(bound, LOW_AMPLITUDE) if d.start < steps - LOW_SECONDS / 2.0 else bound)
+        assert d.log_density == pytest.approx(float(np.log(law.density(d.amplitude))))
+
+
+@pytest.mark.parametrize(("level", "low"), [(0.7, 0.3), (0.3, 0.3), (0.98, 0.6), (0.4, 0.6)])
+def test_the_density_near_an_amplitude_integrates_to_one_and_is_that_of_the_draws(level, low):
+    law = near_density(level, low)
+    assert quad(law.density, *law.near)[0] == pytest.approx(1.0)
+    assert law.density(law.near[0] - 0.01) == law.density(law.near[1] + 0.01) == 0
+    rng = np.random.default_rng(0)
+    first, last = law.near
+    assert kstest([law.draw(rng) for _ in range(500)], "uniform", args=(first, last - first)).pvalue > 0.001
+
+
+@pytest.mark.parametrize("level", [0.4, 0.55, 0.62, 0.8, 0.97])
+def test_the_dose_of_a_session_near_an_amplitude_is_the_mean_of_many(level):
+    runs = np.stack([near_session(level, 300, 2.0, 0.3, seed, 0).amplitudes for seed in range(300)])
+    mean, late = near_doses(level, 300, 2.0, 0.3)
+    assert runs.mean() == pytest.approx(mean, abs=0.003)
+    assert runs[:, -150:].mean() == pytest.approx(late, abs=0.003)
+
+
+@pytest.mark.parametrize("level", [0.29, 1.0])
+def test_no_session_is_held_below_the_bound_or_at_cdbs(level):
+    with pytest.raises(ValueError, match="held near"):
+        near_session(level, 300, 2.0, 0.3, 1, 0)

@@ -146,6 +146,9 @@ def assess(
         session_noise(evaluation),
         version.lower_bound,
         cdbs_ma,
+        tuple((held, table[i][POSTERIOR]) for i in references if (held := policies[i].amplitude) is not None and POSTERIOR in table[i]),
+        evaluation.horizon_steps,
+        version.period_s,
     )
     candidates = {i: e for i, e in by_method.items() if i not in references}
     decided = {

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from app.evaluation.models import Evaluation
 from app.evaluation.schemas import Decision, Standing
@@ -15,8 +18,9 @@ from app.study.margins.service import margins_of
 from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag
-from ml.ope.posterior.further_sessions import sessions_to_tell
-from ml.ope.posterior.verdict import HAZARDS, Levels, Verdict, slacks, verdict
+from ml.ope.posterior.further_sessions import Needed, Reachable, reachable, sessions_to_tell
+from ml.ope.posterior.support import FEWEST_VISITS
+from ml.ope.posterior.verdict import HAZARDS, OUTCOMES, Levels, Verdict, outcome_draws, slacks, verdict
 from ml.ope.registry import POSTERIOR
 
 SESSION_NOISE = "session_noise"
@@ -33,6 +37,8 @@ class Circumstances:
         unchecked: why what the data cover could not be checked; None where it was.
         noise: of a session, by outcome. lowest_dose: B, below which no further session is asked for.
         cdbs_ma: the cDBS amplitude, mA; None where it is not known.
+        held: what constants would do, the amplitude (fraction of cDBS) of each with its posterior: by them it is known what sessions held
+            near an amplitude would show. steps, period_s: of a session, and seconds of a step.
     """
 
     evaluation_id: int
@@ -43,6 +49,18 @@ class Circumstances:
     noise: Mapping[str, float]
     lowest_dose: float
     cdbs_ma: float | None
+    held: tuple[tuple[float, Estimate], ...] = ()
+    steps: int = 300
+    period_s: float = 2.0
+
+
+@dataclass(frozen=True)
+class Further:
+    """Sessions that would tell: how many, on how many visits at least, held near which fraction of cDBS."""
+
+    sessions: int
+    visits: int
+    fraction: float
 
 
 @dataclass(frozen=True)
@@ -52,6 +70,7 @@ class Decided:
     decision: Decision
     reasons: tuple[Flag, ...]
     verdict: Verdict | None = None
+    further: Further | None = None
 
     @property
     def hazards(self) -> tuple[Flag, ...]:
@@ -107,8 +126,12 @@ def decide(
         return Decided("unsafe", (*happened, *known.reasons)) if happened else known
     reference, levels = cdbs.get(POSTERIOR), levels_of(given.levels)
     found = verdict(own, reference, margins_of(given.margins), levels, adverse_event=adverse_event, unchecked=given.unchecked)
-    more = _further(own, reference, given, levels, policy_id) if found.code == "cannot_tell" and not found.hazards else ()
-    return Decided(found.code, (*found.reasons, *more), found)
+    if found.code != "cannot_tell" or found.reasons[0].code not in SETTLED_BY_SESSIONS:
+        return Decided(found.code, found.reasons, found)
+    if not given.noise:
+        return Decided(found.code, found.reasons, found)  # how much a session tells is not known
+    further = _further(own, reference, given, levels, policy_id)
+    return Decided(found.code, (*found.reasons, *_of_sessions(further, given.cdbs_ma)), found, further)
 
 
 def levels_of(margins: MarginsVersion) -> Levels:
@@ -136,28 +159,70 @@ def _without_posterior(own: Estimate | None, reference: Estimate | None) -> Deci
     return Decided("cannot_tell", (unknown,))
 
 
-_needed: OrderedDict[tuple[int, datetime, int, int, int], int | None] = OrderedDict()
+SETTLED_BY_SESSIONS = frozenset({"undecided", "few_near_sessions", "few_near_visits"})
+"""Deciding reasons of *cannot tell* that more sessions near a policy may settle; whether they would is simulated."""
+
+_needed: OrderedDict[tuple[int, datetime, int, int, int], Further | None] = OrderedDict()
 """Simulated numbers of sessions by evaluation, policy and versions of margins and levels, none of which ever changes."""
 _KEPT = 5000
 
 
-def _further(own: Estimate, cdbs: Estimate | None, given: Circumstances, levels: Levels, policy_id: int) -> tuple[Flag, ...]:
-    """How many further sessions near which amplitude would tell, and that amplitude; empty where none would."""
-    support = own.details.get("support") or {}
-    dose = support.get("dose")
+def _further(own: Estimate, cdbs: Estimate | None, given: Circumstances, levels: Levels, policy_id: int) -> Further | None:
+    """How many further sessions near which amplitude would tell; None where none would that a plan can hold."""
+    dose = (own.details.get("support") or {}).get("dose")
     if cdbs is None or dose is None:
-        return ()
+        return None
     key = (given.evaluation_id, given.evaluated_at, policy_id, given.margins.id, given.levels.id)
     if key not in _needed:
-        gaps = slacks(own, cdbs, margins_of(given.margins))
-        near = int(support.get("near_sessions") or 0)
-        _needed[key] = sessions_to_tell(gaps, given.noise, levels, already_near=near, supported=own.supported)
+        place = reachable(float(dose), given.lowest_dose, given.steps, given.period_s)
+        found = _simulated(own, cdbs, place, given, levels) if place is not None else None
+        _needed[key] = Further(found.sessions, found.visits, place.level) if found is not None and place is not None else None
         while len(_needed) > _KEPT:
             _needed.popitem(last=False)
-    if _needed[key] is None:
-        return ()
-    wanted = max(float(dose), given.lowest_dose)
-    at = Flag("near_amplitude", wanted, None, "of cDBS")
-    if given.cdbs_ma is not None:
-        at = Flag("near_amplitude", wanted * given.cdbs_ma, None, "mA")
-    return (Flag("sessions_needed", float(_needed[key] or 0), None, "sessions"), at)
+    return _needed[key]
+
+
+def _simulated(own: Estimate, cdbs: Estimate, place: Reachable, given: Circumstances, levels: Levels) -> Needed | None:
+    support = own.details.get("support") or {}
+    ours, theirs = outcome_draws(own, "energy"), outcome_draws(cdbs, "energy")
+    return sessions_to_tell(
+        slacks(own, cdbs, margins_of(given.margins)),
+        given.noise,
+        levels,
+        shown=_shown(place.dose, cdbs, given.held),
+        saved=theirs - ours if ours is not None and theirs is not None else None,
+        near=(int(support.get("near_sessions") or 0), int(support.get("near_visits") or 0)),
+        supported=own.supported,
+    )
+
+
+def _shown(dose: float, cdbs: Estimate, held: Sequence[tuple[float, Estimate]]) -> dict[str, NDArray[np.float64]] | None:
+    """What a session of a mean dose would show of each outcome less cDBS, by draw: between the constants next to it.
+
+    None where the evaluation has no two constants: then the policy's own outcomes stand for them.
+    """
+    rows = sorted(held, key=lambda pair: pair[0])
+    if len(rows) < 2:
+        return None
+    above = min(max(1, sum(fraction < dose for fraction, _ in rows)), len(rows) - 1)
+    (low, lower), (high, upper) = rows[above - 1], rows[above]
+    share = min(max((dose - low) / (high - low), 0.0), 1.0)
+    found = {}
+    for name in OUTCOMES:
+        a, b, reference = (outcome_draws(e, name) for e in (lower, upper, cdbs))
+        if a is not None and b is not None and reference is not None and a.size == b.size == reference.size:
+            found[name] = (1 - share) * a + share * b - reference
+    return found or None
+
+
+def _of_sessions(further: Further | None, cdbs_ma: float | None) -> tuple[Flag, ...]:
+    """What would tell as findings, or that nothing would."""
+    if further is None:
+        return (Flag("not_settled_by_sessions"),)
+    at = Flag("near_amplitude", further.fraction, None, "of cDBS")
+    if cdbs_ma is not None:
+        at = Flag("near_amplitude", further.fraction * cdbs_ma, None, "mA")
+    needed = Flag("sessions_needed", float(further.sessions), None, "sessions")
+    if further.visits < FEWEST_VISITS:
+        return (needed, at)
+    return (needed, Flag("visits_needed", float(further.visits), None, "visits"), at)

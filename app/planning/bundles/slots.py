@@ -152,7 +152,7 @@ def _scheduled(db: Session, view: PlanView, line: PlanLine, slot: Slot, signatur
         return BundleManifest(
             participant=participant.code,
             policy_id=None,
-            policy_name="cDBS" if schedule.design == "constant" else f"random session, {schedule.design} design",
+            policy_name=wording.scheduled_name(schedule.design, schedule.level),
             hemisphere=side.value if side else None,
             window=settings.window,
             period_s=settings.period_s,

@@ -1,19 +1,21 @@
-"""What the random sessions of a visit shall try: laid out with the plan, bounded in milliamperes, signed with it."""
+"""What the random sessions of a visit shall try, and those held near an amplitude: laid out, bounded in mA and signed with the plan."""
 
 from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from app.planning.plans.models import NEAR
 from app.platform.errors import Invalid
 from app.study.cdbs_amplitude import held_settings, plausible
 from app.study.models import SettingsVersion, Visit
-from ml.designs import LOW_AMPLITUDE, Decision, DesignedSession, DesignSettings, amplitudes, lay_out
+from ml.designs import LOW_AMPLITUDE, Decision, DesignedSession, DesignSettings, amplitudes, lay_out, near_session
 
 RESOLUTION_MA: Final = 0.1
 """What a stimulator rounds amplitudes to."""
@@ -41,7 +43,8 @@ class Planned:
     """What one random session shall try.
 
     Attributes:
-        design: `paper`, where the device draws anew every step, `stratified` or `ladder`. level: of the session; None where it has none.
+        design: `paper`, where the device draws anew every step, `stratified`, `ladder` or `near`. level: of the session; None where it has
+            none.
         seed: of the draws; None in the paper's design. lower_bound: B. period_s: of a step. holds: empty in the paper's design.
         bounds: in milliamperes, as they stood when the plan was approved; empty before.
     """
@@ -102,6 +105,37 @@ def planned_sessions(settings: SettingsVersion, code: str, earlier_visits: int, 
     return [_planned(session, wanted) for session in lay_out(wanted) if session.visit == place + 1]
 
 
+def near_sessions(
+    levels: Sequence[float], settings: SettingsVersion, code: str, visit_number: int, minutes: float, cdbs_ma: float | None = None
+) -> list[Planned]:
+    """Sessions that are held near stated amplitudes. Drafting the visit again gives the same draws.
+
+    Args:
+        levels: fraction of cDBS of each session. settings: B and period. code: the participant's. visit_number, minutes: of the visit, and
+            of each session. cdbs_ma: the cDBS amplitude, for words; None where it is not known.
+
+    Raises:
+        Invalid: a level below B, or cDBS itself.
+    """
+    seed, bound = seed_of(f"{code}/{NEAR}", visit_number), settings.lower_bound
+    steps = max(1, round(60 * minutes / settings.period_s))
+    found = []
+    for number, level in enumerate(levels):
+        if not bound <= level < 1:
+            wanted, lowest, highest = (_amplitude(share, cdbs_ma) for share in (level, bound, 1.0))
+            raise Invalid(
+                f"A session held near {wanted} cannot be planned: the participant's lower bound is {lowest}, and cDBS {highest}.",
+                "Name an amplitude from the lower bound to below that of cDBS.",
+            )
+        session = near_session(level, steps, settings.period_s, bound, seed, number)
+        found.append(Planned(NEAR, level, seed, bound, settings.period_s, session.decisions))
+    return found
+
+
+def _amplitude(fraction: float, cdbs_ma: float | None) -> str:
+    return f"{fraction:.2f} of the cDBS amplitude" if cdbs_ma is None else f"{fraction * cdbs_ma:.2f} mA"
+
+
 def seed_of(code: str, number: int) -> int:
     """Seed of a participant's designs in one round of early visits."""
     digest = hashlib.sha256(f"{code.upper()}/{number}".encode()).digest()
@@ -133,9 +167,13 @@ def rounded_up(milliamperes: float) -> float:
 
 
 def delivered_ma(fraction: float, bound: Bound) -> float:
-    """What a stimulator gives for a fraction of cDBS: rounded to its resolution, within the bound and cDBS, mA."""
+    """What a stimulator gives for a fraction of cDBS: rounded to its resolution, within the bound and cDBS, mA.
+
+    Rounding makes no amplitude one of those at which a session stays for `LOW_SECONDS` at most.
+    """
     nearest = round(round(fraction * bound.cdbs_ma / RESOLUTION_MA) * RESOLUTION_MA, 6)
-    return min(max(nearest, bound.lowest_ma), bound.cdbs_ma)
+    least = bound.lowest_ma if fraction < LOW_AMPLITUDE else max(bound.lowest_ma, bound.low_ma)
+    return min(max(nearest, least), bound.cdbs_ma)
 
 
 def _planned(session: DesignedSession, wanted: DesignSettings) -> Planned:

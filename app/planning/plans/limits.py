@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from sqlalchemy.orm import Session
 
 from app.planning.plans import repository
-from app.planning.plans.models import PlanItem
+from app.planning.plans.models import PlanItem, is_held
 from app.platform.errors import Conflict, Invalid
 from app.study import cdbs_amplitude
 from app.study.models import Controller, Hemisphere, Participant, Visit
@@ -143,8 +143,21 @@ def set_limits(db: Session, visit: Visit, items: Sequence[PlanItem], stated: Sta
     for item in items:
         least = item.design["lower_bound"] if item.design is not None else item.min_fraction
         found = slot_limits(cdbs_ma, Controller(item.controller), period_s, stated, device, least or 0.0)
+        _require_reach(item, found)
         item.hemisphere = hemisphere
         item.cdbs_ma, item.min_ma, item.max_ma, item.ramp_ma_per_s = found.cdbs_ma, found.min_ma, found.max_ma, found.ramp_ma_per_s
+
+
+def _require_reach(item: PlanItem, limits: SlotLimits) -> None:
+    """Raises Invalid where a session is to be held near an amplitude that its limits forbid."""
+    if item.design is None or not is_held(item):
+        return
+    wanted = item.design["level"] * limits.cdbs_ma
+    if wanted < limits.min_ma - _TOLERANCE_MA:
+        raise Invalid(
+            f"A session is to be held near {wanted:g} mA, and the lowest amplitude of the plan is {limits.min_ma:g} mA.",
+            "Lower the limit, or hold the session at or above it.",
+        )
 
 
 def require_limits(visit: Visit, items: Sequence[PlanItem]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime, time
-from typing import Any
+from typing import Any, Final
 
 from sqlalchemy import CheckConstraint, ForeignKey, Index, SmallInteger, String, Text, UniqueConstraint, and_, func
 from sqlalchemy.dialects.postgresql import JSONB
@@ -101,4 +101,14 @@ class PlanItem(Base):
     override_reason: Mapped[str | None] = mapped_column(Text)
     """Why a clinician plans an unsafe policy all the same."""
     design: Mapped[dict[str, Any] | None] = mapped_column(JSONB(none_as_null=True))
-    """What a random session shall try, `app.planning.plans.designs.Planned.as_json`; null for other controllers and in plans of before."""
+    """What a random session shall try, or one held near an amplitude, `app.planning.plans.designs.Planned.as_json`; null for other
+    controllers and in plans of before."""
+
+
+NEAR: Final = "near"
+"""The design of a session held near a stated amplitude."""
+
+
+def is_held(item: PlanItem) -> bool:
+    """Whether a session is held near a stated amplitude."""
+    return item.design is not None and item.design["design"] == NEAR

@@ -19,6 +19,7 @@ from app.accounts.permissions import Caller
 from app.evaluation import verdict_wording
 from app.evaluation import wording as evaluation_wording
 from app.evaluation.ranking.answer import Answer, Row
+from app.evaluation.ranking.assessment import cdbs_amplitude_now
 from app.evaluation.ranking.judged import Judged
 from app.evaluation.ranking.service import current
 from app.evaluation.wording import method_name, sentence
@@ -26,10 +27,10 @@ from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning import wording
 from app.planning.plans import key, repository, service
-from app.planning.plans.schemas import Id, LimitIn, Move, PlanIn, PlanOptions
+from app.planning.plans.schemas import MOST_HELD, HeldIn, Id, LimitIn, Move, PlanIn, PlanOptions
 from app.planning.plans.service import rules_of
 from app.planning.plans.sign_off import MEANING
-from app.planning.plans.suggested import suggested
+from app.planning.plans.suggested import Hold, suggested, worth_holding
 from app.planning.plans.view import PlanView, read_plan, shown
 from app.planning.plans.visits import remove_visit, today, visit_for_draft
 from app.planning.protocol.schedule import most_policies, total_minutes
@@ -41,6 +42,7 @@ from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant, CurrentVisit
 from app.study.models import Controller, Participant, Visit
 from app.study.service import may, require
+from ml.designs import LOW_AMPLITUDE
 
 router = APIRouter()
 
@@ -64,10 +66,18 @@ LABELS = {
     "note": "Note on the sheet",
     "min_fraction": "Lowest amplitude, share of cDBS",
     "reason": "Why the approved plan is replaced",
+    "amplitude_ma": "Held near, mA",
+    "amplitude_fraction": "Held near, share of cDBS",
+    "sessions": "Sessions held near it",
     "visit_id": "Visit",
     "visit_number": "Number of the new visit",
     "visit_date": "Date of the new visit",
 }
+
+
+UNITS = ("amplitude_ma", "amplitude_fraction")
+"""In which the form names amplitudes."""
+MOST_ROWS = 5
 
 
 class VisitChoice(Model):
@@ -210,7 +220,8 @@ def _draft(values: FormData) -> PlanIn:
     overrides = [{"policy_id": int(i), "reason": text} for i, text in reasons.items() if text]
     limits = [parse(LimitIn, {"policy_id": i, "min_fraction": text}, LABELS) for i, text in lowest.items() if text]
     return PlanIn.model_validate(
-        {"policy_ids": [int(i) for i in ids], "overrides": overrides, "limits": limits} | options.model_dump(exclude_unset=True)
+        {"policy_ids": [int(i) for i in ids], "overrides": overrides, "limits": limits, "held": _held_of(values)}
+        | options.model_dump(exclude_unset=True)
     )
 
 
@@ -230,7 +241,8 @@ def _page(
     defaults = rules_of(PlanOptions())
     choices = _choices(db, participant, found.answer if found is not None else None)
     form = _form_values(full, values, choices)
-    suggestions = suggested(found, most_policies(defaults))
+    slots = most_policies(defaults)
+    suggestions = suggested(found, slots)
     return render(
         request,
         "planning/plan.html",
@@ -257,6 +269,10 @@ def _page(
         plan_method=method_name(view.evaluation.default_method) if view and view.evaluation else "",
         choices=choices,
         suggestions=[(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],
+        held_rows=_held_rows(values, worth_holding(found, slots - len(suggestions)), cdbs_amplitude_now(participant)),
+        holding=wording.holding,
+        low_amplitude=LOW_AMPLITUDE,
+        most_held=MOST_HELD,
         outlook=request.app.state.outlook(db, participant, caller),
         form_values=form,
         chosen=_chosen(full if view is full else None, values),
@@ -321,3 +337,41 @@ def _form_values(view: PlanView | None, values: FormData | None, choices: Sequen
             "blinded": "blinded" in values,
         }
     return shown
+
+
+@dataclass(frozen=True)
+class HeldRow:
+    """One row of the form.
+
+    Attributes:
+        unit: of `UNITS`. amplitude, sessions: as they stand in the fields. why: what the sessions would tell; None of a free row.
+    """
+
+    unit: str
+    amplitude: str
+    sessions: str
+    why: Hold | None = None
+
+
+def _held_of(values: FormData) -> list[HeldIn]:
+    """The sessions that the form asks for; a row without a number of sessions asks for none.
+
+    Raises:
+        Invalid: what no row of the form sends, or values outside their range.
+    """
+    units, amplitudes, sessions = ([str(v).strip() for v in values.getlist(f"held_{name}")] for name in ("unit", "amplitude", "sessions"))
+    if not len(units) == len(amplitudes) == len(sessions) <= MOST_ROWS or any(unit not in UNITS for unit in units):
+        raise Invalid("The held sessions are not those of the form.", "Load the page again.")
+    rows = zip(units, amplitudes, sessions, strict=True)
+    return [parse(HeldIn, {unit: amplitude, "sessions": number}, LABELS) for unit, amplitude, number in rows if number not in ("", "0")]
+
+
+def _held_rows(values: FormData | None, holds: Sequence[Hold], cdbs_ma: float | None) -> list[HeldRow]:
+    """What the form shows: what is suggested, no session asked for, and a free row; what was sent where it was refused."""
+    unit = "amplitude_ma" if cdbs_ma is not None else "amplitude_fraction"
+    rows = [HeldRow(unit, f"{h.amplitude_ma:.1f}" if h.amplitude_ma is not None else f"{h.fraction:.2f}", "", h) for h in holds]
+    rows = [*rows[: MOST_ROWS - 1], HeldRow(unit, "", "")]
+    sent = [[str(v) for v in values.getlist(f"held_{name}")] for name in ("amplitude", "sessions")] if values is not None else [[], []]
+    if len(sent[0]) != len(rows) or len(sent[1]) != len(rows):
+        return rows
+    return [HeldRow(row.unit, sent[0][i], sent[1][i], row.why) for i, row in enumerate(rows)]

@@ -6,7 +6,7 @@ import datetime as dt
 from datetime import datetime
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from app.evaluation.schemas import EstimateSummary
 from app.planning.notices import Code
@@ -14,7 +14,10 @@ from app.planning.protocol.session_order import Order
 from app.platform.signatures.schemas import SignatureOut, Signing
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
+from ml.designs import SessionDesign
 
+MOST_HELD = 4
+"""Sessions near one amplitude in a visit, at most."""
 Id = Annotated[Int, Field(ge=1)]
 Milliamperes = Annotated[Number, Field(ge=0, le=25.5)]
 
@@ -69,6 +72,20 @@ class LimitIn(Model):
     min_fraction: Number = Field(gt=0, le=1, description="Fraction of the cDBS amplitude.")
 
 
+class HeldIn(Model):
+    """Sessions that are held near an amplitude, as a verdict asks for."""
+
+    amplitude_ma: Milliamperes | None = Field(None, description="Near which, mA; either this or `amplitude_fraction`.")
+    amplitude_fraction: Number | None = Field(None, gt=0, lt=1, description="Near which, fraction of the cDBS amplitude.")
+    sessions: Int = Field(1, ge=1, le=MOST_HELD)
+
+    @model_validator(mode="after")
+    def _one_amplitude(self) -> HeldIn:
+        if (self.amplitude_ma is None) == (self.amplitude_fraction is None):
+            raise ValueError("give either amplitude_ma or amplitude_fraction")
+        return self
+
+
 class PlanIn(PlanOptions):
     """A plan to draft."""
 
@@ -76,6 +93,11 @@ class PlanIn(PlanOptions):
         default_factory=list,
         max_length=20,
         description="Policies to test, in `repeats` sessions each; none for a visit of random sessions alone.",
+    )
+    held: list[HeldIn] = Field(
+        default_factory=list,
+        max_length=5,
+        description="Sessions held near an amplitude, at or above the participant's lower bound; they count as the random arm.",
     )
     overrides: list[OverrideIn] = Field(
         default_factory=list, max_length=20, description="For each unsafe policy the reason of a clinician who may approve plans."
@@ -120,7 +142,7 @@ class BoundOut(Model):
 class PlannedDesignOut(Model):
     """What a random session shall try."""
 
-    design: Literal["paper", "stratified", "ladder"]
+    design: SessionDesign
     level: float | None = Field(description="Of the session, fraction of the cDBS amplitude; null where it has none.")
     seed: int | None
     lower_bound: float

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 
+import numpy as np
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
@@ -17,12 +18,12 @@ from app.evaluation.ranking.judged import judged
 from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning.plans import repository
-from app.planning.plans.designs import Planned, bounds_of, planned_sessions, seed_of
+from app.planning.plans.designs import Planned, bounds_of, near_sessions, planned_sessions, seed_of
 from app.planning.plans.key import label_sessions, sealed
-from app.planning.plans.limits import StatedLimits, require_limits, set_limits
-from app.planning.plans.models import Plan, PlanItem
+from app.planning.plans.limits import StatedLimits, planned_cdbs_ma, require_limits, set_limits
+from app.planning.plans.models import Plan, PlanItem, is_held
 from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
-from app.planning.plans.schemas import Move, PlanIn, PlanOptions
+from app.planning.plans.schemas import HeldIn, Move, PlanIn, PlanOptions
 from app.planning.plans.sign_off import sign_plan
 from app.planning.plans.view import PlanView, medication_due, read_plan, refuse_withdrawn, view_of
 from app.planning.protocol.schedule import Candidate, Rules, require_controls, schedule
@@ -32,7 +33,7 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.platform.signatures.service import SignatureState
 from app.study import service as study
-from app.study.models import Controller, Participant, Visit
+from app.study.models import Controller, Hemisphere, Participant, Visit
 from app.study.sessions.logged import CONTROLLER_OF_KIND
 
 MAX_SEED = 2**31 - 1
@@ -43,13 +44,14 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
 
     Raises:
         NotFound: a policy or ranking that the participant does not have. Forbidden: an approved plan, or an unsafe policy, and a caller
-            who may not approve. Invalid: a retired policy, a day that does not fit, no reason why an approved plan is replaced, or what
-            `safeguards` refuses.
+            who may not approve. Invalid: a retired policy, a day that does not fit, no reason why an approved plan is replaced, a session
+            held near an amplitude that the participant's bound forbids, or what `safeguards` refuses.
     """
     participant = visit.participant
     study.require(caller, can.DRAFT_PLAN, participant)
     chosen = testable_policies(db, participant, draft.policy_ids)
-    rules = replace(rules_of(draft), block=repository.earlier_planned_visits(db, visit))
+    held = sum(wish.sessions for wish in draft.held)
+    rules = replace(rules_of(draft), held_sessions=held, block=repository.earlier_planned_visits(db, visit))
     seed = _seed(participant, rules) if draft.seed is None else draft.seed
     day = schedule([Candidate(p.id, controller_of(p)) for p in chosen], rules, seed)
     evaluation = _evaluation(db, participant, draft.evaluation_id)
@@ -69,7 +71,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
         blinded=draft.blinded,
         starts_at=draft.starts_at,
     )
-    to_try = iter(_random_sessions(db, visit, rules))
+    to_try = iter(_to_try(db, visit, rules, draft, seed))
     stated = StatedLimits(draft.min_ma, draft.max_ma, draft.ramp_ma_per_s)
     plan.items = [
         PlanItem(
@@ -165,10 +167,10 @@ def controller_of(policy: Policy) -> Controller:
 
 
 def count_repeats(items: Sequence[PlanItem]) -> None:
-    """Number the sessions of each policy, and of each controller without one, from 1 in their order."""
-    seen: Counter[tuple[Controller, int | None]] = Counter()
+    """Number the sessions of each policy, and of each controller without one, from 1 in their order; held ones by themselves."""
+    seen: Counter[tuple[Controller, int | None, bool]] = Counter()
     for item in items:
-        arm = (Controller(item.controller), item.policy_id)
+        arm = (Controller(item.controller), item.policy_id, is_held(item))
         seen[arm] += 1
         item.repeat = seen[arm]
 
@@ -252,11 +254,40 @@ def _supersede(db: Session, visit: Visit, reason: str | None, caller: Caller) ->
     set_reason(db, None)
 
 
-def _random_sessions(db: Session, visit: Visit, rules: Rules) -> list[Planned]:
-    """What the visit's random sessions shall try, by the participant's settings of today."""
-    participant = visit.participant
+def _to_try(db: Session, visit: Visit, rules: Rules, draft: PlanIn, seed: int) -> list[Planned]:
+    """What the visit's random and held sessions shall try by the settings of today, in a drawn order where there are both."""
+    participant, settings = visit.participant, visit.participant.current_settings
     earlier = repository.earlier_designed_visits(db, visit)
-    return planned_sessions(participant.current_settings, participant.code, earlier, rules.random_sessions, rules.session_minutes)
+    random = planned_sessions(settings, participant.code, earlier, rules.random_sessions, rules.session_minutes)
+    if not draft.held:
+        return random
+    levels, cdbs_ma = _levels(visit, draft.held, draft.hemisphere)
+    everyone = random + near_sessions(levels, settings, participant.code, visit.number, rules.session_minutes, cdbs_ma)
+    return [everyone[i] for i in np.random.default_rng([seed, 0x6E6561]).permutation(len(everyone))]
+
+
+def _levels(visit: Visit, held: Sequence[HeldIn], hemisphere: Hemisphere | None) -> tuple[list[float], float | None]:
+    """Fraction of cDBS of every held session, and the cDBS amplitude in mA; None where no wish is in mA and nobody has stated it.
+
+    Raises:
+        Invalid: an amplitude in mA, and nobody knows which fraction of cDBS that is.
+    """
+    try:
+        cdbs_ma: float | None = planned_cdbs_ma(visit, hemisphere)
+    except Invalid:
+        if any(wish.amplitude_ma is not None for wish in held):
+            raise
+        cdbs_ma = None
+    levels = []
+    for wish in held:
+        if wish.amplitude_fraction is not None:
+            level = wish.amplitude_fraction
+        else:
+            assert wish.amplitude_ma is not None
+            assert cdbs_ma is not None
+            level = round(wish.amplitude_ma / cdbs_ma, 6)
+        levels += [level] * wish.sessions
+    return levels, cdbs_ma
 
 
 def _fix_designs(visit: Visit, plan: Plan) -> None:

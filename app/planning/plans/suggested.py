@@ -1,16 +1,19 @@
-"""Which of the candidates a visit's plan suggests: the portfolio of those that may be proposed. The clinician decides."""
+"""What a visit's plan suggests: the portfolio of candidates that may be proposed, then sessions that would tell of others.
+
+The clinician decides."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from app.evaluation.ranking.answer import answer
+from app.evaluation.ranking.answer import Answer, answer
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.judged import Judged
 from app.evaluation.repository import PolicyHead
+from app.planning.plans.schemas import MOST_HELD
 from ml.ope.posterior.portfolio import Suggestion, portfolio
 from ml.ope.posterior.verdict import FEWEST_DRAWS
 
@@ -24,6 +27,55 @@ class Suggested:
 
     policy: PolicyHead
     why: Suggestion
+
+
+ALIKE = 0.05
+"""Amplitudes closer than this fraction of cDBS are held by the same sessions: their draws reach as far."""
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Sessions near an amplitude that would tell of policies.
+
+    Attributes:
+        fraction: of cDBS. amplitude_ma: the same; None where the cDBS amplitude is not known. sessions, visits: with which they would tell.
+        here: how many of the sessions this visit has room for. policies: of which they would tell.
+    """
+
+    fraction: float
+    amplitude_ma: float | None
+    sessions: int
+    visits: int
+    here: int
+    policies: tuple[PolicyHead, ...]
+
+
+def worth_holding(found: Judged | None, slots: int) -> tuple[Hold, ...]:
+    """What to hold in slots that no policy takes: near the amplitudes that would tell soonest of policies that cannot be told yet."""
+    return () if found is None else held_for(found.answer, found.assessment.cdbs_ma, slots)
+
+
+def held_for(answered: Answer, cdbs_ma: float | None, slots: int) -> tuple[Hold, ...]:
+    """As `worth_holding`, of an answer.
+
+    The fewest sessions come first, then the likeliest policy. Of sessions on two visits this one takes half.
+    """
+    waiting = [(row, row.decided.further) for row in answered.undecided if row.decided.further is not None]
+    waiting.sort(key=lambda pair: (pair[1].sessions, -(pair[0].within or 0.0)))
+    made: list[Hold] = []
+    for row, further in waiting:
+        near = next((i for i, hold in enumerate(made) if abs(hold.fraction - further.fraction) < ALIKE), None)
+        if near is not None:
+            if made[near].sessions == further.sessions:
+                made[near] = replace(made[near], policies=(*made[near].policies, row.one.policy))
+            continue
+        room = slots - sum(hold.here for hold in made)
+        if room < 1:
+            continue
+        ma = None if cdbs_ma is None else further.fraction * cdbs_ma
+        here = min(room, MOST_HELD, math.ceil(further.sessions / further.visits))
+        made.append(Hold(further.fraction, ma, further.sessions, further.visits, here, (row.one.policy,)))
+    return tuple(made)
 
 
 def suggested(found: Judged | None, slots: int) -> tuple[Suggested, ...]:

@@ -45,7 +45,8 @@ class Rules:
         total_minutes: from the first session's start to the last one's end, at most.
         no_dbs: one session without stimulation, at the end of the day: what it does to the symptoms then reaches no other session.
         no_dbs_minutes: its length; no longer than another session, to spare the participant.
-        random_sessions: sessions of the random controller, which widen what the replay buffer covers.
+        random_sessions: sessions of the random controller, which widen what the replay buffer covers. held_sessions: those held near a
+            stated amplitude; they stand where random ones stand, and count as such.
         repeats: sessions of each policy; each round has all of them.
         order: how the order of the policies is found. block: visits before this one that followed the same square.
         break_minutes: one rest in the middle of the visit; 0 for none.
@@ -60,6 +61,7 @@ class Rules:
     no_dbs: bool = False
     no_dbs_minutes: float = 5.0
     random_sessions: int = 0
+    held_sessions: int = 0
     repeats: int = 1
     order: Order = Order.DRAWN
     block: int = 0
@@ -82,8 +84,13 @@ class Rules:
             )
         if not 1 <= self.repeats <= MOST_REPEATS:
             raise Invalid(f"{self.repeats} sessions of each policy are not possible.", f"Choose 1 to {MOST_REPEATS}.", rule=Rule.REPEATS)
-        if min(self.washout_minutes, self.random_sessions, self.break_minutes) < 0 or self.total_minutes <= 0:
+        if min(self.washout_minutes, self.random_sessions, self.held_sessions, self.break_minutes) < 0 or self.total_minutes <= 0:
             raise Invalid("The washout, the break, the visit's minutes and the random sessions cannot be negative.", "Correct them.")
+
+    @property
+    def exploring(self) -> int:
+        """Sessions of the random arm: those of the random controller, and those held near an amplitude."""
+        return self.random_sessions + self.held_sessions
 
 
 @dataclass(frozen=True)
@@ -109,13 +116,13 @@ class PlannedSession:
 def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[PlannedSession]:
     """Lay out a visit day: the policies in the order that the rules ask for, a cDBS session between any two of their sessions.
 
-    A single policy gets its cDBS session first, so that it too has a control, and so does a day of random sessions alone: an early visit
-    that only fills the replay buffer. Random-controller sessions stand at drawn places, the no-DBS session at the end. The same arguments
-    give the same day.
+    A single policy gets its cDBS session first, so that it too has a control, and so does a day of random or held sessions alone: an early
+    visit that only fills the replay buffer. Random and held sessions stand at drawn places, the no-DBS session at the end. The same
+    arguments give the same day.
 
     Raises:
-        Invalid: neither a policy nor a random session, a policy twice, more than four, or a day longer than `rules.total_minutes`; the
-            message says how many policies would fit. The member `rule` names the rule of the protocol.
+        Invalid: neither a policy nor a random or held session, a policy twice, more than four, or a day longer than
+            `rules.total_minutes`; the message says how many policies would fit. The member `rule` names the rule of the protocol.
     """
     _check_candidates(candidates, rules)
     needed = total_minutes(len(candidates), rules)
@@ -128,7 +135,7 @@ def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[P
         if i:
             day.append((Controller.CDBS, None))
         day.append((candidate.controller, candidate.policy_id))
-    for _ in range(rules.random_sessions):
+    for _ in range(rules.exploring):
         # without policies the one cDBS session stays first
         day.insert(int(rng.integers(0 if order else 1, len(day) + 1)), (Controller.RANDOM, None))
     if rules.no_dbs:
@@ -139,8 +146,8 @@ def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[P
 def total_minutes(policies: int, rules: Rules) -> float:
     """Minutes from the first session's start to the last one's end of a day with this many policies."""
     tested = policies * rules.repeats
-    controls = max(tested - 1, 1) if tested or rules.random_sessions else 0
-    full = tested + controls + rules.random_sessions
+    controls = max(tested - 1, 1) if tested or rules.exploring else 0
+    full = tested + controls + rules.exploring
     sessions = full + rules.no_dbs
     rest = rules.break_minutes if sessions > 1 else 0.0
     return full * rules.session_minutes + rules.no_dbs * rules.no_dbs_minutes + max(sessions - 1, 0) * rules.washout_minutes + rest
@@ -175,8 +182,11 @@ def require_controls(day: Sequence[tuple[Controller, int | None]]) -> None:
 
 
 def _check_candidates(candidates: Sequence[Candidate], rules: Rules) -> None:
-    if not candidates and not rules.random_sessions:
-        raise Invalid("A plan needs at least one policy or one random session.", "Choose a policy in the ranking, or add random sessions.")
+    if not candidates and not rules.exploring:
+        raise Invalid(
+            "A plan needs at least one policy, or one random or held session.",
+            "Choose a policy in the ranking, or add random sessions or ones held near an amplitude.",
+        )
     ids = [c.policy_id for c in candidates]
     twice = sorted({i for i in ids if ids.count(i) > 1})
     if twice:
@@ -191,14 +201,23 @@ def _check_candidates(candidates: Sequence[Candidate], rules: Rules) -> None:
 
 def _too_long(policies: int, needed: float, rules: Rules) -> Invalid:
     most = most_policies(rules)
-    extras = (["the no-DBS session"] if rules.no_dbs else []) + (["random sessions"] if rules.random_sessions else [])
+    extras = [
+        name
+        for name, there in (
+            ("the no-DBS session", rules.no_dbs),
+            ("random sessions", rules.random_sessions),
+            ("held sessions", rules.held_sessions),
+        )
+        if there
+    ]
     ways = ["shorten sessions or washout", "give the visit more minutes"] + ([f"leave out {' and '.join(extras)}"] if extras else [])
-    tested = _policies(policies) if policies else "The random sessions"
+    kinds = [name for name, there in (("random", rules.random_sessions), ("held", rules.held_sessions)) if there]
+    tested = _policies(policies) if policies else f"The {' and '.join(kinds)} sessions"
     detail = f"{tested} with the sessions around them take {needed:g} minutes; the visit has {rules.total_minutes:g}."
     if not policies:
         return Invalid(
             detail,
-            f"Plan fewer random sessions, or {', or '.join(ways[:2])}.",
+            f"Plan fewer of them, or {', or '.join(ways[:2])}.",
             minutes_needed=needed,
             policies_that_fit=0,
             rule=Rule.VISIT_MINUTES,

@@ -18,7 +18,7 @@ from app.study.traces import StepTable
 from ml.designs import recognise, unstated_holds
 from ml.trajectories import Hold
 
-Kind = Literal["paper", "stratified", "ladder", "held", "unstated"]
+Kind = Literal["paper", "stratified", "ladder", "near", "held", "unstated"]
 """The stated design; `held` where nobody stated one and the amplitudes are held; `unstated` where they are not: taken for the paper's."""
 
 AGREEING_SHARE: Final = 0.9

@@ -25,7 +25,7 @@ class Schedule:
     """What a session without a network delivers.
 
     Attributes:
-        design: `paper`, `stratified`, `ladder`, or `constant`.
+        design: `paper`, `stratified`, `ladder`, `near`, or `constant`.
         level, seed, lower_bound: of the design; None where it has none.
         holds: in order and without gaps from step 0; cDBS follows the last one.
 

@@ -22,7 +22,7 @@ from ml.formats.tables.steps import GRID_TOLERANCE
 NEWEST = 3
 """Version of logs that this decoder reads at the most."""
 PURPOSES = ("session", "bench", "replay")
-DESIGNS = ("paper", "stratified", "ladder")
+DESIGNS = ("paper", "stratified", "ladder", "near")
 CONTROLLERS = ("cdbs", "rl", "distilled", "no_dbs", "random", "other")
 ENDS = (
     "complete", "stopped", "input_ended", "other_device", "device_gone", "log_failed", "expired", "stood_still", "fault",

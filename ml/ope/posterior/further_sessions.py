@@ -1,17 +1,24 @@
 """How many further sessions near a dose would tell what cannot be told yet, by simulation.
 
 Preposterior analysis (Raiffa and Schlaifer 1961, ch. 4): a truth is drawn from the posterior, the mean of n sessions under it is drawn
-with the noise of sessions, the posterior is reweighted by the likelihood of that mean, and the verdict is asked again. n is the least
-number with which it is told in four of five such futures.
+with the noise of sessions, the posterior is moved by that mean as tested sessions move it (linear prediction over joint draws), and the
+verdict is asked again. n is the least number with which it is told in four of five such futures.
+
+What the sessions show is not the policy itself but an amplitude that is held near its dose, as a plan can hold it: below `LOW_AMPLITUDE`
+for the last `LOW_SECONDS` of a session alone. So a policy whose dose no session of a plan comes near has no number, nor one whose
+outcomes go their own way beside those of the amplitudes that can be held.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.designs import NEAR_SPREAD, near_doses
+from ml.ope.posterior.support import FEWEST_SESSIONS, FEWEST_VISITS, NEAR
 from ml.ope.posterior.verdict import OUTCOMES, Levels
 from ml.qoc import Qoc
 from ml.returns import actual_return
@@ -26,6 +33,10 @@ TOLD = 0.8
 """Share of simulated futures in which the verdict must be told."""
 
 FUTURES = 200
+STEP = 0.01
+"""Levels are tried in steps of this, fraction of cDBS."""
+_SLACK = 0.02
+"""By how much draws may move a session's mean from its expectation, fraction of cDBS; ten minutes of draws move it by 0.01."""
 _FEWEST = 3
 """Degrees of freedom from which the noise of sessions is known."""
 
@@ -77,41 +88,112 @@ def _within_groups(groups: Sequence[Sequence[float | None]]) -> float:
     return float(np.sqrt(squares / freedom)) if freedom >= _FEWEST else 0.0
 
 
+@dataclass(frozen=True)
+class Reachable:
+    """An amplitude that a plan can hold so that its sessions lie near a policy.
+
+    Attributes:
+        level: that is held, fraction of cDBS. dose: mean of such a session.
+    """
+
+    level: float
+    dose: float
+
+
+def reachable(dose: float, lower_bound: float, steps: int, period_s: float) -> Reachable | None:
+    """The level nearest to a policy's mean dose whose sessions lie near the policy (`support.NEAR`); None where there is none.
+
+    A session is not held much lower than the policy itself would go, so as to make up for minutes at which it may not be low.
+
+    Args:
+        dose: of the policy, fraction of cDBS. lower_bound: B. steps: of a session. period_s: of a step.
+    """
+    mean_within, late_within = float(NEAR[0]) - _SLACK, float(NEAR[1]) - _SLACK
+    lowest, highest = lower_bound, 1.0 - NEAR_SPREAD
+    wanted = min(max(dose, lowest), highest)
+    tried = [wanted, *(float(v) for v in np.arange(max(lowest, dose - NEAR_SPREAD), highest, STEP))]
+    for level in sorted(tried, key=lambda level: abs(level - wanted)):
+        mean, late = near_doses(level, steps, period_s, lower_bound)
+        if abs(mean - dose) <= mean_within and abs(late - dose) <= late_within:
+            return Reachable(level, mean)
+    return None
+
+
+@dataclass(frozen=True)
+class Needed:
+    """What would tell: so many sessions, on at least so many visits."""
+
+    sessions: int
+    visits: int
+
+
 def sessions_to_tell(
-    gaps: Mapping[str, Floats], noise: Mapping[str, float], levels: Levels, *, already_near: int = 0, supported: bool = True, seed: int = 0
-) -> int | None:
-    """The least number of further sessions near the policy's dose with which it would be told as a test or as unsafe.
+    gaps: Mapping[str, Floats],
+    noise: Mapping[str, float],
+    levels: Levels,
+    *,
+    shown: Mapping[str, Floats] | None = None,
+    saved: Floats | None = None,
+    near: tuple[int, int] = (0, 0),
+    supported: bool = True,
+    seed: int = 0,
+) -> Needed | None:
+    """The fewest further sessions near the policy's dose with which it would be told as a test or as unsafe.
 
     Args:
         gaps: by how much each outcome keeps within its margin, draw by draw (`verdict.slacks`), [draws].
         noise: of a session, by outcome (`session_noise`). levels: of the verdict.
-        already_near: sessions that were near already. supported: whether the data support the policy; else two near it are needed besides.
+        shown: what such a session shows of each outcome less what cDBS shows, from the same draws, [draws]; the policy's own where None.
+        saved: energy of cDBS less that of the policy, [draws]; above 0 everywhere where None.
+        near: sessions, and their visits, that were near already. supported: whether the data support the policy; else two sessions on two
+            visits near it are needed besides.
         seed: of the simulated futures.
 
     Returns:
         None where not even the largest of `NUMBERS` would do, or where the noise of no outcome is known.
     """
     names = [name for name in gaps if noise.get(name, 0.0) > 0]
-    if not names:
+    seen_of = {name: (shown or gaps)[name] for name in names if name in (shown or gaps)}
+    if not seen_of:
         return None
-    known = np.stack([gaps[name] for name in names], axis=1)
-    others = [gaps[name] for name in gaps if name not in names]
-    inside = np.min(np.stack([*known.T, *others]), axis=0) >= 0
-    # a session of the policy less one of cDBS at the same visit: both have the noise
-    error = np.sqrt(2.0) * np.array([noise[name] for name in names])
+    least = 1 if supported else max(1, FEWEST_SESSIONS - near[0])
+    visits = 1 if supported else max(1, FEWEST_VISITS - near[1])
+    asked = np.stack([*gaps.values(), *(() if saved is None else (saved,))])
+    seen = np.stack(list(seen_of.values()))
+    # a session held near less one of cDBS at the same visit: both have the noise
+    variance = 2.0 * np.array([noise[name] for name in seen_of]) ** 2
     rng = np.random.default_rng(seed)
-    truths = rng.integers(0, len(known), FUTURES)
-    shocks = rng.standard_normal((FUTURES, len(names)))
-    least = 1 if supported else max(1, 2 - already_near)
+    truths = rng.integers(0, seen.shape[1], FUTURES)
+    futures, own = rng.standard_normal((FUTURES, len(seen))), rng.standard_normal(seen.shape)
     for n in NUMBERS:
-        if n < least:
+        if n < max(least, visits):
             continue
-        spread = error / np.sqrt(n)
-        seen = known[truths] + shocks * spread
-        log_weight = -0.5 * (((seen[:, None, :] - known[None, :, :]) / spread) ** 2).sum(axis=2)
-        weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
-        within = (weight * inside).sum(axis=1) / weight.sum(axis=1)
-        told = (within >= levels.test_within) | (1 - within >= levels.unsafe_beyond)
-        if float(told.mean()) >= TOLD:
-            return n
+        told = _told(asked, len(gaps), seen, variance / n, truths, futures, own, levels)
+        if told >= TOLD:
+            return Needed(n, visits)
     return None
+
+
+def _told(
+    asked: Floats, outcomes: int, seen: Floats, variance: Floats, truths: NDArray[np.int64], futures: Floats, own: Floats, levels: Levels
+) -> float:
+    """Share of futures in which the verdict is told.
+
+    Args:
+        asked: gaps, and energy saved where it is known, [outcomes or outcomes + 1, draws]. outcomes: how many gaps.
+        seen: [S, draws]. variance: of the mean of the sessions, [S]. truths: draws that are true, [F]. futures: chance of the sessions,
+            [F, S]. own: chance of the draws, [S, draws].
+    """
+    k = seen.shape[1] - 1
+    away = seen - seen.mean(1, keepdims=True)
+    covariance = away @ away.T / k + np.diag(variance)
+    gain = (asked - asked.mean(1, keepdims=True)) @ away.T / k @ np.linalg.pinv(covariance, hermitian=True)
+    sd = np.sqrt(variance)[:, None]
+    told = 0
+    for truth, chance in zip(truths, futures, strict=True):
+        said = seen[:, truth : truth + 1] + sd * chance[:, None]
+        moved = asked + gain @ (said - seen - sd * own)
+        within = float(np.mean((moved[:outcomes] >= 0).all(0)))
+        saves = float(np.mean(moved[outcomes:] > 0)) if len(moved) > outcomes else 1.0
+        told += (within >= levels.test_within and saves >= levels.test_saves) or 1 - within >= levels.unsafe_beyond
+    return told / len(truths)

@@ -12,6 +12,7 @@ from fastapi.testclient import TestClient
 
 from app.evaluation.ranking.decisions import Circumstances, decide
 from app.study.margins.models import MarginsVersion
+from ml.ope.flags import Flag
 from tests.app.evaluations import judged
 from tests.app.words import above_fold, methods_named
 from tests.conftest import PASSWORD
@@ -22,6 +23,11 @@ PAGE = "/participants/P1/ranking"
 WORSE = {"outcome_draws": {"tremor_percent": [45.0] * N}}
 NEARLY_OFF = {"behaviour": {"below_cdbs_20_percent": 0.42}}
 Judge = Callable[..., int]
+
+
+def few_near(sessions: int) -> dict[str, Any]:
+    """The finding that too few sessions are near, as it is stored."""
+    return Flag.of("few_near_sessions", float(sessions), 2.0, "sessions", refuses=True, dose=0.6).to_json()
 
 
 def ranked(client: TestClient) -> dict[str, Any]:
@@ -164,7 +170,7 @@ def test_a_ranking_with_nothing_to_test_says_so_why_and_what_to_do(client: TestC
 
 def test_every_policy_that_as_few_sessions_would_tell_is_named(client: TestClient, policies: list[int], judge: Judge) -> None:
     noise = {"coverage": {"policies": {}, "session_noise": {"tremor_percent": 4.0}}}
-    open_still, likelier = ([low + 0.03 * i for i in range(N)] for low in (10.0, 9.0))
+    open_still, likelier = ([low + 0.03 * i for i in range(N)] for low in (10.0, 9.9))
     support = {"dose": 0.6}
     judge(
         {
@@ -193,12 +199,51 @@ def test_how_many_sessions_near_which_amplitude_would_tell_is_said(client: TestC
     assert f"{n} session{'s' if n > 1 else ''} held near 1.8 mA would tell" in first_screen(client)
 
 
+NOISE = {"coverage": {"policies": {}, "session_noise": {"tremor_percent": 4.0}}}
+OPEN = {"tremor_percent": [10.0 + 0.03 * i for i in range(N)]}
+
+
+def reasons_of(client: TestClient, place: int = 0) -> dict[str, Any]:
+    return {r["code"]: r["value"] for r in ranked(client)["policies"][place]["decision_reasons"]}
+
+
 def test_no_session_is_asked_for_below_the_participants_lower_bound(client: TestClient, policies: list[int], judge: Judge) -> None:
-    noise = {"coverage": {"policies": {}, "session_noise": {"tremor_percent": 4.0}}}
-    draws = {"tremor_percent": [10.0 + 0.03 * i for i in range(N)]}
-    judge({policies[0]: judged(50.0, outcome_draws=draws, support={"dose": 0.1})}, **noise)
-    by_code = {r["code"]: r["value"] for r in ranked(client)["policies"][0]["decision_reasons"]}
-    assert by_code["near_amplitude"] == pytest.approx(0.9), "B is 0.3 of 3 mA, the policy's own dose 0.3 mA"
+    judge({policies[0]: judged(50.0, outcome_draws=OPEN, support={"dose": 0.27})}, **NOISE)
+    assert reasons_of(client)["near_amplitude"] == pytest.approx(0.9), "B is 0.3 of 3 mA, the policy's own dose 0.81 mA"
+
+
+def test_a_dose_that_no_planned_session_comes_near_is_settled_by_no_number_of_them(
+    client: TestClient, policies: list[int], judge: Judge
+) -> None:
+    judge({policies[0]: judged(50.0, outcome_draws=OPEN, support={"dose": 0.1})}, **NOISE)
+    found = reasons_of(client)
+    assert "not_settled_by_sessions" in found
+    assert found.keys().isdisjoint({"sessions_needed", "near_amplitude"})
+    words = first_screen(client)
+    assert "more sessions near its amplitude would not settle it" in words
+    assert "would tell" not in words
+
+
+def test_support_asks_for_sessions_on_two_visits_and_says_so(client: TestClient, policies: list[int], judge: Judge) -> None:
+    far = {"dose": 0.6, "near_sessions": 0, "near_visits": 0}
+    judge({policies[0]: judged(50.0, outcome_draws={"tremor_percent": share(0.3, 21.0, 33.0)}, supported=False, support=far)}, **NOISE)
+    by_code = {r["code"]: r for r in ranked(client)["policies"][0]["decision_reasons"]}
+    assert "sessions_needed" not in by_code, "the data refuse it for another reason than too few sessions near: no number settles that"
+    near = judged(50.0, outcome_draws={"tremor_percent": share(0.3, 21.0, 33.0)}, supported=False, support=far)
+    judge({policies[0]: near | {"flags": [few_near(0)]}}, **NOISE)
+    by_code = {r["code"]: r for r in ranked(client)["policies"][0]["decision_reasons"]}
+    assert by_code["visits_needed"] == {"code": "visits_needed", "value": 2.0, "limit": None, "unit": "visits"}
+    n = int(by_code["sessions_needed"]["value"])
+    assert n >= 2
+    assert f"{n} sessions held near 1.8 mA on 2 visits would tell" in first_screen(client)
+
+
+def test_no_number_of_sessions_is_said_to_tell_where_the_data_cannot_order_policies(
+    client: TestClient, policies: list[int], judge: Judge
+) -> None:
+    judge({policies[0]: judged(50.0, told=False, outcome_draws=OPEN)}, cdbs(told=False).to_json(), **NOISE)
+    assert reasons_of(client).keys().isdisjoint({"sessions_needed", "near_amplitude", "not_settled_by_sessions"})
+    assert "would tell" not in first_screen(client)
 
 
 def test_another_method_can_order_the_fold_and_the_verdicts_stay(client: TestClient, policies: list[int], judge: Judge) -> None:

@@ -61,7 +61,7 @@ def test_they_enter_once_a_qoc_is_significantly_better_and_none_is_worse(upload:
 
 def test_designed_sessions_are_the_random_arm(upload: Upload, client: TestClient) -> None:
     learned, random = sessions(upload, [qoc(2.0, 9, 10.0)] * 4, [qoc(2.0, 4, 10.0)] * 4)
-    for session, design in zip(random, ("stratified", "stratified", "ladder", "paper"), strict=True):
+    for session, design in zip(random, ("stratified", "near", "ladder", "paper"), strict=True):
         stated = client.put(f"/api/v1/sessions/{session}/conditions", json={"design": design, "seed": 1, "reason": "as planned"})
         assert stated.status_code == 200, stated.text
     gate = client.get(GATE).json()

@@ -71,6 +71,35 @@ def _with(value: float, draws: list[float], **changed: Any) -> dict[str, Any]:
     return estimate
 
 
+def test_slots_that_no_policy_takes_name_sessions_that_would_tell_and_ask_for_none(
+    client: TestClient, policies: list[int], judge: Judge, suggested: Callable[[], list[str]]
+) -> None:
+    a, b, c = policies
+    noise = {"coverage": {"policies": {}, "session_noise": {"tremor_percent": 4.0}}}
+    undecided = {"tremor_percent": [10.0 + 0.03 * k for k in range(N)]}
+    likelier = {"tremor_percent": [9.9 + 0.03 * k for k in range(N)]}
+    judge(
+        {
+            a: judged(50.0, outcome_draws=undecided, support={"dose": 0.6}),
+            b: judged(50.0, outcome_draws=likelier, support={"dose": 0.62}),
+            c: judged(50.0, **UNSAFE),
+        },
+        **noise,
+    )
+    assert suggested() == []
+    page = client.get("/visits/2/plan", headers={"accept": "text/html"}).text
+    fields = re.search(r'<fieldset id="held">(.*?)</fieldset>', page, re.S)
+    assert fields is not None
+    words = html.unescape(" ".join(re.sub(r"<[^>]+>", " ", fields.group(1)).split()))
+    assert re.search(r"sessions near mA \d sessions? held near it would tell whether 'p1' and 'p0' are worth a test", words), words
+    assert re.findall(r'name="held_amplitude"[^>]* value="([^"]*)"', fields.group(1)) == ["1.9", ""]
+    assert re.findall(r'name="held_sessions"[^>]* value="([^"]*)"', fields.group(1)) == ["", ""], "the clinician decides"
+    asked = {"held_unit": ["amplitude_ma"] * 2, "held_amplitude": ["1.9", ""], "held_sessions": ["2", ""]}
+    assert client.post("/visits/2/plan", data=asked, follow_redirects=False).status_code == 303
+    held = [s["design"]["level"] for s in client.get("/api/v1/visits/2/plan").json()["sessions"] if s["design"]]
+    assert held == pytest.approx([1.9 / 3, 1.9 / 3])
+
+
 def test_policies_that_do_the_same_stand_under_their_teacher_and_can_still_be_ticked(
     client: TestClient, db: Session, policies: list[int], judge: Judge
 ) -> None:

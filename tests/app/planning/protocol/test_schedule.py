@@ -102,7 +102,7 @@ def test_a_day_too_short_for_any_policy_says_so() -> None:
 def test_the_same_policy_twice_and_none_at_all_are_refused() -> None:
     with pytest.raises(Invalid, match="Policy 3 is named twice"):
         schedule([Candidate(3, Controller.RL), Candidate(3, Controller.RL)], Rules(), seed=0)
-    with pytest.raises(Invalid, match="at least one policy or one random session"):
+    with pytest.raises(Invalid, match="at least one policy, or one random or held session"):
         schedule([], Rules(), seed=0)
 
 
@@ -112,7 +112,7 @@ def test_an_early_visit_without_policies_is_random_sessions_after_one_of_cdbs() 
     assert end_minute(day[-1]) == pytest.approx(total_minutes(0, Rules(random_sessions=3, no_dbs=True)))
     with pytest.raises(Invalid, match=r"The random sessions .* take 130 minutes") as refusal:
         schedule([], Rules(random_sessions=8), seed=3)
-    assert refusal.value.hint.startswith("Plan fewer random sessions, or shorten sessions or washout")
+    assert refusal.value.hint.startswith("Plan fewer of them, or shorten sessions or washout")
 
 
 @pytest.mark.parametrize("minutes", [4.9, 20.1])
@@ -143,3 +143,13 @@ def test_policies_are_repeated_within_a_visit_in_whole_rounds() -> None:
     assert tested[:2] != tested[2:], "the second round takes the square's next row"
     assert [s.break_minutes for s in day] == [0, 0, 0, 15, 0, 0, 0]
     assert end_minute(day[-1]) == total_minutes(2, Rules(repeats=2, break_minutes=15)) == 7 * 10 + 6 * 5 + 15
+
+
+def test_held_sessions_stand_and_count_as_random_ones_and_a_refusal_names_them() -> None:
+    day = schedule([Candidate(7, Controller.RL), Candidate(8, Controller.RL)], Rules(held_sessions=2), seed=3)
+    assert [s.controller for s in day].count(Controller.RANDOM) == 2
+    assert end_minute(day[-1]) == pytest.approx(total_minutes(2, Rules(random_sessions=2)))
+    assert Rules(random_sessions=1, held_sessions=2).exploring == 3
+    with pytest.raises(Invalid, match="The random and held sessions") as refusal:
+        schedule([], Rules(random_sessions=4, held_sessions=4), seed=3)
+    assert refusal.value.hint.startswith("Plan fewer of them")

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from ml.designs import NEAR_SPREAD, near_session
 from ml.mdp import MdpSettings
-from ml.ope.posterior.further_sessions import session_noise, sessions_to_tell
+from ml.ope.posterior.further_sessions import Needed, reachable, session_noise, sessions_to_tell
+from ml.ope.posterior.support import LATE_STEPS, NEAR
 from ml.ope.posterior.verdict import Levels
 from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -38,23 +40,59 @@ def test_the_number_is_that_of_the_closed_form(mean: float, sd: float, noise: fl
     surely, hardly = (next((n for n, p in shares.items() if p >= level), None) for level in (0.86, 0.74))
     assert hardly is not None
     assert found is not None
-    assert hardly <= found <= (surely or 24)
+    assert hardly <= found.sessions <= (surely or 24)
 
 
 def test_noisier_sessions_take_more_of_them_and_hopeless_ones_give_no_number() -> None:
     gaps = {"tremor_percent": normal_draws(3.0, 10.0)}
     quiet, loud = (sessions_to_tell(gaps, {"tremor_percent": noise}, Levels()) for noise in (2.0, 15.0))
     assert quiet is not None
-    assert loud is None or loud > quiet
+    assert loud is None or loud.sessions > quiet.sessions
     assert sessions_to_tell(gaps, {"tremor_percent": 1000.0}, Levels()) is None
     assert sessions_to_tell(gaps, {}, Levels()) is None, "without the noise of a session no number is told"
 
 
-def test_an_unsupported_policy_needs_two_sessions_near_it_whatever_is_predicted() -> None:
+def test_an_unsupported_policy_needs_two_sessions_on_two_visits_whatever_is_predicted() -> None:
     sure = {"rating": normal_draws(5.0, 0.5)}
-    assert sessions_to_tell(sure, {"rating": 1.0}, Levels()) == 1
-    assert sessions_to_tell(sure, {"rating": 1.0}, Levels(), supported=False) == 2
-    assert sessions_to_tell(sure, {"rating": 1.0}, Levels(), supported=False, already_near=1) == 1
+    noise = {"rating": 1.0}
+    assert sessions_to_tell(sure, noise, Levels()) == Needed(1, 1)
+    assert sessions_to_tell(sure, noise, Levels(), supported=False) == Needed(2, 2)
+    assert sessions_to_tell(sure, noise, Levels(), supported=False, near=(1, 1)) == Needed(1, 1), "on another visit than that one"
+    assert sessions_to_tell(sure, noise, Levels(), supported=False, near=(3, 1)) == Needed(1, 1)
+
+
+def test_sessions_that_show_nothing_of_the_policy_would_not_tell() -> None:
+    gaps = {"rating": normal_draws(1.0, 2.0)}
+    rng = np.random.default_rng(0)
+    alike = gaps["rating"] + rng.normal(0, 0.1, len(RANKS))
+    of_something_else = rng.permutation(gaps["rating"])
+    noise = {"rating": 0.5}
+    assert sessions_to_tell(gaps, noise, Levels(), shown={"rating": alike}) is not None
+    assert sessions_to_tell(gaps, noise, Levels(), shown={"rating": of_something_else}) is None
+
+
+def test_what_would_not_surely_save_energy_is_told_by_no_session() -> None:
+    gaps, noise = {"rating": normal_draws(1.0, 1.5)}, {"rating": 0.5}
+    rng = np.random.default_rng(0)
+    assert sessions_to_tell(gaps, noise, Levels(), saved=np.full(len(RANKS), 0.3)) is not None
+    assert sessions_to_tell(gaps, noise, Levels(), saved=rng.normal(0.1, 0.3, len(RANKS))) is None
+
+
+@pytest.mark.parametrize("dose", [0.44, 0.5, 0.6, 0.75, 0.9])
+def test_what_is_named_is_held_so_near_that_it_supports_the_policy(dose: float) -> None:
+    found = reachable(dose, 0.3, 300, 2.0)
+    assert found is not None
+    assert found.level >= dose - NEAR_SPREAD
+    for seed in range(50):
+        a = near_session(found.level, 300, 2.0, 0.3, seed, 0).amplitudes
+        assert abs(a.mean() - dose) <= NEAR[0]
+        assert abs(a[-LATE_STEPS:].mean() - dose) <= NEAR[1]
+
+
+def test_a_dose_that_no_session_may_hold_is_not_named() -> None:
+    assert reachable(0.4, 0.3, 300, 2.0) is None, "of ten minutes the first five are above 0.6"
+    assert reachable(0.4, 0.3, 150, 2.0) is not None, "five minutes may be low all along"
+    assert reachable(0.45, 0.6, 300, 2.0) is None, "below B"
 
 
 def buffer_of(*rows: tuple[int, str, int | None]) -> ReplayBuffer:
