@@ -4,6 +4,7 @@
     python -m benchmarks.development.learned --memory                             critics that see past amplitudes, and those that do not
     python -m benchmarks.development.learned --anchors both,all                   held near two amplitudes, or also near the best constant
     python -m benchmarks.development.learned --updates 2000 --minutes 20          shorter trainings; no further world after so long
+    python -m benchmarks.development.learned --untrained --every 4 --worlds 15    the dose alone that the anchor `best` holds a policy near
     python -m benchmarks.development.learned --quick                              one world, few updates and simulated sessions
     python -m benchmarks.development.learned --designs stratified,paper           data by both designs
     python -m benchmarks.development.learned --part B                             to report on; each run is counted
@@ -31,7 +32,7 @@ import torch
 
 from app.learning.schemas import DEFAULT_SWEEP, Anchor, TrainParams
 from app.learning.sweeps.comparison import held_near
-from app.learning.training.compute import hold_out, with_best_anchor
+from app.learning.training.compute import hold_out, supported_best, with_best_anchor
 from app.learning.training.configs import training_groups
 from benchmarks.support.cells import Cells
 from benchmarks.support.looks import look
@@ -49,16 +50,17 @@ ANCHORS: tuple[Anchor, ...] = ("both", "all")
 
 
 class Arm(NamedTuple):
-    """How data are made and policies trained."""
+    """How data are made and policies trained; not `trained`, the dose alone that they would be held near."""
 
     design: DataDesign
     memory: bool
     anchor: Anchor
+    trained: bool = True
 
     @property
     def key(self) -> str:
         """Its name in files and lines."""
-        return f"{self.design} {'memory' if self.memory else 'window'} {self.anchor}"
+        return f"{self.design} {'memory' if self.memory else 'window'} {self.anchor}" if self.trained else f"{self.design} untrained"
 
 
 def sweep(buffer: ReplayBuffer, arm: Arm, updates: int | None) -> dict[str, Policy]:
@@ -74,13 +76,19 @@ def sweep(buffer: ReplayBuffer, arm: Arm, updates: int | None) -> dict[str, Poli
     return found
 
 
+def anchor_alone(buffer: ReplayBuffer) -> dict[str, Policy]:
+    """The dose that the anchor `best` holds a policy near, as a policy."""
+    best = supported_best(buffer, margins=None)
+    return {"anchor": ConstantPolicy(1.0 if best is None else best)}
+
+
 def cell(w: World, arm: Arm, updates: int | None, truth: int) -> dict[str, Any]:
     """What the six of one virtual patient are, by the posterior and by truth; none are trained for who responds to nothing simple."""
     cdbs = w.truth(ConstantPolicy(1.0), truth)
     if not is_responder({name: w.truth(policy, truth) for name, policy in simple_policies(w.settings, w.spread).items()}, cdbs):
         return {"responder": False, "policies": {}}
     buffer = w.data(arm.design)
-    policies = sweep(buffer, arm, updates)
+    policies = sweep(buffer, arm, updates) if arm.trained else anchor_alone(buffer)
     gains = gains_over_cdbs(buffer, policies)
     rows = {}
     for name, policy in policies.items():
@@ -136,6 +144,8 @@ def differences(cells: dict[str, dict[str, Any]], others: dict[str, dict[str, An
 
 def arms(chosen: argparse.Namespace) -> list[Arm]:
     """What is asked for."""
+    if chosen.untrained:
+        return [Arm(d, False, "best", trained=False) for d in DESIGNS if d in chosen.designs.split(",")]
     memories = (False, True) if chosen.memory else (bool(DEFAULT_SWEEP["critic_memory"]),)
     anchors = [a for a in ANCHORS if a in chosen.anchors.split(",")]
     return [Arm(d, m, a) for d in DESIGNS if d in chosen.designs.split(",") for m in memories for a in anchors]
@@ -172,6 +182,7 @@ def main() -> None:
     parser.add_argument("--designs", default="stratified", help="with commas: stratified, paper")
     parser.add_argument("--anchors", default=DEFAULT_SWEEP["anchor"], help="with commas: both, all")
     parser.add_argument("--memory", action="store_true", help="critics that see past amplitudes, and those that do not")
+    parser.add_argument("--untrained", action="store_true", help="the dose alone that policies would be held near")
     parser.add_argument("--updates", type=int, help="of every training; those of the preset by default")
     parser.add_argument("--minutes", type=float, default=1e9, help="start no further training after so many minutes")
     parser.add_argument("--out", type=Path, help="folder of the finished worlds; a temporary one by default")

@@ -33,9 +33,9 @@ DISTILLATION: dict[str, dict[str, Any]] = {"full": {"updates": 5_000, "sigma": 0
 def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]) -> list[dict[str, Any]]:
     """The policies of a sweep in groups that are trained side by side, each in a child process of its own.
 
-    From scratch the policies are dealt to the algorithms in turn, each of which goes through its aims and anchors; those of one kind have
-    learning rates spread evenly in the logarithm and fill two groups, one for each core. Seeds count up over all. A fine-tuned policy is a
-    group of its own.
+    From scratch the policies are dealt to the algorithms in turn, each of which goes through its aims and anchors; those of one algorithm
+    have learning rates spread evenly in the logarithm, whatever their aims and anchors. Those of one kind fill two groups, one for each
+    core. Seeds count up over all. A fine-tuned policy is a group of its own.
 
     Args:
         params: what was asked for.
@@ -49,12 +49,13 @@ def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]
         return [_fine_tuning(params, k, start) for k, start in enumerate(starts) if start is not None]
     groups: list[dict[str, Any]] = []
     kinds = _kinds(params)
+    algorithms = [kinds[number % len(kinds)][0] for number in range(params.count)]
     for which, (algorithm, changes) in enumerate(kinds):
-        numbers = list(range(which, params.count, len(kinds)))
         low, high = _rates(params, algorithm)
         configs = [
-            _config(params, algorithm, actor_lr=_between(low, high, k, len(numbers)), seed=params.seed + number) | changes
-            for k, number in enumerate(numbers)
+            _config(params, algorithm, actor_lr=_between(low, high, place, algorithms.count(algorithm)), seed=params.seed + number)
+            | changes
+            for number, place in ((n, algorithms[:n].count(algorithm)) for n in range(which, params.count, len(kinds)))
         ]
         half = -(-len(configs) // 2)
         groups += [{"algorithm": algorithm, "configs": part, "start": None} for part in (configs[:half], configs[half:]) if part]

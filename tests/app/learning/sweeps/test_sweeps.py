@@ -76,6 +76,11 @@ def test_the_six_of_the_default_sweep_have_both_aims_and_all_three_anchors() -> 
         ("ddpg", "steps", None), ("rebrac", "steps", "logged"), ("ddpg", "return", None),
         ("rebrac", "return", "best"), ("rebrac", "steps", "cDBS"), ("rebrac", "return", "logged"),
     ]  # fmt: skip
+    rates = {a: sorted(c["actor_lr"] for g in groups for c in g["configs"] if g["algorithm"] == a) for a in ("ddpg", "rebrac")}
+    assert (rates["ddpg"][0], rates["ddpg"][-1]) == (pytest.approx(1e-5), pytest.approx(1e-3)), (
+        "the paper's from scratch, whatever the kinds"
+    )
+    assert rates["rebrac"] == pytest.approx([1e-4, 2.15e-4, 4.64e-4, 1e-3])
     many = training_groups(TrainParams(algorithms=["rebrac"], aim="both", anchor="all", count=6), [None] * 6)
     assert len({(c["aim"], held_near(c)) for g in many for c in g["configs"]}) == 6, "every pair once"
 
