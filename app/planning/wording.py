@@ -8,7 +8,7 @@ from app.evaluation.wording import amplitude, chance, count, joined
 from app.planning.notices import Code, PlanWarning
 from app.planning.plans.designs import Bound, Planned, delivered_ma
 from app.planning.plans.models import NEAR, Plan, PlanItem, is_held
-from app.planning.plans.suggested import Hold
+from app.planning.plans.suggested import Held
 from app.planning.protocol.session_order import Order
 from app.planning.slots.matching import Deviation
 from app.planning.visit_day.record import Contradiction, Entry, grasp_hz, moment
@@ -82,13 +82,20 @@ def suggestion(why: Suggestion, first: bool) -> str:
     return f"{chance(why.better)} likely to turn out better on the whole {than}{tells}."
 
 
-def holding(hold: Hold) -> str:
-    """What sessions near an amplitude would tell, in one clause."""
-    names = [f"'{policy.name}'" for policy in hold.policies]
+def holding(held: Held) -> str:
+    """What sessions near an amplitude would tell, in one sentence."""
+    further = held.hold.further
+    if further is None:
+        return (
+            "The recordings cannot tell policies apart. This is the lowest amplitude that a whole session may hold: beside cDBS it shows "
+            "best whether doses differ; no number of sessions is known to settle it."
+        )
+    names = [f"'{policy.name}'" for policy in held.policies]
     of = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-    visits = f" on {hold.visits} visits" if hold.visits > 1 else ""
+    visits = f" on {further.visits} visits" if further.visits > 1 else ""
     is_worth = f"{of} {'is' if len(names) == 1 else 'are'} worth a test"
-    return f"{count(hold.sessions, 'session', 'sessions')} held near it{visits} would tell whether {is_worth}"
+    now = f"; {held.hold.here} of them at this visit" if held.hold.here < further.sessions else ""
+    return f"{count(further.sessions, 'session', 'sessions')} held near it{visits} would tell whether {is_worth}{now}."
 
 
 TELLING = 0.2

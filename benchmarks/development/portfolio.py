@@ -4,13 +4,20 @@
     python -m benchmarks.development.portfolio --worlds 40 --out FOLDER   40 worlds; resumable
     python -m benchmarks.development.portfolio --part B ...               patients to report on; each run is counted
     python -m benchmarks.development.portfolio --dlsm ...                 the order of the DLSM too, which costs a minute per world
+    python -m benchmarks.development.portfolio --named --worlds 30        whether as many sessions as a verdict names do tell
 
 Every virtual patient has three visits of data by the stratified design. Three more visits test up to four policies each: 60 minutes, two
 cDBS sessions and four others of ten minutes. `portfolio` is what the plan's page suggests: verdicts are respected, and tested sessions move
-the posterior before the next visit. `any verdict` is the same choice among all candidates without a hazard. `linear`, `dlsm` and `random`
+the posterior before the next visit. `and held` spends the slots that no policy takes as that page says too: sessions held near the
+amplitudes that would tell soonest, or that explore where the data cannot order policies; with the visit's cDBS sessions they join the data,
+to which everything is fitted anew. `any verdict` is the same choice among all candidates without a hazard. `linear`, `dlsm` and `random`
 test the next four of their order. Told after each visit: the true gain over cDBS of the best policy tested so far, as a share of what the
 best candidate gains (`tested`), and of the policy that would be kept by what was seen (`kept`). Nothing is chosen by true returns.
 Patients whose best candidate gains less than two standard errors of the truth are left out. CPU seconds of one thread.
+
+`--named` takes each policy of which a number of sessions is said to tell after the three early visits, holds so many near the amplitude
+named, at most four a visit beside two of cDBS, fits everything anew and asks for the verdict again: `told` is the share that is no *cannot
+tell* then, which the number promises for four of five, `told_without` the same after those visits with their cDBS sessions alone.
 """
 
 from __future__ import annotations
@@ -21,30 +28,36 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from benchmarks.support.cells import Cells
 from benchmarks.support.looks import look
 from benchmarks.support.ope_cases import CDBS, STEPS, virtual_case
+from ml.designs import near_session
 from ml.mdp import step_reward
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.estimator import FittedPosterior, build
+from ml.ope.posterior.further_sessions import MOST_HELD, Further, Place, further_sessions, session_noise, worth_exploring, worth_holding
 from ml.ope.posterior.portfolio import portfolio
 from ml.ope.posterior.tested import TestSession, differences_to_cdbs
-from ml.ope.posterior.verdict import Levels, verdict
+from ml.ope.posterior.verdict import SETTLED_BY_SESSIONS, Levels, verdict
 from ml.ope.registry import estimators
-from ml.policies.policy import Policy
+from ml.policies.policy import ConstantPolicy, Policy
 from ml.population.virtual import WORLDS_PER_PART, World, visit_days, world
+from ml.population.virtual.sessions import Days
 from ml.population.virtual.world import Part
-from ml.qoc import Margins
+from ml.qoc import Margins, Qoc
 from ml.statistics.bootstrap import percentile_interval
-from ml.trajectories import ReplayBuffer
+from ml.trajectories import Hold, ReplayBuffer, SessionTrajectory
+
+Floats = NDArray[np.float64]
 
 SLOTS, TEST_VISITS, EARLY_VISITS = 4, 3, 3
 HOURS = (0.0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6)
@@ -52,6 +65,8 @@ HOURS = (0.0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6)
 CDBS_PLACES, TEST_PLACES = (0, 3), (1, 2, 4, 5)
 TESTED = 1 << 43
 """First session number of the tests, which no other data of a world have."""
+HELD = {f"held at {amplitude:g}": ConstantPolicy(amplitude) for amplitude in (0.85, 0.7, 0.55, 0.4)}
+"""Constants beside the candidates, by which it is known what held sessions would show, as the service has them."""
 SHARE = 0.9
 QUICK_WORLDS, TRUTH, QUICK_TRUTH = 2, 200, 80
 RESAMPLES = 1000
@@ -69,6 +84,38 @@ class Clinic:
         placed = [*((CDBS, place) for place in CDBS_PLACES), *zip(names, TEST_PLACES, strict=False)]
         return [self._session(number, name, place) for name, place in placed]
 
+    def held(self, number: int, levels: Sequence[float], free: Sequence[int]) -> tuple[SessionTrajectory, ...]:
+        """The visit's cDBS sessions, and sessions held near levels in free slots, as they join the data."""
+        s = self.world.settings
+        rows: list[tuple[int, str, Floats, tuple[Hold, ...]]] = [(place, "cdbs", np.ones(STEPS), ()) for place in CDBS_PLACES]
+        for place, level in zip(free, levels, strict=True):
+            session = near_session(level, STEPS, s.period_s, s.lower_bound, number, place)
+            rows.append((place, "random", session.amplitudes, session.holds))
+        found = []
+        for place, controller, amplitudes, holds in rows:
+            # the first sessions of cDBS are those that the tests are held against
+            first = TESTED + 1000 * number + (10 * list(self.policies).index(CDBS) if controller == "cdbs" else 500) + place
+            run = self.world.run(amplitudes[None], self._day(number, place), first)
+            qoc = Qoc(float(run.grasp_hz[0]), int(run.rating[0]), float(run.tremor_percent[0]))
+            bound = s.lower_bound if controller == "random" else None
+            found.append(
+                SessionTrajectory(
+                    session_id=first,
+                    visit=EARLY_VISITS + number,
+                    controller=controller,
+                    lead_beta=run.lead[0],
+                    beta=run.beta[0],
+                    amplitude=run.amplitude[0],
+                    qoc=qoc,
+                    random_lower_bound=bound,
+                    holds=holds,
+                )
+            )
+        return tuple(found)
+
+    def _day(self, number: int, place: int) -> Days:
+        return visit_days(self.world.key, np.array([EARLY_VISITS + number]), np.array([HOURS[place]]))
+
     def early(self, buffer: ReplayBuffer) -> list[TestSession]:
         """The cDBS sessions of the visits before, which tell how sessions of one day differ; no test is held against them."""
         s, found = self.world.settings, []
@@ -82,9 +129,8 @@ class Clinic:
 
     def _session(self, number: int, name: str, place: int) -> TestSession:
         w, s = self.world, self.world.settings
-        days = visit_days(w.key, np.array([EARLY_VISITS + number]), np.array([HOURS[place]]))
         which = list(self.policies).index(name)
-        run = w.run(self.policies[name], days, TESTED + 1000 * number + 10 * which + (place if name == CDBS else 0))
+        run = w.run(self.policies[name], self._day(number, place), TESTED + 1000 * number + 10 * which + (place if name == CDBS else 0))
         tremor = run.tremor_percent[0] / (100.0 if s.tremor_as_fraction else 1.0)
         end = s.c2 * run.grasp_hz[0] + s.c3 * run.rating[0] - s.c4 * tremor
         steps = step_reward(s, run.beta[0], run.amplitude[0]) @ s.gamma ** np.arange(STEPS)
@@ -100,31 +146,75 @@ class Clinic:
 
 @dataclass(frozen=True)
 class Found:
-    """Policies tested at each visit, and the one to be kept after it (cDBS where none is better)."""
+    """Policies tested at each visit, and the one to be kept after it (cDBS where none is better).
+
+    Attributes:
+        held: sessions held near an amplitude, by visit.
+    """
 
     tested: list[tuple[str, ...]]
     kept: list[str]
+    held: list[int] = field(default_factory=list)
 
 
-def by_posterior(clinic: Clinic, fitted: FittedPosterior, *, respecting: bool) -> Found:
-    """Three visits of portfolios; each visit's sessions move the posterior."""
+def by_posterior(clinic: Clinic, fitted: FittedPosterior, *, respecting: bool, holding: bool = False) -> Found:
+    """Three visits of portfolios; each visit's sessions move the posterior, and what is held in free slots joins the data."""
     sessions: list[TestSession] = clinic.early(fitted.buffer)
-    tested, kept = [], []
-    estimates = fitted.evaluate(clinic.policies, STEPS)
+    tested, kept, held = [], [], []
+    everyone = {**clinic.policies, **HELD} if holding else clinic.policies
+    estimates = fitted.evaluate(everyone, STEPS)
     for number in range(1, TEST_VISITS + 1):
         had = {name for names in tested for name in names}
         names = suggested(estimates, respecting, had)
         sessions += clinic.visit(number, names)
-        estimates = replace(fitted, tests=tuple(differences_to_cdbs(sessions))).evaluate(clinic.policies, STEPS)
+        levels = asked_for(estimates, fitted.buffer, SLOTS - len(names)) if holding else []
+        if levels:
+            b = fitted.buffer
+            more = clinic.held(number, levels, TEST_PLACES[len(names) : len(names) + len(levels)])
+            fitted = build("posterior", 0, "demo").fit(replace(b, sessions=b.sessions + more))
+        estimates = replace(fitted, tests=tuple(differences_to_cdbs(sessions))).evaluate(everyone, STEPS)
         tested.append(names)
+        held.append(len(levels))
         kept.append(max([CDBS, *sorted(had.union(names))], key=lambda name: estimates[name].value))
-    return Found(tested, kept)
+    return Found(tested, kept, held)
+
+
+def asked_for(estimates: Mapping[str, Estimate], buffer: ReplayBuffer, slots: int) -> list[float]:
+    """Levels of the sessions to hold in free slots, as the plan's page says."""
+    if estimates[CDBS].details["skill"]["told"]:
+        holds = worth_holding(waiting_for(estimates, buffer)[0], slots)
+    else:
+        holds = worth_exploring(_place(buffer), slots)
+    return [hold.fraction for hold in holds for _ in range(hold.here)]
+
+
+def waiting_for(estimates: Mapping[str, Estimate], buffer: ReplayBuffer) -> tuple[dict[str, tuple[Further, float | None]], list[str]]:
+    """Candidates of which a number of sessions would tell, with their probability within the margins; and all that sessions may settle.
+
+    Args:
+        estimates: of the candidates, cDBS and `HELD`. buffer: that they rest on.
+    """
+    cdbs, noise = estimates[CDBS], session_noise(buffer)
+    constants = [(1.0, cdbs), *((policy.amplitude, estimates[n]) for n, policy in HELD.items())]
+    named: dict[str, tuple[Further, float | None]] = {}
+    open_still = []
+    for name, own in estimates.items():
+        found = verdict(own, cdbs, Margins(), Levels())
+        if name not in (CDBS, *HELD) and found.code == "cannot_tell" and found.reasons[0].code in SETTLED_BY_SESSIONS:
+            open_still.append(name)
+            further = further_sessions(own, cdbs, constants, noise, Margins(), Levels(), _place(buffer))
+            named |= {name: (further, found.within)} if further is not None else {}
+    return named, open_still
+
+
+def _place(buffer: ReplayBuffer) -> Place:
+    return Place(buffer.settings.lower_bound, STEPS, buffer.settings.period_s)
 
 
 def suggested(estimates: Mapping[str, Estimate], respecting: bool, had: set[str]) -> tuple[str, ...]:
     """The portfolio of a visit among what may be proposed, or among all without a hazard."""
     cdbs = estimates[CDBS]
-    verdicts = {n: verdict(e, cdbs, Margins(), Levels()) for n, e in estimates.items() if n != CDBS}
+    verdicts = {n: verdict(e, cdbs, Margins(), Levels()) for n, e in estimates.items() if n not in (CDBS, *HELD)}
     able = {n for n, v in verdicts.items() if (v.proposed if respecting else not v.hazards)}
     careful = {n for n in able if verdicts[n].code == "test_with_care"} if respecting else set()
     draws = {n: np.asarray(e.details["draws"]) for n, e in estimates.items()}
@@ -146,6 +236,46 @@ def in_order(clinic: Clinic, order: list[str]) -> Found:
     return Found(tested, kept)
 
 
+def named(part: Part, index: int) -> dict[str, Any]:
+    """What is said of further sessions after the early visits, and what comes of them."""
+    w = world(part, index)
+    clinic = Clinic(w, {**w.candidates(), CDBS: ConstantPolicy(1.0)})
+    buffer = w.data("stratified", visits=EARLY_VISITS)
+    estimates = build("posterior", 0, "demo").fit(buffer).evaluate({**clinic.policies, **HELD}, STEPS)
+    waiting, open_still = waiting_for(estimates, buffer)
+    rows = [
+        [name, further.sessions, *(_told(clinic, buffer, name, further, hold=hold) for hold in (True, False))]
+        for name, (further, _) in waiting.items()
+    ]
+    return {"rows": rows, "unsettled": len(open_still) - len(waiting)}
+
+
+def _told(clinic: Clinic, buffer: ReplayBuffer, name: str, further: Further, *, hold: bool) -> bool:
+    """Whether a verdict is told after the sessions that are named, or after the same visits without them."""
+    visits = max(further.visits, -(-further.sessions // MOST_HELD))
+    for number in range(1, visits + 1):
+        here = further.sessions // visits + (number <= further.sessions % visits)
+        levels = [further.fraction] * here if hold else []
+        buffer = replace(buffer, sessions=buffer.sessions + clinic.held(number, levels, TEST_PLACES[: len(levels)]))
+    estimates = build("posterior", 0, "demo").fit(buffer).evaluate({**clinic.policies, **HELD}, STEPS)
+    return verdict(estimates[name], estimates[CDBS], Margins(), Levels()).code != "cannot_tell"
+
+
+def print_named(part: Part, worlds: int) -> None:
+    """A line for each policy and, as the last line, one JSON object."""
+    begun, found = time.process_time(), [named(part, index) for index in range(worlds)]
+    rows = [(index, *row) for index, one in enumerate(found) for row in one["rows"]]
+    sys.stdout.writelines(f"{part}{i:02d} {name}: {n} sessions; told {told}, without them {bare}\n" for i, name, n, told, bare in rows)
+    figures = {
+        "named": len(rows),
+        "unsettled": sum(one["unsettled"] for one in found),
+        "told": float(np.mean([row[3] for row in rows])) if rows else None,
+        "told_without": float(np.mean([row[4] for row in rows])) if rows else None,
+        "cpu_seconds": time.process_time() - begun,
+    }
+    sys.stdout.write(json.dumps({"name": "named", "figures": figures, "ratios": {}, "baseline": "cDBS sessions alone"}) + "\n")
+
+
 def arms(part: Part, index: int, truth_sessions: int, dlsm: bool) -> dict[str, Any] | None:
     """Shares of the best gain by arm and visit; None where no candidate gains more than two standard errors."""
     case, w = virtual_case(part, index, truth_sessions), world(part, index)
@@ -156,7 +286,11 @@ def arms(part: Part, index: int, truth_sessions: int, dlsm: bool) -> dict[str, A
     if gains[best] < 2 * true[best][1]:
         return None
     fitted = build("posterior", 0, "demo").fit(buffer)
-    found = {name: by_posterior(clinic, fitted, respecting=name == "portfolio") for name in ("portfolio", "any verdict")}
+    found = {
+        "portfolio": by_posterior(clinic, fitted, respecting=True),
+        "and held": by_posterior(clinic, fitted, respecting=True, holding=True),
+        "any verdict": by_posterior(clinic, fitted, respecting=False),
+    }
     orders = {"random": list(np.random.default_rng([index, 0x90F]).permutation(list(case.candidates)))}
     for method in ("linear", *(("dlsm",) if dlsm else ())):
         said = estimators(0, demo=True)[method].fit(buffer).evaluate(case.candidates, STEPS)
@@ -167,7 +301,12 @@ def arms(part: Part, index: int, truth_sessions: int, dlsm: bool) -> dict[str, A
 
 def _shares(found: Found, gains: Mapping[str, float], best: float) -> dict[str, list[float]]:
     tested = [max([0.0, *(gains[n] for names in found.tested[: k + 1] for n in names)]) / best for k in range(TEST_VISITS)]
-    return {"tested": tested, "kept": [gains[n] / best for n in found.kept], "sessions": [float(len(n)) for n in found.tested]}
+    return {
+        "tested": tested,
+        "kept": [gains[n] / best for n in found.kept],
+        "sessions": [float(len(n)) for n in found.tested],
+        "held": [float(n) for n in found.held],
+    }
 
 
 def lines(shares: Mapping[str, list[dict[str, list[float]]]]) -> Iterator[str]:
@@ -194,9 +333,13 @@ def main() -> None:
     parser.add_argument("--dlsm", action="store_true", help="the order of the DLSM as well")
     parser.add_argument("--minutes", type=float, default=1e9, help="start no further world after so many minutes")
     parser.add_argument("--out", type=Path, help="folder of the finished worlds; a temporary one by default")
+    parser.add_argument("--named", action="store_true", help="whether as many sessions as a verdict names do tell")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     look(chosen.part, " ".join(["portfolio", *sys.argv[1:]]), None)
+    if chosen.named:
+        print_named(chosen.part, min(chosen.worlds, QUICK_WORLDS) if chosen.quick else chosen.worlds)
+        return
     out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-portfolio-"))
     out.mkdir(parents=True, exist_ok=True)
     cells = Cells(out / f"portfolio{'-quick' if chosen.quick else ''}{'-dlsm' if chosen.dlsm else ''}.jsonl")

@@ -18,6 +18,7 @@ from app.study import cdbs_amplitude
 from app.study.models import Participant, SettingsVersion
 from ml.ope.compare.ranking import rank_policies
 from ml.ope.estimate import Estimate
+from ml.ope.posterior.further_sessions import Place
 from ml.ope.registry import POSTERIOR
 
 _LAST = ("unsafe",)
@@ -144,11 +145,9 @@ def assess(
         participant.current_margins,
         coverage_failed(evaluation),
         session_noise(evaluation),
-        version.lower_bound,
+        Place(version.lower_bound, evaluation.horizon_steps, version.period_s),
         cdbs_ma,
         tuple((held, table[i][POSTERIOR]) for i in references if (held := policies[i].amplitude) is not None and POSTERIOR in table[i]),
-        evaluation.horizon_steps,
-        version.period_s,
     )
     candidates = {i: e for i, e in by_method.items() if i not in references}
     decided = {

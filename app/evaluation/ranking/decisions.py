@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from app.evaluation.models import Evaluation
 from app.evaluation.schemas import Decision, Standing
@@ -18,9 +15,9 @@ from app.study.margins.service import margins_of
 from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag
-from ml.ope.posterior.further_sessions import Needed, Reachable, reachable, sessions_to_tell
+from ml.ope.posterior.further_sessions import Further, Place, further_sessions
 from ml.ope.posterior.support import FEWEST_VISITS
-from ml.ope.posterior.verdict import HAZARDS, OUTCOMES, Levels, Verdict, outcome_draws, slacks, verdict
+from ml.ope.posterior.verdict import HAZARDS, SETTLED_BY_SESSIONS, Levels, Verdict, verdict
 from ml.ope.registry import POSTERIOR
 
 SESSION_NOISE = "session_noise"
@@ -35,10 +32,10 @@ class Circumstances:
         evaluation_id, evaluated_at: of the evaluation.
         margins: of the participant, in force now: those of the newest lock, else the newest. levels: the newest version, locked or not.
         unchecked: why what the data cover could not be checked; None where it was.
-        noise: of a session, by outcome. lowest_dose: B, below which no further session is asked for.
+        noise: of a session, by outcome. place: within what a plan holds sessions near an amplitude, B among it.
         cdbs_ma: the cDBS amplitude, mA; None where it is not known.
         held: what constants would do, the amplitude (fraction of cDBS) of each with its posterior: by them it is known what sessions held
-            near an amplitude would show. steps, period_s: of a session, and seconds of a step.
+            near an amplitude would show.
     """
 
     evaluation_id: int
@@ -47,20 +44,9 @@ class Circumstances:
     levels: MarginsVersion
     unchecked: str | None
     noise: Mapping[str, float]
-    lowest_dose: float
+    place: Place
     cdbs_ma: float | None
     held: tuple[tuple[float, Estimate], ...] = ()
-    steps: int = 300
-    period_s: float = 2.0
-
-
-@dataclass(frozen=True)
-class Further:
-    """Sessions that would tell: how many, on how many visits at least, held near which fraction of cDBS."""
-
-    sessions: int
-    visits: int
-    fraction: float
 
 
 @dataclass(frozen=True)
@@ -159,9 +145,6 @@ def _without_posterior(own: Estimate | None, reference: Estimate | None) -> Deci
     return Decided("cannot_tell", (unknown,))
 
 
-SETTLED_BY_SESSIONS = frozenset({"undecided", "few_near_sessions", "few_near_visits"})
-"""Deciding reasons of *cannot tell* that more sessions near a policy may settle; whether they would is simulated."""
-
 _needed: OrderedDict[tuple[int, datetime, int, int, int], Further | None] = OrderedDict()
 """Simulated numbers of sessions by evaluation, policy and versions of margins and levels, none of which ever changes."""
 _KEPT = 5000
@@ -169,50 +152,14 @@ _KEPT = 5000
 
 def _further(own: Estimate, cdbs: Estimate | None, given: Circumstances, levels: Levels, policy_id: int) -> Further | None:
     """How many further sessions near which amplitude would tell; None where none would that a plan can hold."""
-    dose = (own.details.get("support") or {}).get("dose")
-    if cdbs is None or dose is None:
+    if cdbs is None:
         return None
     key = (given.evaluation_id, given.evaluated_at, policy_id, given.margins.id, given.levels.id)
     if key not in _needed:
-        place = reachable(float(dose), given.lowest_dose, given.steps, given.period_s)
-        found = _simulated(own, cdbs, place, given, levels) if place is not None else None
-        _needed[key] = Further(found.sessions, found.visits, place.level) if found is not None and place is not None else None
+        _needed[key] = further_sessions(own, cdbs, given.held, given.noise, margins_of(given.margins), levels, given.place)
         while len(_needed) > _KEPT:
             _needed.popitem(last=False)
     return _needed[key]
-
-
-def _simulated(own: Estimate, cdbs: Estimate, place: Reachable, given: Circumstances, levels: Levels) -> Needed | None:
-    support = own.details.get("support") or {}
-    ours, theirs = outcome_draws(own, "energy"), outcome_draws(cdbs, "energy")
-    return sessions_to_tell(
-        slacks(own, cdbs, margins_of(given.margins)),
-        given.noise,
-        levels,
-        shown=_shown(place.dose, cdbs, given.held),
-        saved=theirs - ours if ours is not None and theirs is not None else None,
-        near=(int(support.get("near_sessions") or 0), int(support.get("near_visits") or 0)),
-        supported=own.supported,
-    )
-
-
-def _shown(dose: float, cdbs: Estimate, held: Sequence[tuple[float, Estimate]]) -> dict[str, NDArray[np.float64]] | None:
-    """What a session of a mean dose would show of each outcome less cDBS, by draw: between the constants next to it.
-
-    None where the evaluation has no two constants: then the policy's own outcomes stand for them.
-    """
-    rows = sorted(held, key=lambda pair: pair[0])
-    if len(rows) < 2:
-        return None
-    above = min(max(1, sum(fraction < dose for fraction, _ in rows)), len(rows) - 1)
-    (low, lower), (high, upper) = rows[above - 1], rows[above]
-    share = min(max((dose - low) / (high - low), 0.0), 1.0)
-    found = {}
-    for name in OUTCOMES:
-        a, b, reference = (outcome_draws(e, name) for e in (lower, upper, cdbs))
-        if a is not None and b is not None and reference is not None and a.size == b.size == reference.size:
-            found[name] = (1 - share) * a + share * b - reference
-    return found or None
 
 
 def _of_sessions(further: Further | None, cdbs_ma: float | None) -> tuple[Flag, ...]:

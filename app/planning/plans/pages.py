@@ -27,10 +27,10 @@ from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning import wording
 from app.planning.plans import key, repository, service
-from app.planning.plans.schemas import MOST_HELD, HeldIn, Id, LimitIn, Move, PlanIn, PlanOptions
+from app.planning.plans.schemas import HeldIn, Id, LimitIn, Move, PlanIn, PlanOptions
 from app.planning.plans.service import rules_of
 from app.planning.plans.sign_off import MEANING
-from app.planning.plans.suggested import Hold, suggested, worth_holding
+from app.planning.plans.suggested import Held, held_in, suggested
 from app.planning.plans.view import PlanView, read_plan, shown
 from app.planning.plans.visits import remove_visit, today, visit_for_draft
 from app.planning.protocol.schedule import most_policies, total_minutes
@@ -43,6 +43,7 @@ from app.study.deps import CurrentParticipant, CurrentVisit
 from app.study.models import Controller, Participant, Visit
 from app.study.service import may, require
 from ml.designs import LOW_AMPLITUDE
+from ml.ope.posterior.further_sessions import MOST_HELD, Place
 
 router = APIRouter()
 
@@ -241,7 +242,8 @@ def _page(
     defaults = rules_of(PlanOptions())
     choices = _choices(db, participant, found.answer if found is not None else None)
     form = _form_values(full, values, choices)
-    slots = most_policies(defaults)
+    slots, settings = most_policies(defaults), participant.current_settings
+    place = Place(settings.lower_bound, round(60 * defaults.session_minutes / settings.period_s), settings.period_s)
     suggestions = suggested(found, slots)
     return render(
         request,
@@ -269,7 +271,7 @@ def _page(
         plan_method=method_name(view.evaluation.default_method) if view and view.evaluation else "",
         choices=choices,
         suggestions=[(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],
-        held_rows=_held_rows(values, worth_holding(found, slots - len(suggestions)), cdbs_amplitude_now(participant)),
+        held_rows=_held_rows(values, held_in(found, slots - len(suggestions), place), cdbs_amplitude_now(participant)),
         holding=wording.holding,
         low_amplitude=LOW_AMPLITUDE,
         most_held=MOST_HELD,
@@ -350,7 +352,7 @@ class HeldRow:
     unit: str
     amplitude: str
     sessions: str
-    why: Hold | None = None
+    why: Held | None = None
 
 
 def _held_of(values: FormData) -> list[HeldIn]:
@@ -366,10 +368,10 @@ def _held_of(values: FormData) -> list[HeldIn]:
     return [parse(HeldIn, {unit: amplitude, "sessions": number}, LABELS) for unit, amplitude, number in rows if number not in ("", "0")]
 
 
-def _held_rows(values: FormData | None, holds: Sequence[Hold], cdbs_ma: float | None) -> list[HeldRow]:
+def _held_rows(values: FormData | None, holds: Sequence[Held], cdbs_ma: float | None) -> list[HeldRow]:
     """What the form shows: what is suggested, no session asked for, and a free row; what was sent where it was refused."""
     unit = "amplitude_ma" if cdbs_ma is not None else "amplitude_fraction"
-    rows = [HeldRow(unit, f"{h.amplitude_ma:.1f}" if h.amplitude_ma is not None else f"{h.fraction:.2f}", "", h) for h in holds]
+    rows = [HeldRow(unit, f"{h.amplitude_ma:.1f}" if h.amplitude_ma is not None else f"{h.hold.fraction:.2f}", "", h) for h in holds]
     rows = [*rows[: MOST_ROWS - 1], HeldRow(unit, "", "")]
     sent = [[str(v) for v in values.getlist(f"held_{name}")] for name in ("amplitude", "sessions")] if values is not None else [[], []]
     if len(sent[0]) != len(rows) or len(sent[1]) != len(rows):

@@ -15,9 +15,8 @@ from app.platform.signatures.schemas import SignatureOut, Signing
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
 from ml.designs import SessionDesign
+from ml.ope.posterior.further_sessions import MOST_HELD
 
-MOST_HELD = 4
-"""Sessions near one amplitude in a visit, at most."""
 Id = Annotated[Int, Field(ge=1)]
 Milliamperes = Annotated[Number, Field(ge=0, le=25.5)]
 

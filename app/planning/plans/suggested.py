@@ -5,15 +5,15 @@ The clinician decides."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from app.evaluation.ranking.answer import Answer, answer
+from app.evaluation.ranking.answer import answer
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.judged import Judged
 from app.evaluation.repository import PolicyHead
-from app.planning.plans.schemas import MOST_HELD
+from ml.ope.posterior.further_sessions import Hold, Place, worth_exploring, worth_holding
 from ml.ope.posterior.portfolio import Suggestion, portfolio
 from ml.ope.posterior.verdict import FEWEST_DRAWS
 
@@ -29,53 +29,35 @@ class Suggested:
     why: Suggestion
 
 
-ALIKE = 0.05
-"""Amplitudes closer than this fraction of cDBS are held by the same sessions: their draws reach as far."""
-
-
 @dataclass(frozen=True)
-class Hold:
-    """Sessions near an amplitude that would tell of policies.
+class Held:
+    """Sessions to hold near an amplitude, and the policies of which they would tell.
 
     Attributes:
-        fraction: of cDBS. amplitude_ma: the same; None where the cDBS amplitude is not known. sessions, visits: with which they would tell.
-        here: how many of the sessions this visit has room for. policies: of which they would tell.
+        amplitude_ma: None where the cDBS amplitude is not known.
     """
 
-    fraction: float
+    hold: Hold
     amplitude_ma: float | None
-    sessions: int
-    visits: int
-    here: int
     policies: tuple[PolicyHead, ...]
 
 
-def worth_holding(found: Judged | None, slots: int) -> tuple[Hold, ...]:
-    """What to hold in slots that no policy takes: near the amplitudes that would tell soonest of policies that cannot be told yet."""
-    return () if found is None else held_for(found.answer, found.assessment.cdbs_ma, slots)
+def held_in(found: Judged | None, slots: int, place: Place) -> tuple[Held, ...]:
+    """What to hold in slots that no policy takes; nothing before there is a ranking, or where it would tell nothing.
 
-
-def held_for(answered: Answer, cdbs_ma: float | None, slots: int) -> tuple[Hold, ...]:
-    """As `worth_holding`, of an answer.
-
-    The fewest sessions come first, then the likeliest policy. Of sessions on two visits this one takes half.
+    Args:
+        found: the ranking. slots: of the visit that are free. place: within what the visit's sessions are held.
     """
-    waiting = [(row, row.decided.further) for row in answered.undecided if row.decided.further is not None]
-    waiting.sort(key=lambda pair: (pair[1].sessions, -(pair[0].within or 0.0)))
-    made: list[Hold] = []
-    for row, further in waiting:
-        near = next((i for i, hold in enumerate(made) if abs(hold.fraction - further.fraction) < ALIKE), None)
-        if near is not None:
-            if made[near].sessions == further.sessions:
-                made[near] = replace(made[near], policies=(*made[near].policies, row.one.policy))
-            continue
-        room = slots - sum(hold.here for hold in made)
-        if room < 1:
-            continue
-        ma = None if cdbs_ma is None else further.fraction * cdbs_ma
-        here = min(room, MOST_HELD, math.ceil(further.sessions / further.visits))
-        made.append(Hold(further.fraction, ma, further.sessions, further.visits, here, (row.one.policy,)))
-    return tuple(made)
+    if found is None:
+        return ()
+    rows = {str(row.one.policy.id): row for row in found.answer.undecided}
+    waiting = {name: (row.decided.further, row.within) for name, row in rows.items() if row.decided.further is not None}
+    holds = worth_holding(waiting, slots) if found.answer.ordered else worth_exploring(place, slots)
+    cdbs_ma = found.assessment.cdbs_ma
+    return tuple(
+        Held(hold, None if cdbs_ma is None else hold.fraction * cdbs_ma, tuple(rows[name].one.policy for name in hold.names))
+        for hold in holds
+    )
 
 
 def suggested(found: Judged | None, slots: int) -> tuple[Suggested, ...]:

@@ -12,15 +12,16 @@ outcomes go their own way beside those of the amplitudes that can be held.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.designs import NEAR_SPREAD, near_doses
+from ml.designs import LOW_AMPLITUDE, NEAR_SPREAD, near_doses
+from ml.ope.estimate import Estimate
 from ml.ope.posterior.support import FEWEST_SESSIONS, FEWEST_VISITS, NEAR
-from ml.ope.posterior.verdict import OUTCOMES, Levels
-from ml.qoc import Qoc
+from ml.ope.posterior.verdict import OUTCOMES, Levels, outcome_draws, slacks
+from ml.qoc import Margins, Qoc
 from ml.returns import actual_return
 from ml.trajectories import ReplayBuffer
 
@@ -39,6 +40,94 @@ _SLACK = 0.02
 """By how much draws may move a session's mean from its expectation, fraction of cDBS; ten minutes of draws move it by 0.01."""
 _FEWEST = 3
 """Degrees of freedom from which the noise of sessions is known."""
+
+
+@dataclass(frozen=True)
+class Further:
+    """Sessions that would tell: how many, on how many visits at least, held near which fraction of cDBS."""
+
+    sessions: int
+    visits: int
+    fraction: float
+
+
+def further_sessions(
+    own: Estimate,
+    cdbs: Estimate,
+    held: Sequence[tuple[float, Estimate]],
+    noise: Mapping[str, float],
+    margins: Margins,
+    levels: Levels,
+    place: Place,
+) -> Further | None:
+    """The fewest sessions that would tell of a policy; None where none would that a plan can hold, or its dose is not known.
+
+    Args:
+        own, cdbs: posteriors of the policy and of cDBS. held: amplitude and posterior of constants. noise: of a session, by outcome.
+        margins, levels: of the verdict. place: within what sessions are held.
+    """
+    support = own.details.get("support") or {}
+    near = reachable(float(support["dose"]), place) if support.get("dose") is not None else None
+    if near is None:
+        return None
+    ours, theirs = outcome_draws(own, "energy"), outcome_draws(cdbs, "energy")
+    found = sessions_to_tell(
+        slacks(own, cdbs, margins),
+        noise,
+        levels,
+        shown=_shown(near.dose, cdbs, held),
+        saved=theirs - ours if ours is not None and theirs is not None else None,
+        near=(int(support.get("near_sessions") or 0), int(support.get("near_visits") or 0)),
+        supported=own.supported,
+    )
+    return Further(found.sessions, found.visits, near.level) if found is not None else None
+
+
+ALIKE = NEAR_SPREAD
+"""Amplitudes closer than this are held by the same sessions: their draws reach as far."""
+MOST_HELD = 4
+"""Sessions near one amplitude in a visit, at most."""
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Sessions of one visit near an amplitude.
+
+    Attributes:
+        fraction: of cDBS. here: how many. further: what would tell; None where they explore, and nothing is known to tell.
+        names: of which policies they would tell.
+    """
+
+    fraction: float
+    here: int
+    further: Further | None
+    names: tuple[str, ...] = ()
+
+
+def worth_holding(waiting: Mapping[str, tuple[Further, float | None]], slots: int) -> tuple[Hold, ...]:
+    """What to hold in so many slots: the fewest sessions first, then the likeliest policy. Of sessions on two visits this one takes half.
+
+    Args:
+        waiting: of policies that cannot be told yet, what would tell, and their probability of keeping within the margins.
+    """
+    made: list[Hold] = []
+    for name, (further, _) in sorted(waiting.items(), key=lambda item: (item[1][0].sessions, -(item[1][1] or 0.0), item[0])):
+        near = next((i for i, hold in enumerate(made) if abs(hold.fraction - further.fraction) < ALIKE), None)
+        if near is not None:
+            first = made[near].further
+            if first is not None and first.sessions == further.sessions:
+                made[near] = replace(made[near], names=(*made[near].names, name))
+            continue
+        room = slots - sum(hold.here for hold in made)
+        if room >= 1:
+            made.append(Hold(further.fraction, min(room, MOST_HELD, -(-further.sessions // further.visits)), further, (name,)))
+    return tuple(made)
+
+
+def worth_exploring(place: Place, slots: int) -> tuple[Hold, ...]:
+    """What to hold where the data cannot order policies: the lowest amplitude that a whole session may hold, beside cDBS."""
+    level = max(place.lower_bound, LOW_AMPLITUDE) + NEAR_SPREAD
+    return (Hold(level, min(slots, MOST_HELD), None),) if slots >= 1 and level <= 1.0 - 2 * NEAR_SPREAD else ()
 
 
 def session_noise(buffer: ReplayBuffer) -> dict[str, float]:
@@ -89,6 +178,15 @@ def _within_groups(groups: Sequence[Sequence[float | None]]) -> float:
 
 
 @dataclass(frozen=True)
+class Place:
+    """Within what a plan holds sessions: B (fraction of cDBS), the steps of a session, seconds of a step."""
+
+    lower_bound: float
+    steps: int = 300
+    period_s: float = 2.0
+
+
+@dataclass(frozen=True)
 class Reachable:
     """An amplitude that a plan can hold so that its sessions lie near a policy.
 
@@ -100,20 +198,20 @@ class Reachable:
     dose: float
 
 
-def reachable(dose: float, lower_bound: float, steps: int, period_s: float) -> Reachable | None:
+def reachable(dose: float, place: Place) -> Reachable | None:
     """The level nearest to a policy's mean dose whose sessions lie near the policy (`support.NEAR`); None where there is none.
 
     A session is not held much lower than the policy itself would go, so as to make up for minutes at which it may not be low.
 
     Args:
-        dose: of the policy, fraction of cDBS. lower_bound: B. steps: of a session. period_s: of a step.
+        dose: of the policy, fraction of cDBS. place: within what sessions are held.
     """
     mean_within, late_within = float(NEAR[0]) - _SLACK, float(NEAR[1]) - _SLACK
-    lowest, highest = lower_bound, 1.0 - NEAR_SPREAD
+    lowest, highest = place.lower_bound, 1.0 - NEAR_SPREAD
     wanted = min(max(dose, lowest), highest)
     tried = [wanted, *(float(v) for v in np.arange(max(lowest, dose - NEAR_SPREAD), highest, STEP))]
     for level in sorted(tried, key=lambda level: abs(level - wanted)):
-        mean, late = near_doses(level, steps, period_s, lower_bound)
+        mean, late = near_doses(level, place.steps, place.period_s, lowest)
         if abs(mean - dose) <= mean_within and abs(late - dose) <= late_within:
             return Reachable(level, mean)
     return None
@@ -172,6 +270,25 @@ def sessions_to_tell(
         if told >= TOLD:
             return Needed(n, visits)
     return None
+
+
+def _shown(dose: float, cdbs: Estimate, held: Sequence[tuple[float, Estimate]]) -> dict[str, Floats] | None:
+    """What a session of a mean dose would show of each outcome less cDBS, by draw: between the constants next to it.
+
+    None where there are no two constants: then the policy's own outcomes stand for them.
+    """
+    rows = sorted(held, key=lambda pair: pair[0])
+    if len(rows) < 2:
+        return None
+    above = min(max(1, sum(fraction < dose for fraction, _ in rows)), len(rows) - 1)
+    (low, lower), (high, upper) = rows[above - 1], rows[above]
+    share = min(max((dose - low) / (high - low), 0.0), 1.0)
+    found = {}
+    for name in OUTCOMES:
+        a, b, reference = (outcome_draws(e, name) for e in (lower, upper, cdbs))
+        if a is not None and b is not None and reference is not None and a.size == b.size == reference.size:
+            found[name] = (1 - share) * a + share * b - reference
+    return found or None
 
 
 def _told(

@@ -36,6 +36,9 @@ FEWEST_DRAWS = 50
 HAZARDS = frozenset({"adverse_event", "nearly_off", "beyond_margin"})
 """Codes of reasons for which a policy is not to be run without a clinician's word, whatever the verdict."""
 
+SETTLED_BY_SESSIONS = frozenset({"undecided", "few_near_sessions", "few_near_visits"})
+"""Deciding reasons of *cannot tell* that more sessions near a policy may settle; whether they would is simulated."""
+
 OUTCOMES = ("grasp_hz", "rating", "tremor_percent")
 
 

@@ -13,6 +13,7 @@ from fastapi.testclient import TestClient
 from app.evaluation.ranking.decisions import Circumstances, decide
 from app.study.margins.models import MarginsVersion
 from ml.ope.flags import Flag
+from ml.ope.posterior.further_sessions import Place
 from tests.app.evaluations import judged
 from tests.app.words import above_fold, methods_named
 from tests.conftest import PASSWORD
@@ -255,7 +256,7 @@ def test_another_method_can_order_the_fold_and_the_verdicts_stay(client: TestCli
 
 
 def test_a_serious_event_is_unsafe_without_a_posterior_and_of_a_retired_policy_too() -> None:
-    given = Circumstances(1, datetime(2026, 1, 1, tzinfo=UTC), MarginsVersion(), MarginsVersion(), None, {}, 0.3, None)
+    given = Circumstances(1, datetime(2026, 1, 1, tzinfo=UTC), MarginsVersion(), MarginsVersion(), None, {}, Place(0.3), None)
     found = decide({}, {}, "dlsm", given, 7, adverse_event=True)
     assert (found.decision, found.reasons[0].code) == ("unsafe", "adverse_event")
     retired = decide({}, {}, "dlsm", given, 7, retired_reason="replaced", adverse_event=True)

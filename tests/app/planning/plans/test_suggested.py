@@ -16,7 +16,7 @@ from app.learning.models import BufferSnapshot, Policy
 from tests.app.evaluations import judge as judge
 from tests.app.evaluations import judged
 from tests.app.evaluations import policies as policies
-from tests.ml.ope.posterior.draws import N
+from tests.ml.ope.posterior.draws import N, cdbs
 
 Judge = Callable[..., int]
 UNSAFE = {"behaviour": {"below_cdbs_20_percent": 0.42}}
@@ -98,6 +98,11 @@ def test_slots_that_no_policy_takes_name_sessions_that_would_tell_and_ask_for_no
     assert client.post("/visits/2/plan", data=asked, follow_redirects=False).status_code == 303
     held = [s["design"]["level"] for s in client.get("/api/v1/visits/2/plan").json()["sessions"] if s["design"]]
     assert held == pytest.approx([1.9 / 3, 1.9 / 3])
+    judge({i: judged(50.0, told=False, outcome_draws=undecided) for i in policies}, cdbs(told=False).to_json(), **noise)
+    page = client.get("/visits/2/plan", headers={"accept": "text/html"}).text
+    assert re.findall(r'name="held_amplitude"[^>]* value="([^"]*)"', page) == [f"{0.65 * 3:.1f}", ""]
+    assert "no number of sessions is known to settle it" in page
+    assert "would tell" not in page
 
 
 def test_policies_that_do_the_same_stand_under_their_teacher_and_can_still_be_ticked(
