@@ -85,10 +85,15 @@ function send(files, fields, shown) {
       shown.words.textContent = event.loaded < event.total ? `sending, ${Math.round((100 * event.loaded) / event.total)} %` : "decoding …";
     });
     request.upload.addEventListener("load", () => follow(shown, request));
-    request.addEventListener("load", () => { report(shown, request.status, request.response ?? {}); renew(); done(); });
+    request.addEventListener("load", () => { report(shown, request.status, request.response ?? {}); taken(request.status); renew(); done(); });
     request.addEventListener("error", () => { report(shown, 0, { detail: "The connection broke off.", hint: "Send the files again; what has arrived is not counted twice." }); done(); });
     request.send(body);
   });
+}
+
+// what was stated for these files is no entry that waits to be saved any more
+function taken(status) {
+  if (status < 400) form.dispatchEvent(new CustomEvent("betaloop:saved", { bubbles: true }));
 }
 
 // on the page of a visit, what the files changed is shown at once
