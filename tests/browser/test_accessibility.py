@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from app.settings import get_settings
 from ml.ope.support.behaviour_map import COLUMNS, DOSES, BehaviourMap, Curve
 from tests.app.evaluations import judge as judge
 from tests.app.evaluations import judged
+from tests.browser import tour
 from tests.ml.ope.posterior.draws import N, constructed
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -46,11 +46,11 @@ PAGES = {
     "style-guide": "/styleguide",
 }
 RANKED = {
-    "ranking": "/participants/P1/ranking",
-    "policy": "/participants/P1/policies/{policy}",
-    "compare": "/participants/P1/compare",
-    "plan": "/visits/{visit}/plan",
-    "day": "/visits/{visit}",
+    "evaluate/ranking": "/participants/P1/ranking",
+    "evaluate/policy": "/participants/P1/policies/{policy}",
+    "evaluate/compare": "/participants/P1/compare",
+    "plan/plan": "/visits/{visit}/plan",
+    "plan/visit": "/visits/{visit}",
 }
 """Of a participant who has a ranking, and a draft of a plan with its best policy."""
 RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]}
@@ -84,6 +84,18 @@ def test_on_paper_nothing_runs_past_its_card(window: Callable, studied: list[int
     assert found == []
 
 
+def test_on_paper_settings_and_margins_have_their_values(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+    watched = window(SHEET, 900, "light")
+    watched.sign_in()
+    watched.page.emulate_media(media="print")
+    for page, field in (("settings", "cdbs_amplitude_ma"), ("margins", "rating_points")):
+        watched.open(f"/participants/P1/{page}")
+        assert watched.page.is_visible(f"form.print [name={field}]")
+        assert watched.page.input_value(f"form.print [name={field}]")
+        assert not watched.page.is_visible("form.print [name=reason]")
+        assert not watched.page.is_visible("form.print button")
+
+
 WINDOWS = pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (1280, "dark"), (768, "light"), (768, "dark")])
 
 
@@ -97,13 +109,13 @@ def test_no_page_breaks_a_rule_of_accessibility_or_moves(
 ) -> None:
     monkeypatch.setattr(get_settings(), "development", True)
     addresses = {name: path.format(session=studied[0]) for name, path in PAGES.items()}
-    assert looked_at(window(width, 900, scheme), addresses, (width, scheme) == (1280, "light")) == []
+    assert looked_at(window(width, 900, scheme), addresses) == []
 
 
 def test_the_first_tick_of_a_ranking_is_fifteen_tabs_away_at_most(ranked: dict[str, int], window: Callable) -> None:  # type: ignore[type-arg]
     watched = window(1280, 900, "light")
     watched.sign_in()
-    watched.open(RANKED["ranking"])
+    watched.open(RANKED["evaluate/ranking"])
     keys = 0
     while not watched.page.evaluate("() => document.activeElement.matches('input[name=policy_ids]')"):
         assert keys < 15
@@ -131,7 +143,7 @@ def test_the_pages_of_a_ranking_break_no_rule_either(
         assert watched.page.evaluate(PAST_THE_CARD) == [], path
 
 
-def looked_at(watched: Any, addresses: dict[str, str], for_the_tour: bool) -> list[str]:
+def looked_at(watched: Any, addresses: dict[str, str], for_the_tour: bool = False) -> list[str]:
     """What axe-core and the eye for shifts find on pages; pictures of them where they are asked for."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     pictures = os.environ.get("BETALOOP_TOUR") if for_the_tour else None
@@ -146,7 +158,7 @@ def looked_at(watched: Any, addresses: dict[str, str], for_the_tour: bool) -> li
         broken = axe.run(watched.page, options=RULES).response["violations"]
         found += [f"{name}: {v['id']} {v['nodes'][0]['html'][:120]}" for v in broken]
         if pictures:
-            watched.page.screenshot(path=Path(pictures) / f"{name}.png", scale="css")
+            tour.take(watched.page, pictures, name)
     return found
 
 

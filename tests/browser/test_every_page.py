@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +15,7 @@ from tests.app.conftest import full_study as full_study
 from tests.app.conftest import world as world
 from tests.app.every_route import PASSWORD, World, token_of
 from tests.app.pages.every_page import addresses
+from tests.browser import tour
 from tests.browser.conftest import Watched, serving, windows
 from tests.browser.test_accessibility import MOST_SHIFT, RULES, SHIFTS, WINDOWS
 
@@ -26,14 +26,6 @@ TOO_WIDE = "() => document.documentElement.scrollWidth - document.documentElemen
 SEND = """([action, name, value]) => { const form = document.createElement('form'); form.method = 'post'; form.action = action;
   const field = document.createElement('input'); field.name = name; field.value = value; form.append(field); document.body.append(form);
   form.submit(); }"""
-TOUR = {
-    "replay": "/participants/{code}/compare",
-    "sweep": "/sweeps/{sweep_id}",
-    "calibration": "/participants/{code}/calibration",
-    "bundle": "/participants/{code}/policies/{policy_id}/bundle",
-    "protocol": "/participants/{code}/settings",
-}
-"""Pictures of the tour that need sessions of policies and a sweep."""
 DRAWN = ("/visit-day/shell",)
 """What nobody opens by its address: a tablet without network draws the clinic day into it."""
 SUBMIT = "main form[method=post] button.primary"
@@ -65,16 +57,22 @@ def broken(axe: Any, watched: Watched, name: str) -> list[str]:
     return [f"{name}: {v['id']} {v['nodes'][0]['html'][:160]}" for v in found] + [f"{name}: {wider} px too wide"] * (wider > 0)
 
 
-def test_the_tour_shows_what_a_whole_study_has(window: Callable, world: World) -> None:  # type: ignore[type-arg]
-    watched = window(1280, 900, "light")
-    watched.sign_in(password=PASSWORD)
+def test_the_tour_shows_every_page(window: Callable, world: World) -> None:  # type: ignore[type-arg]
+    watched = window(tour.WIDTH, tour.HEIGHT, "light")
     pictures, there = os.environ.get("BETALOOP_TOUR"), addresses(world)
-    for name, route in TOUR.items():
+    trained = next(j["id"] for j in world.read("/participants/P1/jobs")["items"] if j["status"] == "succeeded")
+    there["/jobs/{job_id}"] = f"/jobs/{trained}"  # which has steps and curves
+    for route in ["/sign-in", *(r for r, name in tour.PAGES.items() if r != "/sign-in" and name not in tour.OF_THE_RANKED)]:
         watched.open(there[route])
+        assert watched.page.url.endswith(there[route])
         watched.charts_drawn()
+        if route == "/visit-day/{visit_id}":
+            watched.page.wait_for_selector("#day:not([hidden])")
         watched.page.evaluate("() => scrollTo(0, 0)")
         if pictures:
-            watched.page.screenshot(path=Path(pictures) / "study" / f"{name}.png", scale="css")
+            tour.take(watched.page, pictures, tour.PAGES[route])
+        if route == "/sign-in":
+            watched.sign_in(password=PASSWORD)
     assert watched.errors == []
 
 

@@ -1,0 +1,88 @@
+"""Which page of the service stands under which name in docs/tour.md, and how its picture is made: small enough to be kept in git."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+COLOURS = 64
+WIDTH, HEIGHT = 1280, 860
+MOST_BYTES = 120_000
+
+PAGES = {
+    "/": "study/today",
+    "/energy-saved": "study/energy-saved",
+    "/search": "study/search",
+    "/analyses": "study/all-analyses",
+    "/trial-time": "study/trial-time",
+    "/jobs": "study/all-jobs",
+    "/audit": "study/audit",
+    "/glossary": "study/glossary",
+    "/sign-in": "study/sign-in",
+    "/account": "study/account",
+    "/accounts": "study/accounts",
+    "/studies": "study/studies",
+    "/api-reference": "study/rest-interface",
+    "/styleguide": "study/style-guide",
+    "/participants/new": "participant/new",
+    "/participants/{code}": "participant/participant",
+    "/participants/{code}/visits": "participant/visits",
+    "/participants/{code}/visits/new": "participant/new-visit",
+    "/participants/{code}/settings": "participant/settings",
+    "/participants/{code}/characteristics": "participant/characteristics",
+    "/participants/{code}/margins": "participant/margins",
+    "/participants/{code}/adverse-events": "participant/adverse-events",
+    "/participants/{code}/data-queries": "participant/data-queries",
+    "/sessions/{session_id}": "participant/session",
+    "/sessions/{session_id}/signal": "participant/signal",
+    "/participants/{code}/upload": "collect/upload",
+    "/uploads/{upload_id}": "collect/report",
+    "/participants/{code}/proposals": "collect/proposals",
+    "/proposals/{session_id}": "collect/proposal",
+    "/participants/{code}/quarantine": "collect/quarantine",
+    "/uploaded-files/{file_id}/mapping": "collect/mapping",
+    "/studies/{study_code}/column-mappings": "collect/column-mappings",
+    "/participants/{code}/device-history": "collect/device-history",
+    "/participants/{code}/jobs": "learn/jobs",
+    "/jobs/{job_id}": "learn/job",
+    "/participants/{code}/policies": "learn/policies",
+    "/sweeps/{sweep_id}": "learn/sweep",
+    "/snapshots/{snapshot_id}": "learn/snapshot",
+    "/participants/{code}/buffer-gate": "learn/buffer-gate",
+    "/participants/{code}/next-generation": "learn/next-generation",
+    "/participants/{code}/ranking": "evaluate/ranking",
+    "/participants/{code}/policies/{policy_id}": "evaluate/policy",
+    "/participants/{code}/compare": "evaluate/compare",
+    "/participants/{code}/calibration": "evaluate/calibration",
+    "/participants/{code}/plans": "plan/plans",
+    "/visits/{visit_id}/plan": "plan/plan",
+    "/visits/{visit_id}": "plan/visit",
+    "/visits/{visit_id}/slots": "plan/slots",
+    "/visits/{visit_id}/bundles": "plan/bundles",
+    "/participants/{code}/policies/{policy_id}/bundle": "plan/bundle",
+    "/visit-day/{visit_id}": "plan/clinic-day",
+    "/participants/{code}/analyses": "analyse/analyses",
+    "/participants/{code}/analyses/visits/{key}": "analyse/visit-by-visit",
+    "/participants/{code}/analyses/models/{key}": "analyse/models",
+    "/participants/{code}/analyses/paper": "analyse/as-in-the-paper",
+    "/participants/{code}/analyses/energy": "analyse/energy",
+    "/participants/{code}/analyses/beta": "analyse/beta",
+    "/participants/{code}/analyses/evaluations": "analyse/methods-by-seed",
+}
+"""Name of the picture of each page, by its route."""
+OF_THE_RANKED = ("evaluate/ranking", "evaluate/policy", "evaluate/compare", "plan/plan", "plan/visit")
+"""Made of a study with a judged ranking and a draft, in which there is more to see."""
+
+
+def take(page: Any, folder: str | Path, name: str) -> None:
+    """The upper part of the page that is shown, in a picture of few colours."""
+    page.set_viewport_size({"width": WIDTH, "height": HEIGHT})
+    page.wait_for_timeout(400)  # charts fit themselves to the window
+    whole = Image.open(io.BytesIO(page.screenshot(scale="css"))).convert("RGB")
+    path = Path(folder) / f"{name}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    whole.quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+    assert path.stat().st_size <= MOST_BYTES, f"{name}: {path.stat().st_size} bytes"
