@@ -26,6 +26,18 @@ def reason(evidence: Evidence) -> str:
     return _stated(evidence) if evidence.reason is Reason.STATED else _SENTENCES[evidence.reason](evidence.facts)
 
 
+KIND_NAMES = {
+    "rcs": "RC+S session folder",
+    "percept": "Percept report",
+    "csv": "table",
+    "parquet": "table (Parquet)",
+    "control_log": "controller's log",
+    "tremor": "tremor export",
+    "grasp": "grasp test",
+    "mapped": "table with a column mapping",
+    "unknown": "not read",
+}
+"""Kinds of files (`ml.formats.FileKind`, and `unknown` before a file is read) as people call them."""
 WAITS = "cut short: read again by itself"
 AFTER_READER_ENDED = (
     "It is kept encrypted. Send it again in smaller parts, or have BETALOOP_DECODE_MEMORY_MB or BETALOOP_DECODE_SECONDS raised and read it "

@@ -79,7 +79,8 @@ def _looked(path: str) -> str:
     """Which results, by the address of their page."""
     whose, _, page = path.removeprefix("/api/v1").removeprefix("/participants/").partition("/")
     if not whose or not page:
-        return f"looked at the results of {path}"
+        which = path.removeprefix("/api/v1").strip("/").removeprefix("analyses").replace("-", " ").replace("/", " ").strip()
+        return "looked at the results of all participants" + (f": {which}" if which else "")
     return f"looked at the results of {whose}: {page.replace('-', ' ').replace('/', ', ')}"
 
 

@@ -38,7 +38,22 @@ TRAINABLE = [(name, ALGORITHM_NAMES[name]) for name in get_args(AlgorithmName)]
 SHOWN_EVENTS = 20_000
 LOG_LINES = 200
 REFRESH_S = 4
-MOST_PARTICIPANTS, MOST_LIVE = 1000, 200
+MOST_PARTICIPANTS, MOST_LIVE, MOST_NAMED = 1000, 200, 20
+PARAM_NAMES = {
+    "actor_lr_high": "Highest learning rate", "actor_lr_low": "Lowest learning rate", "aim": "What the policies learn from",
+    "algorithms": "Algorithms", "anchor": "What TD3+BC and ReBRAC are held near", "count": "Policies to train",
+    "critic_memory": "Critics see past amplitudes", "distil_updates": "Gradient steps of each student",
+    "held_out": "Scored on held-out sessions", "horizon_steps": "Steps estimated ahead", "methods": "Methods of evaluation",
+    "parents": "Policies to go on from", "policies": "Policies", "preset": "Size", "seed": "Seed", "sigma": "Noise of distillation",
+    "sweep": "Sweep", "tuned": "Fine-tuned from each", "updates": "Gradient steps of each policy",
+}  # fmt: skip
+"""What a job was asked for, in the words of its form."""
+VALUE_NAMES = {
+    "aim": {"steps": "step rewards, as in the paper", "return": "step rewards and each step's share of the end-of-session reward",
+            "both": "by turns step rewards alone, and with the end-of-session reward"},
+    "anchor": {"logged": "the logged amplitudes", "cdbs": "the cDBS amplitude", "both": "by turns the logged and the cDBS amplitude"},
+    "preset": {"full": "full: for a study", "quick": "quick: for a first look"},
+}  # fmt: skip
 
 
 @router.get("/participants/{code}/jobs")
@@ -79,6 +94,8 @@ def all_jobs_page(request: Request, db: Db, caller: CurrentCaller, paging: Pagin
         request,
         "pipeline/all_jobs.html",
         codes=codes,
+        stoppable={p.id for p in participants if may(caller, can.RUN_JOBS, p)},
+        startable=[p.code for p in participants if may(caller, can.RUN_JOBS, p)][:MOST_NAMED],
         live=live,
         ended=ended,
         total=total,
@@ -103,7 +120,7 @@ def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller)
         live=not JobStatus(found.job.status).ended,
         curves=charts.job_curves(found.job, [e for e in events if e.kind == "points"]),
         log=[e for e in events if e.kind == "log"][-LOG_LINES:],
-        params=_in_words({k: v for k, v in found.job.params.items() if v not in (None, [])}),
+        params=_in_words(found.job.params),
         refresh_s=REFRESH_S,
         workers=len(jobs.live_workers(db, job_service.STALE_S)),
         may_run=may(caller, can.RUN_JOBS, found.participant),
@@ -151,6 +168,8 @@ def _jobs(
         kinds=list(_titles().items()),
         titles=_titles(),
         codes=None,
+        stoppable={participant.id} if may(caller, can.RUN_JOBS, participant) else set(),
+        chosen=bool((given or {}).keys() - {"kind", "preset"}),
         live=any(not JobStatus(j.status).ended for j in rows),
         refresh_s=REFRESH_S,
         problem=problem or (blocked.problem(request.url.path) if blocked else None),
@@ -171,7 +190,13 @@ def _titles() -> dict[str, str]:
     return {kind.name: kind.title for kind in registry.kinds().values()}
 
 
-def _in_words(params: dict[str, Any]) -> dict[str, Any]:
-    """What was asked for, with methods and algorithms by their names."""
-    names = {"methods": method_names(), "algorithms": ALGORITHM_NAMES}
-    return {k: [str(names[k].get(one, one)) for one in v] if k in names else v for k, v in params.items()}
+def _in_words(params: dict[str, Any]) -> list[tuple[str, str]]:
+    """What was asked for, by the names that its form has; what was left open is left out."""
+    return [(PARAM_NAMES.get(name, name.replace("_", " ")), _value(name, v)) for name, v in params.items() if v is not None and v != []]
+
+
+def _value(name: str, value: Any) -> str:
+    names: dict[Any, str] = {"methods": method_names(), "algorithms": ALGORITHM_NAMES}.get(name) or VALUE_NAMES.get(name, {})
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ", ".join(str(names.get(one, one)) for one in (value if isinstance(value, list) else [value]))

@@ -19,6 +19,8 @@ from fastapi.testclient import TestClient
 
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 PASSWORD = "correct horse battery"
+PATIENCE_MS = 120_000
+"""How long a page may take to come, or a part of it: on a machine that is busy with other work, half a minute was too short."""
 FLAGS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync",
@@ -121,6 +123,7 @@ def windows(chromium: Any, address: str) -> Iterator[Callable[..., Watched]]:
 
     def make(width: int = 1400, height: int = 900, scheme: str = "light") -> Watched:
         context = chromium.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
+        context.set_default_timeout(PATIENCE_MS)
         contexts.append(context)
         watched = Watched(context.new_page(), address)
         watched.page.on("console", lambda m: watched.errors.append(m.text) if m.type in ("error", "warning") else None)

@@ -43,6 +43,28 @@ def test_no_chart_offers_to_send_data_elsewhere(window: Callable, studied: list[
     assert watched.foreign == []
 
 
+BUTTONS_OVER = """() => [...document.querySelectorAll("figure[data-drawn=yes]")].flatMap((figure) => {
+  const bar = figure.querySelector(".modebar").getBoundingClientRect();
+  const over = (box) => bar.width > 0 && box.width > 0 && bar.bottom > box.top + 0.5 && bar.top < box.bottom - 0.5
+    && bar.right > box.left && bar.left < box.right;
+  const rects = (e) => { const range = document.createRange(); range.selectNodeContents(e); return [...range.getClientRects()]; };
+  const words = [...figure.querySelectorAll("figcaption > *")].flatMap(rects);
+  const data = over(figure.querySelector(".plot").getBoundingClientRect());
+  return [...(data ? [`${figure.id}: data`] : []), ...(words.some(over) ? [`${figure.id}: title`] : [])];
+})"""
+
+
+def test_the_buttons_of_a_chart_cover_neither_its_data_nor_on_a_tablet_its_title(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+    for width in (768, 1280):
+        watched = window(width, 1024)
+        watched.sign_in()
+        for path in (f"/sessions/{studied[0]}", "/participants/P1", "/participants/P1/analyses/paper"):
+            watched.open(path)
+            assert watched.charts_drawn() >= 1
+            covered = watched.page.evaluate(BUTTONS_OVER)
+            assert [c for c in covered if width == 768 or c.endswith("data")] == [], (width, path)
+
+
 def test_the_session_chart_breaks_its_line_at_missing_beta(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
     watched = window()
     watched.sign_in()
@@ -155,10 +177,10 @@ def test_what_cannot_be_taken_back_asks_first(window: Callable, enrolled: str) -
     assert watched.page.inner_text("code.secret").startswith("blp_")
     row = watched.page.locator("tr", has_text="a tablet")
     row.locator("button").click()
-    watched.page.click("dialog[open] >> text=Leave it as it is")
+    watched.page.click("dialog[open] >> text=Keep the token")
     expect(row.locator(".badge")).to_have_text("live")
     row.locator("button").click()
-    assert watched.page.inner_text("dialog[open] [value=yes]") == "Revoke"
+    assert watched.page.inner_text("dialog[open] [value=yes]") == "Revoke the token"
     watched.page.click("dialog[open] [value=yes]")
     watched.page.wait_for_selector("text=Token revoked")
     expect(row.locator(".badge")).to_have_text("revoked")

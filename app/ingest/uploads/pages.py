@@ -110,7 +110,9 @@ def report(request: Request, upload_id: RowId, db: Db, caller: CurrentCaller) ->
     row, participant = repository.upload(db, upload_id, caller)
     outcome = UploadOutcome(row, participant, service.stored_outcomes(db, row))
     waiting = {s.id for s in study.proposals_of_participant(db, participant.id)} & set(outcome.session_ids)
-    return HTMLResponse(render(request, "ingest/report.html", participant=participant, outcome=outcome, waiting=len(waiting)))
+    return HTMLResponse(
+        render(request, "ingest/report.html", participant=participant, outcome=outcome, waiting=len(waiting), kind_names=wording.KIND_NAMES)
+    )
 
 
 def _state(upload: Upload) -> tuple[str, str]:
@@ -145,6 +147,7 @@ def _page(
         policies=study.policy_names(db, participant.id),
         typed=known,
         outcome=outcome,
+        kind_names=wording.KIND_NAMES,
         sessions=study.sessions_of_participant(db, participant.id, with_proposals=True),
         proposed=len(study.proposals_of_participant(db, participant.id)),
         held=sum(f.quarantine_sha256 is not None for f in repository.quarantined_files(db, participant.id)),

@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 
 Value = TypeVar("Value")
 _RETRY_S = (0.2, 5.0)
+MOST_UNFINISHED = 0.99
+"""Share that a step or a job shows at most before it has ended: its computation may be done, its results are not stored yet."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class Ledger:
             with self._locked() as (db, job):
                 step = repository.step(db, job.id, key)
                 if messages.progress is not None:
-                    step.progress = messages.progress
+                    step.progress = min(messages.progress, MOST_UNFINISHED)
                 if messages.message is not None:
                     step.message = messages.message
                 for text in messages.logs or ():
@@ -176,7 +178,7 @@ class Ledger:
         db.flush()
         # never backwards: a step that is resumed from its checkpoint starts to report from there
         mean = select(func.sum(JobStep.weight * JobStep.progress) / func.sum(JobStep.weight)).where(JobStep.job_id == job.id)
-        job.progress = max(job.progress, min(1.0, db.scalar(mean) or 0.0))
+        job.progress = max(job.progress, min(MOST_UNFINISHED, db.scalar(mean) or 0.0))
         job.updated_at = now()
         job.message = f"{step.title}: {step.message}" if step.message else step.title
         data = {"progress": step.progress, "job_progress": job.progress, "message": step.message}

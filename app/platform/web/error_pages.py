@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 from fastapi import Request
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
@@ -13,7 +16,7 @@ _ADVICE = {
     404: ("There is no such page", "The address may be mistyped; or what it named is gone, or lies outside your study or site."),
     405: ("This address takes no such request", "Open the page it belongs to and use its buttons."),
     413: ("Too large to take", "Go back and choose less at once."),
-    422: ("Something in this request cannot be used", "Correct what is named and send it again."),
+    422: ("Something in this request cannot be used", "Open the page from a link of betaloop, or correct what is named and send it again."),
 }
 
 
@@ -23,6 +26,22 @@ def advised(status: int, title: str, has_entries: bool) -> tuple[str, str]:
         kept = " Then send what you had entered from here." if has_entries else ""
         return "Your sign-in has expired", f"Sign in again in a new window.{kept}"
     return _ADVICE.get(status, (title, ""))
+
+
+_WANTED = {"int_parsing": "a whole number", "int_type": "a whole number", "float_parsing": "a number", "bool_parsing": "yes or no"}
+
+
+def input_in_words(errors: Sequence[Mapping[str, Any]]) -> str:
+    """What is wrong with an address or a form, from the errors of its validation (pydantic's), without the names of types and members."""
+    return " ".join(_said(error) for error in errors[:5])
+
+
+def _said(error: Mapping[str, Any]) -> str:
+    given, name = str(error.get("input"))[:80], str(error["loc"][-1]).replace("_", " ")
+    wanted = _WANTED.get(str(error["type"]))
+    if error["loc"][0] == "path":
+        return f"The address has \u201c{given}\u201d where {wanted or f'another {name}'} belongs."
+    return f"\u201c{given}\u201d cannot be taken for {name}" + (f": {wanted} belongs there." if wanted else f": {error['msg']}.")
 
 
 async def kept_entries(request: Request) -> list[tuple[str, str]]:

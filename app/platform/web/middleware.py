@@ -6,6 +6,7 @@ import errno
 import json
 import secrets
 import time
+from contextlib import suppress
 from typing import Any
 from urllib.parse import quote, urlsplit
 
@@ -25,7 +26,7 @@ from starlette.routing import compile_path
 from app.platform.errors import BetaloopError, Conflict, DatabaseAway, Forbidden, StorageFull, TooMany, Unauthorized
 from app.platform.web.body_limit import BodyLimit, Judge
 from app.platform.web.compression import Compression
-from app.platform.web.error_pages import advised, kept_entries
+from app.platform.web.error_pages import advised, input_in_words, kept_entries
 from app.platform.web.templates import render
 from app.settings import get_settings
 
@@ -45,6 +46,7 @@ def install(app: FastAPI, judge: Judge) -> None:
     app.add_middleware(BodyLimit, refusal=_refused_unread, judge=judge)  # inside the other: its refusals have the headers of every answer
     app.middleware("http")(_around)
     app.add_middleware(Compression)  # outermost: what it shrinks is whole
+    app.state.judge = judge
     app.add_exception_handler(BetaloopError, _known_error)
     app.add_exception_handler(RequestValidationError, _bad_input)
     app.add_exception_handler(HTTPException, _http_error)
@@ -137,6 +139,8 @@ class _InputError(BetaloopError):
 async def _bad_input(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     errors = [{"where": " > ".join(map(str, e["loc"])), "what": e["msg"]} for e in error.errors()]
+    if wants_page(request):
+        return await _answer(request, _InputError(input_in_words(error.errors())))
     detail = "; ".join(f"{e['where']}: {e['what']}" for e in errors[:5])
     return await _answer(request, _InputError(detail, "Correct the named members and send again.", errors=errors))
 
@@ -159,6 +163,10 @@ async def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     if isinstance(error.__cause__, OSError):  # what the framework calls a body that cannot be read, where our disk could not take it
         return await _system_error(request, error.__cause__)
+    if wants_page(request) and getattr(request.state, "caller", None) is None:
+        # no route asked who this is: the page of the error still has the way back for somebody who has signed in, if the database answers
+        with suppress(Unauthorized, Forbidden, DBAPIError, PoolTimeout):
+            await request.app.state.judge(request)
     hint = _HINTS.get(error.status_code, "") if not wants_page(request) else ""
     response = await _answer(request, _PlainError(error.status_code, str(error.detail), hint))
     response.headers.update(error.headers or {})

@@ -102,6 +102,8 @@ def minutes_left(seconds: float) -> str:
 
 def size(value: int) -> str:
     """Bytes for people."""
+    if value < 1024:
+        return f"{value} B"
     amount, unit = float(value), "B"
     for larger in ("KiB", "MiB", "GiB"):
         if amount >= 1024:

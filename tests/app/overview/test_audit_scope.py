@@ -120,6 +120,6 @@ def test_the_page_shows_it_and_says_that_it_is_a_part(
     page = TestClient(service_app, headers=calling).get("/audit")
     assert (page.status_code, "seen N1" in page.text, "admin@clinic.example" in page.text) == (200, True, True)
     assert "of the studies and sites in which your role reads it" in page.text
-    assert "No row matches" in TestClient(service_app, headers=calling).get("/audit?entity=app_user").text
+    assert "Nothing matches" in TestClient(service_app, headers=calling).get("/audit?entity=app_user").text
     assert "of the studies and sites" not in client.get("/audit").text, "who reads it everywhere reads all of it"
     assert viewer.get("/audit").status_code == 403

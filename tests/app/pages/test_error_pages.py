@@ -21,7 +21,17 @@ def test_a_page_of_an_error_says_what_to_do(browser: TestClient, method: str, pa
     answer = browser.request(method, path)
     assert answer.status_code == status
     assert f"<h1>{heading}</h1>" in answer.text
-    assert "Today" in answer.text
+    assert '<a href="/jobs"' in answer.text  # the way on of somebody who has signed in
+    assert "Sign out" in answer.text
+
+
+def test_a_page_names_what_is_wrong_with_an_address_in_words(browser: TestClient) -> None:
+    page = browser.get("/sessions/none").text
+    assert "The address has \u201cnone\u201d where a whole number belongs." in page
+    assert "Open the page from a link" in page
+    assert "path &gt;" not in page
+    assert "integer" not in page
+    assert "\u201cx\u201d cannot be taken for offset: a whole number belongs there." in browser.get("/audit?offset=x").text
 
 
 def test_an_expired_sign_in_gives_back_every_entry_and_takes_it_after_signing_in(browser: TestClient, enrolled: str) -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 from html import unescape
+from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
+
+TEMPLATES = Path(__file__).resolve().parents[3] / "app" / "templates"
 
 
 def test_a_session_that_cannot_be_read_says_why_and_nothing_else(
@@ -73,3 +76,20 @@ def test_unit_and_source_of_a_tables_beta_are_stated_on_the_upload_page(
     assert refused.status_code == 422
     assert "Source of beta" in refused.text
     assert 'value="device units"' in refused.text
+
+
+def test_no_confirmation_can_be_read_backwards() -> None:
+    """A button asks with what both answers do; where it names no answers of its own, its label is a verb with its object."""
+    asked = 0
+    for path in sorted(TEMPLATES.rglob("*.html")):
+        if path.name == "macros.html":
+            continue
+        html = path.read_text()
+        for tag, label in re.findall(r"<button([^>]*data-confirm=[^>]*)>([^<]*)<", html):
+            asked += 1
+            assert "data-confirm-yes=" in tag or len(label.split()) > 1, f"{path.name}: {label}"
+        for call in re.findall(r"(?:post_button|call form)\([^{}]*?confirm=.*?\) ?(?:%\}|\}\})", html):
+            asked += 1
+            assert "yes=" in call, f"{path.name}: {call}"
+            assert "no=" in call, f"{path.name}: {call}"
+    assert asked >= 12

@@ -73,9 +73,30 @@ def test_all_jobs_stand_in_one_page_with_their_participant(browser: TestClient, 
     page = browser.get("/jobs").text
     assert "Running and waiting" in page
     assert f'<a href="/participants/{enrolled}/jobs">' in page
+    assert 'action="/jobs/4f00aaaa-0000-4000-8000-000000000000/cancel"' in page
+    assert 'data-confirm-yes="Stop the job" data-confirm-no="Let it run"' in page
     # a running job at 99.6 % is not done
     assert "99 %" in page
     assert "100 %" not in page
+
+
+def test_a_job_is_stopped_from_the_list_by_those_who_may_and_says_so(
+    browser: TestClient, sign_in: Callable[[str], TestClient], enrolled: str, db: Session
+) -> None:
+    job = _job(db, JobStatus.RUNNING)
+    job.cancel_requested_at = datetime.now(UTC)
+    db.commit()
+    for path in ("/jobs", f"/participants/{enrolled}/jobs", f"/jobs/{job.id}"):
+        page = browser.get(path).text
+        assert "stopping</span>" in page, path
+        assert "/cancel" not in page, path
+    job.cancel_requested_at = None
+    db.commit()
+    assert "/cancel" not in sign_in("viewer").get("/jobs").text
+    assert browser.post(f"/jobs/{job.id}/cancel").status_code == 303
+    page = browser.get("/jobs").text
+    assert "cancelled</span>" in page
+    assert f'Start one for <a href="/participants/{enrolled}/jobs">' in page
 
 
 def test_energy_saved_is_weighted_by_minutes() -> None:

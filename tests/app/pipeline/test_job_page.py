@@ -62,7 +62,10 @@ def test_the_page_names_methods_in_words(client: TestClient, upload: Callable[..
     job = client.post("/api/v1/participants/P1/jobs", json=asked).json()["id"]
     page = client.get(f"/jobs/{job}").text
     assert "Weighted importance sampling, DualDICE" in page
-    assert "dual_dice" not in page[page.index("Asked for</h2>") :]
+    asked_for = page[page.index("Asked for</h2>") :]
+    assert "dual_dice" not in asked_for
+    for name, value in (("Size", "quick: for a first look"), ("Critics see past amplitudes", "yes"), ("Seed", "0")):
+        assert f"<dt>{name}</dt><dd>{value}</dd>" in asked_for
 
 
 def test_members_that_learn_one_after_the_other_have_a_curve_each(db: Session, tmp_path: Path) -> None:

@@ -267,6 +267,24 @@ def test_progress_is_the_weighted_mean_of_the_steps_and_never_falls(jobs):
     assert jobs.get(job_id).progress == pytest.approx(0.75)
 
 
+def test_nothing_that_goes_on_has_a_hundred_per_cent(jobs):
+    job_id = jobs.submit()
+    ledger = Ledger(job_id, "test", "here", lambda: None)
+    ledger.open()
+    ledger.declare("a", "A", 1.0)
+    ledger.begin("a")
+
+    def shown():
+        with new_session() as db:
+            job, step = repository.get(db, job_id), repository.step(db, job_id, "a")
+            return str(step.status), step.progress, str(job.status), job.progress
+
+    ledger.record("a", ChildMessages(progress=1.0, message="update 4000 of 4000"))
+    assert shown() == ("running", 0.99, "running", 0.99)
+    ledger.commit_step("a", lambda db: {})
+    assert shown() == ("succeeded", 1.0, "running", 0.99)
+
+
 def test_a_step_is_stored_once_however_often_it_is_committed(jobs):
     job_id = jobs.submit()
     ledger = Ledger(job_id, "test", "here", lambda: None)
