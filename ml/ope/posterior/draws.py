@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from ml.ope.estimate import OUTCOMES
 from ml.ope.flags import Flag
 from ml.ope.observed import mean_over_days
 from ml.ope.outcomes.model import EndModel
-from ml.ope.posterior.constants import COMMON_SHARE, MODEL_ERRORS
+from ml.ope.posterior.constants import COMMON_SHARE, MODEL_ERRORS, ModelError, error_unit
 from ml.ope.posterior.gaussian import correlated
 from ml.trajectories import ReplayBuffer
 
@@ -54,12 +55,22 @@ class Draws:
     unknown: Flag | None
 
 
-def joint_draws(buffer: ReplayBuffer, replays: Replays, ends: EndModel, alike: Floats, leverage: Floats, horizon: int, seed: int) -> Draws:
+def joint_draws(
+    buffer: ReplayBuffer,
+    replays: Replays,
+    ends: EndModel,
+    alike: Floats,
+    leverage: Floats,
+    horizon: int,
+    seed: int,
+    model_errors: Mapping[str, ModelError] = MODEL_ERRORS,
+    common_share: float = COMMON_SHARE,
+) -> Draws:
     """Draws of coefficients and structures, of the days that were not seen, and of what the structures get wrong.
 
     Args:
         replays: P policies, cDBS last. ends: model of r_end. alike: correlation of what structures get wrong, [P, P]. leverage: [P].
-        horizon: steps. seed: of the draws.
+        horizon: steps. seed: of the draws. model_errors, common_share: of `constants`.
     """
     settings = buffer.settings
     visits = np.array([s.visit for s in buffer.sessions])
@@ -75,12 +86,12 @@ def joint_draws(buffer: ReplayBuffer, replays: Replays, ends: EndModel, alike: F
     for name, values in parts.items():
         base, over_draws = values @ days.weights, np.einsum("pdn,d->pn", values, replays.weights)
         own = mean_over_days(over_draws, visits, KEPT, seed)
-        rows = base[:, picked] + COMMON_SHARE * own.common + own.own
+        rows = base[:, picked] + common_share * own.common + own.own
         # what was picked has a mean of its own: the draws keep that of all
         rows += (base @ replays.weights - rows.mean(1))[:, None]
-        if name in MODEL_ERRORS:
-            unit = reach if name == "steps" else 1.0
-            rows += correlated(alike, np.array([unit * MODEL_ERRORS[name].sd(v) for v in leverage]), KEPT, rng)
+        if name in model_errors:
+            sd = error_unit(name, rows.mean(1), reach) * np.array([model_errors[name].sd(v) for v in leverage])
+            rows += correlated(alike, sd, KEPT, rng)
         drawn[name] = rows
         between[name] = _between_visits(over_draws - over_draws[-1], visits)
     if constants is not None:

@@ -20,7 +20,7 @@ from ml.ope.flags import FEW_END_REWARDS, Flag, distinct
 from ml.ope.lead import dose_before
 from ml.ope.linear.estimator import FittedLinear, LinearConfig, Replayed
 from ml.ope.outcomes.model import EndModel, fit_end_model
-from ml.ope.posterior.constants import VERSION
+from ml.ope.posterior.constants import COMMON_SHARE, MODEL_ERRORS, VERSION, ModelError
 from ml.ope.posterior.draws import Draws, Replays, joint_draws
 from ml.ope.posterior.further_sessions import return_noise
 from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference, similarity, updated
@@ -57,11 +57,15 @@ class PosteriorConfig:
         draws: sets of coefficients, over all structures together, with which every session is replayed.
         most_rows: replayed sessions per policy at most; a longer record takes fewer draws, though never fewer than 24.
         seed: of all draws.
+        model_errors: what structures get wrong, by component; a component that is absent has none.
+        common_share: see `constants.COMMON_SHARE`.
     """
 
     draws: int = 48
     most_rows: int = 1500
     seed: int = 0
+    model_errors: Mapping[str, ModelError] = field(default_factory=lambda: MODEL_ERRORS)
+    common_share: float = COMMON_SHARE
 
 
 @dataclass(frozen=True)
@@ -135,10 +139,7 @@ class FittedPosterior:
             return {}
         everyone = {**policies, CDBS: ConstantPolicy(1.0)}
         names, chosen = list(everyone), list(everyone.values())
-        replays = self._replays(chosen, horizon, report)
-        support = SessionSupport(self.buffer)
-        supports = [support.of(s) for s in replays.summaries]
-        draws = self._draws(replays, everyone, supports, horizon)
+        replays, supports, draws = self.joint(everyone, horizon, report)
         skill = ordering_skill(self.buffer, self.predictions, self.equal, self.ends, self.levels)
         common = {"skill": skill.to_json(), "return_noise": round(return_noise(self.buffer, horizon), 4)}
         look = AmplitudeSupport(self.buffer)
@@ -146,6 +147,13 @@ class FittedPosterior:
             name: self._estimate(i, replays, draws, supports[i], common, list(look.of_policy(chosen[i]).flags()), horizon)
             for i, name in enumerate(names[:-1])
         }
+
+    def joint(self, policies: Mapping[str, Policy], horizon: int, report: Report = silent) -> tuple[Replays, list[Support], Draws]:
+        """Replays, support and joint draws of all policies, cDBS last: what their estimates are made of."""
+        replays = self._replays(list(policies.values()), horizon, report)
+        support = SessionSupport(self.buffer)
+        supports = [support.of(s) for s in replays.summaries]
+        return replays, supports, self._draws(replays, policies, supports, horizon)
 
     @property
     def levels(self) -> Floats:
@@ -200,7 +208,8 @@ class FittedPosterior:
     def _draws(self, replays: Replays, policies: Mapping[str, Policy], supports: Sequence[Support], horizon: int) -> Draws:
         alike = similarity(list(policies.values()), self.buffer.transitions().states)
         leverage = np.array([s.leverage for s in supports])
-        found = joint_draws(self.buffer, replays, self.ends, alike, leverage, horizon, self.config.seed)
+        c = self.config
+        found = joint_draws(self.buffer, replays, self.ends, alike, leverage, horizon, c.seed, c.model_errors, c.common_share)
         if not self.tests:
             return found
         names, rng = list(policies), np.random.default_rng([self.config.seed, 0x7E57])

@@ -10,6 +10,9 @@ a second policy that does what the first does adds nothing, nor does one that is
 whether it is new or has shown one lucky session. Without noise, and before any test, this is the expected improvement of a batch
 (Ginsbourger, Le Riche, Carraro 2010); with noise the knowledge gradient for correlated beliefs (Frazier, Powell, Dayanik 2009). Chosen
 greedily.
+
+One session with much noise may change no mean enough to count, while several would: the value of information is not concave (Frazier and
+Powell 2010). Slots that are left then go to policies that have never run, by what knowing them for certain would add.
 """
 
 from __future__ import annotations
@@ -36,7 +39,8 @@ class Suggestion:
     Attributes:
         name: of the policy.
         expected: mean difference of its return to that of cDBS, reward units.
-        adds: expected improvement of the best tested policy that its session adds to those chosen before it, reward units.
+        adds: expected improvement of the best tested policy that its session adds to those chosen before it, reward units; about 0 of one
+            that several sessions would tell and one does not.
         better: probability that it returns more than all chosen before it; for the first, than cDBS.
         informs: share of the variance of the other candidates that its test alone would explain, from 0 to 1.
     """
@@ -61,7 +65,7 @@ def portfolio(
         noise: standard deviation of one session's difference to its visit's cDBS, reward units; 0 where it is not known.
 
     Returns:
-        At most `slots` policies, fewer where further ones would add nothing.
+        At most `slots` policies, fewer where further ones would add nothing, even if they were known for certain.
 
     Raises:
         ValueError: draws that are not aligned or not finite.
@@ -80,16 +84,31 @@ def portfolio(
         left = [i for i, name in enumerate(names) if name not in held_back]
         if not left:
             break
-        now = beliefs.worth(chosen, had)
-        adds = np.array([beliefs.worth([*chosen, i], had) for i in left]) - now
-        i = left[int(np.argmax(adds))]
-        if adds.max() <= LEAST_GAIN * now or adds.max() <= _NOTHING:
+        i, added = _next(beliefs, left, chosen, had)
+        if i is None:
             break
         before = np.maximum(0.0, draws[chosen].max(axis=0)) if chosen else np.zeros(draws.shape[1])
         better = float(np.mean(draws[i] > before))
-        found.append(Suggestion(names[i], float(draws[i].mean()), float(adds.max()), better, _informs(draws, i)))
+        found.append(Suggestion(names[i], float(draws[i].mean()), added, better, _informs(draws, i)))
         chosen.append(i)
     return tuple(found)
+
+
+def _next(beliefs: _Beliefs, left: list[int], chosen: list[int], had: list[int]) -> tuple[int | None, float]:
+    """Which of those left to take next, and what its session adds; None where none is worth a patient's minutes."""
+    now = beliefs.worth(chosen, had)
+    adds = np.array([beliefs.worth([*chosen, i], had) for i in left]) - now
+    if adds.max() > max(LEAST_GAIN * now, _NOTHING):
+        return left[int(np.argmax(adds))], float(adds.max())
+    new = [k for k, i in enumerate(left) if i not in had]
+    if not new:
+        return None, 0.0
+    best = np.maximum(0.0, beliefs.draws[[*chosen, *had]].max(axis=0)) if chosen or had else np.zeros(beliefs.draws.shape[1])
+    known = np.array([np.maximum(beliefs.draws[left[k]] - best, 0.0).mean() for k in new])
+    if known.max() <= max(LEAST_GAIN * float(best.mean()), _NOTHING):
+        return None, 0.0
+    k = new[int(np.argmax(known))]
+    return left[k], max(float(adds[k]), 0.0)
 
 
 @dataclass(frozen=True)

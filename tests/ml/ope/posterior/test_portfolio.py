@@ -82,6 +82,14 @@ def test_a_session_with_noise_is_worth_what_it_may_change_the_mean_by() -> None:
     assert [s.name for s in again] == ["lucky"], "one session does not settle it"
 
 
+def test_a_slot_that_is_left_goes_to_a_new_policy_that_several_sessions_would_tell() -> None:
+    """One session with so much noise moves the mean of the open policy by nothing that counts; knowing it may be worth much."""
+    given = {"sure": drawn(8.0, 0.01, 1)[:4000], "open": drawn(4.0, 3.0, 2)[:4000], "hopeless": drawn(-9.0, 0.5, 3)[:4000]}
+    assert [s.name for s in portfolio(given, 3, noise=60.0)] == ["sure", "open"]
+    assert [s.name for s in portfolio(given, 3, tested={"sure"}, noise=60.0)] == ["open"]
+    assert portfolio(given, 3, tested={"sure", "open"}, noise=60.0) == (), "it has run already"
+
+
 def test_nothing_is_suggested_where_there_is_nothing() -> None:
     assert portfolio({}, 3) == ()
     assert portfolio({"a": drawn(1, 1, 1)}, 0) == ()

@@ -76,7 +76,8 @@ def test_levels_of_visits_are_no_skill() -> None:
 
 @pytest.mark.slow
 def test_noise_is_seldom_taken_for_skill() -> None:
-    assert sum(told(of_visits_alone(seed)) for seed in range(20)) <= 2
+    """A reduction of errors by more than one standard error: 16 % by chance where differences were normal; here more, by their skewness."""
+    assert sum(told(of_visits_alone(seed)) for seed in range(20)) <= 7
 
 
 def test_a_reduction_of_errors_by_chance_is_no_skill() -> None:
