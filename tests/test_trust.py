@@ -6,6 +6,8 @@ import re
 import tomllib
 from pathlib import Path
 
+from tests.promises import PROMISES
+
 ROOT = Path(__file__).resolve().parents[1]
 TEST = re.compile(r"`(tests/[\w/]+\.py)(?:: (\w+))?`")
 
@@ -55,3 +57,12 @@ def test_the_rules_of_bandit_are_checked() -> None:
     # what is left out is written down here and in pyproject.toml with its reason: nothing that calls a shell or builds SQL
     assert {rule for rule in lint["ignore"] if rule.startswith("S")} == {"S101", "S603", "S607"}
     assert {names for names, rules in lint["per-file-ignores"].items() if "S" in rules} == {"benchmarks/*", "tests/*"}
+
+
+def test_every_promise_that_is_broken_on_purpose_is_still_there() -> None:
+    """`python -m tests.broken_promises` breaks them; here only that each would be another code, and that its test is there."""
+    for promise in PROMISES:
+        path, _, name = promise.test.partition("::")
+        assert (ROOT / promise.file).read_text().count(promise.old) == 1, promise
+        assert promise.new != promise.old
+        assert not name or f"def {name}(" in (ROOT / path).read_text(), promise

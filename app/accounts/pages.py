@@ -196,12 +196,14 @@ def add_user(request: Request, db: Db, caller: CurrentCaller, values: FormValues
     fields = {name: str(values.get(name, "")) for name in ("email", "name", "role", "study")}
     try:
         caller.require(can.MANAGE_ACCOUNTS)
-        if not service.administers(caller, service.study_of(db, fields["study"] or None).id):
+        mine = [s.code for s in repository.studies(db) if service.administers(caller, s.id)]
+        study = fields["study"] or (mine[0] if len(mine) == 1 else "")
+        if study not in mine:
             raise NotFound("There is no such study, or you do not administer it.")
         if fields["role"] not in set(Role):
             raise Invalid("Choose a role.", f"Known: {', '.join(Role)}.")
         password = str(values.get("password", ""))
-        service.add_user(db, fields["email"], Role(fields["role"]), password, fields["study"] or None, fields["name"].strip()[:200])
+        service.add_user(db, fields["email"], Role(fields["role"]), password, study, fields["name"].strip()[:200])
     except BetaloopError as error:
         db.rollback()
         return _accounts_page(request, db, caller, error, fields)

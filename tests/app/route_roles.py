@@ -1,9 +1,11 @@
-"""Who may call each route of the REST interface."""
+"""Who may call each route of the REST interface: the permission that it needs, and what is open to a blinded assessor."""
 
 from __future__ import annotations
 
-EVERYONE = {"viewer", "monitor", "coordinator", "clinician", "engineer", "admin"}
-RECORDERS = {"coordinator", "clinician", "engineer", "admin"}
+from app.accounts import permissions as can
+from app.accounts.models import Role, Scope
+from app.accounts.permissions import PERMISSIONS, SCOPES
+
 READABLE = (
     "/api/v1/participants",
     "/api/v1/participants/{code}",
@@ -64,64 +66,64 @@ READABLE = (
     "/healthz",
     "/readyz",
 )
-ROLES: dict[tuple[str, str], set[str]] = {
-    # method and path: roles that may
-    ("post", "/api/v1/participants"): RECORDERS,
-    ("put", "/api/v1/participants/{code}/settings"): {"clinician", "engineer", "admin"},
-    ("put", "/api/v1/participants/{code}/margins"): {"clinician", "admin"},
-    ("post", "/api/v1/participants/{code}/visits"): RECORDERS,
-    ("patch", "/api/v1/visits/{visit_id}"): RECORDERS,
-    ("post", "/api/v1/visits/{visit_id}/lock"): {"clinician", "admin"},
-    ("post", "/api/v1/visits/{visit_id}/unlock"): {"clinician", "admin"},
-    ("post", "/api/v1/participants/{code}/margins/locks"): {"clinician", "admin"},
-    ("put", "/api/v1/participants/{code}/characteristics"): RECORDERS,
-    ("post", "/api/v1/visits/{visit_id}/doses"): RECORDERS,
-    ("post", "/api/v1/doses/{dose_id}/removal"): RECORDERS,
-    ("post", "/api/v1/participants/{code}/adverse-events"): RECORDERS,
-    ("put", "/api/v1/adverse-events/{event_id}"): RECORDERS,
-    ("post", "/api/v1/adverse-events/{event_id}/clearance"): {"clinician", "admin"},
-    ("post", "/api/v1/participants/{code}/data-queries"): {"monitor", "coordinator", "clinician", "admin"},
-    ("post", "/api/v1/data-queries/{query_id}/entries"): RECORDERS,
-    ("patch", "/api/v1/sessions/{session_id}"): RECORDERS,
-    ("post", "/api/v1/sessions/{session_id}/outcomes"): RECORDERS,
-    ("put", "/api/v1/sessions/{session_id}/conditions"): RECORDERS,
-    ("put", "/api/v1/sessions/{session_id}/qoc"): RECORDERS,
-    ("post", "/api/v1/uploads"): RECORDERS,
-    ("patch", "/api/v1/proposals/{session_id}"): RECORDERS,
-    ("post", "/api/v1/proposals/{session_id}/confirm"): RECORDERS,
-    ("post", "/api/v1/proposals/{session_id}/split"): RECORDERS,
-    ("post", "/api/v1/proposals/{session_id}/visit"): RECORDERS,
-    ("post", "/api/v1/proposals/{session_id}/discard"): RECORDERS,
-    ("post", "/api/v1/uploaded-files/{file_id}/session"): RECORDERS,
-    ("post", "/api/v1/uploaded-files/{file_id}/review"): {"clinician", "admin"},
-    ("post", "/api/v1/uploaded-files/{file_id}/release"): {"clinician", "admin"},
-    ("post", "/api/v1/uploaded-files/{file_id}/discard"): {"clinician", "admin"},
-    ("get", "/api/v1/uploaded-files/{file_id}/preview"): RECORDERS,
-    ("put", "/api/v1/uploaded-files/{file_id}/mapping"): RECORDERS,
-    ("post", "/api/v1/column-mappings/{mapping_id}/removal"): RECORDERS,
-    ("post", "/api/v1/participants/{code}/policies"): {"engineer", "admin"},
-    ("patch", "/api/v1/policies/{policy_id}"): {"engineer", "admin"},
-    ("post", "/api/v1/participants/{code}/snapshots"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/participants/{code}/jobs"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/jobs/{job_id}/cancel"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/jobs/{job_id}/retry"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/visits/{visit_id}/plan"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/visits/{visit_id}/plan/approve"): {"clinician", "admin"},
-    ("post", "/api/v1/visits/{visit_id}/day/entries"): RECORDERS,
-    ("post", "/api/v1/visits/{visit_id}/slots/confirm"): RECORDERS,
-    ("post", "/api/v1/visits/{visit_id}/plan/moves"): {"clinician", "engineer", "admin"},
-    ("post", "/api/v1/visits/{visit_id}/plan/key"): {"clinician", "admin"},
-    ("post", "/api/v1/visits/{visit_id}/removal"): RECORDERS,
-    ("post", "/api/v1/participants/{code}/buffer-gate"): {"clinician", "admin"},
-    ("post", "/api/v1/policies/{policy_id}/release"): {"clinician", "admin"},
-    ("get", "/api/v1/policies/{policy_id}/bundle"): {"clinician", "engineer", "admin"},
-    ("get", "/api/v1/visits/{visit_id}/plan/sessions/{position}/bundle"): {"clinician", "engineer", "admin"},
-    ("patch", "/api/v1/participants/{code}"): RECORDERS,
-    ("post", "/api/v1/studies"): {"admin"},
-    ("patch", "/api/v1/studies/{study_code}"): {"admin"},
-    ("post", "/api/v1/studies/{study_code}/sites"): {"admin"},
-    ("patch", "/api/v1/studies/{study_code}/sites/{site_code}"): {"admin"},
-    **{("get", path): EVERYONE for path in READABLE},
+NEEDS: dict[tuple[str, str], str] = {
+    # method and path: the permission that it needs
+    ("post", "/api/v1/participants"): can.WRITE_STUDY,
+    ("put", "/api/v1/participants/{code}/settings"): can.WRITE_SETTINGS,
+    ("put", "/api/v1/participants/{code}/margins"): can.APPROVE_PLAN,
+    ("post", "/api/v1/participants/{code}/visits"): can.WRITE_STUDY,
+    ("patch", "/api/v1/visits/{visit_id}"): can.WRITE_STUDY,
+    ("post", "/api/v1/visits/{visit_id}/lock"): can.LOCK_VISIT,
+    ("post", "/api/v1/visits/{visit_id}/unlock"): can.LOCK_VISIT,
+    ("post", "/api/v1/participants/{code}/margins/locks"): can.APPROVE_PLAN,
+    ("put", "/api/v1/participants/{code}/characteristics"): can.WRITE_STUDY,
+    ("post", "/api/v1/visits/{visit_id}/doses"): can.WRITE_STUDY,
+    ("post", "/api/v1/doses/{dose_id}/removal"): can.WRITE_STUDY,
+    ("post", "/api/v1/participants/{code}/adverse-events"): can.WRITE_STUDY,
+    ("put", "/api/v1/adverse-events/{event_id}"): can.WRITE_STUDY,
+    ("post", "/api/v1/adverse-events/{event_id}/clearance"): can.APPROVE_PLAN,
+    ("post", "/api/v1/participants/{code}/data-queries"): can.ASK_QUERIES,
+    ("post", "/api/v1/data-queries/{query_id}/entries"): can.WRITE_STUDY,
+    ("patch", "/api/v1/sessions/{session_id}"): can.WRITE_STUDY,
+    ("post", "/api/v1/sessions/{session_id}/outcomes"): can.WRITE_QOC,
+    ("put", "/api/v1/sessions/{session_id}/conditions"): can.WRITE_STUDY,
+    ("put", "/api/v1/sessions/{session_id}/qoc"): can.WRITE_QOC,
+    ("post", "/api/v1/uploads"): can.UPLOAD,
+    ("patch", "/api/v1/proposals/{session_id}"): can.WRITE_STUDY,
+    ("post", "/api/v1/proposals/{session_id}/confirm"): can.WRITE_STUDY,
+    ("post", "/api/v1/proposals/{session_id}/split"): can.WRITE_STUDY,
+    ("post", "/api/v1/proposals/{session_id}/visit"): can.WRITE_STUDY,
+    ("post", "/api/v1/proposals/{session_id}/discard"): can.WRITE_STUDY,
+    ("post", "/api/v1/uploaded-files/{file_id}/session"): can.WRITE_STUDY,
+    ("post", "/api/v1/uploaded-files/{file_id}/review"): can.DECIDE_QUARANTINE,
+    ("post", "/api/v1/uploaded-files/{file_id}/release"): can.DECIDE_QUARANTINE,
+    ("post", "/api/v1/uploaded-files/{file_id}/discard"): can.DECIDE_QUARANTINE,
+    ("get", "/api/v1/uploaded-files/{file_id}/preview"): can.UPLOAD,
+    ("put", "/api/v1/uploaded-files/{file_id}/mapping"): can.UPLOAD,
+    ("post", "/api/v1/column-mappings/{mapping_id}/removal"): can.UPLOAD,
+    ("post", "/api/v1/participants/{code}/policies"): can.WRITE_POLICIES,
+    ("patch", "/api/v1/policies/{policy_id}"): can.WRITE_POLICIES,
+    ("post", "/api/v1/participants/{code}/snapshots"): can.RUN_JOBS,
+    ("post", "/api/v1/participants/{code}/jobs"): can.RUN_JOBS,
+    ("post", "/api/v1/jobs/{job_id}/cancel"): can.RUN_JOBS,
+    ("post", "/api/v1/jobs/{job_id}/retry"): can.RUN_JOBS,
+    ("post", "/api/v1/visits/{visit_id}/plan"): can.DRAFT_PLAN,
+    ("post", "/api/v1/visits/{visit_id}/plan/approve"): can.APPROVE_PLAN,
+    ("post", "/api/v1/visits/{visit_id}/day/entries"): can.WRITE_QOC,
+    ("post", "/api/v1/visits/{visit_id}/slots/confirm"): can.WRITE_STUDY,
+    ("post", "/api/v1/visits/{visit_id}/plan/moves"): can.DRAFT_PLAN,
+    ("post", "/api/v1/visits/{visit_id}/plan/key"): can.APPROVE_PLAN,
+    ("post", "/api/v1/visits/{visit_id}/removal"): can.WRITE_STUDY,
+    ("post", "/api/v1/participants/{code}/buffer-gate"): can.APPROVE_PLAN,
+    ("post", "/api/v1/policies/{policy_id}/release"): can.APPROVE_PLAN,
+    ("get", "/api/v1/policies/{policy_id}/bundle"): can.TAKE_BUNDLES,
+    ("get", "/api/v1/visits/{visit_id}/plan/sessions/{position}/bundle"): can.TAKE_BUNDLES,
+    ("patch", "/api/v1/participants/{code}"): can.WRITE_STUDY,
+    ("post", "/api/v1/studies"): can.MANAGE_ACCOUNTS,
+    ("patch", "/api/v1/studies/{study_code}"): can.MANAGE_ACCOUNTS,
+    ("post", "/api/v1/studies/{study_code}/sites"): can.MANAGE_ACCOUNTS,
+    ("patch", "/api/v1/studies/{study_code}/sites/{site_code}"): can.MANAGE_ACCOUNTS,
+    **{("get", path): can.READ for path in READABLE},
 }
 BLINDED = {
     # what is open to a blinded assessor while no visit is locked
@@ -148,3 +150,11 @@ BLINDED = {
     ("get", "/api/v1/participants/{code}/analyses/beta"),
     ("get", "/api/v1/analyses"),
 }
+
+
+def may_call(role: Role, method: str, path: str, scope: Scope = Scope.FULL) -> bool:
+    """Whether a route answers to a role, and to a token of it with a scope."""
+    if role is Role.BLINDED_ASSESSOR:
+        return (method, path) in BLINDED
+    left = SCOPES[scope]
+    return NEEDS[method, path] in PERMISSIONS[role] and (left is None or NEEDS[method, path] in left)

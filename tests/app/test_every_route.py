@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tests.app.every_route import METHODS, routes
-from tests.app.route_roles import ROLES
+from tests.app.route_roles import NEEDS
 
 
 def test_the_contract_has_every_route_others_rely_on(service_app: Any) -> None:
@@ -22,4 +22,4 @@ def test_the_contract_has_every_route_others_rely_on(service_app: Any) -> None:
 def test_the_table_of_roles_has_every_route_and_no_other(service_app: Any) -> None:
     described = {(m, path) for path, entry in service_app.openapi()["paths"].items() for m in entry if m in METHODS}
     assert described == set(routes(service_app))
-    assert set(ROLES) == described, "say in ROLES who may call each route"
+    assert set(NEEDS) == described, "say in NEEDS which permission each route needs"

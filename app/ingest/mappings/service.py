@@ -17,7 +17,7 @@ from app.ingest.models import ColumnMapping, UploadFile
 from app.ingest.quarantine import service as quarantine
 from app.ingest.uploads.service import FileOutcome
 from app.platform.database import set_reason
-from app.platform.errors import Conflict, Invalid, NotFound
+from app.platform.errors import Conflict, Forbidden, Invalid, NotFound
 from app.study import service as study_service
 from app.study.models import Participant
 from ml.formats.tables.mapping import TableMapping
@@ -106,10 +106,17 @@ def remove(db: Session, mapping_id: int, reason: str, caller: Caller) -> ColumnM
     """End a mapping: what was read by it stays, the next table with its header asks again. Not committed.
 
     Raises:
-        NotFound: no such mapping. Forbidden: the caller may not upload in the study. Conflict: it is not the present version.
+        NotFound: no such mapping. Forbidden: the caller may not upload in the study, or works at one site alone and has not made it: tables
+            of every site are read by it. Conflict: it is not the present version.
     """
     row = repository.mapping(db, mapping_id, caller)
     caller.require(can.UPLOAD, row.study_id)
+    everywhere = any(g.study_id == row.study_id and g.site_id is None for g in caller.grants_with(can.UPLOAD))
+    if not (caller.is_system or everywhere or row.created_by == caller.label):
+        raise Forbidden(
+            "Tables of every site of the study are read by this column mapping, and you work at one of them.",
+            f"Ask somebody who works at all sites of the study, or {row.created_by}, who made it.",
+        )
     newest = repository.newest(db, row.study_id, row.header)
     if newest is None or newest.id != row.id or row.removed:
         raise Conflict(f"Column mapping {row.id} is not in force any more.", "Load the list again.")

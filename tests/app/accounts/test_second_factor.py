@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
 from app import cli
-from app.accounts import second_factor, service, totp
+from app.accounts import second_factor, service, signing, totp
 from app.accounts.models import Role, User
 from app.platform.database import new_session
 from app.platform.errors import Forbidden, Invalid, Unauthorized
@@ -79,9 +79,12 @@ def test_signing_in_needs_a_code_that_was_not_used(db: Session, ada: tuple[User,
 
 
 def test_signatures_and_a_new_password_need_a_code(db: Session, ada: tuple[User, bytes, list[str]]) -> None:
-    user, secret, _ = ada
+    user, secret, codes = ada
+    signed = {"kind": "plan", "subject_id": 7, "meaning": "approved", "content": {"order": ["cdbs"]}}
     with pytest.raises(Forbidden, match="second factor"):
-        service.confirm_password(user.id, PASSWORD)
+        signing.sign(db, service.caller_of(user), PASSWORD, **signed)  # type: ignore[arg-type]
+    assert signing.sign(db, service.caller_of(user), PASSWORD, **signed, code=codes[0]).signer == EMAIL  # type: ignore[arg-type]
+    db.commit()
     with pytest.raises(Forbidden, match="second factor"):
         service.change_own_password(db, user.id, PASSWORD, "another long one of words", "123456")
     service.confirm_password(user.id, PASSWORD, code_now(secret, 1))

@@ -132,6 +132,19 @@ def test_nobody_blinds_who_works_in_a_study_of_others(client: TestClient, client
     assert eve.post("/studies/ADAPT/members", data=wanted | {"email": "own@clinic.example"}).status_code == 303
 
 
+@pytest.mark.parametrize("named", ["", "main", "nothing"])
+def test_an_administrator_of_one_study_is_not_told_of_others(client: TestClient, client_as: Clients, named: str) -> None:
+    add_second(client)
+    assert client.post("/api/v1/studies", json={"code": "HIDDEN7", "name": "Another"}).status_code == 201
+    with transaction("test") as db:
+        accounts.add_user(db, "eve@clinic.example", Role.ADMIN, PASSWORD, study_code="ADAPT")
+    eve = browser(client, "eve@clinic.example")
+    person = {"email": "new@clinic.example", "role": "viewer", "study": named, "password": "another good password"}
+    answer = eve.post("/accounts", data=person)
+    assert answer.status_code == (404 if named else 303), "without a study it is the only one that she administers"
+    assert "HIDDEN7" not in answer.text
+
+
 def test_the_command_line_does_the_same(client: TestClient) -> None:
     with transaction("test") as db:
         accounts.add_user(db, "ada@clinic.example", Role.VIEWER, PASSWORD)
