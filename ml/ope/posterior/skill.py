@@ -27,9 +27,9 @@ BETA_MARGIN, OUTCOME_MARGIN = 1.0, 2.0
 """Squared errors of left-out sessions must fall by more than so many of their standard errors below those of calling all doses equal: of
 the reward by beta, and of r_end.
 
-From part A of the virtual population (60 worlds of 21 sessions, `python -m benchmarks.development.verdicts`): an order is told in two thirds of
-the worlds, and in 30 % of the data in which nothing answers to the amplitude; with 1.0 for r_end too in three quarters and 42 %. With 2.0
-for both it was told in half of the worlds, orders that were told were no righter, and *test* was right as often."""
+From part A of the virtual population (60 worlds of 21 sessions, `benchmarks/development/verdicts.py`): an order is told in two thirds
+of the worlds, and in 30 % of the data in which nothing answers to the amplitude; with 1.0 for r_end too in three quarters and 42 %. With
+2.0 for both it was told in half of the worlds, orders that were told were no righter, and *test* was right as often."""
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 """How much of the level of a visit may be told by its other sessions; the share that errs least counts."""
 CHANCE = 0.001
