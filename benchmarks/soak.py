@@ -40,7 +40,9 @@ PATIENCE_S = 120.0
 """Whoever is not healthy by then ends the run."""
 ORPHANS_S = 5.0
 JOBS_S = 90.0
-"""Time for the last jobs to end, on a machine that is busy with other work too."""
+"""For so long the last jobs may show no progress; a busy machine makes them slow, and does not stop them."""
+LAST_JOBS_S = 600.0
+"""By then they must have ended, whatever their progress."""
 BETWEEN_S = (1.0, 5.0)
 
 
@@ -151,7 +153,7 @@ def soak(installed: Installation, rounds: int, minutes: float, seed: int) -> dic
     done = _rounds(run, rounds, first + 36 * minutes)  # the rest of the time is for the jobs to end
     run.writers.stop_jobs()
     run.say("no more jobs are begun")
-    _wait_for_jobs(installed, max(first + 60 * minutes - time.monotonic(), JOBS_S))
+    _wait_for_jobs(installed)
     run.writers.stop()
     run.say(f"writers have stopped: {run.writers.said}; answers {dict(run.writers.said.answers)}")
     wrong = what_is_wrong(installed, run.writers.said, study)
@@ -228,12 +230,20 @@ def _acknowledged(run: Soak) -> int:
     return len(said.uploads) + len(said.qocs) + len(said.entries) + len(said.jobs)
 
 
-def _wait_for_jobs(installed: Installation, seconds: float) -> None:
-    try:
-        installed.wait_until("every job to end", lambda: live_jobs(installed) == [], seconds, 0.5)
-    except TooLate as late:
-        listed = "\n".join(live_jobs(installed) or ["the database does not answer"])
-        raise TooLate(f"{late}\njobs that have not ended (id, kind, status, message, executor, its status):\n{listed}") from None
+def _wait_for_jobs(installed: Installation) -> None:
+    """Wait for the end of every job, as long as they go on. Raises TooLate with those that do not."""
+    before, moved, latest = live_jobs(installed), time.monotonic(), time.monotonic() + LAST_JOBS_S
+    while before != []:
+        time.sleep(0.5)
+        present, now = live_jobs(installed), time.monotonic()
+        if present is not None and present != before:
+            before, moved = present, now
+        elif now - moved > JOBS_S or now > latest:
+            listed = "\n".join(before or ["the database does not answer"])
+            raise TooLate(
+                f"jobs have not ended, and show nothing new since {now - moved:.0f} s (id, kind, status, message, executor, its status):\n"
+                f"{listed}\n{installed.said()}"
+            )
 
 
 def _left_after_the_stop(installed: Installation) -> list[str]:

@@ -125,8 +125,8 @@ def copy_database(server: EmbeddedPostgres, name: str, template: str) -> None:
 
 
 def drop_database(server: EmbeddedPostgres, name: str) -> None:
-    """Remove a database, whoever is connected to it."""
-    _administer(server, f"drop database {name} with (force)")
+    """Remove a database where it is there, whoever is connected to it."""
+    _administer(server, f"drop database if exists {name} with (force)")
 
 
 def close_connections() -> None:
@@ -150,14 +150,18 @@ def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv("BETALOOP_OWNER_URL", server.owner_url(name))
     monkeypatch.setenv("BETALOOP_DATA_DIR", str(data))
     get_settings.cache_clear()
-    yield url
-    close_connections()
-    get_settings.cache_clear()
-    if keep:
-        copy_database(server, keep, name)
-    else:
-        shutil.rmtree(data, ignore_errors=True)
-    drop_database(server, name)
+    try:
+        yield url
+        close_connections()
+        if keep:
+            drop_database(server, keep)  # of a making that was cut short, which pytest begins anew
+            copy_database(server, keep, name)
+    finally:
+        close_connections()
+        get_settings.cache_clear()
+        if not keep:
+            shutil.rmtree(data, ignore_errors=True)
+        drop_database(server, name)
 
 
 @pytest.fixture

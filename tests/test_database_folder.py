@@ -6,9 +6,12 @@ import os
 import subprocess
 from pathlib import Path
 
+import psycopg
 import pytest
 
 import tests.conftest as suite
+from app.platform.embedded.server import EmbeddedPostgres
+from app.settings import get_settings
 
 
 def test_databases_lie_in_memory_where_there_is_room(
@@ -35,3 +38,22 @@ def test_what_a_killed_run_left_in_memory_goes(
     suite.database_folder(tmp_path_factory, tmp_path)
     assert not left.exists()
     assert used.exists()
+
+
+def test_a_study_whose_making_was_cut_short_is_made_anew_and_leaves_nothing(
+    server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def databases() -> set[str]:
+        with psycopg.connect(server.admin_conninfo()) as connection:
+            return {name for (name,) in connection.execute("select datname from pg_database")}
+
+    before, settings = databases(), get_settings()
+    with pytest.raises(ZeroDivisionError), suite.own_database(server, tmp_path / "data", monkeypatch, "betaloop", keep="cut_short"):
+        _ = 1 / 0
+    assert databases() == before
+    assert get_settings() is not settings, "nothing goes on with the settings of a database that is gone"
+    for _ in range(2):
+        with suite.own_database(server, tmp_path / "data", monkeypatch, "betaloop", keep="cut_short"):
+            pass
+        assert databases() == before | {"cut_short"}
+    suite.drop_database(server, "cut_short")

@@ -118,8 +118,9 @@ def begin_with(
             made = make()
             kept = tmp_path_factory.mktemp(name) / "data"
             close_connections()
-            copy_database(server, name, own)
             shutil.copytree(data, kept)
+            drop_database(server, name)  # of a making that was cut short
+            copy_database(server, name, own)
             beginnings[name] = Beginning((name, kept), client.headers["authorization"], rng.bit_generator.state, made, written)
         else:
             before = beginnings[name].written

@@ -193,39 +193,56 @@ async def _gone(request: Request, error: Exception) -> Response:
 RETRY_S = 5
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _DISK_FULL = "53100"
-_AT_ONCE = {"23505", "23503", "40001", "40P01"}
-"""Of what two requests do at the same moment: a row that is there already, one that is gone, transactions in each other's way."""
+_FIRST = {"23505", "23503"}
+"""Of a row that is there already, or is gone: somebody did it at the same moment, after both had looked."""
+_IN_THE_WAY = {"40001", "40P01"}
+"""Of a transaction that was given up for another one: the same request may be sent again."""
+
+
+class _GivenUp(DatabaseAway):
+    title = "Another request stood in the way"
 
 
 async def _database_error(request: Request, error: Exception) -> Response:
-    """503 where the database is away, restarting or out of connections, 507 where its disk is full, 409 where somebody else was first;
-    anything else is an error of ours.
+    """503 where the database is away, restarting or out of connections, 507 where its disk is full, 409 where somebody else was first,
+    503 where this was given up for another request; anything else is an error of ours.
     """
     state = getattr(getattr(error, "orig", None), "sqlstate", None)
     if state == _DISK_FULL:
         return await _full(request, error)
-    if state in _AT_ONCE:
-        constraint = getattr(getattr(getattr(error, "orig", None), "diag", None), "constraint_name", None)
-        log.warning("two requests at the same moment", path=request.url.path, sqlstate=state, constraint=constraint)
-        return await _answer(
-            request,
-            Conflict(
-                "Another request changed the same at the same moment, and was first; or this one was sent twice.",
-                "Look at what is stored now, then send what is missing.",
-            ),
-        )
+    if state in _FIRST:
+        return await _second(request, error)
     invalidated = isinstance(error, DBAPIError) and error.connection_invalidated
     unreached = isinstance(error, PoolTimeout) or (isinstance(error, OperationalError) and state is None)
-    if not (invalidated or unreached or (state or "")[:2] == "08" or (state or "")[:3] in {"57P", "533"}):
+    if not (invalidated or unreached or state in _IN_THE_WAY or (state or "")[:2] == "08" or (state or "")[:3] in {"57P", "533"}):
         return await _unknown_error(request, error)
-    log.warning("the database is away", path=request.url.path, error=type(error).__name__)
-    away = DatabaseAway(
-        "The database does not answer for the moment.",
-        "It comes back by itself. Wait a few seconds, look at what is stored, then try again.",
-    )
+    given_up = state in _IN_THE_WAY
+    event = "a request was given up for another" if given_up else "the database is away"
+    log.warning(event, path=request.url.path, error=type(error).__name__, sqlstate=state)
+    if given_up:
+        away = _GivenUp("Another request changed the same at the same moment.", "Look at what is stored, then send this again.")
+    else:
+        away = DatabaseAway(
+            "The database does not answer for the moment.",
+            "It comes back by itself. Wait a few seconds, look at what is stored, then try again.",
+        )
     response = await _answer(request, away)
     response.headers["Retry-After"] = str(RETRY_S)
     return response
+
+
+async def _second(request: Request, error: Exception) -> Response:
+    """Two requests did the same at the same moment, and this one came second."""
+    told = getattr(error, "orig", None)
+    constraint = getattr(getattr(told, "diag", None), "constraint_name", None)
+    log.warning("two requests at the same moment", path=request.url.path, sqlstate=getattr(told, "sqlstate", None), constraint=constraint)
+    return await _answer(
+        request,
+        Conflict(
+            "Another request changed the same at the same moment, and was first; or this one was sent twice.",
+            "Look at what is stored now, then send what is missing.",
+        ),
+    )
 
 
 async def _system_error(request: Request, error: Exception) -> Response:

@@ -12,7 +12,7 @@ import httpx2 as httpx
 import psycopg
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import IntegrityError, OperationalError
 
 from app import main
 from app.platform.embedded.server import EmbeddedPostgres
@@ -77,6 +77,8 @@ class _Refused(Exception):
         (OperationalError("select 1", {}, _Refused(None)), 503, "The database is not available"),
         (OperationalError("select 1", {}, _Refused("57P03")), 503, "The database is not available"),
         (OperationalError("select 1", {}, _Refused("53300")), 503, "The database is not available"),
+        (OperationalError("select 1", {}, _Refused("40P01")), 503, "Another request stood in the way"),
+        (IntegrityError("insert", {}, _Refused("23503")), 409, "Not possible in the present state"),
         (OperationalError("insert", {}, _Refused("53100")), 507, "The disk is full"),
         (OSError(errno.ENOSPC, "No space left on device"), 507, "The disk is full"),
         (OperationalError("select 1", {}, _Refused("57014")), 500, "Something went wrong on our side."),
