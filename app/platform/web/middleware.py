@@ -220,7 +220,7 @@ async def _database_error(request: Request, error: Exception) -> Response:
     event = "a request was given up for another" if given_up else "the database is away"
     log.warning(event, path=request.url.path, error=type(error).__name__, sqlstate=state)
     if given_up:
-        away = _GivenUp("Another request changed the same at the same moment.", "Look at what is stored, then send this again.")
+        away: DatabaseAway = _GivenUp("Another request changed the same at the same moment.", "Look at what is stored, then send this again.")
     else:
         away = DatabaseAway(
             "The database does not answer for the moment.",
