@@ -219,14 +219,12 @@ async def _database_error(request: Request, error: Exception) -> Response:
     given_up = state in _IN_THE_WAY
     event = "a request was given up for another" if given_up else "the database is away"
     log.warning(event, path=request.url.path, error=type(error).__name__, sqlstate=state)
-    if given_up:
-        away: DatabaseAway = _GivenUp("Another request changed the same at the same moment.", "Look at what is stored, then send this again.")
-    else:
-        away = DatabaseAway(
-            "The database does not answer for the moment.",
-            "It comes back by itself. Wait a few seconds, look at what is stored, then try again.",
-        )
-    response = await _answer(request, away)
+    away = DatabaseAway(
+        "The database does not answer for the moment.",
+        "It comes back by itself. Wait a few seconds, look at what is stored, then try again.",
+    )
+    busy = _GivenUp("Another request changed the same at the same moment.", "Look at what is stored, then send this again.")
+    response = await _answer(request, busy if given_up else away)
     response.headers["Retry-After"] = str(RETRY_S)
     return response
 
