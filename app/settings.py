@@ -58,6 +58,12 @@ class Settings(BaseSettings):
     oidc_name: str = Field("Hospital sign-on", description="What the sign-on is called on pages.")
     worker_slots: int = Field(2, ge=1, description="Compute steps that one worker runs side by side.")
     job_memory_mb: int = Field(8192, ge=512, description="Memory limit of one compute step, MiB.")
+    job_niceness: int = Field(
+        15,
+        ge=0,
+        le=19,
+        description="How far compute steps step back behind all else on the machine: 0 not at all, 19 furthest.",
+    )
     decode_slots: int = Field(2, ge=1, description="Uploaded files that one process has read side by side.")
     decode_memory_mb: int = Field(2048, ge=512, description="Memory limit of reading one uploaded file, MiB.")
     decode_seconds: int = Field(180, ge=5, description="Processor time that reading one uploaded file may take, s.")

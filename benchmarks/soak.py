@@ -1,6 +1,6 @@
 """Kill -9 of web, worker, compute child and postmaster at random moments, under uploads, QoCs, clinic day, training and evaluation.
 
-    python benchmarks/soak.py                              50 rounds, 20 minutes at most
+    python benchmarks/soak.py                              50 rounds, 14 minutes at most
     python benchmarks/soak.py --quick                      8 rounds, 3 minutes where the machine has nothing else to do
     python benchmarks/soak.py --rounds 12 --minutes 6      as many as fit, and each kind of process once
     python benchmarks/soak.py --webs 2 --workers 3 --own   on the machine's own PostgreSQL (Debian's), one of them killed in each round
@@ -272,7 +272,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="8 rounds, 2 minutes for them and the end of the jobs")
     parser.add_argument("--rounds", type=int, default=50)
-    parser.add_argument("--minutes", type=float, default=20.0, help="for rounds and the end of the jobs, where each kind was killed once")
+    parser.add_argument("--minutes", type=float, default=14.0, help="for rounds and the end of the jobs, where each kind was killed once")
     parser.add_argument("--seed", type=int, default=0, help="of what is killed when")
     parser.add_argument("--webs", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1)

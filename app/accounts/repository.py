@@ -23,6 +23,11 @@ def user_by_email(db: Session, email: str) -> User | None:
     return db.scalar(select(User).where(User.email.in_(spellings)).order_by(User.email != address).limit(1))
 
 
+def some_password_hash(db: Session, address: str) -> str | None:
+    """The hash of some user's password, for an address always the same user's; None where there is no user."""
+    return db.scalar(select(User.password_hash).order_by(func.md5(func.concat(User.id, " ", address))).limit(1))
+
+
 def users(db: Session) -> Sequence[User]:
     """All users with their memberships, by address."""
     return db.scalars(select(User).options(selectinload(User.memberships)).order_by(User.email)).all()

@@ -31,6 +31,8 @@ from app.settings import get_settings
 ROOT = Path(__file__).resolve().parents[2]
 PASSWORD = "four words for a measurement"
 STARTED_S, STOPPED_S = 90.0, 30.0
+PASSED_ON = ("BETALOOP_SERVER_USER", "BETALOOP_JOB_NICENESS")
+"""Settings of the caller's environment that hold for the installation too."""
 _COMPUTING, _FORKING = "app.platform.jobs.children.child", "app.platform.jobs.children.fork_server"
 _PREPARE = """
 import json, sys
@@ -252,7 +254,7 @@ class Installation:
         return "\n".join(f"--- {log.name}\n" + "\n".join(log.read_text(errors="replace").splitlines()[-15:]) for log in logs)
 
     def _env(self) -> dict[str, str]:
-        env = {k: v for k, v in os.environ.items() if not k.startswith("BETALOOP_") or k == "BETALOOP_SERVER_USER"}
+        env = {k: v for k, v in os.environ.items() if not k.startswith("BETALOOP_") or k in PASSED_ON}
         env |= {"BETALOOP_DATA_DIR": str(self.folder), "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
         if self.own:
             env |= {"BETALOOP_DATABASE_URL": self.own.url("betaloop_service"), "BETALOOP_OWNER_URL": self.own.url("betaloop_owner")}

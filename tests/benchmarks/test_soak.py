@@ -49,9 +49,12 @@ def test_what_was_acknowledged_and_is_not_there_is_found(
     ]
 
 
+KEPT = ("BETALOOP_SERVER_USER", "BETALOOP_JOB_NICENESS")
+
+
 def ran(script: str, *arguments: str) -> dict[str, Any]:
     """The figures of a run that found nothing wrong."""
-    env = {k: v for k, v in os.environ.items() if not k.startswith("BETALOOP_") or k == "BETALOOP_SERVER_USER"} | {"PYTHONPATH": str(ROOT)}
+    env = {k: v for k, v in os.environ.items() if not k.startswith("BETALOOP_") or k in KEPT} | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, *script.split(), *arguments], cwd=ROOT, env=env, capture_output=True, text=True, timeout=500, check=False
     )

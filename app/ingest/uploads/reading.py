@@ -117,7 +117,7 @@ def decode(source: Path, kind: str, options: DecodeOptions, name: str, who: str 
 
 def _run(reference: str, params: Mapping[str, Any], who: str, told: Told) -> dict[str, Any]:
     settings = get_settings()
-    limits = ChildLimits(settings.decode_memory_mb, settings.decode_seconds, niceness=0, quotes=False)
+    limits = ChildLimits(settings.decode_memory_mb, settings.decode_seconds, quotes=False)
     try:
         return run_limited(reference, dict(params), limits, told, who)
     except ChildEnded as ended:

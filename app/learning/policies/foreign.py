@@ -13,7 +13,7 @@ from app.platform.jobs.children.limited import ChildEnded, run_limited
 from ml.policies.onnx_policy import PolicyFileError
 
 JUDGE = "app.learning.policies.compute:judge"
-LIMITS = ChildLimits(memory_mb=1024, cpu_s=10, niceness=0, quotes=False)
+LIMITS = ChildLimits(memory_mb=1024, cpu_s=10, quotes=False)
 """A policy of the study's kind needs 60 MiB, with onnxruntime, and milliseconds."""
 
 LONGEST_REASON = 400

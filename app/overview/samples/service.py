@@ -119,7 +119,7 @@ def _params(db: Session, session: StudySession, caller: Caller, folder: Path) ->
 def reading_limits() -> ChildLimits:
     """What a child may take that reads the samples of a session, for whom a person waits."""
     settings = get_settings()
-    return ChildLimits(settings.decode_memory_mb, settings.decode_seconds, niceness=0, quotes=False)
+    return ChildLimits(settings.decode_memory_mb, settings.decode_seconds, quotes=False)
 
 
 def files_of(db: Session, session: StudySession) -> list[dict[str, Any]]:

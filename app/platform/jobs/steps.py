@@ -65,7 +65,9 @@ class JobSteps:
         checked = _as_json(params, f"the params of step {key!r}")
         if (known := self.ledger.outcome(key)) is not None:  # before waiting for a slot: after a crash, most steps have ended
             return known
-        call = ComputeCall(name, registry.compute_reference(name), checked, self.workdir(key), ChildLimits(get_settings().job_memory_mb))
+        settings = get_settings()
+        limits = ChildLimits(settings.job_memory_mb, niceness=settings.job_niceness)
+        call = ComputeCall(name, registry.compute_reference(name), checked, self.workdir(key), limits)
         with self.slots.hold(self.ledger.job_id, self.requests.check):
             if skip():
                 return {"ok": False, "skipped": True}

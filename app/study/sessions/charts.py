@@ -18,6 +18,8 @@ from ml.mdp import AMPLITUDE_TOLERANCE
 MOST_LEVELS = 12
 """Amplitudes that stand for themselves; more of them are drawn in bins."""
 BINS = 10
+MOST_LISTED = 60
+"""Stretches of equal amplitude that are listed whatever they are."""
 NOTED = {"operator_note": "", "patient": "marked by the patient", "annotation": "annotation", "rating": "rating"}
 """Kinds of events that people noted, and what is said behind them."""
 
@@ -54,6 +56,14 @@ def stimulation_steps(data: SessionData, events: Sequence[Mapping[str, Any]], or
     origin = trace.details.get("origin") if trace is not None else None
     logged = [e for e in events if e["kind"] == "stimulation" and "delivered_ma" in e["data"] and e["data"].get("origin", origin) == origin]
     return _logged_steps(data, logged, origin_s) if logged else _table_steps(data)
+
+
+def in_chart_table(data: SessionData, steps: Sequence[StimulationStep]) -> bool:
+    """Whether the table behind the chart lists the same, row by row: many stretches, on its grid, of less than two rows each."""
+    ends = np.array([(s.start_s, s.stop_s) for s in steps]) / data.settings.period_s
+    return (
+        len(steps) > MOST_LISTED and 2 * len(steps) > int(np.sum(data.table.t_s > 0)) and bool(np.allclose(ends, np.rint(ends), atol=1e-3))
+    )
 
 
 def _logged_steps(data: SessionData, logged: Sequence[Mapping[str, Any]], origin_s: float) -> list[StimulationStep]:
@@ -126,17 +136,19 @@ def control_chart(data: SessionData) -> Chart:
     """Beta with the threshold above, amplitude in mA and as a fraction below, one time axis; windows without valid beta stay gaps."""
     table, settings = data.table, data.settings
     minutes = table.t_s / 60
+    # rows lie on a grid, of which its begin and its step travel
+    grid = {"x0": minutes[0], "dx": settings.period_s / 60}
     unit = table.beta_trace.unit if table.beta_trace else ""
     stream = table.beta_trace.stream if table.beta_trace else "beta"
     name = {"beta": "Beta amplitude", "band_power": "Band power"}.get(stream, stream.replace("_", " ").capitalize())
     known = int(np.sum(~np.isnan(table.beta[table.t_s > 0])))
     traces: list[dict[str, Any]] = [
         {
-            "type": "scatter", "mode": "lines+markers", "name": name, "x": minutes, "y": table.beta, "connectgaps": False,
+            "type": "scatter", "mode": "lines+markers", "name": name, **grid, "y": _drawn(table.beta), "connectgaps": False,
             "line": {"color": ACCENT, "width": 1.5}, "marker": {"size": 3.5, "color": ACCENT},
             "hovertemplate": f"%{{x:.2f}} min<br>%{{y:.4g}} {unit}<extra></extra>",
         },
-        *_amplitude_traces(data, minutes),
+        *_amplitude_traces(data, minutes, grid),
     ]  # fmt: skip
     layout: dict[str, Any] = {
         "grid": {"rows": 2, "columns": 1},
@@ -248,15 +260,21 @@ def beta_by_amplitude(data: SessionData) -> Chart | None:
     return Chart("beta-by-amplitude", "Beta by amplitude", subtitle, figure([line], **layout), columns, rows, height=280)
 
 
-def _amplitude_traces(data: SessionData, minutes: NDArray[np.float64]) -> list[dict[str, Any]]:
+def _drawn(values: NDArray[np.float64]) -> list[float]:
+    """Values to four significant digits: a long session has thousands, and the table beside the chart has no more."""
+    return [float(f"{v:.4g}") for v in values]
+
+
+def _amplitude_traces(data: SessionData, minutes: NDArray[np.float64], grid: Mapping[str, float]) -> list[dict[str, Any]]:
     table = data.table
     values = table.amplitude_ma if _has(table.amplitude_ma) else table.fraction
     # a row holds the amplitude over the period that ends at its time, so the line steps first and then runs
     base: dict[str, Any] = {"type": "scatter", "yaxis": "y2", "connectgaps": False, "line": {"shape": "vh", "color": TEXT, "width": 1.8}}
     hover = "%{y:.3g}" + (" mA (%{customdata:.0%})" if _has(table.amplitude_ma) else "") + "<extra>amplitude</extra>"
-    traces = [
-        base | {"mode": "lines", "name": "Amplitude", "x": minutes, "y": values, "customdata": table.fraction, "hovertemplate": hover}
-    ]
+    line = {"mode": "lines", "name": "Amplitude", **grid, "y": _drawn(values), "hovertemplate": hover}
+    if _has(table.amplitude_ma):
+        line["customdata"] = np.round(table.fraction, 2)  # said in whole per cent
+    traces = [base | line]
     above = table.fraction > 1 + AMPLITUDE_TOLERANCE
     if np.any(above):
         mark = {"symbol": "triangle-up", "size": 8, "color": BAD}

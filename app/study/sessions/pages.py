@@ -29,7 +29,7 @@ from app.study.recordings import tablet
 from app.study.schemas import ConditionsChange, DerivedChoice, QocIn, SessionChange
 from app.study.sessions import conditions, designs
 from app.study.sessions import view as session_view
-from app.study.sessions.charts import beta_by_amplitude, notes, operator_conflicts, stimulation_steps
+from app.study.sessions.charts import beta_by_amplitude, in_chart_table, notes, operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.stimulation import beside, delivered
@@ -280,6 +280,7 @@ def _page(
     view = session_view.shown_trace(session, data, traces, request.query_params.get("trace", ""))
     known, seen = _shown_qoc(session.qoc), _correction(session, caller)
     events, origin = _control_events(session, recordings)
+    steps = stimulation_steps(data, events, origin) if data else []
     page = render(
         request,
         "study/sessions/session.html",
@@ -295,7 +296,8 @@ def _page(
         contradictions=sentences(contradictions(db, session, steps_shown=True)),
         control=control_recording(session),
         view=view,
-        steps=stimulation_steps(data, events, origin) if data else [],
+        steps=steps,
+        steps_in_chart=data is not None and view.is_control and view.chart is not None and in_chart_table(data, steps),
         conflicts=operator_conflicts(events, origin),
         notes=notes(events, origin, session.duration_s),
         by_amplitude=beta_by_amplitude(data) if data else None,

@@ -9,6 +9,8 @@ from threading import Barrier
 from typing import Any
 
 import pytest
+from pwdlib import PasswordHash
+from pwdlib.hashers.argon2 import Argon2Hasher
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
@@ -59,6 +61,31 @@ def test_unknown_address_and_wrong_password_sound_the_same(db: Session, ada: str
             service.sign_in(db, email, "wrong password")
         messages.add(str(caught.value))
     assert len(messages) == 1
+
+
+def test_an_unknown_address_costs_as_much_as_a_known_one_of_an_earlier_version(
+    db: Session, ada: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dearer = PasswordHash((Argon2Hasher(time_cost=3, memory_cost=96, parallelism=1),)).hash(PASSWORD)
+    db.execute(text("update app_user set password_hash = :hash"), {"hash": dearer})
+    service.add_user(db, "new@clinic.example", Role.CLINICIAN, PASSWORD)
+    db.commit()
+    judged: list[str] = []
+
+    class Watched(PasswordHash):
+        def verify(self, password: str | bytes, hash: str | bytes) -> bool:
+            judged.append(str(hash))
+            return super().verify(password, hash)
+
+    monkeypatch.setattr(service, "_hasher", Watched(service._hasher.hashers))
+    for i in range(12):
+        for _ in range(2):
+            with pytest.raises(Unauthorized):
+                service.sign_in(db, f"nobody{i}@clinic.example", PASSWORD)
+    assert all(first == again for first, again in zip(judged[::2], judged[1::2], strict=True)), "an address always costs the same"
+    assert dearer in judged, "and some of them what people of before cost"
+    assert len(set(judged)) == 2
+    assert service.sign_in(db, ada, PASSWORD)
 
 
 @pytest.mark.parametrize("column", ["last_seen_at", "created_at"])

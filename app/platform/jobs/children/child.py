@@ -35,6 +35,7 @@ PARENT = "BETALOOP_WORKER_PID"
 _PR_SET_PDEATHSIG = 1
 _LOCK_WAIT_S = 30.0
 _OOM_SCORE = "500"
+_AUTOGROUP, _AUTOGROUP_TRIES = Path("/proc/self/autogroup"), 50
 
 Cause = Literal["memory", "time", "killed", "error"]
 """Why a call gave no result: it met its limit of memory or time, its process was killed or broke down, or its function raised."""
@@ -47,13 +48,13 @@ class ChildLimits:
     Attributes:
         memory_mb: data of the process, what it has imported included, MiB.
         cpu_s: seconds of processor time, which a busy machine does not use up; None for no limit.
-        niceness: how far it steps back behind other processes.
+        niceness: how far it steps back behind other processes, 0 (not at all) to 19.
         quotes: whether its log may quote what its function works on. Files of strangers may name a person: then it may not.
     """
 
     memory_mb: int
     cpu_s: int | None = None
-    niceness: int = 5
+    niceness: int = 0
     quotes: bool = True
 
 
@@ -177,11 +178,32 @@ def _watch_parent(parent: int) -> None:
 
 def _be_modest(limits: ChildLimits) -> None:
     """Step back behind the web service, offer ourselves first when the machine runs out of memory, and leave no image of it on the disk."""
-    os.nice(limits.niceness)
+    if limits.niceness:
+        _step_back(os.nice(limits.niceness))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     score = Path("/proc/self/oom_score_adj")
     if score.exists():
         score.write_text(_OOM_SCORE)
+
+
+def _step_back(niceness: int) -> None:
+    """Have the kernel count our niceness against every other process.
+
+    Linux (sched(7), "The autogroup feature") shares the processor out among sessions first: within ours, of one process, niceness alone
+    would count against nobody.
+    """
+    if not _AUTOGROUP.exists():
+        return
+    for _ in range(_AUTOGROUP_TRIES):
+        try:
+            _AUTOGROUP.write_text(str(niceness))
+            return
+        except BlockingIOError:
+            time.sleep(0.1)  # whoever is not root may do this once in a tenth of a second
+        except OSError as error:  # as in a container whose /proc is read-only
+            sys.stderr.write(f"this step does not step back behind other processes: {error}\n")
+            return
+    sys.stderr.write(f"this step does not step back behind other processes: the kernel refused it {_AUTOGROUP_TRIES} times\n")
 
 
 def _lock(workdir: Path) -> int:
