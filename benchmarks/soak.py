@@ -222,6 +222,7 @@ def report(run: Soak, rounds: int) -> dict[str, float]:
         "over_10_s": len(over),
         "acknowledged": _acknowledged(run),
         "seconds": round(time.monotonic() - run.begun, 1),
+        "load": round(os.getloadavg()[1], 1),  # of the last five minutes: about as long as a short run
     }
 
 

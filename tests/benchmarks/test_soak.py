@@ -68,7 +68,8 @@ def test_kills_of_every_process_lose_and_double_nothing() -> None:
     figures = ran("benchmarks/soak.py", "--quick")
     assert figures["kills"] >= 3
     assert figures["acknowledged"] > 50
-    assert figures["median_s"] < 10
+    # beside other work each process has its share of the cores alone
+    assert figures["median_s"] < 10 * max(1.0, figures["load"] / (os.cpu_count() or 1))
 
 
 @pytest.mark.slow
