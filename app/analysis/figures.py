@@ -6,10 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 
+from app.platform.web.charts import side_by_side
+
 COLOURS = {"cdbs": "#0067a8", "rl": "#c24e00", "distilled": "#9b3f86", "no_dbs": "#5d6770", "random": "#00795a", "other": "#7a6200"}
 PANEL_W, PANEL_H, LEFT, TOP, BOTTOM, GAP, EMPTY_W = 250, 190, 52, 44, 52, 18, 1000
 CHARACTER_W = 6.3
 """Of the figures' font, px, on average."""
+DOT = 2.4
+"""Radius of a session's point, px."""
 
 
 @dataclass(frozen=True)
@@ -74,13 +78,14 @@ def _panel(panel: Panel, x: float, w: float) -> list[str]:
         at = low + (high - low) * i / 4
         parts.append(f'<line x1="{x:.1f}" y1="{y(at):.1f}" x2="{x + w:.1f}" y2="{y(at):.1f}" stroke="#e5e7eb"/>')
         parts.append(f'<text x="{x - 6:.1f}" y="{y(at) + 4:.1f}" text-anchor="end" fill="#6b7280">{at:.3g}</text>')
-    step = w / max(1, len(panel.boxes))
+    step, scale = w / max(1, len(panel.boxes)), PANEL_H * 0.94 / (high - low)
     for i, box in enumerate(panel.boxes):
-        parts += _box(box, x + step * (i + 0.5), min(26.0, step * 0.6), y, bottom)
+        parts += _box(box, x + step * (i + 0.5), min(26.0, step * 0.6), y, bottom, scale)
     return parts
 
 
-def _box(box: Box, x: float, w: float, y: Callable[[float], float], bottom: float) -> list[str]:
+def _box(box: Box, x: float, w: float, y: Callable[[float], float], bottom: float, scale: float) -> list[str]:
+    # `scale`: px of one unit of the values
     parts = [
         f'<text x="{x:.1f}" y="{bottom + 14 + 13 * k}" text-anchor="middle">{escape(line)}</text>'
         for k, line in enumerate(box.label.split("\n"))
@@ -95,8 +100,8 @@ def _box(box: Box, x: float, w: float, y: Callable[[float], float], bottom: floa
             f'fill="#ffffff" stroke="{c}"/>',
             f'<line x1="{x - w / 2:.1f}" y1="{y(middle):.1f}" x2="{x + w / 2:.1f}" y2="{y(middle):.1f}" stroke="{c}" stroke-width="2"/>',
         ]
-        for k, value in enumerate(box.values):
-            parts.append(f'<circle cx="{x + w * 0.3 * ((k % 3) - 1):.1f}" cy="{y(value):.1f}" r="2.2" fill="{c}" fill-opacity="0.7"/>')
+        for sideways, value in zip(side_by_side(box.values, 2 * DOT / scale, 0.55 * w, 2 * DOT + 0.4), box.values, strict=True):
+            parts.append(f'<circle cx="{x + sideways:.1f}" cy="{y(value):.1f}" r="{DOT}" fill="{c}" stroke="#ffffff" stroke-width="0.6"/>')
     parts.append(f'<text x="{x:.1f}" y="{TOP - 2}" text-anchor="middle">{escape(box.above)}</text>')
     return parts
 

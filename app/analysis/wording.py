@@ -30,6 +30,10 @@ TITLES: dict[str, tuple[str, str]] = {
 }
 """The paper's five metrics: title and unit; the unit of beta is the participant's."""
 
+ENERGY_SHOWN = ("% of cDBS", 100.0)
+"""How every page and figure shows energy: unit, and factor of the stored share of the energy under cDBS. Files and the REST interface keep
+the share."""
+
 OUTCOMES = {"grasp": "grasp", "rating": "the rating", "tremor": "tremor", ENERGY: "the energy saved"}
 FAMILY = (
     "Planned family: the five metrics of RL and of distilled RL, each against the same visit's cDBS; p-values are adjusted by Holm over "
@@ -295,3 +299,13 @@ def _numbers(numbers: Iterable[int]) -> str:
 
 def _n(count: int, word: str) -> str:
     return f"{count} {word}" if count == 1 else f"{count} {word}s"
+
+
+def shown_unit(metric: str, unit: str) -> str:
+    """The unit in which pages and figures show a metric whose own unit is `unit`."""
+    return ENERGY_SHOWN[0] if metric == "energy" else unit
+
+
+def shown_factor(metric: str) -> float:
+    """What a metric's numbers are multiplied by where they are shown in `shown_unit`."""
+    return ENERGY_SHOWN[1] if metric == "energy" else 1.0

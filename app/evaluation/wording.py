@@ -95,7 +95,7 @@ def _sessions_changed(flag: Flag) -> str:
     what = {
         "newer": "newer: visit " + ", ".join(flag.fact("visits")),
         "unconfirmed": "no longer confirmed",
-        "qoc": "with corrected QoCs",
+        "qoc": "with corrected outcomes",
         "conditions": "whose conditions were corrected",
         "left_out": "newly left out",
         "included": "newly included",

@@ -31,10 +31,10 @@ def gate_grounds(gate: Gate) -> str:
     if worse:
         return f"{' and '.join(worse)} significantly worse than under the random controller"
     if not gate.tests:
-        return "no QoC counts in r_end (C2 = C3 = C4 = 0), so nothing can be tested"
+        return "no outcome counts in the reward of a session's end (C2 = C3 = C4 = 0), so nothing can be tested"
     if not any(t.tested for t in gate.tests):
         return gate_test_note(gate.tests[0])
-    return "no QoC is significantly better than under the random controller"
+    return "no outcome is significantly better than under the random controller"
 
 
 def gate_test_note(test: QocTest) -> str:

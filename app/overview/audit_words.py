@@ -222,7 +222,7 @@ _SAID: dict[str, Callable[[Row, Row, Names], str]] = {
     "dose": _dose,
     "visit": _visit,
     "session": _session,
-    "qoc": _of_session("entered the QoCs of", "corrected the QoCs of"),
+    "qoc": _of_session("entered the outcomes of", "corrected the outcomes of"),
     "session_conditions": _of_session("took down the conditions of", "corrected the conditions of"),
     "evaluation": lambda b, a, n: f"stored an evaluation of {n.participant((a or b)['participant_id'])}",
     "sweep": lambda b, a, n: f"stored {(a or b)['name']} of {n.participant((a or b)['participant_id'])}",

@@ -47,7 +47,7 @@ def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[Sett
     ]
     visits_seen = len({s.visit_id for _, s in dated})
     subtitle = f"n = {len(dated)} sessions in {visits_seen} visits, those of a day side by side \u00b7 press a dot for its session"
-    return Chart("story", "All months", subtitle, figure(data, **layout), columns, rows, height=70 + 82 * len(panels))
+    return Chart("story", "All months", subtitle, figure(data, **layout), columns, rows, height=82 + 82 * len(panels))
 
 
 def _moment(session: Facts, days: Mapping[int, dt.date | None]) -> dt.datetime | None:
@@ -83,10 +83,10 @@ def _quantities(held: Evidence, sessions: Sequence[Facts]) -> list[tuple[str, st
     return [
         ("Beta", held.beta_unit or "", beta),
         ("Amplitude", "mA", own),
-        ("Energy", "cDBS = 1", of("energy")),
+        ("Energy", "% of cDBS", [None if v is None else 100 * v for v in of("energy")]),
         ("Grasp", "Hz", of("grasp")),
         ("Rating", "1–10", of("rating")),
-        ("Tremor", "%", of("tremor")),
+        ("Tremor", "% of time", of("tremor")),
         ("Last dose", "h before", [s.medication_h for s in sessions]),
     ]
 
@@ -102,7 +102,7 @@ def _panels(
     data: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
         "xaxis": {"type": "date", "anchor": "free", "position": 0, "zeroline": False},
-        "margin": {"l": 78, "r": 16, "t": 30, "b": 36},
+        "margin": {"l": 78, "r": 16, "t": 30, "b": 48},
         "legend": {"orientation": "h", "y": 1.01, "yanchor": "bottom", "x": 0},
         "showlegend": True,
     }
@@ -130,9 +130,11 @@ def _days(dated: Sequence[tuple[dt.datetime, Facts]], places: Sequence[dt.dateti
     spans: dict[int, list[tuple[dt.datetime, dt.datetime]]] = {}
     for (moment, s), place in zip(dated, places, strict=True):
         spans.setdefault(s.visit_id, []).append((place, moment))
-    ticks = sorted((min(at)[0] + (max(at)[0] - min(at)[0]) / 2, min(m for _, m in at)) for at in spans.values())
+    numbers = {s.visit_id: s.visit for _, s in dated}
+    ticks = sorted((min(at)[0] + (max(at)[0] - min(at)[0]) / 2, min(m for _, m in at), numbers[visit]) for visit, at in spans.items())
     shown = ticks[:: -(-len(ticks) // _TICKS)]
-    return {"tickvals": [at.isoformat() for at, _ in shown], "ticktext": [f"{day:%Y-%m-%d}" for _, day in shown]}
+    words = [f"visit {number}<br>{day:%Y-%m-%d}" for _, day, number in shown]
+    return {"tickvals": [at.isoformat() for at, _, _ in shown], "ticktext": words}
 
 
 def _title(name: str, unit: str) -> dict[str, Any]:
@@ -142,13 +144,13 @@ def _title(name: str, unit: str) -> dict[str, Any]:
 def _marks(
     dated: Sequence[tuple[dt.datetime, Facts]], places: Sequence[dt.datetime], versions: Sequence[SettingsVersion]
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """A line per visit with its number, and a dashed one where settings were changed."""
+    """A line per visit, and a dashed one with its words where settings were changed."""
     first: dict[int, dt.datetime] = {}
     for place, (_, s) in zip(places, dated, strict=True):
         first[s.visit] = min(place, first.get(s.visit, place))
     lines, labels = [], []
     for text, at, ink, dash in (
-        *((f"visit {n}", moment, GRID, "solid") for n, moment in sorted(first.items())),
+        *(("", moment, GRID, "solid") for _, moment in sorted(first.items())),
         *((f"settings {v.version}", v.created_at, WARN, "dash") for v in versions if v.version > 1),
     ):
         where = {"xref": "x", "yref": "paper"}
@@ -156,6 +158,8 @@ def _marks(
         lines.append(
             {"type": "line", **where, "x0": at.isoformat(), "x1": at.isoformat(), "y0": 0, "y1": 1, "line": line, "layer": "below"}
         )
+        if not text:
+            continue
         labels.append(
             {"text": text, **where, "x": at.isoformat(), "y": 0, "yanchor": "bottom", "xanchor": "left", "showarrow": False,
              "textangle": -90, "font": {"size": 11, "color": MUTED}}

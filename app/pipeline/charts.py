@@ -17,7 +17,7 @@ DASHES = ("solid", "dash", "dot")
 
 JOB_CURVES = {
     "mean_q": ("Training: mean Q of each policy", "reward; an unbounded climb is over-estimation"),
-    "action_distance": ("Training: distance from the logged amplitudes", "mean absolute difference, fraction"),
+    "action_distance": ("Training: distance from the recorded amplitudes", "mean absolute difference, fraction of cDBS"),
     "score": ("Training: estimated return on held-out sessions", "reward, fitted Q evaluation"),
     "loss": ("Distillation: loss", "mean squared difference from the teacher, fraction squared"),
     "dlsm_loss": ("DLSM: training loss", "negative objective"),

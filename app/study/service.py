@@ -126,7 +126,7 @@ def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller
     if known is not None and all(getattr(known, name) == value for name, value in merged.items()):
         return known
     if known is None and all(value is None for value in merged.values()):
-        raise Invalid("No QoC was given.", "Enter at least one of grasp frequency, rating and tremor.")
+        raise Invalid("No outcome was given.", "Enter at least one of grasp frequency, rating and tremor.")
     questions.require_sure(given, values.sure, known, {"rating": other_ratings(db, session)})
     kept = [name for name in (known.derived if known else ()) if merged[name] == getattr(known, name)]
     return outcomes.add_revision(db, session, given, caller.label, values.reason, kept)

@@ -96,7 +96,7 @@ for _method in (
     Method(key="wis", name="Weighted importance sampling", short="WIS", family="importance weights", needs=_DENSITY, factory=_IS, held_out=True, quick=True, preference=6, colour="random", symbol="triangle-up"),  # noqa: E501
     Method(key="pdis", name="Per-decision importance sampling", short="PDIS", family="importance weights", needs=_DENSITY, factory=_IS, quick=True, preference=8, colour="other", symbol="x"),  # noqa: E501
     Method(key="cwpdis", name="Consistent weighted per-decision importance sampling", short="CWPDIS", family="importance weights", needs=_DENSITY, factory=_IS, held_out=True, preference=5, colour="muted", symbol="triangle-down"),  # noqa: E501
-    Method(key=POSTERIOR, name="Posterior of all structures", short="Posterior", family="combination", needs="two sessions", factory="ml.ope.posterior.estimator:build", quick=True, weight=3.0, colour="info", symbol="star-diamond"),  # noqa: E501
+    Method(key=POSTERIOR, name="All structures together", short="All structures", family="combination", needs="two sessions", factory="ml.ope.posterior.estimator:build", quick=True, weight=3.0, colour="info", symbol="star-diamond"),  # noqa: E501
     Method(key=AGGREGATE, name="Combination of all methods", short="Combination", family="combination", needs="two other methods", factory=None, quick=True, colour="text", symbol="pentagon"),  # noqa: E501
 ):
     register(_method)

@@ -11,12 +11,13 @@ from app.platform.web.charts import MUTED, Chart, axis, figure
 from ml.ope.registry import shown as method_of
 
 QUANTITY_NAMES = {
-    "grasp_hz": ("Grasp frequency", "Hz"),
-    "rating": ("Rating", "1–10"),
-    "tremor_percent": ("Tremor", "% of time"),
-    "energy": ("Energy", "share of cDBS"),
-    "mean_beta": ("Mean beta", ""),
+    "grasp_hz": ("Grasp frequency", "Hz", 1.0),
+    "rating": ("Rating", "1–10", 1.0),
+    "tremor_percent": ("Tremor", "% of the time", 1.0),
+    "energy": ("Energy", "% of cDBS", 100.0),
+    "mean_beta": ("Mean beta", "", 1.0),
 }
+"""Title, unit, and factor of the stored number in that unit; the unit of beta is the participant's."""
 METRIC_NAMES = {
     "mae": ("Mean absolute error", "reward"),
     "rank_correlation": ("Rank correlation", "Spearman"),
@@ -85,6 +86,7 @@ def metrics(found: CalibrationOut) -> Chart:
                 "x": [v.value for v in values],
                 "y": names,
                 "xaxis": f"x{suffix}",
+                "cliponaxis": False,
                 "error_x": _error_bars(values),
                 "marker": {
                     "size": 10,
@@ -185,20 +187,20 @@ def quantities(found: CalibrationOut, method: str) -> list[Chart]:
     """Actual against predicted, of every outcome that the method predicts."""
     points = [(p, q) for p in found.policies for q in p.predictions if q.method == method]
     charts = []
-    for name, (title, unit) in QUANTITY_NAMES.items():
+    for name, (title, unit, factor) in QUANTITY_NAMES.items():
         own = [(p, quantity) for p, q in points for quantity in q.quantities if quantity.name == name]
         if not own:
             continue
         unit = unit or found.beta_unit or ""
-        ends = [v for _, q in own for v in (q.predicted, q.actual)]
+        ends = [factor * v for _, q in own for v in (q.predicted, q.actual)]
         square = _square(ends, ends)
         marks = style(method)
         trace = {
             "type": "scatter",
             "mode": "markers",
             "name": method_of(method).name,
-            "x": [q.predicted for _, q in own],
-            "y": [q.actual for _, q in own],
+            "x": [factor * q.predicted for _, q in own],
+            "y": [factor * q.actual for _, q in own],
             "text": [label(p) for p, _ in own],
             "marker": {"size": 9, "color": marks["color"], "symbol": ["circle" if p.reference else marks["symbol"] for p, _ in own]},
             "hovertemplate": "%{text}: predicted %{x:.3g}, actual %{y:.3g}<extra></extra>",
@@ -216,7 +218,7 @@ def quantities(found: CalibrationOut, method: str) -> list[Chart]:
                     showlegend=False,
                 ),
                 columns=["Policy", f"Predicted ({unit})", f"Actual ({unit})", "Sessions"],
-                rows=[[label(p), q.predicted, q.actual, q.sessions] for p, q in own],
+                rows=[[label(p), factor * q.predicted, factor * q.actual, q.sessions] for p, q in own],
                 height=280,
             )
         )

@@ -38,6 +38,7 @@ def calibration_page(
         participant=participant,
         calibration=found,
         method=chosen,
+        asked=method is not None,
         method_names=names(),
         sentences=in_sentences(found, chosen) if chosen else [],
         over_visits=calibration_charts.over_visits(found, chosen) if chosen else None,

@@ -11,7 +11,7 @@ from app.accounts.deps import CurrentCaller
 from app.analysis.energy import service
 from app.analysis.energy.schemas import ImplantIn
 from app.analysis.energy.serializers import CSV_COLUMNS, csv_rows
-from app.analysis.energy.wording import MEASURES
+from app.analysis.energy.wording import MEASURES, SHARES
 from app.analysis.tables import csv_of
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
@@ -61,6 +61,7 @@ def energy_page(
         participant=participant,
         found=found,
         measures=MEASURES,
+        shares=SHARES,
         impedance=impedance,
         fields=FIELDS,
         typed=typed,

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from app.analysis.energy.measures import Measure
 
+SHARES = {Measure.AMPLITUDE, Measure.SQUARE, Measure.ALL_SIDES}
+"""Measures that are shares of what cDBS takes: pages show them in % of cDBS, files and the API as they are."""
+
 MEASURES: dict[Measure, tuple[str, str, str]] = {
     Measure.AMPLITUDE: (
         "Mean amplitude", "cDBS = 1", "Mean over the session's steps of a, the share of the cDBS amplitude, on the controlled side.",
@@ -15,11 +18,11 @@ MEASURES: dict[Measure, tuple[str, str, str]] = {
     ),
     Measure.ALL_SIDES: (
         "Energy of all sides and programs", "cDBS = 1",
-        "Sum over sides and programs of mean I² · w · f, over the same sum at their cDBS amplitudes; width w and rate f as logged. "
+        "Sum over sides and programs of mean I² · w · f, over the same sum at their cDBS amplitudes; width w and rate f as recorded. "
         "With one side and program the mean of a².",
     ),
     Measure.CHARGE: (
-        "Charge", "µC/s", "Sum over sides and programs of mean I · w · f, with width w and rate f as logged; only where all are known.",
+        "Charge", "µC/s", "Sum over sides and programs of mean I · w · f, with width w and rate f as recorded; only where all are known.",
     ),
     Measure.TEED: (
         "Total electrical energy delivered", "µW",

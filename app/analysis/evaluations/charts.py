@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from app.analysis.evaluations.service import BySeed, SeedRow
 from app.analysis.figures import Box, Panel
-from app.platform.web.charts import TEXT, Cell, Chart, axis, figure
+from app.platform.web.charts import TEXT, Cell, Chart, axis, figure, side_by_side
 
 METRICS = {
     "mae": ("Mean absolute error", "reward, lower is better"),
@@ -47,8 +47,9 @@ def _chart(found: BySeed, metric: str) -> Chart:
     grouped = _by_method(found, metric)
     names = [rows[0].name for rows in grouped.values()]
     means = [sum(v for _, v in _values(rows, metric)) / len(rows) for rows in grouped.values()]
-    x = [i for i, rows in enumerate(grouped.values()) for _ in rows]
     points = [p for rows in grouped.values() for p in _values(rows, metric)]
+    height = max((abs(v) for _, v in points), default=0.0)
+    x = [i + s for i, own in enumerate(grouped.values()) for s in side_by_side([v for _, v in _values(own, metric)], height / 24, 0.3, 0.1)]
     data = [
         {"type": "bar", "x": list(range(len(names))), "y": means, "marker": {"color": "token:accent/0.3"}, "name": "mean"},
         {

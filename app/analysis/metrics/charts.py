@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Any
 
 from app.analysis.evidence.measurements import HIGHER_IS_BETTER
 from app.analysis.metrics.comparisons import ALPHA, Comparison, Group
 from app.analysis.metrics.service import FiveMetrics, MetricResult
+from app.analysis.metrics.shown import for_readers
 from app.platform.kept import kept
-from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, figure, marker
+from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, figure, marker, side_by_side
 from app.platform.web.templates import p_text
 from app.study.models import Controller
 
@@ -21,7 +22,8 @@ COLUMNS = (
     "Controller", "n", "Median", "Quartile 1", "Quartile 3", "Difference from cDBS", "95 % low", "95 % high", "p", "p (Holm)", "Test",
 )  # fmt: skip
 
-_SPREAD, _GOLDEN = 0.18, 0.618034
+_HALF, _STEP, _ROWS = 0.27, 0.11, 24
+"""Of the dots beside a box: furthest offset, distance of neighbours where there is room, and how many rows of dots a panel is high."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,9 @@ class FiveMetricsView:
 
 
 def view(result: FiveMetrics, evidence: Hashable) -> FiveMetricsView:
-    """The analysis with its charts, which are kept under the key of the evidence that it is made of."""
-    return FiveMetricsView(result, kept(("metric charts", evidence), lambda: [metric_chart(m) for m in result.metrics if m.n]))
+    """The analysis as it is shown, with its charts, which are kept under the key of the evidence that it is made of."""
+    shown = for_readers(result)
+    return FiveMetricsView(shown, kept(("metric charts", evidence), lambda: [metric_chart(m) for m in shown.metrics if m.n]))
 
 
 def metric_chart(metric: MetricResult) -> Chart:
@@ -72,23 +75,15 @@ def box(at: int, g: Group) -> dict[str, Any]:
 
 def points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
     """Every session of a group, to the four digits that its label shows: a page of many participants has thousands."""
+    height = max((max(other.values) for other in metric.groups if other.n), default=0.0)
     unit = metric.unit if metric.metric != "rating" else "of 10"
     return {
-        "type": "scatter", "mode": "markers", "x": [round(at + s, 3) for s in _spread(g.values)],
+        "type": "scatter", "mode": "markers", "x": [round(at + s, 3) for s in side_by_side(g.values, height / _ROWS, _HALF, _STEP)],
         "y": [float(f"{v:.4g}") for v in g.values], "cliponaxis": False,
-        "marker": marker(g.controller, 7, opacity=0.8), "name": g.label,
+        "marker": marker(g.controller, 8, opacity=0.9, line={"color": "token:surface", "width": 0.7}), "name": g.label,
         "customdata": list(g.session_ids), "meta": "/sessions/",
         "hovertemplate": f"{g.label}, session %{{customdata}}<br>%{{y:.4g}} {unit}<extra></extra>",
     }  # fmt: skip
-
-
-def _spread(values: Sequence[float]) -> list[float]:
-    """Sideways places of points so that equal values stay apart: by rank, in steps of the golden ratio, of which none falls on another."""
-    order = sorted(range(len(values)), key=lambda i: (values[i], i))
-    places = [0.0] * len(values)
-    for rank, i in enumerate(order):
-        places[i] = _SPREAD * (2 * ((0.5 + rank * _GOLDEN) % 1) - 1)
-    return places
 
 
 def above(test: Comparison | None, metric: str) -> str:

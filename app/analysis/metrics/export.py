@@ -12,6 +12,7 @@ from app.analysis.figures import COLOURS, Box, Panel, boxes_svg
 from app.analysis.metrics.charts import SHORT, above
 from app.analysis.metrics.comparisons import Comparison, Group
 from app.analysis.metrics.service import FiveMetrics
+from app.analysis.metrics.shown import for_readers
 from app.analysis.tables import csv_of
 from app.platform.web.csv_files import download
 
@@ -29,7 +30,8 @@ def table(found: Sequence[FiveMetrics], name: str) -> Response:
 
 def svg(found: Sequence[FiveMetrics], name: str) -> Response:
     """The results figure: a panel per metric, a box per participant and controller, every session a point."""
-    panels = [_panel(found, metric) for metric in METRICS]
+    shown = [for_readers(one) for one in found]
+    panels = [_panel(shown, metric) for metric in METRICS]
     note = "Two-sided Wilcoxon rank-sum test against cDBS, sessions taken as independent; * p < .05 in the desired direction."
     content = boxes_svg([p for p in panels if any(b.values for b in p.boxes)], f"Results {name}", note)
     return Response(content, media_type=SVG, headers={"Content-Disposition": f'inline; filename="{name}-results.svg"'})
@@ -52,7 +54,8 @@ def _row(participant: str, metric: str, unit: str, policy_id: int | None, g: Gro
 
 
 def _panel(found: Sequence[FiveMetrics], metric: str) -> Panel:
-    boxes, unit = [], wording.TITLES[metric][1]
+    boxes: list[Box] = []
+    unit = ""
     for one in found:
         m = next(m for m in one.metrics if m.metric == metric)
         unit = unit or m.unit

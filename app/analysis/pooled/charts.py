@@ -9,12 +9,14 @@ from app.analysis import wording
 from app.analysis.evidence.facts import METRICS
 from app.analysis.metrics.charts import SHORT, above, box, points
 from app.analysis.metrics.service import FiveMetrics
+from app.analysis.metrics.shown import for_readers
 from app.platform.web.charts import TEXT, Cell, Chart, axis, figure
 
 
 def results(found: Sequence[FiveMetrics]) -> list[Chart]:
     """A chart per metric that some session has."""
-    return [c for c in (_chart(found, metric) for metric in METRICS) if c.rows]
+    shown = [for_readers(one) for one in found]
+    return [c for c in (_chart(shown, metric) for metric in METRICS) if c.rows]
 
 
 def _chart(found: Sequence[FiveMetrics], metric: str) -> Chart:

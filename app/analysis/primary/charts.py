@@ -10,13 +10,15 @@ from ml.statistics.within_visits.contrasts import Average
 
 
 def by_visit(tested: Tested, found: Comparison, unit: str) -> Chart:
-    """Contrasts by visit as points, the average over visits beside them."""
+    """Contrasts by visit as points, the average over visits beside them; `unit` is the one that pages show."""
     rows = [r for r in found.rows if r.contrast is not None]
+    factor = wording.shown_factor(found.metric)
     name, title = wording.tested_name(tested), wording.TITLES[found.metric][0]
     places: list[float] = [float(i) for i in range(len(rows))]
     data = [
         {
-            "type": "scatter", "mode": "markers", "x": places, "y": [r.contrast for r in rows], "marker": marker(tested.controller, 10),
+            "type": "scatter", "mode": "markers", "x": places, "y": [factor * (r.contrast or 0.0) for r in rows],
+            "marker": marker(tested.controller, 10),
             "text": [f"Visit {r.visit}: {len(r.tested)} against {len(r.cdbs)} sessions" for r in rows],
             "hovertemplate": "%{text}<br>%{y:.3g} " + unit + "<extra></extra>", "name": name,
         }
@@ -24,14 +26,15 @@ def by_visit(tested: Tested, found: Comparison, unit: str) -> Chart:
     ticks = [str(r.visit) for r in rows]
     if isinstance(found.result, Average):
         a = found.result
+        estimate, low, high = (factor * v for v in (a.estimate, a.low, a.high))
         data.append(
             {
-                "type": "scatter", "mode": "markers", "x": [len(rows) + 0.3], "y": [a.estimate], "name": "Average",
+                "type": "scatter", "mode": "markers", "x": [len(rows) + 0.3], "y": [estimate], "name": "Average",
                 "error_y": {
-                    "type": "data", "symmetric": False, "array": [a.high - a.estimate], "arrayminus": [a.estimate - a.low], "width": 8,
+                    "type": "data", "symmetric": False, "array": [high - estimate], "arrayminus": [estimate - low], "width": 8,
                 },
                 "marker": {"symbol": "line-ew-open", "size": 18, "color": TEXT, "line": {"width": 3}}, "line": {"color": TEXT},
-                "hovertemplate": f"Average {a.estimate:.3g} ({a.low:.3g} to {a.high:.3g}) {unit}<extra></extra>",
+                "hovertemplate": f"Average {estimate:.3g} ({low:.3g} to {high:.3g}) {unit}<extra></extra>",
             }
         )  # fmt: skip
         places, ticks = [*places, len(rows) + 0.3], [*ticks, "Average"]
@@ -42,7 +45,7 @@ def by_visit(tested: Tested, found: Comparison, unit: str) -> Chart:
         "shapes": [horizontal(0.0, "", MUTED)[0]],
         "showlegend": False, "dragmode": False,
     }  # fmt: skip
-    table: list[list[Cell]] = [[r.visit, r.contrast, len(r.tested), len(r.cdbs)] for r in rows]
+    table: list[list[Cell]] = [[r.visit, factor * (r.contrast or 0.0), len(r.tested), len(r.cdbs)] for r in rows]
     sub = f"{unit} \u00b7 n = {len(rows)} visits \u00b7 {better}"
     columns = ("Visit", f"Contrast ({unit})", "Sessions", "cDBS sessions")
     return Chart(f"contrast-{tested.key}-{found.metric}", title, sub, figure(data, **layout), columns, table, height=260)

@@ -34,7 +34,7 @@ def primary_page(request: Request, participant: CurrentParticipant, db: Db, call
         participant=participant,
         found=found,
         wording=wording,
-        units={m: written(unit_of(m, found)) for m in METRICS},
+        units=_units(found),
     )
     return HTMLResponse(page)
 
@@ -50,7 +50,7 @@ def visits_page(request: Request, key: str, participant: CurrentParticipant, db:
     """One controller or policy visit by visit, with the sessions behind every number and what else could explain it."""
     found = service.primary(db, participant, caller)
     result = service.result_of(found, key)
-    units = {m: written(unit_of(m, found)) for m in METRICS}
+    units = _units(found)
     charts = {c.metric: by_visit(result.tested, c, units[c.metric]) for c in result.comparisons}
     sessions = {s.session_id: s for s in found.sessions}
     page = render(
@@ -90,7 +90,12 @@ def models_page(
         per_arm=sessions,
         names=service.policy_names(db, participant),
         planned=result.tested.controller in PLANNED,
-        units={m: written(unit_of(m, found)) for m in METRICS},
+        units=_units(found),
         wording=wording,
     )
     return HTMLResponse(page)
+
+
+def _units(found: service.Primary) -> dict[str, str]:
+    """The unit in which a page shows each metric."""
+    return {m: written(wording.shown_unit(m, unit_of(m, found))) for m in METRICS}

@@ -21,6 +21,9 @@ SAME_BEHAVIOUR = 0.02
 OFF_SHARE = 0.8
 """A policy that is nearly off in more than this share of its steps acts like no stimulation."""
 
+LEAST_SAVING = 0.05
+"""Of the energy of cDBS; a behaviour that saves less is not worth further sessions to know of."""
+
 QUANTITIES = ("energy", "grasp_hz", "rating", "tremor_percent")
 
 
@@ -54,6 +57,11 @@ class Row:
     def within(self) -> float | None:
         """Probability that grasp, rating and tremor are all no worse than cDBS by more than their margins."""
         return self.decided.verdict.within if self.decided.verdict else None
+
+    @property
+    def saving(self) -> float:
+        """Energy that it is expected to save, as a share of that of cDBS; 0 where that is not predicted, or it spends more."""
+        return max(0.0, -self.differences["energy"].value) if "energy" in self.differences else 0.0
 
     @property
     def may_be_picked(self) -> bool:
@@ -113,10 +121,14 @@ class Answer:
 
     @property
     def cheapest(self) -> list[Row]:
-        """The rows that the fewest further sessions would tell, the likeliest within the margins first."""
+        """The rows that the fewest further sessions would tell, what saves most and is likely within the margins first.
+
+        What is expected to save less than `LEAST_SAVING` is left out, unless nothing else is there: to know of it helps nobody.
+        """
         told = [(n, r) for r in self.rows for n in [_needed(r)] if n is not None]
         fewest = min((n for n, _ in told), default=None)
-        return sorted((r for n, r in told if n == fewest), key=lambda r: -(r.within or 0.0))
+        rows = sorted((r for n, r in told if n == fewest), key=lambda r: (-(r.within or 0.0) * r.saving, -(r.within or 0.0)))
+        return [r for r in rows if r.saving >= LEAST_SAVING] or rows
 
 
 def answer(found: Assessment) -> Answer:

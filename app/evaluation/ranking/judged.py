@@ -21,7 +21,7 @@ from app.evaluation.models import Evaluation
 from app.evaluation.ranking.answer import Answer, Row, answer
 from app.evaluation.ranking.assessment import Assessed, Assessment, assess, cdbs_amplitude_now
 from app.evaluation.ranking.picture import Picture, picture
-from app.evaluation.ranking.results import tested_before
+from app.evaluation.ranking.results import RandomSessions, random_sessions, tested_before
 from app.evaluation.repository import PolicyHead
 from app.evaluation.schemas import TestedBefore
 from app.learning.models import BufferSnapshot
@@ -114,6 +114,12 @@ class Judged:
             return replace(found, rows=rows, like_cdbs=like_cdbs, like_off=like_off)
 
         return self.kept("answer", read)
+
+    def random_sessions(self, lower_bound: float) -> RandomSessions | None:
+        """What random sessions have been for the participant so far; None without any, and where nobody asks what sessions showed."""
+        if self.caller is None or self.sessions is None:
+            return None
+        return random_sessions(self.sessions.rows, self.caller, lower_bound, self.cdbs_ma)
 
     def picture(self, lower_bound: float, policy_id: int | None = None) -> Picture:
         """The picture of the candidates that are neither cDBS nor off by another name, or of one candidate.

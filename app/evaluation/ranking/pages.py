@@ -95,6 +95,8 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             ranking=found,
             answer=answered,
             picture=judged.picture(lower_bound),
+            drawn=judged.random_sessions(lower_bound),
+            minutes=found.horizon_steps * participant.current_settings.period_s / 60,
             held=held_out.of_evaluation(judged.evaluation),
             plainly=verdict_wording.plainly,
             amplitude=wording.amplitude,

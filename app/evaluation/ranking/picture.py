@@ -26,7 +26,7 @@ MOST = 8
 TONES = {"test": "good", "test_with_care": "warn", "unsafe": "bad", "not_advised": "bad", "cannot_tell": "accent", "same_as_cdbs": "cdbs"}
 DASHES = ("", "8 4", "2 4", "10 3 2 3")
 """Of candidates with one colour, so that colour is never the only sign."""
-SHAPES = ("circle", "diamond", "square")
+SHAPES = ("circle", "diamond", "square", "up", "down")
 _PANELS = {
     "energy": ("Energy, % of cDBS", 100.0),
     "grasp_hz": ("Grasp, Hz", 1.0),

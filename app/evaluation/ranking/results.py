@@ -1,10 +1,11 @@
-"""Sessions that policies drove, read as a snapshot's settings read them, and what they returned."""
+"""Sessions that policies drove, read as a snapshot's settings read them, and what they returned; what random sessions have been so far."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from statistics import fmean, median
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -24,9 +25,13 @@ from app.study.models import Controller, Participant, SettingsVersion, StudySess
 from app.study.sessions.repository import ReadOnce
 from app.study.threshold import mdp_settings
 from app.study.traces import TracesOf, laid_out, traces_of
+from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
 from ml.mdp import MdpSettings
 from ml.ope.posterior.tested import TestSession, differences_to_cdbs
 from ml.trajectories import SessionTrajectory
+
+WORST = {"grasp_hz": min, "rating": min, "tremor_percent": max}
+"""The outcomes of a session, each with what makes the worst of several."""
 
 
 @dataclass(frozen=True)
@@ -146,3 +151,70 @@ def _read(session: StudySession, traces: TracesOf, arm: Arm, version: SettingsVe
     if not isinstance(read, str) and trace is not None and (trace.unit, trace.source) != (snapshot.beta_unit, snapshot.beta_source):
         return f"its beta is in {trace.unit} from {trace.source}, the estimates are in {snapshot.beta_unit} from {snapshot.beta_source}"
     return read
+
+
+@dataclass(frozen=True)
+class RandomSessions:
+    """Random sessions that count and that the reader may know of.
+
+    Attributes:
+        sessions, visits: how many, at how many visits. minutes: median length.
+        lowest, highest: B and the amplitude of cDBS, in `unit`. low: only the last `low_minutes` of a session may lie below it.
+        hold_s: shortest and longest time for which an amplitude is held, s.
+        differences: random less cDBS of the same visit, averaged over visits with both, by outcome. worst: of a single session, by outcome.
+    """
+
+    sessions: int
+    visits: int
+    minutes: float
+    lowest: float
+    low: float
+    highest: float
+    unit: str
+    hold_s: tuple[float, float]
+    low_minutes: float
+    differences: Mapping[str, float]
+    worst: Mapping[str, float]
+
+
+def random_sessions(rows: Sequence[StudySession], caller: Caller, lower_bound: float, cdbs_ma: float | None) -> RandomSessions | None:
+    """What random sessions have been so far; None without any.
+
+    Args:
+        rows: confirmed sessions. caller: decides which arms may be known. lower_bound: B, fraction of cDBS. cdbs_ma: where it is known, mA.
+    """
+    by_visit: defaultdict[int, dict[Controller, list[StudySession]]] = defaultdict(lambda: defaultdict(list))
+    for s in blinding.unsealed(rows):
+        arm = blinding.visible_arm(s, caller)
+        if arm is not None and s.excluded_reason is None:
+            by_visit[s.visit_id][arm.controller].append(s)
+    drawn = [s for arms in by_visit.values() for s in arms[Controller.RANDOM]]
+    if not drawn:
+        return None
+    factor, unit = (100.0, "% of cDBS") if cdbs_ma is None else (cdbs_ma, "mA")
+    differences, worst = {}, {}
+    for name, worse in WORST.items():
+        pairs = [(_values(arms[Controller.RANDOM], name), _values(arms[Controller.CDBS], name)) for arms in by_visit.values()]
+        apart = [fmean(ours) - fmean(theirs) for ours, theirs in pairs if ours and theirs]
+        if apart:
+            differences[name] = fmean(apart)
+        if values := _values(drawn, name):
+            worst[name] = worse(values)
+    return RandomSessions(
+        sessions=len(drawn),
+        visits=len({s.visit_id for s in drawn}),
+        minutes=median(s.duration_s for s in drawn) / 60,
+        lowest=factor * lower_bound,
+        low=factor * LOW_AMPLITUDE,
+        highest=factor,
+        unit=unit,
+        hold_s=HOLD_SECONDS,
+        low_minutes=LOW_SECONDS / 60,
+        differences=differences,
+        worst=worst,
+    )
+
+
+def _values(sessions: Sequence[StudySession], name: str) -> list[float]:
+    known = [getattr(s.qoc, name) for s in sessions if s.qoc is not None]
+    return [float(v) for v in known if v is not None]

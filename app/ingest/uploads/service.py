@@ -327,7 +327,7 @@ def attach_grasps(db: Session, file: UploadFile, session: StudySession) -> list[
     if file.kind != GRASP_KIND or file.status != "decoded" or file.stored_sha256 is None:
         raise Invalid(f"File {file.id} is no decoded grasp test.", "Choose a grasp file that waits for its session.")
     if file.session_id is not None and file.session_id != session.id:
-        raise Conflict(f"File {file.id} belongs to session {file.session_id} already.", "Correct the QoCs of the session by hand instead.")
+        raise Conflict(f"File {file.id} belongs to session {file.session_id} already.", "Correct the session's outcomes by hand.")
     try:
         decoded = reading.decode(files.path_of(file.stored_sha256), file.kind, DecodeOptions(), file.name)
     except UndecodableFile as error:

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from app.platform.web.charts import ACCENT, Chart, axis, figure
 
 CURVES = {
-    "mean_q": ("Mean Q of the policy", "reward; an unbounded climb is over-estimation"),
-    "action_distance": ("Distance from the logged amplitudes", "mean absolute difference, fraction"),
+    "mean_q": ("Promised return of the policy", "reward; an unbounded climb is over-estimation"),
+    "action_distance": ("Distance from the recorded amplitudes", "mean absolute difference, fraction of cDBS"),
     "saturated": ("States answered with next to 0 or 1", "share; at 1 the policy is cDBS or no DBS by another name"),
     "critic_loss": ("Critic loss", "mean squared temporal-difference error, reward squared"),
     "loss": ("Distillation loss", "mean squared difference from the teacher, fraction squared"),

@@ -101,7 +101,7 @@ def _amplitude_chart(buffer: ReplayBuffer) -> Chart:
     ]
     return Chart(
         id="amplitudes",
-        title="Logged amplitudes",
+        title="Recorded amplitudes",
         subtitle=f"amplitude fraction of the cDBS amplitude · n = {actions.size} usable steps",
         figure=figure(data, xaxis=axis("Amplitude", "fraction", range=[-0.02, 1.02]), yaxis=axis("Steps"), bargap=0.05),
         columns=["From (fraction)", "To (fraction)", "Steps"],

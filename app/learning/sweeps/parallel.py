@@ -108,14 +108,14 @@ def _axes(candidates: Sequence[Candidate]) -> list[Axis]:
     configs = [c.policy.config for c in candidates]
     return [
         _named("Algorithm", [ALGORITHM_NAMES.get(c.policy.algorithm, c.policy.algorithm) for c in candidates]),
-        _named("Aim", [{"steps": "steps", "return": "with r_end"}.get(str(g.get("aim", "steps")), "other") for g in configs]),
-        _named("Held near", [held_near(g) or "nothing" for g in configs]),
+        _named("Aim", [{"steps": "steps", "return": "with end reward"}.get(str(g.get("aim", "steps")), "other") for g in configs]),
+        _named("Held near", ["recorded" if (near := held_near(g)) == "logged" else near or "nothing" for g in configs]),
         _number("Learning rate", [c.rate for c in candidates], logarithmic=True),
-        _number("Critic's rate", [g.get("critic_lr") for g in configs], logarithmic=True),
+        _number("Rate of the values", [g.get("critic_lr") for g in configs], logarithmic=True),
         _number("Updates", [g.get("updates") for g in configs], logarithmic=True),
         _number("Kept update", [c.best_update for c in candidates]),
         _number("Mean amplitude", [c.mean_amplitude for c in candidates], always=True),
-        _number("From logged", [c.action_distance for c in candidates]),
+        _number("From recorded", [c.action_distance for c in candidates]),
         _number("Held-out return", [c.score for c in candidates], always=True),
         _number("Gain over cDBS", [c.gain.value if c.gain else None for c in candidates], always=True),
     ]

@@ -63,7 +63,7 @@ def _predicted(line: PlanLine) -> str:
     e = line.estimate
     if e is None:
         return ""
-    told = [] if line.predicted_energy is None else [f"energy {line.predicted_energy:.2f} of cDBS"]
+    told = [] if line.predicted_energy is None else [f"energy {100 * line.predicted_energy:.0f} % of cDBS"]
     units = (("grasp_hz", "grasp {:.2f} Hz"), ("rating", "rating {:.1f}"), ("tremor_percent", "tremor {:.0f} %"))
     told += [words.format(e.predicted[name]) for name, words in units if name in e.predicted]
     return ", ".join([*told, f"return {e.value:.4g} ({e.low:.4g} to {e.high:.4g})" + ("" if e.supported else " *")])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -108,6 +109,40 @@ def horizontal(
         "font": {"color": colour_token, "size": 12},
     }  # fmt: skip
     return line, label
+
+
+# dots of single sessions: as many sessions are as many dots, also where their values are equal
+def side_by_side(values: Sequence[float], close: float, half: float, step: float) -> list[float]:
+    """Sideways offsets of the dots of one box: those of about one height stand beside each other, evenly about its middle.
+
+    Args:
+        values: their heights. close: heights that are no further apart would hide each other; in the unit of the values.
+        half: the furthest offset. step: between neighbours, where there is room.
+    """
+    rows: list[list[int]] = []
+    for i in sorted(range(len(values)), key=lambda i: (values[i], i)):
+        if rows and values[i] - values[rows[-1][0]] <= close:
+            rows[-1].append(i)
+        else:
+            rows.append([i])
+    places = [0.0] * len(values)
+    for row in rows:
+        apart = min(step, 2 * half / max(1, len(row) - 1))
+        for k, i in enumerate(row):
+            places[i] = apart * (k - (len(row) - 1) / 2)
+    return places
+
+
+def apart_where_equal(points: Sequence[tuple[float, float]], step: float) -> list[float]:
+    """Horizontal places of points of a plane: equal ones stand `step` from each other about their own place, all others where they are."""
+    same: defaultdict[tuple[float, float], list[int]] = defaultdict(list)
+    for i, point in enumerate(points):
+        same[point].append(i)
+    places = [x for x, _ in points]
+    for members in same.values():
+        for k, i in enumerate(members):
+            places[i] += step * (k - (len(members) - 1) / 2)
+    return places
 
 
 def written(text: str) -> str:

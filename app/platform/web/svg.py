@@ -120,13 +120,16 @@ class Plane:
         self.mark(self.at_x(x), self.at_y(y), colour, shape, words)
 
     def mark(self, px: float, py: float, colour: str, shape: str = "circle", words: str = "") -> None:
-        """A mark at a place of the figure; `shape` is circle, square, diamond or ring. `words` are its tooltip."""
+        """A mark at a place of the figure; `shape` is circle, square, diamond, up, down or ring. `words` are its tooltip."""
         paint = token(colour)
         title = f"<title>{escape(words)}</title>" if words else ""
         if shape == "square":
             self.parts.append(f'<rect x="{px - 4.5:.1f}" y="{py - 4.5:.1f}" width="9" height="9" fill="{paint}">{title}</rect>')
         elif shape == "diamond":
             self.parts.append(f'<path d="M{px:.1f} {py - 6:.1f}l6 6l-6 6l-6 -6z" fill="{paint}">{title}</path>')
+        elif shape in ("up", "down"):
+            way = 1 if shape == "up" else -1
+            self.parts.append(f'<path d="M{px:.1f} {py - 6 * way:.1f}l6 {10 * way}h-12z" fill="{paint}">{title}</path>')
         else:
             fill = token("surface") if shape == "ring" else paint
             self.parts.append(

@@ -143,9 +143,9 @@ def derive_for_session(db: Session, session: StudySession) -> list[str]:
     """
     found = outcome_values.derive(db, session)
     if session.status != "confirmed":
-        return [f"Session {session.id} is proposed: its QoCs are derived when it is confirmed."] if found else []
+        return [f"Session {session.id} is proposed: its outcomes are derived when it is confirmed."] if found else []
     if session.visit.locked:
-        return [f"Session {session.id}: visit {session.visit.number} is locked, so that its QoCs stay as they are."] if found else []
+        return [f"Session {session.id}: visit {session.visit.number} is locked, so that its outcomes stay as they are."] if found else []
     repository.lock_session(db, session)
     free = {d.name: d for d in found if person_behind(session, d.name) is None}
     known = session.qoc

@@ -50,7 +50,7 @@ GROUPS = (
         "Beta and stimulation",
         (
             SettingField(
-                "xi_beta", "Beta threshold ξβ",
+                "xi_beta", "Beta threshold",
                 "Below it a step earns r_a, at or above it r_b. In the unit of the beta trace. No default: jobs do not start without it.",
             ),
             SettingField(

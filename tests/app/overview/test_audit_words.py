@@ -33,7 +33,7 @@ SESSION = {"id": 7, "visit_id": 4, "ordinal": 3, "status": "confirmed", "exclude
         (event("session", SESSION | {"status": "proposed"}, SESSION), "confirmed session 3 of visit 2 of P1"),
         (event("session", SESSION, SESSION | {"excluded_reason": "fell asleep"}), "excluded session 3 of visit 2 of P1"),
         (event("session", SESSION | {"excluded_reason": "x"}, SESSION), "included session 3 of visit 2 of P1 again"),
-        (event("qoc", None, {"session_id": 7, "revision": 2}), "corrected the QoCs of session 3 of visit 2 of P1"),
+        (event("qoc", None, {"session_id": 7, "revision": 2}), "corrected the outcomes of session 3 of visit 2 of P1"),
         (event("visit_lock", None, {"visit_id": 4, "locked": False}), "unlocked visit 2 of P1"),
         (event("bundle_release", None, {"policy_id": 5}), "took the bundle of policy rl-01 of P1"),
         (event("settings_version", None, {"participant_id": 1, "version": 2}), "changed the settings of P1 (version 2)"),

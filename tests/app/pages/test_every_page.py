@@ -9,8 +9,11 @@ from fastapi.testclient import TestClient
 from app.settings import get_settings
 from tests.app.every_route import PASSWORD, World
 from tests.app.pages.every_page import ELSEWHERE, addresses, routes
+from tests.app.words import above_fold, methods_named
 
 MOST_BYTES = 60_000
+METHODS_EXPLAINED = {"/glossary": "says what the words of the folds mean"}
+"""Pages that are about these words."""
 
 
 def test_every_address_of_a_browser_answers_and_every_page_is_small(world: World) -> None:
@@ -34,3 +37,22 @@ def test_every_address_of_a_browser_answers_and_every_page_is_small(world: World
     assert refused == {}, "give the page a row to show in every_page.py"
     assert large == {}
     assert pages >= 50
+
+
+def test_no_page_meets_its_reader_with_words_of_the_methods_and_energy_has_one_unit(world: World) -> None:
+    reader = TestClient(world.app, headers={"Accept": "text/html"}, follow_redirects=False)
+    assert reader.post("/sign-in", data={"email": "admin@clinic.example", "password": PASSWORD}).status_code == 303
+    found: dict[str, list[str]] = {}
+    shares = []
+    for route, path in addresses(world).items():
+        with reader.stream("get", path) as answer:
+            if answer.status_code != 200 or not answer.headers["content-type"].startswith("text/html"):
+                continue
+            page = answer.read().decode()
+        found[route] = methods_named(above_fold(page))
+        # the REST interface keeps shares of the energy under cDBS, and its reference says so
+        told = "cDBS = 1" in page or "share of cDBS" in page
+        shares += [route] if told and route != "/api-reference" else []
+    assert len(found) >= 50
+    assert {route for route, words in found.items() if words} == set(METHODS_EXPLAINED), {r: w for r, w in found.items() if w}
+    assert shares == [], "energy is told in % of cDBS"

@@ -38,7 +38,7 @@ def test_both_readings_and_the_unknown_minutes_of_a_watch_stand_on_the_session_p
     assert "Tremor by minute" in page
     assert "n = 2 minutes, 1.3 of 1.3 min of the session covered, 0.1 min unknown" in page
     assert re.search(r"Weighted by duration</dt><dd><b>25", page)
-    assert "counts as the QoC" in page
+    assert "counts as the session's outcome" in page
     assert client.get(f"/api/v1/sessions/{timed_session}/qoc").json()["tremor_percent"] == pytest.approx(25.0)
     [told] = client.get(f"/api/v1/sessions/{timed_session}/outcomes").json()
     assert (told["name"], told["value"], told["conflicts"]) == ("tremor_percent", pytest.approx(25.0), False)
@@ -54,7 +54,7 @@ def test_a_typed_value_and_a_derived_one_are_both_shown_and_one_click_takes_the_
     assert "Tremor: two values" in page
     assert "<b>5.00 %</b>" in page
     assert "Use 25.00 % from the files" in page
-    assert "not the QoC: a person's entry counts" in page
+    assert "does not count: a person's entry does" in page
     visit = client.get(f"/api/v1/sessions/{timed_session}").json()["visit_id"]
     assert "two values of tremor" in browser.get(f"/visits/{visit}").text
     tab = Tab(browser, f"/sessions/{timed_session}", f"/sessions/{timed_session}/derived")

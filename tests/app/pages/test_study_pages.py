@@ -39,8 +39,8 @@ def test_what_does_not_exist_is_a_page_and_not_json(browser: TestClient) -> None
 def test_the_overview_names_what_needs_attention(browser: TestClient, client: TestClient, session_id: int) -> None:
     client.post("/api/v1/participants", json={"code": "E9"})
     page = browser.get("/").text
-    assert "Beta threshold ξβ is not set; jobs cannot start" in page
-    assert "1 session without QoCs" in page
+    assert "Beta threshold is not set; jobs cannot start" in page
+    assert "1 session without outcomes" in page
     assert "n = 2" in page
 
 

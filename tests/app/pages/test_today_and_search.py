@@ -28,7 +28,7 @@ def test_the_next_visit_waits_for_what_others_wait_for_and_says_who_acts(
     client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": day.isoformat()})
     page = browser.get("/").text
     row = next(r for r in re.findall(r"<tr>.*?</tr>", page, re.S) if day.isoformat() in r)
-    assert "1 session without QoCs" in row
+    assert "1 session without outcomes" in row
     assert "in 3 days" in row
     assert "Clinician" in row
     client.put(f"/api/v1/sessions/{session_id}/qoc", json={"grasp_hz": 2.0, "rating": 7, "tremor_percent": 10.0})

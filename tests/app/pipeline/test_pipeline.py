@@ -164,7 +164,7 @@ def test_the_pipeline_walks_from_sessions_to_a_ranking(client: TestClient, sessi
     page = client.get(f"/jobs/{job}").text
     for text in ("Training: mean Q of each policy", "DLSM: score on held-out sessions", "Run again"):
         assert text in page
-    assert "Mean Q of the policy" in client.get(f"/participants/P1/policies/{min(policies)}").text
+    assert "Promised return of the policy" in client.get(f"/participants/P1/policies/{min(policies)}").text
 
     # the same job again, on the same snapshot and seed, gives the same weights
     again = ended(client.post(f"/api/v1/jobs/{job}/retry").json()["id"], 400)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import csv
 import html
 import io
+import itertools
+import json
+import math
 import re
 from collections.abc import Callable
 from typing import Any
@@ -80,6 +83,19 @@ def test_the_figure_is_an_svg_with_every_session(client: TestClient, four: dict[
         points = root.findall(".//{http://www.w3.org/2000/svg}circle")
         participants = 1 if "P1" in path else 4
         assert len(points) == participants * 12 * 4  # four metrics were measured: energy, beta, grasp and rating
+
+
+def test_sessions_with_equal_values_are_as_many_dots(client: TestClient, add_session: Callable[..., int]) -> None:
+    for _ in range(6):
+        add_session("cdbs", fraction=1.0, grasp=2.0, rating=7)
+    root = ElementTree.fromstring(client.get("/participants/P1/analyses/paper.svg").text)
+    points = [(float(c.get("cx", "")), float(c.get("cy", ""))) for c in root.iter("{http://www.w3.org/2000/svg}circle")]
+    assert len(points) >= 18
+    assert min(math.dist(a, b) for a, b in itertools.combinations(points, 2)) >= 4.0, "px; a dot is 4.8 wide"
+    charts = json.loads(client.get("/analyses/figure?metric=rating").text)
+    dots = next(t for t in charts["data"] if t["type"] == "scatter")
+    assert len(set(dots["x"])) == 6
+    assert client.get("/participants/P1/analyses/paper").text.count("% of cDBS") >= 2, "energy is told as on every page"
 
 
 def test_the_table_has_every_comparison(client: TestClient, four: dict[str, float]) -> None:

@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 from fastapi.testclient import TestClient
 
+from app.evaluation.ranking.picture import SHAPES
+from app.platform.web.svg import Plane
 from ml.ope.support.behaviour_map import COLUMNS, DOSES, BehaviourMap, Curve
 from tests.app.evaluations import judged
 
@@ -33,6 +35,14 @@ def test_lines_limits_and_doses_are_in_milliamperes_with_their_tables(
     assert re.search(r'<td>p0</td><td class="num">1\.20?</td>', page), "0.4 of 3 mA"
     assert re.search(r'<td class="num">7</td><td class="num">1\.20?</td>', page)
     assert "evaluate again to see it" not in page
+
+
+def test_candidates_of_one_verdict_have_shapes_of_their_own() -> None:
+    assert len(set(SHAPES)) == len(SHAPES) >= 5
+    plane = Plane(0, 0, 100, 100, (0.0, 1.0), (0.0, 1.0))
+    for shape in SHAPES:
+        plane.mark(10, 10, "accent", shape)
+    assert len(set(plane.parts)) == len(SHAPES)
 
 
 def test_a_ranking_of_before_says_how_to_get_the_figure(client: TestClient, policies: list[int], judge: Callable[..., int]) -> None:

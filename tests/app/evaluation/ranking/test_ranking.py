@@ -114,7 +114,7 @@ def test_another_method_can_rank(client: TestClient, policies: list[int], evalua
     ("change", "reason"),
     [
         (lambda c, u: u("random", visit=1), "1 session newer: visit 1"),
-        (lambda c, u: c.put("/api/v1/sessions/1/qoc", json={"rating": 2}), "1 session with corrected QoCs"),
+        (lambda c, u: c.put("/api/v1/sessions/1/qoc", json={"rating": 2}), "1 session with corrected outcomes"),
         (lambda c, u: c.patch("/api/v1/sessions/1", json={"excluded_reason": "tablet froze"}), "1 session newly left out"),
         (lambda c, u: c.put("/api/v1/participants/P1/settings", json={"settings": {"c1": 0.5}}), "settings version 2 is in force"),
         (lambda c, u: c.put("/api/v1/participants/P1/settings", json={"settings": {"xi_beta": None}}), "no beta threshold"),
@@ -125,7 +125,7 @@ def test_another_method_can_rank(client: TestClient, policies: list[int], evalua
             "1 policy not in it: late",
         ),
     ],
-    ids=["new session", "corrected QoC", "excluded session", "new settings", "threshold gone", "new policy"],
+    ids=["new session", "corrected outcome", "excluded session", "new settings", "threshold gone", "new policy"],
 )
 def test_whatever_changes_since_makes_the_ranking_stale_and_is_named(
     client: TestClient,

@@ -112,10 +112,11 @@ def test_the_first_screen_says_what_to_test_why_and_at_what_risk_without_a_word_
     judge({a: judged(50.0, outcome_draws=likely), b: judged(60.0, **NEARLY_OFF), c: judged(70.0, supported=False)})
     words = first_screen(client)
     assert (
-        "Worth a test: p0 : energy \N{MINUS SIGN}29 %, grasp \N{MINUS SIGN}0.2 Hz, rating 0.0 points, tremor +4 points; "
+        "minutes each: p0 : energy \N{MINUS SIGN}29 %, grasp \N{MINUS SIGN}0.2 Hz, rating 0.0 points, tremor +4 points; "
         "85 % likely within the margins." in words
     )
-    assert "Worth a test with care, one of them at a visit: p2 , not below 1.5 mA" in words
+    assert re.search(r"Worth a test, \d+ minutes each:", words)
+    assert re.search(r"Worth a test with care, \d+ minutes, one of them at a visit: p2 , not below 1.5 mA", words)
     assert "Not advised: p1 : unsafe, nearly off 42 % of the time" in words
     assert methods_named(words) == []
 
@@ -184,6 +185,34 @@ def test_every_policy_that_as_few_sessions_would_tell_is_named(client: TestClien
     assert found["p0"]["sessions_needed"] == found["p1"]["sessions_needed"], "the same number would tell of both"
     named = re.findall(r"would tell whether (p\d) is worth it: energy", first_screen(client))
     assert named == ["p1", "p0"]
+
+
+def test_further_sessions_are_asked_for_what_would_save_most(client: TestClient, policies: list[int], judge: Judge) -> None:
+    noise = {"coverage": {"policies": {}, "session_noise": {"tremor_percent": 4.0}}}
+    tremor, support = [10.0 + 0.03 * i for i in range(N)], {"dose": 0.6}
+    saving = {policies[0]: 0.9, policies[1]: 0.7, policies[2]: 0.99}
+    draws = {i: {"tremor_percent": tremor, "energy": [left] * N} for i, left in saving.items()}
+    judge({i: judged(50.0, outcome_draws=of, support=support) for i, of in draws.items()}, **noise)
+    named = re.findall(r"would tell whether (p\d) is worth it: energy", first_screen(client))
+    assert named == ["p1", "p0"], "p2 would save 1 % of the energy: nobody needs to know of it"
+
+
+def test_where_nothing_is_worth_a_test_the_page_says_what_a_random_session_asks_of_the_patient(
+    client: TestClient, policies: list[int], judge: Judge
+) -> None:
+    outcomes = {1: (2.0, 6, 20.0), 2: (1.4, 4, 35.0), 3: (2.2, 7, 10.0), 4: (2.0, 6, 15.0)}
+    for number, (grasp, rating, tremor) in outcomes.items():
+        given = {"grasp_hz": grasp, "rating": rating, "tremor_percent": tremor, "reason": "read again"}
+        assert client.put(f"/api/v1/sessions/{number}/qoc", json=given).status_code == 200
+    judge({policies[0]: judged(50.0, told=False)}, cdbs(told=False).to_json())
+    words = first_screen(client)
+    minus = "\N{MINUS SIGN}"
+    assert "the amplitude changes every 10 to 60 s, between 0.9 and 3.0 mA, below 1.8 mA for the last 5 minutes at most" in words
+    # sessions 1, 2 and 4 were random, 3 was cDBS: 1.8 less 2.2 Hz, 5.3 less 7, 23.3 less 10 %
+    assert f"The 3 so far, against cDBS of the same day: grasp {minus}0.4 Hz, rating {minus}1.7 points, tremor +13 points" in words
+    assert "at worst grasp 1.4 Hz, rating 4 of 10, tremor 35 % of the time" in words
+    judge({policies[0]: judged(50.0)})
+    assert "asks of the patient" not in first_screen(client), "something is worth a test"
 
 
 def test_how_many_sessions_near_which_amplitude_would_tell_is_said(client: TestClient, policies: list[int], judge: Judge) -> None:

@@ -239,7 +239,7 @@ def test_each_policy_is_a_line_from_its_hyper_parameters_to_its_standing(store: 
     found = parallel.parallel(candidates(db.get_one(Sweep, sweep.id)), wording.STANDINGS)
     assert found is not None
     assert found.columns[1] == "Learning rate"
-    assert "Critic's rate" not in found.columns  # all are alike
+    assert "Rate of the values" not in found.columns  # all are alike
     assert [(row[0], row[1], row[-1]) for row in found.rows] == [
         ("rl-0", 1e-5, "estimated above cDBS"),
         ("rl-1", 1e-4, "not above cDBS with confidence"),

@@ -95,7 +95,7 @@ def test_new_data_make_the_ranking_behind_a_plan_stale(client: TestClient, studi
     client.put(f"/api/v1/sessions/{session}/qoc", json={"rating": 3, "reason": "misread"})
     plan = client.get(_path(studied.visit)).json()
     assert plan["stale"] is True
-    assert [w["text"] for w in plan["warnings"]] == ["The ranking is out of date: 1 session with corrected QoCs."]
+    assert [w["text"] for w in plan["warnings"]] == ["The ranking is out of date: 1 session with corrected outcomes."]
     assert next(s for s in plan["sessions"] if s["policy_id"] == studied.policies[0])["estimate"]["value"] == 95.0
 
 

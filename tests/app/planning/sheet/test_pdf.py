@@ -39,7 +39,7 @@ def test_a_draft_says_so_and_holds_everything_that_the_clinic_needs(client: Test
         "Note: left hand only",
         "rl-01-small",
         "95 (93 to 96.5)",
-        "energy 0.40 of cDBS",
+        "energy 40 % of cDBS",
         "Limits",
         "Bundle not taken yet",
         "Started",
@@ -127,7 +127,7 @@ def test_a_blinded_sheet_has_letters_and_common_limits_and_predicts_nothing(clie
     assert "Session A" in text
     assert text.count("Limits") == text.count("Started hh:mm")
     assert "Stop rules" in text
-    for words in ("Predicted", "Policy", "Bundle 1", "not taken yet", "rl-01-small", "energy 0.40"):
+    for words in ("Predicted", "Policy", "Bundle 1", "not taken yet", "rl-01-small", "energy 40 %"):
         assert words not in text, words
 
 

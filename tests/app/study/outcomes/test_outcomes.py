@@ -170,7 +170,7 @@ def test_a_proposed_session_gets_its_qocs_when_it_is_confirmed(db: Session, stud
     store(db, study_session, new_file(study_session), HALF_MILD)
     assert study_session.qoc is None
     assert outcomes.derive_for_session(db, study_session) == [
-        f"Session {study_session.id} is proposed: its QoCs are derived when it is confirmed."
+        f"Session {study_session.id} is proposed: its outcomes are derived when it is confirmed."
     ]
     study_session.status = "confirmed"
     db.flush()
