@@ -104,7 +104,7 @@ def test_the_page_the_sheet_and_the_bundle_name_what_is_held(client: TestClient,
     answer = client.post(f"/visits/{number}/plan", data=form, follow_redirects=False)
     assert answer.status_code == 303, answer.text
     words = " ".join(re.sub(r"<[^>]+>", " ", client.get(f"/visits/{number}/plan").text).split())
-    assert "held near 1.5 mA (0.50 of cDBS)" in words
+    assert words.count("Random held near 1.5 mA (0.50 of cDBS)") == 2, "no row of the table counts them as random sessions of the design"
     assert "Random and held sessions" in words
     assert "back to cDBS at once" in words
     assert client.get(f"/api/v1/visits/{number}/plan.pdf").content[:4] == b"%PDF"
