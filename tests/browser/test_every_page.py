@@ -13,7 +13,7 @@ from app.settings import get_settings
 from tests import identity_provider
 from tests.app.conftest import full_study as full_study
 from tests.app.conftest import world as world
-from tests.app.every_route import PASSWORD, World, token_of
+from tests.app.every_route import PASSWORD, TABLE, World, token_of
 from tests.app.pages.every_page import addresses
 from tests.browser import tour
 from tests.browser.conftest import Watched, serving, windows
@@ -97,6 +97,25 @@ def test_every_page_keeps_to_every_rule_and_to_its_place(window: Callable, world
     assert seen >= 50
     assert watched.errors == []
     assert watched.foreign == []
+
+
+@WINDOWS
+def test_pages_of_a_sealed_plan_keep_to_every_rule_and_name_no_controller(
+    window: Callable[..., Watched], world: World, axe: Any, width: int, scheme: str
+) -> None:
+    visit = world.ids_of("post", "/api/v1/visits/{visit_id}/plan/key")["visit_id"]
+    number = next(v["number"] for v in world.read("/participants/P2/visits")["items"] if v["id"] == visit)
+    stated = {"participant": "P2", "visit": str(number), "controller": "cdbs"}
+    session = world.send("/uploads", data=stated, files={"file": ("s.csv", TABLE.replace(b"8,1,1", b"8,1.3,1", 1))})["sessions"][0]["id"]
+    watched = window(width, 900, scheme)
+    watched.sign_in(password=PASSWORD)
+    found = []
+    for name, path in (("visit", f"/visits/{visit}"), ("plan", f"/visits/{visit}/plan"), ("session", f"/sessions/{session}")):
+        watched.open(path)
+        assert "sealed" in watched.page.inner_text("main"), name
+        found += broken(axe, watched, name)
+    assert "cDBS" not in watched.page.inner_text("main h1")
+    assert "\n".join(found) == ""
 
 
 @WINDOWS
