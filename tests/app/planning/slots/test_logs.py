@@ -77,17 +77,18 @@ def test_logs_fill_the_slots_that_they_name_whatever_else_would_explain_them(cli
     assert [p for p, confirmed in held.items() if confirmed] == [between, last]
 
 
-def test_the_draws_of_a_random_session_are_those_of_its_log(client: TestClient, studied: Any, planned: Plan) -> None:
+@pytest.mark.parametrize("design", ["stratified", "near"])
+def test_the_draws_of_a_random_session_are_those_of_its_log(client: TestClient, studied: Any, planned: Plan, design: str) -> None:
     position = next(i.position for i in planned.items if i.controller == "random")
     holds = [(0, 60, 0.9, -0.25), (60, 90, 0.7, 0.5)]
     timed = {"n": 200, "mean": 217.0, "std": 33.0, "median": 200.0, "p99": 300.0}
-    log = log_of(planned, position, 20, holds=holds, design="stratified", level=0.8, seed=99, lower_bound=0.45, latency_us=timed)
+    log = log_of(planned, position, 20, holds=holds, design=design, level=0.8, seed=99, lower_bound=0.45, latency_us=timed)
     send(client, log)
     done = client.post(f"/api/v1/visits/{studied.visit}/slots/confirm", json={})
     assert done.status_code == 200, done.text
     session = next(r["session_id"] for r in done.json()["comparison"]["rows"] if r["position"] == position)
     found = client.get(f"/api/v1/sessions/{session}/conditions").json()
-    assert (found["design"], found["seed"], found["lower_bound"], found["origin"]) == ("stratified", 99, 0.45, "stated")
+    assert (found["design"], found["seed"], found["lower_bound"], found["origin"]) == (design, 99, 0.45, "stated")
     kept = found["design_parameters"]
     assert kept["level"] == 0.8
     assert [(h["start"], h["steps"], h["amplitude"], h["log_density"]) for h in kept["holds"]][:2] == [tuple(h) for h in holds]
