@@ -198,7 +198,7 @@ PROMISES = [
          ".where(Participant.code == code)", f"{ROUTES}::test_a_caller_of_another_study_sees_nothing"),
         ("visits of another study look as if they did not exist", ".where(Visit.id == visit_id, in_scope(caller))",
          ".where(Visit.id == visit_id)",
-         f"{PAGES}::test_an_administrator_of_another_study_or_site_sees_and_changes_nothing"),
+         f"{ROUTES}::test_a_caller_of_another_study_sees_nothing"),
     ),
     *_of(
         "study/service",

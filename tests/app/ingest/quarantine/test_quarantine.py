@@ -127,8 +127,15 @@ def test_bytes_that_were_read_meanwhile_are_not_read_twice(send: Any, client: Te
 
 def test_tampered_bytes_are_refused_in_words(held: dict[str, Any], client: TestClient) -> None:
     path = files.path_of(held["stored_sha256"])
-    path.write_bytes(path.read_bytes()[:-40])
+    sealed = path.read_bytes()
+    path.write_bytes(sealed[:-40])
     assert decide(client, held, "review").status_code == 409
+    # each part opens with the installation's key; together they are not what came
+    for exchanged in (b"", sealed + sealed):
+        path.write_bytes(exchanged)
+        assert decide(client, held, "review").status_code == 409
+    path.write_bytes(sealed)
+    assert decide(client, held, "review").status_code == 200
     path.unlink()
     assert "missing or damaged" in decide(client, held, "review").json()["detail"]
 

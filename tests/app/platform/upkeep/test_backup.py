@@ -101,7 +101,13 @@ def test_a_backup_comes_back_in_a_new_data_folder(place: Path, filled: dict[str,
     assert "holds data already" in again.stderr
 
 
-def test_a_backup_comes_back_in_another_postgresql(place: Path, filled: dict[str, int], server: EmbeddedPostgres) -> None:
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_backup_comes_back_in_another_postgresql(place: Path, filled: dict[str, int], server: EmbeddedPostgres, damaged: bool) -> None:
+    """Also one that was made around a damaged file, which is named; every other row and file comes back."""
+    with transaction("test") as db:
+        first = db.connection().exec_driver_sql("select sha256 from stored_file order by sha256 limit 1").scalar_one()
+    if damaged:
+        path_of(first).write_bytes(b"other bytes")
     folder, key = made(place)
     with psycopg.connect(server.admin_conninfo(), autocommit=True) as connection:
         connection.execute("drop database if exists restored with (force)")
@@ -113,6 +119,8 @@ def test_a_backup_comes_back_in_another_postgresql(place: Path, filled: dict[str
         done = betaloop(new, "restore", str(folder), "--key-file", str(key), "--json", database_url=url)
         assert done.returncode == 0, done.stderr
         assert json.loads(done.stdout)["rows"] == filled
+        assert json.loads(done.stdout)["damaged"] == ([first] if damaged else [])
+        assert json.loads(done.stdout)["files"] == filled["stored_file"] - damaged
         assert not (new / "postgres").exists()
     finally:
         with psycopg.connect(server.admin_conninfo(), autocommit=True) as connection:
