@@ -71,7 +71,7 @@ def test_a_refused_form_comes_back_as_it_was_filled_in(client: TestClient, studi
     assert db.scalars(select(Plan)).all() == []
     nothing = _post(client, path, note="x")
     assert nothing.status_code == 422
-    assert "at least one policy or one random session" in nothing.text
+    assert "at least one policy, or one random or held session" in nothing.text
     wrong = _post(client, path, policy_ids=["x"])
     assert wrong.status_code == 422
     spelled = _post(client, path, policy_ids=chosen[:1], washout_minutes="five")
