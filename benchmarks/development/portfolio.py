@@ -3,14 +3,14 @@
     python -m benchmarks.development.portfolio --quick                    two worlds of part A
     python -m benchmarks.development.portfolio --worlds 40 --out FOLDER   40 worlds; resumable
     python -m benchmarks.development.portfolio --part B ...               patients to report on; each run is counted
-    python -m benchmarks.development.portfolio --dlsm ...                 the order of the DLSM too, which costs a minute per world
+    python -m benchmarks.development.portfolio --dlsm ...                 the order of the paper's DLSM too
     python -m benchmarks.development.portfolio --named --worlds 30        whether as many sessions as a verdict names do tell
 
 Every virtual patient has three visits of data by the stratified design. Three more visits test up to four policies each: 60 minutes, two
 cDBS sessions and four others of ten minutes. `portfolio` is what the plan's page suggests: verdicts are respected, and tested sessions move
 the posterior before the next visit. `and held` spends the slots that no policy takes as that page says too: sessions held near the
 amplitudes that would tell soonest, or that explore where the data cannot order policies; with the visit's cDBS sessions they join the data,
-to which everything is fitted anew. `any verdict` is the same choice among all candidates without a hazard. `linear`, `dlsm` and `random`
+to which everything is fitted anew. `any verdict` is the same choice among all candidates without a hazard. `linear`, `dlsm_paper`, `random`
 test the next four of their order. Told after each visit: the true gain over cDBS of the best policy tested so far, as a share of what the
 best candidate gains (`tested`), and of the policy that would be kept by what was seen (`kept`). Nothing is chosen by true returns.
 Patients whose best candidate gains less than two standard errors of the truth are left out. CPU seconds of one thread.
@@ -38,6 +38,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.support.cells import Cells
+from benchmarks.support.figure import Point, draw_curves
 from benchmarks.support.looks import look
 from benchmarks.support.ope_cases import CDBS, STEPS, virtual_case
 from ml.designs import near_session
@@ -292,7 +293,7 @@ def arms(part: Part, index: int, truth_sessions: int, dlsm: bool) -> dict[str, A
         "any verdict": by_posterior(clinic, fitted, respecting=False),
     }
     orders = {"random": list(np.random.default_rng([index, 0x90F]).permutation(list(case.candidates)))}
-    for method in ("linear", *(("dlsm",) if dlsm else ())):
+    for method in ("linear", *(("dlsm_paper",) if dlsm else ())):
         said = estimators(0, demo=True)[method].fit(buffer).evaluate(case.candidates, STEPS)
         orders[method] = sorted(said, key=lambda n: -said[n].value)
     found |= {name: in_order(clinic, order) for name, order in orders.items()}
@@ -309,19 +310,26 @@ def _shares(found: Found, gains: Mapping[str, float], best: float) -> dict[str, 
     }
 
 
-def lines(shares: Mapping[str, list[dict[str, list[float]]]]) -> Iterator[str]:
-    """A table of means with 90 % intervals over patients, one row for each arm and figure."""
-    rng = np.random.default_rng(0)
-    yield f"{'':12} {'':8} {'after visit 1':>24} {'2':>24} {'3':>24} {f'>= {SHARE:g} after 3':>16}\n"
+def curves(shares: Mapping[str, list[dict[str, list[float]]]], figure: str) -> dict[str, list[Point]]:
+    """Means over patients with 90 % intervals after each visit, by arm."""
+    rng, found = np.random.default_rng(0), {}
     for arm, rows in shares.items():
-        for figure in ("tested", "kept"):
-            table = np.array([row[figure] for row in rows])
-            told = []
-            for column in table.T:
-                means = rng.choice(column, (RESAMPLES, column.size)).mean(1)
-                interval = percentile_interval(means, 0.9)
-                told.append(f"{column.mean():.2f} ({interval.low:.2f} to {interval.high:.2f})")
-            yield f"{arm:12} {figure:8} {told[0]:>24} {told[1]:>24} {told[2]:>24} {float(np.mean(table[:, -1] >= SHARE)):16.2f}\n"
+        points = []
+        for column in np.array([row[figure] for row in rows]).T:
+            interval = percentile_interval(rng.choice(column, (RESAMPLES, column.size)).mean(1), 0.9)
+            points.append((float(column.mean()), interval.low, interval.high))
+        found[arm] = points
+    return found
+
+
+def lines(shares: Mapping[str, list[dict[str, list[float]]]]) -> Iterator[str]:
+    """A table of the curves, one row for each arm and figure."""
+    yield f"{'':12} {'':8} {'after visit 1':>24} {'2':>24} {'3':>24} {f'>= {SHARE:g} after 3':>16}\n"
+    for figure in ("tested", "kept"):
+        for arm, points in curves(shares, figure).items():
+            told = "".join(f" {f'{mean:.2f} ({low:.2f} to {high:.2f})':>24}" for mean, low, high in points)
+            most = float(np.mean([row[figure][-1] >= SHARE for row in shares[arm]]))
+            yield f"{arm:12} {figure:8}{told} {most:16.2f}\n"
 
 
 def main() -> None:
@@ -330,9 +338,9 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_WORLDS} worlds, few simulated sessions")
     parser.add_argument("--part", default="A", choices=("A", "B"), help="A to develop on, B to report on")
     parser.add_argument("--worlds", type=int, default=WORLDS_PER_PART)
-    parser.add_argument("--dlsm", action="store_true", help="the order of the DLSM as well")
+    parser.add_argument("--dlsm", action="store_true", help="the order of the paper's DLSM as well")
     parser.add_argument("--minutes", type=float, default=1e9, help="start no further world after so many minutes")
-    parser.add_argument("--out", type=Path, help="folder of the finished worlds; a temporary one by default")
+    parser.add_argument("--out", type=Path, help="folder of the finished worlds and of portfolio.svg; a temporary one by default")
     parser.add_argument("--named", action="store_true", help="whether as many sessions as a verdict names do tell")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
@@ -356,6 +364,10 @@ def main() -> None:
     sys.stdout.writelines(
         [f"{len(rows)} virtual patients, share of the best candidate's true gain over cDBS, 90 % intervals\n", *lines(shares)]
     )
+    titles = {"tested": "Best policy tested so far", "kept": "Policy kept by what was seen"}
+    if rows:
+        panels = {f"{title}, share of the best gain": curves(shares, figure) for figure, title in titles.items()}
+        (out / "portfolio.svg").write_text(draw_curves(panels, "visits with tests"))
     figures = {
         f"{arm}_{figure}".replace(" ", "_"): float(np.mean([r[figure][-1] for r in of]))
         for arm, of in shares.items()

@@ -1,7 +1,9 @@
-"""Bars with error bars as plain SVG: one row per metric, one group per world, one bar per method, like the paper's."""
+"""Figures as plain SVG: bars with error bars (one row per metric, one group per world, one bar per method, like the paper's), and curves
+with intervals over visits (one for each arm)."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -67,4 +69,57 @@ def _panel(
                 parts.append(f'<text x="{middle}" y="{top + 10}" font-size="9" text-anchor="middle" fill="#ffffff">{mean:.0f}</text>')
         if last:
             parts.append(f'<text x="{LEFT + (g + 0.5) * group}" y="{top + PANEL + 18}" text-anchor="middle">{escape(world)}</text>')
+    return parts
+
+
+CURVES, MARGIN, ABOVE, BELOW, HIGH, LEGEND = 300, 60, 46, 50, 260, 170
+Point = tuple[float, float, float]
+"""Mean, and the ends of its interval."""
+
+
+def draw_curves(panels: Mapping[str, Mapping[str, Sequence[Point]]], across: str) -> str:
+    """The figure: title -> arm -> one point per visit, shares from 0 to 1; `across` names the axis below."""
+    arms = list(dict.fromkeys(arm for curves in panels.values() for arm in curves))
+    width = MARGIN + len(panels) * (CURVES + MARGIN) + LEGEND
+    height = ABOVE + HIGH + BELOW
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
+        'font-family="sans-serif" font-size="12">',
+        f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
+    ]
+    for k, (title, curves) in enumerate(panels.items()):
+        parts += _curves_panel(title, curves, arms, MARGIN + k * (CURVES + MARGIN), across)
+    for k, arm in enumerate(arms):
+        y = ABOVE + 18 * k
+        parts.append(f'<rect x="{width - LEGEND}" y="{y}" width="11" height="11" fill="{COLORS[k % len(COLORS)]}"/>')
+        parts.append(f'<text x="{width - LEGEND + 17}" y="{y + 10}">{escape(arm)}</text>')
+    return "\n".join([*parts, "</svg>\n"])
+
+
+def _curves_panel(title: str, curves: Mapping[str, Sequence[Point]], arms: Sequence[str], left: float, across: str) -> list[str]:
+    visits = max(len(points) for points in curves.values())
+
+    def x(visit: float) -> float:
+        return left + CURVES * (visit + 0.5) / visits
+
+    def y(share: float) -> float:
+        return ABOVE + HIGH * (1 - min(max(share, 0.0), 1.0))
+
+    parts = [f'<text x="{left}" y="{ABOVE - 16}" font-weight="bold">{escape(title)}</text>']
+    for tick in (0.0, 0.25, 0.5, 0.75, 1.0):
+        parts.append(f'<line x1="{left}" x2="{left + CURVES}" y1="{y(tick):.1f}" y2="{y(tick):.1f}" stroke="#dddddd"/>')
+        parts.append(f'<text x="{left - 8}" y="{y(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>')
+    for visit in range(visits):
+        parts.append(f'<text x="{x(visit):.1f}" y="{ABOVE + HIGH + 18}" text-anchor="middle">{visit + 1}</text>')
+    parts.append(f'<text x="{left + CURVES / 2:.1f}" y="{ABOVE + HIGH + 38}" text-anchor="middle">{escape(across)}</text>')
+    for arm, points in curves.items():
+        k = arms.index(arm)
+        color, aside = COLORS[k % len(COLORS)], 0.03 * (k - (len(arms) - 1) / 2)
+        path = " ".join(f"{x(i + aside):.1f},{y(mean):.1f}" for i, (mean, _, _) in enumerate(points))
+        parts.append(f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="2"/>')
+        for i, (mean, low, high) in enumerate(points):
+            at = x(i + aside)
+            parts.append(f'<line x1="{at:.1f}" x2="{at:.1f}" y1="{y(low):.1f}" y2="{y(high):.1f}" stroke="{color}"/>')
+            said = escape(f"{arm}: {mean:.2f} ({low:.2f} to {high:.2f})")
+            parts.append(f'<circle cx="{at:.1f}" cy="{y(mean):.1f}" r="4" fill="{color}"><title>{said}</title></circle>')
     return parts
