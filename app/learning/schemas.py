@@ -224,7 +224,7 @@ class SweepCandidateOut(Model):
     supported: bool | None = Field(description="Whether sessions lie near what the policy does; null where that was not asked.")
     beyond_margin: bool | None = Field(
         description="Whether an outcome is as probably worse than under cDBS by more than its margin as makes a verdict `unsafe`; "
-        "null where that was not asked."
+        "null where that was not asked, or no outcome is known."
     )
     below_bound: float | None = Field(
         description="Share of the buffer's states answered with less than the lower bound of its random sessions; null without those."

@@ -31,7 +31,7 @@ from app.study import blinding
 from app.study import repository as study_repository
 from app.study.adverse_events.repository import events_of_participant
 from app.study.adverse_events.service import blocked_policies
-from app.study.models import Participant
+from app.study.models import Participant, SettingsVersion
 from app.study.sessions.repository import ReadOnce
 from ml.ope.estimate import Estimate
 from ml.ope.registry import method_keys
@@ -115,11 +115,11 @@ class Judged:
 
         return self.kept("answer", read)
 
-    def random_sessions(self, lower_bound: float) -> RandomSessions | None:
+    def random_sessions(self, settings: SettingsVersion) -> RandomSessions | None:
         """What random sessions have been for the participant so far; None without any, and where nobody asks what sessions showed."""
         if self.caller is None or self.sessions is None:
             return None
-        return random_sessions(self.sessions.rows, self.caller, lower_bound, self.cdbs_ma)
+        return random_sessions(self.sessions.rows, self.caller, settings, self.cdbs_ma)
 
     def picture(self, lower_bound: float, policy_id: int | None = None) -> Picture:
         """The picture of the candidates that are neither cDBS nor off by another name, or of one candidate.

@@ -85,7 +85,7 @@ def ranking_page(
 def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: bool, may_run: bool, *, unfolded: bool) -> str:
     """The page below its notes, which is kept: it is made of nothing but what is named here."""
     participant, unfolded = judged.participant, unfolded or shown != RankingFilter()
-    lower_bound = participant.current_settings.lower_bound
+    settings = participant.current_settings
 
     def write() -> str:
         answered, assessment = judged.answer, judged.assessment
@@ -94,9 +94,9 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             base=f"/participants/{participant.code}",
             ranking=found,
             answer=answered,
-            picture=judged.picture(lower_bound),
-            drawn=judged.random_sessions(lower_bound),
-            minutes=found.horizon_steps * participant.current_settings.period_s / 60,
+            picture=judged.picture(settings.lower_bound),
+            drawn=judged.random_sessions(settings),
+            minutes=found.horizon_steps * settings.period_s / 60,
             held=held_out.of_evaluation(judged.evaluation),
             plainly=verdict_wording.plainly,
             amplitude=wording.amplitude,
@@ -123,7 +123,7 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
         )
 
     # `found` less its reasons to be stale, which the page has above, follows from the evaluation, its key and the filter
-    name = ("body", participant.code, lower_bound, tuple(shown.model_dump().items()), may_plan, may_run, unfolded)
+    name = ("body", participant.code, settings.id, tuple(shown.model_dump().items()), may_plan, may_run, unfolded)
     return judged.kept(name, write)
 
 

@@ -159,7 +159,8 @@ class RandomSessions:
 
     Attributes:
         sessions, visits: how many, at how many visits. minutes: median length.
-        lowest, highest: B and the amplitude of cDBS, in `unit`. low: only the last `low_minutes` of a session may lie below it.
+        lowest, highest: B and the amplitude of cDBS, in `unit`. low: only the last `low_minutes` of a session may lie below it; None where
+            nothing is that low, or the design has no such rule.
         hold_s: shortest and longest time for which an amplitude is held, s.
         differences: random less cDBS of the same visit, averaged over visits with both, by outcome. worst: of a single session, by outcome.
     """
@@ -168,7 +169,7 @@ class RandomSessions:
     visits: int
     minutes: float
     lowest: float
-    low: float
+    low: float | None
     highest: float
     unit: str
     hold_s: tuple[float, float]
@@ -177,11 +178,14 @@ class RandomSessions:
     worst: Mapping[str, float]
 
 
-def random_sessions(rows: Sequence[StudySession], caller: Caller, lower_bound: float, cdbs_ma: float | None) -> RandomSessions | None:
+def random_sessions(
+    rows: Sequence[StudySession], caller: Caller, settings: SettingsVersion, cdbs_ma: float | None
+) -> RandomSessions | None:
     """What random sessions have been so far; None without any.
 
     Args:
-        rows: confirmed sessions. caller: decides which arms may be known. lower_bound: B, fraction of cDBS. cdbs_ma: where it is known, mA.
+        rows: confirmed sessions. caller: decides which arms may be known. settings: design, B and period of the next one.
+        cdbs_ma: where it is known, mA.
     """
     by_visit: defaultdict[int, dict[Controller, list[StudySession]]] = defaultdict(lambda: defaultdict(list))
     for s in blinding.unsealed(rows):
@@ -192,6 +196,7 @@ def random_sessions(rows: Sequence[StudySession], caller: Caller, lower_bound: f
     if not drawn:
         return None
     factor, unit = (100.0, "% of cDBS") if cdbs_ma is None else (cdbs_ma, "mA")
+    held = settings.design != "paper"  # the paper's draws change every step and know no rule for low amplitudes
     differences, worst = {}, {}
     for name, worse in WORST.items():
         pairs = [(_values(arms[Controller.RANDOM], name), _values(arms[Controller.CDBS], name)) for arms in by_visit.values()]
@@ -204,11 +209,11 @@ def random_sessions(rows: Sequence[StudySession], caller: Caller, lower_bound: f
         sessions=len(drawn),
         visits=len({s.visit_id for s in drawn}),
         minutes=median(s.duration_s for s in drawn) / 60,
-        lowest=factor * lower_bound,
-        low=factor * LOW_AMPLITUDE,
+        lowest=factor * settings.lower_bound,
+        low=factor * LOW_AMPLITUDE if held and settings.lower_bound < LOW_AMPLITUDE else None,
         highest=factor,
         unit=unit,
-        hold_s=HOLD_SECONDS,
+        hold_s=HOLD_SECONDS if held else (settings.period_s, settings.period_s),
         low_minutes=LOW_SECONDS / 60,
         differences=differences,
         worst=worst,

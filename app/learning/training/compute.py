@@ -189,7 +189,7 @@ def stored_gains(
 
 
 def _stored(one: PosteriorGain, levels: Levels) -> dict[str, Any]:
-    beyond = one.within is not None and 1 - one.within >= levels.unsafe_beyond
+    beyond = None if one.within is None else 1 - one.within >= levels.unsafe_beyond
     return asdict(one.gain) | {"by": "posterior", "supported": one.supported, "told": one.told, "beyond_margin": beyond}
 
 

@@ -166,6 +166,17 @@ def rounded_up(milliamperes: float) -> float:
     return round(math.ceil(milliamperes / RESOLUTION_MA - 1e-6) * RESOLUTION_MA, 6)
 
 
+def offered(fraction: float, lower_bound: float, cdbs_ma: float | None) -> str:
+    """An amplitude as the plan's form proposes it: in steps of 0.1 mA, or 0.01 of cDBS, and one that the plan takes.
+
+    Args:
+        fraction: of cDBS, that is to be held. lower_bound: B. cdbs_ma: None where it is not known.
+    """
+    scale, step, digits = (1.0, 0.01, 2) if cdbs_ma is None else (cdbs_ma, RESOLUTION_MA, 1)
+    least, below_cdbs = math.ceil(lower_bound * scale / step - 1e-6), math.ceil(scale / step - 1e-6) - 1
+    return f"{max(least, min(below_cdbs, round(fraction * scale / step))) * step:.{digits}f}"
+
+
 def delivered_ma(fraction: float, bound: Bound) -> float:
     """What a stimulator gives for a fraction of cDBS: rounded to its resolution, within the bound and cDBS, mA.
 

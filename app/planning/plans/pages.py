@@ -27,6 +27,7 @@ from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning import wording
 from app.planning.plans import key, repository, service
+from app.planning.plans.designs import offered
 from app.planning.plans.schemas import HeldIn, Id, LimitIn, Move, PlanIn, PlanOptions
 from app.planning.plans.service import rules_of
 from app.planning.plans.sign_off import MEANING
@@ -271,7 +272,7 @@ def _page(
         plan_method=method_name(view.evaluation.default_method) if view and view.evaluation else "",
         choices=choices,
         suggestions=[(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],
-        held_rows=_held_rows(values, held_in(found, slots - len(suggestions), place), cdbs_amplitude_now(participant)),
+        held_rows=_held_rows(values, held_in(found, slots - len(suggestions), place), place.lower_bound, cdbs_amplitude_now(participant)),
         holding=wording.holding,
         low_amplitude=LOW_AMPLITUDE,
         most_held=MOST_HELD,
@@ -368,10 +369,10 @@ def _held_of(values: FormData) -> list[HeldIn]:
     return [parse(HeldIn, {unit: amplitude, "sessions": number}, LABELS) for unit, amplitude, number in rows if number not in ("", "0")]
 
 
-def _held_rows(values: FormData | None, holds: Sequence[Held], cdbs_ma: float | None) -> list[HeldRow]:
+def _held_rows(values: FormData | None, holds: Sequence[Held], lower_bound: float, cdbs_ma: float | None) -> list[HeldRow]:
     """What the form shows: what is suggested, no session asked for, and a free row; what was sent where it was refused."""
     unit = "amplitude_ma" if cdbs_ma is not None else "amplitude_fraction"
-    rows = [HeldRow(unit, f"{h.amplitude_ma:.1f}" if h.amplitude_ma is not None else f"{h.hold.fraction:.2f}", "", h) for h in holds]
+    rows = [HeldRow(unit, offered(h.hold.fraction, lower_bound, cdbs_ma), "", h) for h in holds]
     rows = [*rows[: MOST_ROWS - 1], HeldRow(unit, "", "")]
     sent = [[str(v) for v in values.getlist(f"held_{name}")] for name in ("amplitude", "sessions")] if values is not None else [[], []]
     if len(sent[0]) != len(rows) or len(sent[1]) != len(rows):

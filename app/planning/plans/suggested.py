@@ -31,14 +31,9 @@ class Suggested:
 
 @dataclass(frozen=True)
 class Held:
-    """Sessions to hold near an amplitude, and the policies of which they would tell.
-
-    Attributes:
-        amplitude_ma: None where the cDBS amplitude is not known.
-    """
+    """Sessions to hold near an amplitude, and the policies of which they would tell."""
 
     hold: Hold
-    amplitude_ma: float | None
     policies: tuple[PolicyHead, ...]
 
 
@@ -53,11 +48,7 @@ def held_in(found: Judged | None, slots: int, place: Place) -> tuple[Held, ...]:
     rows = {str(row.one.policy.id): row for row in found.answer.undecided}
     waiting = {name: (row.decided.further, row.within) for name, row in rows.items() if row.decided.further is not None}
     holds = worth_holding(waiting, slots) if found.answer.ordered else worth_exploring(place, slots)
-    cdbs_ma = found.assessment.cdbs_ma
-    return tuple(
-        Held(hold, None if cdbs_ma is None else hold.fraction * cdbs_ma, tuple(rows[name].one.policy for name in hold.names))
-        for hold in holds
-    )
+    return tuple(Held(hold, tuple(rows[name].one.policy for name in hold.names)) for hold in holds)
 
 
 def suggested(found: Judged | None, slots: int) -> tuple[Suggested, ...]:

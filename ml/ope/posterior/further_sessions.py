@@ -258,7 +258,7 @@ def sessions_to_tell(
     visits = 1 if supported else max(1, FEWEST_VISITS - near[1])
     asked = np.stack([*gaps.values(), *(() if saved is None else (saved,))])
     seen = np.stack(list(seen_of.values()))
-    # a session held near less one of cDBS at the same visit: both have the noise
+    # each less one of cDBS of its own; a visit of held sessions alone has one for up to `MOST_HELD`, so that many tell less than this
     variance = 2.0 * np.array([noise[name] for name in seen_of]) ** 2
     rng = np.random.default_rng(seed)
     truths = rng.integers(0, seen.shape[1], FUTURES)

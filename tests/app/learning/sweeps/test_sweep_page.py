@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -26,6 +27,7 @@ from app.study.repository import participant_by_code
 from ml.ope.posterior.gains import PosteriorGain
 from ml.policies.policy import ConstantPolicy
 from ml.population.virtual import world
+from ml.qoc import Qoc
 from ml.returns import Gain
 from ml.trajectories import ReplayBuffer
 
@@ -190,6 +192,8 @@ def test_a_stored_gain_says_whether_an_outcome_is_probably_beyond_its_margin() -
     wide = {"grasp_share": 0.9, "rating_points": 8.0, "tremor_points": 99.0}
     assert [g["beyond_margin"] for g in stored_gains(buffer, policies).values() if g] == [True, False]
     assert [g["beyond_margin"] for g in stored_gains(buffer, policies, wide).values() if g] == [False, False]
+    unknown = replace(buffer, sessions=tuple(replace(s, qoc=Qoc()) for s in buffer.sessions))
+    assert [g["beyond_margin"] for g in stored_gains(unknown, policies).values() if g] == [None, None], "no outcome is known"
 
 
 def test_a_controller_without_learning_that_no_session_supports_is_marked(store: Store, client: TestClient) -> None:

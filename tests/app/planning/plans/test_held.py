@@ -14,8 +14,11 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.planning.plans.designs import Bound, delivered_ma
+from app.planning.plans.pages import _held_rows
+from app.planning.plans.suggested import Held
 from ml.deploy.bundle import open_bundle
 from ml.designs import LOW_AMPLITUDE, LOW_SECONDS, NEAR_SPREAD
+from ml.ope.posterior.further_sessions import Hold, Place, reachable
 from tests.app.planning.plans.test_designs import amplitudes, buffer_of, settle, upload, visit
 
 
@@ -51,6 +54,18 @@ def test_a_plan_holds_sessions_near_stated_amplitudes_within_the_rules_of_safety
         assert np.abs(steps[-100:] - design["level"]).max() <= NEAR_SPREAD + 1e-9
         assert all(h["log_density"] is not None for h in design["holds"])
         assert (s["min_ma"], s["max_ma"]) == (0.9, 3.0)
+
+
+@pytest.mark.parametrize("lower_bound", [0.2, 1 / 3, 0.45, 0.5, 0.65])
+@pytest.mark.parametrize("cdbs_ma", [None, 0.9, 1.7, 2.3, 2.9, 3.1, 4.3])
+def test_an_amplitude_that_the_form_proposes_is_one_that_the_plan_takes(lower_bound: float, cdbs_ma: float | None) -> None:
+    place = Place(lower_bound, 300, 2.0)
+    near = [found for dose in np.arange(0.45, 1.0, 0.05) if (found := reachable(float(dose), place)) is not None]
+    assert near
+    for one in near:
+        proposed = float(_held_rows(None, [Held(Hold(one.level, 1, None), ())], lower_bound, cdbs_ma)[0].amplitude)
+        assert lower_bound <= round(proposed / (cdbs_ma or 1.0), 6) < 1
+        assert abs(proposed - one.level * (cdbs_ma or 1.0)) <= 0.1
 
 
 def test_drafting_again_draws_the_same_and_another_visit_others(client: TestClient, number: int) -> None:
