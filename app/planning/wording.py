@@ -174,7 +174,9 @@ def design_words(planned: Planned) -> str:
         return f"titration ladder: {steps} of cDBS, {planned.holds[0].steps * planned.period_s / 60:g} min each"
     low, high = HOLD_SECONDS
     if planned.design == NEAR:
-        return f"held near {_near(planned)}: {len(planned.holds)} draws within {NEAR_SPREAD:g} of it, each held {low:g} to {high:g} s"
+        words = f"held near {_near(planned)}: {len(planned.holds)} draws within {NEAR_SPREAD:g} of it, each held {low:g} to {high:g} s"
+        guarded = f"; just above {LOW_AMPLITUDE:g} until the last {LOW_SECONDS / 60:g} min"
+        return words + (guarded if (planned.level or 0.0) < LOW_AMPLITUDE else "")
     return f"stratified design: level {planned.level:.2f} of cDBS, {len(planned.holds)} draws held {low:g} to {high:g} s"
 
 

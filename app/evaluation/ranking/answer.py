@@ -125,10 +125,10 @@ class Answer:
 
         What is expected to save less than `LEAST_SAVING` is left out, unless nothing else is there: to know of it helps nobody.
         """
-        told = [(n, r) for r in self.rows for n in [_needed(r)] if n is not None]
-        fewest = min((n for n, _ in told), default=None)
-        rows = sorted((r for n, r in told if n == fewest), key=lambda r: (-(r.within or 0.0) * r.saving, -(r.within or 0.0)))
-        return [r for r in rows if r.saving >= LEAST_SAVING] or rows
+        told = [(n, r) for r in self.undecided for n in [_needed(r)] if n is not None]
+        worth = [(n, r) for n, r in told if r.saving >= LEAST_SAVING] or told
+        fewest = min((n for n, _ in worth), default=None)
+        return sorted((r for n, r in worth if n == fewest), key=lambda r: (-(r.within or 0.0) * r.saving, -(r.within or 0.0)))
 
 
 def answer(found: Assessment) -> Answer:

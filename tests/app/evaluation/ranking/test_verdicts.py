@@ -195,6 +195,14 @@ def test_further_sessions_are_asked_for_what_would_save_most(client: TestClient,
     judge({i: judged(50.0, outcome_draws=of, support=support) for i, of in draws.items()}, **noise)
     named = re.findall(r"would tell whether (p\d) is worth it: energy", first_screen(client))
     assert named == ["p1", "p0"], "p2 would save 1 % of the energy: nobody needs to know of it"
+    sooner = {"tremor_percent": [9.0 + 0.03 * i for i in range(N)], "energy": [0.99] * N}
+    judge({i: judged(50.0, outcome_draws=draws[i] if i != policies[2] else sooner, support=support) for i in draws}, **noise)
+    needed = {p["name"]: p["decision_reasons"] for p in ranked(client)["policies"]}
+    by = {name: next((r["value"] for r in of if r["code"] == "sessions_needed"), 99.0) for name, of in needed.items()}
+    assert by["p2"] < by["p0"] == by["p1"], by
+    assert re.findall(r"would tell whether (p\d) is worth it: energy", first_screen(client)) == ["p1", "p0"], "nor if it is known sooner"
+    assert client.patch(f"/api/v1/policies/{policies[1]}", json={"retired_reason": "no longer wanted"}).status_code == 200
+    assert re.findall(r"would tell whether (p\d) is worth it: energy", first_screen(client)) == ["p0"]
 
 
 def test_where_nothing_is_worth_a_test_the_page_says_what_a_random_session_asks_of_the_patient(

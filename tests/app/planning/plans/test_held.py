@@ -13,11 +13,12 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
-from app.planning.plans.designs import Bound, delivered_ma
+from app.planning.plans.designs import Bound, Planned, delivered_ma
 from app.planning.plans.pages import _held_rows
 from app.planning.plans.suggested import Held
+from app.planning.wording import design_words
 from ml.deploy.bundle import open_bundle
-from ml.designs import LOW_AMPLITUDE, LOW_SECONDS, NEAR_SPREAD
+from ml.designs import LOW_AMPLITUDE, LOW_SECONDS, NEAR_SPREAD, near_session
 from ml.ope.posterior.further_sessions import Hold, Place, reachable
 from tests.app.planning.plans.test_designs import amplitudes, buffer_of, settle, upload, visit
 
@@ -66,6 +67,13 @@ def test_an_amplitude_that_the_form_proposes_is_one_that_the_plan_takes(lower_bo
         proposed = float(_held_rows(None, [Held(Hold(one.level, 1, None), ())], lower_bound, cdbs_ma)[0].amplitude)
         assert lower_bound <= round(proposed / (cdbs_ma or 1.0), 6) < 1
         assert abs(proposed - one.level * (cdbs_ma or 1.0)) <= 0.1
+
+
+def test_a_session_near_a_low_amplitude_is_told_to_be_there_in_its_last_minutes_alone() -> None:
+    low, high = (Planned("near", level, 1, 0.3, 2.0, near_session(level, 300, 2.0, 0.3, 1, 0).decisions) for level in (0.45, 0.7))
+    assert low.holds[0].amplitude > 0.45 + NEAR_SPREAD
+    assert design_words(low).endswith("; just above 0.6 until the last 5 min")
+    assert "until" not in design_words(high)
 
 
 def test_drafting_again_draws_the_same_and_another_visit_others(client: TestClient, number: int) -> None:
