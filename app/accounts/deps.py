@@ -41,7 +41,9 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
         raise Unauthorized(
             "This needs a bearer token or a browser session.", "Make one with `betaloop token create EMAIL --name NAME`, or sign in."
         )
-    path = request.scope["path"]  # what the router goes by; that of `url` is put together with the Host header, which the caller writes
+    path = request.scope[
+        "path"
+    ]  # what the router goes by; that of `url` is put together anew, with escapes and beside what the caller's Host says
     if caller.token_scope is Scope.METRICS and path != METRICS:
         raise Forbidden("A token for 'metrics' reads the figures of the service and nothing else.", "Make one with a wider scope.")
     if caller.is_blinded and not is_open(request.method, path):

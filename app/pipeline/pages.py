@@ -51,7 +51,9 @@ PARAM_NAMES = {
 VALUE_NAMES = {
     "aim": {"steps": "step rewards, as in the paper", "return": "step rewards and each step's share of the end-of-session reward",
             "both": "by turns step rewards alone, and with the end-of-session reward"},
-    "anchor": {"logged": "the logged amplitudes", "cdbs": "the cDBS amplitude", "both": "by turns the logged and the cDBS amplitude"},
+    "anchor": {"logged": "the logged amplitudes", "cdbs": "the cDBS amplitude", "best": "the best constant amplitude",
+               "both": "by turns the logged and the cDBS amplitude",
+               "all": "by turns the logged amplitudes, the best constant one and the cDBS amplitude"},
     "preset": {"full": "full: for a study", "quick": "quick: for a first look"},
 }  # fmt: skip
 

@@ -16,25 +16,45 @@ from app.settings import Settings, get_settings
 _WHY = {
     errno.EADDRINUSE: ("another program listens there", "Is betaloop running already? Else choose another port: --port 8001."),
     errno.EACCES: ("this user may not listen there", "Choose a port from 1024 up: --port 8000. A proxy before it may have port 443."),
-    errno.EADDRNOTAVAIL: ("this machine has no such address", "Give one that it has, or 0.0.0.0 for all of them: --host."),
+    **dict.fromkeys(
+        (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT),
+        ("this machine has no such address", "Give one that it has, or 0.0.0.0 for all of them: --host."),
+    ),
 }
 
 
 def require_free(host: str, port: int) -> None:
-    """Raises Conflict where nobody can listen at this port of this machine."""
+    """Raises Conflict where nobody can listen at this port of this machine: at each of the addresses that a name stands for here."""
     try:
         if not 0 <= port < 1 << 16:
             raise OverflowError("no port")  # which some systems would cut to 16 bits
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-    except (OSError, OverflowError) as error:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except (OSError, OverflowError, UnicodeError) as error:
         raise Conflict(f"No service can listen at {host}:{port}: there is no such address.", "Give another: --host, --port.") from error
-    with socket.socket(family, kind, protocol) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was left a moment ago is free
-        try:
+    refusals = [refused for family, _, _, _, address in found if (refused := _refusal(family, address)) is not None]
+    absent = [refused for refused in refusals if refused.errno in _ABSENT]
+    # `localhost` is an address of each kind, of which a machine may lack one
+    if len(absent) == len(refusals) < len(found):
+        return
+    first = next((refused for refused in refusals if refused not in absent), refusals[0])
+    why, hint = _WHY.get(first.errno or 0, (str(first.strerror), "Give another address: --host, --port."))
+    raise Conflict(f"No service can listen at {host}:{port}: {why}.", hint) from first
+
+
+_ABSENT = {errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT}
+
+
+def _refusal(family: int, address: tuple[str, int] | tuple[str, int, int, int] | tuple[int, bytes]) -> OSError | None:
+    """Why nobody can listen at an address; None where somebody can."""
+    try:
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was left a moment ago is free
+            if family == socket.AF_INET6:
+                probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)  # as the service does
             probe.bind(address)
-        except OSError as error:
-            why, hint = _WHY.get(error.errno or 0, (str(error.strerror), "Give another address: --host, --port."))
-            raise Conflict(f"No service can listen at {host}:{port}: {why}.", hint) from error
+    except OSError as error:
+        return error
+    return None
 
 
 def require_data_folder() -> None:

@@ -158,17 +158,16 @@ class Receiver:
             return known
         log.warning("a stored file was damaged and is made anew", upload_file=row.id, sha256=row.stored_sha256)
         row.stored_sha256, row.redactor_version = content.stored_sha256, REDACTOR_VERSION
-        sealed_still = row.quarantine_sha256 is not None and content.quarantine_sha256 is not None and row.decided_at is None
-        if sealed_still:
-            row.quarantine_sha256 = content.quarantine_sha256
-        else:
-            self._drop_seal(content.quarantine_sha256)
+        spare = content.quarantine_sha256
+        if row.quarantine_sha256 is not None and spare is not None and row.decided_at is None:
+            row.quarantine_sha256, spare = spare, row.quarantine_sha256
         self.db.commit()
+        self._drop_seal(spare)
         known.reports[0].understood.append(wording.MADE_ANEW)
         return known
 
     def _drop_seal(self, sealed: str | None) -> None:
-        """Remove bytes that were encrypted for nothing: they are encrypted anew each time, so that no other row has them."""
+        """Remove encrypted bytes that no row names any more: they are encrypted anew each time, so that no other row has them."""
         if sealed is not None:
             self.db.delete(self.db.get_one(files.StoredFile, sealed))
             self.db.commit()
@@ -351,7 +350,7 @@ class Receiver:
         sealed, kept = row.quarantine_sha256, before.quarantine_sha256
         before.report = {**(before.report or {}), **lasting(row)}
         if sealed is not None and kept is not None and not files.is_whole(kept):
-            before.quarantine_sha256, sealed = sealed, None
+            before.quarantine_sha256, sealed = sealed, kept
             before.stored_sha256 = before.quarantine_sha256 if before.stored_sha256 == kept else before.stored_sha256
         self.db.delete(row)
         store_reports(before, [report])

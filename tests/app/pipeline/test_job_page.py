@@ -5,13 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.evaluation.estimates.compute import evaluate_method, fit_dlsm
+from app.learning.schemas import Aim, Anchor, Preset
 from app.pipeline.charts import job_curves
+from app.pipeline.pages import VALUE_NAMES
 from app.platform.jobs import StepReport
 from app.platform.jobs.models import Job, JobEvent, JobStep
 from ml.ope.dlmm import DlmmConfig
@@ -66,6 +68,12 @@ def test_the_page_names_methods_in_words(client: TestClient, upload: Callable[..
     assert "dual_dice" not in asked_for
     for name, value in (("Size", "quick: for a first look"), ("Critics see past amplitudes", "yes"), ("Seed", "0")):
         assert f"<dt>{name}</dt><dd>{value}</dd>" in asked_for
+
+
+def test_every_answer_to_a_question_of_the_form_has_its_words() -> None:
+    assert {name: set(words) for name, words in VALUE_NAMES.items()} == {
+        "aim": set(get_args(Aim)), "anchor": set(get_args(Anchor)), "preset": set(get_args(Preset))
+    }  # fmt: skip
 
 
 def test_members_that_learn_one_after_the_other_have_a_curve_each(db: Session, tmp_path: Path) -> None:

@@ -26,7 +26,28 @@ def test_a_taken_port_is_named_with_what_to_do() -> None:
     require_free("127.0.0.1", port)
 
 
-@pytest.mark.parametrize("address", [("192.0.2.1", 8000), ("nowhere.invalid", 8000), ("127.0.0.1", 65536), ("127.0.0.1", -1)])
+LOCAL = [(socket.AF_INET6, ("::1", 0, 0, 0)), (socket.AF_INET, ("127.0.0.1", 0))]
+
+
+@pytest.mark.parametrize("order", [LOCAL, LOCAL[::-1]])
+def test_a_name_of_several_addresses_is_asked_at_each_and_one_that_the_machine_lacks_is_no_fault(
+    order: list[tuple[int, tuple[object, ...]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        found = [(family, socket.SOCK_STREAM, 6, "", (address[0], port, *address[2:])) for family, address in order]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+        with pytest.raises(Conflict, match=f"{port}: another program listens there"):
+            require_free("localhost", port)
+    lacked = (socket.AF_INET, socket.SOCK_STREAM, 6, "", ("192.0.2.1", port))
+    found[order.index(LOCAL[0])] = lacked
+    require_free("localhost", port)
+    found[:] = [lacked]
+    with pytest.raises(Conflict, match="this machine has no such address"):
+        require_free("localhost", port)
+
+
+@pytest.mark.parametrize("address", [("192.0.2.1", 8000), ("nowhere.invalid", 8000), ("127.0.0.1", 65536), ("127.0.0.1", -1), ("..", 8000)])
 def test_an_address_that_this_machine_does_not_have_is_refused(address: tuple[str, int]) -> None:
     with pytest.raises(Conflict, match="no such address"):
         require_free(*address)

@@ -36,6 +36,7 @@ _PR_SET_PDEATHSIG = 1
 _LOCK_WAIT_S = 30.0
 _OOM_SCORE = "500"
 _AUTOGROUP, _AUTOGROUP_TRIES = Path("/proc/self/autogroup"), 50
+_AUTOGROUPS_ON = Path("/proc/sys/kernel/sched_autogroup_enabled")
 
 Cause = Literal["memory", "time", "killed", "error"]
 """Why a call gave no result: it met its limit of memory or time, its process was killed or broke down, or its function raised."""
@@ -192,8 +193,8 @@ def _step_back(niceness: int) -> None:
     Linux (sched(7), "The autogroup feature") shares the processor out among sessions first: within ours, of one process, niceness alone
     would count against nobody.
     """
-    if not _AUTOGROUP.exists():
-        return
+    if not (_AUTOGROUPS_ON.exists() and _AUTOGROUPS_ON.read_text().strip() == "1" and _AUTOGROUP.exists()):
+        return  # niceness counts by itself
     for _ in range(_AUTOGROUP_TRIES):
         try:
             _AUTOGROUP.write_text(str(niceness))
