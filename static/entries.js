@@ -136,6 +136,7 @@ document.addEventListener("submit", (event) => {
   const form = event.target;
   if (event.defaultPrevented || !(form instanceof HTMLFormElement)) return;
   if (form.getAttribute("action") === "/sign-out") { write({ person: "", forms: {} }); return; }
+  if (!posts(form)) unsend();
   if (!keeps(form)) return;
   const store = read();
   // the page of an expired sign-in sends all of a form as hidden fields: there its address alone tells which one it was
@@ -144,6 +145,15 @@ document.addEventListener("submit", (event) => {
   write(store);
 });
 document.addEventListener("betaloop:saved", (event) => forget(event.target)); // by a page's own script
+
+// whoever goes on from a page by another way than its form was not answered: the connection broke off, or they stopped it
+document.addEventListener("click", (event) => { if (event.target.closest?.("a[href]")) unsend(); });
+window.addEventListener("pageshow", (event) => { if (event.persisted) unsend(); });
+function unsend() {
+  const store = read();
+  for (const held of Object.values(store.forms)) if (held.sent === location.pathname) delete held.sent;
+  write(store);
+}
 
 // this page answers what was sent from the page before it: led on to, or shown without a complaint, it was taken
 function settle() {

@@ -110,6 +110,20 @@ def test_what_is_sent_again_after_signing_in_is_kept_no_longer(tab: Watched, cli
     assert client.get(f"/api/v1{path}/qoc").json()["grasp_hz"] == 2.4
 
 
+def test_what_was_stopped_on_its_way_is_kept_whatever_is_opened_next(tab: Watched, client: TestClient) -> None:
+    page, path = tab.page, session_of(client)
+    tab.open(path)
+    page.fill("[name=grasp_hz]", "2.4")
+    page.route("**/qoc", lambda route: route.abort("aborted"))
+    with page.expect_event("requestfailed"):
+        page.eval_on_selector(SAVE, "button => { setTimeout(() => button.click(), 0); }")  # a click of the test's would wait for an answer
+    page.eval_on_selector(".crumbs a[href^='/visits/']", "link => { setTimeout(() => link.click(), 0); }")
+    page.wait_for_url("**/visits/*")
+    tab.open(path)
+    assert page.input_value("[name=grasp_hz]") == "2.4"
+    expect(page.locator(BACK)).to_contain_text("is not saved yet")
+
+
 def test_what_a_colleague_saved_meanwhile_stands_and_the_entry_is_told(tab: Watched, client: TestClient) -> None:
     page, path = tab.page, session_of(client)
     tab.open(path)
