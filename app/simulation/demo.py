@@ -37,7 +37,7 @@ from app.simulation.demo_study import DemoVisit, demo_visits, participant_body
 
 ACCOUNTS = {"admin@demo.example": Role.ADMIN, "clinician@demo.example": Role.CLINICIAN, "engineer@demo.example": Role.ENGINEER}
 PARTICIPANTS = ("P1", "P2", "P3", "P4")
-START_TIMEOUT_S = 60.0
+START_TIMEOUT_S = 180.0
 STOP_TIMEOUT_S = 20.0
 _POLL_S = 0.5
 _LINE_S = 15.0

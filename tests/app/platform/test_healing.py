@@ -21,6 +21,12 @@ from tests.app.platform.test_stops import data as data
 from tests.app.platform.test_stops import free_port, start, wait_for
 
 HEALTHY_WITHIN_S = 10.0
+"""On processors that have nothing else to do; `patience` gives more where others wait for them."""
+
+
+def patience() -> float:
+    """Seconds, by how many processes share each processor."""
+    return HEALTHY_WITHIN_S * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 @pytest.mark.slow
@@ -36,8 +42,8 @@ def test_a_service_whose_database_was_killed_heals_by_itself(data: Path) -> None
             os.kill(server.pid(), signal.SIGKILL)
             killed, answers = time.monotonic(), []
             while not answers or answers[-1].status_code != 200:
-                assert time.monotonic() - killed < HEALTHY_WITHIN_S, [a.text for a in answers[-1:]]
-                answers.append(httpx.get(url, timeout=HEALTHY_WITHIN_S))
+                assert time.monotonic() - killed < patience(), [a.text for a in answers[-1:]]
+                answers.append(httpx.get(url, timeout=patience()))
                 time.sleep(0.05)
             refused = [a for a in answers if a.status_code != 200]
             assert {a.status_code for a in refused} <= {503}

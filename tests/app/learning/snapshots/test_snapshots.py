@@ -186,7 +186,7 @@ def test_the_snapshot_page_tells_what_the_buffer_covers(upload: Upload, client: 
     assert answer.status_code == 201
     assert client.get(f"/api/v1/snapshots/{answer.json()['id']}").json() == answer.json()
     page = client.get(f"/snapshots/{answer.json()['id']}").text
-    for text in ("fell asleep", "Logged amplitudes", "Visit 1", "60"):
+    for text in ("fell asleep", "Recorded amplitudes", "Visit 1", "60"):
         assert text in page
     assert db.scalar(select(func.count()).select_from(Participant)) == 1
 

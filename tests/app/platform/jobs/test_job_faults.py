@@ -83,7 +83,7 @@ def test_a_live_worker_takes_the_jobs_of_one_that_fell_silent(jobs):
     job_id = jobs.submit(parts=2, numbers=40, pause_s=0.1)
     _count_until(jobs, job_id, 3)
     workers.pop(_worker_of(jobs, job_id)).send_signal(signal.SIGKILL)
-    job = jobs.ended(job_id, 30)
+    job = jobs.ended(job_id)
     assert (job.status, jobs.counted(job_id)) == ("succeeded", [0, 1])
     assert {s.worker for s in job.steps} == set(workers)
     assert [w.poll() for w in workers.values()] == [None]
