@@ -16,8 +16,9 @@ best candidate gains (`tested`), and of the policy that would be kept by what wa
 Patients whose best candidate gains less than two standard errors of the truth are left out. CPU seconds of one thread.
 
 `--named` takes each policy of which a number of sessions is said to tell after the three early visits, holds so many near the amplitude
-named, at most four a visit beside two of cDBS, fits everything anew and asks for the verdict again: `told` is the share that is no *cannot
-tell* then, which the number promises for four of five, `told_without` the same after those visits with their cDBS sessions alone.
+named, at most four a visit after one of cDBS as a plan lays them out, fits everything anew and asks for the verdict again: `told` is the
+share that is no *cannot tell* then, which the number promises for four of five, `told_without` the same after those visits with their cDBS
+sessions alone.
 """
 
 from __future__ import annotations
@@ -85,10 +86,12 @@ class Clinic:
         placed = [*((CDBS, place) for place in CDBS_PLACES), *zip(names, TEST_PLACES, strict=False)]
         return [self._session(number, name, place) for name, place in placed]
 
-    def held(self, number: int, levels: Sequence[float], free: Sequence[int]) -> tuple[SessionTrajectory, ...]:
-        """The visit's cDBS sessions, and sessions held near levels in free slots, as they join the data."""
+    def held(
+        self, number: int, levels: Sequence[float], free: Sequence[int], controls: Sequence[int] = CDBS_PLACES
+    ) -> tuple[SessionTrajectory, ...]:
+        """The visit's cDBS sessions at places `controls`, and sessions held near levels in free slots, as they join the data."""
         s = self.world.settings
-        rows: list[tuple[int, str, Floats, tuple[Hold, ...]]] = [(place, "cdbs", np.ones(STEPS), ()) for place in CDBS_PLACES]
+        rows: list[tuple[int, str, Floats, tuple[Hold, ...]]] = [(place, "cdbs", np.ones(STEPS), ()) for place in controls]
         for place, level in zip(free, levels, strict=True):
             session = near_session(level, STEPS, s.period_s, s.lower_bound, number, place)
             rows.append((place, "random", session.amplitudes, session.holds))
@@ -150,12 +153,14 @@ class Found:
     """Policies tested at each visit, and the one to be kept after it (cDBS where none is better).
 
     Attributes:
-        held: sessions held near an amplitude, by visit.
+        held: sessions held near an amplitude, by visit. ordered: whether the data could order policies, before the first visit and after
+            the last one.
     """
 
     tested: list[tuple[str, ...]]
     kept: list[str]
     held: list[int] = field(default_factory=list)
+    ordered: tuple[bool, bool] | None = None
 
 
 def by_posterior(clinic: Clinic, fitted: FittedPosterior, *, respecting: bool, holding: bool = False) -> Found:
@@ -164,6 +169,7 @@ def by_posterior(clinic: Clinic, fitted: FittedPosterior, *, respecting: bool, h
     tested, kept, held = [], [], []
     everyone = {**clinic.policies, **HELD} if holding else clinic.policies
     estimates = fitted.evaluate(everyone, STEPS)
+    before = _ordered(estimates)
     for number in range(1, TEST_VISITS + 1):
         had = {name for names in tested for name in names}
         names = suggested(estimates, respecting, had)
@@ -177,15 +183,17 @@ def by_posterior(clinic: Clinic, fitted: FittedPosterior, *, respecting: bool, h
         tested.append(names)
         held.append(len(levels))
         kept.append(max([CDBS, *sorted(had.union(names))], key=lambda name: estimates[name].value))
-    return Found(tested, kept, held)
+    return Found(tested, kept, held, (before, _ordered(estimates)))
+
+
+def _ordered(estimates: Mapping[str, Estimate]) -> bool:
+    return bool(estimates[CDBS].details["skill"]["told"])
 
 
 def asked_for(estimates: Mapping[str, Estimate], buffer: ReplayBuffer, slots: int) -> list[float]:
     """Levels of the sessions to hold in free slots, as the plan's page says."""
-    if estimates[CDBS].details["skill"]["told"]:
-        holds = worth_holding(waiting_for(estimates, buffer)[0], slots)
-    else:
-        holds = worth_exploring(_place(buffer), slots)
+    ordered = _ordered(estimates)
+    holds = worth_holding(waiting_for(estimates, buffer)[0], slots) if ordered else worth_exploring(_place(buffer), slots)
     return [hold.fraction for hold in holds for _ in range(hold.here)]
 
 
@@ -257,7 +265,7 @@ def _told(clinic: Clinic, buffer: ReplayBuffer, name: str, further: Further, *, 
     for number in range(1, visits + 1):
         here = further.sessions // visits + (number <= further.sessions % visits)
         levels = [further.fraction] * here if hold else []
-        buffer = replace(buffer, sessions=buffer.sessions + clinic.held(number, levels, TEST_PLACES[: len(levels)]))
+        buffer = replace(buffer, sessions=buffer.sessions + clinic.held(number, levels, TEST_PLACES[: len(levels)], CDBS_PLACES[:1]))
     estimates = build("posterior", 0, "demo").fit(buffer).evaluate({**clinic.policies, **HELD}, STEPS)
     return verdict(estimates[name], estimates[CDBS], Margins(), Levels()).code != "cannot_tell"
 
@@ -307,6 +315,7 @@ def _shares(found: Found, gains: Mapping[str, float], best: float) -> dict[str, 
         "kept": [gains[n] / best for n in found.kept],
         "sessions": [float(len(n)) for n in found.tested],
         "held": [float(n) for n in found.held],
+        "ordered": [float(told) for told in found.ordered or ()],
     }
 
 
@@ -330,6 +339,11 @@ def lines(shares: Mapping[str, list[dict[str, list[float]]]]) -> Iterator[str]:
             told = "".join(f" {f'{mean:.2f} ({low:.2f} to {high:.2f})':>24}" for mean, low, high in points)
             most = float(np.mean([row[figure][-1] >= SHARE for row in shares[arm]]))
             yield f"{arm:12} {figure:8}{told} {most:16.2f}\n"
+    for arm, rows in shares.items():
+        first = [row["ordered"] for row in rows if row["ordered"]]
+        if first:
+            mute = [after for before, after in first if not before]
+            yield f"{arm:12} no order told at first in {len(mute)} of {len(first)}; in {sum(mute):.0f} of these one is told after visit 3\n"
 
 
 def main() -> None:

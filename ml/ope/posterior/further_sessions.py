@@ -258,17 +258,18 @@ def sessions_to_tell(
     visits = 1 if supported else max(1, FEWEST_VISITS - near[1])
     asked = np.stack([*gaps.values(), *(() if saved is None else (saved,))])
     seen = np.stack(list(seen_of.values()))
-    # each less one of cDBS of its own; a visit of held sessions alone has one for up to `MOST_HELD`, so that many tell less than this
-    variance = 2.0 * np.array([noise[name] for name in seen_of]) ** 2
+    variance = np.array([noise[name] for name in seen_of]) ** 2
     rng = np.random.default_rng(seed)
     truths = rng.integers(0, seen.shape[1], FUTURES)
     futures, own = rng.standard_normal((FUTURES, len(seen))), rng.standard_normal(seen.shape)
     for n in NUMBERS:
         if n < max(least, visits):
             continue
-        told = _told(asked, len(gaps), seen, variance / n, truths, futures, own, levels)
+        # a visit of held sessions alone has one of cDBS, from which all of them differ together
+        days = max(visits, -(-n // MOST_HELD))
+        told = _told(asked, len(gaps), seen, variance * (1 / n + 1 / days), truths, futures, own, levels)
         if told >= TOLD:
-            return Needed(n, visits)
+            return Needed(n, days)
     return None
 
 
