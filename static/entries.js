@@ -131,10 +131,19 @@ function forget(form) {
   write(store);
 }
 
+// the address says for whom the page was made: in a browser that has changed hands since, the service takes it under nobody else's name
+function sign(form) {
+  if (!person) return;
+  const address = new URL(form.getAttribute("action") || location.href, location.href);
+  address.searchParams.set("written_by", person);
+  form.setAttribute("action", address.pathname + address.search);
+}
+
 // sent is not saved: what follows tells
 document.addEventListener("submit", (event) => {
   const form = event.target;
   if (event.defaultPrevented || !(form instanceof HTMLFormElement)) return;
+  if (posts(form) && form.getAttribute("action") !== "/sign-out") sign(form);
   if (form.getAttribute("action") === "/sign-out") { write({ person: "", forms: {} }); return; }
   if (!posts(form)) unsend();
   if (!keeps(form)) return;

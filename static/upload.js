@@ -78,7 +78,7 @@ function send(files, fields, shown) {
   if (!fields.get("visit")) body.append("confirm", "false"); // proposed, with the visit of their date
   return new Promise((done) => {
     const request = new XMLHttpRequest();
-    request.open("POST", "/api/v1/uploads");
+    request.open("POST", `/api/v1/uploads?written_by=${document.body.dataset.person}`); // refused where somebody else has signed in since
     request.responseType = "json";
     request.upload.addEventListener("progress", (event) => {
       if (event.lengthComputable) shown.bar.value = event.loaded / event.total;

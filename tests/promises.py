@@ -10,6 +10,7 @@ ACCOUNTS, TOKENS = "tests/app/accounts/test_accounts.py", "tests/app/accounts/te
 FACTOR, SIGN_ON = "tests/app/accounts/test_second_factor.py", "tests/app/accounts/test_sign_on.py"
 SIGNED = "tests/app/accounts/test_sign_on_signatures.py"
 STUDIES, ROUTES = "tests/app/accounts/studies/test_studies.py", "tests/app/test_routes.py"
+ERROR_PAGES = "tests/app/pages/test_error_pages.py"
 PAGES, SIGN_IN = "tests/app/pages/test_page_roles.py", "tests/app/pages/test_sign_in_pages.py"
 SEALING, BACKUP = "tests/app/platform/upkeep/test_sealing.py", "tests/app/platform/upkeep/test_backup.py"
 DAMAGED = "tests/app/ingest/uploads/test_damaged_files.py"
@@ -180,6 +181,8 @@ PROMISES = [
         "accounts/deps",
         ("a token for figures reads nothing else", "if caller.token_scope is Scope.METRICS and path != METRICS:", "if False:",
          f"{FIGURES}::test_a_token_for_figures_reads_them_and_nothing_else"),
+        ("entries are saved under their writer's name alone", "if writer is not None and writer != caller.user_id:", "if False:",
+         f"{ERROR_PAGES}::test_what_an_expired_sign_in_gives_back_is_sent_again_by_its_writer_alone"),
         ("what is not listed is closed to the blinded", "if caller.is_blinded and not is_open(request.method, path):", "if False:",
          f"{LOCKS}::test_whatever_is_not_listed_is_closed_to_blinded_assessors"),
     ),

@@ -16,8 +16,9 @@ from app.accounts.models import Scope
 from app.accounts.permissions import Caller
 from app.platform.audit import record_view
 from app.platform.database import Db, new_session, set_actor
-from app.platform.errors import Forbidden, Unauthorized
+from app.platform.errors import EntriesOfAnother, Forbidden, Unauthorized
 from app.platform.sources import from_this_machine
+from app.platform.web.forms import written_by
 from app.settings import get_settings
 
 COOKIE = "betaloop_session"
@@ -38,6 +39,7 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
     elif cookie := request.cookies.get(COOKIE):
         caller = service.caller_of_cookie(db, cookie)
     if caller is None:
+        request.state.last_caller = service.last_user_of_cookie(db, request.cookies.get(COOKIE, ""))
         raise Unauthorized(
             "This needs a bearer token or a browser session.", "Make one with `betaloop token create EMAIL --name NAME`, or sign in."
         )
@@ -51,9 +53,24 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
             "This is closed to blinded assessors: it may show which controller a session had.",
             "Results by controller stand under Analyses once a visit is locked.",
         )
+    _refuse_entries_of_others(request, caller)
     set_actor(db, caller.label, caller.user_id, getattr(request.state, "request_id", None))
     request.state.caller = caller
     return caller
+
+
+def _refuse_entries_of_others(request: Request, caller: Caller) -> None:
+    """Raise EntriesOfAnother for a form that somebody else filled in, in a browser that has changed hands since.
+
+    Forms say who wrote them where that is known (entries.js, and the page of an expired sign-in); this guards against mix-ups, not
+    against attackers, who can type whatever they like once they have signed in.
+    """
+    writer = written_by(request)
+    if writer is not None and writer != caller.user_id:
+        raise EntriesOfAnother(
+            "Somebody else had signed in when this was entered; nothing was saved under your name.",
+            "Whoever entered it signs in here and sends it again; or open the page anew and enter what is yours.",
+        )
 
 
 CurrentCaller = Annotated[Caller, Depends(get_caller)]

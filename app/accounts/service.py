@@ -208,6 +208,12 @@ def caller_of_cookie(db: Session, token: str, used: bool = True) -> Caller | Non
     return replace(caller_of(row.user), sign_in_id=row.id, confirmed_at=row.confirmed_at)
 
 
+def last_user_of_cookie(db: Session, token: str) -> int | None:
+    """Whose browser session a cookie's token was, although it has ended."""
+    row = repository.sign_in_of(db, _hash(token)) if token else None
+    return row.user_id if row is not None else None
+
+
 def caller_of_token(db: Session, token: str) -> Caller | None:
     """Who an API token belongs to, unless it was revoked."""
     row = repository.api_token_by_hash(db, _hash(token))

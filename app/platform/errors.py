@@ -51,6 +51,12 @@ class Conflict(BetaloopError):
     title = "Not possible in the present state"
 
 
+class EntriesOfAnother(Conflict):
+    """A form that somebody else had filled in before another person signed in."""
+
+    title = "Entered by somebody else"
+
+
 class Unauthorized(BetaloopError):
     """Nobody is signed in."""
 

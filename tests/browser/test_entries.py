@@ -78,6 +78,33 @@ def test_another_person_in_the_same_tab_is_shown_nothing(tab: Watched, client: T
     assert page.input_value("[name=grasp_hz]") == ""
 
 
+def test_what_one_person_entered_is_never_saved_under_anothers_name(tab: Watched, client: TestClient) -> None:
+    with transaction("test") as db:
+        accounts.add_user(db, OTHER, Role.CLINICIAN, PASSWORD)
+    page, path = tab.page, session_of(client)
+    tab.open(path)
+    page.fill("[name=grasp_hz]", "2.4")
+    cookies = page.context.cookies()
+    page.context.clear_cookies()
+    second = page.context.new_page()
+    Watched(second, tab.address).sign_in(OTHER)  # somebody else, in another tab of the same browser
+    page.click(SAVE)
+    page.wait_for_selector("h1:text('Entered by somebody else')")
+    assert "2.4" not in client.get(f"/api/v1{path}/qoc").text
+    assert page.evaluate(KEPT) is None
+    page.context.clear_cookies()
+    page.context.add_cookies(cookies)
+    tab.open(path)
+    page.fill("[name=grasp_hz]", "2.4")
+    page.context.clear_cookies()
+    page.click(SAVE)
+    page.wait_for_selector("h1:text('Your sign-in has expired')")
+    Watched(second, tab.address).sign_in(OTHER)
+    page.click("text=Send it again")
+    page.wait_for_selector("h1:text('Entered by somebody else')")
+    assert "2.4" not in client.get(f"/api/v1{path}/qoc").text
+
+
 def test_signing_out_forgets_and_an_expired_sign_in_does_not(tab: Watched, client: TestClient) -> None:
     page, path = tab.page, session_of(client)
     tab.open(path)
@@ -114,7 +141,7 @@ def test_what_was_stopped_on_its_way_is_kept_whatever_is_opened_next(tab: Watche
     page, path = tab.page, session_of(client)
     tab.open(path)
     page.fill("[name=grasp_hz]", "2.4")
-    page.route("**/qoc", lambda route: route.abort("aborted"))
+    page.route("**/qoc?*", lambda route: route.abort("aborted"))
     with page.expect_event("requestfailed"):
         page.eval_on_selector(SAVE, "button => { setTimeout(() => button.click(), 0); }")  # a click of the test's would wait for an answer
     page.eval_on_selector(".crumbs a[href^='/visits/']", "link => { setTimeout(() => link.click(), 0); }")

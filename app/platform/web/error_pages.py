@@ -9,6 +9,8 @@ from fastapi import Request
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from app.platform.web.forms import written_by
+
 _PLAIN_FORM = "application/x-www-form-urlencoded"
 _SECRET = "password"  # noqa: S105 - the name of a field
 
@@ -20,10 +22,22 @@ _ADVICE = {
 }
 
 
-def advised(status: int, title: str, has_entries: bool) -> tuple[str, str]:
+ADDRESS_ALONE = {404, 405}
+"""Of the framework's own errors those that say no more than that the address is wrong."""
+
+
+def writer_of(request: Request) -> int | None:
+    """Who entered what a form holds: as the form says, else who has signed in, else whose sign-in has just ended."""
+    caller = getattr(request.state, "caller", None)
+    last = getattr(request.state, "last_caller", None)
+    return written_by(request) or (caller.user_id if caller is not None else last)
+
+
+def advised(status: int, title: str, has_entries: bool, writer: int | None) -> tuple[str, str]:
     """The heading of an error's page, and what to do where the error itself does not say."""
     if status == 401:
-        kept = " Then send what you had entered from here." if has_entries else ""
+        again = "Then send what you had entered from here." if writer else "Then open the form anew and enter this again."
+        kept = f" {again}" if has_entries else ""
         return "Your sign-in has expired", f"Sign in again in a new window.{kept}"
     return _ADVICE.get(status, (title, ""))
 

@@ -23,10 +23,10 @@ from starlette.middleware.base import RequestResponseEndpoint
 from starlette.requests import ClientDisconnect
 from starlette.routing import compile_path
 
-from app.platform.errors import BetaloopError, Conflict, DatabaseAway, Forbidden, StorageFull, TooMany, Unauthorized
+from app.platform.errors import BetaloopError, Conflict, DatabaseAway, EntriesOfAnother, Forbidden, StorageFull, TooMany, Unauthorized
 from app.platform.web.body_limit import BodyLimit, Judge
 from app.platform.web.compression import Compression
-from app.platform.web.error_pages import advised, input_in_words, kept_entries
+from app.platform.web.error_pages import ADDRESS_ALONE, advised, input_in_words, kept_entries, writer_of
 from app.platform.web.templates import render
 from app.settings import get_settings
 
@@ -112,9 +112,12 @@ async def _answer(request: Request, error: BetaloopError) -> Response:
     if isinstance(error, Unauthorized) and request.method in _SAFE:
         target = request.url.path + (f"?{request.url.query}" if request.url.query else "")
         return RedirectResponse(f"/sign-in?next={quote(target, safe='/')}" if target != "/" else "/sign-in", 303)
-    entries = await kept_entries(request)
-    title, advice = advised(error.status, error.title, bool(entries))
-    return HTMLResponse(render(request, "error.html", problem=body, title=title, advice=advice, entries=entries), error.status, headers)
+    entries = await kept_entries(request) if not isinstance(error, EntriesOfAnother) else []
+    writer = writer_of(request)
+    title, advice = advised(error.status, error.title, bool(entries), writer)
+    only_advice = isinstance(error, _PlainError) and error.status in ADDRESS_ALONE
+    page = render(request, "error.html", problem=body, title=title, advice=advice, only_advice=only_advice, entries=entries, writer=writer)
+    return HTMLResponse(page, error.status, headers)
 
 
 async def _refused_unread(request: Request, error: Exception) -> Response:
@@ -165,7 +168,7 @@ async def _http_error(request: Request, error: Exception) -> Response:
         return await _system_error(request, error.__cause__)
     if wants_page(request) and getattr(request.state, "caller", None) is None:
         # no route asked who this is: the page of the error still has the way back for somebody who has signed in, if the database answers
-        with suppress(Unauthorized, Forbidden, DBAPIError, PoolTimeout):
+        with suppress(BetaloopError, DBAPIError, PoolTimeout):
             await request.app.state.judge(request)
     hint = _HINTS.get(error.status_code, "") if not wants_page(request) else ""
     response = await _answer(request, _PlainError(error.status_code, str(error.detail), hint))

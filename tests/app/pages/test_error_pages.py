@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from datetime import timedelta
+
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import select
 
+from app.accounts import service as accounts
 from app.accounts.deps import COOKIE
+from app.accounts.models import Role, SignIn
+from app.platform.database import now, transaction
+
+SECOND = "another horse battery"
 
 
 @pytest.mark.parametrize(
@@ -41,11 +50,51 @@ def test_an_expired_sign_in_gives_back_every_entry_and_takes_it_after_signing_in
     refused = browser.post("/participants/P1/visits", data=entered)
     assert refused.status_code == 401
     assert "Your sign-in has expired" in refused.text
-    assert '<input type="hidden" name="note" value="slept &lt;badly&gt; &amp; late">' in refused.text
-    assert 'action="/participants/P1/visits"' in refused.text
+    assert "<dd>slept &lt;badly&gt; &amp; late</dd>" in refused.text
+    assert "Send it again" not in refused.text  # nobody knows who entered this
+    assert "open the form anew" in refused.text
     browser.cookies.clear()
     browser.cookies.set(COOKIE, live)
     assert browser.post("/participants/P1/visits", data=entered).status_code == 303
+
+
+def again(page: str) -> str:
+    """Where the page of an error sends what was entered."""
+    return re.findall(r'<form method="post" action="([^"]*)"[^>]*data-again', page)[0]
+
+
+def test_what_an_expired_sign_in_gives_back_is_sent_again_by_its_writer_alone(browser: TestClient, enrolled: str) -> None:
+    entered = {"number": "2", "date": "2026-03-30", "note": "slept badly"}
+    with transaction("test") as db:
+        accounts.add_user(db, "second@clinic.example", Role.CLINICIAN, SECOND)
+        first = db.scalars(select(SignIn)).one()
+        first.last_seen_at = now() - timedelta(days=1)
+    live = browser.cookies[COOKIE]
+    refused = browser.post("/participants/P1/visits", data=entered)
+    assert refused.status_code == 401
+    assert '<input type="hidden" name="note" value="slept badly">' in refused.text
+    target = again(refused.text)
+    browser.cookies.clear()
+    browser.post("/sign-in", data={"email": "second@clinic.example", "password": SECOND})
+    assert browser.cookies[COOKIE] != live
+    stopped = browser.post(target, data=entered)
+    assert stopped.status_code == 409
+    assert "Somebody else had signed in when this was entered" in stopped.text
+    assert "slept badly" not in stopped.text
+    assert "2026-03-30" not in browser.get("/participants/P1").text
+    with transaction("test") as db:
+        db.get_one(SignIn, first.id).last_seen_at = now()
+    browser.cookies.clear()
+    browser.cookies.set(COOKIE, live)
+    assert browser.post(target, data=entered).status_code == 303
+    assert "2026-03-30" in browser.get("/participants/P1").text
+
+
+def test_what_another_error_gives_back_is_its_writers_too(browser: TestClient) -> None:
+    refused = browser.post("/participants/NOBODY/visits", data={"number": "2"})
+    assert refused.status_code == 404
+    assert "NOBODY" in re.findall(r"(?s)<main.*?<section", refused.text)[0]  # a rule of ours says what is not there
+    assert re.fullmatch(r"/participants/NOBODY/visits\?written_by=\d+", again(refused.text))
 
 
 def test_a_password_is_not_given_back(browser: TestClient) -> None:
