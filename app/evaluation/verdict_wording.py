@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
+from app.evaluation.ranking.answer import Difference
 from app.evaluation.schemas import Standing
-from app.evaluation.wording import OUTCOME_NAMES, amplitude, chance, number, percent, sentence
+from app.evaluation.wording import OUTCOME_NAMES, amplitude, chance, number, percent, sentence, signed
 from ml.ope.flags import Flag
 
 STANDING_NAMES: dict[Standing, str] = {
@@ -51,6 +52,29 @@ def further_sessions(reasons: Sequence[Flag]) -> str:
     return f"{' '.join(told)} would tell"
 
 
+def effect(differences: Mapping[str, Difference], within: float | None = None) -> str:
+    """What a policy is expected to change against cDBS, in one line.
+
+    Args:
+        differences: by quantity, as the answer's rows have them. within: probability that all outcomes are within their margins.
+    """
+    told = [
+        f"{name} {signed(scale * differences[quantity].value, digits)} {unit}"
+        for quantity, name, scale, digits, unit in _CHANGES
+        if quantity in differences
+    ]
+    likely = "" if within is None else f"; {chance(within)} likely within the margins"
+    return (", ".join(told) or "what it would change is not estimated") + likely
+
+
+_CHANGES = (
+    ("energy", "energy", 100, 0, "%"),
+    ("grasp_hz", "grasp", 1, 1, "Hz"),
+    ("rating", "rating", 1, 1, "points"),
+    ("tremor_percent", "tremor", 1, 0, "points"),
+)
+"""Of each quantity: name, scale, digits, unit."""
+
 _FURTHER = ("sessions_needed", "near_amplitude", "visits_needed")
 
 
@@ -74,4 +98,4 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "undecided": lambda f: "within the margins or beyond: still open",
     "not_settled_by_sessions": lambda f: "more sessions near its amplitude would not settle it",
 }
-"""For the first screen of the ranking, by code; what is not here is told further down alone."""
+"""For the first screen of the ranking, and for plans, by code; what is not here is told further down alone."""

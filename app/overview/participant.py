@@ -3,26 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
+from markupsafe import Markup
+from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
 from app.analysis.evidence.service import Evidence, evidence
 from app.analysis.metrics import service as analysis
 from app.analysis.metrics.charts import view
+from app.evaluation.ranking import service as ranking
+from app.evaluation.ranking.staleness import stale_reasons
+from app.evaluation.ranking.what_next import what_next
 from app.overview import state, wording
 from app.overview.story import story_chart
 from app.platform.database import Db
+from app.platform.errors import NotFound
 from app.platform.kept import kept
 from app.platform.web.charts import Chart
 from app.platform.web.templates import render
 from app.study import repository as study
 from app.study.characteristics.service import fields_of
 from app.study.deps import CurrentParticipant
-from app.study.models import SettingsVersion, Visit
+from app.study.models import Participant, SettingsVersion, Visit
+from app.study.service import may
 from app.study.visits.service import days_of
 from app.study.wording import characteristics_words
 
@@ -42,6 +51,7 @@ def participant_page(request: Request, participant: CurrentParticipant, db: Db, 
         settings=participant.current_settings,
         state=state.states(db, [participant], datetime.now(UTC).date())[participant.id],
         phases=state.PHASES,
+        answer=_answer(db, participant, caller),
         what=wording.what,
         characteristics=characteristics_words(fields_of(participant.current_characteristics)),
         actors=wording.ACTORS,
@@ -53,6 +63,24 @@ def participant_page(request: Request, participant: CurrentParticipant, db: Db, 
         may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
     )
     return HTMLResponse(page)
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """What to test next, in the ranking's own words; whether they are of data that have changed since."""
+
+    words: Markup
+    stale: bool
+
+
+def _answer(db: Session, participant: Participant, caller: Caller) -> _Answer | None:
+    """None before the first ranking."""
+    try:
+        found = ranking.current(db, participant, caller)
+    except NotFound:
+        return None
+    words = what_next(found, may_run=may(caller, can.RUN_JOBS, participant))
+    return _Answer(words, bool(stale_reasons(db, participant, found.evaluation, found.sessions)))
 
 
 def _story(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsVersion]) -> Chart | None:

@@ -15,9 +15,9 @@ from app.evaluation.estimates import coverage, held_out
 from app.evaluation.estimates.methods import names
 from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
-from app.evaluation.ranking.answer import OFF_SHARE
 from app.evaluation.ranking.export import csv_of
 from app.evaluation.ranking.judged import Judged
+from app.evaluation.ranking.what_next import what_next
 from app.evaluation.schemas import RANKING_KINDS, RankingFilter, RankingOut
 from app.learning.snapshots.service import not_ready
 from app.platform.database import Db
@@ -95,15 +95,11 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             ranking=found,
             answer=answered,
             picture=judged.picture(settings.lower_bound),
-            drawn=judged.random_sessions(settings),
-            minutes=found.horizon_steps * settings.period_s / 60,
+            next=what_next(judged, may_run=may_run),
             held=held_out.of_evaluation(judged.evaluation),
             plainly=verdict_wording.plainly,
-            amplitude=wording.amplitude,
             signed=wording.signed,
             chance=wording.chance,
-            further=verdict_wording.further_sessions,
-            off_share=OFF_SHARE,
             weights=assessment.weights,
             correlation=assessment.held_out_correlation,
             unfolded=unfolded,

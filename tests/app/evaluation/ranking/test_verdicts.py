@@ -11,6 +11,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.evaluation.ranking.decisions import Circumstances, decide
+from app.learning.policies.baselines import constant_onnx
 from app.study.margins.models import MarginsVersion
 from ml.ope.flags import Flag
 from ml.ope.posterior.further_sessions import Place
@@ -119,6 +120,18 @@ def test_the_first_screen_says_what_to_test_why_and_at_what_risk_without_a_word_
     assert re.search(r"Worth a test with care, \d+ minutes, one of them at a visit: p2 , not below 1.5 mA", words)
     assert "Not advised: p1 : unsafe, nearly off 42 % of the time" in words
     assert methods_named(words) == []
+
+
+def test_the_participants_page_begins_with_the_words_of_the_ranking(client: TestClient, policies: list[int], judge: Judge) -> None:
+    a, b, c = policies
+    judge({a: judged(50.0), b: judged(60.0, **NEARLY_OFF), c: judged(70.0, supported=False)})
+    ranking, words = first_screen(client), above_fold(client.get("/participants/P1").text)
+    answered = ranking[ranking.index("Worth a test") : ranking.index(" A proposal by stated rules")]
+    assert words.index(answered) < words.index("Needs attention"), "the answer comes first"
+    assert "out of date" not in words
+    assert methods_named(words) == []
+    client.post("/api/v1/participants/P1/policies", data={"name": "p3"}, files={"file": ("p3.onnx", constant_onnx(0.3, 10))})
+    assert "out of date The study has changed since: what has ." in above_fold(client.get("/participants/P1").text)
 
 
 def test_only_what_may_be_planned_without_a_clinicians_reason_can_be_ticked(client: TestClient, policies: list[int], judge: Judge) -> None:

@@ -1,0 +1,38 @@
+"""What to test next, in a few sentences: the first that the ranking and the participant's page say, made and kept once."""
+
+from __future__ import annotations
+
+from markupsafe import Markup
+
+from app.evaluation import verdict_wording, wording
+from app.evaluation.ranking.answer import OFF_SHARE
+from app.evaluation.ranking.judged import Judged
+from app.platform.web.templates import render_part
+
+
+def what_next(judged: Judged, *, may_run: bool) -> Markup:
+    """The sentences, as HTML.
+
+    Args:
+        judged: the ranking. may_run: whether who reads them may start jobs.
+    """
+    settings = judged.participant.current_settings
+
+    def write() -> Markup:
+        return render_part(
+            "evaluation/_next.html",
+            base=f"/participants/{judged.participant.code}",
+            answer=judged.answer,
+            drawn=judged.random_sessions(settings),
+            minutes=judged.evaluation.horizon_steps * settings.period_s / 60,
+            off_share=OFF_SHARE,
+            plainly=verdict_wording.plainly,
+            effect=verdict_wording.effect,
+            further=verdict_wording.further_sessions,
+            amplitude=wording.amplitude,
+            signed=wording.signed,
+            chance=wording.chance,
+            may_run=may_run,
+        )
+
+    return judged.kept(("next", judged.participant.code, settings.id, may_run), write)
