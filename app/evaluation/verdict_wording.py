@@ -90,6 +90,8 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "outside_range": lambda f: "it asks for amplitudes that nobody has tried",
     "thin": lambda f: "it asks for amplitudes that were hardly ever tried",
     "far": lambda f: "it does what no session has shown",
+    "unseen_dose": lambda f: f"{percent(f.value)} of the time its average amplitude is one that no session held",
+    "below_random_bound": lambda f: f"{percent(f.value)} of the time it goes lower than the random sessions did",
     "no_ordering_skill": lambda f: "the recordings so far cannot tell policies apart",
     "coverage_unchecked": lambda f: "what the recordings cover could not be checked",
     "reference_missing": lambda f: "there is no estimate of cDBS to hold it against",

@@ -19,7 +19,7 @@ from app.analysis.metrics import service as analysis
 from app.analysis.metrics.charts import view
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.staleness import stale_reasons
-from app.evaluation.ranking.what_next import what_next
+from app.evaluation.what_next import what_next
 from app.overview import state, wording
 from app.overview.story import story_chart
 from app.platform.database import Db

@@ -29,6 +29,10 @@ class Code(StrEnum):
     """The participant's schedule says otherwise now than when the plan was drafted."""
 
 
+OF_METHODS = (Code.RANKING_NOTE, Code.FLAGS)
+"""What is about estimates and the methods that made them; a plan's verdicts say what follows from it."""
+
+
 @dataclass(frozen=True)
 class PlanWarning:
     """One warning.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from app.evaluation.verdict_wording import plainly
 from app.evaluation.wording import amplitude, chance, count, joined
-from app.planning.notices import Code, PlanWarning
+from app.planning.notices import OF_METHODS, Code, PlanWarning
 from app.planning.plans.designs import Bound, Planned, delivered_ma
 from app.planning.plans.models import NEAR, Plan, PlanItem, is_held
 from app.planning.plans.suggested import Held
@@ -43,7 +44,7 @@ _ABOUT: dict[Code, str] = {
     Code.NOT_EVALUATED: "No ranking stands behind this plan: the participant's policies have not been evaluated.",
     Code.OVERRIDDEN: "Policy '{policy}' is unsafe and planned all the same: {reason}.",
     Code.NOT_RANKED: "Policy '{policy}' is not in the ranking.",
-    Code.NOT_SUPPORTED: "The data do not support the estimate of policy '{policy}': {flags}.",
+    Code.NOT_SUPPORTED: "The recordings say too little of what policy '{policy}' does to rely on what is expected of it{flags}.",
     Code.FLAGS: "Policy '{policy}': {flags}.",
     Code.RETIRED: "Policy '{policy}' was retired: {reason}.",
     Code.CANNOT_BE_SIGNED: "The plan cannot be signed: {why}",
@@ -63,9 +64,28 @@ def warning(found: PlanWarning) -> str:
         return f"Policy '{found.policy}' may not go below {amplitude(fraction, None if cdbs_ma is None else fraction * cdbs_ma)}."
     if found.code is Code.VISIT_HELD:
         return f"The visit already has {values['sessions']} {'session' if values['sessions'] == 1 else 'sessions'}."
-    if "flags" in values:
-        values["flags"] = joined(values["flags"]) or "no reason given"
+    if found.code is Code.NOT_SUPPORTED:
+        why = plainly(values["flags"])
+        values["flags"] = f": {why}" if why else ""
+    elif found.code is Code.FLAGS:
+        values["flags"] = joined(values["flags"])
     return _ABOUT[found.code].format(**values)
+
+
+def plain_warnings(warnings: Sequence[PlanWarning]) -> list[tuple[PlanWarning, str]]:
+    """Those that whoever signs or runs the plan reads, with their sentences; what is about methods is told in plain words or left out."""
+    told = []
+    for found in warnings:
+        if found.code not in OF_METHODS:
+            told.append((found, warning(found)))
+        elif "flags" in found.values and (why := plainly(found.values["flags"])):
+            told.append((found, f"Policy '{found.policy}': {why}."))
+    return told
+
+
+def method_notes(warnings: Sequence[PlanWarning]) -> list[str]:
+    """What engineers read of the ranking behind a plan."""
+    return [warning(found) for found in warnings if found.code in OF_METHODS]
 
 
 STOP_RULES = (

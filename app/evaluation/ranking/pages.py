@@ -17,8 +17,8 @@ from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.export import csv_of
 from app.evaluation.ranking.judged import Judged
-from app.evaluation.ranking.what_next import what_next
 from app.evaluation.schemas import RANKING_KINDS, RankingFilter, RankingOut
+from app.evaluation.what_next import what_next
 from app.learning.snapshots.service import not_ready
 from app.platform.database import Db
 from app.platform.errors import NotFound

@@ -13,7 +13,8 @@ from app.accounts.permissions import Caller
 from app.evaluation import repository as evaluations
 from app.evaluation import wording
 from app.evaluation.models import Evaluation
-from app.evaluation.ranking.judged import Judged, judged
+from app.evaluation.ranking.answer import Row
+from app.evaluation.ranking.judged import Judged, judged, own_row
 from app.evaluation.ranking.service import evaluation_notes
 from app.evaluation.ranking.staleness import stale_reasons
 from app.learning.models import Policy
@@ -42,6 +43,7 @@ class PlanLine:
     Attributes:
         start_minute: from the first session's start.
         estimate: of the pinned evaluation's method, as it was; None for what was not ranked.
+        row: what that evaluation says of the policy against cDBS, judged by the margins in force now; None as above.
         predicted_energy: mean squared amplitude fraction; 1 for cDBS and 0 for no-DBS by definition, else as the estimate predicts.
         design: what a random session shall try, in a draft with the bounds of today; None for other sessions.
     """
@@ -50,8 +52,8 @@ class PlanLine:
     start_minute: float
     policy: Policy | None
     estimate: Estimate | None
+    row: Row | None
     predicted_energy: float | None
-
     design: Planned | None
 
 
@@ -133,7 +135,7 @@ def shown(view: PlanView) -> PlanView:
         return view
     limits = common_limits(view.plan.items)
     lines = [
-        PlanLine(_masked(line.item, limits), line.start_minute, policy=None, estimate=None, predicted_energy=None, design=None)
+        PlanLine(_masked(line.item, limits), line.start_minute, policy=None, estimate=None, row=None, predicted_energy=None, design=None)
         for line in view.lines
     ]
     return replace(view, lines=lines, warnings=without_policies(view.warnings))
@@ -167,7 +169,8 @@ def view_of(db: Session, plan: Plan, visit: Visit) -> PlanView:
     for item in plan.items:
         estimate = estimates.get(item.policy_id) if item.policy_id else None
         policy = policies.get(item.policy_id) if item.policy_id else None
-        lines.append(PlanLine(item, start, policy, estimate, _energy(item, estimate), _design(visit, item)))
+        row = own_row(found.assessment, found.answer, policy.id) if found and policy else None
+        lines.append(PlanLine(item, start, policy, estimate, row, _energy(item, estimate), _design(visit, item)))
         start += item.minutes + item.washout_minutes + item.break_minutes
     stale = _stale_reasons(db, visit.participant, evaluation)
     state, signature = signature_of(db, visit, plan, policies)

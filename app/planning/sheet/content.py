@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from app.evaluation.verdict_wording import STANDING_NAMES, effect, plainly
 from app.planning import wording
 from app.planning.plans.view import PlanLine, PlanView
 from app.planning.sheet.ink import clock, printed_name, printed_warning, shade
@@ -38,18 +39,20 @@ def card_of(line: PlanLine, view: PlanView, bundle: str | None) -> Card:
     limits = f"{wording.limits_ma(item)} mA" if item.max_ma is not None else "not set"
     limits += f", ramp {item.ramp_ma_per_s:g} mA/s" if item.ramp_ma_per_s is not None else ""
     limits += f", {item.hemisphere} side" if item.hemisphere else ""
-    told = {
+    rows = {
         "Policy": printed_name(line.policy) if line.policy else "",
         "Limits": limits,
         "Design": wording.design_name(line.design) if line.design else "",
         BUNDLE: "" if view.sealed else _bundle(line, bundle),
-        "Predicted": _predicted(line),
+        "Verdict": _verdict(line),
+        "Expected": _expected(line),
+        "Against cDBS": effect(line.row.differences, line.row.within) if line.row and line.row.differences else "",
         "Medication": f"due before: {item.medication}" if item.medication else "",
     }
-    mine = [w for w in view.warnings if line.policy is not None and w.policy_id == line.policy.id]
-    warnings = tuple(printed_warning(wording.warning(w), line.policy) for w in mine)
+    told = wording.plain_warnings(view.warnings)
+    warnings = tuple(printed_warning(text, line.policy) for w, text in told if line.policy is not None and w.policy_id == line.policy.id)
     head = f"{item.position}  {clock(line.start_minute, view.plan.starts_at)}  {wording.session_name(item)}"
-    return Card(head, length, tuple((label, text) for label, text in told.items() if text), warnings, shade(line))
+    return Card(head, length, tuple((label, text) for label, text in rows.items() if text), warnings, shade(line))
 
 
 def _bundle(line: PlanLine, sha256: str | None) -> str:
@@ -58,12 +61,19 @@ def _bundle(line: PlanLine, sha256: str | None) -> str:
     return sha256[:HASH] if sha256 else "not taken yet"
 
 
-def _predicted(line: PlanLine) -> str:
-    """What is predicted of a session; empty of one that was not ranked, as cDBS, whose energy is 1 by definition."""
+def _verdict(line: PlanLine) -> str:
+    """The ranking's verdict with its reason; empty of what was not ranked."""
+    if line.row is None:
+        return ""
+    why = plainly(line.row.decided.hazards or line.row.decided.reasons, line.row.limit, line.row.limit_ma)
+    return STANDING_NAMES[line.row.decided.standing] + (f": {why}" if why else "")
+
+
+def _expected(line: PlanLine) -> str:
+    """What is expected in a session; empty of one that was not ranked, as cDBS, whose energy is 100 % by definition."""
     e = line.estimate
     if e is None:
         return ""
     told = [] if line.predicted_energy is None else [f"energy {100 * line.predicted_energy:.0f} % of cDBS"]
     units = (("grasp_hz", "grasp {:.2f} Hz"), ("rating", "rating {:.1f}"), ("tremor_percent", "tremor {:.0f} %"))
-    told += [words.format(e.predicted[name]) for name, words in units if name in e.predicted]
-    return ", ".join([*told, f"return {e.value:.4g} ({e.low:.4g} to {e.high:.4g})" + ("" if e.supported else " *")])
+    return ", ".join([*told, *(words.format(e.predicted[name]) for name, words in units if name in e.predicted)])

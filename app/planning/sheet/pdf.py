@@ -179,17 +179,12 @@ def _designs(pdf: _Sheet, view: PlanView) -> None:
 def _reading(pdf: _Sheet, view: PlanView) -> None:
     """What the numbers mean, and what speaks against them."""
     evaluation = view.evaluation
-    levels = {line.estimate.level for line in view.lines if line.estimate}
     sentences = []
-    if evaluation and levels:
+    if evaluation and any(line.row for line in view.lines):
         sentences.append(
-            f"Return: what a session of {evaluation.horizon_steps} control steps is worth by this study's scores of beta, energy, grasp, "
-            f"rating and tremor, more being better, as estimated on {evaluation.created_at:%Y-%m-%d}; in brackets its "
-            f"{100 * min(levels):.0f} % interval. "
-            "Energy: the mean of the squared amplitude, 1 under cDBS."
+            f"Expected, and against cDBS: by the ranking of {evaluation.created_at:%Y-%m-%d}. Energy: the mean of the squared amplitude, "
+            "100 % under cDBS. Margins: how much worse grasp, rating and tremor may be, set for this participant."
         )
-    if any(line.estimate and not line.estimate.supported for line in view.lines):
-        sentences.append("* The recordings hold too little of the kind to rely on this estimate.")
     start = "by the clinic's clock" if view.plan.starts_at else "h:mm from the start of the first session"
     sentences.append(f"Start: {start}. Washout: pause on clinical stimulation after it. Bundle: first {HASH} characters of its hash.")
     pdf.set_font("Helvetica", "", 8)
@@ -197,12 +192,12 @@ def _reading(pdf: _Sheet, view: PlanView) -> None:
     pdf.multi_cell(WIDTH, 3.8, latin(" ".join(sentences)), align="L", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
     pdf.ln(1.5)
     on_cards = {line.policy.id for line in view.lines if line.policy}
-    for found in view.warnings:
+    for found, text in wording.plain_warnings(view.warnings):
         if found.policy_id in on_cards:
             continue
         pdf.set_text_color(*INK)
         pdf.set_font("Helvetica", "B", 8.5)
-        pdf.multi_cell(WIDTH, 4.2, latin(f"! {wording.warning(found)}"), align="L", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
+        pdf.multi_cell(WIDTH, 4.2, latin(f"! {text}"), align="L", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
 
 
 def _paragraph(pdf: _Sheet, title: str, text: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -9,6 +10,7 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from pypdf import PdfReader
 
 from app.evaluation.ranking.decisions import Circumstances, decide
 from app.learning.policies.baselines import constant_onnx
@@ -132,6 +134,22 @@ def test_the_participants_page_begins_with_the_words_of_the_ranking(client: Test
     assert methods_named(words) == []
     client.post("/api/v1/participants/P1/policies", data={"name": "p3"}, files={"file": ("p3.onnx", constant_onnx(0.3, 10))})
     assert "out of date The study has changed since: what has ." in above_fold(client.get("/participants/P1").text)
+
+
+def test_a_plan_says_of_its_policies_what_the_ranking_says(client: TestClient, policies: list[int], judge: Judge) -> None:
+    likely = {"energy": [0.71] * N, "grasp_hz": [1.8] * 400 + [1.85] * 600, "tremor_percent": share(0.15, 21.0, 40.0)}
+    judge({policies[0]: judged(50.0, outcome_draws=likely), policies[1]: judged(60.0, **NEARLY_OFF)})
+    visit = client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": "2046-04-06"}).json()["id"]
+    assert client.post(f"/api/v1/visits/{visit}/plan", json={"policy_ids": [policies[0]], "seed": 1}).status_code == 201
+    words = above_fold(client.get(f"/visits/{visit}/plan").text)
+    assert re.search(r"RL p0 test 10 — 0 to 3 [0-9.]+ 85 % \N{MINUS SIGN}29 \N{MINUS SIGN}0.2 0.0 \+4 ", words), "as the ranking's table"
+    assert methods_named(words) == []
+    pages = PdfReader(io.BytesIO(client.get(f"/api/v1/visits/{visit}/plan.pdf").content)).pages
+    sheet = " ".join(" ".join(page.extract_text() for page in pages).split())
+    assert "Verdict test" in sheet
+    assert re.search(
+        r"Against cDBS energy .29 %, grasp .0.2 Hz, rating 0.0 points, tremor \+4 points; 85 % likely within the margins", sheet
+    )
 
 
 def test_only_what_may_be_planned_without_a_clinicians_reason_can_be_ticked(client: TestClient, policies: list[int], judge: Judge) -> None:

@@ -35,12 +35,14 @@ def test_every_session_has_a_letter_of_its_own_and_nothing_tells_its_controller(
     assert {s[name] for s in sessions for name in telling} == {None}
     # those of the session without stimulation and of cDBS are within them
     assert {(s["min_ma"], s["max_ma"], s["ramp_ma_per_s"], s["repeat"]) for s in sessions} == {(0.0, 3.0, 1.5, 1)}
-    page = client.get(f"/visits/{studied.visit}/plan", headers=PAGE).text
-    day = page[: page.index('id="draft"')]
+    day = client.get(f"/visits/{studied.visit}/plan", headers=PAGE).text
     sheet = " ".join(p.extract_text() for p in PdfReader(BytesIO(client.get(f"{path}.pdf").content)).pages)
     for text in (day, sheet, str(plan["warnings"])):
         assert not [name for name in ("rl-01", "rl-02", "Distilled", "not supported", "95.0") if name in text]
     assert "key sealed" in day
+    form = client.get(f"/visits/{studied.visit}/plan?replace=yes", headers=PAGE).text
+    assert "rl-01" in form[form.index('id="draft"') :], "policies are named to who would replace the plan, and ticked are none"
+    assert " checked>" not in form
 
 
 def test_the_key_is_opened_with_a_reason_and_stands_in_the_audit_trail(

@@ -13,8 +13,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
+from app.planning.draft_form import held_rows
 from app.planning.plans.designs import Bound, Planned, delivered_ma
-from app.planning.plans.pages import _held_rows
 from app.planning.plans.suggested import Held
 from app.planning.wording import design_words
 from ml.deploy.bundle import open_bundle
@@ -64,7 +64,7 @@ def test_an_amplitude_that_the_form_proposes_is_one_that_the_plan_takes(lower_bo
     near = [found for dose in np.arange(0.45, 1.0, 0.05) if (found := reachable(float(dose), place)) is not None]
     assert near
     for one in near:
-        proposed = float(_held_rows(None, [Held(Hold(one.level, 1, None), ())], lower_bound, cdbs_ma)[0].amplitude)
+        proposed = float(held_rows(None, [Held(Hold(one.level, 1, None), ())], lower_bound, cdbs_ma)[0].amplitude)
         assert lower_bound <= round(proposed / (cdbs_ma or 1.0), 6) < 1
         assert abs(proposed - one.level * (cdbs_ma or 1.0)) <= 0.1
 

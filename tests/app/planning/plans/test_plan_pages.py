@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.planning.plans.models import Plan
 from app.study.models import Visit
+from tests.app.words import above_fold
 
 PAGE = {"Accept": "text/html"}
 
@@ -50,12 +51,15 @@ def test_draft_then_sign_with_forms_alone(client: TestClient, client_as: Any, st
         "DLSM",
     ):
         assert words in page, words
+    first = above_fold(page)
+    assert [words for words in ("95.00", "93.00", "DLSM") if words in first] == [], "estimates stand in the fold for engineers"
     approved = _post(clinician, f"{path}/approve", plan_id=str(plan.id), password="correct horse battery")
     assert (approved.status_code, approved.headers["location"]) == (303, f"{path}?done=approved")
     page = client.get(path, headers=PAGE).text
     assert "by clinician@clinic.example" in page
     assert "Your password, again" not in page
-    assert "Why the approved plan is replaced" in page
+    assert 'id="draft"' not in page, "a signed plan is there to be run"
+    assert "Why the approved plan is replaced" in client.get(f"{path}?replace=yes", headers=PAGE).text
 
 
 def test_a_refused_form_comes_back_as_it_was_filled_in(client: TestClient, studied: Any, db: Session) -> None:
@@ -152,7 +156,7 @@ def test_a_viewer_sees_the_plan_and_no_buttons(client: TestClient, client_as, st
 def test_a_participant_without_policies_gets_a_visit_of_random_sessions(client: TestClient, enrolled: str) -> None:
     visit = client.get(f"/api/v1/participants/{enrolled}/visits").json()["items"][0]["id"]
     page = client.get(f"/visits/{visit}/plan").text
-    assert "A visit of random sessions fills the replay buffer first" in page
+    assert "Policies learn from a visit of random sessions first" in page
     drafted = _post(client, f"/visits/{visit}/plan", random_sessions="3")
     assert drafted.status_code == 303
     plan = client.get(f"/api/v1/visits/{visit}/plan").json()

@@ -1,0 +1,193 @@
+"""What the form for a draft shows and sends: policies, sessions held near an amplitude, and the rules of the day."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy.orm import Session
+from starlette.datastructures import FormData
+
+from app.accounts.permissions import Caller
+from app.evaluation.ranking.answer import Answer, Row
+from app.evaluation.ranking.assessment import cdbs_amplitude_now
+from app.evaluation.ranking.judged import Judged
+from app.evaluation.ranking.service import current
+from app.learning import repository as learning
+from app.learning.models import Policy
+from app.planning import wording
+from app.planning.plans.designs import offered
+from app.planning.plans.schemas import HeldIn, LimitIn, PlanIn, PlanOptions
+from app.planning.plans.service import rules_of
+from app.planning.plans.suggested import Held, held_in, suggested
+from app.planning.plans.view import PlanView
+from app.planning.protocol.schedule import most_policies, total_minutes
+from app.platform.errors import Invalid, NotFound
+from app.platform.web.forms import parse
+from app.study.models import Participant, Visit
+from ml.designs import LOW_AMPLITUDE
+from ml.ope.posterior.further_sessions import MOST_HELD, Place
+
+EARLY_RANDOM_SESSIONS = 3
+"""What the form offers while a participant has no policy: with a cDBS session first, an hour."""
+
+LABELS = {
+    "minutes_per_session": "Minutes per session",
+    "total_minutes": "Minutes of the visit",
+    "washout_minutes": "Washout",
+    "random_sessions": "Random sessions",
+    "no_dbs_minutes": "No-DBS session",
+    "repeats": "Sessions of each policy",
+    "order": "Order",
+    "break_minutes": "Break",
+    "starts_at": "First session at",
+    "hemisphere": "Side that the controllers set",
+    "min_ma": "Lowest amplitude",
+    "max_ma": "Highest amplitude",
+    "ramp_ma_per_s": "Fastest change",
+    "note": "Note on the sheet",
+    "min_fraction": "Lowest amplitude, share of cDBS",
+    "reason": "Why the approved plan is replaced",
+    "amplitude_ma": "Held near, mA",
+    "amplitude_fraction": "Held near, share of cDBS",
+    "sessions": "Sessions held near it",
+    "visit_id": "Visit",
+    "visit_number": "Number of the new visit",
+    "visit_date": "Date of the new visit",
+}
+
+
+UNITS = ("amplitude_ma", "amplitude_fraction")
+"""In which the form names amplitudes."""
+MOST_ROWS = 5
+
+
+def draft_of(values: FormData) -> PlanIn:
+    """The form as the API's type."""
+    ids = [str(v) for v in values.getlist("policy_ids")]
+    wrong = [i for i in ids if not (i.isdecimal() and 0 < int(i) < 2**31)]
+    if wrong:
+        raise Invalid(f"'{wrong[0]}' is no policy.", "Choose policies of the list.")
+    if len(ids) > 20:
+        raise Invalid(f"{len(ids)} policies are chosen; a visit takes 20 at most.", "Tick fewer.")
+    options = parse(PlanOptions, values, LABELS)
+    reasons, lowest = ({i: str(values.get(f"{name}_{i}", "")).strip() for i in ids} for name in ("override", "limit"))
+    overrides = [{"policy_id": int(i), "reason": text} for i, text in reasons.items() if text]
+    limits = [parse(LimitIn, {"policy_id": i, "min_fraction": text}, LABELS) for i, text in lowest.items() if text]
+    return PlanIn.model_validate(
+        {"policy_ids": [int(i) for i in ids], "overrides": overrides, "limits": limits, "held": held_of(values)}
+        | options.model_dump(exclude_unset=True)
+    )
+
+
+def shown_of(db: Session, visit: Visit, caller: Caller, full: PlanView | None, values: FormData | None) -> dict[str, Any]:
+    """What the form for a draft shows."""
+    participant = visit.participant
+    try:
+        found: Judged | None = current(db, participant, caller)
+    except NotFound:
+        found = None
+    defaults = rules_of(PlanOptions())
+    choices = _choices(db, participant, found.answer if found is not None else None)
+    slots, settings = most_policies(defaults), participant.current_settings
+    place = Place(settings.lower_bound, round(60 * defaults.session_minutes / settings.period_s), settings.period_s)
+    suggestions = suggested(found, slots)
+    return {
+        "ranking": found,
+        "typed": values or {},
+        "choices": choices,
+        "suggestions": [(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],
+        "held_rows": held_rows(values, held_in(found, slots - len(suggestions), place), place.lower_bound, cdbs_amplitude_now(participant)),
+        "holding": wording.holding,
+        "low_amplitude": LOW_AMPLITUDE,
+        "most_held": MOST_HELD,
+        "form_values": _form_values(full, values, choices),
+        "chosen": _chosen(None if full is not None and full.sealed else full, values),
+        "orders": wording.ORDER_NAMES,
+        "fit": [(n, total_minutes(n, defaults)) for n in range(1, slots + 1)],
+        "defaults": defaults,
+    }
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A policy that may be planned, and what the ranking says of it.
+
+    Attributes:
+        row: None for what no ranking holds. twins: policies that do the same by the ranking, such as its students.
+    """
+
+    policy: Policy
+    row: Row | None
+    twins: tuple[Policy, ...]
+
+
+def _choices(db: Session, participant: Participant, answered: Answer | None) -> list[Choice]:
+    """Behaviours that may be planned, what to test first; policies that no ranking holds come last."""
+    rows = answered.everyone() if answered is not None else {}
+    places = {i: k for k, i in enumerate(rows)}
+    policies = sorted(learning.candidates(db, participant.id), key=lambda p: (places.get(p.id, len(places)), p.id))
+    known = {p.id for p in policies}
+    heads = {p.id: rows[p.id].one.policy.id if p.id in rows and rows[p.id].one.policy.id in known else p.id for p in policies}
+    twins = {head: tuple(p for p in policies if heads[p.id] == head and p.id != head) for head in heads.values()}
+    return [Choice(p, rows.get(p.id), twins[p.id]) for p in policies if heads[p.id] == p.id]
+
+
+def _chosen(view: PlanView | None, values: FormData | None) -> Sequence[int]:
+    if values is not None:
+        return [int(v) for v in map(str, values.getlist("policy_ids")) if v.isdecimal()]
+    return [line.item.policy_id for line in view.lines if line.item.policy_id] if view else []
+
+
+def _form_values(view: PlanView | None, values: FormData | None, choices: Sequence[Any]) -> dict[str, Any]:
+    """What the form shows: what was sent, else the present plan's note, else the defaults."""
+    shown: dict[str, Any] = {k: f"{v:g}" if isinstance(v, float) else v for k, v in PlanOptions().model_dump().items()}
+    if view:
+        shown["note"] = view.plan.note
+    elif not choices:
+        shown["random_sessions"] = EARLY_RANDOM_SESSIONS
+    if values is not None:
+        shown |= {name: str(values[name]) for name in shown if name in values} | {
+            "no_dbs": "no_dbs" in values,
+            "blinded": "blinded" in values,
+        }
+    return shown
+
+
+@dataclass(frozen=True)
+class HeldRow:
+    """One row of the form.
+
+    Attributes:
+        unit: of `UNITS`. amplitude, sessions: as they stand in the fields. why: what the sessions would tell; None of a free row.
+    """
+
+    unit: str
+    amplitude: str
+    sessions: str
+    why: Held | None = None
+
+
+def held_of(values: FormData) -> list[HeldIn]:
+    """The sessions that the form asks for; a row without a number of sessions asks for none.
+
+    Raises:
+        Invalid: what no row of the form sends, or values outside their range.
+    """
+    units, amplitudes, sessions = ([str(v).strip() for v in values.getlist(f"held_{name}")] for name in ("unit", "amplitude", "sessions"))
+    if not len(units) == len(amplitudes) == len(sessions) <= MOST_ROWS or any(unit not in UNITS for unit in units):
+        raise Invalid("The held sessions are not those of the form.", "Load the page again.")
+    rows = zip(units, amplitudes, sessions, strict=True)
+    return [parse(HeldIn, {unit: amplitude, "sessions": number}, LABELS) for unit, amplitude, number in rows if number not in ("", "0")]
+
+
+def held_rows(values: FormData | None, holds: Sequence[Held], lower_bound: float, cdbs_ma: float | None) -> list[HeldRow]:
+    """What the form shows: what is suggested, no session asked for, and a free row; what was sent where it was refused."""
+    unit = "amplitude_ma" if cdbs_ma is not None else "amplitude_fraction"
+    rows = [HeldRow(unit, offered(h.hold.fraction, lower_bound, cdbs_ma), "", h) for h in holds]
+    rows = [*rows[: MOST_ROWS - 1], HeldRow(unit, "", "")]
+    sent = [[str(v) for v in values.getlist(f"held_{name}")] for name in ("amplitude", "sessions")] if values is not None else [[], []]
+    if len(sent[0]) != len(rows) or len(sent[1]) != len(rows):
+        return rows
+    return [HeldRow(row.unit, sent[0][i], sent[1][i], row.why) for i, row in enumerate(rows)]
