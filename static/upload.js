@@ -8,7 +8,7 @@ const home = `/participants/${form.dataset.participant}`;
 const LABELS = { understood: "Understood", flagged: "Flagged", repaired: "Repaired", ignored: "Left aside", removed: "Removed" };
 const FIELDS = ["visit", "controller", "policy", "started_at", "hemisphere", "beta_unit", "beta_source", "lfp_unit", "session"];
 const UNKNOWN_COLUMNS = ["columns not known", "warn"];
-const STATES = { decoded: ["decoded", "good"], received: ["being read", "info"], released: ["released unread", "warn"], discarded: ["discarded", "warn"] };
+const STATES = { decoded: ["read", "good"], received: ["being read", "info"], released: ["released unread", "warn"], discarded: ["discarded", "warn"] };
 
 form.querySelector("[data-drop-hint]").prepend("Drop files or whole folders here, or choose them. ");
 

@@ -163,7 +163,7 @@ def _side(f: Mapping[str, Any]) -> str:
 def _above_cdbs(f: Mapping[str, Any]) -> str:
     return (
         f"{f['above']} of {f['steps']} steps lie above the cDBS amplitude of {f['cdbs_ma'] or float('nan'):g} mA; "
-        "they are kept as they are and stay out of replay buffers."
+        "they are kept as they are, and no policy learns from them."
     )
 
 

@@ -267,7 +267,7 @@ def _expected(m: BundleManifest) -> list[tuple[str, str]]:
         return [("Delivered", lowest), ("Energy", f"{energy_words(square)}, as scheduled")]
     if m.asked_mean is None or m.energy_of_cdbs is None or m.charge_of_cdbs is None:
         return [("Not known", "no beta of this participant was logged with this window: neither amplitude nor energy can be estimated")]
-    asked = f"{m.asked_mean * m.cdbs_ma:.2f} mA on average over {m.test_windows} logged windows ({m.test_windows_from})"
+    asked = f"{m.asked_mean * m.cdbs_ma:.2f} mA on average over {m.test_windows} recorded windows ({m.test_windows_from})"
     below = f"below {m.min_ma:g} mA (lowest) in {100 * (m.asked_below_minimum or 0):.0f} %"
     if m.logged_lower_bound is not None and m.asked_below_bound is not None:
         below += f", below {m.logged_lower_bound * m.cdbs_ma:.3g} mA (B, lowest tried at random) in {100 * m.asked_below_bound:.0f} %"

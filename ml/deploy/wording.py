@@ -14,8 +14,8 @@ def warning_sentences(manifest: BundleManifest) -> list[str]:
 
 def _sentence(warning: BundleWarning, m: BundleManifest) -> str:
     if warning.code == WarningCode.UNTRIED or warning.value is None or warning.limit is None:
-        return "Nobody knows what this policy asks for on this participant's beta: no logged beta of its window was there to try it on."
-    share = f"{100 * warning.value:.0f} % of {m.test_windows} logged windows"
+        return "Nobody knows what this policy asks for on this participant's beta: no recorded beta of its window was there to try it on."
+    share = f"{100 * warning.value:.0f} % of {m.test_windows} recorded windows"
     if warning.code == WarningCode.BELOW_LOGGED:
         bound = f"B = {m.logged_lower_bound:g} of cDBS, {warning.limit:.3g} mA"
         return f"Asks for less than was tried at random ({bound}) in {share}: no data there."

@@ -6,7 +6,8 @@ from html.parser import HTMLParser
 
 BANNED = (
     "E[", "horizon", "logged", "saturated", "data support it", "DLSM", "DLMM", "FQE", "QoC", "ξβ", "xi_beta", "r_end", "posterior",
-    "fitted Q", "Mean Q", "critic", "temporal-difference", "extrapolation",
+    "fitted Q", "Mean Q", "critic", "temporal-difference", "extrapolation", "Estimated return", "data do not support", "replay buffer",
+    "decoded",
 )  # fmt: skip
 _UNSEEN = {"details", "script", "style", "title", "head"}
 
@@ -19,6 +20,8 @@ class _Reader(HTMLParser):
     def handle_starttag(self, tag, attrs):  # type: ignore[no-untyped-def]
         # a fold that the page opens by itself is read
         self.folded += tag in _UNSEEN and not (tag == "details" and "open" in dict(attrs) and not self.folded)
+        if not self.folded:
+            self.words += [value for name, value in attrs if name in ("title", "aria-label", "placeholder") and value]
 
     def handle_endtag(self, tag):  # type: ignore[no-untyped-def]
         self.folded = max(0, self.folded - (tag in _UNSEEN))

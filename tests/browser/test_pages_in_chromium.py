@@ -129,7 +129,7 @@ def test_files_dropped_on_the_upload_page_become_sessions(window: Callable, enro
         files,
     )
     watched.page.dispatch_event("[data-drop]", "drop", {"dataTransfer": transfer})
-    outcomes = ["received", "decoded", "look at this", "columns not known", "known already"]
+    outcomes = ["received", "read", "look at this", "columns not known", "known already"]
     expect(watched.page.locator("[data-upload-list] .badge")).to_have_text(outcomes, timeout=60_000)
     expect(watched.page.locator("[data-upload-list] li").first).to_contain_text("bad <b>.csv")
     assert client.get("/api/v1/visits/1/sessions").json()["total"] == 1

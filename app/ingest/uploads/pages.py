@@ -118,7 +118,7 @@ def report(request: Request, upload_id: RowId, db: Db, caller: CurrentCaller) ->
 def _state(upload: Upload) -> tuple[str, str]:
     """What became of an upload, in a few words, and their tone."""
     if upload.status == "decoded":
-        return "decoded", "good"
+        return "read", "good"
     if any(f.preview is not None for f in upload.files):
         return "columns not known", "warn"
     if upload.status == "failed":

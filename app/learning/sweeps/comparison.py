@@ -15,7 +15,7 @@ from ml.returns import Gain
 PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")
 DASHES = ("solid", "dash", "dot")
 CURVES = (
-    ("held_out", "score", "Estimated return on held-out sessions", "reward; from the sessions that were kept out of training"),
+    ("held_out", "score", "Held-out return", "reward; estimated on the sessions that were kept out of training"),
     ("held_out", "over_logged", "Promised return beyond the recorded one", "reward; at the first states of the left-out sessions"),
     ("curve", "mean_q", "Promised return of the policy", "reward; an unbounded climb is over-estimation"),
     ("curve", "action_distance", "Distance from the recorded amplitudes", "mean absolute difference, fraction of cDBS"),

@@ -73,7 +73,7 @@ GROUPS = (
                 "steps", attrs=_WHOLE,
             ),
             SettingField(
-                "beta_measure", "Measure of beta", "What is computed from time-domain LFP. Recordings decoded before keep theirs.",
+                "beta_measure", "Measure of beta", "What is computed from time-domain LFP. Recordings read before keep theirs.",
                 options=(("rms", "RMS amplitude, in the LFP's unit"), ("power", "power, in the LFP's unit squared")),
             ),
             SettingField(

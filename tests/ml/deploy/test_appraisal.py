@@ -55,7 +55,7 @@ def test_a_policy_that_often_leaves_what_was_tried_or_allowed_is_warned_of_on_th
         (WarningCode.BELOW_LOGGED, 1.0, pytest.approx(0.9)),
         (WarningCode.BELOW_MINIMUM, 1.0, 0.5),
     ]
-    for sentence in ("B = 0.3 of cDBS, 0.9 mA) in 100 % of 16 logged windows", "lowest amplitude (0.5 mA) in 100 %"):
+    for sentence in ("B = 0.3 of cDBS, 0.9 mA) in 100 % of 16 recorded windows", "lowest amplitude (0.5 mA) in 100 %"):
         assert sentence in text
     between, text = sheet(-0.6)  # 0.23: 0.69 mA
     assert len(between) == 1

@@ -174,7 +174,7 @@ def test_the_sheet_prints_on_one_page_even_with_long_names(network, manifest, te
     assert len(pages) == 1
     text = pages[0].extract_text()
     assert "P-07" in text
-    assert text.count("logged windows") == 3
+    assert text.count("recorded windows") == 3
     assert "no medical device" in text
 
 
