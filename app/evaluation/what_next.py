@@ -26,6 +26,7 @@ def what_next(judged: Judged, *, may_run: bool) -> Markup:
             drawn=judged.random_sessions(settings),
             minutes=judged.evaluation.horizon_steps * settings.period_s / 60,
             off_share=OFF_SHARE,
+            margins=judged.participant.margins_in_force,
             plainly=verdict_wording.plainly,
             effect=verdict_wording.effect,
             further=verdict_wording.further_sessions,

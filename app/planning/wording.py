@@ -182,7 +182,7 @@ def design_name(planned: Planned) -> str:
     """A design in two words, for a table."""
     if planned.design == NEAR:
         return f"held near {_near(planned)}"
-    return {"paper": "paper's draws", "ladder": "titration ladder"}.get(planned.design) or f"level {planned.level:.2f}"
+    return {"paper": "paper's draws", "ladder": "titration ladder"}.get(planned.design) or f"level {planned.level:.2f} of cDBS"
 
 
 def design_words(planned: Planned) -> str:

@@ -103,7 +103,6 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             weights=assessment.weights,
             correlation=assessment.held_out_correlation,
             unfolded=unfolded,
-            margins=participant.margins_in_force,
             levels=participant.current_margins,
             forest=charts.forest(found),
             references=charts.shown_references(found),

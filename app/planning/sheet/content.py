@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from app.evaluation.verdict_wording import STANDING_NAMES, effect, plainly
+from app.evaluation.wording import chance
 from app.planning import wording
 from app.planning.plans.view import PlanLine, PlanView
 from app.planning.sheet.ink import clock, printed_name, printed_warning, shade
@@ -46,7 +47,7 @@ def card_of(line: PlanLine, view: PlanView, bundle: str | None) -> Card:
         BUNDLE: "" if view.sealed else _bundle(line, bundle),
         "Verdict": _verdict(line),
         "Expected": _expected(line),
-        "Against cDBS": effect(line.row.differences, line.row.within) if line.row and line.row.differences else "",
+        "Against cDBS": effect(line.row.differences) if line.row and line.row.differences else "",
         "Medication": f"due before: {item.medication}" if item.medication else "",
     }
     told = wording.plain_warnings(view.warnings)
@@ -62,11 +63,12 @@ def _bundle(line: PlanLine, sha256: str | None) -> str:
 
 
 def _verdict(line: PlanLine) -> str:
-    """The ranking's verdict with its reason; empty of what was not ranked."""
+    """The ranking's verdict with its reason and the chance of being within the margins; empty of what was not ranked."""
     if line.row is None:
         return ""
     why = plainly(line.row.decided.hazards or line.row.decided.reasons, line.row.limit, line.row.limit_ma)
-    return STANDING_NAMES[line.row.decided.standing] + (f": {why}" if why else "")
+    likely = "" if line.row.within is None else f"; {chance(line.row.within)} likely within the margins"
+    return STANDING_NAMES[line.row.decided.standing] + (f": {why}" if why else "") + likely
 
 
 def _expected(line: PlanLine) -> str:
