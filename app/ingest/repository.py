@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import datetime, timedelta
 
-from sqlalchemy import func, select, true
+from sqlalchemy import func, or_, select, true
 from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.permissions import Caller
@@ -39,6 +39,12 @@ def failed_file(db: Session, participant_id: int, file: UploadFile) -> UploadFil
     sealed = UploadFile.quarantine_sha256.is_not(None) if file.quarantine_sha256 else UploadFile.quarantine_sha256.is_(None)
     query = select(UploadFile).where(UploadFile.participant_id == participant_id, same, sealed, UploadFile.decided_at.is_(None))
     return db.scalar(query.order_by(UploadFile.id).limit(1))
+
+
+def names_stored(db: Session, sha256: str) -> bool:
+    """Whether any uploaded file has these stored bytes, cleaned, encrypted or released."""
+    columns = (UploadFile.stored_sha256, UploadFile.quarantine_sha256, UploadFile.released_sha256)
+    return db.scalar(select(UploadFile.id).where(or_(*(column == sha256 for column in columns))).limit(1)) is not None
 
 
 def session_ids_of_file(db: Session, file: UploadFile, known_recordings: Sequence[int] = ()) -> list[int]:

@@ -154,24 +154,33 @@ class Receiver:
             return known
         content = self._store(raw)
         if content.problem is not None or content.stored_sha256 is None:
-            self._drop_seal(content.quarantine_sha256)
+            self._forget(content.quarantine_sha256)
+            self.db.commit()
             return known
         log.warning("a stored file was damaged and is made anew", upload_file=row.id, sha256=row.stored_sha256)
-        row.stored_sha256, row.redactor_version = content.stored_sha256, REDACTOR_VERSION
-        spare = content.quarantine_sha256
+        damaged, spare = row.stored_sha256, content.quarantine_sha256
+        # a newer betaloop, or another column mapping, may make other bytes of it
+        row.kind, row.stored_sha256, row.column_mapping_id = content.kind, content.stored_sha256, content.column_mapping_id
+        row.redactor_version = REDACTOR_VERSION
         if row.quarantine_sha256 is not None and spare is not None and row.decided_at is None:
             row.quarantine_sha256, spare = spare, row.quarantine_sha256
+        self._forget(spare)
+        self._forget(damaged)
         self.db.commit()
-        self._drop_seal(spare)
         known.reports[0].understood.append(wording.MADE_ANEW)
         return known
 
-    def _drop_seal(self, sealed: str | None) -> None:
-        """Remove encrypted bytes that no row names any more: they are encrypted anew each time, so that no other row has them."""
-        if sealed is not None:
-            self.db.delete(self.db.get_one(files.StoredFile, sealed))
-            self.db.commit()
-            files.remove(sealed)
+    def _forget(self, sha256: str | None) -> None:
+        """Remove bytes that no file names any more in this transaction. The caller commits.
+
+        They go before that: where the service is stopped in between, the file still names them, and the same is done again. The other
+        way round, bytes that nothing names would stay for ever.
+        """
+        self.db.flush()
+        if sha256 is not None and not repository.names_stored(self.db, sha256):
+            self.db.delete(self.db.get_one(files.StoredFile, sha256))
+            self.db.flush()
+            files.remove(sha256)
 
     def _recordings(self, row: UploadFile) -> list[Recording]:
         mine = [*repository.recordings_of_file(self.db, row.id), *repository.recordings_by_id(self.db, known_recordings(row))]
@@ -309,6 +318,7 @@ class Receiver:
         if known is None or known.row.id == row.id:
             return None
         self.db.delete(row)
+        self._forget(row.quarantine_sha256)
         self.db.commit()
         return known
 
@@ -354,8 +364,8 @@ class Receiver:
             before.stored_sha256 = before.quarantine_sha256 if before.stored_sha256 == kept else before.stored_sha256
         self.db.delete(row)
         store_reports(before, [report])
+        self._forget(sealed)
         self.db.commit()
-        self._drop_seal(sealed)
         return FileOutcome(name, before, [report], duplicate=True, same_bytes=True, for_sender=problem.for_sender)
 
 

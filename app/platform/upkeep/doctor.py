@@ -9,21 +9,23 @@ from pathlib import Path
 
 from alembic.config import Config
 from alembic.script import ScriptDirectory
-from sqlalchemy import text
+from sqlalchemy import or_, select, text
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from app.platform import files
 from app.platform.audit.chain import verify
 from app.platform.bucket import StoreAway, bucket
-from app.platform.database import new_session, now
+from app.platform.database import Base, new_session, now
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.service import STALE_S
 from app.platform.service_role import excess
+from app.platform.tables import load_tables
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[3]
 LEAST_FREE_MB = 1024
+MOST_NAMED = 20
 MOST_CLOCK_DIFFERENCE_S = 2.0
 
 
@@ -108,9 +110,28 @@ def _files(db: Session, hashes: bool) -> Finding:
     bad = [row.sha256 for row in rows if not files.is_whole(row.sha256, row.size, hashes)]
     checked = "hashes" if hashes else "sizes"
     if bad:
-        detail = f"{len(bad)} of {len(rows)} stored files are missing or damaged, the first {bad[0]}"
-        return Finding("files", False, detail, "Restore them from a backup (`betaloop restore`).")
+        detail = f"{len(bad)} of {len(rows)} stored files are missing or damaged, the first {bad[0]}{_named(db, bad)}"
+        hint = (
+            "What was uploaded is made anew when the same file is uploaded once more for its participant; "
+            "the rest comes back from a backup (`betaloop restore`)."
+        )
+        return Finding("files", False, detail, hint)
     return Finding("files", True, f"{len(rows)} stored files, {checked} checked")
+
+
+def _named(db: Session, bad: list[str]) -> str:
+    """What names stored files, as tables and numbers: by these they can be looked up and sent again."""
+    load_tables()
+    found = []
+    for table in Base.metadata.sorted_tables:
+        columns = [key.parent for key in table.foreign_keys if key.column.table.name == files.StoredFile.__tablename__]
+        if not columns:
+            continue
+        query = select(table.c.id).where(or_(*(column.in_(bad) for column in columns))).order_by(table.c.id)
+        if numbers := db.scalars(query.limit(MOST_NAMED + 1)).all():
+            more = " and more" if len(numbers) > MOST_NAMED else ""
+            found.append(f"{table.name.replace('_', ' ')} {', '.join(map(str, numbers[:MOST_NAMED]))}{more}")
+    return f" (needed by {'; '.join(found)})" if found else ""
 
 
 def _jobs(db: Session) -> Iterator[Finding]:

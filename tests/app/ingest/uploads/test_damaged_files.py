@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,24 @@ from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
 from app import cli
+from app.accounts.permissions import SYSTEM
+from app.ingest.sessions import StatedSession
+from app.ingest.uploads import reading, receiving, service
+from app.ingest.uploads.incoming import Incoming
+from app.ingest.uploads.interrupted import resume
 from app.ingest.wording import MADE_ANEW
 from app.platform import files
+from app.platform.database import new_session
 from app.platform.upkeep import backup as backups
+from app.platform.upkeep.doctor import examine
+from app.settings import get_settings
+from app.study import repository as study
 from tests.app.every_route import TABLE
+
+
+class Stopped(BaseException):
+    """The process ends here."""
+
 
 DAMAGES = ("changed", "missing", "unreadable")
 
@@ -67,6 +82,71 @@ def test_a_damaged_file_in_quarantine_comes_back_encrypted(client: TestClient, e
     assert files.is_whole(after)
     assert b"no recording" not in files.read(after)
     assert db.scalars(text("select sha256 from stored_file")).all() == [after], "nothing that is damaged is left for `doctor` to find"
+
+
+def test_a_file_that_is_cleaned_otherwise_today_leaves_nothing_damaged_behind(
+    client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = send(client, enrolled, "s.csv", TABLE, visit="1", controller="random")
+    damage(first["stored_sha256"], "changed")
+    real = reading.clean
+
+    def newer(raw: Any, clean: Path, *args: Any) -> Any:
+        found = real(raw, clean, *args)
+        clean.write_bytes(clean.read_bytes() + b"\n")
+        return found
+
+    monkeypatch.setattr(reading, "clean", newer)
+    monkeypatch.setattr(receiving, "REDACTOR_VERSION", 99)
+    again = send(client, enrolled, "s.csv", TABLE)
+    assert MADE_ANEW in again["told"]
+    assert again["stored_sha256"] != first["stored_sha256"]
+    assert files.is_whole(again["stored_sha256"])
+    assert db.scalars(text("select redactor_version from upload_file")).all() == [99]
+    assert [f for f in examine(hashes=True) if f.name == "files" and not f.ok] == []
+    assert not files.path_of(first["stored_sha256"]).exists()
+
+
+@pytest.mark.parametrize("stopped", ["before they go", "after they went"])
+@pytest.mark.parametrize("first_is", ["whole", "changed"])
+def test_a_stop_while_bytes_of_no_use_come_again_leaves_nothing_that_nobody_names(
+    client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch, first_is: str, stopped: str
+) -> None:
+    send_unreadable(client, enrolled)
+    sealed = text("select quarantine_sha256 from upload_file")
+    (before,) = db.scalars(sealed).all()
+    if first_is != "whole":
+        damage(before, first_is)
+    real = files.remove
+
+    def stop(sha256: str) -> None:
+        if stopped == "after they went":
+            real(sha256)
+        raise Stopped
+
+    with monkeypatch.context() as patch, new_session() as dying:
+        patch.setattr(files, "remove", stop)
+        mine = study.participant_by_code(dying, enrolled, SYSTEM)
+        with pytest.raises(Stopped):
+            service.receive(dying, mine, StatedSession(), [Incoming("x.csv", io.BytesIO(b"no recording at all"))], SYSTEM)
+    assert [taken.done for taken in resume("test")] == [True]
+    db.rollback()
+    (after,) = db.scalars(sealed).all()
+    assert files.is_whole(after)
+    assert db.scalars(text("select sha256 from stored_file")).all() == [after]
+    kept = [path for path in get_settings().files_dir.rglob("*") if path.is_file() and "incoming" not in path.parts]
+    assert kept == [files.path_of(after)]
+
+
+def test_the_doctor_names_what_needs_a_damaged_file_and_how_it_comes_back(client: TestClient, enrolled: str) -> None:
+    first = send(client, enrolled, "s.csv", TABLE, visit="1", controller="random")
+    damage(first["stored_sha256"], "missing")
+    (found,) = [f for f in examine() if f.name == "files"]
+    assert f"needed by upload file {first['id']})" in found.detail
+    assert "uploaded once more" in found.hint
+    assert "betaloop restore" in found.hint
+    send(client, enrolled, "s.csv", TABLE)
+    assert [f.ok for f in examine(hashes=True) if f.name == "files"] == [True]
 
 
 def test_bytes_that_are_kept_a_second_time_replace_damaged_ones(db: Session) -> None:
