@@ -30,15 +30,15 @@ test: install ## Run the test suite.
 test-slow: install ## Run learning curves and fault rounds (about 35 minutes on two cores).
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow
 
-check: install ## Lint, types and the import contract.
+check: install ## Lint, types, the import contract, and known flaws of the pinned packages where a public list of them can be asked.
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tests/packages/known_flaws.py
 
-audit: ## Ask a public list for known flaws of the pinned packages (needs network; the tool lives in build/audit).
-	@test -x build/audit/bin/pip-audit || { $(PYTHON) -m venv build/audit && build/audit/bin/python -m pip install -qq --disable-pip-version-check pip-audit; }
-	build/audit/bin/pip-audit --requirement requirements.lock --no-deps --disable-pip
+audit: install ## Ask a public list for known flaws of the pinned packages, and fail where it cannot be asked.
+	$(BIN)/python tests/packages/known_flaws.py --required
 
 format: install ## Format the code and fix what the linter can.
 	$(BIN)/ruff format .
@@ -46,7 +46,7 @@ format: install ## Format the code and fix what the linter can.
 
 lock: ## Pin the installed packages in requirements.lock.
 	$(BIN)/python -m pip freeze --exclude-editable --exclude betaloop --all | grep -v -i '^pip==' | sed 's/^torch==\([0-9.]*\).*/torch==\1/' > requirements.lock
-	PYTHONPATH=. $(BIN)/python tests/service_lock.py
+	PYTHONPATH=. $(BIN)/python tests/packages/service_lock.py
 
 bench: install ## Run every benchmark in its quick form.
 	@for script in benchmarks/*.py; do echo "== $$script"; OMP_NUM_THREADS=1 $(BIN)/python $$script --quick || exit 1; done

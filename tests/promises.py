@@ -11,6 +11,7 @@ FACTOR, SIGN_ON = "tests/app/accounts/test_second_factor.py", "tests/app/account
 SIGNED = "tests/app/accounts/test_sign_on_signatures.py"
 STUDIES, ROUTES = "tests/app/accounts/studies/test_studies.py", "tests/app/test_routes.py"
 ERROR_PAGES = "tests/app/pages/test_error_pages.py"
+FLAWS = "tests/packages/test_known_flaws.py"
 PAGES, SIGN_IN = "tests/app/pages/test_page_roles.py", "tests/app/pages/test_sign_in_pages.py"
 SEALING, BACKUP = "tests/app/platform/upkeep/test_sealing.py", "tests/app/platform/upkeep/test_backup.py"
 DAMAGED = "tests/app/ingest/uploads/test_damaged_files.py"
@@ -43,6 +44,10 @@ def _of(file: str, *broken: tuple[str, str, str, str], at_start: bool = False) -
 
 
 PROMISES = [
+    Promise("known flaws of pinned packages fail the checks", "tests/packages/known_flaws.py", "return 1 if flaws else 0", "return 0",
+            f"{FLAWS}::test_known_flaws_fail_and_are_named"),
+    Promise("a server that is not the list is no clean answer", "tests/packages/known_flaws.py", "or not numbers[0]:", "or False:",
+            f"{FLAWS}::test_what_is_not_the_list_is_never_taken_for_a_clean_answer"),
     *_of(
         "platform/audit/chain",
         ("an edited row is found", "elif digest_of(before, fields) != stored:", "elif False:",

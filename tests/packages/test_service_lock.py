@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.service_lock import LOCK, held, service_packages
+from tests.packages.service_lock import LOCK, held, service_packages
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_lock_of_the_image_is_the_service_s_part_of_the_whole_with_a_hash_each() -> None:
