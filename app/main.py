@@ -131,7 +131,7 @@ class _Static(StaticFiles):
 
 def _watched(module: str) -> list[Any]:
     """What routes of a module depend on beside their own: analyses tell the audit trail who looked at results."""
-    return [Depends(results_viewed)] if module.startswith("app.analysis.") else []
+    return [Depends(results_viewed, scope="function")] if module.startswith("app.analysis.") else []
 
 
 def create_app() -> FastAPI:

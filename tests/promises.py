@@ -12,6 +12,7 @@ SIGNED = "tests/app/accounts/test_sign_on_signatures.py"
 STUDIES, ROUTES = "tests/app/accounts/studies/test_studies.py", "tests/app/test_routes.py"
 ERROR_PAGES = "tests/app/pages/test_error_pages.py"
 FLAWS = "tests/packages/test_known_flaws.py"
+MEMBERS = "tests/app/platform/test_json_members.py"
 PAGES, SIGN_IN = "tests/app/pages/test_page_roles.py", "tests/app/pages/test_sign_in_pages.py"
 SEALING, BACKUP = "tests/app/platform/upkeep/test_sealing.py", "tests/app/platform/upkeep/test_backup.py"
 DAMAGED = "tests/app/ingest/uploads/test_damaged_files.py"
@@ -63,6 +64,11 @@ PROMISES = [
         ("a trigger that is off is found", "t.tgenabled in ('O', 'A') and ", "", f"{CHAIN}::test_a_trigger_that_is_off_is_named"),
         ("seals stand outside the database too", "*_seals_of_file()]", "]",
          f"{CHAIN}::test_a_seal_that_was_deleted_from_the_database_still_stands_in_its_file"),
+    ),
+    *_of(
+        "platform/json_members",
+        ("a document with a doubled member is refused", "if doubled is not None:", "if False:",
+         f"{MEMBERS}::test_a_doubled_member_is_refused_and_nothing_is_stored"),
     ),
     *_of(
         "platform/audit/trail",
@@ -186,6 +192,8 @@ PROMISES = [
         "accounts/deps",
         ("a token for figures reads nothing else", "if caller.token_scope is Scope.METRICS and path != METRICS:", "if False:",
          f"{FIGURES}::test_a_token_for_figures_reads_them_and_nothing_else"),
+        ("the address that is answered is the one that is judged", 'path = request.scope["path"]', "path = request.url.path",
+         f"{TOKENS}::test_an_address_in_disguise_opens_nothing_more"),
         ("entries are saved under their writer's name alone", "if writer is not None and writer != caller.user_id:", "if False:",
          f"{ERROR_PAGES}::test_what_an_expired_sign_in_gives_back_is_sent_again_by_its_writer_alone"),
         ("what is not listed is closed to the blinded", "if caller.is_blinded and not is_open(request.method, path):", "if False:",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Annotated
 
 from fastapi import Depends, Request
@@ -43,9 +43,8 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
         raise Unauthorized(
             "This needs a bearer token or a browser session.", "Make one with `betaloop token create EMAIL --name NAME`, or sign in."
         )
-    path = request.scope[
-        "path"
-    ]  # what the router goes by; that of `url` is put together anew, with escapes and beside what the caller's Host says
+    # what the router goes by; that of `url` is put together anew, with escapes, beside what the caller's Host says
+    path = request.scope["path"]
     if caller.token_scope is Scope.METRICS and path != METRICS:
         raise Forbidden("A token for 'metrics' reads the figures of the service and nothing else.", "Make one with a wider scope.")
     if caller.is_blinded and not is_open(request.method, path):
@@ -113,7 +112,11 @@ def caller_now(request: Request) -> Callable[[Session], Caller | None]:
 CallerNow = Annotated[Callable[[Session], Caller | None], Depends(caller_now)]
 
 
-def results_viewed(request: Request, db: Db, caller: CurrentCaller) -> None:
-    """For routes that show results by controller: the audit trail says who looked at which, at most once in a quarter of an hour."""
-    if request.method == "GET" and not caller.is_blinded and record_view(db, request.url.path):
+def results_viewed(request: Request, db: Db, caller: CurrentCaller) -> Iterator[None]:
+    """For routes that show results by controller: the audit trail says who looked at which, at most once in a quarter of an hour.
+
+    It is written before the answer leaves, and not where there was nothing to see: addresses of nothing would fill the trail.
+    """
+    yield
+    if request.method == "GET" and not caller.is_blinded and record_view(db, request.scope["path"]):
         db.commit()

@@ -10,7 +10,6 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
 from starlette.datastructures import FormData
 
-from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.models import Study
 from app.accounts.permissions import Caller
@@ -189,7 +188,7 @@ def _list_page(request: Request, db: Session, study: Study, caller: Caller, erro
         role_names=ROLE_NAMES,
         holds_names=HOLDS_NAMES,
         formats=dict(TIME_FORMATS),
-        may_remove=caller.may(can.UPLOAD, study.id),
+        removable={m.id for m in rows if service.may_remove(caller, study.id, m.created_by)},
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

@@ -102,6 +102,12 @@ def _store(db: Session, table: WaitingTable, mapping: TableMapping, wanted: Mapp
     return row
 
 
+def may_remove(caller: Caller, study_id: int, created_by: str) -> bool:
+    """Whether somebody may end a mapping of a study: who uploads at all of its sites, and whoever made it."""
+    everywhere = any(g.study_id == study_id and g.site_id is None for g in caller.grants_with(can.UPLOAD))
+    return caller.may(can.UPLOAD, study_id) and (caller.is_system or everywhere or created_by == caller.label)
+
+
 def remove(db: Session, mapping_id: int, reason: str, caller: Caller) -> ColumnMapping:
     """End a mapping: what was read by it stays, the next table with its header asks again. Not committed.
 
@@ -111,8 +117,7 @@ def remove(db: Session, mapping_id: int, reason: str, caller: Caller) -> ColumnM
     """
     row = repository.mapping(db, mapping_id, caller)
     caller.require(can.UPLOAD, row.study_id)
-    everywhere = any(g.study_id == row.study_id and g.site_id is None for g in caller.grants_with(can.UPLOAD))
-    if not (caller.is_system or everywhere or row.created_by == caller.label):
+    if not may_remove(caller, row.study_id, row.created_by):
         raise Forbidden(
             "Tables of every site of the study are read by this column mapping, and you work at one of them.",
             f"Ask somebody who works at all sites of the study, or {row.created_by}, who made it.",

@@ -24,6 +24,7 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import compile_path
 
 from app.platform.errors import BetaloopError, Conflict, DatabaseAway, EntriesOfAnother, Forbidden, StorageFull, TooMany, Unauthorized
+from app.platform.json_members import UniqueMembers
 from app.platform.web.body_limit import BodyLimit, Judge
 from app.platform.web.compression import Compression
 from app.platform.web.error_pages import ADDRESS_ALONE, advised, input_in_words, kept_entries, writer_of
@@ -43,6 +44,7 @@ _seconds = Histogram("betaloop_request_seconds", "Time to answer by route.", ["r
 
 def install(app: FastAPI, judge: Judge) -> None:
     """Add middleware and error handlers to the service; `judge` tells who sends a request before its body is read."""
+    app.add_middleware(UniqueMembers, refusal=_refused_unread)
     app.add_middleware(BodyLimit, refusal=_refused_unread, judge=judge)  # inside the other: its refusals have the headers of every answer
     app.middleware("http")(_around)
     app.add_middleware(Compression)  # outermost: what it shrinks is whole

@@ -10,6 +10,7 @@ from fastapi import FastAPI, Request
 from fastapi.testclient import TestClient
 from sqlalchemy import text
 from sqlalchemy.orm import Session
+from starlette.datastructures import URL
 
 from app.accounts import service
 from app.accounts.deps import COOKIE, caller_now
@@ -79,17 +80,21 @@ def test_a_narrow_token_of_an_administrator_changes_no_study(
     assert "Other" not in client.get("/api/v1/studies").text
 
 
-def test_a_host_in_disguise_opens_nothing_more(db: Session, ada: str, client_with: Callable[[str], TestClient]) -> None:
-    """What is open to a token for figures, and to blinded assessors, is told by the address that is answered, not by what `Host` says."""
+def test_an_address_in_disguise_opens_nothing_more(
+    db: Session, ada: str, client_with: Callable[[str], TestClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is open to a token for figures, and to blinded assessors, is told by the address that is answered, not by one that the framework
+    puts together from what the caller says of the host."""
     service.add_user(db, "blind@clinic.example", Role.BLINDED_ASSESSOR, PASSWORD)
     figures = service.create_token(db, ada, "figures", Scope.METRICS)
     blinded = service.create_token(db, "blind@clinic.example", "tablet")
     db.commit()
-    for host in ("x", "x/metrics?", "x/participants?", "x/metrics#", "x/account/\\", "user@x/metrics?:80"):
-        for path in ("/api/v1/studies", "/audit", "//metrics/../audit", "/audit%3F/metrics", "/audit%00", "/audit%0A"):
-            for token in (figures, blinded):
-                answer = client_with(token).get(path, headers={"Host": host})
-                assert answer.status_code in (403, 404), (host, path, answer.status_code)
+    for token, open_to_it in ((figures, "/metrics"), (blinded, "/analyses")):
+        assert client_with(token).get(open_to_it).status_code == 200
+        monkeypatch.setattr(URL, "path", property(lambda _, said=open_to_it: said))
+        for path in ("/api/v1/studies", "/audit"):
+            assert client_with(token).get(path).status_code == 403, path
+        monkeypatch.undo()
 
 
 def test_a_token_ends_on_its_day(db: Session, ada: str) -> None:

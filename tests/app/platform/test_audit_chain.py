@@ -178,6 +178,8 @@ def actions(entity: str) -> list[tuple[str, str, str]]:
 def test_what_leaves_and_who_looked_is_in_the_trail(client: TestClient, enrolled: str) -> None:
     for _ in range(2):
         assert client.get(f"/participants/{enrolled}/analyses").status_code == 200
+    for nothing in ("NOBODY/analyses", f"{enrolled}/analyses/models/nothing"):
+        assert client.get(f"/participants/{nothing}").status_code == 404
     assert client.get(f"/participants/{enrolled}/export.zip").status_code == 200
     me = "admin@clinic.example"
     assert actions("results") == [(me, "view", f"/participants/{enrolled}/analyses")], "a reload is one view"

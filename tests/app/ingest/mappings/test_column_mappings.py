@@ -15,8 +15,11 @@ from fastapi.testclient import TestClient
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
+from app.accounts.models import Role
+from app.accounts.permissions import Caller, Grant
 from app.ingest.mappings import rules
 from app.ingest.mappings.schemas import MappingIn
+from app.ingest.mappings.service import may_remove
 from app.platform.errors import Invalid
 from app.platform.files import path_of
 from tests.app.ingest.conftest import Send
@@ -209,6 +212,16 @@ def test_a_mapping_is_versioned_audited_and_can_be_removed(client: TestClient, s
     with pytest.raises(Exception, match="column_mapping"):
         db.execute(text("update column_mapping set name = 'x'"))
     db.rollback()
+
+
+def test_whoever_made_a_mapping_or_works_at_all_sites_may_remove_it() -> None:
+    at_one_site = Caller("site@clinic.example", 2, (Grant(1, 5, Role.COORDINATOR),))
+    at_all_sites = Caller("study@clinic.example", 3, (Grant(1, None, Role.COORDINATOR),))
+    reads = Caller("reads@clinic.example", 4, (Grant(1, None, Role.VIEWER),))
+    elsewhere = Caller("else@clinic.example", 5, (Grant(2, None, Role.COORDINATOR),))
+    made_by = "site@clinic.example"
+    assert [may_remove(c, 1, "other@clinic.example") for c in (at_one_site, at_all_sites, reads, elsewhere)] == [False, True, False, False]
+    assert [may_remove(c, 1, made_by) for c in (at_one_site, at_all_sites, reads, elsewhere)] == [True, True, False, False]
 
 
 def test_all_tables_of_an_upload_with_one_header_are_read_together(client: TestClient, send: Send) -> None:
