@@ -63,9 +63,10 @@ class SweepParams(Model):
     anchor: Anchor = Field(
         "logged",
         description="What TD3+BC and ReBRAC hold the policy near: the logged amplitudes, as published; the cDBS amplitude, so that it "
-        "leaves the standard of care only where the values speak for it; `best`, the constant amplitude with the largest estimated return "
-        "of those that sessions support and that probably keep all QoCs within the margins; `both`, by turns logged and cDBS; or `all` "
-        "three by turns. The others have no such bond. Where policies are fine-tuned, by turns means what each was held near.",
+        "leaves the standard of care only where the values speak for it; `best`, the constant amplitude with the largest expected saving "
+        "(energy saved times the probability that all QoCs keep within the margins) of those that sessions support and that probably "
+        "keep them; `both`, by turns logged and cDBS; or `all` three by turns. The others have no such bond. Where policies are "
+        "fine-tuned, by turns means what each was held near.",
     )
     critic_memory: bool = Field(
         False,

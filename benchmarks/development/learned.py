@@ -13,6 +13,7 @@ A policy succeeds where all three QoCs are truly within the default margins of c
 responders, patients in whom some constant or proportional controller does, and others are not trained: the share in which the policy that
 the posterior puts first succeeds, and in which any of the six does; energy and true gain of both; between arms the difference of the same
 patients with its standard error. First is as in the ranking: what no session supports, or what probably leaves the margins, comes last.
+`first_by_saving` is the one with the largest saving times the probability of keeping the margins instead of the largest return.
 Training is the service's: learning rates, left-out sessions and the choice of a state are those of a sweep of the preset `quick`. True
 returns only measure. CPU seconds of one thread.
 """
@@ -37,7 +38,7 @@ from app.learning.training.configs import training_groups
 from benchmarks.support.cells import Cells
 from benchmarks.support.looks import look
 from ml import rl
-from ml.ope.posterior.gains import gains_over_cdbs
+from ml.ope.posterior.gains import PosteriorGain, gains_over_cdbs
 from ml.ope.posterior.verdict import Levels
 from ml.policies.policy import ConstantPolicy, Policy
 from ml.population.virtual import DataDesign, World, is_responder, simple_policies, within_margins, world
@@ -99,6 +100,7 @@ def cell(w: World, arm: Arm, updates: int | None, truth: int) -> dict[str, Any]:
             "supported": gains[name].supported,
             "within": gains[name].within,
             "told": gains[name].told,
+            "expected_saving": expected_saving(gains[name]),
             "gain": true.total.value - cdbs.total.value,
             "saves": saves,
             "succeeds": bool(saves >= SAVED and within_margins(true, cdbs)),
@@ -106,23 +108,31 @@ def cell(w: World, arm: Arm, updates: int | None, truth: int) -> dict[str, Any]:
     return {"responder": True, "policies": rows}
 
 
-def first_by_posterior(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The row with the largest estimated gain, of those that the ranking does not put last where any is."""
+def first_by(rows: dict[str, dict[str, Any]], column: str) -> dict[str, Any]:
+    """The row with the largest value of a column, of those that the ranking does not put last where any is."""
     fit = [row for row in rows.values() if row["supported"] and 1 - row["within"] < Levels().unsafe_beyond]
-    return max(fit or rows.values(), key=lambda row: float(row["posterior"]))
+    return max(fit or rows.values(), key=lambda row: float(row[column]))
+
+
+def expected_saving(one: PosteriorGain) -> float:
+    """Energy that a policy is expected to save times its probability of keeping the margins, as the anchor `best` is found."""
+    return (one.saves or 0.0) * (1.0 if one.within is None else one.within)
 
 
 def outcomes(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
     """One patient's figures."""
-    first, best = first_by_posterior(rows), max(rows.values(), key=lambda row: float(row["gain"]))
+    first, saving = first_by(rows, "posterior"), first_by(rows, "expected_saving")
+    best = max(rows.values(), key=lambda row: float(row["gain"]))
     return {
         "first_succeeds": float(first["succeeds"]),
+        "first_by_saving_succeeds": float(saving["succeeds"]),
         "any_succeeds": float(any(row["succeeds"] for row in rows.values())),
         "succeed": float(np.mean([row["succeeds"] for row in rows.values()])),
         "first_gain": first["gain"],
         "best_gain": best["gain"],
         "mean_gain": float(np.mean([row["gain"] for row in rows.values()])),
         "first_saves": first["saves"],
+        "first_by_saving_saves": saving["saves"],
     }
 
 

@@ -10,7 +10,7 @@ import schemathesis
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
 from tests.app.every_route import World
-from tests.app.test_routes import CHECKS
+from tests.app.test_routes import ANSWER_S, CHECKS
 
 SECONDS = 12.0
 """After which the fast form begins no further round over all operations."""
@@ -41,7 +41,7 @@ def conforms(world: World, operation: Any, examples: int, number: int) -> list[i
         for place in (case.query, case.body):
             if isinstance(place, dict):
                 place |= {name: ids[name] for name in place.keys() & ids.keys()}
-        answered.append(case.call_and_validate(headers=headers, checks=CHECKS).status_code)
+        answered.append(case.call_and_validate(headers=headers, checks=CHECKS, timeout=ANSWER_S).status_code)
 
     run()
     return answered

@@ -79,7 +79,7 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
 
     Returns:
         `rows` with `controller`, `score` on held-out sessions, `mean_amplitude` and `gain_over_cdbs`; `best_constant`, the amplitude with
-        the largest gain by the posterior among those of `best_supported`, None without one; `held_out_sessions`.
+        the largest expected saving (`best_supported`), None without one; `held_out_sessions`.
     """
     buffer = read_buffer(params["snapshot_sha256"])
     learnt, held_out = hold_out(buffer, params["held_out"], every=1)
@@ -117,20 +117,23 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
 
 
 def best_supported(constants: Mapping[str, PosteriorGain], level: float) -> float | None:
-    """The amplitude with the largest gain, by names such as `0.70`; None without one.
+    """The amplitude with the largest expected saving, by names such as `0.70`; None without one.
 
-    Among those that sessions support and, where a QoC is known, that keep all of them within the margins with a probability of `level`.
-    A return without r_end would else take the lowest amplitude at which beta is still well.
+    Expected is the energy that it saves times the probability that all QoCs keep within the margins, among those that sessions support and
+    that keep them with a probability of `level` at least. Where no QoC is known, the one with the largest gain: a saving alone would be
+    the lowest of all.
     """
-    fit = {name: one.gain.value for name, one in constants.items() if one.supported and (one.within is None or one.within >= level)}
-    return float(max(fit, key=fit.__getitem__)) if fit else None
+    fit = {name: one for name, one in constants.items() if one.supported and (one.within is None or one.within >= level)}
+    known = {name: one.within * (1 - float(name) ** 2) for name, one in fit.items() if one.within is not None}
+    of = known or {name: one.gain.value for name, one in fit.items()}
+    return float(max(of, key=of.__getitem__)) if of else None
 
 
 def supported_best(buffer: ReplayBuffer, margins: Mapping[str, float] | None) -> float | None:
-    """`best_supported` of tenths; `margins` as `_judged_by` takes them."""
+    """`best_supported` of tenths that are probably within the margins; `margins` as `_judged_by` takes them."""
     limits, levels = _judged_by(margins)
     constants = _gains(buffer, {f"{a:.2f}": ConstantPolicy(a) for a in CONSTANT_GRID}, limits)
-    return best_supported(constants, levels.test_within)
+    return best_supported(constants, 1 - levels.unsafe_beyond)
 
 
 def _judged_by(margins: Mapping[str, float] | None) -> tuple[Margins, Levels]:

@@ -13,7 +13,7 @@ import numpy as np
 from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.estimator import build
-from ml.ope.posterior.verdict import slacks
+from ml.ope.posterior.verdict import outcome_draws, slacks
 from ml.policies.policy import ConstantPolicy, Policy
 from ml.progress import Report, silent
 from ml.qoc import Margins
@@ -31,12 +31,14 @@ class PosteriorGain:
     Attributes:
         gain: of the return. supported: whether sessions lie near what the policy would do. told: whether the sessions can order policies.
         within: probability that every known QoC lies within its margin of cDBS; None where no QoC is known.
+        saves: share of cDBS's energy that it is expected to save; None where no energy is predicted.
     """
 
     gain: Gain
     supported: bool
     told: bool
     within: float | None = None
+    saves: float | None = None
 
 
 def gains_over_cdbs(
@@ -55,9 +57,14 @@ def gains_over_cdbs(
         *estimates, cdbs = fitted.evaluate(numbered).values()
         for name, one in zip(part, estimates, strict=True):
             within = _within(one, cdbs, margins or Margins())
-            found[name] = PosteriorGain(gain_over(one, cdbs), one.supported, bool(one.details["skill"]["told"]), within)
+            found[name] = PosteriorGain(gain_over(one, cdbs), one.supported, bool(one.details["skill"]["told"]), within, _saves(one, cdbs))
         report(len(found) / len(names), "estimating gains over cDBS")
     return found
+
+
+def _saves(one: Estimate, cdbs: Estimate) -> float | None:
+    ours, theirs = outcome_draws(one, "energy"), outcome_draws(cdbs, "energy")
+    return float(1 - ours.mean() / theirs.mean()) if ours is not None and theirs is not None and theirs.mean() > 0 else None
 
 
 def _within(one: Estimate, cdbs: Estimate, margins: Margins) -> float | None:

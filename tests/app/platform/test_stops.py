@@ -61,7 +61,7 @@ def start(data: Path, *command: str) -> subprocess.Popen[bytes]:
 
 
 def wait_for(data: Path, sentence: str, process: subprocess.Popen[bytes]) -> None:
-    deadline = time.monotonic() + 150
+    deadline = time.monotonic() + 400
     while sentence not in (said := (data / "said.txt").read_text()):
         assert process.poll() is None, said
         assert time.monotonic() < deadline, said

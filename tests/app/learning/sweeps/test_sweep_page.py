@@ -161,8 +161,10 @@ def test_the_best_constant_is_one_that_sessions_support_and_that_keeps_the_outco
 
     assert best_supported({"0.10": one(50.0, False), "0.70": one(3.0, True), "1.00": one(0.0, True)}, 0.8) == 0.7
     assert best_supported({"0.10": one(50.0, False)}, 0.8) is None
-    doses = {"0.40": one(9.0, True, 0.3), "0.60": one(5.0, True, 0.8), "0.80": one(2.0, True, 0.97)}
-    assert [best_supported(doses, level) for level in (0.8, 0.9, 0.99)] == [0.6, 0.8, None]
+    doses = {"0.40": one(9.0, True, 0.3), "0.60": one(1.0, True, 0.8), "0.80": one(2.0, True, 0.97), "1.00": one(5.0, True, 1.0)}
+    assert [best_supported(doses, level) for level in (0.5, 0.9, 0.99)] == [0.6, 0.8, 1.0], "energy saved, not the return"
+    unsure = doses | {"0.60": one(1.0, True, 0.4)}
+    assert best_supported(unsure, 0.0) == 0.8, "0.36 of the energy at 0.97 is more than 0.64 at 0.4 or 0.84 at 0.3"
 
 
 def test_policies_are_ordered_by_the_posterior_and_not_by_the_held_out_score(store: Store, client: TestClient) -> None:
