@@ -107,7 +107,7 @@ class Soak:
         try:
             folder = child.cmdline()[-1]
             child.kill()
-        except psutil.Error:
+        except (psutil.Error, IndexError):  # who has ended and is not yet reaped has no command line
             return "the child ended before it was killed;", -1.0
         if "/jobs/" not in folder:  # an upload, which its sender sends again
             self.installed.wait_until("every web to answer after a reader of uploads was killed", self.installed.webs_are_ready, PATIENCE_S)
