@@ -52,9 +52,9 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
             "This is closed to blinded assessors: it may show which controller a session had.",
             "Results by controller stand under Analyses once a visit is locked.",
         )
-    _refuse_entries_of_others(request, caller)
     set_actor(db, caller.label, caller.user_id, getattr(request.state, "request_id", None))
-    request.state.caller = caller
+    request.state.caller = caller  # before a form is refused: the page that says so is of who has signed in, and drops what another typed
+    _refuse_entries_of_others(request, caller)
     return caller
 
 

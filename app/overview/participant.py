@@ -74,7 +74,9 @@ class _Answer:
 
 
 def _answer(db: Session, participant: Participant, caller: Caller) -> _Answer | None:
-    """None before the first ranking."""
+    """None before the first ranking, and for blinded assessors, to whom rankings are closed."""
+    if caller.is_blinded:
+        return None
     try:
         found = ranking.current(db, participant, caller)
     except NotFound:

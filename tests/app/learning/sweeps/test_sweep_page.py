@@ -121,7 +121,7 @@ def test_a_policy_below_the_random_controllers_bound_in_more_than_a_twentieth_of
     sweep = store(metrics(9.0, 8.0, 0.5, 0.051), metrics(7.0, 3.0, 2.0, 0.05))
     page = client.get(f"/sweeps/{sweep.id}").text
     assert BELOW in page
-    assert "rl-0 asks for less than 30 % of the cDBS amplitude in 5 % of the buffer's steps." in page
+    assert "rl-0 asks for less than 30 % of the cDBS amplitude in 5 % of the recorded steps." in page
     low, high = db.query(Policy).order_by(Policy.id)
     assert BELOW in client.get(f"/participants/P1/policies/{low.id}").text
     assert BELOW not in client.get(f"/participants/P1/policies/{high.id}").text
