@@ -28,6 +28,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import psutil
 from installed.installation import STARTED_S, Installation, TooLate, installation, utc
@@ -105,9 +106,10 @@ class Soak:
         child = random.choice(found)
         killed = time.monotonic()
         try:
-            folder = child.cmdline()[-1]
+            if not (folder := _folder(child)):
+                return "the child had not begun, and was not killed;", -1.0
             child.kill()
-        except (psutil.Error, IndexError):  # who has ended and is not yet reaped has no command line
+        except psutil.Error:
             return "the child ended before it was killed;", -1.0
         if "/jobs/" not in folder:  # an upload, which its sender sends again
             self.installed.wait_until("every web to answer after a reader of uploads was killed", self.installed.webs_are_ready, PATIENCE_S)
@@ -122,8 +124,8 @@ class Soak:
     def _computes(self, folder: str, other_than: int) -> bool:
         """Whether a step has a process, but one that was killed."""
         for child in (c for worker in self.installed.workers for c in self.installed.children(worker)):
-            with contextlib.suppress(psutil.Error, IndexError):
-                if child.pid != other_than and child.cmdline()[-1] == folder:
+            with contextlib.suppress(psutil.Error):
+                if child.pid != other_than and _folder(child) == folder:
                     return True
         return False
 
@@ -253,6 +255,11 @@ def _left_after_the_stop(installed: Installation) -> list[str]:
     except TooLate:
         return installed.left()
     return []
+
+
+def _folder(child: psutil.Process) -> str:
+    """The folder of the step that a child computes, which it holds locked; empty where it has not begun."""
+    return next((str(Path(held.path).parent) for held in child.open_files() if held.path.endswith("/.lock")), "")
 
 
 def _is_postgres(process: psutil.Process) -> bool:

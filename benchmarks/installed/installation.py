@@ -33,7 +33,7 @@ PASSWORD = "four words for a measurement"
 STARTED_S, STOPPED_S = 90.0, 30.0
 PASSED_ON = ("BETALOOP_SERVER_USER", "BETALOOP_JOB_NICENESS")
 """Settings of the caller's environment that hold for the installation too."""
-_COMPUTING, _FORKING = "app.platform.jobs.children.child", "app.platform.jobs.children.fork_server"
+_FORKING = "app.platform.jobs.children.fork_server"
 _PREPARE = """
 import json, sys
 from app.accounts import service
@@ -221,8 +221,7 @@ class Installation:
             for process in psutil.Process(self.processes[name].pid).children(recursive=True):
                 with contextlib.suppress(psutil.Error):
                     parent = process.parent()
-                    forked = parent is not None and _FORKING in parent.cmdline()
-                    if forked or _COMPUTING in process.cmdline():
+                    if parent is not None and _FORKING in parent.cmdline():
                         found.append(process)
         return found
 

@@ -188,7 +188,7 @@ class Writers:
             return
         if sum(job["finished_at"] is None for job in listed.json()["items"]) < MOST_LIVE_JOBS:
             body = EVALUATE | {"policies": [self._study.policy]} if len(self.said.jobs) % 2 else TRAIN
-            answer = self._once(lambda: caller.post("/participants/S2/jobs", json=body))  # not again: it may have begun
+            answer = self._once(lambda: caller.post("/participants/S2/jobs", json=body | {"again": True}))  # sent once: it may have begun
             if answer is not None and answer.status_code == 202:
                 self.said.jobs.append(answer.json()["id"])
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime as ort
 from numpy.typing import NDArray
 
 RANGE_TOLERANCE = 1e-4
@@ -210,6 +209,8 @@ def _dimensions(role: str, value: Any, wanted: str) -> tuple[int | None, int | N
 
 
 def _open(content: bytes) -> Any:
+    import onnxruntime as ort  # starts a thread, which a process whose forks compute must not have
+
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1

@@ -11,11 +11,12 @@ from app.learning.snapshots.buffers import read_buffer
 from app.platform import files
 from app.platform.jobs import StepReport, write_atomically
 from ml import progress
+from ml.loading import load_libraries
 from ml.ope.compare.skill import choose_default
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.posterior.further_sessions import session_noise
 from ml.ope.posterior.gaussian import TestedDifference
-from ml.ope.registry import AGGREGATE, Size, build, quick_estimators
+from ml.ope.registry import AGGREGATE, Size, build, estimators, quick_estimators
 from ml.ope.support.behaviour_map import behaviour_map
 from ml.ope.support.diagnostics import diagnose
 from ml.policies.onnx_policy import OnnxPolicy
@@ -28,6 +29,12 @@ if TYPE_CHECKING:
 
 FIT_SHARE = 0.5
 """Share of an evaluation step's progress that fitting takes."""
+
+
+def prepare() -> None:
+    """Load what the methods use, once, in the process whose forks estimate."""
+    load_libraries()
+    estimators()
 
 
 def member_file(k: int) -> str:

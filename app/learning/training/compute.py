@@ -18,6 +18,7 @@ from app.learning.training.results import CLONE, POLICY, policy_file, training_f
 from app.platform import files
 from app.platform.jobs import JobError, StepReport, write_atomically
 from ml import rl
+from ml.loading import load_libraries
 from ml.ope.fqe.score import fqe_value
 from ml.ope.posterior.gains import PosteriorGain, gains_over_cdbs
 from ml.ope.posterior.verdict import Levels
@@ -34,6 +35,11 @@ FEWEST_TO_HOLD_OUT = 5
 CONSTANT_GRID = tuple(round(0.1 * k, 2) for k in range(1, 11))
 CLONE_UPDATES = 2000
 _CURVE_POINTS = 200
+
+
+def prepare() -> None:
+    """Load what training uses, once, in the process whose forks train."""
+    load_libraries()
 
 
 def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
@@ -193,7 +199,8 @@ def stored_gains(
 
 def _stored(one: PosteriorGain, levels: Levels) -> dict[str, Any]:
     beyond = None if one.within is None else 1 - one.within >= levels.unsafe_beyond
-    return asdict(one.gain) | {"by": "posterior", "supported": one.supported, "told": one.told, "beyond_margin": beyond}
+    told = {"by": "posterior", "supported": one.supported, "told": one.told, "beyond_margin": beyond}
+    return asdict(one.gain) | told | {"within": one.within, "saves": one.saves, "expected_saving": one.expected_saving}
 
 
 def _gains(buffer: ReplayBuffer, policies: Mapping[str, Policy], margins: Margins) -> dict[str, PosteriorGain]:

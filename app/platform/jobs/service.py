@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import uuid
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,16 @@ _MANY = 10_000
 _ROOT = Path(__file__).resolve().parents[3]
 
 
+def checked_params(kind: str, params: Mapping[str, Any]) -> BaseModel:
+    """Params as their kind reads them, with its defaults. Raises UnknownKind, Invalid: as `submit`."""
+    try:
+        return registry.kind(kind).params.model_validate(dict(params))
+    except ValidationError as error:
+        errors = error.errors(include_url=False, include_context=False, include_input=False)
+        places = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'params'}: {e['msg']}" for e in errors)
+        raise Invalid(f"These params do not fit the job kind {kind!r}: {places}.", errors=errors) from error
+
+
 def submit(db: Session, kind: str, participant_id: int | None, params: dict[str, Any] | BaseModel, created_by: str) -> Job:
     """Make a job and put it on the queue, both in the caller's transaction.
 
@@ -42,13 +53,7 @@ def submit(db: Session, kind: str, participant_id: int | None, params: dict[str,
         Invalid: the params break the kind's schema; `errors` lists where.
     """
     wanted = registry.kind(kind)
-    raw = params.model_dump(mode="json") if isinstance(params, BaseModel) else params
-    try:
-        checked = wanted.params.model_validate(raw).model_dump(mode="json")
-    except ValidationError as error:
-        errors = error.errors(include_url=False, include_context=False, include_input=False)
-        places = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'params'}: {e['msg']}" for e in errors)
-        raise Invalid(f"These params do not fit the job kind {kind!r}: {places}.", errors=errors) from error
+    checked = checked_params(kind, params.model_dump(mode="json") if isinstance(params, BaseModel) else params).model_dump(mode="json")
     job = Job(
         id=str(uuid.uuid4()),
         participant_id=participant_id,

@@ -18,6 +18,7 @@ from app.platform.database import new_session
 from app.platform.errors import BetaloopError
 from app.platform.jobs import registry, repository
 from app.platform.jobs.children.child import ChildLimits
+from app.platform.jobs.children.forked import ForkedProcesses
 from app.platform.jobs.children.slots import Slots
 from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall
 from app.platform.jobs.context import JobContext, StepOutcome
@@ -105,7 +106,7 @@ class JobRunner:
     def __init__(self, worker: str, slots: int) -> None:
         self._worker = worker
         self._slots = Slots(slots)
-        self._children = ChildProcesses()
+        self._children = ForkedProcesses(learns=True, niceness=get_settings().job_niceness)
         self._running: dict[str, StopRequests] = {}
         self._changed = threading.Condition()
         self._stopping = False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import subprocess
 import sys
@@ -53,7 +52,7 @@ class Workers:
         folder = step.replace("/", "__")
         for process in psutil.Process(worker.pid).children(recursive=True):
             with contextlib.suppress(psutil.Error):  # ended between two looks
-                if process.cmdline()[-1:] and os.path.basename(process.cmdline()[-1]) == folder:
+                if any(Path(held.path).parts[-2:] == (folder, ".lock") for held in process.open_files()):
                     return process
         return None
 
@@ -126,7 +125,7 @@ def test_an_evaluation_cancelled_in_the_middle_of_a_fit_ends_promptly_and_leaves
     wait(lambda: all(0.02 < step(client, job, key)["progress"] < 1.0 for key in middle_of), 90.0)
     children = [child for key in middle_of if (child := workers.computing(worker, key)) is not None]
     assert len(children) == len(middle_of)
-    family = psutil.Process(worker.pid).children(recursive=True)
+    family = [*children, *(below for child in children for below in child.children(recursive=True))]
     assert client.post(f"/api/v1/jobs/{job}/cancel").status_code == 200
     assert wait(lambda: all(gone(process) for process in family), 10.0) < 2.5
     body = ended(job, 5.0)

@@ -1,4 +1,4 @@
-"""The child process of one compute step: `python -m app.platform.jobs.children.child NAME WORKDIR`, or a fork of `fork_server`.
+"""The child process of one compute step, a fork of `fork_server`.
 
 It reads `params.json` from its folder, runs the function within its limits, and leaves `result.json` there by atomic rename. Progress goes
 as JSON lines to the file descriptor that BETALOOP_REPORT_FD names; what the function prints goes to `log.txt`. It dies with the process
@@ -32,6 +32,8 @@ REPORT_FD = "BETALOOP_REPORT_FD"
 """Names the descriptor of the pipe of reports."""
 PARENT = "BETALOOP_WORKER_PID"
 """Names the process that must live as long as the child."""
+STEPPED_BACK = "BETALOOP_STEPPED_BACK"
+"""Names how far the process whose fork we are has stepped back."""
 _PR_SET_PDEATHSIG = 1
 _LOCK_WAIT_S = 30.0
 _OOM_SCORE = "500"
@@ -83,13 +85,9 @@ def too_much_memory(limit_mb: int) -> str:
     )
 
 
-def main(arguments: list[str]) -> int:
-    """Run one call; 0 when it gave a result, 1 when it failed (the reason stands in result.json), 2 for wrong arguments."""
+def main(name: str, workdir: Path) -> int:
+    """Run one call; 0 when it gave a result, 1 when it failed: the reason stands in result.json."""
     die_with_parent()
-    if len(arguments) != 2:
-        sys.stderr.write("usage: python -m app.platform.jobs.children.child NAME WORKDIR\n")
-        return 2
-    name, workdir = arguments[0], Path(arguments[1])
     os.umask(0o077)  # checkpoints and results are of participants
     call = json.loads((workdir / "params.json").read_bytes())
     limits = ChildLimits(**call["limits"])
@@ -179,25 +177,28 @@ def _watch_parent(parent: int) -> None:
 
 def _be_modest(limits: ChildLimits) -> None:
     """Step back behind the web service, offer ourselves first when the machine runs out of memory, and leave no image of it on the disk."""
-    if limits.niceness:
-        _step_back(os.nice(limits.niceness))
+    step_back(limits.niceness)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     score = Path("/proc/self/oom_score_adj")
     if score.exists():
         score.write_text(_OOM_SCORE)
 
 
-def _step_back(niceness: int) -> None:
-    """Have the kernel count our niceness against every other process.
+def step_back(niceness: int) -> None:
+    """Be so much nicer, 0 to 19, than who started us, and have the kernel count it against every other process.
 
-    Linux (sched(7), "The autogroup feature") shares the processor out among sessions first: within ours, of one process, niceness alone
-    would count against nobody.
+    A fork of a process that has stepped back already adds only what is missing. Linux (sched(7), "The autogroup feature") shares the
+    processor out among sessions first: within ours, of one process, niceness alone would count against nobody.
     """
+    if niceness <= 0:
+        return
+    nice = os.nice(max(0, niceness - int(os.environ.get(STEPPED_BACK, "0"))))
+    os.environ[STEPPED_BACK] = str(niceness)
     if not (_AUTOGROUPS_ON.exists() and _AUTOGROUPS_ON.read_text().strip() == "1" and _AUTOGROUP.exists()):
         return  # niceness counts by itself
     for _ in range(_AUTOGROUP_TRIES):
         try:
-            _AUTOGROUP.write_text(str(niceness))
+            _AUTOGROUP.write_text(str(nice))
             return
         except BlockingIOError:
             time.sleep(0.1)  # whoever is not root may do this once in a tenth of a second
@@ -219,7 +220,3 @@ def _lock(workdir: Path) -> int:
             if time.monotonic() > deadline:
                 raise JobError(f"Another process still works in {workdir}.", "Wait until it ends or end it, then retry the job.") from None
             time.sleep(0.1)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

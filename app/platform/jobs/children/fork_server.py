@@ -1,11 +1,12 @@
 """A process that has imported what its children need, and forks one child per order.
 
-It is started as `python -m app.platform.jobs.children.fork_server NAME...`.
+It is started as `python -m app.platform.jobs.children.fork_server NICENESS NAME...`.
 A fresh interpreter needs seconds until the decoders are imported; a fork of this process needs some milliseconds, and has a memory of its
 own all the same. It runs one thread, so that a fork finds no lock held, and holds no data: orders go to the children unread.
 
 Each order is one byte on the socket at standard input, with three descriptors: a socket of its own, the log and the pipe of reports. The
-order itself, JSON, comes on the order's socket, which answers `{"pid": ...}` at once and `{"status": ...}`, as of `waitpid`, at the end.
+order itself, JSON, comes on the order's socket, which answers `{"pid": ...}` at once and `{"status": ...}`, as of `waitpid`, at the end. An
+order that names a `module` has it imported first, once, and its `prepare()` called where it has one: torch alone takes five seconds.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import socket
 import sys
 import traceback
 from importlib import import_module
+from pathlib import Path
 
 from app.platform.jobs.children import child
 
@@ -27,19 +29,26 @@ DESCRIPTORS = 3
 LONGEST_ORDER = 1 << 16
 
 
-def main(names: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Import modules (`module`), call what is to be made ready (`module:function`), and serve until the starter has gone."""
     child.die_with_parent()
+    niceness, *names = arguments
+    child.step_back(int(niceness))
     for name in names:
         module, _, function = name.partition(":")
         loaded = import_module(module)
         if function:
             getattr(loaded, function)()
-    gc.collect()
-    gc.freeze()  # the collector would touch, and so copy, every page that the children share
+    _leave_to_itself()
     with socket.socket(fileno=os.dup(0)) as orders:
         _Server(orders).serve()
     return 0
+
+
+def _leave_to_itself() -> None:
+    """What is loaded stays: the collector would touch, and so copy, every page that the children share."""
+    gc.collect()
+    gc.freeze()
 
 
 class _Server:
@@ -48,6 +57,7 @@ class _Server:
     def __init__(self, orders: socket.socket) -> None:
         self._orders = orders
         self._running: dict[int, socket.socket] = {}
+        self._loaded: set[str] = set()
         self._awake, wake = os.pipe()
         os.set_blocking(self._awake, False)
         os.set_blocking(wake, False)
@@ -71,6 +81,8 @@ class _Server:
     def _fork(self, order_fd: int, log: int, report: int) -> None:
         order = socket.socket(fileno=order_fd)
         call = json.loads(order.recv(LONGEST_ORDER))
+        if (module := call.get("module")) is not None:
+            self._load(module)
         pid = os.fork()
         if pid == 0:
             self._become_child(call, order, log, report)
@@ -78,6 +90,19 @@ class _Server:
         os.close(report)
         self._running[pid] = order
         _tell(order, {"pid": pid})
+
+    def _load(self, module: str) -> None:
+        """Import a module of compute functions for the children to come; what goes wrong with it, its child tells in its own log."""
+        if module in self._loaded:
+            return
+        self._loaded.add(module)
+        try:
+            prepare = getattr(import_module(module), "prepare", None)
+            if prepare is not None:
+                prepare()
+        except Exception:
+            traceback.print_exc()
+        _leave_to_itself()
 
     def _reap(self) -> None:
         while self._running:
@@ -103,7 +128,7 @@ class _Server:
             for held in (self._orders, order, *self._running.values()):
                 held.close()
             os.environ |= {child.REPORT_FD: str(report), child.PARENT: str(server)}
-            status = child.main([call["name"], call["workdir"]])
+            status = child.main(call["name"], Path(call["workdir"]))
         except BaseException as error:
             # in the log of the child: its places, not its values, which may be of a person
             sys.stderr.write(child.places(error))

@@ -11,7 +11,7 @@ import subprocess
 import threading
 from collections.abc import Sequence
 
-from app.platform.jobs.children.supervisor import Child, ChildProcesses
+from app.platform.jobs.children.supervisor import Child, ChildProcesses, ComputeCall
 
 MODULE = "app.platform.jobs.children.fork_server"
 
@@ -21,11 +21,15 @@ class ForkedProcesses(ChildProcesses):
 
     Args:
         prepared: what the server imports (`module`) and calls (`module:function`) before it forks.
+        learns: whether it also imports the module of each call before it forks the first child for it, and calls its `prepare()` where it
+            has one, so that later children of that module find everything loaded.
+        niceness: how far the server steps back behind other processes while it imports, 0 to 19; children go by their limits.
     """
 
-    def __init__(self, prepared: Sequence[str]) -> None:
+    def __init__(self, prepared: Sequence[str] = (), *, learns: bool = False, niceness: int = 0) -> None:
         super().__init__(self._fork)
-        self._prepared = list(prepared)
+        self._arguments = [str(niceness), *prepared]
+        self._learns = learns
         self._one_at_a_time = threading.Lock()
         self._server: subprocess.Popen[bytes] | None = None
         self._to_server: socket.socket | None = None
@@ -40,21 +44,29 @@ class ForkedProcesses(ChildProcesses):
         """Number of the server process, once there is one."""
         return None if self._server is None else self._server.pid
 
-    def _fork(self, arguments: list[str], log: int, report: int) -> Child:
-        name, workdir = arguments
+    def close(self) -> None:
+        """End the starting thread, the server and every child that is left."""
+        super().close()
+        with self._one_at_a_time:
+            self._forget()
+
+    def _fork(self, call: ComputeCall, log: int, report: int) -> Child:
+        order = {"name": call.name, "workdir": str(call.workdir.resolve())}
+        if self._learns:
+            order["module"] = call.reference.partition(":")[0]
         with self._one_at_a_time:
             try:
-                return self._order(name, workdir, log, report)
+                return self._order(order, log, report)
             except OSError:
                 # the server was killed, as by a machine that ran out of memory: its children died with it
                 self._forget()
-                return self._order(name, workdir, log, report)
+                return self._order(order, log, report)
 
-    def _order(self, name: str, workdir: str, log: int, report: int) -> ForkedChild:
+    def _order(self, order: dict[str, str], log: int, report: int) -> ForkedChild:
         orders = self._connected()
         mine, theirs = socket.socketpair()
         with theirs:
-            mine.sendall(json.dumps({"name": name, "workdir": workdir}).encode())
+            mine.sendall(json.dumps(order).encode())
             socket.send_fds(orders, [b"c"], [theirs.fileno(), log, report])
         return ForkedChild(mine)
 
@@ -62,7 +74,7 @@ class ForkedProcesses(ChildProcesses):
         if self._to_server is None:
             mine, theirs = socket.socketpair()
             with theirs:
-                self._server = self.open_process(["-m", MODULE, *self._prepared], stdin=theirs.fileno(), stdout=subprocess.DEVNULL)
+                self._server = self.open_process(["-m", MODULE, *self._arguments], stdin=theirs.fileno(), stdout=subprocess.DEVNULL)
             self._to_server = mine
         return self._to_server
 

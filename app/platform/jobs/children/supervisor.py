@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import psutil
 
-from app.platform.jobs.children.child import PARENT, REPORT_FD, Cause, ChildLimits, params_hash, stored_result, too_much_memory
+from app.platform.jobs.children.child import PARENT, Cause, ChildLimits, params_hash, stored_result, too_much_memory
 from app.platform.jobs.children.report import write_atomically
 from app.platform.jobs.context import StepOutcome
 from app.settings import private_folder
@@ -31,7 +31,7 @@ REPORT_S = 0.5
 """Least time between two reports to the database."""
 MEMORY_CHECK_S = 0.5
 LOG_TAIL = 6000
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,8 @@ class Child(Protocol):
         """End it."""
 
 
-Starter = Callable[[list[str], int, int], Child]
-"""Starts a child with these arguments, this log and this pipe of reports, in a session of its own."""
+Starter = Callable[[ComputeCall, int, int], Child]
+"""Starts the child of a call, whose folder is ready, with this log and this pipe of reports, in a session of its own."""
 _Popen = subprocess.Popen[bytes]
 _Order = tuple[Callable[[], _Popen], Future[_Popen]]
 
@@ -104,11 +104,11 @@ class ChildProcesses:
     """Starts every process from one thread, because the kernel's parent-death signal fires when the starting *thread* ends.
 
     Args:
-        start: starts a child in another way than as a fresh interpreter.
+        start: starts a child.
     """
 
-    def __init__(self, start: Starter | None = None) -> None:
-        self._start_child = start or self._fresh
+    def __init__(self, start: Starter) -> None:
+        self._start_child = start
         self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="child-starter", daemon=True)
         self._thread.start()
@@ -149,7 +149,7 @@ class ChildProcesses:
         """Start a Python process that lives no longer than this one, with its libraries on one thread; see `subprocess.Popen`."""
         env = (
             os.environ
-            | _ONE_THREAD
+            | ONE_THREAD
             | {PARENT: str(os.getpid()), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
             | named.pop("env", {})
         )
@@ -165,22 +165,12 @@ class ChildProcesses:
         reader, writer = os.pipe()
         with log.open("ab") as out:
             try:
-                return self._start_child([call.name, str(call.workdir.resolve())], out.fileno(), writer), reader
+                return self._start_child(call, out.fileno(), writer), reader
             except BaseException:
                 os.close(reader)
                 raise
             finally:
                 os.close(writer)
-
-    def _fresh(self, arguments: list[str], log: int, report: int) -> Child:
-        return self.open_process(
-            ["-m", "app.platform.jobs.children.child", *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            env={REPORT_FD: str(report)},
-            pass_fds=(report,),
-        )
 
     def _work(self) -> None:
         while order := self._orders.get():

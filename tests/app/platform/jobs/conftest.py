@@ -21,6 +21,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.database import new_session, transaction
 from app.platform.jobs import repository, service
+from app.platform.jobs.children.forked import MODULE as FORKING
 from app.platform.jobs.models import Job
 from app.settings import get_settings
 
@@ -93,7 +94,7 @@ class Jobs:
         found = []
         for process in psutil.Process(worker.pid).children(recursive=True):
             with contextlib.suppress(psutil.Error):  # ended between two looks
-                if "app.platform.jobs.children.child" in process.cmdline():
+                if FORKING in psutil.Process(process.ppid()).cmdline():
                     found.append(process)
         return found
 

@@ -17,6 +17,21 @@ from sqlalchemy.orm import Session
 from app.platform.jobs import JobContext, JobError, JobKind, StepReport, register, write_atomically
 from app.platform.jobs.worker import Pace, run_worker
 
+PREPARED: list[int] = []
+"""The processes that have prepared this module, those of which ours is a fork among them."""
+
+
+def prepare() -> None:
+    """Told by the process whose forks compute."""
+    PREPARED.append(os.getpid())
+    if os.environ.get("TEST_PREPARE_FAILS"):
+        raise RuntimeError("this module cannot be prepared")
+
+
+def who_prepared(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """The processes that have prepared this module, the one that forked us, and how nice we are."""
+    return {"prepared": PREPARED, "forked_by": os.getppid(), "nice": os.nice(0)}
+
 
 class CountParams(BaseModel):
     """How many parts, how far each counts, how long each number takes."""

@@ -17,9 +17,8 @@ from app.platform import files
 from app.platform.database import new_session, transaction
 from app.platform.errors import NotFound
 from app.platform.jobs import JobContext, StepFailed, StepReport, registry, repository, stream, write_atomically
-from app.platform.jobs.children.child import ChildLimits, params_hash
 from app.platform.jobs.children.slots import Slots
-from app.platform.jobs.children.supervisor import ChildMessages, ChildProcesses, ComputeCall
+from app.platform.jobs.children.supervisor import ChildMessages
 from app.platform.jobs.errors import JobCancelled
 from app.platform.jobs.ledger import Ledger
 from app.platform.jobs.models import JobStatus
@@ -187,24 +186,6 @@ def test_a_name_belongs_to_one_function(registered):
 def test_a_kind_names_its_functions_by_module_and_name(wrong):
     with pytest.raises(ValueError, match=r"cannot name a job kind|names no function: write module:function"):
         _kind(**wrong)
-
-
-def test_a_result_is_reused_for_equal_params_and_the_folder_emptied_for_others(kinds, tmp_path):
-    children, workdir = ChildProcesses(), tmp_path / "step"
-
-    def run(**params):
-        call = ComputeCall(
-            "count", "sample_job_kinds:count", {"part": 0, "numbers": 2, "pause_s": 0.0, **params}, workdir, ChildLimits(1024)
-        )
-        return children.run(call, lambda messages: None, lambda: None)["result"]
-
-    first = run()
-    assert run() == first
-    assert params_hash("count", {"a": 1, "b": 2}) == params_hash("count", {"b": 2, "a": 1})
-    other = run(numbers=3)
-    assert (other["counted"], other["resumed_from"]) == (3, 0)
-    assert other["pid"] != first["pid"]
-    children.close()
 
 
 def _lines(job_id, last=None):

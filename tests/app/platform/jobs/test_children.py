@@ -1,0 +1,52 @@
+"""Processes of compute steps: what they keep of a call, and what the process that forks them loads for all."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+from app.platform.jobs.children.child import ChildLimits, params_hash
+from app.platform.jobs.children.forked import ForkedProcesses
+from app.platform.jobs.children.supervisor import ComputeCall
+
+
+def test_a_result_is_reused_for_equal_params_and_the_folder_emptied_for_others(kinds, tmp_path):
+    children, workdir = ForkedProcesses(learns=True), tmp_path / "step"
+
+    def run(**params):
+        call = ComputeCall(
+            "count", "sample_job_kinds:count", {"part": 0, "numbers": 2, "pause_s": 0.0, **params}, workdir, ChildLimits(1024)
+        )
+        return children.run(call, lambda messages: None, lambda: None)["result"]
+
+    first = run()
+    assert run() == first
+    assert params_hash("count", {"a": 1, "b": 2}) == params_hash("count", {"b": 2, "a": 1})
+    other = run(numbers=3)
+    assert (other["counted"], other["resumed_from"]) == (3, 0)
+    assert other["pid"] != first["pid"]
+    children.close()
+
+
+@pytest.mark.parametrize("fails", ["", "yes"])
+def test_the_module_of_a_step_is_imported_and_prepared_once_for_all_its_children(kinds, tmp_path, monkeypatch, fails):
+    monkeypatch.setenv("TEST_PREPARE_FAILS", fails)
+    children = ForkedProcesses(learns=True, niceness=3)
+
+    def run(number, niceness):
+        call = ComputeCall("who", "sample_job_kinds:who_prepared", {}, tmp_path / str(number), ChildLimits(1024, niceness=niceness))
+        return children.run(call, lambda messages: None, lambda: None)["result"]
+
+    try:
+        each = [run(1, 3), run(2, 5), run(3, 0)]
+        assert [one["prepared"] for one in each] == [[children.server_pid]] * 3
+        assert {one["forked_by"] for one in each} == {children.server_pid}
+        ours = os.nice(0)
+        assert [one["nice"] for one in each] == [min(ours + n, 19) for n in (3, 5, 3)], "the server's step back is not taken twice"
+        os.kill(children.server_pid, signal.SIGKILL)
+        again = run(4, 0)
+        assert again["prepared"] == [again["forked_by"]] != each[0]["prepared"], "another server, which has prepared it itself"
+    finally:
+        children.close()
