@@ -11,6 +11,8 @@ COPY ml ml
 COPY migrations migrations
 COPY static static
 RUN pip install --no-cache-dir --no-deps --no-build-isolation -e . && mkdir /data && chown betaloop /data
+# the service's user may not write here, and each start would compile them
+RUN python -m compileall -q app ml migrations
 USER betaloop
 ENV BETALOOP_DATA_DIR=/data
 EXPOSE 8000

@@ -16,9 +16,10 @@ install: $(STAMP) ## Create .venv with the pinned packages.
 $(STAMP): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "betaloop needs Python 3.11 or newer; name one with: make install PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	@: # most modules are never imported: compiling each at its first import takes half the time
+	@: # most modules are never imported: only those that are get their bytecode, below
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -r requirements.lock
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
+	OMP_NUM_THREADS=1 $(BIN)/python tests/packages/bytecode.py
 	@touch $(STAMP)
 
 demo: install ## Start betaloop with a synthetic study at http://127.0.0.1:8000.
