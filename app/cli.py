@@ -161,6 +161,7 @@ def pipeline(
         str | None, typer.Option(help="Named settings of the pipeline: 'quick' for a first look, 'full' for a study.")
     ] = None,
     wait: Annotated[bool, typer.Option(help="Show progress until the job has ended.")] = True,
+    again: Annotated[bool, typer.Option("--again", help="Start another although the same one waits or runs.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Train, distil, evaluate and rank: the work between two visits. A worker must be running."""
@@ -171,7 +172,10 @@ def pipeline(
     params: dict[str, Any] = {} if preset is None else {"preset": preset}
     with transaction(ACTOR) as db:
         person = study.participant_by_code(db, code, SYSTEM)
-        job_id = start_job(db, person, "pipeline", params, SYSTEM).id
+        started = start_job(db, person, "pipeline", params, SYSTEM, again=again)
+        job_id = started.job.id
+    if not started.new:
+        typer.echo(f"Job {job_id} does this already: no second one was started. Add --again to run it twice.", err=True)
     follow(job_id, wait, as_json)
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime
 from typing import Any, NamedTuple
 
-from sqlalchemy import or_, select, text
+from sqlalchemy import ColumnElement, and_, or_, select, text
 from sqlalchemy.orm import Session, defer
 
 from app.evaluation.models import EstimateRow, Evaluation
 from app.learning.models import Policy
 from app.platform.audit import AuditEvent
+
+Rows = list[dict[str, Any]]
 
 
 def newest_evaluation(db: Session, participant_id: int) -> Evaluation | None:
@@ -92,25 +94,27 @@ def _amplitude(stored: Any) -> float | None:
     return float(stored) if isinstance(stored, int | float) else None
 
 
-def changed_since(
-    db: Session, entity: str, column: str, ids: Collection[int], moment: datetime
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Rows as they were at a moment and as they are now, of those that the audit trail has a change of since.
+def changed_since(db: Session, moment: datetime, wanted: Mapping[str, tuple[str, Collection[int]]]) -> dict[str, tuple[Rows, Rows]]:
+    """Rows as they were at a moment and as they are now, of those that the audit trail has a change of since, by table.
 
     Changes are chained from row to row, not by key, because a key may change too. What was changed back stands on both sides.
 
     Args:
-        entity: the table. column: of it, whose value is one of `ids`.
+        wanted: by table, a column, and the values of it that are looked for.
     """
-    mine = or_(AuditEvent.before[column].as_integer().in_(ids), AuditEvent.after[column].as_integer().in_(ids))
-    query = select(AuditEvent).where(AuditEvent.entity == entity, AuditEvent.at > moment, mine).order_by(AuditEvent.id)
-    then: list[dict[str, Any]] = []
-    now: list[dict[str, Any]] = []
-    for event in db.scalars(query):
+
+    def mine(entity: str, column: str, ids: Collection[int]) -> ColumnElement[bool]:
+        either = or_(AuditEvent.before[column].as_integer().in_(ids), AuditEvent.after[column].as_integer().in_(ids))
+        return and_(AuditEvent.entity == entity, either)
+
+    found: dict[str, tuple[Rows, Rows]] = {entity: ([], []) for entity in wanted}
+    matches = or_(*(mine(entity, column, ids) for entity, (column, ids) in wanted.items()))
+    for event in db.scalars(select(AuditEvent).where(AuditEvent.at > moment, matches).order_by(AuditEvent.id)):
+        then, now = found[event.entity]
         if event.before is not None and event.before in now:
             now.remove(event.before)
         elif event.before is not None:
             then.append(event.before)
         if event.after is not None:
             now.append(event.after)
-    return then, now
+    return found

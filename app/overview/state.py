@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from sqlalchemy.orm import Session
 
 from app.overview import repository
-from app.overview.next_steps import NextStep, next_steps
+from app.overview.tasks import Actor, NextStep, Task
 from app.overview.visit_progress import VisitProgress, visit_progress
 from app.platform.jobs.models import Job
 from app.study.models import Participant
@@ -97,6 +97,48 @@ def states(db: Session, participants: Sequence[Participant], today: dt.date) -> 
     for participant in participants:
         found[participant.id].steps = next_steps(participant, found[participant.id])
     return found
+
+
+def next_steps(participant: Participant, state: State) -> list[NextStep]:
+    """Everything that is to be done for a participant, what others wait for first."""
+    return list(_steps(participant, state))
+
+
+def _steps(participant: Participant, state: State) -> Iterator[NextStep]:
+    home, settings = f"/participants/{participant.code}", participant.current_settings
+    clinician, engineer = Actor.CLINICIAN, Actor.ENGINEER
+    if not state.visits:
+        yield NextStep(Task.ADD_VISIT, clinician, f"{home}/visits/new")
+    if settings.cdbs_amplitude_ma is None and not state.sessions:
+        yield NextStep(Task.STATE_AMPLITUDE, clinician, f"{home}/settings")
+    if state.visits and not state.sessions:
+        yield NextStep(Task.UPLOAD, clinician, f"{home}/upload", blocks_visit=False)
+    for visit in state.planned_visits:
+        if visit.logs_missing:
+            yield NextStep(Task.SEND_LOGS, Actor.COORDINATOR, f"/visits/{visit.visit_id}/slots", visit.logs_missing, blocks_visit=False)
+    if state.proposed:
+        yield NextStep(Task.CONFIRM, clinician, f"{home}/proposals", state.proposed)
+    if state.without_qoc:
+        yield NextStep(Task.ENTER_QOCS, clinician, f"{home}/visits", state.without_qoc)
+    if settings.xi_beta is None:
+        yield NextStep(Task.SET_THRESHOLD, clinician, f"{home}/settings", blocks_visit=bool(state.sessions))
+    if state.ranking_job is not None:
+        yield NextStep(Task.WAIT_FOR_RANKING, Actor.SERVICE, f"/jobs/{state.ranking_job.id}", urgent=False)
+    elif state.sessions and state.evaluated_at is None:
+        yield NextStep(Task.RANK, engineer, f"{home}/jobs", urgent=False)
+    for visit in state.planned_visits:
+        if visit.sealed and visit.held == visit.planned:
+            yield NextStep(Task.OPEN_KEY, clinician, f"/visits/{visit.visit_id}/plan", blocks_visit=False)
+    if state.grown and any(visit.tested for visit in state.planned_visits):
+        yield NextStep(Task.TRAIN_NEXT, engineer, f"{home}/next-generation")
+    elif state.grown:
+        yield NextStep(Task.RANK_AGAIN, engineer, f"{home}/jobs")
+    if state.plan == "draft":
+        yield NextStep(Task.APPROVE_PLAN, clinician, f"{home}/plans")
+    elif state.next_visit is not None and state.evaluated_at is not None and not state.next_planned:
+        yield NextStep(Task.DRAFT_PLAN, clinician, f"{home}/ranking", urgent=False)
+    if state.failed:
+        yield NextStep(Task.LOOK_AT_FAILED, engineer, f"{home}/jobs", state.failed, blocks_visit=False)
 
 
 def _study(db: Session, ids: list[int], found: dict[int, State], today: dt.date) -> None:

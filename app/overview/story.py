@@ -9,7 +9,7 @@ from typing import Any
 
 from app.analysis.evidence.facts import Facts
 from app.analysis.evidence.service import Evidence
-from app.platform.web.charts import GRID, MUTED, SYMBOLS, WARN, Cell, Chart, colour, figure, marker
+from app.platform.web.charts import GRID, MUTED, SYMBOLS, WARN, Cell, Chart, colour, counted, figure, marker
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import SettingsVersion, Visit
 
@@ -46,7 +46,8 @@ def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[Sett
         for i, (moment, s) in enumerate(dated)
     ]
     visits_seen = len({s.visit_id for _, s in dated})
-    subtitle = f"n = {len(dated)} sessions in {visits_seen} visits, those of a day side by side \u00b7 press a dot for its session"
+    n = f"{counted(len(dated), 'session')} in {counted(visits_seen, 'visit')}"
+    subtitle = f"n = {n}, those of a day side by side \u00b7 press a dot for its session"
     return Chart("story", "All months", subtitle, figure(data, **layout), columns, rows, height=82 + 82 * len(panels))
 
 

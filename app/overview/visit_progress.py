@@ -1,4 +1,4 @@
-"""How far the visits with a signed plan are: sessions planned, held, and those whose logs are missing. What is to be done: `next_steps`."""
+"""How far the visits with a signed plan are: sessions planned, held, and those whose logs are missing. What is to be done: `state`."""
 
 from __future__ import annotations
 

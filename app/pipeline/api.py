@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Query
+from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy.orm import Session
 
@@ -24,12 +24,23 @@ from app.study.deps import CurrentParticipant
 router = APIRouter(tags=["jobs"], responses=problems(401, 403, 404, 422))
 
 
-@router.post("/participants/{code}/jobs", status_code=202)
-def start_job(participant: CurrentParticipant, body: JobIn, db: Db, caller: CurrentCaller) -> JobOut:
-    """Start a job; everything but `kind` has a default. It needs the threshold xi_beta and at least one usable session."""
-    job = service.start_job(db, participant, body.kind, body.model_dump(mode="json", exclude={"kind"}), caller)
+@router.post(
+    "/participants/{code}/jobs",
+    status_code=202,
+    responses={200: {"model": JobOut, "description": "The same job waits or runs already: that one; no other was started."}},
+)
+def start_job(participant: CurrentParticipant, body: JobIn, db: Db, caller: CurrentCaller, response: Response) -> JobOut:
+    """Start a job; everything but `kind` has a default. It needs the threshold xi_beta and at least one usable session.
+
+    While a job of the same kind and params waits, or runs on the data as they are now, the same request is answered with that job (200) and
+    starts no other (202), so that it may be sent again after a timeout; `again` starts another all the same. There is one
+    `next_generation` at a time.
+    """
+    params = body.model_dump(mode="json", exclude={"kind", "again"})
+    started = service.start_job(db, participant, body.kind, params, caller, again=body.again)
     db.commit()
-    return job_out(job, participant)
+    response.status_code = 202 if started.new else 200
+    return job_out(started.job, participant)
 
 
 @router.get("/participants/{code}/jobs")

@@ -8,7 +8,7 @@ from app.learning.training.configs import training_groups
 from app.pipeline.distillation import declare_distillation, distil_all
 from app.pipeline.evaluation import declare_evaluation, declare_fit, evaluate_all, fit_calls, store_members
 from app.pipeline.params import PipelineParams
-from app.pipeline.stages import STORE_WEIGHT, plan_on_snapshot
+from app.pipeline.stages import PLAN, STORE_WEIGHT, plan_on_snapshot
 from app.pipeline.training import declare_training, store_trained, training_calls, training_starts
 from app.platform.jobs import JobContext
 
@@ -17,7 +17,7 @@ def run_pipeline(job: JobContext) -> dict[str, Any]:
     """Snapshot, train, distil, fit the DLSM, estimate, rank. Training and fitting run side by side."""
     params = PipelineParams.model_validate(job.params)
     training, evaluation = params.training(), params.evaluation()
-    job.step("plan", "Take a buffer snapshot", weight=STORE_WEIGHT)
+    job.step(PLAN, "Pin the sessions to learn from", weight=STORE_WEIGHT)
     declare_training(job, training)
     declare_fit(job, evaluation)
     declare_distillation(job, len(params.policies) or params.count)

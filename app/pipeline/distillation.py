@@ -12,7 +12,7 @@ from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies import service
 from app.learning.schemas import DistilParams
 from app.learning.training.configs import distillation_config
-from app.pipeline.stages import STORE_WEIGHT, ComputeStep, plan_on_snapshot, policy_facts
+from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, plan_on_snapshot, policy_facts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
 
@@ -22,7 +22,7 @@ DISTIL_WEIGHT = 2.0
 def run_distil(job: JobContext) -> dict[str, Any]:
     """Distil the named policies, or every trained one that has no student."""
     params = DistilParams.model_validate(job.params)
-    job.step("plan", "Take a buffer snapshot", weight=STORE_WEIGHT)
+    job.step(PLAN, "Pin the sessions to learn from", weight=STORE_WEIGHT)
     planned = plan_on_snapshot(job, lambda db, snapshot: {"teachers": policy_facts(teachers(db, snapshot.participant_id, params))})
     declare_distillation(job, len(planned["teachers"]))
     students = distil_all(job, params, planned["snapshot"], planned["teachers"])

@@ -14,7 +14,7 @@ from app.evaluation.schemas import EvaluateParams
 from app.learning.models import BufferSnapshot
 from app.learning.policies.baselines import ensure_baselines
 from app.learning.snapshots.buffers import read_buffer
-from app.pipeline.stages import STORE_WEIGHT, ComputeStep, acting, participant_of, plan_on_snapshot
+from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, acting, participant_of, plan_on_snapshot
 from app.platform import files
 from app.platform.jobs import JobContext
 from ml.ope.registry import AGGREGATE, POSTERIOR, shown
@@ -29,7 +29,7 @@ SKILL_WEIGHT = 2.0
 def run_evaluate(job: JobContext) -> dict[str, Any]:
     """Estimate the named policies, or all, on a fresh snapshot."""
     params = EvaluateParams.model_validate(job.params)
-    job.step("plan", "Take a buffer snapshot", weight=STORE_WEIGHT)
+    job.step(PLAN, "Pin the sessions to learn from", weight=STORE_WEIGHT)
     declare_evaluation(job, params, fit=True)
     snapshot = plan_on_snapshot(job)["snapshot"]
     models = store_members(job, job.compute_all(fit_calls(params, snapshot["sha256"])))

@@ -77,12 +77,13 @@ def start_job(request: Request, participant: CurrentParticipant, db: Db, caller:
         kind = kinds.get(given.get("kind", ""))
         if kind is None:
             raise Invalid("The form names no kind of job.", f"Choose one of {', '.join(kinds)}.")
-        job = service.start_job(db, participant, kind.name, parse(kind.params, given).model_dump(mode="json"), caller)
+        asked = parse(kind.params, {name: v for name, v in given.items() if name != "again"}).model_dump(mode="json")
+        started = service.start_job(db, participant, kind.name, asked, caller, again="again" in given)
         db.commit()
     except BetaloopError as error:
         db.rollback()
         return _jobs(request, participant, db, caller, 50, 0, error.problem(request.url.path), given, error.status)
-    return RedirectResponse(f"/jobs/{job.id}?done=started", 303)
+    return RedirectResponse(f"/jobs/{started.job.id}?done={'started' if started.new else 'same'}", 303)
 
 
 @router.get("/jobs")

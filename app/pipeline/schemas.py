@@ -16,7 +16,8 @@ from app.platform.web.schemas import Model
 def _start_of(kind: registry.JobKind) -> type[BaseModel]:
     """The kind's params with its name beside them, as `POST .../jobs` takes them."""
     name = f"{kind.name.title().replace('_', '')}Job"
-    return create_model(name, __base__=kind.params, __doc__=f"{kind.title}.", kind=(Literal[kind.name], ...))  # type: ignore[arg-type]
+    again = Field(False, description="Whether to start another one although the same waits or runs.")
+    return create_model(name, __base__=kind.params, __doc__=f"{kind.title}.", kind=(Literal[kind.name], ...), again=(bool, again))  # type: ignore[arg-type]
 
 
 if TYPE_CHECKING:

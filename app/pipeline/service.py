@@ -3,22 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
+from pydantic import BaseModel
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import repository as learning
-from app.platform.jobs import registry, repository
+from app.learning.snapshots.service import collect
+from app.pipeline.stages import PLAN, snapshot_facts
+from app.platform.jobs import registry
 from app.platform.jobs import service as jobs
 from app.platform.jobs.models import Job
 from app.study import service as study
 from app.study.models import Participant
 
 
-def start_job(db: Session, participant: Participant, kind: str, params: Mapping[str, Any], caller: Caller) -> Job:
-    """Put a job of this participant on the queue; of a kind of which there is one at a time, the one that has not ended is given instead.
+class Started(NamedTuple):
+    """A job that was asked for, and whether it is a new one."""
+
+    job: Job
+    new: bool
+
+
+def start_job(
+    db: Session, participant: Participant, kind: str, params: Mapping[str, Any], caller: Caller, *, again: bool = False
+) -> Started:
+    """Put a job of this participant on the queue, unless the same one is there: a request that is sent twice starts one job.
+
+    Given instead is one that has not ended: of a kind of which there is one at a time, whatever it was asked for; of others one with the
+    same params and data, unless another is asked for by `again`.
 
     Raises:
         UnknownKind: there is no such kind. Invalid: params that break its schema, or something that it requires is not there.
@@ -26,21 +41,34 @@ def start_job(db: Session, participant: Participant, kind: str, params: Mapping[
     """
     study.require(caller, can.RUN_JOBS, participant)
     wanted = registry.kind(kind)
-    if wanted.one_at_a_time:
-        # two requests at once: the second waits here and finds the job of the first
-        learning.lock_participant(db, participant.id)
-        live, _ = repository.find(db, participant.id, kind, repository.LIVE, limit=1)
-        if live:
-            return live[0]
-    job = jobs.submit(db, kind, participant.id, dict(params), caller.label)
-    checked = wanted.params.model_validate(job.params)
+    checked = jobs.checked_params(kind, params)
+    # two requests at once: the second waits here and finds the job of the first
+    learning.lock_participant(db, participant.id)
+    if not again or wanted.one_at_a_time:
+        for live in jobs.live_of(db, participant.id):
+            if live.kind == kind and (wanted.one_at_a_time or _same(db, participant, live, checked)):
+                return Started(live, False)
+    job = jobs.submit(db, kind, participant.id, checked, caller.label)
     for requirement in wanted.requires:
         requirement(db, participant.id, checked)
-    return job
+    return Started(job, True)
+
+
+def _same(db: Session, participant: Participant, live: Job, params: BaseModel) -> bool:
+    """Whether a job that has not ended does what these params ask for; one that waits reads its data when it begins, as a new one would."""
+    if live.cancel_requested_at is not None or live.params != params.model_dump(mode="json"):
+        return False
+    planned = next((s for s in live.steps if s.key == PLAN and s.result is not None), None)
+    if planned is None or planned.result is None or planned.finished_at is None:
+        return True
+    now = learning.snapshot_by_pins(db, participant.id, collect(db, participant).pins_sha256)
+    if now is None or snapshot_facts(db, now) != planned.result["snapshot"]:
+        return False
+    return not any(p.job_id != live.id and p.created_at > planned.finished_at for p in learning.candidates(db, participant.id))
 
 
 def retry_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
-    """A new job with the same params.
+    """A new job with the same params, whichever else is at work.
 
     Raises:
         Conflict: the job has not ended, or another one repeats it. NotFound: it is another participant's.
@@ -48,7 +76,7 @@ def retry_job(db: Session, participant: Participant, job: Job, caller: Caller) -
     study.require(caller, can.RUN_JOBS, participant)
     study.require_own(participant, job, f"job {job.id}")
     job = jobs.repeatable(db, job)
-    return start_job(db, participant, job.kind, job.params, caller)
+    return start_job(db, participant, job.kind, job.params, caller, again=True).job
 
 
 def cancel_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:

@@ -19,6 +19,9 @@ from app.study.models import Participant
 STORE_WEIGHT = 0.1
 """Share of a job's progress of a step that stores or reads."""
 
+PLAN = "plan"
+"""Key of the first step of every kind, which takes the snapshot."""
+
 ComputeStep = tuple[str, str, dict[str, Any]]
 """One call of a compute function: the step's key, the function's name, its params."""
 
@@ -60,7 +63,7 @@ def plan_on_snapshot(job: JobContext, more: Callable[[Session, BufferSnapshot], 
         snapshot = take_snapshot(job, db)
         return {"snapshot": snapshot_facts(db, snapshot)} | (more(db, snapshot) if more else {})
 
-    return job.transact("plan", plan)
+    return job.transact(PLAN, plan)
 
 
 def policy_facts(policies: Sequence[Policy]) -> list[dict[str, Any]]:

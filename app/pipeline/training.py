@@ -14,7 +14,7 @@ from app.learning.schemas import ALGORITHM_NAMES, TrainParams
 from app.learning.sweeps import service as sweeps
 from app.learning.sweeps.service import Group
 from app.learning.training.configs import training_groups
-from app.pipeline.stages import STORE_WEIGHT, ComputeStep, plan_on_snapshot, policy_facts
+from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, plan_on_snapshot, policy_facts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
 from app.study.models import Participant
@@ -26,7 +26,7 @@ BASELINES = "baselines"
 def run_train(job: JobContext) -> dict[str, Any]:
     """Train policies on a fresh snapshot."""
     params = TrainParams.model_validate(job.params)
-    job.step("plan", "Take a buffer snapshot", weight=STORE_WEIGHT)
+    job.step(PLAN, "Pin the sessions to learn from", weight=STORE_WEIGHT)
     declare_training(job, params)
     planned = plan_on_snapshot(job, lambda db, snapshot: {"starts": training_starts(db, snapshot.participant_id, params)})
     groups = training_groups(params, planned["starts"])

@@ -79,15 +79,15 @@ def test_jobs_read_no_trace_twice_and_say_at_once_that_nothing_can_be_learned(
 ) -> None:
     session, page = upload("random", steps=20), "/participants/P1/jobs"
     forget()
-    assert "can enter a replay buffer" not in client.get(page).text
+    assert "has no session that policies can learn from" not in client.get(page).text
     assert any("trace.values_f32" in s for s in statements)
     statements.clear()
-    assert "can enter a replay buffer" not in client.get(page).text
+    assert "has no session that policies can learn from" not in client.get(page).text
     assert not any("trace.values_f32" in s for s in statements)
     assert client.patch(f"/api/v1/sessions/{session}", json={"excluded_reason": "tablet froze"}).status_code == 200
-    assert "has no session that can enter a replay buffer" in client.get(page).text
+    assert "has no session that policies can learn from" in client.get(page).text
     assert client.patch(f"/api/v1/sessions/{session}", json={"excluded_reason": None}).status_code == 200
-    assert "can enter a replay buffer" not in client.get(page).text
+    assert "has no session that policies can learn from" not in client.get(page).text
 
 
 def test_a_participants_page_asks_for_no_recording_once_it_has_been_seen(

@@ -126,20 +126,18 @@ def _was_read(pinned: SnapshotSession) -> bool:
 def _edited(db: Session, sessions: Sequence[StudySession], moment: datetime) -> tuple[set[int], set[int]]:
     """Sessions whose steps are other ones since a moment, and those that a person had excluded then and not any more."""
     ids, visits = [s.id for s in sessions], {s.visit_id for s in sessions}
+    wanted = {"session": ("id", ids), "session_segment": ("session_id", ids), "visit": ("id", visits)}
+    changed = repository.changed_since(db, moment, wanted)
     moved, readmitted = set(), set()
-    for before, after in _pairs(*repository.changed_since(db, "session", "id", ids, moment)):
+    for before, after in _pairs(*changed["session"]):
         # rows of before sessions could be marked as stopped lack that column
         if any(before[name] != after[name] for name in OF_STEPS) or bool(before.get(STOPPED)) != bool(after.get(STOPPED)):
             moved.add(int(after["id"]))
         if before["excluded_reason"] and not after["excluded_reason"]:
             readmitted.add(int(after["id"]))
-    then, now = repository.changed_since(db, "session_segment", "session_id", ids, moment)
+    then, now = changed["session_segment"]
     moved |= {int(row["session_id"]) for row in (*(r for r in then if r not in now), *(r for r in now if r not in then))}
-    renumbered = {
-        int(after["id"])
-        for before, after in _pairs(*repository.changed_since(db, "visit", "id", visits, moment))
-        if before["number"] != after["number"]
-    }
+    renumbered = {int(after["id"]) for before, after in _pairs(*changed["visit"]) if before["number"] != after["number"]}
     return moved | {s.id for s in sessions if s.visit_id in renumbered}, readmitted
 
 

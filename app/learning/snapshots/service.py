@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import structlog
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
@@ -40,6 +41,8 @@ from app.study.threshold import mdp_settings, suggest_xi_beta
 from app.study.traces import StepTable, TracesOf, traces_of
 from ml.mdp import MdpSettings
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
+
+log = structlog.get_logger()
 
 PINS_VERSION = 2
 SEALED = "the key of its visit's blinded plan is sealed: a clinician opens it on the page of the plan"
@@ -153,7 +156,7 @@ def collect(db: Session, participant: Participant, sessions: Sequence[StudySessi
         reasons = Counter(m.left_out for m in members)
         listed = "; ".join(f"{n} x {reason}" for reason, n in reasons.most_common(4))
         raise Invalid(
-            f"Participant {participant.code} has no session that can enter a replay buffer"
+            f"Participant {participant.code} has no session that policies can learn from"
             + (f": {listed}." if listed else ": no confirmed session at all."),
             "Upload sessions with a beta trace and an amplitude trace, or correct what is named.",
         )
@@ -197,6 +200,7 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
     found = collect(db, participant)
     known = repository.snapshot_by_pins(db, participant.id, found.pins_sha256)
     if known is not None:
+        _mend(db, known, found)
         return known
     stored = files.store(db, to_parquet(found.buffer))
     row_id = repository.add_snapshot(
@@ -220,6 +224,16 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
     db.add_all(_row(row_id, m) for m in found.members)
     db.flush()
     return db.get_one(BufferSnapshot, row_id)
+
+
+def _mend(db: Session, snapshot: BufferSnapshot, found: Collection) -> None:
+    """Make a snapshot's missing or damaged file anew, where the same data still give the same bytes; else whoever reads it is told."""
+    if not files.is_whole(snapshot.file_sha256):
+        content = to_parquet(found.buffer)
+        same = hashlib.sha256(content).hexdigest() == snapshot.file_sha256
+        log.warning("the file of a snapshot was damaged", snapshot=snapshot.id, sha256=snapshot.file_sha256, made_anew=same)
+        if same:
+            files.store(db, content)
 
 
 def _read(db: Session, session: StudySession, version: SettingsVersion, traces: TracesOf) -> Member:
@@ -302,7 +316,7 @@ def _pass_gate(m: Member, barrier: Gate) -> Member:
     """Leave out sessions of learned policies while the gate is shut."""
     if m.trajectory is None or barrier.is_open or blinding.arm(m.session, SYSTEM).controller not in LEARNED:
         return m
-    return Member(m.session, m.table, None, f"session of a learned policy, and the buffer's gate is shut: {wording.gate_grounds(barrier)}")
+    return Member(m.session, m.table, None, f"session of a learned policy, and these are not learned from: {wording.gate_grounds(barrier)}")
 
 
 def _row(snapshot_id: int, m: Member) -> SnapshotSession:

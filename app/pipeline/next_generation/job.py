@@ -14,7 +14,7 @@ from app.pipeline.distillation import declare_distillation, distil_all
 from app.pipeline.evaluation import declare_evaluation, declare_fit, evaluate_all, fit_calls, store_members
 from app.pipeline.next_generation.parents import best, posterior_on, tested_policies
 from app.pipeline.params import NextGenerationParams
-from app.pipeline.stages import STORE_WEIGHT, acting, participant_of, plan_on_snapshot, policy_facts
+from app.pipeline.stages import PLAN, STORE_WEIGHT, acting, participant_of, plan_on_snapshot, policy_facts
 from app.pipeline.training import declare_training, store_trained, training_calls, training_starts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext, JobError
@@ -28,7 +28,7 @@ def run_next_generation(job: JobContext) -> dict[str, Any]:
     """Choose the parents, fine-tune them and train fresh policies side by side, distil all, evaluate and rank."""
     params = NextGenerationParams.model_validate(job.params)
     training, evaluation = params.training(), params.evaluation()
-    job.step("plan", "Take a buffer snapshot", weight=STORE_WEIGHT)
+    job.step(PLAN, "Pin the sessions to learn from", weight=STORE_WEIGHT)
     job.step(CHOOSE, "Choose the policies to go on from", weight=STORE_WEIGHT)
     planned = plan_on_snapshot(job, lambda db, snapshot: _plan(db, job, snapshot))
     snapshot = planned["snapshot"]

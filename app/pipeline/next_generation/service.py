@@ -73,4 +73,4 @@ def start(db: Session, participant: Participant, params: NextGenerationParams, c
     # two clicks at once: the second waits here and finds the job of the first
     learning.lock_participant(db, participant.id)
     found = outlook(db, participant, caller)
-    return found.live or found.done or pipeline.start_job(db, participant, NEXT_GENERATION, params.model_dump(mode="json"), caller)
+    return found.live or found.done or pipeline.start_job(db, participant, NEXT_GENERATION, params.model_dump(mode="json"), caller).job

@@ -112,8 +112,8 @@ def _files(db: Session, hashes: bool) -> Finding:
     if bad:
         detail = f"{len(bad)} of {len(rows)} stored files are missing or damaged, the first {bad[0]}{_named(db, bad)}"
         hint = (
-            "What was uploaded is made anew when the same file is uploaded once more for its participant; "
-            "the rest comes back from a backup (`betaloop restore`)."
+            "What was uploaded is made anew when the same file is uploaded once more for its participant, "
+            "a buffer snapshot by the next job on the data that it was made of; the rest comes back from a backup (`betaloop restore`)."
         )
         return Finding("files", False, detail, hint)
     return Finding("files", True, f"{len(rows)} stored files, {checked} checked")

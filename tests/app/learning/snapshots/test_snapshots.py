@@ -66,6 +66,18 @@ def test_the_same_data_give_the_same_snapshot_and_any_change_another(upload: Upl
     assert from_parquet(files.read(first.file_sha256)).sessions[0].qoc.rating == 7
 
 
+def test_a_damaged_snapshot_is_made_anew_from_the_same_data(upload: Upload, db: Session) -> None:
+    upload("random")
+    participant = participant_by_code(db, "P1", SYSTEM)
+    first = take_snapshot(db, participant, SYSTEM)
+    db.commit()
+    whole = files.read(first.file_sha256)
+    for damage in (lambda path: path.write_bytes(b"x"), lambda path: path.unlink()):
+        damage(files.path_of(first.file_sha256))
+        assert take_snapshot(db, participant, SYSTEM).id == first.id
+        assert files.read(first.file_sha256) == whole
+
+
 def test_a_short_lead_makes_the_first_steps_unusable(upload: Upload, db: Session) -> None:
     upload("random", steps=40, lead=4)
     snapshot, buffer = taken(db)
