@@ -227,6 +227,13 @@ class SweepCandidateOut(Model):
         description="Whether an outcome is as probably worse than under cDBS by more than its margin as makes a verdict `unsafe`; "
         "null where that was not asked, or no outcome is known."
     )
+    within_margins: float | None = Field(
+        description="Probability that every known outcome keeps its margin against cDBS; null where that is not known."
+    )
+    energy_saved: float | None = Field(
+        description="Share of cDBS's energy that the policy is predicted to save; null where that is not known. "
+        "The policies stand in the order of this times `within_margins`."
+    )
     below_bound: float | None = Field(
         description="Share of the buffer's states answered with less than the lower bound of its random sessions; null without those."
     )

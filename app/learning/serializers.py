@@ -131,6 +131,8 @@ def sweep_out(db: Session, sweep: Sweep) -> SweepOut:
                 gain_method=None if c.gain is None else "posterior" if c.by_posterior else "fqe",
                 supported=c.supported if c.by_posterior else None,
                 beyond_margin=c.beyond,
+                within_margins=c.within,
+                energy_saved=c.saves,
                 below_bound=c.below[1] if c.below else None,
             )
             for c in comparison.candidates(sweep)

@@ -310,6 +310,10 @@ INTENDED: dict[str, str] = {
         "API: a session has `stopped_reason` and `medication_h`",
     ),
     **dict.fromkeys(
+        tuple(f"components > schemas > {job} > properties > again" for job in ("DistillJob", "EvaluateJob", "PipelineJob", "TrainJob")),
+        "API: a request for a job that is sent twice starts one",
+    ),
+    **dict.fromkeys(
         tuple(f"components > schemas > {job} > properties > critic_memory" for job in ("PipelineJob", "TrainJob")),
         "Critics may remember past amplitudes (`critic_memory`)",
     ),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.learning.models import Policy, Sweep
-from app.platform.web.charts import Chart, axis, figure
+from app.platform.web.charts import Chart, axis, counted, figure
 from ml.ope.compare.selection import surest
 from ml.policies.logged_range import LARGEST_SHARE_BELOW
 from ml.returns import Gain
@@ -38,6 +38,8 @@ class Candidate:
         gain: estimated return less that of cDBS, with its lower bound; None where it was not estimated.
         by_posterior: whether the posterior estimated it; sweeps of before have gains by fitted Q evaluation, which decide nothing.
         supported, told: whether sessions lie near what the policy does, and whether they can order policies at all.
+        within, saves, expected_saving: probability that every known outcome keeps its margin, share of cDBS's energy that the policy is
+            predicted to save, and their product; None where unknown, as in sweeps of before.
         beyond: whether an outcome is as probably beyond its margin as makes a verdict *unsafe*; None where that was not asked.
         below: the lower bound B of the buffer's random sessions, and the share of its states answered with less; None where unknown.
     """
@@ -57,15 +59,20 @@ class Candidate:
     supported: bool = True
     told: bool = True
     beyond: bool | None = None
+    within: float | None = None
+    saves: float | None = None
+    expected_saving: float | None = None
 
     @property
     def standing(self) -> tuple[bool, float] | None:
-        """Larger is better; who is unsupported or probably beyond a margin is last, as in the ranking.
+        """Larger is better: the expected saving, or the gain where that is unknown; who is unsupported or probably beyond a margin is last.
 
-        None where the posterior has not spoken, or the data cannot order policies.
+        Energy hardly counts in the return of most participants, whose best policy by it is cDBS again. None where the posterior has not
+        spoken, or the data cannot order policies.
         """
-        fit = self.supported and not self.beyond
-        return (fit, self.gain.value) if self.by_posterior and self.told and self.gain is not None else None
+        if not self.by_posterior or not self.told or self.gain is None:
+            return None
+        return self.supported and not self.beyond, self.gain.value if self.expected_saving is None else self.expected_saving
 
     @property
     def leaves_the_logged_range(self) -> bool:
@@ -74,10 +81,10 @@ class Candidate:
 
 
 def candidates(sweep: Sweep) -> list[Candidate]:
-    """The sweep's policies, the largest gain over cDBS by the posterior first; last those without supporting sessions or beyond a margin.
+    """The sweep's policies, the largest expected saving by the posterior first; last those without supporting sessions or beyond a margin.
 
-    Where the posterior has not spoken of all of them, or the data cannot order policies: by their score on held-out sessions, and in the
-    order of training where nothing was held out.
+    In sweeps of before, which have no saving, the largest gain over cDBS. Where the posterior has not spoken of all of them, or the data
+    cannot order policies: by their score on held-out sessions, and in the order of training where nothing was held out.
     """
     found = [_candidate(p) for p in sweep.policies]
     if ordered_by_posterior(found):
@@ -90,14 +97,20 @@ def ordered_by_posterior(found: Sequence[Candidate]) -> bool:
     return bool(found) and all(c.standing is not None for c in found)
 
 
+def ordered_by_saving(found: Sequence[Candidate]) -> bool:
+    """Whether the posterior orders all of them by what they are expected to save, and not by the gain of the return."""
+    return ordered_by_posterior(found) and all(c.expected_saving is not None for c in found)
+
+
 def better_without_learning(found: Sequence[Candidate], baselines: Sequence[dict[str, Any]]) -> str | None:
     """The best controller without learning where it is above every policy of the sweep, else None; None too where nothing was estimated.
 
-    By the gain over cDBS where the posterior orders all of them, else by the scores on held-out sessions.
+    By what orders the policies where that is the posterior, else by the scores on held-out sessions.
     """
     stored = {str(row["controller"]): row.get("gain_over_cdbs") for row in baselines}
     fit = {name: bool(g["supported"]) and not g.get("beyond_margin", False) for name, g in stored.items() if g is not None}
-    told = {name: (fit[name], float(g["value"])) for name, g in stored.items() if g is not None and g["told"]}
+    by = "expected_saving" if ordered_by_saving(found) else "value"
+    told = {name: (fit[name], float(g[by])) for name, g in stored.items() if g is not None and g["told"] and g.get(by) is not None}
     if ordered_by_posterior(found) and told:
         name = max(told, key=told.__getitem__)
         return name if told[name] > max(c.standing for c in found if c.standing is not None) else None
@@ -138,7 +151,7 @@ def _candidate(policy: Policy) -> Candidate:
     at = _chosen(held, policy.metrics.get("best_update"))
     stored = dict(policy.metrics.get("gain_over_cdbs") or {})
     by, supported, told = stored.pop("by", None), stored.pop("supported", True), stored.pop("told", True)
-    beyond = stored.pop("beyond_margin", None)
+    beyond, within, saves, expected = (stored.pop(name, None) for name in ("beyond_margin", "within", "saves", "expected_saving"))
     return Candidate(
         policy=policy,
         score=_at(held, "score", at),
@@ -155,6 +168,9 @@ def _candidate(policy: Policy) -> Candidate:
         supported=supported,
         told=told,
         beyond=beyond,
+        within=within,
+        saves=saves,
+        expected_saving=expected,
     )
 
 
@@ -190,7 +206,7 @@ def _chart(policies: Sequence[Policy], place: str, name: str, title: str, unit: 
     return Chart(
         id=f"sweep-{name.replace('_', '-')}",
         title=title,
-        subtitle=f"{unit} · n = {len(data)} policies",
+        subtitle=f"{unit} · n = {counted(len(data), 'policy', 'policies')}",
         figure=figure(data, xaxis=axis("Update"), yaxis=axis(""), showlegend=True, legend={"orientation": "h", "y": -0.3}),
         columns=["Policy", "Update", title],
         rows=rows,

@@ -31,6 +31,7 @@ def sweep_page(request: Request, sweep: CurrentSweep, db: Db) -> HTMLResponse:
         gains=any(c.gain and c.by_posterior for c in found),
         untold=any(c.by_posterior and not c.told for c in found),
         by_posterior=comparison.ordered_by_posterior(found),
+        by_saving=comparison.ordered_by_saving(found),
         low_ones=[c for c in found if c.leaves_the_logged_range],
         baselines=sorted(sweep.baselines["rows"], key=lambda row: -row["score"]),
         held_out=sweep.baselines["held_out_sessions"],

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from app.learning.schemas import ALGORITHM_NAMES
 from app.learning.sweeps.comparison import Candidate, held_near
-from app.platform.web.charts import Cell
+from app.platform.web.charts import Cell, counted
 from app.platform.web.svg import Plane, apart, drawing, shown_tick
 
 W, H, TOP, BOTTOM, LEFT, RIGHT = 1120.0, 400.0, 66.0, 26.0, 96.0, 118.0
@@ -118,6 +118,7 @@ def _axes(candidates: Sequence[Candidate]) -> list[Axis]:
         _number("From recorded", [c.action_distance for c in candidates]),
         _number("Held-out return", [c.score for c in candidates], always=True),
         _number("Gain over cDBS", [c.gain.value if c.gain else None for c in candidates], always=True),
+        _number("Energy saved", [c.saves for c in candidates]),
     ]
 
 
@@ -170,7 +171,7 @@ def _figure(candidates: Sequence[Candidate], axes: Sequence[Axis], stands: Seque
         for place, text in column.ticks:
             plane.text(plane.at_x(k) - 9, plane.at_y(place) - 7, text, "end", "muted")
     _names(plane, candidates, axes[-1], stands)
-    told = f"{len(candidates)} policies; the columns are {', '.join(a.name for a in axes)}."
+    told = f"{counted(len(candidates), 'policy', 'policies')}; the columns are {', '.join(a.name for a in axes)}."
     return drawing(W, H, "Hyper-parameters and what became of them", told, [plane])
 
 

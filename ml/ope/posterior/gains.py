@@ -40,6 +40,11 @@ class PosteriorGain:
     within: float | None = None
     saves: float | None = None
 
+    @property
+    def expected_saving(self) -> float | None:
+        """Share of cDBS's energy that it saves times the probability of keeping the margins; None where either is unknown."""
+        return None if self.within is None or self.saves is None else self.within * self.saves
+
 
 def gains_over_cdbs(
     buffer: ReplayBuffer, policies: Mapping[str, Policy], seed: int = 0, report: Report = silent, margins: Margins | None = None

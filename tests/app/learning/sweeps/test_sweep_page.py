@@ -19,7 +19,7 @@ from app.learning.policies.baselines import constant_onnx
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.snapshots.service import take_snapshot
 from app.learning.sweeps import parallel
-from app.learning.sweeps.comparison import candidates
+from app.learning.sweeps.comparison import better_without_learning, candidates
 from app.learning.training.compute import best_supported, stored_gains
 from app.platform import files
 from app.platform.jobs import service as jobs
@@ -113,6 +113,32 @@ def test_the_policy_with_the_largest_lower_bound_is_named_and_not_that_of_the_la
         ("rl-0", 8.0, 0.5, 0.05),
         ("rl-1", 3.0, 2.0, 0.0),
     ]
+
+
+def saving(within: float, saves: float) -> dict[str, float]:
+    return {"within": within, "saves": saves, "expected_saving": within * saves}
+
+
+def test_the_largest_expected_saving_stands_first_and_not_cdbs_by_another_name(store: Store, client: TestClient) -> None:
+    rows = [
+        metrics(9.0, 0.4, -0.1, 0.0, **saving(1.0, 0.01)),
+        metrics(5.0, 0.2, -2.0, 0.0, **saving(0.8, 0.4)),
+        metrics(7.0, 0.3, -1.0, 0.0, beyond_margin=True, **saving(0.5, 0.9)),
+    ]
+    dose = {"controller": "best constant, 0.80", "score": 1.0, "mean_amplitude": 0.8}
+    sweep = store(*rows, also=(dose | {"gain_over_cdbs": estimated(0.0, -1.0, **saving(0.9, 0.35))},))
+    told = client.get(f"/api/v1/sweeps/{sweep.id}").json()["candidates"]
+    assert [(c["name"], c["energy_saved"], c["within_margins"]) for c in told] == [
+        ("rl-1", 0.4, 0.8),
+        ("rl-0", 0.01, 1.0),
+        ("rl-2", 0.9, 0.5),
+    ]
+    page = client.get(f"/sweeps/{sweep.id}").text
+    assert "ordered by the energy saved times the chance of keeping the margins" in page
+    assert re.search(r"40 <small[^>]*>\(80 %\)</small>", page), "rl-1 saves 40 %, with 80 % within all margins"
+    assert NOT_BETTER not in page, "0.32 of the policy is more than 0.315 of the dose"
+    more = dose | {"gain_over_cdbs": estimated(0.0, -1.0, **saving(0.9, 0.36))}
+    assert better_without_learning(candidates(sweep), [more]) == "best constant, 0.80"
 
 
 def test_a_policy_below_the_random_controllers_bound_in_more_than_a_twentieth_of_steps_is_flagged(
