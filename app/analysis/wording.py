@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from app.analysis.evidence.facts import Excluded, LeftOut, Missing
 from app.analysis.primary.results import Basis, Comparison, Disagreement, Tested
 from app.analysis.primary.verdict import LockedMargins, NoVerdict, VerdictResult
+from app.platform.web.charts import counted
 from app.study.blinding import CONTROLLER_NAMES
 from ml.statistics.noninferiority import (
     ENERGY,
@@ -22,7 +23,7 @@ from ml.statistics.power import MOST_VISITS
 from ml.statistics.within_visits.contrasts import Adjustment, Reason, Unavailable
 
 TITLES: dict[str, tuple[str, str]] = {
-    "energy": ("Stimulation energy", "cDBS = 1"),
+    "energy": ("Stimulation energy", "share of cDBS"),
     "mean_beta": ("Mean beta amplitude", ""),
     "grasp": ("Grasp frequency", "Hz"),
     "rating": ("Rating", "1\u201310"),
@@ -72,8 +73,8 @@ def unavailable(why: Unavailable, what: str = "the controller") -> str:
     sentences = {
         Reason.NO_SESSION: f"No session of {what}, or none of cDBS, has this metric.",
         Reason.NO_VISIT_WITH_BOTH_ARMS: f"No visit has both {what} and cDBS with this metric: no primary evidence.",
-        Reason.TOO_FEW_VISITS: f"{_n(why.found, 'visit')} with both arms; it takes {why.needed}.",
-        Reason.TOO_FEW_PARTICIPANTS: f"{_n(why.found, 'participant')} with a result; it takes {why.needed}.",
+        Reason.TOO_FEW_VISITS: f"{counted(why.found, 'visit')} with both arms; it takes {why.needed}.",
+        Reason.TOO_FEW_PARTICIPANTS: f"{counted(why.found, 'participant')} with a result; it takes {why.needed}.",
         Reason.TOO_FEW_SESSIONS: "One session of either arm at one visit does not tell how much sessions differ.",
         Reason.ALL_EQUAL: "Every session has the same value, which does not tell how far another could differ: nothing can be tested.",
         Reason.NO_VARIANCE: f"{_upper(what)} differs from cDBS by the same at every visit, which does not tell how far another visit could "
@@ -105,7 +106,7 @@ def basis(tested: Tested) -> str:
     if tested.basis is Basis.SELECTION:
         return "selection: these sessions may have picked the policy, and confirm nothing"
     left = len(tested.selection_sessions)
-    return "confirmation" + (f"; {_n(left, 'earlier session')} that may have picked it left out" if left else "")
+    return "confirmation" + (f"; {counted(left, 'earlier session')} that may have picked it left out" if left else "")
 
 
 def verdict(result: VerdictResult) -> str:
@@ -122,7 +123,7 @@ def verdict(result: VerdictResult) -> str:
 
 def verdict_sentence(name: str, found: Verdict, visits: int, *, planned: bool) -> str:
     """A verdict over so many visits, in one sentence. `planned`: whether it was asked how many further visits would settle it."""
-    over = f"over {_n(visits, 'visit')}"
+    over = f"over {counted(visits, 'visit')}"
     if isinstance(found, NonInferiorAndSaving):
         return (
             f"{name} is non-inferior to cDBS on grasp, rating and tremor and saves {found.percent:.0f} % of the stimulation energy "
@@ -142,7 +143,9 @@ def _more(found: Inconclusive, *, planned: bool = True) -> str:
     with_ = "both arms" if {*short, ENERGY} >= OUTCOMES.keys() else f"{_listed(short)} in both arms" if short else ""
     few = f"nothing is concluded from fewer than {LEAST_VISITS} visits with {with_}" if short else ""
     if found.more_visits is not None:
-        more = f"{_n(found.more_visits, 'more visit')} with both arms would settle it with a probability of 80 %, if what was seen holds"
+        more = (
+            f"{counted(found.more_visits, 'more visit')} with both arms would settle it with a probability of 80 %, if what was seen holds"
+        )
         return f"{few}; {more}" if few else more
     if few:
         return few
@@ -176,11 +179,11 @@ def outlook(result: VerdictResult, sessions_per_arm: int) -> str:
     found = a.verdict
     if found.more_visits is None:
         return f"{name}: {_more(found)}."
-    visits, arms = _n(found.more_visits, "more visit"), _n(sessions_per_arm, "session")
+    visits, arms = counted(found.more_visits, "more visit"), counted(sessions_per_arm, "session")
     settled = f"{name}: {visits}, each with {arms} of it and as many of cDBS, would show with a probability of 80 % that it saves energy"
     settled += " without loss, if what was seen holds"
     if found.fewest_visits is not None and found.fewest_visits < found.more_visits:
-        return f"{settled}. With more sessions at each it is {_n(found.fewest_visits, 'visit')} at the least."
+        return f"{settled}. With more sessions at each it is {counted(found.fewest_visits, 'visit')} at the least."
     return f"{settled}. More sessions at a visit would not replace one."
 
 
@@ -217,7 +220,7 @@ def margins(found: LockedMargins) -> str:
 
 
 def _n_points(points: float) -> str:
-    return f"{points:g} point{'' if points == 1 else 's'}"
+    return counted(points, "point")
 
 
 def disagreement(found: Comparison) -> str:
@@ -258,7 +261,7 @@ def left_out(excluded: Excluded) -> str:
 def no_association(why: Unavailable) -> str:
     """Why two measurements are not set against each other."""
     if why.reason is Reason.TOO_FEW_VISITS:
-        return f"{_n(why.found, 'visit')} with what it takes; {why.needed} are needed."
+        return f"{counted(why.found, 'visit')} can be compared; {why.needed} are needed."
     sentences = {
         Reason.ALL_EQUAL: "One of the two does not vary.",
         Reason.ONE_VISIT: "One visit alone carries it: without that visit one of the two does not vary.",
@@ -295,10 +298,6 @@ def _upper(text: str) -> str:
 
 def _numbers(numbers: Iterable[int]) -> str:
     return ", ".join(map(str, numbers))
-
-
-def _n(count: int, word: str) -> str:
-    return f"{count} {word}" if count == 1 else f"{count} {word}s"
 
 
 def shown_unit(metric: str, unit: str) -> str:

@@ -59,7 +59,7 @@ def effect(differences: Mapping[str, Difference], within: float | None = None) -
         differences: by quantity, as the answer's rows have them. within: probability that all outcomes are within their margins.
     """
     told = [
-        f"{name} {signed(scale * differences[quantity].value, digits)} {unit}"
+        change(name, scale * differences[quantity].value, digits, unit)
         for quantity, name, scale, digits, unit in _CHANGES
         if quantity in differences
     ]
@@ -67,11 +67,23 @@ def effect(differences: Mapping[str, Difference], within: float | None = None) -
     return (", ".join(told) or "what it would change is not estimated") + likely
 
 
+def change(name: str, difference: float, digits: int, unit: str) -> str:
+    """What changes by how much: signed, with its unit, of one point in the singular; unchanged where it rounds to nothing.
+
+    Args:
+        name: of what changes. difference: by how much, in the unit. digits: after the point. unit: its symbol, or a noun in the plural.
+    """
+    shown = signed(difference, digits)
+    if not float(shown.replace("\N{MINUS SIGN}", "-")):
+        return f"{name} unchanged"
+    return f"{name} {shown} {unit[:-1] if shown[1:] == '1' and unit.endswith('points') else unit}"
+
+
 _CHANGES = (
     ("energy", "energy", 100, 0, "%"),
     ("grasp_hz", "grasp", 1, 1, "Hz"),
     ("rating", "rating", 1, 1, "points"),
-    ("tremor_percent", "tremor", 1, 0, "points"),
+    ("tremor_percent", "tremor", 1, 0, "percentage points"),
 )
 """Of each quantity: name, scale, digits, unit."""
 

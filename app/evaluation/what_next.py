@@ -17,6 +17,7 @@ def what_next(judged: Judged, *, may_run: bool) -> Markup:
         judged: the ranking. may_run: whether who reads them may start jobs.
     """
     settings = judged.participant.current_settings
+    minutes = judged.evaluation.horizon_steps * settings.period_s / 60
 
     def write() -> Markup:
         return render_part(
@@ -24,15 +25,16 @@ def what_next(judged: Judged, *, may_run: bool) -> Markup:
             base=f"/participants/{judged.participant.code}",
             answer=judged.answer,
             drawn=judged.random_sessions(settings),
-            minutes=judged.evaluation.horizon_steps * settings.period_s / 60,
+            minutes=round(minutes) if minutes >= 1 else round(minutes, 1),
             off_share=OFF_SHARE,
             margins=judged.participant.margins_in_force,
             plainly=verdict_wording.plainly,
             effect=verdict_wording.effect,
+            change=verdict_wording.change,
             further=verdict_wording.further_sessions,
             amplitude=wording.amplitude,
-            signed=wording.signed,
             chance=wording.chance,
+            outcome_names=wording.OUTCOME_NAMES,
             may_run=may_run,
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from app.platform.web.charts import counted
 from ml.ope.flags import TEXT, Flag
 from ml.ope.registry import shown
 
@@ -40,11 +41,6 @@ def signed(value: float, digits: int = 1) -> str:
     """A difference with its sign."""
     shown = round(value, digits)
     return f"{shown:+.{digits}f}".replace("-", "\N{MINUS SIGN}") if shown else f"{0:.{digits}f}"
-
-
-def count(n: int, one: str, many: str) -> str:
-    """A number with its noun."""
-    return f"{n} {one if n == 1 else many}"
 
 
 def percent(share: float | None) -> str:
@@ -103,13 +99,13 @@ def _sessions_changed(flag: Flag) -> str:
         "cdbs": "with another cDBS amplitude",
         "moved": "whose times, control channel, controller or stop were corrected",
     }
-    return f"{count(int(number(flag)), 'session', 'sessions')} {what[flag.fact('change')]}"
+    return f"{counted(int(number(flag)), 'session')} {what[flag.fact('change')]}"
 
 
 def _policies_missing(flag: Flag) -> str:
     names, n = flag.fact("names"), int(number(flag))
     listed = ", ".join(names) + (f" and {n - len(names)} more" if n > len(names) else "")
-    return f"{count(n, 'policy', 'policies')} not in it: {listed}"
+    return f"{counted(n, 'policy', 'policies')} not in it: {listed}"
 
 
 def _reference(flag: Flag) -> str:
@@ -148,11 +144,10 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         "there is a model's guess"
     ),
     "few_near_sessions": lambda f: (
-        f"{_refusal(f)}{count(int(number(f)), 'session', 'sessions')} came near what it would do; {f.limit:.0f} on two visits are needed"
+        f"{_refusal(f)}{counted(int(number(f)), 'session')} came near what it would do; {f.limit:.0f} on two visits are needed"
     ),
     "few_near_visits": lambda f: (
-        f"{_refusal(f)}all sessions that came near what it would do are of {count(int(number(f)), 'visit', 'visits')}, "
-        f"and {f.limit:.0f} are needed"
+        f"{_refusal(f)}all sessions that came near what it would do are of {counted(int(number(f)), 'visit')}, and {f.limit:.0f} are needed"
     ),
     "not_converged": lambda f: (
         f"{_refusal(f)}not converged: its ratios break the equation that defines them by {number(f):.2f} standard deviations "
@@ -161,10 +156,10 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "few_effective_sessions": lambda f: f"{_refusal(f)}the weights rest on {number(f):.1f} effective sessions of {f.fact('sessions'):.0f}",
     "acts_within_hold": lambda f: (
         f"{_refusal(f)}the policy acts within amplitudes that were drawn once and held, in "
-        f"{count(round(number(f)), 'session', 'sessions')}: importance weights cannot tell what it would have done"
+        f"{counted(round(number(f)), 'session')}: importance weights cannot tell what it would have done"
     ),
     "hold_density_unknown": lambda f: (
-        f"{_refusal(f)}the held amplitudes of {count(round(number(f)), 'session', 'sessions')} were drawn by no stated design, "
+        f"{_refusal(f)}the held amplitudes of {counted(round(number(f)), 'session')} were drawn by no stated design, "
         "so that they have no weight"
     ),
     "few_sessions_behind_correction": lambda f: (
@@ -177,7 +172,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "no_end_reward": lambda f: "no session has an end-of-session reward: the estimate is the step return alone",
     "days_unknown": lambda f: "how returns differ from day to day cannot be told from these sessions: the intervals leave it out",
     "stopped_sessions": lambda f: (
-        f"{count(int(number(f)), 'session', 'sessions')} stopped for the participant's sake: counted as failures with the worst outcomes. "
+        f"{counted(int(number(f)), 'session')} stopped for the participant's sake: counted as failures with the worst outcomes. "
         f"Counted as measured, the end-of-session reward would be {f.fact('measured'):.1f} instead of {f.fact('counted'):.1f}"
     ),
     "no_better_than_mean": lambda f: (
@@ -215,9 +210,9 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         f"{chance(number(f))} likely within the margins of grasp, rating and tremor (a test asks for {percent(f.limit)})"
     ),
     "saves_energy": lambda f: f"{chance(number(f))} likely to use less energy (a test asks for {percent(f.limit)})",
-    "visits_needed": lambda f: f"on {count(int(number(f)), 'visit', 'visits')}",
+    "visits_needed": lambda f: f"on {counted(int(number(f)), 'visit')}",
     "not_settled_by_sessions": lambda f: "more sessions held near what it does would not settle it",
-    "sessions_needed": lambda f: count(int(number(f)), "session", "sessions"),
+    "sessions_needed": lambda f: counted(int(number(f)), "session"),
     "near_amplitude": lambda f: f"held near {f.value:.1f} mA" if f.unit == "mA" else f"held near {percent(f.value)} of the cDBS amplitude",
     # of the choice of a method
     "difference_error": _difference_error,
@@ -239,7 +234,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         "whether it improves on cDBS in return is open."
     ),
     "placed_below": lambda f: (
-        "Policies that the data do not support stand below all supported ones, whatever their estimated value: "
+        "Hardly any session came near what these do, so that their values are guesses; they stand last, whatever the value: "
         + ", ".join(f.fact("policies"))
         + "."
     ),

@@ -181,7 +181,8 @@ def _of_session(first: str, later: str) -> Callable[[Row, Row, Names], str]:
 
 
 def _decided(_before: Row, after: Row, names: Names) -> str:
-    return f"decided on the buffer's gate of {names.participant(after.get('participant_id'))}: {after.get('choice')}"
+    of = names.participant(after.get("participant_id"))
+    return f"decided whether policies of {of} learn from sessions of earlier ones: {after.get('choice')}"
 
 
 def _token(before: Row, after: Row, _: Names) -> str:
@@ -227,7 +228,7 @@ _SAID: dict[str, Callable[[Row, Row, Names], str]] = {
     "evaluation": lambda b, a, n: f"stored an evaluation of {n.participant((a or b)['participant_id'])}",
     "sweep": lambda b, a, n: f"stored {(a or b)['name']} of {n.participant((a or b)['participant_id'])}",
     "policy": _policy,
-    "buffer_snapshot": lambda b, a, n: f"took a buffer snapshot of {n.participant((a or b)['participant_id'])}",
+    "buffer_snapshot": lambda b, a, n: f"pinned the sessions that policies of {n.participant((a or b)['participant_id'])} learn from",
     "job": _job,
     "app_user": _account,
     "api_token": _token,

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from app.overview.next_steps import Actor, NextStep, Task
+from app.overview.tasks import Actor, NextStep, Task
 from app.overview.visit_progress import VisitProgress
+from app.platform.web.charts import counted
 
 ACTORS = {
     Actor.CLINICIAN: "Clinician",
@@ -46,11 +47,6 @@ def progress(visit: VisitProgress) -> str:
     """How far a visit with a signed plan is."""
     missing = f", {counted(visit.logs_missing, 'log')} missing" if visit.logs_missing else ""
     return f"Visit {visit.number}: {visit.held} of {counted(visit.planned, 'planned session')} held{missing}"
-
-
-def counted(count: int, noun: str) -> str:
-    """A count with its noun."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def in_days(days: int) -> str:

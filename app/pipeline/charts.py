@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from app.platform.jobs.models import Job, JobEvent
-from app.platform.web.charts import MUTED, Chart, axis, figure
+from app.platform.web.charts import MUTED, Chart, axis, counted, figure
 
 PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")
 
@@ -69,7 +69,7 @@ def _curve_chart(curve: str, by_step: dict[str, dict[float, float]], titles: dic
     return Chart(
         id=f"job-{curve.replace('_', '-')}",
         title=title,
-        subtitle=f"{unit} · n = {len(rows)} points of {len(by_step)} {'step' if len(by_step) == 1 else 'steps'}",
+        subtitle=f"{unit} · n = {counted(len(rows), 'point')} of {counted(len(by_step), 'step')}",
         figure=figure(
             data,
             xaxis=axis(x_title),

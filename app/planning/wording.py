@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from app.evaluation.verdict_wording import plainly
-from app.evaluation.wording import amplitude, chance, count, joined
+from app.evaluation.wording import amplitude, chance, joined
 from app.planning.notices import OF_METHODS, Code, PlanWarning
 from app.planning.plans.designs import Bound, Planned, delivered_ma
 from app.planning.plans.models import NEAR, Plan, PlanItem, is_held
@@ -15,6 +15,7 @@ from app.planning.slots.matching import Deviation
 from app.planning.visit_day.record import Contradiction, Entry, grasp_hz, moment
 from app.planning.visit_day.schemas import SlotOut
 from app.planning.visit_day.screening import Found
+from app.platform.web.charts import counted
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller
 from ml.deploy.manifest import BundleManifest
@@ -115,7 +116,7 @@ def holding(held: Held) -> str:
     visits = f" on {further.visits} visits" if further.visits > 1 else ""
     is_worth = f"{of} {'is' if len(names) == 1 else 'are'} worth a test"
     now = f"; {held.hold.here} of them at this visit" if held.hold.here < further.sessions else ""
-    return f"{count(further.sessions, 'session', 'sessions')} held near it{visits} would tell whether {is_worth}{now}."
+    return f"{counted(further.sessions, 'session')} held near it{visits} would tell whether {is_worth}{now}."
 
 
 TELLING = 0.2
@@ -238,7 +239,7 @@ def session_name(item: PlanItem) -> str:
 
 
 ORDER_NAMES = {
-    Order.DRAWN: "drawn from the seed",
+    Order.DRAWN: "by lot",
     Order.WILLIAMS: "Williams' design, balanced over visits",
     Order.LATIN_SQUARE: "Latin square, balanced over visits",
     Order.STATED: "as stated",

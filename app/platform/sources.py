@@ -13,6 +13,8 @@ from collections.abc import Callable
 
 from fastapi import Request
 
+from app.platform.web.charts import counted
+
 MOST_SOURCES = 10_000
 """Sources that are remembered; beyond them those that have asked for the least are forgotten."""
 
@@ -86,5 +88,5 @@ def from_this_machine(request: Request) -> bool:
 def in_words(seconds: int) -> str:
     """A wait for people."""
     if seconds < 90:
-        return f"{seconds} seconds"
+        return counted(seconds, "second")
     return f"{math.ceil(seconds / 60)} minutes"

@@ -169,7 +169,7 @@ class ParticipantLoop:
         else:
             parents = self._parents(db, person) if self.design.fine_tunes(number) else []
             params = self.design.preset.pipeline | {"policies": parents, "seed": (self.design.seed + 100 * number) % 10**6}
-            job_id = start_job(db, person, "pipeline", params, self.caller).id
+            job_id = start_job(db, person, "pipeline", params, self.caller).job.id
         db.commit()
         while not (view := look(job_id)).status.ended:
             self.check_worker()

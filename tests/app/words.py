@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
 
 BANNED = (
     "E[", "horizon", "logged", "saturated", "data support it", "DLSM", "DLMM", "FQE", "QoC", "ξβ", "xi_beta", "r_end", "posterior",
     "fitted Q", "Mean Q", "critic", "temporal-difference", "extrapolation", "Estimated return", "data do not support", "replay buffer",
-    "decoded",
+    "decoded", "r_a", "r_b", "buffer", "from the seed", "cDBS = 1", "estimand", "off-policy",
 )  # fmt: skip
 _UNSEEN = {"details", "script", "style", "title", "head"}
 
@@ -36,6 +37,17 @@ def above_fold(page: str) -> str:
     reader = _Reader()
     reader.feed(page)
     return " ".join(" ".join(reader.words).split())
+
+
+def miscounted(words: str) -> list[str]:
+    """Where some words speak of one minutes, or of one of any other thing of which there are counts."""
+    return re.findall(rf"(?<![\d.,:/@\u202f-])\b1 (?:more |planned |further )?(?:{'|'.join(_COUNTED)})\b", words)
+
+
+_COUNTED = (
+    "minutes", "seconds", "days", "months", "visits", "sessions", "policies", "points", "percentage points", "participants", "files",
+    "jobs", "rows", "intervals", "windows", "tests", "seeds", "logs", "revisions", "channels", "candidates",
+)  # fmt: skip
 
 
 def methods_named(words: str) -> list[str]:

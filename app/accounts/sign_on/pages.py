@@ -127,7 +127,7 @@ def _refusal(request: Request, error: BetaloopError, way: _Way | None) -> Respon
     if way and way.confirms:
         # who had signed in still is: the page that asked says what is wrong
         problem = error.problem(RETURN_PATH) | {"request_id": request.state.request_id}
-        page = render(request, "error.html", problem=problem, title=error.title, advice="", only_advice=False, entries=[], writer=None)
+        page = render(request, "error.html", problem=problem, title=error.title, advice="", only_advice=False, entries=[], again="")
         return HTMLResponse(page, error.status, headers)
     page = render(request, "accounts/sign_in.html", problem=error.problem(RETURN_PATH), email="", next=target)
     return HTMLResponse(page, error.status, headers)

@@ -7,7 +7,7 @@ from typing import Any
 
 from app.analysis.calibration.schemas import AccuracyOut, CalibrationOut, MethodMetricOut, PredictionOut, TestedPolicyOut
 from app.evaluation.ranking.charts import style
-from app.platform.web.charts import MUTED, Chart, axis, figure
+from app.platform.web.charts import MUTED, Chart, axis, counted, figure
 from ml.ope.registry import shown as method_of
 
 QUANTITY_NAMES = {
@@ -34,37 +34,31 @@ def label(p: TestedPolicyOut) -> str:
 
 
 def returns(found: CalibrationOut, method: str) -> Chart:
-    """Actual against predicted return with the line on which they agree; one method is shown, the others wait in the legend."""
-    order = sorted(found.methods, key=lambda m: m != method)
-    points = {m: [(p, q) for p in found.policies for q in p.predictions if q.method == m] for m in order}
-    ends = [v for own in points.values() for _, q in own for v in (q.predicted, q.actual)]
-    data = [_trace(m, points[m], visible=m == method) for m in order]
-    shown = points[method]
+    """Actual against predicted return by one method, with the line on which they agree."""
+    shown = [(p, q) for p in found.policies for q in p.predictions if q.method == method]
     bars = [v for _, q in shown for v in (q.predicted, q.low, q.high, q.actual, q.actual_low, q.actual_high) if v is not None]
-    square = _square(bars, ends)
+    square = _square(bars, bars)
     rows = [
         [
-            label(p), method_of(m).name, q.predicted, q.low, q.high, q.actual, q.actual_low, q.actual_high, q.sessions,
+            label(p), q.predicted, q.low, q.high, q.actual, q.actual_low, q.actual_high, q.sessions,
             "whole return" if q.parts == "return" else "steps alone",
         ]
-        for m in order
-        for p, q in points[m]
+        for p, q in shown
     ]  # fmt: skip
     level = f"{100 * found.level:.0f} %"
     return Chart(
         id="predicted-actual",
-        title="Actual against predicted return",
-        subtitle=f"reward, {level} intervals \u00b7 {_n([(p, q.sessions) for p, q in shown])} \u00b7 "
-        "dashed: predicted = actual \u00b7 circles: cDBS \u00b7 open marks: not supported by the data",
+        title="Worth of a session, predicted and seen",
+        subtitle=f"score of the whole session, {level} intervals \u00b7 {_n([(p, q.sessions) for p, q in shown])} \u00b7 "
+        "dashed: predicted = seen \u00b7 circles: cDBS \u00b7 open marks: no session near",
         figure=figure(
-            data,
-            xaxis=axis("Predicted before the visit", "reward", range=square["range"]),
-            yaxis=axis("Actual", "reward", range=square["range"]),
+            [_trace(method, shown)],
+            xaxis=axis("Predicted before the visit", "score", range=square["range"]),
+            yaxis=axis("Seen at the visit", "score", range=square["range"]),
             shapes=square["shapes"],
-            showlegend=True,
-            legend={"orientation": "h", "y": -0.2, "yanchor": "top", "x": 0, "font": {"color": MUTED, "size": 11}},
+            showlegend=False,
         ),
-        columns=["Policy", "Method", "Predicted (reward)", "Low", "High", "Actual (reward)", "Low", "High", "Sessions", "Compared"],
+        columns=["Policy", "Predicted (score)", "Low", "High", "Seen (score)", "Low", "High", "Sessions", "Compared"],
         rows=rows,
         height=460,
     )
@@ -98,14 +92,14 @@ def metrics(found: CalibrationOut) -> Chart:
         )
         more = {"range": [-1.1, 1.1]} if metric == "rank_correlation" else {"rangemode": "tozero"}
         layout[f"xaxis{suffix}"] = axis(title, unit, domain=[k / 3 + (0.03 if k else 0.0), (k + 1) / 3 - 0.02], anchor="y", **more)
-    level = f"{100 * found.level:.0f} %"
+    level, most = f"{100 * found.level:.0f} %", max((m.sessions for m in rows), default=0)
     columns = ["Method", "n policies at visits", "n sessions"]
     for title, unit in METRIC_NAMES.values():
         columns += [f"{title} ({unit})", f"Low ({level})", f"High ({level})"]
     return Chart(
         id="metrics",
         title="Metrics of every method",
-        subtitle=f"over all visits, {level} over resampled visits \u00b7 n = {max((m.sessions for m in rows), default=0)} sessions",
+        subtitle=f"over all visits, {level} over resampled visits \u00b7 n = {counted(most, 'session')}",
         figure=figure(
             data,
             yaxis=axis("", categoryorder="array", categoryarray=names[::-1]),
@@ -166,8 +160,8 @@ def over_visits(found: CalibrationOut, method: str) -> Chart | None:
     return Chart(
         id="over-visits",
         title="Metrics visit by visit",
-        subtitle=f"strong: {method_of(method).name}, points: one visit each \u00b7 n = {len(visits)} visits, "
-        f"{sum(m.sessions for m in rows if m.method == method)} sessions \u00b7 a gap: too few policies at that visit",
+        subtitle=f"strong: {method_of(method).name}, points: one visit each \u00b7 n = {counted(len(visits), 'visit')}, "
+        f"{counted(sum(m.sessions for m in rows if m.method == method), 'session')} \u00b7 a gap: too few policies at that visit",
         figure=figure(
             data,
             showlegend=True,
@@ -203,21 +197,21 @@ def quantities(found: CalibrationOut, method: str) -> list[Chart]:
             "y": [factor * q.actual for _, q in own],
             "text": [label(p) for p, _ in own],
             "marker": {"size": 9, "color": marks["color"], "symbol": ["circle" if p.reference else marks["symbol"] for p, _ in own]},
-            "hovertemplate": "%{text}: predicted %{x:.3g}, actual %{y:.3g}<extra></extra>",
+            "hovertemplate": "%{text}: predicted %{x:.3g}, seen %{y:.3g}<extra></extra>",
         }
         charts.append(
             Chart(
                 id=f"actual-{name.replace('_', '-')}",
                 title=title,
-                subtitle=f"{unit}, {method_of(method).name} \u00b7 {_n([(p, q.sessions) for p, q in own])}",
+                subtitle=f"{unit} \u00b7 {_n([(p, q.sessions) for p, q in own])}",
                 figure=figure(
                     [trace],
-                    xaxis=axis("Predicted", unit, range=square["range"]),
-                    yaxis=axis("Actual", unit, range=square["range"]),
+                    xaxis=axis("Predicted before", unit, range=square["range"]),
+                    yaxis=axis("Seen", unit, range=square["range"]),
                     shapes=square["shapes"],
                     showlegend=False,
                 ),
-                columns=["Policy", f"Predicted ({unit})", f"Actual ({unit})", "Sessions"],
+                columns=["Policy", f"Predicted ({unit})", f"Seen ({unit})", "Sessions"],
                 rows=[[label(p), factor * q.predicted, factor * q.actual, q.sessions] for p, q in own],
                 height=280,
             )
@@ -225,11 +219,12 @@ def quantities(found: CalibrationOut, method: str) -> list[Chart]:
     return charts
 
 
-def _n(counted: Sequence[tuple[TestedPolicyOut, int]]) -> str:
+def _n(compared: Sequence[tuple[TestedPolicyOut, int]]) -> str:
     """How many points and sessions; cDBS is named apart, since it is not counted in the metrics."""
-    policies = sum(p.reference is None for p, _ in counted)
-    beside = len(counted) - policies
-    return f"n = {policies} policies at visits{f' and {beside} of cDBS' if beside else ''}, {sum(n for _, n in counted)} sessions"
+    policies = sum(p.reference is None for p, _ in compared)
+    beside = len(compared) - policies
+    references = f" and {beside} of cDBS" if beside else ""
+    return f"n = {counted(policies, 'policy', 'policies')} at visits{references}, {counted(sum(n for _, n in compared), 'session')}"
 
 
 def _square(values: Sequence[float], everything: Sequence[float]) -> dict[str, Any]:
@@ -241,7 +236,7 @@ def _square(values: Sequence[float], everything: Sequence[float]) -> dict[str, A
     return {"range": [low - margin, high + margin], "shapes": [line | {"line": {"color": MUTED, "width": 1.2, "dash": "dash"}}]}
 
 
-def _trace(method: str, points: Sequence[Point], *, visible: bool) -> dict[str, Any]:
+def _trace(method: str, points: Sequence[Point]) -> dict[str, Any]:
     marks = style(method)
 
     def bars(of: Callable[[PredictionOut], tuple[float | None, float, float | None]]) -> dict[str, Any]:
@@ -261,14 +256,13 @@ def _trace(method: str, points: Sequence[Point], *, visible: bool) -> dict[str, 
         "type": "scatter",
         "mode": "markers",
         "name": method_of(method).short,
-        "visible": True if visible else "legendonly",
         "x": [q.predicted for _, q in points],
         "y": [q.actual for _, q in points],
         "text": [label(p) for p, _ in points],
         "error_x": bars(lambda q: (q.low, q.predicted, q.high)),
         "error_y": bars(lambda q: (q.actual_low, q.actual, q.actual_high)),
         "marker": {"size": 10, "color": marks["color"], "symbol": symbols},
-        "hovertemplate": "%{text}: predicted %{x:.2f}, actual %{y:.2f}<extra>" + method_of(method).name + "</extra>",
+        "hovertemplate": "%{text}: predicted %{x:.2f}, seen %{y:.2f}<extra></extra>",
     }
 
 

@@ -9,15 +9,15 @@ SHARES = {Measure.AMPLITUDE, Measure.SQUARE, Measure.ALL_SIDES}
 
 MEASURES: dict[Measure, tuple[str, str, str]] = {
     Measure.AMPLITUDE: (
-        "Mean amplitude", "cDBS = 1", "Mean over the session's steps of a, the share of the cDBS amplitude, on the controlled side.",
+        "Mean amplitude", "share of cDBS", "Mean over the session's steps of a, the share of the cDBS amplitude, on the controlled side.",
     ),
     Measure.SQUARE: (
-        "Mean squared amplitude", "cDBS = 1",
-        "Mean over the session's steps of a² on the controlled side: its energy at the pulse width and rate of cDBS. The tests use "
-        "this.",
+        "Mean squared amplitude", "share of cDBS",
+        "Mean over the session's steps of a² on the controlled side: its energy at the pulse width and rate of cDBS. Every page that "
+        "speaks of energy uses this.",
     ),
     Measure.ALL_SIDES: (
-        "Energy of all sides and programs", "cDBS = 1",
+        "Energy of all sides and programs", "share of cDBS",
         "Sum over sides and programs of mean I² · w · f, over the same sum at their cDBS amplitudes; width w and rate f as recorded. "
         "With one side and program the mean of a².",
     ),

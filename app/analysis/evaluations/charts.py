@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from app.analysis.evaluations.service import BySeed, SeedRow
 from app.analysis.figures import Box, Panel
-from app.platform.web.charts import TEXT, Cell, Chart, axis, figure, side_by_side
+from app.platform.web.charts import TEXT, Cell, Chart, axis, counted, figure, side_by_side
 
 METRICS = {
     "mae": ("Mean absolute error", "reward, lower is better"),
@@ -63,7 +63,7 @@ def _chart(found: BySeed, metric: str) -> Chart:
         "dragmode": False,
     }
     rows: list[list[Cell]] = [[r.name, r.seed, r.policies, getattr(r, metric)] for own in grouped.values() for r in own]
-    subtitle = f"{unit} \u00b7 {len(found.seeds)} seeds \u00b7 {found.policies} policies"
+    subtitle = f"{unit} \u00b7 {counted(len(found.seeds), 'seed')} · {counted(found.policies, 'policy', 'policies')}"
     return Chart(
         f"seed-{metric.replace('_', '-')}", title, subtitle, figure(data, **layout), ("Method", "Seed", "Policies", title), rows, height=280
     )

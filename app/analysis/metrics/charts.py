@@ -11,7 +11,7 @@ from app.analysis.metrics.comparisons import ALPHA, Comparison, Group
 from app.analysis.metrics.service import FiveMetrics, MetricResult
 from app.analysis.metrics.shown import for_readers
 from app.platform.kept import kept
-from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, figure, marker, side_by_side
+from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, counted, figure, marker, side_by_side
 from app.platform.web.templates import p_text
 from app.study.models import Controller
 
@@ -60,7 +60,7 @@ def metric_chart(metric: MetricResult) -> Chart:
     if metric.metric == "rating":
         layout["yaxis"] |= {"range": [0.5, 10.5], "dtick": 1}
     rows = [_row(g, tests.get(g.controller)) for g in metric.groups]
-    subtitle = f"{metric.unit} \u00b7 n = {metric.n} sessions"
+    subtitle = f"{metric.unit} \u00b7 n = {counted(metric.n, 'session')}"
     return Chart(f"metric-{metric.metric}", metric.title, subtitle, figure(data, **layout), COLUMNS, rows, height=270)
 
 

@@ -16,6 +16,7 @@ from app.analysis.evidence.service import Evidence, evidence
 from app.analysis.metrics.comparisons import Comparison, Group, adjust, compare, group
 from app.analysis.primary import repository
 from app.platform.kept import kept
+from app.platform.web.charts import counted
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller, Participant
 from app.study.sessions.stimulation import MEAN_FRACTION, fits
@@ -234,4 +235,4 @@ def _summary(controller: Controller, sessions: Sequence[Facts], energy: MetricRe
 
 
 def _sessions(count: int) -> str:
-    return "1 session" if count == 1 else f"{count} sessions"
+    return counted(count, "session")

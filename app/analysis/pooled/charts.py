@@ -10,7 +10,10 @@ from app.analysis.evidence.facts import METRICS
 from app.analysis.metrics.charts import SHORT, above, box, points
 from app.analysis.metrics.service import FiveMetrics
 from app.analysis.metrics.shown import for_readers
-from app.platform.web.charts import TEXT, Cell, Chart, axis, figure
+from app.platform.web.charts import TEXT, Cell, Chart, axis, counted, figure
+
+MOST_WIDE = 8
+"""Boxes whose names stand side by side on a tablet in letters of full size."""
 
 
 def results(found: Sequence[FiveMetrics]) -> list[Chart]:
@@ -46,6 +49,7 @@ def _chart(found: Sequence[FiveMetrics], metric: str) -> Chart:
             "ticktext": names,
             "range": [-0.6, len(names) - 0.4],
             "tickangle": 0,
+            "tickfont": {"size": 10 if len(names) > MOST_WIDE else 12},
             "showgrid": False,
             "zeroline": False,
         },
@@ -56,7 +60,7 @@ def _chart(found: Sequence[FiveMetrics], metric: str) -> Chart:
         "dragmode": False,
     }
     sessions = sum(int(r[2] or 0) for r in rows)
-    subtitle = f"{unit} \u00b7 n = {sessions} sessions"
+    subtitle = f"{unit} \u00b7 n = {counted(sessions, 'session')}"
     columns = ("Participant", "Controller", "n", "Median", "Quartile 1", "Quartile 3", "p")
     return Chart(
         f"all-{metric}",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from app.analysis import wording
 from app.analysis.evidence.measurements import HIGHER_IS_BETTER
 from app.analysis.primary.results import Comparison, Tested
-from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, figure, horizontal, marker
+from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, counted, figure, horizontal, marker
 from ml.statistics.within_visits.contrasts import Average
 
 
@@ -19,7 +19,7 @@ def by_visit(tested: Tested, found: Comparison, unit: str) -> Chart:
         {
             "type": "scatter", "mode": "markers", "x": places, "y": [factor * (r.contrast or 0.0) for r in rows],
             "marker": marker(tested.controller, 10),
-            "text": [f"Visit {r.visit}: {len(r.tested)} against {len(r.cdbs)} sessions" for r in rows],
+            "text": [f"Visit {r.visit}: {len(r.tested)} against {counted(len(r.cdbs), 'session')}" for r in rows],
             "hovertemplate": "%{text}<br>%{y:.3g} " + unit + "<extra></extra>", "name": name,
         }
     ]  # fmt: skip
@@ -46,6 +46,6 @@ def by_visit(tested: Tested, found: Comparison, unit: str) -> Chart:
         "showlegend": False, "dragmode": False,
     }  # fmt: skip
     table: list[list[Cell]] = [[r.visit, factor * (r.contrast or 0.0), len(r.tested), len(r.cdbs)] for r in rows]
-    sub = f"{unit} \u00b7 n = {len(rows)} visits \u00b7 {better}"
+    sub = f"{unit} \u00b7 n = {counted(len(rows), 'visit')} \u00b7 {better}"
     columns = ("Visit", f"Contrast ({unit})", "Sessions", "cDBS sessions")
     return Chart(f"contrast-{tested.key}-{found.metric}", title, sub, figure(data, **layout), columns, table, height=260)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from app.evaluation.schemas import RankedPolicy, RankingOut
-from app.platform.web.charts import Chart, axis, figure
+from app.platform.web.charts import Chart, axis, counted, figure
 from ml.ope.registry import shown
 
 
@@ -70,7 +70,7 @@ def forest(ranking: RankingOut) -> Chart:
         id="forest",
         title="Estimated return",
         subtitle=f"E[r_end + discounted step rewards over {ranking.horizon_steps} steps], {100 * level:.0f} % intervals · "
-        f"n = {ranking.snapshot.sessions} sessions · open marks: not supported by the data",
+        f"n = {counted(ranking.snapshot.sessions, 'session')} · open marks: not supported by the data",
         figure=figure(
             data,
             xaxis=axis("Estimated return", "reward"),

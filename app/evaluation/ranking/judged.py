@@ -119,7 +119,7 @@ class Judged:
         """What random sessions have been for the participant so far; None without any, and where nobody asks what sessions showed."""
         if self.caller is None or self.sessions is None:
             return None
-        return random_sessions(self.sessions.rows, self.caller, settings, self.cdbs_ma)
+        return random_sessions(self.sessions.rows, self.caller, settings, self.participant.margins_in_force, self.cdbs_ma)
 
     def picture(self, lower_bound: float, policy_id: int | None = None) -> Picture:
         """The picture of the candidates that are neither cDBS nor off by another name, or of one candidate.

@@ -21,6 +21,7 @@ from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study.blinding import Arm
+from app.study.margins.models import MarginsVersion
 from app.study.models import Controller, Participant, SettingsVersion, StudySession
 from app.study.sessions.repository import ReadOnce
 from app.study.threshold import mdp_settings
@@ -163,6 +164,7 @@ class RandomSessions:
             nothing is that low, or the design has no such rule.
         hold_s: shortest and longest time for which an amplitude is held, s.
         differences: random less cDBS of the same visit, averaged over visits with both, by outcome. worst: of a single session, by outcome.
+        beyond: outcomes that were worse than under cDBS by more than the margin, on average.
     """
 
     sessions: int
@@ -176,16 +178,17 @@ class RandomSessions:
     low_minutes: float
     differences: Mapping[str, float]
     worst: Mapping[str, float]
+    beyond: tuple[str, ...]
 
 
 def random_sessions(
-    rows: Sequence[StudySession], caller: Caller, settings: SettingsVersion, cdbs_ma: float | None
+    rows: Sequence[StudySession], caller: Caller, settings: SettingsVersion, margins: MarginsVersion, cdbs_ma: float | None
 ) -> RandomSessions | None:
     """What random sessions have been so far; None without any.
 
     Args:
         rows: confirmed sessions. caller: decides which arms may be known. settings: design, B and period of the next one.
-        cdbs_ma: where it is known, mA.
+        margins: the participant's. cdbs_ma: where it is known, mA.
     """
     by_visit: defaultdict[int, dict[Controller, list[StudySession]]] = defaultdict(lambda: defaultdict(list))
     for s in blinding.unsealed(rows):
@@ -197,12 +200,12 @@ def random_sessions(
         return None
     factor, unit = (100.0, "% of cDBS") if cdbs_ma is None else (cdbs_ma, "mA")
     held = settings.design != "paper"  # the paper's draws change every step and know no rule for low amplitudes
-    differences, worst = {}, {}
+    differences, worst, usual = {}, {}, {}
     for name, worse in WORST.items():
         pairs = [(_values(arms[Controller.RANDOM], name), _values(arms[Controller.CDBS], name)) for arms in by_visit.values()]
-        apart = [fmean(ours) - fmean(theirs) for ours, theirs in pairs if ours and theirs]
-        if apart:
-            differences[name] = fmean(apart)
+        both = [(fmean(ours), fmean(theirs)) for ours, theirs in pairs if ours and theirs]
+        if both:
+            differences[name], usual[name] = fmean(ours - theirs for ours, theirs in both), fmean(theirs for _, theirs in both)
         if values := _values(drawn, name):
             worst[name] = worse(values)
     return RandomSessions(
@@ -217,7 +220,19 @@ def random_sessions(
         low_minutes=LOW_SECONDS / 60,
         differences=differences,
         worst=worst,
+        beyond=tuple(name for name, apart in differences.items() if _loss(name, apart) > _allowed(name, margins, usual[name])),
     )
+
+
+def _loss(name: str, difference: float) -> float:
+    """By how much an outcome is worse, in its unit: more tremor, less of the others."""
+    return difference if name == "tremor_percent" else -difference
+
+
+def _allowed(name: str, margins: MarginsVersion, under_cdbs: float) -> float:
+    """The margin of an outcome in its unit."""
+    of = {"grasp_hz": margins.grasp_share * under_cdbs, "rating": margins.rating_points, "tremor_percent": margins.tremor_points}
+    return of[name]
 
 
 def _values(sessions: Sequence[StudySession], name: str) -> list[float]:

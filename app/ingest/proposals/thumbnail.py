@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from app.platform.web.charts import written
+from app.platform.web.charts import counted, written
 from app.platform.web.svg import Plane, drawing
 from app.study.sessions.data import SessionData
 
@@ -32,7 +32,7 @@ def thumbnail(data: SessionData) -> Markup | None:
     planes = [_strip(minutes, *strip, titles[k], TOP + k * (EACH + BETWEEN)) for k, strip in enumerate(shown)]
     height = TOP + len(shown) * (EACH + BETWEEN) - BETWEEN + BOTTOM
     words = " and ".join(title for _, title, _ in shown)
-    return drawing(W, height, f"{words} over {minutes[-1]:.0f} minutes", "Gaps are steps without a value.", planes)
+    return drawing(W, height, f"{words} over {counted(round(float(minutes[-1])), 'minute')}", "Gaps are steps without a value.", planes)
 
 
 def _strip(minutes: NDArray[np.float64], values: NDArray[Any], title: str, colour: str, below: str, top: float) -> Plane:

@@ -28,7 +28,11 @@ from ml.statistics.ranksum import p_greater
 
 ALPHA = 0.05
 LEARNED = (Controller.RL, Controller.DISTILLED)
-QOCS = (("grasp_hz", "Grasp frequency", "Hz", True), ("rating", "Rating", "1-10", True), ("tremor_percent", "Tremor", "% of time", False))
+QOCS = (
+    ("grasp_hz", "Grasp frequency", "Hz", True),
+    ("rating", "Rating", "1\u201310", True),
+    ("tremor_percent", "Tremor", "% of time", False),
+)
 """Field, name, unit, and whether more is better."""
 
 
@@ -100,7 +104,7 @@ def decide(db: Session, participant: Participant, choice: GateChoice, reason: st
     """
     study.require(caller, can.APPROVE_PLAN, participant)
     if not reason.strip():
-        raise Invalid("A decision on the replay buffer needs its reason.", "Say why in a sentence.")
+        raise Invalid("A decision on what policies learn from needs its reason.", "Say why in a sentence.")
     row = BufferGateDecision(participant_id=participant.id, choice=choice, reason=reason.strip(), created_by=caller.label)
     set_reason(db, row.reason)
     db.add(row)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from app.platform.web.charts import ACCENT, Chart, axis, figure
+from app.platform.web.charts import ACCENT, Chart, axis, counted, figure
 
 CURVES = {
     "mean_q": ("Promised return of the policy", "reward; an unbounded climb is over-estimation"),
@@ -30,7 +30,7 @@ def curve_charts(curve: Mapping[str, Sequence[float]], of: str) -> list[Chart]:
             Chart(
                 id=f"curve-{name}",
                 title=title,
-                subtitle=f"{unit} · {of} · n = {len(values)} points",
+                subtitle=f"{unit} · {of} · n = {counted(len(values), 'point')}",
                 figure=figure(data, xaxis=axis("Update"), yaxis=axis("", type="log" if log else "linear")),
                 columns=["Update", title],
                 rows=[[int(u), float(v)] for u, v in zip(updates, values, strict=True)],

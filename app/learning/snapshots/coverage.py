@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.learning.models import BufferSnapshot
 from app.learning.snapshots.buffers import read_buffer
-from app.platform.web.charts import ACCENT, CONTROLLERS, WARN, Chart, axis, figure
+from app.platform.web.charts import ACCENT, CONTROLLERS, WARN, Chart, axis, counted, figure
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study.models import StudySession
@@ -138,7 +138,7 @@ def _beta_chart(buffer: ReplayBuffer) -> Chart:
     return Chart(
         id="betas",
         title="Beta of each session",
-        subtitle=f"{unit} from {buffer.beta_source} · n = {len(labels)} sessions",
+        subtitle=f"{unit} from {buffer.beta_source.replace('_', ' ')} · n = {counted(len(labels), 'session')}",
         figure=figure(data, xaxis=axis("Session", showticklabels=len(labels) <= 24), yaxis=axis("Beta", unit)),
         columns=["Session", *(f"{100 * q:.0f} % quantile ({unit})" for q in QUANTILES)],
         rows=[[label, *map(float, row)] for label, row in zip(labels, quantiles, strict=True)],

@@ -14,6 +14,7 @@ import numpy as np
 
 from app.planning.protocol.session_order import Order, rounds
 from app.platform.errors import Invalid
+from app.platform.web.charts import counted
 from app.study.models import Controller
 
 SESSION_MINUTES = (5.0, 20.0)
@@ -72,13 +73,13 @@ class Rules:
         for name, minutes in (("A session", self.session_minutes), ("A no-DBS session", self.no_dbs_minutes)):
             if not shortest <= minutes <= longest:
                 raise Invalid(
-                    f"{name} of {minutes:g} minutes is not possible.",
+                    f"{name} of {counted(minutes, 'minute')} is not possible.",
                     f"Choose {shortest:g} to {longest:g} minutes.",
                     rule=Rule.SESSION_MINUTES,
                 )
         if self.no_dbs and self.no_dbs_minutes > self.session_minutes:
             raise Invalid(
-                f"The session without stimulation would take {self.no_dbs_minutes:g} minutes, longer than another session.",
+                f"The session without stimulation would take {counted(self.no_dbs_minutes, 'minute')}, longer than another session.",
                 f"Make it short: {shortest:g} to {self.session_minutes:g} minutes.",
                 rule=Rule.NO_DBS_SHORT,
             )
@@ -213,7 +214,7 @@ def _too_long(policies: int, needed: float, rules: Rules) -> Invalid:
     ways = ["shorten sessions or washout", "give the visit more minutes"] + ([f"leave out {' and '.join(extras)}"] if extras else [])
     kinds = [name for name, there in (("random", rules.random_sessions), ("held", rules.held_sessions)) if there]
     tested = _policies(policies) if policies else f"The {' and '.join(kinds)} sessions"
-    detail = f"{tested} with the sessions around them take {needed:g} minutes; the visit has {rules.total_minutes:g}."
+    detail = f"{tested} with the sessions around them take {counted(needed, 'minute')}; the visit has {rules.total_minutes:g}."
     if not policies:
         return Invalid(
             detail,
@@ -233,7 +234,7 @@ def _too_long(policies: int, needed: float, rules: Rules) -> Invalid:
 
 
 def _policies(count: int) -> str:
-    return f"{count} policy" if count == 1 else f"{count} policies"
+    return counted(count, "policy", "policies")
 
 
 def _timed(day: Sequence[tuple[Controller, int | None]], rules: Rules) -> list[PlannedSession]:

@@ -23,7 +23,7 @@ from app.study.cdbs_amplitude import held_settings
 from app.study.characteristics.service import fields_of
 from app.study.wording import MEDICATION, characteristics_words, doses_words
 
-_CLOSING_MM = 35.0
+_CLOSING_MM = 32.0
 
 
 class _Sheet(FPDF):  # type: ignore[misc]
@@ -33,7 +33,7 @@ class _Sheet(FPDF):  # type: ignore[misc]
         super().__init__("landscape", "mm", "A4")
         self._view, self._printed = view, f"Printed {printed_at:%Y-%m-%d %H:%M} UTC by {printed_by}"
         self.set_margins(10, 9, 10)
-        self.set_auto_page_break(True, 16)
+        self.set_auto_page_break(True, 14)
         self.set_draw_color(*LINE)
         self.set_line_width(0.2)
         self.c_margin = 0.0  # text begins where boxes begin
@@ -217,7 +217,7 @@ def _closing(pdf: _Sheet, view: PlanView) -> None:
     pdf.cell(0, 5, "Stop rules", new_x=XPos.LMARGIN, new_y=YPos.NEXT)
     pdf.set_font("Helvetica", "", 9)
     pdf.multi_cell(WIDTH, 4.4, wording.STOP_RULES, align="L", border=1, padding=1.5, new_x=XPos.LMARGIN, new_y=YPos.NEXT)
-    line_y, width = pdf.get_y() + 12, 86.0
+    line_y, width = pdf.get_y() + 9, 86.0
     who = "name, signature, date"
     signers = (f"Clinician in charge: {who}", f"Study engineer: {who}", "Back on clinical settings: time, initials")
     pdf.set_font("Helvetica", "", 8)

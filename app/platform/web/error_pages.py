@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
+from urllib.parse import quote, urlencode
 
 from fastapi import Request
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from app.platform.web.forms import written_by
+from app.platform.web.forms import WRITTEN_BY, written_by
 
 _PLAIN_FORM = "application/x-www-form-urlencoded"
 _SECRET = "password"  # noqa: S105 - the name of a field
@@ -31,6 +32,15 @@ def writer_of(request: Request) -> int | None:
     caller = getattr(request.state, "caller", None)
     last = getattr(request.state, "last_caller", None)
     return written_by(request) or (caller.user_id if caller is not None else last)
+
+
+def send_again_to(request: Request, writer: int) -> str:
+    """Where the page of an error sends what was entered: the form's own address with its query, and whose entries they are.
+
+    It begins with one slash, because what begins with two is another host's.
+    """
+    query = [(name, value) for name, value in request.query_params.multi_items() if name != WRITTEN_BY]
+    return "/" + quote(request.scope["path"].lstrip("/")) + "?" + urlencode([*query, (WRITTEN_BY, writer)])
 
 
 def advised(status: int, title: str, has_entries: bool, writer: int | None) -> tuple[str, str]:

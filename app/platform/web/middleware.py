@@ -27,7 +27,7 @@ from app.platform.errors import BetaloopError, Conflict, DatabaseAway, EntriesOf
 from app.platform.json_members import UniqueMembers
 from app.platform.web.body_limit import BodyLimit, Judge
 from app.platform.web.compression import Compression
-from app.platform.web.error_pages import ADDRESS_ALONE, advised, input_in_words, kept_entries, writer_of
+from app.platform.web.error_pages import ADDRESS_ALONE, advised, input_in_words, kept_entries, send_again_to, writer_of
 from app.platform.web.templates import render
 from app.settings import get_settings
 
@@ -118,7 +118,8 @@ async def _answer(request: Request, error: BetaloopError) -> Response:
     writer = writer_of(request)
     title, advice = advised(error.status, error.title, bool(entries), writer)
     only_advice = isinstance(error, _PlainError) and error.status in ADDRESS_ALONE
-    page = render(request, "error.html", problem=body, title=title, advice=advice, only_advice=only_advice, entries=entries, writer=writer)
+    again = send_again_to(request, writer) if writer else ""
+    page = render(request, "error.html", problem=body, title=title, advice=advice, only_advice=only_advice, entries=entries, again=again)
     return HTMLResponse(page, error.status, headers)
 
 

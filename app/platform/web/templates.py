@@ -15,7 +15,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from markupsafe import Markup
 
 from app.platform.database import now
-from app.platform.web.charts import written
+from app.platform.web.charts import counted, written
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -97,7 +97,9 @@ def minutes(seconds: float | None) -> str:
 
 def minutes_left(seconds: float) -> str:
     """A remaining time for people, no finer than it can be known."""
-    return "less than a minute left" if seconds < 60 else f"about {math.ceil(seconds / 60)} min left"
+    if seconds < 60:
+        return "less than a minute left"
+    return f"about {math.ceil(seconds / 60)} min left" if seconds <= 7200 else f"about {seconds / 3600:.0f} h left"
 
 
 def size(value: int) -> str:
@@ -125,6 +127,6 @@ def sign_on_name() -> str:
 
 
 _environment.filters.update(
-    written=written, number=number, fixed=fixed, p=p_text, minutes=minutes, minutes_left=minutes_left, size=size, when=when
+    written=written, counted=counted, number=number, fixed=fixed, p=p_text, minutes=minutes, minutes_left=minutes_left, size=size, when=when
 )
 _environment.globals.update(static_url=static_url, plotly_url=plotly_url, now=now, sign_on_name=sign_on_name)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from app.platform.web.charts import ACCENT, BAD, MUTED, TEXT, WARN, Cell, Chart, axis, figure, horizontal
+from app.platform.web.charts import ACCENT, BAD, MUTED, TEXT, WARN, Cell, Chart, axis, counted, figure, horizontal
 from app.study.outcomes.values import GraspOutcome, TremorOutcome
 from ml.qoc import PLAUSIBLE_INTERVAL_S, TREMOR_CLASSES
 
@@ -55,8 +55,8 @@ def tremor_chart(outcome: TremorOutcome, uploads: dict[int, int]) -> Chart:
         for i, file in enumerate(outcome.minutes.upload_file_ids)
     ]
     subtitle = (
-        f"% of each minute · n = {begin.size} minutes, {reading.covered_s / 60:.1f} of {length_min:.1f} min of the session covered, "
-        f"{reading.unknown_s / 60:.1f} min unknown"
+        f"% of each minute · n = {counted(begin.size, 'minute')}, {reading.covered_s / 60:.1f} of {length_min:.1f} min of the session "
+        f"covered, {reading.unknown_s / 60:.1f} min unknown"
     )
     return Chart("tremor", "Tremor by minute", subtitle, figure(traces, **layout), columns, rows, height=300)
 
@@ -105,7 +105,8 @@ def grasp_chart(outcome: GraspOutcome) -> Chart:
             layout["annotations"].append(label)
     n = sum(t.intervals_s.size for t in outcome.tests)
     odd_n = sum(int(t.implausible.sum()) for t in outcome.tests)
-    subtitle = f"s between open fists · n = {n} intervals in {len(outcome.tests)} tests" + (f", {odd_n} implausible" if odd_n else "")
+    implausible = f", {odd_n} implausible" if odd_n else ""
+    subtitle = f"s between open fists · n = {counted(n, 'interval')} in {counted(len(outcome.tests), 'test')}{implausible}"
     columns = ("Hand", "Interval", "From (s)", "Length (s)", "Mark")
     return Chart("grasps", "Grasp intervals", subtitle, figure(traces, **layout), columns, rows, height=280)
 

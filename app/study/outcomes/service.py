@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.database import set_reason
 from app.platform.errors import Invalid
+from app.platform.web.charts import counted
 from app.study import repository
 from app.study.models import Hemisphere, QocRevision, StudySession
 from app.study.outcomes import repository as of_files
@@ -83,7 +84,7 @@ def store_tremor(
     db.add(row)
     db.flush()
     spans.append((row.first_start_at, row.last_end_at))
-    said = [f"{row.n} minutes of tremor from {_when(row.first_start_at)} to {_when(row.last_end_at)} UTC are kept."]
+    said = [f"Kept: {counted(row.n, 'minute')} of tremor from {_when(row.first_start_at)} to {_when(row.last_end_at)} UTC."]
     others = of_files.tremor_series(db, participant_id, row.first_start_at, row.last_end_at, but_file_id=upload_file_id)
     same, different = tremor.compare(minutes, others)
     if same or different:

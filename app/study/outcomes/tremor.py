@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
+from app.platform.web.charts import counted
 from app.study.outcomes.models import TremorSeries
 from ml.qoc import SAME_TIME_S, TREMOR_CLASSES
 
@@ -98,7 +99,7 @@ def within(series: Sequence[TremorSeries], start_unix_s: float, stop_unix_s: flo
         single, contested = _told_once(minutes)
         if contested:
             notes.append(
-                f"{contested} minutes of {names[row.upload_file_id]} claim the same time and say different things: left out. "
+                f"{counted(contested, 'minute')} of {names[row.upload_file_id]} left out: the same time is told twice, in different ways. "
                 "A spreadsheet may have rounded their times"
             )
         differing: dict[int, int] = {}
@@ -111,7 +112,7 @@ def within(series: Sequence[TremorSeries], start_unix_s: float, stop_unix_s: flo
         free = [i for i in single if all(_overlap_s(minutes, i, k[2], k[3]) <= SAME_TIME_S for k in kept)]
         kept += [(float(minutes.start_unix_s[i]), row.upload_file_id, minutes, i) for i in free]
         notes += [
-            f"{count} minutes of {names[row.upload_file_id]} say otherwise than the newer {names[newer]}, which counts"
+            f"{counted(count, 'minute')} of {names[row.upload_file_id]} told otherwise by the newer {names[newer]}, which counts"
             for newer, count in differing.items()
         ]
     kept.sort(key=lambda k: k[0])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.platform.web.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, figure, horizontal
+from app.platform.web.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, counted, figure, horizontal
 from app.study.recordings.charts import TIME, trace_name
 from app.study.sessions.data import SessionData
 from app.study.traces import amplitude_program, session_offset_s
@@ -213,7 +213,7 @@ def control_chart(data: SessionData) -> Chart:
     if over.any():
         subtitle += f" · {int(over.sum())} above the axis, up to {float(np.nanmax(table.beta)):.3g}"
     if spikes.any():
-        subtitle += f" · power spikes left out of {int(spikes.sum())} windows"
+        subtitle += f" · power spikes left out of {counted(int(spikes.sum()), 'window')}"
     columns = ("Step end (s)", f"{name} ({unit or '—'})", "Amplitude (mA)", "Fraction of cDBS", "Mark")
     marks = [_mark(m, x) for m, x in zip(np.isnan(table.beta), spikes, strict=True)]
     rows: list[list[Cell]] = [
@@ -256,7 +256,9 @@ def beta_by_amplitude(data: SessionData) -> Chart | None:
         shape, label = horizontal(data.threshold, "threshold", WARN)
         layout |= {"shapes": [shape], "annotations": [label]}
     columns = (f"Amplitude ({unit})", "Windows", f"Median ({beta_unit})", f"25 % ({beta_unit})", f"75 % ({beta_unit})")
-    subtitle = f"median and quartiles, {beta_unit} · n = {int(known.sum())} windows · what came together, not what the amplitude did"
+    subtitle = (
+        f"median and quartiles, {beta_unit} · n = {counted(int(known.sum()), 'window')} · what came together, not what the amplitude did"
+    )
     return Chart("beta-by-amplitude", "Beta by amplitude", subtitle, figure([line], **layout), columns, rows, height=280)
 
 

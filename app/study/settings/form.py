@@ -51,10 +51,10 @@ GROUPS = (
         (
             SettingField(
                 "xi_beta", "Beta threshold",
-                "Below it a step earns r_a, at or above it r_b. In the unit of the beta trace. No default: jobs do not start without it.",
+                "Below it a step counts as good. In the unit of the beta trace. No default: jobs do not start without it.",
             ),
             SettingField(
-                "beta_unit", "Unit of beta", "As the trace states it, e.g. uV. Traces of another unit stay out of the buffer.", attrs=_WORDS
+                "beta_unit", "Unit of beta", "As the trace states it, e.g. uV. Traces of another unit are not learned from.", attrs=_WORDS
             ),
             SettingField("beta_source", "Source of beta", "Where the trace that drives the controller comes from.", options=SOURCES),
             SettingField(
@@ -68,8 +68,8 @@ GROUPS = (
                 "Coverage: a window whose measured samples cover less than this share counts as missing, 0 to 1.",
             ),
             SettingField(
-                "most_imputed", "Imputed beta in a state",
-                "Missing beta amplitudes of a state that may be taken from their neighbours, never the newest; 0 for none.",
+                "most_imputed", "Missing beta filled in",
+                "Of the beta values before a decision, how many may be taken from their neighbours, never the newest; 0 for none.",
                 "steps", attrs=_WHOLE,
             ),
             SettingField(
@@ -79,23 +79,26 @@ GROUPS = (
             SettingField(
                 "pool_programmings", "Sessions of another programming",
                 "Contacts, pulse width and rate of the newest session count as the participant's. A fraction is another dose under others.",
-                options=(("no", "stay out of buffers"), ("yes", "enter buffers too")),
+                options=(("no", "are not learned from"), ("yes", "are learned from too")),
             ),
         ),
     ),
     SettingGroup(
-        "State and time",
+        "Decisions and time",
         (
-            SettingField("window", "State length W", "Beta amplitudes that a policy sees. The paper uses 10.", "steps", attrs=_WHOLE),
-            SettingField("period_s", "Step length m", "Time between two decisions. The paper uses 2 s.", "s"),
+            SettingField(
+                "window", "Beta values seen (W)", "The newest beta values, by which a policy decides. The paper uses 10.", "steps",
+                attrs=_WHOLE,
+            ),
+            SettingField("period_s", "Step length (m)", "Time between two decisions. The paper uses 2 s.", "s"),
             SettingField("gamma", "Discount γ", "Weight of the next step against this one, 0 to below 1. The paper gives none."),
         ),
     ),
     SettingGroup(
         "Rewards per step",
         (
-            SettingField("r_a", "Reward r_a", "For a step with beta below the threshold. The paper uses 0."),
-            SettingField("r_b", "Reward r_b", "For a step with beta at or above it; not more than r_a. The paper uses −1."),
+            SettingField("r_a", "Beta below the threshold", "Reward of such a step. The paper uses 0."),
+            SettingField("r_b", "Beta at or above it", "Reward of such a step, not more than below it. The paper uses −1."),
             SettingField("c1", "Price of amplitude C₁", "Taken off per step, times the amplitude fraction. The paper uses 0.3."),
         ),
     ),

@@ -79,12 +79,14 @@ def test_the_api_gives_the_time_left(client: TestClient, pipeline: str) -> None:
 
 
 def test_remaining_times_are_words() -> None:
-    assert [minutes_left(s) for s in (0.0, 59.9, 60.0, 61.0, 600.0)] == [
+    assert [minutes_left(s) for s in (0.0, 59.9, 60.0, 61.0, 600.0, 7200.0, 20_000.0)] == [
         "less than a minute left",
         "less than a minute left",
         "about 1 min left",
         "about 2 min left",
         "about 10 min left",
+        "about 120 min left",
+        "about 6 h left",
     ]
 
 

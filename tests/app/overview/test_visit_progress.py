@@ -7,8 +7,8 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from app.overview.next_steps import Actor, Task, next_steps
-from app.overview.state import State
+from app.overview.state import State, next_steps
+from app.overview.tasks import Actor, Task
 from app.overview.visit_progress import VisitProgress, visit_progress
 from app.overview.wording import progress, what
 from app.study.models import Participant, SettingsVersion

@@ -97,6 +97,15 @@ def test_what_another_error_gives_back_is_its_writers_too(browser: TestClient) -
     assert re.fullmatch(r"/participants/NOBODY/visits\?written_by=\d+", again(refused.text))
 
 
+def test_what_is_sent_again_goes_to_the_whole_address_of_its_form_and_to_no_other_host(browser: TestClient) -> None:
+    refused = browser.post("/participants/NOBODY/visits?from=day&written_by=1&of=a%26b", data={"number": "2"})
+    assert re.fullmatch(r"/participants/NOBODY/visits\?from=day&amp;of=a%26b&amp;written_by=\d+", again(refused.text))
+    for elsewhere in ("//evil.example/visits", "/\\evil.example/visits"):
+        refused = browser.post(f"http://testserver{elsewhere}?written_by=1", data={"number": "2"})
+        assert refused.status_code == 404
+        assert re.match(r"/(evil|%5Cevil)", again(refused.text))
+
+
 def test_a_password_is_not_given_back(browser: TestClient) -> None:
     browser.cookies.set(COOKIE, "ended")
     refused = browser.post("/account/password", data={"present_password": "old secret 123", "new_password": "new secret 123"})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 
 from fastapi.testclient import TestClient
@@ -9,7 +10,7 @@ from fastapi.testclient import TestClient
 from app.settings import get_settings
 from tests.app.every_route import PASSWORD, World
 from tests.app.pages.every_page import ELSEWHERE, addresses, routes
-from tests.app.words import above_fold, methods_named
+from tests.app.words import above_fold, methods_named, miscounted
 
 MOST_BYTES = 60_000
 METHODS_EXPLAINED = {"/glossary": "says what the words of the folds mean"}
@@ -43,15 +44,18 @@ def test_no_page_meets_its_reader_with_words_of_the_methods_and_energy_has_one_u
     reader = TestClient(world.app, headers={"Accept": "text/html"}, follow_redirects=False)
     assert reader.post("/sign-in", data={"email": "admin@clinic.example", "password": PASSWORD}).status_code == 303
     found: dict[str, list[str]] = {}
-    shares = []
+    shares, counts = [], {}
     for route, path in addresses(world).items():
         with reader.stream("get", path) as answer:
             if answer.status_code != 200 or not answer.headers["content-type"].startswith("text/html"):
                 continue
             page = answer.read().decode()
         found[route] = methods_named(above_fold(page))
+        # a number in one element and a noun in the next are no count
+        counts[route] = miscounted(" ".join(re.sub("<[^>]+>", " | ", page).split()))
         # the REST interface keeps shares of the energy under cDBS, and its reference says so
         shares += [route] if "cDBS = 1" in page and route != "/api-reference" else []
     assert len(found) >= 50
     assert {route for route, words in found.items() if words} == set(METHODS_EXPLAINED), {r: w for r, w in found.items() if w}
+    assert {route: said for route, said in counts.items() if said} == {}
     assert shares == [], "energy is told in % of cDBS"

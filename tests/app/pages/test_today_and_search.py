@@ -11,9 +11,9 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.overview.next_steps import Actor, Task
 from app.overview.saved import Saved, overall
 from app.overview.state import states
+from app.overview.tasks import Actor, Task
 from app.platform.jobs import service as jobs
 from app.platform.jobs.models import Job, JobStatus
 from app.study.models import Participant

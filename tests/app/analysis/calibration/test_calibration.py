@@ -85,7 +85,7 @@ def test_numbers_are_those_computed_by_hand(client: TestClient, upload: Upload, 
     assert errors["dlsm", "rating"] == pytest.approx(0.5)
     page = client.get("/participants/P1/calibration")
     assert page.status_code == 200
-    for text in ("Actual against predicted return", "Regret@1", "cDBS (reference)", "Mean absolute error of every method", ">p0<"):
+    for text in ("Worth of a session, predicted and seen", "Regret@1", "cDBS (reference)", "Mean absolute error of every method", ">p0<"):
         assert text in page.text
     assert client.get("/participants/P1/calibration", params={"method": "fqe"}).status_code == 200
     assert client.get("/participants/P1/calibration", params={"method": "wis"}).status_code == 422

@@ -47,27 +47,30 @@ RIGHT_WAY = [at_visit(v, k, 10.0 + k, 11.0 + k) for v in (2, 3) for k in range(4
 def test_a_good_record_says_distance_order_choice_and_intervals() -> None:
     found = in_sentences(calibration(RIGHT_WAY), "linear")
     assert found == [
-        "Linear model was off by 1.0 in the mean (33 % of the range of what was seen) over 8 tests of a policy at 2 visits, on average 1.0 "
-        "too low.",
-        "It put them in the right order better than chance (rank correlation 1.00, p < 0.01).",
-        "At every visit the policy that it put first returned the most.",
-        "Its 90 % intervals held 8 of 8 actual means.",
+        "What a session is worth was predicted 1.0 off in the mean (33 % of the range of what was seen), over 8 tests of a policy at 2 "
+        "visits, on average 1.0 too low.",
+        "Policies were put in the right order better than by chance (rank correlation 1.00, p < 0.01).",
+        "At every visit the policy put first was worth the most.",
+        "The 90 % intervals held the truth in 8 of 8 tests.",
     ]
 
 
 def test_a_bad_record_is_said_as_plainly() -> None:
     found = in_sentences(calibration(WRONG_WAY), "linear")
-    assert found[1] == "It put them in the wrong order (rank correlation -1.00, p < 0.01)."
-    assert found[2].startswith("The policy that it put first returned 3.0 less than the best of its visit, 100 % of the visit's range")
-    assert found[3] == "Its 90 % intervals held 0 of 8 actual means."
+    assert found[1] == "Policies were put in the wrong order (rank correlation -1.00, p < 0.01)."
+    assert found[2].startswith("The policy put first was worth 3.0 less than the best of its visit, 100 % of the visit's range")
+    assert found[3] == "The 90 % intervals held the truth in 0 of 8 tests."
 
 
 def test_too_little_is_said_to_be_too_little_and_cdbs_is_not_counted() -> None:
     found = in_sentences(calibration([at_visit(2, 1, 12.0, 10.0), at_visit(2, 9, 50.0, 0.0, reference="cdbs")]), "linear")
-    assert found[0] == "Linear model was off by 2.0 in the mean over 1 test of a policy at 1 visit, on average 2.0 too high."
-    assert found[1].startswith("Whether it puts policies in the right order cannot be said")
-    assert found[2].startswith("What its choice cost cannot be said: a ranking needs at least 2 policies at one visit")
-    assert found[-1] == "1 test of a policy is few: methods whose intervals overlap cannot be told apart."
+    assert (
+        found[0]
+        == "What a session is worth was predicted 2.0 off in the mean, over 1 test of a policy at 1 visit, on average 2.0 too high."
+    )
+    assert found[1].startswith("Whether policies were put in the right order cannot be said")
+    assert found[2].startswith("What going by it cost cannot be said: a ranking needs at least 2 policies at one visit")
+    assert found[-1] == "1 test of a policy is few: much of this may be chance."
     assert in_sentences(calibration([]), "fqe") == []
 
 

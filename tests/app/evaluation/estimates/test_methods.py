@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -19,7 +21,8 @@ from app.evaluation.estimates.compute import evaluate_method
 from app.evaluation.schemas import EvaluateParams
 from app.platform.jobs import StepReport
 from app.platform.jobs.children.child import ChildLimits
-from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall
+from app.platform.jobs.children.forked import ForkedProcesses
+from app.platform.jobs.children.supervisor import ONE_THREAD, ComputeCall
 from ml.ope import registry
 from ml.ope.estimate import Estimate
 from ml.ope.registry import Method, Size
@@ -76,7 +79,7 @@ def registered() -> Iterator[None]:
 def test_a_method_of_its_own_file_runs_in_a_child_process(db: Session, tmp_path: Path) -> None:
     db_call = call(db, buffer_of(sessions()), method=MEAN.key)
     db.commit()
-    children = ChildProcesses()
+    children = ForkedProcesses(learns=True)
     try:
         step = ComputeCall("evaluate_mean_session", f"{__name__}:evaluate_here", db_call, tmp_path / "step", ChildLimits(2048))
         outcome = children.run(step, lambda messages: None, lambda: None)
@@ -117,6 +120,24 @@ def test_the_published_interface_lists_the_methods_and_refuses_others(client: Te
     assert schemas["EvaluateJob"]["properties"]["methods"]["items"]["enum"] == list(registry.method_keys())
     with pytest.raises(ValidationError, match="'nonsense' is no method of evaluation; choose among dlsm, dlsm_paper, linear"):
         EvaluateParams(methods=["nonsense", "fqe"])
+
+
+LOADED = """
+import sys, threading
+from importlib import import_module
+from pathlib import Path
+for name in ("app.learning.training.compute", "app.evaluation.estimates.compute"):
+    import_module(name).prepare()
+assert {"torch._dynamo", "scipy.optimize", "numba.core.dispatcher"} <= set(sys.modules)
+print([name for task in Path("/proc/self/task").iterdir() if (name := (task / "comm").read_text().strip()) != "jemalloc_bg_thd"])
+"""
+
+
+def test_the_process_whose_forks_compute_has_loaded_everything_and_has_one_thread() -> None:
+    command = [sys.executable, "-c", LOADED]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=600, env=os.environ | ONE_THREAD)
+    names = ast.literal_eval(done.stdout)
+    assert len(names) == 1, "a fork of several threads may find a lock that nobody will release; jemalloc, of pyarrow, sees to its own"
 
 
 def test_the_web_process_loads_no_torch() -> None:

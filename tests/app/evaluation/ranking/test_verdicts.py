@@ -115,11 +115,12 @@ def test_the_first_screen_says_what_to_test_why_and_at_what_risk_without_a_word_
     judge({a: judged(50.0, outcome_draws=likely), b: judged(60.0, **NEARLY_OFF), c: judged(70.0, supported=False)})
     words = first_screen(client)
     assert (
-        "minutes each: p0 : energy \N{MINUS SIGN}29 %, grasp \N{MINUS SIGN}0.2 Hz, rating 0.0 points, tremor +4 points; "
+        "minutes each (expected against cDBS): p0 : energy \N{MINUS SIGN}29 %, grasp \N{MINUS SIGN}0.2 Hz, rating unchanged, tremor +4 "
+        "percentage points; "
         "85 % likely within the margins." in words
     )
-    assert re.search(r"Worth a test, \d+ minutes each:", words)
-    assert re.search(r"Worth a test with care, \d+ minutes, one of them at a visit: p2 , not below 1.5 mA", words)
+    assert re.search(r"Worth a test, \d+ minutes each \(", words)
+    assert re.search(r"Worth a test with care, \d+ minutes, one of them at a visit \(expected against cDBS\): p2 , not below 1.5 mA", words)
     assert "Not advised: p1 : unsafe, nearly off 42 % of the time" in words
     assert methods_named(words) == []
 
@@ -149,7 +150,7 @@ def test_a_plan_says_of_its_policies_what_the_ranking_says(client: TestClient, p
     pages = PdfReader(io.BytesIO(client.get(f"/api/v1/visits/{visit}/plan.pdf").content)).pages
     sheet = " ".join(" ".join(page.extract_text() for page in pages).split())
     assert "Verdict test; 85 % likely within the margins" in sheet
-    assert re.search(r"Against cDBS energy .29 %, grasp .0.2 Hz, rating 0.0 points, tremor \+4 points", sheet)
+    assert re.search(r"Against cDBS energy .29 %, grasp .0.2 Hz, rating unchanged, tremor \+4 percentage points", sheet)
 
 
 def test_only_what_may_be_planned_without_a_clinicians_reason_can_be_ticked(client: TestClient, policies: list[int], judge: Judge) -> None:
@@ -191,12 +192,12 @@ def test_a_ranking_with_nothing_to_test_says_so_why_and_what_to_do(client: TestC
     words = first_screen(client)
     assert (
         "No policy is worth a visit yet. 1 acts like cDBS, so that a session would show nothing new; the rest is not advised. "
-        "Further policies are needed: train some . Another visit of random and cDBS sessions" in words
+        "Further policies are needed: train some . At the next visit: random and cDBS sessions," in words
     )
     assert "p0 : unsafe, > 99 % likely beyond a margin, most often that of tremor; to expect: energy \N{MINUS SIGN}40 %" in words
-    assert "tremor +25 points" in words, "what it would cost the patient"
+    assert "tremor +25 percentage points" in words, "what it would cost the patient"
     assert "p2 : acts like no stimulation, nearly off more than 80 % of the time" in words
-    assert "To expect under cDBS itself: grasp 2.0 Hz, rating 7.0, tremor 20 % of the time." in words
+    assert "To expect under cDBS itself: grasp 2.0 Hz, rating 7.0 of 10 (10 is best), tremor 20 % of the time." in words
     page = client.get(PAGE).text
     assert not re.search("tick policies|ticked policies|Skip to the candidates", page), "there is nothing to tick"
 
@@ -246,10 +247,16 @@ def test_where_nothing_is_worth_a_test_the_page_says_what_a_random_session_asks_
     judge({policies[0]: judged(50.0, told=False)}, cdbs(told=False).to_json())
     words = first_screen(client)
     minus = "\N{MINUS SIGN}"
-    assert "the amplitude changes every 10 to 60 s, between 0.9 and 3.0 mA, below 1.8 mA for the last 5 minutes at most" in words
+    assert "the amplitude changes every 10 to 60 s, between 0.9 and 3.0 mA, below 1.8 mA only within the last 5 minutes" in words
     # sessions 1, 2 and 4 were random, 3 was cDBS: 1.8 less 2.2 Hz, 5.3 less 7, 23.3 less 10 %
-    assert f"The 3 so far, against cDBS of the same day: grasp {minus}0.4 Hz, rating {minus}1.7 points, tremor +13 points" in words
+    assert (
+        f"The 3 so far, against cDBS of the same day: grasp {minus}0.4 Hz, rating {minus}1.7 points, tremor +13 percentage points" in words
+    )
     assert "at worst grasp 1.4 Hz, rating 4 of 10, tremor 35 % of the time" in words
+    assert "On average that is beyond this participant's margins of grasp, rating and tremor" in words
+    wide = {"margins": {"grasp_share": 0.2, "rating_points": 1.8, "tremor_points": 13.0}, "reason": "agreed"}
+    assert client.put("/api/v1/participants/P1/margins", json=wide).status_code == 200
+    assert "On average that is beyond this participant's margin of tremor : these sessions explore" in first_screen(client)
     assert client.put("/api/v1/participants/P1/settings", json={"settings": {"design": "paper"}}).status_code == 200
     words = first_screen(client)
     assert "the amplitude changes every 2 s, between 0.9 and 3.0 mA. The 3 so far" in words, "nothing keeps it from being low throughout"

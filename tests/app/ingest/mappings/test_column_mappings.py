@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 from html import unescape
 from typing import Any
 
@@ -241,7 +242,7 @@ def test_a_damaged_table_of_the_same_upload_waits_on_and_hides_no_result(client:
     assert (answer.status_code, answer.json().get("waiting")) == (200, [second]), answer.text
 
 
-def test_the_form_works_without_javascript(client: TestClient, waiting: int, db: Session) -> None:
+def test_the_form_works_without_javascript(client: TestClient, client_as: Callable[[str], TestClient], waiting: int, db: Session) -> None:
     upload = db.scalar(text("select upload_id from upload_file"))
     assert f"/uploaded-files/{waiting}/mapping" in client.get(f"/uploads/{upload}", headers=PAGE).text
     page = unescape(client.get(f"/uploaded-files/{waiting}/mapping", headers=PAGE).text)
@@ -263,6 +264,9 @@ def test_the_form_works_without_javascript(client: TestClient, waiting: int, db:
     assert "Clinic's system" in listed
     assert "a step's time is its end" in listed
     number = db.scalar(text("select id from column_mapping"))
+    offered = f'action="/column-mappings/{number}/remove"'
+    assert offered in listed
+    assert offered not in client_as("viewer").get(f"/studies/{code}/column-mappings", headers=PAGE).text, "who may not is not asked"
     gone = client.post(f"/column-mappings/{number}/remove", headers=PAGE, data={"reason": "done"}, follow_redirects=False)
     assert gone.status_code == 303
 

@@ -231,7 +231,8 @@ def test_a_plan_repeats_what_its_ranking_says_of_unsupported_policies(client: Te
     )
     db.commit()
     assert [w["text"] for w in _draft(client, studied).json()["warnings"]] == [
-        "Policies that the data do not support stand below all supported ones, whatever their estimated value: rl-02-small (99.0)."
+        "Hardly any session came near what these do, so that their values are guesses; "
+        "they stand last, whatever the value: rl-02-small (99.0)."
     ]
 
 
