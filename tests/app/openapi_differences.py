@@ -323,6 +323,10 @@ INTENDED: dict[str, str] = {
     ),
     "components > schemas > SweepCandidateOut > properties > beyond_margin": "(API: `beyond_margin`)",
     **dict.fromkeys(
+        tuple(f"components > schemas > SweepCandidateOut > properties > {name}" for name in ("energy_saved", "within_margins")),
+        "(API: `energy_saved`, `within_margins`)",
+    ),
+    **dict.fromkeys(
         tuple(f"components > schemas > {job} > properties > anchor" for job in ("PipelineJob", "TrainJob")),
         "Policies may be held near the best constant amplitude",
     ),

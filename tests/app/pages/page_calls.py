@@ -134,7 +134,7 @@ def _of_learning(world: World) -> dict[str, Call]:
         f"{policy}/release": {"data": LIMITS | {"password": PASSWORD}},
         f"{policy}/retire": of_api(world, "patch", "/policies/{policy_id}") | {"data": {"reason": "worn out"}},
         "/participants/{code}/buffer-gate": {"data": {"choice": "open", "reason": "agreed in the trial meeting"}},
-        "/participants/{code}/jobs": {"code": "P4", "data": {"kind": "evaluate", "preset": "quick", "methods": "linear"}},
+        "/participants/{code}/jobs": {"code": "P4", "data": {"kind": "evaluate", "preset": "quick", "methods": "linear", "again": "on"}},
         "/participants/{code}/next-generation": {"code": "P2", "data": {}},
         "/jobs/{job_id}/cancel": of_api(world, "post", "/jobs/{job_id}/cancel"),
         "/jobs/{job_id}/retry": of_api(world, "post", "/jobs/{job_id}/retry"),

@@ -72,7 +72,7 @@ def test_grasp_intervals_are_shown_with_implausible_ones_marked(browser: TestCli
     fields = {"participant": "P1", "session": str(timed_session)}
     assert client.post("/api/v1/uploads", data=fields, files={"file": ("grasp.csv", rows.encode())}).status_code == 201
     page = unescape(browser.get(f"/sessions/{timed_session}").text)
-    assert "n = 4 intervals in 1 tests, 1 implausible" in page
+    assert "n = 4 intervals in 1 test, 1 implausible" in page
     assert "without them 2 Hz" in page
     assert client.get(f"/api/v1/sessions/{timed_session}/qoc").json()["grasp_hz"] == pytest.approx(4 / 5.5)
 

@@ -112,7 +112,7 @@ def test_minutes_of_one_file_that_contradict_each_other_are_left_out(db: Session
     assert qoc.tremor_percent == pytest.approx(45.0)
     assert "9.0 of 10.0 min covered" in (qoc.reason or "")
     assert "2 minutes of upload" in (qoc.reason or "")
-    assert "claim the same time and say different things" in (qoc.reason or "")
+    assert "left out: the same time is told twice, in different ways" in (qoc.reason or "")
 
 
 def test_a_typed_value_stays_and_both_numbers_are_told(db: Session, study_session: StudySession, new_file: NewFile) -> None:
