@@ -77,20 +77,28 @@ class Planned:
         return sum(h.steps for h in self.holds if h.amplitude < LOW_AMPLITUDE) * self.period_s
 
 
-def planned_sessions(settings: SettingsVersion, code: str, earlier_visits: int, count: int, minutes: float) -> list[Planned]:
+def planned_sessions(settings: SettingsVersion, code: str, earlier_visits: int, count: int, minutes: float, bound: float) -> list[Planned]:
     """What the random sessions of one visit shall try, by the participant's settings.
 
     Levels are spread over `early_visits` visits; after these a new round of strata begins. The draws depend on the participant's code and
     the round alone, so that drafting a plan again gives the same ones.
 
     Args:
-        settings: design, ladder, B and period. code: the participant's. earlier_visits: with a plan of this design.
-        count: random sessions of the visit. minutes: of each.
+        settings: design, ladder and period. code: the participant's. earlier_visits: with a plan of this design.
+        count: random sessions of the visit. minutes: of each. bound: below which nothing is drawn, fraction of cDBS.
+
+    Raises:
+        Invalid: nothing lies between the bound and cDBS.
     """
     if count == 0:
         return []
+    if bound >= 1:
+        raise Invalid(
+            "Random sessions have nothing to draw: the lowest amplitude of the plan is that of cDBS.",
+            "Lower the limit, or plan the visit without random sessions.",
+        )
     if settings.design == "paper":
-        return [Planned("paper", None, None, settings.lower_bound, settings.period_s, ())] * count
+        return [Planned("paper", None, None, bound, settings.period_s, ())] * count
     number, place = divmod(earlier_visits, settings.early_visits)
     wanted = DesignSettings(
         name="stratified",
@@ -98,7 +106,7 @@ def planned_sessions(settings: SettingsVersion, code: str, earlier_visits: int, 
         sessions=count,
         steps=max(1, round(60 * minutes / settings.period_s)),
         period_s=settings.period_s,
-        lower_bound=settings.lower_bound,
+        lower_bound=bound,
         ladder=settings.design_ladder,
         seed=seed_of(code, number),
     )
@@ -106,26 +114,39 @@ def planned_sessions(settings: SettingsVersion, code: str, earlier_visits: int, 
 
 
 def near_sessions(
-    levels: Sequence[float], settings: SettingsVersion, code: str, visit_number: int, minutes: float, cdbs_ma: float | None = None
+    levels: Sequence[float],
+    settings: SettingsVersion,
+    code: str,
+    visit_number: int,
+    minutes: float,
+    bound: float,
+    cdbs_ma: float | None = None,
 ) -> list[Planned]:
     """Sessions that are held near stated amplitudes. Drafting the visit again gives the same draws.
 
     Args:
         levels: fraction of cDBS of each session. settings: B and period. code: the participant's. visit_number, minutes: of the visit, and
-            of each session. cdbs_ma: the cDBS amplitude, for words; None where it is not known.
+            of each session. bound: below which nothing is drawn, fraction of cDBS. cdbs_ma: the cDBS amplitude, for words; None where it
+            is not known.
 
     Raises:
-        Invalid: a level below B, or cDBS itself.
+        Invalid: a level below B or the bound, or cDBS itself.
     """
-    seed, bound = seed_of(f"{code}/{NEAR}", visit_number), settings.lower_bound
+    seed = seed_of(f"{code}/{NEAR}", visit_number)
     steps = max(1, round(60 * minutes / settings.period_s))
     found = []
     for number, level in enumerate(levels):
-        if not bound <= level < 1:
-            wanted, lowest, highest = (_amplitude(share, cdbs_ma) for share in (level, bound, 1.0))
+        if not settings.lower_bound <= level < 1:
+            wanted, lowest, highest = (_amplitude(share, cdbs_ma) for share in (level, settings.lower_bound, 1.0))
             raise Invalid(
                 f"A session held near {wanted} cannot be planned: the participant's lower bound is {lowest}, and cDBS {highest}.",
                 "Name an amplitude from the lower bound to below that of cDBS.",
+            )
+        if level < bound:
+            raise Invalid(
+                f"A session is to be held near {_amplitude(level, cdbs_ma)}, and the lowest amplitude of the plan is "
+                f"{_amplitude(bound, cdbs_ma)}.",
+                "Lower the limit, or hold the session at or above it.",
             )
         session = near_session(level, steps, settings.period_s, bound, seed, number)
         found.append(Planned(NEAR, level, seed, bound, settings.period_s, session.decisions))

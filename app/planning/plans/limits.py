@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from sqlalchemy.orm import Session
 
 from app.planning.plans import repository
-from app.planning.plans.models import PlanItem, is_held
+from app.planning.plans.models import PlanItem
 from app.platform.errors import Conflict, Invalid
 from app.study import cdbs_amplitude
 from app.study.models import Controller, Hemisphere, Participant, Visit
 
 _TOLERANCE_MA = 1e-6
+_ROUNDING_MA = 0.01
+"""By how much limits that follow from B are rounded up at most."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,25 @@ def slot_limits(
     return SlotLimits(cdbs_ma, low, high, ramp)
 
 
+def lowest_draw(db: Session, visit: Visit, stated: StatedLimits, hemisphere: Hemisphere | None) -> float:
+    """B of a visit's random sessions, fraction of cDBS: the participant's, or the plan's lowest amplitude where that is higher.
+
+    Draws below a limit would be cut by the tablet: the sheet would name amplitudes that nobody gives, and a density that is not theirs.
+    Where nobody knows the cDBS amplitude it is the participant's, because the plan has no limits then.
+
+    Raises:
+        Invalid: as `slot_limits`.
+    """
+    settings = visit.participant.current_settings
+    try:
+        cdbs_ma = planned_cdbs_ma(visit, hemisphere)
+    except Invalid:
+        return settings.lower_bound  # the limits of the plan say what is missing, and signing is refused
+    device = device_limits(db, visit.participant, hemisphere)
+    least = slot_limits(cdbs_ma, Controller.RANDOM, settings.period_s, stated, device, settings.lower_bound).min_ma
+    return least / cdbs_ma if least > settings.lower_bound * cdbs_ma + _ROUNDING_MA else settings.lower_bound
+
+
 def set_limits(db: Session, visit: Visit, items: Sequence[PlanItem], stated: StatedLimits, hemisphere: Hemisphere | None) -> None:
     """Set the limits of every session; where nobody knows the cDBS amplitude they stay open, and the plan cannot be signed.
 
@@ -143,21 +164,8 @@ def set_limits(db: Session, visit: Visit, items: Sequence[PlanItem], stated: Sta
     for item in items:
         least = item.design["lower_bound"] if item.design is not None else item.min_fraction
         found = slot_limits(cdbs_ma, Controller(item.controller), period_s, stated, device, least or 0.0)
-        _require_reach(item, found)
         item.hemisphere = hemisphere
         item.cdbs_ma, item.min_ma, item.max_ma, item.ramp_ma_per_s = found.cdbs_ma, found.min_ma, found.max_ma, found.ramp_ma_per_s
-
-
-def _require_reach(item: PlanItem, limits: SlotLimits) -> None:
-    """Raises Invalid where a session is to be held near an amplitude that its limits forbid."""
-    if item.design is None or not is_held(item):
-        return
-    wanted = item.design["level"] * limits.cdbs_ma
-    if wanted < limits.min_ma - _TOLERANCE_MA:
-        raise Invalid(
-            f"A session is to be held near {wanted:g} mA, and the lowest amplitude of the plan is {limits.min_ma:g} mA.",
-            "Lower the limit, or hold the session at or above it.",
-        )
 
 
 def require_limits(visit: Visit, items: Sequence[PlanItem]) -> None:

@@ -20,7 +20,7 @@ from app.learning.models import Policy
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of, near_sessions, planned_sessions, seed_of
 from app.planning.plans.key import label_sessions, sealed
-from app.planning.plans.limits import StatedLimits, planned_cdbs_ma, require_limits, set_limits
+from app.planning.plans.limits import StatedLimits, lowest_draw, planned_cdbs_ma, require_limits, set_limits
 from app.planning.plans.models import Plan, PlanItem, is_held
 from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
 from app.planning.plans.schemas import HeldIn, Move, PlanIn, PlanOptions
@@ -257,12 +257,13 @@ def _supersede(db: Session, visit: Visit, reason: str | None, caller: Caller) ->
 def _to_try(db: Session, visit: Visit, rules: Rules, draft: PlanIn, seed: int) -> list[Planned]:
     """What the visit's random and held sessions shall try by the settings of today, in a drawn order where there are both."""
     participant, settings = visit.participant, visit.participant.current_settings
+    bound = lowest_draw(db, visit, StatedLimits(draft.min_ma, draft.max_ma, draft.ramp_ma_per_s), draft.hemisphere)
     earlier = repository.earlier_designed_visits(db, visit)
-    random = planned_sessions(settings, participant.code, earlier, rules.random_sessions, rules.session_minutes)
+    random = planned_sessions(settings, participant.code, earlier, rules.random_sessions, rules.session_minutes, bound)
     if not draft.held:
         return random
     levels, cdbs_ma = _levels(visit, draft.held, draft.hemisphere)
-    everyone = random + near_sessions(levels, settings, participant.code, visit.number, rules.session_minutes, cdbs_ma)
+    everyone = random + near_sessions(levels, settings, participant.code, visit.number, rules.session_minutes, bound, cdbs_ma)
     return [everyone[i] for i in np.random.default_rng([seed, 0x6E6561]).permutation(len(everyone))]
 
 

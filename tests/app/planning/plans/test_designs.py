@@ -15,7 +15,7 @@ from app.learning.snapshots.service import take_snapshot
 from app.planning.plans.designs import Bound, delivered_ma, rounded_up
 from app.platform import files
 from app.study.repository import participant_by_code
-from ml.designs import LOW_AMPLITUDE, LOW_SECONDS, DrawDensity
+from ml.designs import LOW_AMPLITUDE, LOW_SECONDS, DrawDensity, near_density
 from ml.ope.importance import ImportanceSampling
 from ml.policies.policy import ConstantPolicy
 from ml.trajectories import from_parquet
@@ -93,6 +93,30 @@ def test_safety_comes_before_information(client: TestClient, enrolled: str) -> N
             for h in d["holds"]:
                 law = DrawDensity(d["level"], LOW_AMPLITUDE if h["start"] < 450 else 0.35)
                 assert h["log_density"] == pytest.approx(float(np.log(law.density(h["amplitude"]))))
+
+
+def test_no_draw_lies_below_the_lowest_amplitude_of_the_plan(client: TestClient, enrolled: str) -> None:
+    """What a limit would cut is not drawn: the sheet names what the tablet gives, and densities are those of what was drawn."""
+    settle(client, cdbs_amplitude_ma=3.0, lower_bound=0.3)
+    number = visit(client, 2)
+    open_ones = designed(client, number)
+    assert min(h["amplitude"] for d in open_ones for h in d["holds"]) < 0.7
+    body = client.post(f"/api/v1/visits/{number}/plan", json=RANDOM | {"min_ma": 2.1, "held": [{"amplitude_ma": 2.2}]}).json()
+    random = [s for s in body["sessions"] if s["design"]]
+    assert len(random) == 4
+    for s in random:
+        design = s["design"]
+        assert (design["lower_bound"], s["min_ma"], design["bounds"][0]["lowest_ma"]) == (pytest.approx(0.7), 2.1, 2.1)
+        assert min(h["amplitude"] for h in design["holds"]) >= 0.7
+        law = {"stratified": DrawDensity, "near": near_density}[design["design"]](design["level"], design["lower_bound"])
+        for h in design["holds"]:
+            assert h["log_density"] == pytest.approx(float(np.log(law.density(h["amplitude"]))))
+    levels = sorted(s["design"]["level"] for s in random if s["design"]["design"] == "stratified")
+    assert [int((level - 0.7) / 0.3 * 3) for level in levels] == [0, 1, 2], "strata are those of what is left"
+    settle(client, design="paper")
+    assert [d["lower_bound"] for d in designed(client, number, min_ma=2.1)] == pytest.approx([0.7] * 3)
+    nothing = client.post(f"/api/v1/visits/{number}/plan", json=RANDOM | {"min_ma": 3.0})
+    assert (nothing.status_code, "Random sessions have nothing to draw" in nothing.text) == (422, True)
 
 
 def test_rounding_never_goes_below_the_bound() -> None:

@@ -102,7 +102,7 @@ def test_what_the_bound_forbids_is_refused_with_the_bound(client: TestClient, nu
 
 def test_a_limit_above_the_amplitude_and_a_day_too_long_are_refused(client: TestClient, number: int) -> None:
     above = drafted(client, number, held=[{"amplitude_ma": 2.1}], min_ma=2.4)
-    assert (above.status_code, "held near 2.1 mA, and the lowest amplitude of the plan is 2.4 mA" in above.text) == (422, True)
+    assert (above.status_code, "held near 2.10 mA, and the lowest amplitude of the plan is 2.40 mA" in above.text) == (422, True)
     long = drafted(client, number, held=[{"amplitude_ma": 2.1, "sessions": 4}], total_minutes=50)
     assert (long.status_code, "The held sessions with the sessions around them take 70 minutes" in long.text) == (422, True)
 
