@@ -11,7 +11,6 @@ from typing import Any
 import plotly
 import structlog
 from fastapi import APIRouter, Depends, FastAPI, Request, Response
-from fastapi.openapi.utils import get_openapi
 from fastapi.responses import JSONResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
@@ -29,6 +28,7 @@ from app.platform.tables import load_tables
 from app.platform.upkeep.doctor import newest_revision, revision
 from app.platform.web import middleware as web
 from app.platform.web.compressed import CompressedFiles
+from app.platform.web.description import describe
 from app.platform.web.schemas import problems
 from app.platform.web.templates import STATIC
 
@@ -220,17 +220,6 @@ def _service_routes() -> APIRouter:
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document; problems are application/problem+json, and FastAPI's own validation schema is left out."""
-    if app.openapi_schema:
-        return app.openapi_schema
-    document = get_openapi(title=app.title, version=app.version, routes=app.routes, description="REST interface of a betaloop study.")
-    for path in document["paths"].values():
-        for operation in path.values():
-            for status, response in operation.get("responses", {}).items():
-                if int(status) >= 400:
-                    schema = {"$ref": "#/components/schemas/Problem"}
-                    response["content"] = {"application/problem+json": {"schema": schema}}
-    for unused in ("HTTPValidationError", "ValidationError"):
-        document.get("components", {}).get("schemas", {}).pop(unused, None)
-    app.openapi_schema = document
-    return document
+    """The OpenAPI document, made once."""
+    app.openapi_schema = app.openapi_schema or describe(app)
+    return app.openapi_schema

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from tests.openapi_everywhere import EVERYWHERE
 from tests.openapi_new_features import NEW_FEATURES
 
 INTENDED: dict[str, str] = {
@@ -335,4 +336,5 @@ INTENDED: dict[str, str] = {
         "API: a dose is an entry of the clinic day (kind `dose`; migration 0029)",
     ),
     **NEW_FEATURES,
+    **EVERYWHERE,
 }

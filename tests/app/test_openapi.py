@@ -81,3 +81,28 @@ def test_a_difference_of_each_kind_is_seen_at_its_place() -> None:
         "components > schemas > QocIn > properties > rating > anyOf > 0 > maximum",
         "components > schemas > ParticipantIn > required",
     }
+
+
+def schemas(part: Any, place: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every schema of an OpenAPI document, and every schema inside one, with its place."""
+    if isinstance(part, list):
+        for i, one in enumerate(part):
+            yield from schemas(one, f"{place} > {i}")
+    if not isinstance(part, dict):
+        return
+    if {"type", "anyOf", "oneOf", "allOf", "$ref", "enum", "const"} & part.keys() and not place.endswith(" > properties"):
+        yield place, part
+    for key, value in part.items():
+        yield from schemas(value, f"{place} > {key}")
+
+
+def test_every_bound_is_one_that_readers_of_a_json_schema_know(service_app: Any) -> None:
+    found = list(schemas(service_app.openapi()))
+    assert sum("minimum" in schema for _, schema in found) > 100
+    raw = [f"{place}: {key}" for place, schema in found for key in schema.keys() & {"ge", "gt", "le", "lt", "multiple_of"}]
+    assert raw == []
+    # none may promise more than the database's own numbers hold
+    wide = [
+        p for p, s in found if s.get("format") == "int32" and not -(2**31) <= s.get("minimum", 0) <= s.get("maximum", 0) + 2**31 < 2**32
+    ]
+    assert wide == []

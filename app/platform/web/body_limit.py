@@ -1,8 +1,8 @@
 """What is judged before the body of a request is read: how large it may be, who sends it, and how much they have sent lately.
 
-No body may be larger than its kind allows, stated or not: files up to the installation's upload limit, all else 1 MiB. Bodies beyond
-`UNJUDGED_LIMIT` are read of callers alone who have signed in, and files count against what a network address and a user may send in an
-hour. An answer to a request whose body was not read ends the connection, so that the rest of it is not received either.
+No body may be larger than its kind allows, stated or not: files up to the installation's upload limit, all else 1 MiB. Of callers alone
+who have signed in are read whatever the REST interface is sent, JSON wherever it is sent, and bodies beyond `UNJUDGED_LIMIT`; files count
+against what a network address and a user may send in an hour. An answer to a request whose body was not read ends the connection, so that the rest of it is not received either.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from app.settings import get_settings
 PLAIN_LIMIT = 1 << 20
 """Bytes of a JSON document or a plain form."""
 UNJUDGED_LIMIT = 1 << 16
-"""Bytes of a body that is read before anybody asks who sends it: a sign-in form, most documents."""
+"""Bytes of a form of a page that is read before anybody asks who sends it: a sign-in, or what an expired sign-in gives back."""
+INTERFACE = "/api/"
+"""What paths of the REST interface begin with."""
 Refusal = Callable[[Request, Exception], Awaitable[Response]]
 """Makes the answer to a request that was refused for a reason; raises what it does not know."""
 Judge = Callable[[Request], Awaitable[str]]
@@ -53,7 +55,7 @@ class BodyLimit:
             await self.app(scope, receive, send)
             return
         body = _Body(scope, receive, send)
-        if body.may_be_large:
+        if body.is_of_callers_alone:
             request = Request(scope)
             try:
                 body.require_size()
@@ -74,8 +76,9 @@ class _Body:
         self._receive, self._send = receive, send
         self._stated = int(stated) if stated.isdigit() else None
         self._has_files = headers.get(b"content-type", b"").lower().startswith(b"multipart/form-data")
+        self._is_data = is_json(scope) or scope["path"].startswith(INTERFACE)
         self._limit = get_settings().upload_limit_mb * 1024 * 1024 + _FORM_ALLOWANCE if self._has_files else PLAIN_LIMIT
-        self.may_be_large = b"transfer-encoding" in headers or (self._stated or 0) > UNJUDGED_LIMIT
+        self.is_of_callers_alone = b"transfer-encoding" in headers or (self._stated or 0) > (0 if self._is_data else UNJUDGED_LIMIT)
         self._sources: list[str] = []
         self._seen, self._whole = 0, False
 
@@ -106,9 +109,15 @@ class _Body:
 
     async def send(self, message: Message) -> None:
         """Pass a part of the answer on; the connection ends with the answer where the body was left unread."""
-        if message["type"] == "http.response.start" and self.may_be_large and not self._whole:
+        if message["type"] == "http.response.start" and self.is_of_callers_alone and not self._whole:
             message["headers"] = [*message.get("headers", []), (b"connection", b"close")]
         await self._send(message)
+
+
+def is_json(scope: Scope) -> bool:
+    """Whether a request says that its body is a JSON document."""
+    kind = dict(scope["headers"]).get(b"content-type", b"").partition(b";")[0].strip().lower()
+    return bool(kind == b"application/json" or kind.endswith(b"+json"))
 
 
 def _take(sources: list[str], size: int) -> None:

@@ -3,22 +3,42 @@
 from __future__ import annotations
 
 from datetime import UTC, date, datetime
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar, cast
 
 from fastapi import Depends, Query
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, Strict
+from pydantic_core import CoreSchema
 
 Item = TypeVar("Item")
 
 
-def _fits_the_database(value: int) -> int:
-    if not -(2**31) <= value < 2**31:
-        raise ValueError(f"the number must lie between {-(2**31)} and {2**31 - 1}")
-    return value
+LEAST_INT, MOST_INT = -(2**31), 2**31 - 1
+"""What an integer column of the database holds."""
 
 
-# a validator and no `Field(ge=…, le=…)`: bounds written here would silently replace the bounds that a field states for itself
-Int = Annotated[int, Strict(), AfterValidator(_fits_the_database), Field(json_schema_extra={"format": "int32"})]
+class _FitsTheDatabase:
+    """Bounds a whole number where nobody has bounded it closer.
+
+    No validator of its own: pydantic cannot look into one, and would publish the bounds of a field as they stand in the code (`ge`, `le`),
+    which no reader of a JSON schema knows. No `Field(ge=…, le=…)` either: it would silently replace the bounds that a field states.
+    """
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        schema: dict[str, Any] = {**handler(source), "strict": True}
+        for bound, other, limit in (("ge", "gt", LEAST_INT), ("le", "lt", MOST_INT)):
+            if other not in schema:
+                schema.setdefault(bound, limit)
+        return cast(CoreSchema, schema)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        described = handler(schema)
+        for bound, limit in (("minimum", LEAST_INT), ("maximum", MOST_INT)):
+            if described.get(bound) == limit:  # the format says as much
+                del described[bound]
+        return described | {"format": "int32"}
+
+
+Int = Annotated[int, _FitsTheDatabase()]
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Bool = Annotated[bool, Strict()]
 

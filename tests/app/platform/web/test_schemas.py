@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import pytest
 from pydantic import Field, ValidationError
 
@@ -30,3 +32,36 @@ def test_whole_numbers_at_their_bounds_are_taken() -> None:
 def test_a_fields_own_bounds_stand_in_the_document() -> None:
     place = Bounded.model_json_schema()["properties"]["place"]
     assert (place["minimum"], place["maximum"]) == (1, 10)
+
+
+class Nullable(Model):
+    """Bounds beside null, on the items of a list, and one that is left to the database."""
+
+    rating: Int | None = Field(None, ge=1, le=10)
+    policies: list[Annotated[Int, Field(ge=1)]] = []
+    above: Int | None = Field(None, gt=0, lt=7)
+    count: Int | None = None
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        *({"rating": v} for v in (0, 11, "3", True, 2.0, 2**31)),
+        *({"policies": [v]} for v in (0, 2**31, "1")),
+        *({"above": v} for v in (0, 7)),
+        *({"count": v} for v in (2**31, -(2**31) - 1)),
+    ],
+)
+def test_bounds_beside_null_and_of_items_hold(values: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        Nullable(**values)  # type: ignore[arg-type]
+
+
+def test_bounds_beside_null_and_of_items_are_those_of_a_json_schema() -> None:
+    assert Nullable(rating=10, policies=[1], above=6, count=-(2**31)).rating == 10
+    fields = Nullable.model_json_schema()["properties"]
+    whole = {"type": "integer", "format": "int32"}
+    assert fields["rating"]["anyOf"] == [whole | {"minimum": 1, "maximum": 10}, {"type": "null"}]
+    assert fields["policies"]["items"] == whole | {"minimum": 1}
+    assert fields["above"]["anyOf"] == [whole | {"exclusiveMinimum": 0, "exclusiveMaximum": 7}, {"type": "null"}]
+    assert fields["count"]["anyOf"] == [whole, {"type": "null"}]
