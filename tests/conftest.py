@@ -19,7 +19,6 @@ from fastapi.testclient import TestClient
 from httpx2 import Response
 from hypothesis import settings
 from pwdlib import PasswordHash
-from pwdlib.hashers.argon2 import Argon2Hasher
 from sqlalchemy import create_engine
 from sqlalchemy.orm import Session
 
@@ -27,6 +26,7 @@ import app.platform.database as database
 from app.accounts import service as accounts
 from app.accounts.models import Role
 from app.accounts.pages import failed_sign_ins
+from app.accounts.passwords import FewAtOnce
 from app.platform import service_role
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.files import path_of
@@ -213,7 +213,7 @@ def released_database(
 @pytest.fixture(autouse=True, scope="session")
 def cheap_passwords() -> None:
     """Argon2 as in the service, at a cost that hundreds of tests can bear."""
-    accounts._hasher = PasswordHash((Argon2Hasher(time_cost=1, memory_cost=64, parallelism=1),))
+    accounts._hasher = PasswordHash((FewAtOnce(time_cost=1, memory_cost=64, parallelism=1),))
     accounts._decoy.cache_clear()
 
 

@@ -16,7 +16,7 @@ from app.accounts.addresses import normal_address
 from app.accounts.browser import SIGNED_OUT, count_try, failed_sign_ins, local_path, signed_in
 from app.accounts.deps import COOKIE, CurrentCaller
 from app.accounts.models import Role, Scope, User
-from app.accounts.passwords import MIN_PASSWORD
+from app.accounts.passwords import AT_ONCE, MIN_PASSWORD
 from app.accounts.permissions import Caller
 from app.platform.database import Db, new_session, now, set_actor
 from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany
@@ -36,7 +36,7 @@ SCOPE_NAMES = {
     Scope.METRICS: "figures of the service alone",
 }
 _A_DAY_S = 86_400
-_passwords = Bounded(2, 100)  # argon2 takes all of a core and 64 MiB each time
+_passwords = Bounded(AT_ONCE, 100)  # in threads of their own, so that those who wait hold up nothing else
 
 
 @router.get("/sign-in")

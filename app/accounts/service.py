@@ -10,13 +10,12 @@ from datetime import timedelta
 from functools import lru_cache
 
 from pwdlib import PasswordHash
-from pwdlib.hashers.argon2 import Argon2Hasher
 from sqlalchemy.orm import Session
 
 from app.accounts import repository, second_factor
 from app.accounts.addresses import LONGEST_ADDRESS, normal_address
 from app.accounts.models import ApiToken, Membership, Role, Scope, SignIn, SignInAttempt, Study, User
-from app.accounts.passwords import MIN_PASSWORD, weakness
+from app.accounts.passwords import MIN_PASSWORD, FewAtOnce, place, weakness
 from app.accounts.permissions import MANAGE_ACCOUNTS, READ_AUDIT, Caller, Grant
 from app.platform.audit import record
 from app.platform.database import new_session, now
@@ -31,7 +30,7 @@ _TOKEN_PREFIX = "blp_"  # noqa: S105 - no secret
 
 # Argon2id with 19 MiB, two passes and one lane: the second of the settings that OWASP's Password Storage Cheat Sheet gives as equally good.
 # A check takes 22 ms of a processor; with the library's default (64 MiB, three passes, four lanes) 180, nearly all of what a sign-in costs
-_hasher = PasswordHash((Argon2Hasher(time_cost=2, memory_cost=19 * 1024, parallelism=1),))
+_hasher = PasswordHash((FewAtOnce(time_cost=2, memory_cost=19 * 1024, parallelism=1),))
 
 
 @lru_cache(maxsize=1)
@@ -48,17 +47,19 @@ def add_user(db: Session, email: str, role: Role, password: str, study_code: str
     email = address
     if repository.user_by_email(db, email):
         raise Conflict(f"There is already a user {email}.")
-    check_password(password, email)
-    user = User(email=email, name=name, password_hash=_hasher.hash(password))
+    check_password(password, email, name)
+    with place():
+        user = User(email=email, name=name, password_hash=_hasher.hash(password))
     user.memberships.append(Membership(study_id=study_of(db, study_code).id, role=role))
     db.add(user)
     db.flush()
     return user
 
 
-def check_password(password: str, email: str) -> None:
-    """Raises Invalid for a password that is too short or too easy to guess."""
-    why = weakness(password, email)
+def check_password(password: str, email: str, name: str = "") -> None:
+    """Raises Invalid for a password that is too short or too easy to guess, TooMany where too many ask at the same moment."""
+    with place():
+        why = weakness(password, email, name)
     if why is not None:
         raise Invalid(
             f"The password {why}.", f"Use at least {MIN_PASSWORD} characters, such as four words that have nothing to do with each other."
@@ -67,8 +68,9 @@ def check_password(password: str, email: str) -> None:
 
 def set_password(db: Session, user: User, password: str) -> None:
     """Change a password; every browser session and API token of the user ends, for somebody else may have made them."""
-    check_password(password, user.email)
-    user.password_hash = _hasher.hash(password)
+    check_password(password, user.email, user.name)
+    with place():
+        user.password_hash = _hasher.hash(password)
     for token in repository.tokens_of(db, user.id):
         token.revoked_at = token.revoked_at or now()
     for sign_in in repository.open_sign_ins(db, user.id):
@@ -82,7 +84,7 @@ def change_own_password(db: Session, user_id: int, present: str, new: str, code:
         TooMany: too many wrong passwords lately. Forbidden: the present one is wrong. Invalid: a bad new one.
     """
     user = db.get_one(User, user_id)
-    check_password(new, user.email)
+    check_password(new, user.email, user.name)
     confirm_password(user_id, present, code)
     set_password(db, user, new)
 
@@ -94,9 +96,10 @@ def confirm_password(user_id: int, password: str, code: str = "") -> None:
         code: of the second factor, where the user has one.
 
     Raises:
-        TooMany: too many wrong passwords lately. Forbidden: it or the code is wrong, or the account is closed.
+        TooMany: too many wrong passwords lately, or too many people at this moment. Forbidden: it or the code is wrong, or the account
+            is closed.
     """
-    with new_session() as db:
+    with place(), new_session() as db:
         user = db.get_one(User, user_id)
         attempt = _count_attempt(db, user.email)
         if not (_hasher.verify(password, user.password_hash) and user.active):
@@ -215,7 +218,7 @@ def last_user_of_cookie(db: Session, token: str) -> int | None:
 
 
 def caller_of_token(db: Session, token: str) -> Caller | None:
-    """Who an API token belongs to, unless it was revoked."""
+    """Who an API token belongs to, unless it was revoked or has run out; the time of its last use is kept, to the minute."""
     row = repository.api_token_by_hash(db, _hash(token))
     if row is None or not row.user.active:
         return None
