@@ -62,8 +62,7 @@ def api_token_by_hash(db: Session, token_sha256: str) -> ApiToken | None:
     """The API token of a hash, unless it was revoked or has run out."""
     return db.scalar(
         select(ApiToken)
-        .where(ApiToken.token_sha256 == token_sha256, ApiToken.revoked_at.is_(None))
-        .where(ApiToken.expires_at.is_(None) | (ApiToken.expires_at > now()))
+        .where(ApiToken.token_sha256 == token_sha256, ApiToken.revoked_at.is_(None), ApiToken.expires_at > now())
         .options(selectinload(ApiToken.user).selectinload(User.memberships))
     )
 

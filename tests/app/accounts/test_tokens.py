@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from datetime import timedelta
 
@@ -18,6 +19,7 @@ from app.accounts.models import Role, Scope, User
 from app.accounts.permissions import PERMISSIONS, READ_ARMS, SCOPES, Caller, Grant
 from app.platform.database import now
 from app.platform.errors import Forbidden, Invalid, TooMany
+from app.platform.web.templates import when
 from tests.conftest import PASSWORD
 
 ADA = "ada@clinic.example"
@@ -102,6 +104,29 @@ def test_a_token_ends_on_its_day(db: Session, ada: str) -> None:
     assert service.caller_of_token(db, token) is not None
     db.execute(text("update api_token set expires_at = :at"), {"at": now() - timedelta(seconds=1)})
     assert service.caller_of_token(db, token) is None
+
+
+def test_the_last_use_of_a_token_is_kept_and_shown(db: Session, ada: str, client_with: Callable[[str], TestClient]) -> None:
+    used, unused = service.create_token(db, ada, "used"), service.create_token(db, ada, "unused")
+    cookie = service.sign_in(db, ada, PASSWORD)
+    db.commit()
+    assert client_with(used).get("/api/v1/studies").status_code == 200
+    assert unused
+    last = db.scalar(text("select last_used_at from api_token where name = 'used'"))
+    assert now() - timedelta(minutes=1) < last <= now()
+    page = TestClient(client_with(used).app, cookies={COOKIE: cookie}).get("/account").text
+    shown = {
+        name: re.findall(r"<td>(.*?)</td>", row)[3] for name in ("used", "unused") for row in re.findall(rf"<tr><td>{name}</td>.*", page)
+    }
+    assert shown["used"] == when(last)
+    assert shown["unused"] == when(None)
+    # seen again within the minute nothing is written, which every request would wait for; after it, it is
+    client_with(used).get("/api/v1/studies")
+    assert db.scalar(text("select last_used_at from api_token where name = 'used'")) == last
+    db.execute(text("update api_token set last_used_at = now() - interval '2 hours' where name = 'used'"))
+    db.commit()
+    client_with(used).get("/api/v1/studies")
+    assert db.scalar(text("select last_used_at from api_token where name = 'used'")) >= last
 
 
 @pytest.mark.parametrize("days", [0, -1, service.MOST_TOKEN_DAYS + 1])

@@ -85,3 +85,19 @@ def test_releases_of_bundles_are_read_from_the_old_audit_trail_where_they_parse(
         (policy, "left", 0.5, 3.25, 1e-05, None, "ada@clinic.example", sha256),
     ]
     owner_db.rollback()
+
+
+def test_a_token_without_an_end_is_given_one_and_others_keep_theirs(owner_db: Session) -> None:
+    connection = owner_db.connection()
+    command.downgrade(config(connection), "0033")
+    owner_db.execute(text("insert into app_user (email, name, password_hash, active) values ('ada@clinic.example', '', '', true)"))
+    made = (
+        "insert into api_token (user_id, name, token_sha256, expires_at) select id, :name, :name, cast(:ends as timestamptz) from app_user"
+    )
+    for name, end in (("endless", None), ("short", "2026-12-01T00:00:00Z")):
+        owner_db.execute(text(made), {"name": name, "ends": end})
+    command.upgrade(config(connection), "head")
+    ends = owner_db.execute(text("select name, expires_at - now() = interval '90 days' from api_token order by name"))
+    assert [tuple(row) for row in ends] == [("endless", True), ("short", False)]
+    assert owner_db.scalar(text("select expires_at = '2026-12-01T00:00:00Z' from api_token where name = 'short'"))
+    owner_db.rollback()

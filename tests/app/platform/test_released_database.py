@@ -187,3 +187,16 @@ def test_every_route_of_the_interface_reads_a_released_study(released_database: 
         token = accounts.create_token(db, PERSON, "tests")
     with TestClient(application, headers={"Authorization": f"Bearer {token}"}) as client:
         assert unexpected(client, {path for path in readable(application) if path.startswith("/api/")}) == {}
+
+
+def test_tokens_of_the_release_end_ninety_days_after_the_upgrade(released_database: str) -> None:
+    """They had no end."""
+    url = released_database.replace("+psycopg", "")
+    with psycopg.connect(url) as connection:
+        left = connection.execute("select extract(epoch from expires_at - now()) / 86400 from api_token").fetchall()
+        reasons = connection.execute("select reason from audit_event where entity = 'api_token' and action = 'update'").fetchall()
+    assert left
+    assert all(89 < days <= 90 for (days,) in left)
+    assert reasons.count(("tokens have an end; one without ends 90 days from this upgrade",)) == len(left)
+    with psycopg.connect(url) as connection, pytest.raises(psycopg.errors.NotNullViolation):
+        connection.execute("update api_token set expires_at = null")
