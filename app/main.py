@@ -11,6 +11,7 @@ from typing import Any
 import plotly
 import structlog
 from fastapi import APIRouter, Depends, FastAPI, Request, Response
+from fastapi.openapi.utils import get_openapi
 from fastapi.responses import JSONResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
@@ -28,7 +29,6 @@ from app.platform.tables import load_tables
 from app.platform.upkeep.doctor import newest_revision, revision
 from app.platform.web import middleware as web
 from app.platform.web.compressed import CompressedFiles
-from app.platform.web.description import describe
 from app.platform.web.schemas import problems
 from app.platform.web.templates import STATIC
 
@@ -219,7 +219,44 @@ def _service_routes() -> APIRouter:
     return router
 
 
+_PROBLEM = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+_BEFORE_ROUTES = {
+    400: "The body cannot be read: it is no JSON in UTF-8 (nested less than a thousand deep, numbers of ordinary length), no whole form,"
+    " or ended early.",
+    413: "The body is larger than this kind of request may have.",
+    429: "Too many tries, or too much was sent from here lately; `Retry-After` says when another try makes sense.",
+    503: "The database does not answer for the moment, or this was given up for another request; try again later.",
+    507: "No room is left on the disk; what was stored before is safe.",
+}
+"""What operations may answer before, or whatever, their routes do."""
+
+
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document, made once."""
-    app.openapi_schema = app.openapi_schema or describe(app)
-    return app.openapi_schema
+    """The OpenAPI document; problems are application/problem+json, and FastAPI's own validation schema is left out."""
+    if app.openapi_schema:
+        return app.openapi_schema
+    document = get_openapi(title=app.title, version=app.version, routes=app.routes, description="REST interface of a betaloop study.")
+    for path in document["paths"].values():
+        for method, operation in path.items():
+            responses = operation["responses"]
+            for status in _answered_before(method, operation):
+                responses.setdefault(str(status), {"description": _BEFORE_ROUTES[status]})
+            for status, response in responses.items():
+                if int(status) >= 400:
+                    response["content"] = _PROBLEM
+    for unused in ("HTTPValidationError", "ValidationError"):
+        document.get("components", {}).get("schemas", {}).pop(unused, None)
+    app.openapi_schema = document
+    return document
+
+
+def _answered_before(method: str, operation: dict[str, Any]) -> set[int]:
+    """Which of those answers an operation may give."""
+    found = {503}
+    if "security" in operation:  # who calls is looked up, and their token's last use is written down, where somebody only reads too
+        found |= {507}
+    if method != "get":
+        found |= {413, 429}
+    if "requestBody" in operation:
+        found |= {400}
+    return found

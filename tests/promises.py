@@ -22,6 +22,8 @@ RELEASES, MARGINS = "tests/app/planning/releases/test_releases.py", "tests/app/s
 SIGNATURES = "tests/app/platform/signatures/test_signatures.py"
 QUARANTINE, QUERIES = "tests/app/ingest/quarantine/test_quarantine.py", "tests/app/study/data_queries/test_data_queries.py"
 SCOPE, HEADERS = "tests/app/overview/test_audit_scope.py", "tests/app/platform/web/test_headers.py"
+MALFORMED, HASHES = "tests/app/platform/test_malformed_bodies.py", "tests/app/accounts/test_few_hashes_at_once.py"
+PASSWORDS, NUMBERS = "tests/app/accounts/test_passwords.py", "tests/app/platform/web/test_schemas.py"
 LIMITS, BODIES = "tests/app/platform/web/test_source_limits.py", "tests/app/platform/web/test_body_limit.py"
 OWNED, FIGURES = "tests/app/test_ids_belong_together.py", "tests/app/platform/web/test_figures.py"
 
@@ -155,17 +157,36 @@ PROMISES = [
          f"{TOKENS}::test_nobody_administers_a_user_without_any_access"),
         ("nobody revokes the token of another", "if row is None or row.user_id != user_id:", "if row is None:",
          f"{ACCOUNTS}::test_nobody_revokes_the_token_of_another"),
+        ("the last use of a token is kept", "        row.last_used_at = now()\n", "        pass\n",
+         f"{TOKENS}::test_the_last_use_of_a_token_is_kept_and_shown"),
+        ("who is sent away has tried no password", "with place(), new_session() as db:", "with new_session() as db:",
+         f"{HASHES}::test_who_finds_too_many_waiting_is_asked_to_come_back_and_has_tried_nothing"),
         ("an account that was closed ends what lasts", "    if row is None or not row.user.active:\n        return None\n    if used",
          "    if row is None:\n        return None\n    if used",
           f"{TOKENS}::test_an_answer_that_lasts_learns_that_its_account_was_closed"),
     ),
     *_of(
+        "accounts/passwords",
+        ("common passwords are refused", "if _guesses(password, [email, name, *words]) < LEAST_GUESSES:", "if False:",
+         f"{PASSWORDS}::test_what_is_guessed_first_is_refused"),
+        ("one's own words are no passwords", 'f"{email} {name}".casefold()', '"".casefold()',
+         f"{PASSWORDS}::test_what_others_know_of_somebody_is_no_secret"),
+        ("no password takes long to judge", "zxcvbn(password[:MOST_JUDGED], ", "zxcvbn(password[:72], ",
+         f"{PASSWORDS}::test_no_password_takes_long_to_judge"),
+        ("two passwords are verified at a time", "        with _turns:\n            return super().verify",
+         "        if True:\n            return super().verify", f"{HASHES}::test_two_at_a_time_whoever_asks_and_for_whatever"),
+        ("two passwords are hashed at a time", "        with _turns:\n            return super().hash",
+         "        if True:\n            return super().hash", f"{HASHES}::test_two_at_a_time_whoever_asks_and_for_whatever"),
+    ),
+    Promise("tokens of the first release end", "migrations/versions/20261126_token_ends.py", "'90 days'", "'90 years'",
+            "tests/app/platform/test_migrations.py::test_a_token_without_an_end_is_given_one_and_others_keep_theirs", at_start=True),
+    *_of(
         "accounts/repository",
-        ("tokens end on their day", "ApiToken.expires_at.is_(None) | (ApiToken.expires_at > now())", "ApiToken.id > 0",
+        ("tokens end on their day", ", ApiToken.expires_at > now())", ")",
          f"{TOKENS}::test_a_token_ends_on_its_day"),
         ("sessions end by idling", "SignIn.last_seen_at > idle_since, ", "", f"{ACCOUNTS}::test_a_session_ends_by_idling_and_by_age"),
         ("sessions end by age", ", SignIn.created_at > begun_since", "", f"{ACCOUNTS}::test_a_session_ends_by_idling_and_by_age"),
-        ("revoked tokens are refused", ", ApiToken.revoked_at.is_(None))", ")", f"{ACCOUNTS}::test_a_token_works_until_it_is_revoked"),
+        ("revoked tokens are refused", ", ApiToken.revoked_at.is_(None), ", ", ", f"{ACCOUNTS}::test_a_token_works_until_it_is_revoked"),
     ),
     *_of(
         "accounts/second_factor",
@@ -338,8 +359,25 @@ PROMISES = [
         "platform/web/body_limit",
         ("strangers send nothing large", ", await self.judge(request)])", "])",
          f"{LIMITS}::test_a_gibibyte_of_nobody_is_refused_before_it_is_received"),
+        ("nothing that the interface is sent is read of strangers", 'is_json(scope) or scope["path"].startswith(INTERFACE)', "False",
+         f"{MALFORMED}::test_no_body_of_nobody_is_read"),
+        ("JSON of strangers is read nowhere", 'is_json(scope) or scope["path"]', 'scope["path"]',
+         f"{MALFORMED}::test_json_of_nobody_is_read_by_no_page_either"),
         ("bodies without a length are cut off", "        if self._seen > self._limit:\n", "        if False:\n",
          f"{BODIES}::test_a_document_that_states_no_length_is_cut_off"),
+    ),
+    *_of(
+        "platform/web/schemas",
+        ("bounds are published as readers know them", "if described.get(bound) == limit:", "if bound in described:",
+         f"{NUMBERS}::test_bounds_beside_null_and_of_items_are_those_of_a_json_schema"),
+    ),
+    *_of(
+        "main",
+        ("what no body can be is documented", "        found |= {400}\n", "        pass\n",
+         f"{MALFORMED}::test_answers_that_stand_before_every_route_are_described"),
+        ("a full disk is documented", "        found |= {507}\n", "        pass\n",
+         f"{MALFORMED}::test_answers_that_stand_before_every_route_are_described"),
+        at_start=True,
     ),
     *_of(
         "accounts/browser",

@@ -2,7 +2,8 @@
 
 No body may be larger than its kind allows, stated or not: files up to the installation's upload limit, all else 1 MiB. Of callers alone
 who have signed in are read whatever the REST interface is sent, JSON wherever it is sent, and bodies beyond `UNJUDGED_LIMIT`; files count
-against what a network address and a user may send in an hour. An answer to a request whose body was not read ends the connection, so that the rest of it is not received either.
+against what a network address and a user may send in an hour. An answer to a request whose body was not read ends the connection, so that
+the rest of it is not received either.
 """
 
 from __future__ import annotations
