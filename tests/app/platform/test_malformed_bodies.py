@@ -18,7 +18,6 @@ BODIES: dict[str, tuple[str, bytes]] = {
     "nested too deep": (JSON, b"[" * 60_000),
     "a number of 5 000 digits": (JSON, b'{"number": ' + b"9" * 5_000 + b"}"),
     "a member stated twice": (JSON, b'{"reason": "a", "reason": "b"}'),
-    "cut off": (JSON, b'{"reason": '),
     "null": (JSON, b"null"),
     "no text and no number": (JSON, b'{"reason": "\\ud800", "number": -Infinity}'),
     "a form": (FORM, b"reason=a"),
@@ -84,7 +83,7 @@ def test_json_of_nobody_is_read_by_no_page_either(service_app: FastAPI, fresh_da
     monkeypatch.setattr(json_members, "doubled_member", looked.append)
     nobody = TestClient(service_app)
     for address in ("/sign-in", "/participants/P1/visits", "/no/such/page"):
-        assert [sent(nobody, "post", address, what) for what, (kind, _) in BODIES.items() if kind == JSON] == [401] * 7, address
+        assert [sent(nobody, "post", address, what) for what, (kind, _) in BODIES.items() if kind == JSON] == [401] * 6, address
     assert looked == []
     assert nobody.post("/sign-in", data={"email": "a@b.example", "password": "wrong"}).status_code == 401, "a form of a page is read"
 
