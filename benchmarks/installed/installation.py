@@ -279,6 +279,16 @@ def installation(webs: int = 1, workers: int = 1, own_server: bool = False, keep
             shutil.rmtree(folder, ignore_errors=True)
 
 
+def times_slower(load: float, own: float) -> float:
+    """How many times as long an answer may take as on a machine with nothing else to do, where it is exactly 1.
+
+    Args:
+        load: processes that wait for a processor or have one, on average (`os.getloadavg`).
+        own: of these, what the measurement makes itself on a machine with nothing else to do.
+    """
+    return max(1.0, load / max(own, os.cpu_count() or 1))
+
+
 def utc() -> datetime:
     """The present."""
     return datetime.now(UTC)

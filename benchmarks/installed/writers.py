@@ -27,6 +27,8 @@ STEPS = 40
 TRAIN = {"kind": "train", "preset": "quick", "algorithms": ["ddpg"], "count": 1, "updates": 300}
 EVALUATE = {"kind": "evaluate", "preset": "quick", "methods": ["linear"]}
 MOST_LIVE_JOBS = 2
+ALLOWED = (503, 507)
+"""Server errors that a caller may meet while processes die and disks fill: the same is sent again."""
 
 
 @dataclass
@@ -36,6 +38,7 @@ class Acknowledged:
     Attributes:
         uploads: number of the upload to its session. qocs: (session, grasp frequency), each frequency once. entries: of the clinic day.
         jobs: their ids. answers: how often each status came, and how often none ("cut off").
+        faults: answers that are a fault of the service whatever was killed: server errors but 503 and 507.
     """
 
     uploads: dict[int, int] = field(default_factory=dict)
@@ -43,6 +46,7 @@ class Acknowledged:
     entries: list[str] = field(default_factory=list)
     jobs: list[str] = field(default_factory=list)
     answers: Counter[str] = field(default_factory=Counter)
+    faults: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
         return f"{len(self.uploads)} uploads, {len(self.qocs)} QoCs, {len(self.entries)} entries, {len(self.jobs)} jobs"
@@ -200,8 +204,8 @@ class Writers:
             self._give_up.wait(REPEAT_S)
             return None
         self.said.answers[str(answer.status_code)] += 1
-        if answer.status_code == 500:
-            self.said.answers[f"500: {answer.text[:300]}"] += 1
+        if answer.is_server_error and answer.status_code not in ALLOWED:
+            self.said.faults.append(f"{answer.request.method} {answer.request.url.path}: {answer.status_code} {answer.text[:300]}")
         return answer
 
     def _until(self, send: Callable[[], httpx.Response], right: tuple[int, ...]) -> Any:
@@ -216,8 +220,8 @@ class Writers:
 
 
 def what_is_wrong(installed: Installation, said: Acknowledged, study: Study) -> list[str]:
-    """Sentences about what was acknowledged and is not there, or is there twice; empty where all is right."""
-    wrong = []
+    """Sentences about what was acknowledged and is not there, or is there twice, and about server errors; empty where all is right."""
+    wrong = [f"a request was answered with a server error: {fault}" for fault in said.faults]
 
     def rows(query: str, *values: Any) -> list[Any]:
         found = installed.ask(query, *values)
